@@ -1,0 +1,1 @@
+"""The judge: the MuJoCo quadrotor, worlds, trials, flight logs, tables and recordings."""

@@ -1,0 +1,41 @@
+"""What a policy expects of the world: its rate, its camera and how its inputs are scaled.
+
+The observation is the paper's (Su et al. 2026, Eq. 1): 12 numbers and a depth image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from tracks.camera import Camera
+
+STATE_SIZE = 12
+"""Numbers in the state observation: v_b (3), third row of R (3), gate in body axes (3), u (3)."""
+ACTION_SIZE = 3
+"""Numbers in an action: wanted net acceleration in current body axes [m/s^2]."""
+
+
+@dataclass(frozen=True)
+class DepthEncoding:
+    """Inverse depth as the network sees it: scale / clip(depth, near, far) - offset."""
+
+    scale: float = 3.0
+    """Numerator [m]."""
+    near: float = 0.3
+    """Depths below this read as this [m]."""
+    offset: float = 0.6
+    """Subtracted, so that far pixels are near zero [1]."""
+
+
+@dataclass(frozen=True)
+class PolicySpec:
+    """What trainer and judge must agree on for a policy to fly; stored in its checkpoint."""
+
+    rate_hz: float = 30.0
+    """Actions per second [Hz]."""
+    camera: Camera = field(default_factory=Camera)
+    """The camera that the images come from; depths are clipped to its range."""
+    depth: DepthEncoding = field(default_factory=DepthEncoding)
+    """How a depth becomes an input."""
+    hidden_size: int = 192
+    """Width of the embeddings and of the recurrent state."""

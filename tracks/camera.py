@@ -1,0 +1,46 @@
+"""The depth camera: a pinhole, 32 x 24 pixels, pitched up in the body's x-z plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A forward-looking depth camera at the body's origin."""
+
+    pitch_deg: float = 15.0
+    """Pitch of the optical axis above body x [deg]."""
+    fov_deg: tuple[float, float] = (78.4, 63.8)
+    """Horizontal and vertical field of view, edge to edge [deg]."""
+    range_m: float = 10.0
+    """Depths beyond this read as this [m]."""
+    width: int = 32
+    """Pixels across."""
+    height: int = 24
+    """Pixels down."""
+
+
+def pixel_rays_b(camera: Camera, fov_scale: float = 1.0) -> np.ndarray:
+    """Return the rays through the pixel centres in body axes, (height * width, 3).
+
+    Row-major from the top left, as the image is stored. Each ray's component along the optical
+    axis is 1, so the ray parameter at a hit is the planar depth itself.
+    """
+    half_u, half_v = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) * fov_scale / 2)
+    left = half_u * (1 - (2 * np.arange(camera.width) + 1) / camera.width)
+    up = half_v * (1 - (2 * np.arange(camera.height) + 1) / camera.height)
+    up, left = np.meshgrid(up, left, indexing="ij")
+    pitch = np.deg2rad(camera.pitch_deg)
+    rays = np.stack(
+        [np.cos(pitch) - up * np.sin(pitch), left, np.sin(pitch) + up * np.cos(pitch)], axis=-1
+    )
+    return rays.reshape(-1, 3)
+
+
+def optical_axis_b(camera: Camera) -> np.ndarray:
+    """Return the unit optical axis in body axes, (3,)."""
+    pitch = np.deg2rad(camera.pitch_deg)
+    return np.array([np.cos(pitch), 0.0, np.sin(pitch)])

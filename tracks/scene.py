@@ -1,0 +1,173 @@
+"""A scene as plain arrays: the gates in flight order and every solid, the ground being z = 0.
+
+The classes are named tuples, so they are immutable and are pytrees for JAX without importing it.
+All positions are in the world frame (z up) in metres; rotation matrices map local to world.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Array = Any  # numpy.ndarray or jax.Array: the geometry functions take both
+
+PARKED_Z = -1000.0
+"""Height at which padding solids are parked [m]: out of reach of every ray and distance."""
+
+
+class Gates(NamedTuple):
+    """Gates in flight order.
+
+    A gate's frame has its origin at the opening's centre, x through the gate in flight
+    direction, and the opening in its y-z plane.
+    """
+
+    center_w: Array
+    """(G, 3) opening centres [m]."""
+    rot_w: Array
+    """(G, 3, 3) gate to world; column 0 is the flight direction."""
+    opening_g: Array
+    """(G, V, 2) corners (y, z) of the convex opening [m], counter-clockwise in the y-z plane
+    (y to z), which is how the flying drone's field of currents threads it along +x. Openings
+    with fewer corners repeat the last one."""
+    frame_width: Array
+    """(G,) width of the frame's bars around the opening [m]."""
+    frame_depth: Array
+    """(G,) extent of the frame along the flight direction [m]."""
+
+
+class Boxes(NamedTuple):
+    """Boxes at any orientation."""
+
+    center_w: Array
+    """(N, 3) [m]."""
+    rot_w: Array
+    """(N, 3, 3) box to world."""
+    half_size: Array
+    """(N, 3) [m]."""
+
+
+class Rods(NamedTuple):
+    """Cylinders (flat ends) or capsules (round ends), told apart by the field that holds them."""
+
+    center_w: Array
+    """(N, 3) [m]."""
+    axis_w: Array
+    """(N, 3) unit vectors."""
+    radius: Array
+    """(N,) [m]."""
+    half_length: Array
+    """(N,) half of the straight part, a capsule's caps not counted [m]."""
+
+
+class Spheres(NamedTuple):
+    """Spheres."""
+
+    center_w: Array
+    """(N, 3) [m]."""
+    radius: Array
+    """(N,) [m]."""
+
+
+class Scene(NamedTuple):
+    """Everything that can be flown through, seen or hit; the ground plane z = 0 is implied."""
+
+    gates: Gates
+    boxes: Boxes
+    """Gate frame bars come first (V a gate, gate by gate), then the obstacles."""
+    cylinders: Rods
+    capsules: Rods
+    spheres: Spheres
+    triangles: Array
+    """(M, 3, 3) corners of mesh triangles [m]; M = 0 on all generated tracks."""
+
+
+class Counts(NamedTuple):
+    """How many of each solid a padded scene holds."""
+
+    boxes: int
+    cylinders: int
+    capsules: int
+    spheres: int
+    triangles: int = 0
+
+
+def no_rods() -> Rods:
+    """Return an empty set of cylinders or capsules."""
+    return Rods(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+
+
+def counts(scene: Scene) -> Counts:
+    """Return how many solids of each kind `scene` (not batched) holds."""
+    return Counts(
+        len(scene.boxes.center_w),
+        len(scene.cylinders.radius),
+        len(scene.capsules.radius),
+        len(scene.spheres.radius),
+        len(scene.triangles),
+    )
+
+
+def _parked(n: int) -> np.ndarray:
+    return np.tile([0.0, 0.0, PARKED_Z], (n, 1))
+
+
+def _pad_rods(rods: Rods, n: int) -> Rods:
+    more = n - len(rods.radius)
+    return Rods(
+        np.concatenate([rods.center_w, _parked(more)]),
+        np.concatenate([rods.axis_w, np.tile([0.0, 0.0, 1.0], (more, 1))]),
+        np.concatenate([rods.radius, np.full(more, 1e-3)]),
+        np.concatenate([rods.half_length, np.full(more, 1e-3)]),
+    )
+
+
+def pad(scene: Scene, to: Counts) -> Scene:
+    """Return `scene` with parked solids added until it holds `to` of each kind.
+
+    Raises:
+        ValueError: where the scene already holds more than `to` of a kind.
+    """
+    have = counts(scene)
+    for kind, n, limit in zip(Counts._fields, have, to, strict=True):
+        if n > limit:
+            raise ValueError(f"scene has {n} {kind}, more than the {limit} it is padded to")
+    more = to.boxes - have.boxes
+    boxes = Boxes(
+        np.concatenate([scene.boxes.center_w, _parked(more)]),
+        np.concatenate([scene.boxes.rot_w, np.tile(np.eye(3), (more, 1, 1))]),
+        np.concatenate([scene.boxes.half_size, np.full((more, 3), 1e-3)]),
+    )
+    more = to.spheres - have.spheres
+    spheres = Spheres(
+        np.concatenate([scene.spheres.center_w, _parked(more)]),
+        np.concatenate([scene.spheres.radius, np.full(more, 1e-3)]),
+    )
+    more = to.triangles - have.triangles
+    corner = np.array([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.0, 1e-3, 0.0]]) + _parked(1)
+    triangles = np.concatenate([scene.triangles, np.tile(corner, (more, 1, 1))])
+    return Scene(
+        scene.gates,
+        boxes,
+        _pad_rods(scene.cylinders, to.cylinders),
+        _pad_rods(scene.capsules, to.capsules),
+        spheres,
+        triangles,
+    )
+
+
+def stack(scenes: list[Scene], to: Counts, dtype: Any = np.float32) -> Scene:
+    """Pad `scenes` to `to` and stack them: every array gains a leading axis (len(scenes), ...).
+
+    All scenes must have the same number of gates and of corners of an opening.
+    """
+    padded = [pad(scene, to) for scene in scenes]
+
+    def merge(parts: list[Any]) -> Any:
+        if isinstance(parts[0], tuple):
+            fields = (merge(list(column)) for column in zip(*parts, strict=True))
+            return type(parts[0])(*fields)
+        return np.stack(parts).astype(dtype)
+
+    return merge(padded)
