@@ -1,0 +1,44 @@
+"""One recorded flight as plain arrays: what the judge hands to the flight log and to the viewer."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Flight(NamedTuple):
+    """One flight, sampled once every period of the attitude loop (100 Hz by default).
+
+    Row k holds what was measured at `time_s[k]` before the command of row k acts; that command
+    holds until `time_s[k + 1]`. The last row is the state at the end of the trial; its command is
+    the one that would have come next, or the last one flown where the trial ended inside a period.
+    """
+
+    time_s: np.ndarray
+    """(T,) increasing, from 0 [s]."""
+    pos_w: np.ndarray
+    """(T, 3) centre of mass [m]."""
+    quat_wxyz: np.ndarray
+    """(T, 4) body to world."""
+    vel_w: np.ndarray
+    """(T, 3) [m/s]."""
+    rate_b: np.ndarray
+    """(T, 3) [rad/s]."""
+    thrust_cmd: np.ndarray
+    """(T,) commanded collective thrust per nominal mass [m/s^2]."""
+    rate_cmd_b: np.ndarray
+    """(T, 3) commanded body rates [rad/s]."""
+    rotor_speed: np.ndarray
+    """(T, 4) in the vehicle file's order [rad/s]."""
+    action_b: np.ndarray
+    """(T, 3) the policy's action in use, after the guard [m/s^2]."""
+    policy_step: np.ndarray
+    """(T,) bool: the first row that flies a new action."""
+    gate: np.ndarray
+    """(T,) int32: the next gate's number from 0, equal to the number of gates passed."""
+    depth_m: np.ndarray | None
+    """(P, H, W) float32 depth images, one for each row with `policy_step`, or None."""
+    about: dict[str, Any]
+    """Where the flight comes from: a row of trials.parquet (track, difficulty, seed, policy,
+    vehicle, world, ended_by, ...) as plain Python values; JSON can hold it."""
