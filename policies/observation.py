@@ -1,0 +1,46 @@
+"""The observation of Su et al. 2026, Eq. 1: 12 numbers and an encoded depth image."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from policies.spec import DepthEncoding
+
+Array = Any
+
+
+def to_body(rot_w: Array, vector_w: Array) -> Array:
+    """Turn world vectors (..., 3) into body axes; rot_w (..., 3, 3) maps body to world."""
+    return (rot_w * vector_w[..., :, None]).sum(-2)
+
+
+def to_world(rot_w: Array, vector_b: Array) -> Array:
+    """Turn body vectors (..., 3) into world axes; rot_w (..., 3, 3) maps body to world."""
+    return (rot_w * vector_b[..., None, :]).sum(-1)
+
+
+def state_vector(
+    pos_w: Array, vel_w: Array, rot_w: Array, gate_w: Array, last_action_b: Array
+) -> Array:
+    """Return the 12 numbers that a policy sees besides the image, (..., 12).
+
+    Args:
+        pos_w: (..., 3) position [m].
+        vel_w: (..., 3) velocity [m/s].
+        rot_w: (..., 3, 3) body to world.
+        gate_w: (..., 3) centre of the next gate [m].
+        last_action_b: (..., 3) the previous action, in the body axes of its own time [m/s^2].
+
+    Returns:
+        Velocity in body axes [m/s], the third row of R (world z in body axes, free of yaw), the
+        next gate's centre in body axes [m] and the last action [m/s^2].
+    """
+    xp = rot_w.__array_namespace__()
+    parts = [to_body(rot_w, vel_w), rot_w[..., 2, :], to_body(rot_w, gate_w - pos_w), last_action_b]
+    return xp.concatenate(parts, axis=-1)
+
+
+def encode_depth(encoding: DepthEncoding, depth_m: Array, range_m: float) -> Array:
+    """Return planar depths [m] as the inverse depths that the network sees, of the same shape."""
+    xp = depth_m.__array_namespace__()
+    return encoding.scale / xp.clip(depth_m, encoding.near, range_m) - encoding.offset
