@@ -1,0 +1,123 @@
+"""Files and folders written whole or not at all: beside their final name, then renamed.
+
+A reader, a kill or a full disk never leaves half a file under its final name. What a killed
+process leaves beside it starts with a dot and ends in ``.part``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+@contextmanager
+def replacing_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a path to write to; on a clean exit it becomes `path`, on an error it is removed.
+
+    The yielded path keeps the suffix of `path`, so that writers that go by it still do. Missing
+    parent folders are made.
+
+    Raises:
+        OSError: where the disk is full or `path` cannot be written; `path` is then untouched.
+    """
+    final = Path(path)
+    final.parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix=f".{final.name}-", suffix=".part", dir=final.parent))
+    beside = folder / final.name
+    try:
+        yield beside
+        _sync(beside)
+        os.replace(beside, final)
+        _sync(final.parent)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield an empty folder to fill; on a clean exit it becomes `path`, else it is removed.
+
+    A folder that already stands at `path` is replaced by two renames; a kill exactly between
+    them leaves the old one beside as ``.NAME-*.part``. Writers that must survive that give
+    every folder a new name (a step number).
+
+    Raises:
+        OSError: where the disk is full or `path` cannot be written.
+    """
+    final = Path(path)
+    final.parent.mkdir(parents=True, exist_ok=True)
+    parent = Path(tempfile.mkdtemp(prefix=f".{final.name}-", suffix=".part", dir=final.parent))
+    beside = parent / final.name
+    beside.mkdir()
+    retired = parent / "replaced"
+    try:
+        yield beside
+        for written in sorted(beside.rglob("*")):
+            _sync(written)
+        if final.exists():
+            os.replace(final, retired)
+        try:
+            os.replace(beside, final)
+        except OSError:
+            if retired.exists():
+                os.replace(retired, final)
+            raise
+        _sync(final.parent)
+    finally:
+        shutil.rmtree(parent, ignore_errors=True)
+
+
+def _sync(path: Path) -> None:
+    """Flush to the disk, so that a rename does not outlive the data after a power cut."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write `text` to `path` as UTF-8, whole or not at all."""
+    with replacing_file(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> None:
+    """Write `value` to `path` as indented JSON (see `to_json`), whole or not at all."""
+    write_text(path, to_json(value, indent=2) + "\n")
+
+
+def to_json(value: Any, indent: int | None = None) -> str:
+    """Return `value` as strict JSON text.
+
+    Dataclasses and named tuples become objects, arrays lists, paths strings; NaN and infinities
+    become null, since JSON has neither.
+    """
+    return json.dumps(plain(value), indent=indent, allow_nan=False)
+
+
+def plain(value: Any) -> Any:
+    """Return `value` made of dicts, lists, strings, finite numbers, booleans and None only."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if hasattr(value, "_asdict"):
+        return plain(value._asdict())
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [plain(entry) for entry in value]
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    return str(value)

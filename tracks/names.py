@@ -1,0 +1,24 @@
+"""The error for a name that is in no table."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+def closest(name: str, allowed: Iterable[str]) -> str | None:
+    """Return the entry of `allowed` that `name` was probably meant to be, or None."""
+    lowered = {entry.lower(): entry for entry in allowed}
+    match = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.6)
+    return lowered[match[0]] if match else None
+
+
+def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> ValueError:
+    """Return (not raise) the error for `name` where only `allowed` names of `kind` exist.
+
+    The message gives the name, the nearest one if any is near, and the whole list.
+    """
+    allowed = list(allowed)
+    guess = closest(name, allowed)
+    meant = f" Did you mean {guess!r}?" if guess else ""
+    return ValueError(f"unknown {kind} {name!r}.{meant} Known: {', '.join(allowed)}.")
