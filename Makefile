@@ -1,0 +1,52 @@
+# make env    the environment in .venv, from requirements.lock
+# make race   the whole loop at a small size: train, fly, record, fit, fine-tune, fly again
+# make test   lint, types and tests
+# make lint   ruff and pyright
+# make lock   requirements.lock from what is installed in .venv
+# make clean  remove caches and build products (runs/ and .venv stay)
+
+VENV ?= .venv
+OUT ?= runs/race
+JOBS ?= 2
+PY := $(VENV)/bin/python
+STAMP := $(VENV)/.made-from-lock
+USABLE := import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))
+
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+
+.PHONY: env race test lint lock clean
+
+env: $(STAMP)
+
+$(STAMP): requirements.lock pyproject.toml setup.py
+	@set -e; found=; \
+	for python in $(PYTHON) python3 python3.11 python3.12 python3.13; do \
+		if "$$python" -c '$(USABLE)' >/dev/null 2>&1; then found=$$python; break; fi; \
+	done; \
+	if [ -z "$$found" ]; then \
+		echo "Python 3.11, 3.12 or 3.13 is needed; name one with make PYTHON=/path/to/python" >&2; \
+		exit 1; \
+	fi; \
+	if [ ! -x $(PY) ]; then echo "making $(VENV) with $$found"; "$$found" -m venv $(VENV); fi
+	$(PY) -m pip install --quiet --requirement requirements.lock
+	$(PY) -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $(STAMP)
+
+race: $(STAMP)
+	$(VENV)/bin/suite loop --preset small --out $(OUT)
+
+lint: $(STAMP)
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pyright --pythonpath $(PY) --warnings
+
+test: lint
+	$(PY) -m pytest -n $(JOBS) --dist worksteal
+
+lock:
+	$(PY) tools/lock.py > requirements.lock.new
+	mv requirements.lock.new requirements.lock
+
+clean:
+	rm -rf build dist .cache .pytest_cache .hypothesis .ruff_cache *.egg-info
+	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +
