@@ -1,0 +1,68 @@
+"""A policy's output checked and limited on its way to the quadrotor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class ActionLimits:
+    """What an action may be."""
+
+    size: float = 50.0
+    """Largest |action_b| [m/s^2]; longer ones are shortened. Over the net acceleration that a
+    thrust-to-weight ratio of 5 can make, so that it stops faults and not flying."""
+    deadline_s: float | None = None
+    """A policy's answer for its batch that takes longer than this is late and not flown [s]; None
+    sets no deadline. With one, outcomes depend on the machine's load and do not repeat."""
+
+
+class Guarded(NamedTuple):
+    """Actions fit to fly, and what was wrong with them."""
+
+    action_b: np.ndarray
+    """(N, 3) float64 [m/s^2]."""
+    bad: np.ndarray
+    """(N,) bool: not finite, replaced by the last good action."""
+    limited: np.ndarray
+    """(N,) bool: shortened to the limit."""
+    late: np.ndarray
+    """(N,) bool: came after the deadline, replaced by the last good action."""
+
+
+def guard_action(
+    limits: ActionLimits, action_b: object, last_b: np.ndarray, took_s: float, policy: str
+) -> Guarded:
+    """Check and limit what a policy returned.
+
+    Args:
+        limits: what an action may be.
+        action_b: what the policy returned; should be (N, 3) real numbers [m/s^2].
+        last_b: (N, 3) the action flown last, zero at the start of a trial [m/s^2].
+        took_s: how long the answer took [s].
+        policy: its name, for the message.
+
+    Raises:
+        ValueError: where the shape or kind of `action_b` is wrong.
+    """
+    action = np.asarray(action_b)
+    if action.shape != last_b.shape or action.dtype.kind not in "fiu":
+        raise ValueError(
+            f"policy {policy!r} returned actions of shape {action.shape} and type {action.dtype}; "
+            f"wanted real numbers of shape {last_b.shape}: one (x, y, z) in body axes for each "
+            "row of its input. Check the policy's output."
+        )
+    action = action.astype(np.float64)
+    late = np.full(len(action), limits.deadline_s is not None and took_s > limits.deadline_s)
+    bad = ~np.isfinite(action).all(-1) & ~late
+    action = np.where((bad | late)[:, None], last_b, action)
+    # Scaled before squaring, so that a huge finite action does not overflow to infinity.
+    largest = np.abs(action).max(-1, keepdims=True)
+    unit = action / np.maximum(largest, 1e-30)
+    size = largest[:, 0] * np.sqrt((unit * unit).sum(-1))
+    limited = size > limits.size
+    shortened = unit * (limits.size / np.sqrt(np.maximum((unit * unit).sum(-1), 1e-30)))[:, None]
+    return Guarded(np.where(limited[:, None], shortened, action), bad, limited, late)

@@ -1,0 +1,137 @@
+"""Intervals for what trials score: Wilson, bootstrap, and differences on the same seeds."""
+
+from __future__ import annotations
+
+from math import comb, sqrt
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+
+CONFIDENCE = 0.95
+"""Of every interval in tables and result files."""
+
+
+class Interval(NamedTuple):
+    """An estimate and its confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+class PairedDifference(NamedTuple):
+    """How much the first differs from the second on the same trials."""
+
+    value: float
+    """First minus second."""
+    low: float
+    high: float
+    p_value: float
+    """Exact McNemar test, two-sided."""
+    only_first: int
+    """Trials in which only the first succeeded."""
+    only_second: int
+    """Trials in which only the second succeeded."""
+
+
+def wilson(successes: int, trials: int, confidence: float = CONFIDENCE) -> Interval:
+    """Return the success rate with its score interval (Wilson 1927, no continuity correction).
+
+    Raises:
+        ValueError: unless 0 <= successes <= trials and trials >= 1.
+    """
+    if trials < 1 or not 0 <= successes <= trials:
+        raise ValueError(f"{successes} successes in {trials} trials: wanted 0 <= successes <= "
+                         "trials and at least one trial")
+    z = NormalDist().inv_cdf((1 + confidence) / 2)
+    rate = successes / trials
+    middle = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
+    half = z / (1 + z * z / trials) * sqrt(rate * (1 - rate) / trials + (z / (2 * trials)) ** 2)
+    # Exact at the ends, where rounding would leave 1e-17 or 1 - 1e-16.
+    low = 0.0 if successes == 0 else middle - half
+    high = 1.0 if successes == trials else middle + half
+    return Interval(rate, low, high)
+
+
+def bootstrap_median(
+    values: np.ndarray, seed: int = 0, confidence: float = CONFIDENCE, resamples: int = 4000
+) -> Interval:
+    """Return the median of values (n,) with its percentile bootstrap interval (Efron 1979).
+
+    NaN in all three where there is no value; the same seed gives the same interval.
+    """
+    values = np.asarray(values, float)
+    if not len(values):
+        return Interval(float("nan"), float("nan"), float("nan"))
+    draws = np.random.default_rng(seed).integers(0, len(values), (resamples, len(values)))
+    medians = np.median(values[draws], axis=1)
+    low, high = np.quantile(medians, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return Interval(float(np.median(values)), float(low), float(high))
+
+
+def paired_bootstrap(
+    first: np.ndarray, second: np.ndarray, seed: int = 0, confidence: float = CONFIDENCE
+) -> Interval:
+    """Return the median of first - second, (n,) on the same trials, with its interval.
+
+    Raises:
+        ValueError: where the two have not the same length.
+    """
+    if len(first) != len(second):
+        raise ValueError(f"{len(first)} values against {len(second)}: pairs need as many of each")
+    return bootstrap_median(np.asarray(first, float) - np.asarray(second, float), seed, confidence)
+
+
+def mcnemar_exact(only_first: int, only_second: int) -> float:
+    """Return the two-sided exact p-value of McNemar's test from the discordant pairs."""
+    n, few = only_first + only_second, min(only_first, only_second)
+    tail = sum(comb(n, k) for k in range(few + 1))
+    return min(1.0, 2 * tail / 2**n)
+
+
+def paired_success(
+    first: np.ndarray, second: np.ndarray, confidence: float = CONFIDENCE
+) -> PairedDifference:
+    """Return the difference of two success rates on the same trials.
+
+    The interval is Newcombe's (1998, method 10): Wilson intervals joined by square-and-add, with
+    the correlation of the pairs.
+
+    Args:
+        first: (n,) bool, in the order of the trials.
+        second: (n,) bool, the same trials in the same order.
+        confidence: of the interval.
+
+    Raises:
+        ValueError: where there is no trial, or not as many in both.
+    """
+    first, second = np.asarray(first, bool), np.asarray(second, bool)
+    if len(first) != len(second):
+        raise ValueError(f"{len(first)} trials against {len(second)}: pairs need as many of each")
+    n = len(first)
+    both, neither = int((first & second).sum()), int((~first & ~second).sum())
+    only_first, only_second = int((first & ~second).sum()), int((~first & second).sum())
+    one = wilson(both + only_first, n, confidence)
+    two = wilson(both + only_second, n, confidence)
+    product = (
+        (both + only_first) * (only_second + neither) * (both + only_second)
+        * (only_first + neither)
+    )
+    covariance = both * neither - only_first * only_second
+    if covariance > 0:
+        covariance = max(covariance - n / 2, 0.0)
+    phi = covariance / sqrt(product) if product else 0.0
+
+    def joined(a: float, b: float) -> float:
+        return sqrt(max(a * a - 2 * phi * a * b + b * b, 0.0))
+
+    value = one.value - two.value
+    return PairedDifference(
+        value,
+        value - joined(one.value - one.low, two.high - two.value),
+        value + joined(one.high - one.value, two.value - two.low),
+        mcnemar_exact(only_first, only_second),
+        only_first,
+        only_second,
+    )
