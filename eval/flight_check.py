@@ -1,0 +1,219 @@
+"""The flight log's columns and the rules that a log must keep to be used.
+
+| columns | unit | needed |
+|---|---|---|
+| `time` | s, increasing | yes |
+| `pos_x pos_y pos_z` | m, world | yes |
+| `quat_w quat_x quat_y quat_z` | body to world | yes |
+| `vel_x vel_y vel_z` | m/s, world | no (derived where absent) |
+| `rate_x rate_y rate_z` | rad/s, body | yes |
+| `cmd_thrust` with `cmd_rate_x cmd_rate_y cmd_rate_z` | m/s^2, rad/s body | these or `motor_*` |
+| `motor_1` to `motor_4` | rad/s, measured | or these |
+| `motor_cmd_1` to `motor_cmd_4` | rad/s, commanded | no |
+| `acc_x acc_y acc_z` | m/s^2, specific force, body | no |
+| `voltage` | V | no |
+
+Missing values are null or NaN. Rows are counted from 1; a CSV's header is not a row.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+
+import numpy as np
+
+
+def _xyz(stem: str) -> tuple[str, ...]:
+    return tuple(f"{stem}_{axis}" for axis in "xyz")
+
+
+def _rotors(stem: str) -> tuple[str, ...]:
+    return tuple(f"{stem}_{number}" for number in range(1, 5))
+
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "time": ("time",),
+    "pos": _xyz("pos"),
+    "quat": tuple(f"quat_{part}" for part in "wxyz"),
+    "vel": _xyz("vel"),
+    "rate": _xyz("rate"),
+    "cmd_thrust": ("cmd_thrust",),
+    "cmd_rate": _xyz("cmd_rate"),
+    "motor": _rotors("motor"),
+    "motor_cmd": _rotors("motor_cmd"),
+    "acc": _xyz("acc"),
+    "voltage": ("voltage",),
+}
+"""Columns that come together, by the name of the group."""
+NEEDED = ("time", "pos", "quat", "rate")
+"""Groups without which a log is refused; so is one without `cmd_*` and without `motor_*`."""
+KNOWN = frozenset(column for group in GROUPS.values() for column in group)
+"""Every column that the rules know."""
+
+POSITION_MAX = 100e3
+"""Positions beyond this are refused [m]."""
+RATE_MAX = 200.0
+"""Body rates beyond this are refused [rad/s]."""
+QUATERNION_TOLERANCE = 0.05
+"""Quaternions further than this from unit norm are refused."""
+DURATION_MIN = 1.0
+"""Shorter flights are refused [s]."""
+
+_OTHER_NAMES = {
+    "time": ("t", "timestamp", "time_s", "stamp"),
+    "cmd_thrust": ("thrust", "thrust_cmd", "c"),
+    "voltage": ("vbat", "battery"),
+    **{f"pos_{a}": (a, f"p{a}", f"p_{a}", f"position_{a}") for a in "xyz"},
+    **{f"vel_{a}": (f"v{a}", f"v_{a}", f"velocity_{a}") for a in "xyz"},
+    **{f"quat_{a}": (f"q{a}", f"q_{a}", f"orientation_{a}") for a in "wxyz"},
+    **{f"rate_{a}": (f"w{a}", f"omega_{a}", f"gyro_{a}", f"ang_vel_{a}") for a in "xyz"},
+    **{f"cmd_rate_{a}": (f"rate_cmd_{a}", f"cmd_w{a}") for a in "xyz"},
+    **{f"motor_{n}": (f"motor{n}", f"rotor_{n}", f"rpm_{n}") for n in range(1, 5)},
+}
+
+
+class FlightLogError(ValueError):
+    """A flight log that cannot be used: which file, which column, which row and why."""
+
+    def __init__(self, name: str, column: str | None, row: int | None, reason: str) -> None:
+        """Keep the parts and join them to one line; `row` is counted from 1."""
+        self.name, self.column, self.row, self.reason = name, column, row, reason
+        where = [part for part in (column and f"column {column}", row and f"row {row}") if part]
+        super().__init__(": ".join([name, ", ".join(where), reason] if where else [name, reason]))
+
+
+def check_columns(
+    columns: Mapping[str, np.ndarray], name: str
+) -> tuple[dict[str, np.ndarray], np.ndarray, list[str]]:
+    """Check `columns` (column name to values, one a row) by the rules of a flight log.
+
+    Returns:
+        The known columns as float64 without the rows that have no time, NaN where a value is
+        missing; a mask (rows,) of the rows that were kept; and warnings about what is odd.
+
+    Raises:
+        FlightLogError: where a rule is broken, naming file, column, first bad row and reason.
+    """
+    present = _present_groups(columns, name)
+    values = {c: _numbers(columns[c], c, name) for group in present for c in GROUPS[group]}
+    for column, data in values.items():
+        _refuse_where(np.isinf(data), name, column, data, "infinite")
+    present = [group for group in present if _has_values(group, values, name)]
+    _need_a_command(present, columns, name)
+
+    rows = np.isfinite(values["time"])
+    row_number = np.flatnonzero(rows) + 1
+    kept = {c: values[c][rows] for group in present for c in GROUPS[group]}
+    warnings = []
+    if not rows.all():
+        warnings.append(f"{name}: {np.sum(~rows)} rows without a time are left out")
+    _check_time(kept["time"], row_number, name)
+    for column in GROUPS["pos"]:
+        bad = np.abs(kept[column]) > POSITION_MAX
+        reason = "beyond 100 km; positions are in m"
+        _refuse_where(bad, name, column, kept[column], reason, row_number)
+    for column in GROUPS["rate"]:
+        bad = np.abs(kept[column]) > RATE_MAX
+        reason = "beyond 200 rad/s; rates are in rad/s"
+        _refuse_where(bad, name, column, kept[column], reason, row_number)
+    _check_quaternion(kept, row_number, name)
+    step = float(np.median(np.diff(kept["time"])))
+    if step > 0.2:
+        warnings.append(f"{name}: rows are {step:.3g} s apart; `time` should be in seconds")
+    return kept, rows, warnings
+
+
+def _present_groups(columns: Mapping[str, np.ndarray], name: str) -> list[str]:
+    present = []
+    for group, members in GROUPS.items():
+        missing = [column for column in members if column not in columns]
+        if not missing:
+            present.append(group)
+        elif group in NEEDED or len(missing) < len(members):
+            raise FlightLogError(
+                name, missing[0], None, "missing" + _did_you_mean(missing[0], columns)
+            )
+    for one, other in (("cmd_thrust", "cmd_rate"), ("cmd_rate", "cmd_thrust")):
+        if one in present and other not in present:
+            column = GROUPS[other][0]
+            reason = f"missing; {GROUPS[one][0]} needs it{_did_you_mean(column, columns)}"
+            raise FlightLogError(name, column, None, reason)
+    if not len(columns["time"]):
+        raise FlightLogError(name, None, None, "no rows; at least 1 s of flight is needed")
+    return present
+
+
+def _need_a_command(present: list[str], columns: Mapping[str, np.ndarray], name: str) -> None:
+    if "cmd_thrust" not in present and "motor" not in present:
+        hint = _did_you_mean("cmd_thrust", columns) or _did_you_mean("motor_1", columns)
+        reason = "neither cmd_thrust with cmd_rate_x, _y, _z nor motor_1 to motor_4 is there"
+        raise FlightLogError(name, None, None, reason + hint)
+
+
+def _did_you_mean(column: str, columns: Mapping[str, np.ndarray]) -> str:
+    free = {other.lower(): other for other in columns if other not in KNOWN}
+    for candidate in (column, *_OTHER_NAMES.get(column, ())):
+        if candidate in free:
+            return f"; did you mean {free[candidate]!r}? Rename it (and check its unit)"
+    close = difflib.get_close_matches(column, free, n=1, cutoff=0.7)
+    if close:
+        return f"; did you mean {free[close[0]]!r}? Rename it (and check its unit)"
+    return ""
+
+
+def _numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
+    values = np.asarray(values)
+    if values.ndim == 1 and values.dtype.kind in "fiub":
+        return values.astype(np.float64)
+    numbers = np.full(len(values), np.nan)
+    for k, value in enumerate(values):
+        try:
+            if value is not None:
+                numbers[k] = float(value)
+        except (TypeError, ValueError):
+            raise FlightLogError(name, column, k + 1, f"{value!r} is not a number") from None
+    return numbers
+
+
+def _has_values(group: str, values: Mapping[str, np.ndarray], name: str) -> bool:
+    for column in GROUPS[group]:
+        if np.isnan(values[column]).all():
+            if group in NEEDED:
+                raise FlightLogError(name, column, 1, "missing in every row")
+            return False
+    return True
+
+
+def _check_time(time: np.ndarray, row_number: np.ndarray, name: str) -> None:
+    back = np.flatnonzero(np.diff(time) <= 0)
+    if len(back):
+        k = back[0] + 1
+        reason = f"{time[k]:.9g} s does not come after {time[k - 1]:.9g} s; time must increase"
+        raise FlightLogError(name, "time", int(row_number[k]), reason)
+    if time[-1] - time[0] < DURATION_MIN:
+        reason = f"{time[-1] - time[0]:.3g} s of flight; at least {DURATION_MIN:g} s is needed"
+        raise FlightLogError(name, "time", int(row_number[-1]), reason)
+
+
+def _check_quaternion(kept: Mapping[str, np.ndarray], row_number: np.ndarray, name: str) -> None:
+    norm = np.linalg.norm(np.stack([kept[column] for column in GROUPS["quat"]]), axis=0)
+    bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
+    if len(bad):
+        reason = f"a quaternion of norm {norm[bad[0]]:.6g}; within 5 % of 1 is allowed"
+        raise FlightLogError(name, "quat_w", int(row_number[bad[0]]), reason)
+
+
+def _refuse_where(
+    bad: np.ndarray,
+    name: str,
+    column: str,
+    values: np.ndarray,
+    reason: str,
+    row_number: np.ndarray | None = None,
+) -> None:
+    where = np.flatnonzero(bad)
+    if len(where):
+        k = where[0]
+        row = k + 1 if row_number is None else row_number[k]
+        raise FlightLogError(name, column, int(row), f"{values[k]:g}, {reason}")

@@ -1,0 +1,61 @@
+"""Velocity from positions that were sampled unevenly and have holes.
+
+A cubic in time is fitted by least squares to the positions within 50 ms of each row (a
+Savitzky-Golay derivative on uneven samples; Savitzky and Golay 1964), and its slope at the row is
+the velocity. A cubic follows a change of acceleration, which a quadrotor makes within tens of
+milliseconds, and eleven samples at 100 Hz average the noise: for white noise of s [m] in the
+position the velocity's is about 29 s [m/s], against 71 s for a central difference.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+HALF_WINDOW_S = 0.05
+"""Positions this near to a row take part [s]; slower logs use the five nearest rows."""
+GAP_STEPS = 3.5
+"""Rows further away than this many median steps (and the half window) take no part."""
+
+
+def velocity_from_position(time_s: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
+    """Return the velocity at each row, (T, 3) [m/s].
+
+    Args:
+        time_s: (T,) increasing [s].
+        pos_w: (T, 3) [m]; a row with a NaN takes no part and gets the fit of its neighbours.
+
+    Returns:
+        (T, 3); where fewer than four positions are near, the fit has a lower degree, and where
+        fewer than two are, NaN.
+    """
+    good = np.flatnonzero(np.isfinite(pos_w).all(axis=1))
+    velocity = np.full(pos_w.shape, np.nan)
+    if len(good) < 2:
+        return velocity
+    time, pos = time_s[good], pos_w[good]
+    step = float(np.median(np.diff(time)))
+    reach = max(HALF_WINDOW_S, GAP_STEPS * step)
+    count = int(np.clip(2 * np.floor(HALF_WINDOW_S / step) + 1, 5, 101))
+    # Neighbours are found among good rows by index; those beyond `reach` get no weight.
+    nearest = np.searchsorted(time, time_s)
+    first = np.clip(nearest - count // 2, 0, max(len(time) - count, 0))
+    moment = np.zeros((7, len(time_s)))
+    right = np.zeros((4, len(time_s), 3))
+    used = np.zeros(len(time_s))
+    origin = pos[np.clip(nearest, 0, len(time) - 1)]  # keeps digits where positions are large
+    for offset in range(min(count, len(time))):
+        k = first + offset
+        u = (time[k] - time_s) / reach
+        weight = (np.abs(u) <= 1).astype(np.float64)
+        powers = np.cumprod([weight, u, u, u, u, u, u], axis=0)
+        moment += powers
+        right += powers[:4, :, None] * (pos[k] - origin)
+        used += weight
+    degree = np.minimum(used - 1, 3)
+    for n in (1, 2, 3):
+        rows = np.flatnonzero(degree == n)
+        index = np.arange(n + 1)
+        normal = np.moveaxis(moment[index[:, None] + index], -1, 0)[rows]
+        coefficient = np.linalg.solve(normal, np.moveaxis(right[: n + 1], 1, 0)[rows])
+        velocity[rows] = coefficient[:, 1] / reach
+    return velocity
