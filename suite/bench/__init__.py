@@ -1,0 +1,6 @@
+"""Benchmarks: our hot paths against plain implementations of the same, in turn in one run."""
+
+from __future__ import annotations
+
+BENCHES: dict[str, str] = {}
+"""Name -> one-line summary; the bench NAME is suite/bench/NAME.py with `run() -> Comparison`."""

@@ -1,0 +1,135 @@
+"""The command line: a table of subcommands, each imported only when it is called.
+
+A command is a module with `Config`, a frozen dataclass that becomes its options (one docstring
+line under each field is its help), and `run(config, console)`, which does the work and returns
+what --json prints. See docs/commands.md for how to add one.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from types import FrameType
+
+from suite.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
+
+COMMANDS: dict[str, str] = {
+    "bench": "time a hot path against a plain implementation of the same",
+    "info": "versions, devices, memory and commit, for bug reports",
+}
+"""Name -> one-line summary; the command NAME lives in suite/commands/NAME.py."""
+
+
+def overview() -> str:
+    """Return the text of `suite --help`."""
+    width = max(map(len, COMMANDS))
+    lines = [
+        "usage: suite COMMAND [options]",
+        "",
+        "Train drone racing policies through a point mass and judge them in MuJoCo.",
+        "",
+        *(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items()),
+        "",
+        "suite COMMAND --help says what a command takes; suite --version, the version.",
+    ]
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command line (`argv` without the program's name) and return the exit code."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    if args[:1] == ["help"]:
+        args = [*args[1:2], "--help"]
+    if not args or args[0] in ("-h", "--help"):
+        print(overview(), file=sys.stdout if args else sys.stderr)
+        return DONE if args else UNUSABLE
+    if args[0] == "--version":
+        from tracks.version import VERSION
+
+        print(f"suite {VERSION}")
+        return DONE
+    name, *rest = args
+    if name not in COMMANDS:
+        from tracks.names import unknown_name
+
+        _complain(f"{unknown_name('command', name, COMMANDS)} See suite --help.")
+        return UNUSABLE
+    try:
+        with _termination_as_interrupt():
+            return _run(name, rest)
+    except KeyboardInterrupt:
+        _complain("interrupted; what was finished is kept")
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output has left: nothing to say, and no one to say it to.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except Exception as error:
+        known = explain(error)
+        if known is None:
+            traceback.print_exc()
+            _complain("this is a bug; please report the lines above and those of `suite info`")
+            return FAILED
+        code, message = known
+        _complain(message)
+        return code
+
+
+def _run(name: str, args: list[str]) -> int:
+    import tyro
+
+    from suite.console import Console, stdout_kept_clean
+
+    command = importlib.import_module(f"suite.commands.{name}")
+    try:
+        config = tyro.cli(
+            command.Config,
+            prog=f"suite {name}",
+            args=args,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    with stdout_kept_clean() if config.json else nullcontext():
+        answer = command.run(config, Console())
+    if config.json:
+        from tracks.files import to_json
+
+        print(to_json(answer, indent=2), flush=True)
+    return DONE
+
+
+@contextmanager
+def _termination_as_interrupt() -> Iterator[None]:
+    """Let a polite kill end a command as Ctrl-C does: cleaning up, keeping what is finished."""
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:  # not in the main thread: signals are someone else's business
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _complain(message: str) -> None:
+    print(f"suite: {message}", file=sys.stderr)
+
+
+def entry() -> None:
+    """Be the program `suite`."""
+    raise SystemExit(main())
+
+
+if __name__ == "__main__":
+    entry()

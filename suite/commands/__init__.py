@@ -1,0 +1,1 @@
+"""The subcommands of `suite`, one file each, imported when called."""

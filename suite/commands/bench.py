@@ -1,0 +1,52 @@
+"""`suite bench NAME`: a hot path of ours against a plain implementation of the same."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import tyro
+
+from suite.bench import BENCHES
+from suite.console import Console
+from tracks.files import plain
+from tracks.names import unknown_name
+
+
+@dataclass(frozen=True)
+class Config:
+    """Time a hot path against a plain implementation of the same; without a name, list them."""
+
+    name: tyro.conf.Positional[str] = ""
+    """Which benchmark."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Run the benchmark `config.name`, both sides in turn, and show figures and ratio.
+
+    Raises:
+        ValueError: for a name that is not in the table.
+    """
+    if not config.name:
+        for name, summary in BENCHES.items():
+            console.say(f"{name:<12} {summary}")
+        return {"benches": BENCHES}
+    if config.name not in BENCHES:
+        raise unknown_name("benchmark", config.name, BENCHES)
+    from suite.bench.compare import load_warnings
+
+    busy = load_warnings()
+    bench = importlib.import_module(f"suite.bench.{config.name}")
+    result = bench.run()
+    answer = {**plain(result), "ratio": result.ratio, "warnings": [*busy, *result.warnings]}
+    for side, figure in (("ours", result.ours), ("baseline", result.baseline)):
+        console.say(f"{side:<9} {figure.value:.4g} {figure.unit}")
+    console.say(f"ratio     {result.ratio:.2f} (above 1: ours is faster)")
+    for name, value in answer["details"].items():
+        console.say(f"{name}: {value}")
+    for warning in answer["warnings"]:
+        console.note(f"warning: {warning}")
+    return answer

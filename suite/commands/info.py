@@ -1,0 +1,55 @@
+"""`suite info`: what a bug report needs."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+from suite.console import Console, size
+from suite.estimate import available_memory_bytes
+from suite.provenance import machine, package_versions
+from tracks.provenance import git_commit
+from tracks.version import VERSION
+
+
+@dataclass(frozen=True)
+class Config:
+    """Show versions, devices, memory and commit."""
+
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Collect and show the facts; a device that cannot be asked says why."""
+    facts: dict[str, Any] = {
+        "suite": VERSION,
+        "git_commit": git_commit(),
+        "python": f"{platform.python_version()} at {sys.executable}",
+        "machine": machine(),
+        "memory_free_bytes": available_memory_bytes(),
+        "jax_devices": _jax_devices(),
+        "packages": package_versions(),
+    }
+    about = facts["machine"]
+    console.say(f"suite      {VERSION}, commit {facts['git_commit'] or 'unknown'}")
+    console.say(f"python     {facts['python']}")
+    console.say(f"system     {about['system']}")
+    console.say(f"processor  {about['processor']}, {about['cores']} usable cores")
+    free, total = size(facts["memory_free_bytes"]), size(about["memory_bytes"])
+    console.say(f"memory     {free} free of {total}")
+    console.say(f"jax        {', '.join(facts['jax_devices'])}")
+    for name, version in facts["packages"].items():
+        console.say(f"  {name:<13}{version or 'missing'}")
+    return facts
+
+
+def _jax_devices() -> list[str]:
+    try:
+        import jax
+
+        return [f"{d.platform}:{d.id} {d.device_kind}" for d in jax.devices()]
+    except Exception as error:  # a broken driver is what the report is about
+        return [f"not usable: {error}"]

@@ -1,0 +1,115 @@
+"""What a command says to a person: lines on standard output, progress on standard error."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+
+PLAIN_PERIOD_S = 10.0
+"""Where standard error is no terminal, progress is a plain line this often [s]."""
+
+Update = Callable[[float, str], None]
+"""update(done, note): how much of the total is done, and a few words to show beside it."""
+
+
+class Console:
+    """People's output of one command."""
+
+    def say(self, text: str = "") -> None:
+        """Print a line of the command's result (on standard error under --json)."""
+        print(text, flush=True)
+
+    def note(self, text: str) -> None:
+        """Print a line about the work itself, on standard error."""
+        print(text, file=sys.stderr, flush=True)
+
+    @contextmanager
+    def progress(
+        self,
+        label: str,
+        total: float,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> Iterator[Update]:
+        """Show how far a long piece of work is; yields the function to call as it goes.
+
+        Args:
+            label: what is being done, a few words.
+            total: the `done` at which it is finished, in any unit.
+            clock: seconds, increasing.
+        """
+        if sys.stderr.isatty():
+            with _bar(label, total) as update:
+                yield update
+            return
+        started = last = clock()
+
+        def update(done: float, note: str = "") -> None:
+            nonlocal last
+            now = clock()
+            if now - last < PLAIN_PERIOD_S:
+                return
+            last = now
+            left = duration((now - started) * (total - done) / done) if done else "unknown"
+            self.note(f"{label}: {done:g} of {total:g}, {left} left{note and ', ' + note}")
+
+        yield update
+
+
+@contextmanager
+def _bar(label: str, total: float) -> Iterator[Update]:
+    from rich.console import Console as RichConsole
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:g}/{task.total:g}"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=RichConsole(stderr=True), transient=True) as bars:
+        task = bars.add_task(label, total=total, note="")
+
+        def update(done: float, note: str = "") -> None:
+            bars.update(task, completed=done, note=note)
+
+        yield update
+
+
+@contextmanager
+def stdout_kept_clean() -> Iterator[None]:
+    """Send all that is printed meanwhile to standard error, native libraries' lines included."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+def duration(seconds: float) -> str:
+    """Return `seconds` for people: "0.4 s", "12 s", "3 min 20 s", "2 h 05 min"."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def size(count: float) -> str:
+    """Return a number of bytes for people: "812 kB", "2.1 GB"."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.1f} GB"

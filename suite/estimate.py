@@ -1,0 +1,33 @@
+"""Say before a long command starts how long it will take and how much memory it needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from suite.console import Console, duration, size
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a piece of work will need; a guess within a factor of about two."""
+
+    seconds: float
+    """Time [s]."""
+    memory_bytes: float
+    """Memory at its peak [bytes]."""
+
+
+def available_memory_bytes() -> int:
+    """Return how much memory can be had without swapping [bytes]."""
+    import psutil
+
+    return psutil.virtual_memory().available
+
+
+def announce(console: Console, what: str, estimate: Estimate) -> None:
+    """Say `estimate` of `what`, and warn where the memory is not there."""
+    free = available_memory_bytes()
+    need = size(estimate.memory_bytes)
+    console.note(f"{what}: about {duration(estimate.seconds)} and {need} of memory")
+    if estimate.memory_bytes > free:
+        console.note(f"warning: only {size(free)} of memory is free; expect it to fail or to swap")

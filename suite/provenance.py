@@ -1,0 +1,94 @@
+"""What a run was made of: versions, machine, command and resolved configuration."""
+
+from __future__ import annotations
+
+import importlib.metadata as metadata
+import os
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+from tracks.files import write_json
+from tracks.provenance import stamp
+
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "jax",
+    "jaxlib",
+    "optax",
+    "safetensors",
+    "mujoco",
+    "mujoco-mjx",
+    "dm-control",
+    "gymnasium",
+    "trimesh",
+    "torch",
+    "onnx",
+    "onnxruntime",
+    "pyarrow",
+    "rerun-sdk",
+)
+"""The packages that can change a result."""
+
+
+def package_versions() -> dict[str, str | None]:
+    """Return the installed version of each of `PACKAGES`, None where it is missing."""
+    versions: dict[str, str | None] = {}
+    for name in PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = None
+    return versions
+
+
+def machine() -> dict[str, Any]:
+    """Return the machine's system, processor, usable cores and memory [bytes]."""
+    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return {
+        "system": platform.platform(),
+        "processor": _processor(),
+        "cores": usable_cores(),
+        "memory_bytes": pages,
+    }
+
+
+def usable_cores() -> int:
+    """Return how many cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _processor() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in text.splitlines() if "model name" in line]
+    return names[0] if names else platform.machine()
+
+
+def run_record(config: Any, seed: int | None) -> dict[str, Any]:
+    """Return all that is needed to repeat a run: the stamp, versions, machine and `config`.
+
+    Args:
+        config: the resolved configuration, a dataclass.
+        seed: the run's seed, None where it has none.
+    """
+    return {
+        **stamp(schema=1, seed=seed),
+        "python": platform.python_version(),
+        "packages": package_versions(),
+        "machine": machine(),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "config_type": f"{type(config).__module__}.{type(config).__qualname__}",
+        "config": config,
+    }
+
+
+def write_run_record(folder: str | os.PathLike[str], config: Any, seed: int | None) -> None:
+    """Write `run_record` to `folder`/run.json."""
+    write_json(Path(folder) / "run.json", run_record(config, seed))
