@@ -1,0 +1,73 @@
+"""Track families by name. A new one is a file with `make(d, rng) -> Layout` and an entry here."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+
+import numpy as np
+
+from tracks.families import circular, ellipse, random, zigzag
+from tracks.families.layout import Layout
+from tracks.scene import Counts
+from tracks.track import Track
+
+FAMILIES: dict[str, Callable[[float, np.random.Generator], Layout]] = {
+    "zigzag": zigzag.make,
+    "circular": circular.make,
+    "ellipse": ellipse.make,
+    "random": random.make,
+}
+JUDGED = ("zigzag", "circular", "ellipse")
+"""The families of the tables; `random` is what policies are trained on."""
+LEVELS = range(10)
+MAX_COUNTS = Counts(boxes=70, cylinders=15, capsules=12, spheres=12)
+"""Most solids of each kind over all families and levels: 32 frame bars, and 7 stretches with at
+most 3 plates, 3 small solids, 1 pillar and 4 ground objects, whose kinds are dealt out evenly."""
+
+
+def make_track(family: str, level: int, seed: int) -> Track:
+    """Return the track that (family, level, seed) alone determine.
+
+    Args:
+        family: a name in `FAMILIES`.
+        level: 0 (easy) to 9 (hard); the difficulty is (level + U(0, 1)) / 10.
+        seed: 0 or more.
+
+    Raises:
+        ValueError: where the family is unknown, the level out of range or the seed negative.
+    """
+    check_family(family)
+    if level not in LEVELS:
+        raise ValueError(f"level is {level!r}, allowed is a whole number from 0 to 9")
+    if seed != int(seed) or seed < 0:
+        raise ValueError(f"seed is {seed!r}, allowed is a whole number, 0 or more")
+    level, seed = int(level), int(seed)
+    rng = np.random.default_rng(np.random.SeedSequence([seed, level, *family.encode()]))
+    d = (level + rng.random()) / 10
+    return Track(family, level, seed, d, *FAMILIES[family](d, rng))
+
+
+def random_track(difficulty: float, rng: np.random.Generator) -> Track:
+    """Return a fresh track of the training distribution; `seed` of the result is 0.
+
+    Args:
+        difficulty: d in [0, 1].
+        rng: source of randomness, advanced by the call.
+
+    Raises:
+        ValueError: where the difficulty is outside [0, 1].
+    """
+    if not 0.0 <= difficulty <= 1.0:
+        raise ValueError(f"difficulty is {difficulty!r}, allowed is 0 to 1")
+    level = min(int(difficulty * 10), LEVELS[-1])
+    return Track("random", level, 0, difficulty, *random.make(difficulty, rng))
+
+
+def check_family(family: str) -> None:
+    """Raise a ValueError that names the nearest family where `family` is unknown."""
+    if family in FAMILIES:
+        return
+    near = difflib.get_close_matches(str(family), FAMILIES, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ValueError(f"track family {family!r} is unknown, known are {', '.join(FAMILIES)}{hint}")

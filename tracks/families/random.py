@@ -1,0 +1,129 @@
+"""Random: the training distribution, which covers the three judged families and is none of them.
+
+A track is a walk of 8 gates. Its drift (a bend of either sign or none, with up to two sharp
+turns) gives circles, U-turns and lines; stray headings and spacings around the drift give
+zigzags. Every parameter is drawn a track, obstacles of each kind have their own density.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tracks.families.layout import GATE_COUNT, MAX_YAW_NOISE, Layout, furnish, ramp
+from tracks.gates import square_gates
+from tracks.obstacles import PerStretch, segment_distance, straight_sites
+from tracks.scene import Gates
+
+MIN_SPACING_M, MAX_SPACING_M = 2.5, 7.0
+PASSING_M = 1.6
+"""Least level distance of a straight stretch from the centre of a gate that it does not join."""
+MAX_APPROACH = np.deg2rad(95.0)
+"""Largest angle between a stretch and the direction of a gate that it joins [rad]."""
+MAX_TOTALS = PerStretch(*(np.array(n) for n in (23, 23, 10, 14)))
+"""Most plates, small solids, pillars and ground objects of a track."""
+_WALKS = 8
+_DRAWS = 12
+
+
+class Walks(NamedTuple):
+    """Several candidate walks (W of them) with the same drift."""
+
+    center: np.ndarray
+    """(W, G, 2) level gate centres [m]."""
+    yaw: np.ndarray
+    """(W, G) flight directions [rad]."""
+    start: np.ndarray
+    """(W, 2) level start [m]."""
+
+
+def make(d: float, rng: np.random.Generator) -> Layout:
+    """Return a random track of difficulty `d` in [0, 1]."""
+    xy, yaw, start = _walk(d, rng)
+    shape = GATE_COUNT
+    side = np.clip(ramp(1.2, 0.85, d) + rng.uniform(-0.1, 0.1, shape), 0.75, 1.3)
+    width = rng.uniform(0.13, 0.27, shape)
+    depth = rng.uniform(0.03, ramp(0.05, 0.08, d), shape)
+    height = rng.uniform(1.0, 1.8) + ramp(0.1, 1, d) * rng.random() * rng.uniform(-1, 1, shape)
+    height = np.clip(height, np.maximum(0.8, side / 2 + width), 2.2)
+    gates = square_gates(np.column_stack([xy, height]), yaw, side, width, depth)
+    start_height = max(0.5, height[0] + rng.uniform(-0.3, 0.3))
+    start_pos_w = np.array([*start, start_height])
+
+    stretches = np.arange(GATE_COUNT - 1)
+    site = straight_sites(gates, stretches, rng.uniform(2.0, 4.0))
+    return furnish(rng, gates, start_pos_w, _density(d, rng, len(stretches)), site)
+
+
+def _density(d: float, rng: np.random.Generator, stretches: int) -> PerStretch:
+    """Draw obstacle counts: none on a fifth of the tracks, up to 1.3 times the baseline's."""
+    level = rng.uniform(0, 1.3) if rng.random() < 0.8 else 0.0
+    kind = np.clip(rng.uniform(0.0, 2.0, 4), 0.3, 1.5)
+    air, pillar, ground = ramp(1, 3.5, d), ramp(0.8, 1.3, d), 2.0
+    mean = level * kind * np.array([air, air, pillar, ground])
+    numbers = np.floor(mean[:, None] + rng.random((4, stretches))).astype(int) * (level > 0)
+    for row, most in zip(numbers, MAX_TOTALS, strict=True):
+        row[:] = np.diff(np.minimum(np.cumsum(row), most), prepend=0)
+    return PerStretch(*numbers)
+
+
+def _walk(d: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return gate centres (G, 2), yaws (G,) and the start (2,) of the first walk that is free."""
+    for _ in range(_DRAWS):
+        walks = _candidates(d, rng, _drift_turns(d, rng))
+        free = np.flatnonzero(_is_free(walks))
+        if len(free):
+            return walks.center[free[0]], walks.yaw[free[0]], walks.start[free[0]]
+    straight = _candidates(0.0, rng, np.zeros(GATE_COUNT))
+    return straight.center[0], straight.yaw[0], straight.start[0]
+
+
+def _drift_turns(d: float, rng: np.random.Generator) -> np.ndarray:
+    """Return how far the drift turns at each gate, (G,) [rad]."""
+    sign = rng.choice([-1.0, 1.0])
+    bend = np.deg2rad(rng.uniform(0, 52)) if rng.random() < 0.6 else 0.0
+    turn = sign * bend + rng.normal(size=GATE_COUNT) * np.deg2rad(rng.uniform(0, 12))
+    if rng.random() < 0.55:
+        corners = rng.choice(GATE_COUNT - 1, rng.integers(1, 3), replace=False)
+        sharp = np.deg2rad(rng.uniform(60, ramp(120, 155, d), len(corners)))
+        turn[corners] = sharp * np.where(rng.random(len(corners)) < 0.8, sign, -sign)
+    return turn
+
+
+def _candidates(d: float, rng: np.random.Generator, turn: np.ndarray) -> Walks:
+    shape = (_WALKS, GATE_COUNT)
+    drift = rng.uniform(-np.pi, np.pi) + np.cumsum(turn) - turn
+    stray = rng.uniform(-1, 1, shape) * np.deg2rad(rng.uniform(0, ramp(15, 50, d)))
+    heading = drift + stray
+    spacing = rng.uniform(3.3, 6.0) + rng.uniform(-1, 1, shape) * rng.uniform(0, ramp(0.5, 2, d))
+    spacing = np.clip(spacing, MIN_SPACING_M, MAX_SPACING_M)
+    spacing[:, 0] = rng.uniform(2, 4, _WALKS)
+    step = spacing[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    point = np.cumsum(step, axis=1)
+    yaw = drift + turn / 2 + rng.uniform(-1, 1, shape) * MAX_YAW_NOISE * d
+    return Walks(point - point[:, :1], yaw, -point[:, 0])
+
+
+def _is_free(walks: Walks) -> np.ndarray:
+    """Return which walks keep clear of their own gates and meet each gate from its side, (W,)."""
+    point = np.concatenate([walks.start[:, None], walks.center], axis=1)
+    way = np.diff(point, axis=1)
+    normal = np.stack([np.cos(walks.yaw), np.sin(walks.yaw)], axis=-1)
+    length = np.linalg.norm(way, axis=-1)
+    least = np.cos(MAX_APPROACH) * length
+    meets = np.all(np.sum(way * normal, -1) > least, axis=1)
+    leaves = np.all(np.sum(way[:, 1:] * normal[:, :-1], -1) > least[:, 1:], axis=1)
+
+    distance = segment_distance(walks.center[:, None], point[:, :-1, None], point[:, 1:, None])
+    stretch, gate = np.arange(GATE_COUNT)[:, None], np.arange(GATE_COUNT)
+    joined = (gate == stretch) | (gate == stretch - 1)
+    passes = np.all((distance > PASSING_M) | joined, axis=(1, 2))
+    return meets & leaves & passes
+
+
+def is_free(gates: Gates, start_pos_w: np.ndarray) -> bool:
+    """Return whether straight flight from gate to gate keeps clear of the other gates' frames."""
+    normal = gates.rot_w[:, :2, 0]
+    yaw = np.arctan2(normal[:, 1], normal[:, 0])
+    return bool(_is_free(Walks(gates.center_w[None, :, :2], yaw[None], start_pos_w[None, :2]))[0])
