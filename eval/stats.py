@@ -42,8 +42,10 @@ def wilson(successes: int, trials: int, confidence: float = CONFIDENCE) -> Inter
         ValueError: unless 0 <= successes <= trials and trials >= 1.
     """
     if trials < 1 or not 0 <= successes <= trials:
-        raise ValueError(f"{successes} successes in {trials} trials: wanted 0 <= successes <= "
-                         "trials and at least one trial")
+        raise ValueError(
+            f"{successes} successes in {trials} trials: wanted 0 <= successes <= "
+            "trials and at least one trial"
+        )
     z = NormalDist().inv_cdf((1 + confidence) / 2)
     rate = successes / trials
     middle = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
@@ -115,7 +117,9 @@ def paired_success(
     one = wilson(both + only_first, n, confidence)
     two = wilson(both + only_second, n, confidence)
     product = (
-        (both + only_first) * (only_second + neither) * (both + only_second)
+        (both + only_first)
+        * (only_second + neither)
+        * (both + only_second)
         * (only_first + neither)
     )
     covariance = both * neither - only_first * only_second

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from tracks.crossing import crossed
+from tracks.crossing import NEAR_RADIUS_M, crossing, is_near
 from tracks.scene import Gates
 
 Array = Any
@@ -82,12 +82,21 @@ class Rules:
     """A trial ends at this time [s]."""
     short_window_s: float = 8.0
     """Gates passed by this time count as `gates_8s` [s]."""
-    near_radius: float = 0.35
+    near_radius_m: float = NEAR_RADIUS_M
     """The baseline's rule: a gate counts within this distance of its centre [m]."""
     speed_limit: float = 1e3
     """A body faster than this [m/s] has diverged."""
     rate_limit: float = 1e4
     """A body turning faster than this [rad/s] has diverged."""
+
+
+class Course(NamedTuple):
+    """The gates of N trials, padded to the same number by repeating the last."""
+
+    gates: Gates
+    """(N, G, ...)."""
+    count: Array
+    """(N,) gates to pass, int32."""
 
 
 class Progress(NamedTuple):
@@ -116,12 +125,11 @@ def start_progress(pos_w: Array) -> Progress:
     return Progress(count, count, count, count, count, real, real, pos_w)
 
 
-def next_gate(gates: Gates, number: Array) -> Gates:
-    """Return each row's gate `number` (N,) from gates (N, G, ...); past the last one, the last."""
+def next_gate(course: Course, number: Array) -> Gates:
+    """Return each row's gate `number` (N,), past the last one the last, with arrays (N, ...)."""
     xp = number.__array_namespace__()
     rows = xp.arange(number.shape[0])
-    last = gates.center_w.shape[1] - 1
-    return Gates(*(field[rows, xp.minimum(number, last)] for field in gates))
+    return Gates(*(field[rows, xp.minimum(number, course.count - 1)] for field in course.gates))
 
 
 def has_diverged(rules: Rules, pos_w: Array, vel_w: Array, rate_b: Array) -> Array:
@@ -136,9 +144,8 @@ def has_diverged(rules: Rules, pos_w: Array, vel_w: Array, rate_b: Array) -> Arr
 def judge_state(
     rules: Rules,
     progress: Progress,
-    gates: Gates,
-    steps_limit: int,
-    steps_short: int,
+    course: Course,
+    dt: float,
     pos_w: Array,
     rot_w: Array,
     vel_w: Array,
@@ -147,15 +154,14 @@ def judge_state(
 ) -> Progress:
     """Judge the states that trials have reached at their physics step `progress.step`.
 
-    A contact found in a state counts before a gate crossed on the way to it, so that a trial
-    that touches the last gate's frame in the step in which it crosses has not finished.
+    A contact found in a state counts before a gate crossed on the way to it: a trial that touches
+    the last gate's frame in the step in which it crosses has not finished.
 
     Args:
         rules: when a trial ends.
         progress: of N trials; rows that have ended are returned as they are.
-        gates: (N, G, ...) the gates of each trial's track.
-        steps_limit: physics steps in the time limit.
-        steps_short: physics steps in the short window.
+        course: the gates of each trial's track.
+        dt: length of a physics step [s].
         pos_w: (N, 3) [m].
         rot_w: (N, 3, 3) body to world.
         vel_w: (N, 3) [m/s].
@@ -163,30 +169,28 @@ def judge_state(
         diverged: (N,) bool, the state is none; its numbers are not looked at.
     """
     xp = pos_w.__array_namespace__()
-    live = (progress.ended == FLYING) & ~diverged
+    flying = progress.ended == FLYING
+    live = flying & ~diverged
     free = live & ~contact
-    target = next_gate(gates, progress.gates)
-    passed = free & crossed(
-        progress.pos_w, pos_w, target.center_w, target.rot_w, target.opening_g
-    )
-    passed = passed & (progress.gates < gates.center_w.shape[1])
-    number = progress.gates + passed
-    near = next_gate(gates, progress.gates_035).center_w - pos_w
-    near = free & ((near * near).sum(-1) <= rules.near_radius**2)
-    near = near & (progress.gates_035 < gates.center_w.shape[1])
+    gate = next_gate(course, progress.gates)
+    passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, progress.pos_w, pos_w)
+    gates = progress.gates + (passed & free & (progress.gates < course.count))
+    near = is_near(next_gate(course, progress.gates_035).center_w, pos_w, rules.near_radius_m)
+    gates_035 = progress.gates_035 + (near & free & (progress.gates_035 < course.count))
     speed = xp.sqrt((vel_w * vel_w).sum(-1))
+    last_step, short_step = round(rules.time_limit_s / dt), round(rules.short_window_s / dt)
 
-    ended = xp.where(free & (progress.step >= steps_limit), TIMEOUT, progress.ended)
+    ended = xp.where(free & (progress.step >= last_step), TIMEOUT, progress.ended)
     ended = xp.where(free & (rot_w[:, 2, 2] < 0), TIPPED, ended)
-    ended = xp.where(free & (number >= gates.center_w.shape[1]), FINISHED, ended)
+    ended = xp.where(free & (gates >= course.count), FINISHED, ended)
     ended = xp.where(live & contact, COLLISION, ended)
-    ended = xp.where((progress.ended == FLYING) & diverged, DIVERGED, ended)
+    ended = xp.where(flying & diverged, DIVERGED, ended)
     return Progress(
         step=progress.step,
         ended=ended.astype(xp.int32),
-        gates=number.astype(xp.int32),
-        gates_8s=xp.where(progress.step <= steps_short, number, progress.gates_8s).astype(xp.int32),
-        gates_035=(progress.gates_035 + near).astype(xp.int32),
+        gates=gates.astype(xp.int32),
+        gates_8s=xp.where(progress.step <= short_step, gates, progress.gates_8s).astype(xp.int32),
+        gates_035=gates_035.astype(xp.int32),
         v_max=xp.where(free, xp.maximum(progress.v_max, speed), progress.v_max),
         v_sum=xp.where(live, progress.v_sum + speed, progress.v_sum),
         pos_w=xp.where(live[:, None], pos_w, progress.pos_w),
