@@ -7,6 +7,7 @@ process leaves beside it starts with a dot and ends in ``.part``.
 from __future__ import annotations
 
 import dataclasses
+import glob
 import json
 import math
 import os
@@ -45,9 +46,8 @@ def replacing_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield an empty folder to fill; on a clean exit it becomes `path`, else it is removed.
 
-    A folder that already stands at `path` is replaced by two renames; a kill exactly between
-    them leaves the old one beside as ``.NAME-*.part``. Writers that must survive that give
-    every folder a new name (a step number).
+    A folder that already stands at `path` is replaced by two renames; after a kill exactly
+    between them `recover_folder` brings the new one in.
 
     Raises:
         OSError: where the disk is full or `path` cannot be written.
@@ -64,15 +64,29 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
             _sync(written)
         if final.exists():
             os.replace(final, retired)
-        try:
-            os.replace(beside, final)
-        except OSError:
-            if retired.exists():
-                os.replace(retired, final)
-            raise
+        os.replace(beside, final)
         _sync(final.parent)
     finally:
+        # Also for an interrupt that comes between the two renames.
+        if retired.exists() and not final.exists():
+            os.replace(retired, final)
         shutil.rmtree(parent, ignore_errors=True)
+
+
+def recover_folder(path: str | os.PathLike[str]) -> None:
+    """Put `path` in place where a kill between the two renames of `replacing_folder` left it out.
+
+    The new folder was complete and on the disk by then, so it is the one taken. Readers of
+    folders that are replaced call this first.
+    """
+    final = Path(path)
+    if final.exists():
+        return
+    for part in final.parent.glob(f".{glob.escape(final.name)}-*.part"):
+        if (part / "replaced").is_dir() and (part / final.name).is_dir():
+            os.replace(part / final.name, final)
+            shutil.rmtree(part, ignore_errors=True)
+            return
 
 
 def _sync(path: Path) -> None:

@@ -1,0 +1,26 @@
+"""The policies that come with the suite: one folder each, a checkpoint with a card.md beside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+DEFAULT = "racer"
+"""Name of the policy that is flown when none is given."""
+
+_HERE = Path(__file__).resolve().parent
+
+
+def names() -> list[str]:
+    """Return the names of the shipped policies, sorted."""
+    return sorted(path.parent.name for path in _HERE.glob("*/config.json"))
+
+
+def folder(name: str) -> Path:
+    """Return the checkpoint's folder of a shipped policy.
+
+    Raises:
+        KeyError: where no shipped policy has that name.
+    """
+    if name not in names():
+        raise KeyError(name)
+    return _HERE / name

@@ -1,0 +1,60 @@
+"""A JAX pytree (parameters, optimizer state, step, random key) as arrays by name, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from policies.errors import PolicyError
+
+
+def tree_to_arrays(tree: Any) -> dict[str, np.ndarray]:
+    """Return the leaves of `tree` by their path, random keys as their data."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path): np.asarray(_data(leaf)) for path, leaf in leaves}
+
+
+def tree_from_arrays(template: Any, arrays: Mapping[str, np.ndarray], where: str) -> Any:
+    """Return a tree like `template` with the leaves that `tree_to_arrays` gave.
+
+    Args:
+        template: a tree of the same structure, shapes and types; its values are not used.
+        arrays: leaves by path.
+        where: the file they came from, for the message.
+
+    Raises:
+        PolicyError: where the names, a shape or a type differ from the template's.
+    """
+    leaves, structure = jax.tree_util.tree_flatten_with_path(template)
+    names = [jax.tree_util.keystr(path) for path, _ in leaves]
+    if arrays.keys() != set(names):
+        missing, unknown = sorted(set(names) - arrays.keys()), sorted(arrays.keys() - set(names))
+        raise PolicyError(
+            f"{where}: missing arrays {missing[:5]}, unknown arrays {unknown[:5]}; "
+            "resume with the configuration that the run was started with"
+        )
+    restored = []
+    for name, (_, leaf) in zip(names, leaves, strict=True):
+        value, like = arrays[name], np.asarray(_data(leaf))
+        if value.shape != like.shape or value.dtype != like.dtype:
+            raise PolicyError(
+                f"{where}: {name!r} is {value.dtype} {value.shape}, expected {like.dtype} "
+                f"{like.shape}; resume with the configuration that the run was started with"
+            )
+        array = jnp.asarray(value)
+        if _is_key(leaf):
+            array = jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf))
+        restored.append(array)
+    return jax.tree_util.tree_unflatten(structure, restored)
+
+
+def _is_key(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _data(leaf: Any) -> Any:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
