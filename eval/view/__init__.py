@@ -1,0 +1,1 @@
+"""Seeing trials: a rerun recording, pictures and a video."""
