@@ -33,8 +33,8 @@ class WorkFailed(RuntimeError):
 def explain(error: BaseException) -> tuple[int, str] | None:
     """Return (exit code, message) for an error that needs no traceback, None for a bug.
 
-    A `ValueError` counts as a message to the user only where our own code raised it on purpose:
-    one that numpy or a cast threw is a bug.
+    A `ValueError` counts as a message to the user only where our own code raised it on purpose
+    (or its class is ours): one that numpy or a cast threw is a bug.
     """
     if isinstance(error, WorkFailed):
         return FAILED, str(error)
@@ -65,6 +65,8 @@ def _is_ours(module: str | None) -> bool:
 
 
 def _raised_on_purpose(error: ValueError) -> bool:
+    if _is_ours(type(error).__module__):
+        return True
     remote = error.__cause__
     if type(remote).__name__ == "_RemoteTraceback":
         return _remote_raise(str(remote))

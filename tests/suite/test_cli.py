@@ -1,0 +1,238 @@
+"""The command line's manners: fast help, exit codes, one clear message, clean JSON."""
+
+import errno
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import traceback
+import types
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from suite import cli
+from suite.console import Console, duration, size
+from suite.errors import explain
+from tracks.scene import Boxes, Counts, Gates, Scene, Spheres, no_rods, pad
+from tracks.version import VERSION
+
+HEAVY = ("numpy", "jax", "mujoco", "torch", "tyro", "rich", "scipy", "pyarrow", "argparse")
+SLOW = ("jax", "mujoco", "torch", "dm_control", "trimesh", "matplotlib", "rerun", "scipy")
+
+
+@dataclass(frozen=True)
+class Config:
+    """A command for these tests."""
+
+    fault: str = ""
+    """What goes wrong."""
+    seed: int = 0
+    """A number."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def _run(config, console):
+    console.say("for people")
+    os.write(1, b"from a native library\n")
+    match config.fault:
+        case "bug":
+            int("three")
+        case "full":
+            raise OSError(errno.ENOSPC, "No space left on device", "runs/x")
+        case "missing":
+            open("/no/such/file")
+        case "ctrl-c":
+            raise KeyboardInterrupt
+        case "kill":
+            os.kill(os.getpid(), signal.SIGTERM)
+        case "memory":
+            raise MemoryError
+    return {"seed": config.seed, "nan": float("nan")}
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Add `suite probe`, whose module is this file's Config and _run."""
+    module = types.ModuleType("suite.commands.probe")
+    module.Config, module.run = Config, _run  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "suite.commands.probe", module)
+    monkeypatch.setitem(cli.COMMANDS, "probe", "for tests")
+
+
+def _main_without(packages, args):
+    """Run the command line in a process where importing any of `packages` fails."""
+    code = (
+        "import sys\n"
+        "class Blocker:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.split('.')[0] in {packages!r}:\n"
+        "            raise ImportError('blocked: ' + name)\n"
+        "sys.meta_path.insert(0, Blocker())\n"
+        "from suite.cli import main\n"
+        f"raise SystemExit(main({args!r}))\n"
+    )
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+
+
+def test_help_imports_nothing_heavy():
+    done = _main_without(HEAVY, ["--help"])
+    assert done.returncode == 0, done.stderr
+    for name in cli.COMMANDS:
+        assert f"  {name} " in done.stdout
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_every_command_has_help_for_every_option(name, capsys):
+    assert cli.main([name, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"suite {name}" in text and "--json" in text
+    module = sys.modules[f"suite.commands.{name}"]
+    assert module.Config.__dataclass_params__.frozen
+    assert "(default: " in text
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_asking_for_a_commands_help_imports_nothing_slow(name):
+    done = _main_without(SLOW, [name, "--help"])
+    assert done.returncode == 0, done.stderr
+
+
+def test_an_unknown_command_gets_the_nearest_and_code_2(capsys):
+    assert cli.main(["inof"]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and "Did you mean 'info'?" in said.err
+
+
+def test_an_unknown_option_is_code_2(command, capsys):
+    assert cli.main(["probe", "--sede", "3"]) == 2
+    assert "--seed" in capsys.readouterr().err
+
+
+def test_no_command_is_code_2_and_shows_the_commands(capsys):
+    assert cli.main([]) == 2
+    assert "info" in capsys.readouterr().err
+
+
+def test_json_is_one_object_on_standard_output_and_nothing_else(command, capfd):
+    assert cli.main(["probe", "--json", "--seed", "5"]) == 0
+    said = capfd.readouterr()
+    assert json.loads(said.out) == {"seed": 5, "nan": None}
+    assert "for people" in said.err and "native library" in said.err
+
+
+def test_without_json_people_are_spoken_to(command, capfd):
+    assert cli.main(["probe"]) == 0
+    assert capfd.readouterr().out.startswith("for people")
+
+
+@pytest.mark.parametrize(
+    ("fault", "code", "words"),
+    [
+        ("full", 1, "the disk is full: runs/x; free some space"),
+        ("missing", 2, "no such file or directory: /no/such/file"),
+        ("memory", 1, "out of memory"),
+        ("ctrl-c", 130, "interrupted; what was finished is kept"),
+        ("kill", 130, "interrupted; what was finished is kept"),
+    ],
+)
+def test_what_a_person_may_meet_is_one_line(command, capsys, fault, code, words):
+    assert cli.main(["probe", "--fault", fault]) == code
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and words in lines[0]
+
+
+def test_a_bug_keeps_its_traceback(command, capsys):
+    assert cli.main(["probe", "--fault", "bug"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_an_error_raised_on_purpose_in_our_rooms_is_a_message(capsys):
+    assert cli.main(["bench", "nothing"]) == 2
+    said = capsys.readouterr().err
+    assert "unknown benchmark 'nothing'" in said and "Traceback" not in said
+
+
+def _pad_one_box(to_boxes, center_w):
+    none = np.zeros((0, 3))
+    gates = Gates(none, np.zeros((0, 3, 3)), np.zeros((0, 4, 2)), np.zeros(0), np.zeros(0))
+    boxes = Boxes(np.array([center_w]), np.zeros((1, 3, 3)), np.ones((1, 3)))
+    spheres = Spheres(none, np.zeros(0))
+    scene = Scene(gates, boxes, no_rods(), no_rods(), spheres, np.zeros((0, 3, 3)))
+    return pad(scene, Counts(to_boxes, 0, 0, 0))
+
+
+def test_a_value_error_that_numpy_throws_in_our_rooms_is_a_bug():
+    with pytest.raises(ValueError) as met:
+        _pad_one_box(2, [0.0, 0.0])
+    frames = traceback.extract_tb(met.value.__traceback__)
+    assert frames[-1].filename.endswith("scene.py"), "the case is one with no frame of numpy's"
+    assert explain(met.value) is None
+
+
+def test_an_error_raised_on_purpose_in_a_worker_process_is_a_message():
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        with pytest.raises(ValueError, match="more than the 0") as met:
+            list(pool.map(_pad_one_box, [0], [[0.0, 0.0, 0.0]]))
+    explained = explain(met.value)
+    assert explained is not None and explained[0] == 2
+
+
+def test_ctrl_c_at_the_program_itself_is_code_130():
+    code = (
+        "import os, signal, sys, types\n"
+        "from dataclasses import make_dataclass\n"
+        "from suite import cli\n"
+        "module = types.ModuleType('suite.commands.wait')\n"
+        "module.Config = make_dataclass('Config', [('json', bool, False)], frozen=True)\n"
+        "module.run = lambda config, console: os.kill(os.getpid(), signal.SIGINT) or input()\n"
+        "sys.modules['suite.commands.wait'] = module\n"
+        "cli.COMMANDS['wait'] = 'for tests'\n"
+        "raise SystemExit(cli.main(['wait']))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, stdin=subprocess.PIPE
+    )
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr
+
+
+def test_a_reader_that_leaves_ends_the_program_quietly():
+    command = f"{sys.executable} -m suite.cli info | true; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert "Traceback" not in done.stderr
+
+
+def test_info_says_versions_devices_and_machine(capfd):
+    assert cli.main(["info", "--json"]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    assert facts["suite"] == VERSION
+    assert facts["packages"]["mujoco"].startswith("3.")
+    assert facts["jax_devices"] and facts["machine"]["cores"] >= 1
+
+
+def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
+    now = [0.0]
+    with Console().progress("flying", 100, clock=lambda: now[0]) as update:
+        for done in range(101):
+            now[0] = done * 0.5
+            update(done, "3.1 m/s")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 5
+    assert lines[0] == "flying: 20 of 100, 40 s left, 3.1 m/s"
+
+
+def test_figures_for_people():
+    assert [duration(s) for s in (0.44, 9.96, 59.6, 200, 7500)] == [
+        "0.4 s",
+        "10 s",
+        "1 min 00 s",
+        "3 min 20 s",
+        "2 h 05 min",
+    ]
+    assert [size(b) for b in (5, 812e3, 2.06e9)] == ["5 B", "812 kB", "2.1 GB"]

@@ -1,0 +1,120 @@
+"""The lock, the metadata and the wheel."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from tracks.version import VERSION
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+ROOMS = {"tracks", "policies", "eval", "suite"}
+LOCK_LINES = [
+    line
+    for line in (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
+    if line and not line.startswith("#")
+]
+LOCK = dict(line.split("==") for line in LOCK_LINES)
+
+
+@pytest.mark.parametrize("line", LOCK_LINES)
+def test_the_lock_has_exact_public_versions_only(line):
+    assert re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.]*", line)
+
+
+@pytest.mark.parametrize(
+    "text", [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["dev"]]
+)
+def test_the_lock_satisfies_the_project(text):
+    wanted = Requirement(text)
+    assert wanted.specifier.contains(LOCK[canonicalize_name(wanted.name)])
+
+
+@pytest.mark.parametrize(
+    ("package", "version"),
+    [("jax", "0.10.2"), ("mujoco", "4.0.0"), ("mujoco-mjx", "4.0.0"), ("rich", "15.0")],
+)
+def test_versions_known_to_break_are_kept_out(package, version):
+    bounds = [Requirement(text) for text in PROJECT["dependencies"]]
+    (bound,) = (entry for entry in bounds if entry.name == package)
+    assert not bound.specifier.contains(version)
+
+
+def test_the_lock_is_the_closure_of_what_is_installed():
+    done = subprocess.run(
+        [sys.executable, ROOT / "tools" / "lock.py"], capture_output=True, text=True, check=True
+    )
+    names = {line.split("==")[0] for line in done.stdout.splitlines() if not line.startswith("#")}
+    # Platforms differ in what a package needs (torch brings GPU libraries on Linux).
+    missing = {n for n in names - LOCK.keys() if not n.startswith(("nvidia-", "cuda-", "triton"))}
+    assert not missing
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """Build the wheel from a copy: an old build/ in the checkout would leak into it."""
+    folder, copy = tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("source")
+    for room in ROOMS:
+        shutil.copytree(ROOT / room, copy / room, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, copy)
+    subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
+        + ["--no-index", "--wheel-dir", folder, copy],
+        check=True,
+        capture_output=True,
+    )
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def test_the_wheel_holds_the_four_rooms_and_their_data(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    tops = {name.split("/")[0] for name in names if ".dist-info/" not in name}
+    assert tops == ROOMS
+    shipped = {
+        path.relative_to(ROOT).as_posix()
+        for room in tops
+        for path in (ROOT / room).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert shipped <= set(names), "a file in a room that the wheel leaves out"
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+
+
+def test_the_wheel_works_from_an_empty_folder(wheel, tmp_path):
+    home = tmp_path / "venv"
+    venv.create(home, with_pip=False)
+    (site,) = home.glob("lib/python*/site-packages")
+    # The requirements come from this environment; the suite itself must come from the wheel.
+    zipfile.ZipFile(wheel).extractall(site)
+    baked = site / "tracks" / "built_from.txt"
+    assert baked.is_file(), "the build writes the commit into the wheel"
+    baked.write_text("0123abc\n")
+    installed = [path for path in sys.path if path.endswith("site-packages")]
+    (site / "requirements.pth").write_text("\n".join(installed) + "\n")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    code = (
+        "import eval, policies, suite, tracks\n"
+        f"for room in (eval, policies, suite, tracks): assert {str(site)!r} in room.__file__\n"
+        "from suite.cli import main\n"
+        "raise SystemExit(main(['info', '--json']))\n"
+    )
+    done = subprocess.run(
+        [home / "bin" / "python", "-c", code], cwd=empty, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert (facts["suite"], facts["git_commit"]) == (VERSION, "0123abc")
+    assert list(empty.iterdir()) == []
