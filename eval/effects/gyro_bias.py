@@ -1,0 +1,43 @@
+"""A constant error of the logged gyroscope; the rate loop sees the true rates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from eval.effects.interface import Array, Effect, Parameter
+
+
+class GyroBias(NamedTuple):
+    """Values of `gyro_bias`."""
+
+    bias: Array
+    """(3,) added to the true value, body axes [rad/s]."""
+
+
+def log_of(values: GyroBias, log: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the changed `rate_b` (T, 3), or nothing where the log has none."""
+    if log.get("rate_b") is None:
+        return {}
+    return {"rate_b": log["rate_b"] + values.bias}
+
+
+EFFECT = Effect(
+    name="gyro_bias",
+    summary="A constant error of the logged gyro values",
+    equation="rate_b in the log = true + bias",
+    source="sensor model",
+    values=GyroBias,
+    parameters=(
+        Parameter(
+            name="bias",
+            unit="rad/s",
+            neutral=0.0,
+            low=-2.0,
+            high=2.0,
+            typical=(0.01, 0.2),
+            size=3,
+        ),
+    ),
+    log=log_of,
+)

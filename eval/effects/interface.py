@@ -1,0 +1,194 @@
+"""What an effect is: a few numbers, and hooks where they act on the nominal quadrotor.
+
+An effect is written once, for numpy and JAX arrays of any leading batch shape, and serves the
+MuJoCo judge, the MJX world and the differentiable quadrotor. With its neutral values it changes
+nothing, so that a model may hold every effect at once and fit any of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from eval.vehicle import Vehicle
+
+Array = Any  # numpy.ndarray or jax.Array
+
+GRAVITY = 9.81
+"""Magnitude of gravity [m/s^2]."""
+E3 = np.array([0.0, 0.0, 1.0])
+"""Body z axis in body axes; world z axis in the world."""
+
+
+class Constants(NamedTuple):
+    """The true constants of a quadrotor; what the controller believes is in `plant.Nominal`."""
+
+    mass: Array
+    """(...,) [kg]."""
+    inertia: Array
+    """(..., 3) principal, body axes, about the centre of mass [kg m^2]."""
+    gravity_w: Array
+    """(..., 3) [m/s^2]."""
+    com_offset_b: Array
+    """(..., 3) true centre of mass, measured from the nominal one [m]."""
+    rotor_position_b: Array
+    """(..., 4, 3) from the true centre of mass [m]."""
+    thrust_coefficient: Array
+    """(..., 4) k_T of each rotor [N/(rad/s)^2]."""
+    torque_coefficient: Array
+    """(..., 4) k_Q of each rotor [N m/(rad/s)^2]."""
+    thrust_axis_b: Array
+    """(..., 3) unit vector along which the total thrust pushes."""
+    time_constant: Array
+    """(...,) of the rotors [s]."""
+    rate_gain: Array
+    """(..., 3) of the rate loop [1/s]."""
+    delay: Array
+    """(...,) by which commands act late [s]."""
+
+
+class Flow(NamedTuple):
+    """What an effect sees of one physics step."""
+
+    constants: Constants
+    pos_w: Array
+    """(..., 3) centre of mass [m]."""
+    rot_w: Array
+    """(..., 3, 3) body to world."""
+    air_vel_b: Array
+    """(..., 3) velocity of the centre of mass relative to the air, v_b [m/s]."""
+    rate_b: Array
+    """(..., 3) [rad/s]."""
+    rotor_speed: Array
+    """(..., 4) mean over the step [rad/s]."""
+    spin: Array
+    """(4,) s_i: +1 for a rotor turning counter-clockwise seen from above."""
+    time_s: Array
+    """(...,) since the start of the flight (the first row of its log) [s]."""
+    voltage_drop: Array | None
+    """(...,) battery voltage at the start minus now [V]; None where there is no voltage."""
+
+
+class Gust(NamedTuple):
+    """What an effect that makes wind sees of one physics step."""
+
+    velocity_w: Array
+    """(..., 3) of this effect's wind in the step before [m/s]."""
+    air_vel_w: Array
+    """(..., 3) velocity of the centre of mass relative to the mean wind [m/s]."""
+    noise: Array | None
+    """(..., 3) standard normal draws of this step; None for none."""
+    dt: Array
+    """Length of the step [s]."""
+
+
+Bound = float | Callable[["Vehicle"], float]
+"""A number, or how to read it off the vehicle that has the effect."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of an effect: what it may be and what it usually is."""
+
+    name: str
+    """As in a vehicle file and in a diagnosis."""
+    unit: str
+    """SI."""
+    neutral: Bound
+    """The value with which the effect is absent (of each component)."""
+    low: Bound
+    """Smallest physical value (of each component)."""
+    high: Bound
+    """Largest physical value (of each component)."""
+    typical: tuple[float, float]
+    """Usual magnitudes on a racing quadrotor of 0.5 to 1 kg (differences from neutral)."""
+    size: int = 0
+    """Components; 0 for a plain number."""
+    required: bool = True
+    """Whether a vehicle file must give it; the neutral value stands for one left out."""
+    fitted: bool = True
+    """Whether flights can tell it; a given constant of the vehicle otherwise."""
+    unseen: tuple[int, ...] = ()
+    """Components that no flight can tell; a diagnosis reports them as null."""
+
+
+Values = Any  # the effect's own NamedTuple of floats, tuples or arrays
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A physical effect; every hook may be left out."""
+
+    name: str
+    """As in a vehicle file and in a diagnosis."""
+    summary: str
+    """One sentence for people."""
+    equation: str
+    """Against the nominal quadrotor."""
+    source: str
+    """Where the form comes from."""
+    values: type
+    """NamedTuple class with a field for each parameter, in order."""
+    parameters: tuple[Parameter, ...]
+    constants: Callable[[Values, Constants], Constants] | None = None
+    """Returns the changed constants."""
+    wind: Callable[[Values, Gust], Array] | None = None
+    """Returns this effect's wind velocity in the world (..., 3) [m/s]."""
+    gust: Callable[[Values, Array], Array] | None = None
+    """For wind that changes at random: the wind at the start from normal draws (..., 3)."""
+    thrust: Callable[[Values, Flow, Array], Array] | None = None
+    """Takes and returns the rotors' thrusts (..., 4) [N]."""
+    force: Callable[[Values, Flow], Array] | None = None
+    """Returns an added force on the centre of mass in body axes (..., 3) [N]."""
+    torque: Callable[[Values, Flow], Array] | None = None
+    """Returns an added torque in body axes (..., 3) [N m]."""
+    log: Callable[[Values, Mapping[str, Array]], dict[str, Array]] | None = None
+    """A fault of the log, not of the flight: takes the arrays of a flight log by name (`time_s`,
+    `pos_w`, `quat_wxyz`, `vel_w`, `rate_b`, `acc_b`, ...) and returns the ones it changes."""
+    read: Callable[[Mapping[str, Any]], Values] | None = None
+    """Reads a vehicle file's table where it is not simply the parameters."""
+    write: Callable[[Values], dict[str, Any]] | None = None
+    """The inverse of `read`."""
+
+
+def at(bound: Bound, vehicle: Vehicle) -> float:
+    """Return `bound` as a number for `vehicle`."""
+    return float(bound(vehicle) if callable(bound) else bound)
+
+
+def neutral(effect: Effect, vehicle: Vehicle) -> Values:
+    """Return the values with which `effect` changes nothing on `vehicle`."""
+
+    def value(parameter: Parameter) -> Any:
+        number = at(parameter.neutral, vehicle)
+        return (number,) * parameter.size if parameter.size else number
+
+    return effect.values(*(value(parameter) for parameter in effect.parameters))
+
+
+def per_axis(value: Array) -> Array:
+    """Return scalars (...,) as (..., 1), to multiply vectors (..., 3) or rotors (..., 4)."""
+    return value[..., None]
+
+
+def cross_e3(vector: Array) -> Array:
+    """Return vector x e3, (..., 3)."""
+    xp = vector.__array_namespace__()
+    return xp.stack([vector[..., 1], -vector[..., 0], xp.zeros_like(vector[..., 0])], axis=-1)
+
+
+def tilted_e3(angle: Array) -> Array:
+    """Return Rot(a_x, a_y, 0) e3 (..., 3) for `angle` (..., 2) [rad].
+
+    The rotation is about x first and then about the fixed y axis (roll, pitch, no yaw).
+    """
+    xp = angle.__array_namespace__()
+    about_x, about_y = angle[..., 0], angle[..., 1]
+    return xp.stack(
+        [xp.sin(about_y) * xp.cos(about_x), -xp.sin(about_x), xp.cos(about_y) * xp.cos(about_x)],
+        axis=-1,
+    )

@@ -1,0 +1,83 @@
+"""One or several rotors that give less than the others: worn motor, chipped propeller."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from eval.effects.interface import Array, Constants, Effect, Parameter
+
+
+class WeakMotor(NamedTuple):
+    """Values of `weak_motor`; the file has `index` (from 1) and `scale`, numbers or lists."""
+
+    scale: Array
+    """(..., 4) true thrust and torque of each rotor over nominal [1]."""
+
+
+def constants_of(values: WeakMotor, constants: Constants) -> Constants:
+    """Return the constants with each rotor's k_T and k_Q scaled."""
+    return constants._replace(
+        thrust_coefficient=constants.thrust_coefficient * values.scale,
+        torque_coefficient=constants.torque_coefficient * values.scale,
+    )
+
+
+def read(table: Mapping[str, Any]) -> WeakMotor:
+    """Read `index` and `scale` from a vehicle file's table.
+
+    Raises:
+        ValueError: with the key, the value and what is allowed.
+    """
+    for key in table:
+        if key not in ("index", "scale"):
+            raise ValueError(f"{key}: unknown key; allowed: index, scale")
+    for key in ("index", "scale"):
+        if key not in table:
+            raise ValueError(f"{key}: missing; needed: index (1 to 4) and scale, numbers or lists")
+    index, scale = table["index"], table["scale"]
+    if isinstance(index, list) != isinstance(scale, list):
+        raise ValueError(f"index = {index}, scale = {scale}: both numbers or both lists")
+    if not isinstance(index, list):
+        index, scale = [index], [scale]
+    if len(index) != len(scale) or not index:
+        raise ValueError(f"index = {index}, scale = {scale}: one scale for each index")
+    each = [1.0] * 4
+    for number, factor in zip(index, scale, strict=True):
+        if isinstance(number, bool) or number not in (1, 2, 3, 4) or index.count(number) > 1:
+            raise ValueError(f"index = {index}: allowed are different whole numbers from 1 to 4")
+        if isinstance(factor, bool) or not isinstance(factor, (int, float)):
+            raise ValueError(f"scale = {factor!r}: must be a number")
+        each[int(number) - 1] = float(factor)
+    return WeakMotor(tuple(each))
+
+
+def write(values: WeakMotor) -> dict[str, Any]:
+    """Return the vehicle file's table: the rotors whose scale is not 1."""
+    weak = [(i + 1, float(s)) for i, s in enumerate(values.scale) if s != 1.0] or [(1, 1.0)]
+    if len(weak) == 1:
+        return {"index": weak[0][0], "scale": weak[0][1]}
+    return {"index": [i for i, _ in weak], "scale": [s for _, s in weak]}
+
+
+EFFECT = Effect(
+    name="weak_motor",
+    summary="One or several rotors give less than the others",
+    equation="rotor index: thrust and torque x scale",
+    source="fault model of one actuator's effectiveness",
+    values=WeakMotor,
+    parameters=(
+        Parameter(
+            name="scale",
+            unit="1",
+            neutral=1.0,
+            low=0.0,
+            high=1.5,
+            typical=(0.03, 0.15),
+            size=4,
+        ),
+    ),
+    constants=constants_of,
+    read=read,
+    write=write,
+)

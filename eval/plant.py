@@ -1,0 +1,321 @@
+"""The quadrotor without its rigid body: a command goes in, force and torque come out.
+
+One step is the nominal quadrotor (rate loop, mixer, rotors) with every effect of its vehicle.
+All functions take numpy or JAX arrays with any leading batch shape; a `Plant` is a pytree of
+arrays, so that it can be built inside a differentiated function.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from eval.effects.interface import GRAVITY, Array, Constants, Flow, Gust
+from eval.mixer import mix, mixer_matrix
+from eval.rate_loop import cross, rate_torque
+from eval.rotors import Spin, follow, speed_command
+from eval.vehicle import Vehicle
+
+
+class Command(NamedTuple):
+    """Collective thrust and body rates (CTBR)."""
+
+    thrust: Array
+    """(...,) along body z per nominal mass [m/s^2]."""
+    rate_b: Array
+    """(..., 3) [rad/s]."""
+
+
+class Motion(NamedTuple):
+    """A rigid body's state at its centre of mass."""
+
+    pos_w: Array
+    """(..., 3) [m]."""
+    rot_w: Array
+    """(..., 3, 3) body to world."""
+    vel_w: Array
+    """(..., 3) [m/s]."""
+    rate_b: Array
+    """(..., 3) [rad/s]."""
+
+
+class Wrench(NamedTuple):
+    """What acts on the rigid body besides gravity and its own gyroscopic terms."""
+
+    force_b: Array
+    """(..., 3) on the centre of mass [N]."""
+    torque_b: Array
+    """(..., 3) about the centre of mass [N m]."""
+
+
+class Memory(NamedTuple):
+    """What a plant remembers from step to step."""
+
+    rotor_speed: Array
+    """(..., 4) at the start of the step [rad/s]."""
+    command: Array
+    """(..., 4, L) thrust and rates of the last L steps, newest first; L = 0 without a delay."""
+    wind: dict[str, Array]
+    """(..., 3) of each effect that makes random wind [m/s]."""
+
+
+class Nominal(NamedTuple):
+    """What the controller believes."""
+
+    mass: Array
+    """[kg]."""
+    inertia: Array
+    """(3,) [kg m^2]."""
+    unmixer: Array
+    """(4, 4) from (force, torque) to rotor thrusts."""
+    thrust_max: Array
+    """Of one rotor [N]."""
+    thrust_coefficient: Array
+    """k_T [N/(rad/s)^2]."""
+    spin: Array
+    """(4,) s_i."""
+
+
+class Plant(NamedTuple):
+    """A vehicle with its effects, prepared for steps of one length."""
+
+    nominal: Nominal
+    constants: Constants
+    """With every effect that changes one."""
+    effects: dict[str, Any]
+    """Values of all effects, as arrays, by name."""
+    delay_weight: Array
+    """(..., L) share of each remembered command in the one that acts; L = 0 without a delay."""
+    dt: Array
+    """Length of a step [s]."""
+
+
+def make_plant(
+    vehicle: Vehicle,
+    dt: float,
+    effects: dict[str, Any] | None = None,
+    max_delay: float | None = None,
+) -> Plant:
+    """Return the plant of `vehicle` for steps of `dt` [s].
+
+    Args:
+        vehicle: what it is; its nominal values are constants.
+        dt: 1 / controller.frequency.
+        effects: values in place of `vehicle.effects`, by name; traced JAX arrays may be among
+            them, also with leading batch axes (one vehicle a trial).
+        max_delay: room to remember commands [s]; needed where a delay is traced, otherwise
+            exactly what the delay needs.
+    """
+    values = dict(vehicle.effects) if effects is None else effects
+    # The table's order is the order in which effects act.
+    values = {name: _arrays(values[name]) for name in EFFECTS if name in values}
+    rotors = vehicle.rotors
+    constants = Constants(
+        mass=np.asarray(vehicle.mass),
+        inertia=np.asarray(vehicle.inertia),
+        gravity_w=np.array([0.0, 0.0, -GRAVITY]),
+        com_offset_b=np.zeros(3),
+        rotor_position_b=np.asarray(rotors.position),
+        thrust_coefficient=np.full(4, rotors.thrust_coefficient),
+        torque_coefficient=np.full(4, rotors.torque_coefficient),
+        thrust_axis_b=np.array([0.0, 0.0, 1.0]),
+        time_constant=np.asarray(rotors.time_constant),
+        rate_gain=np.asarray(vehicle.controller.rate_gain),
+        delay=np.asarray(0.0),
+    )
+    for name, value in values.items():
+        change = EFFECTS[name].constants
+        constants = change(value, constants) if change else constants
+    nominal = Nominal(
+        mass=np.asarray(vehicle.mass),
+        inertia=np.asarray(vehicle.inertia),
+        unmixer=np.linalg.inv(
+            mixer_matrix(
+                rotors.position, rotors.spin, rotors.torque_coefficient / rotors.thrust_coefficient
+            )
+        ),
+        thrust_max=np.asarray(rotors.thrust_max),
+        thrust_coefficient=np.asarray(rotors.thrust_coefficient),
+        spin=np.asarray(rotors.spin, dtype=float),
+    )
+    if max_delay is None:
+        max_delay = float(np.max(constants.delay))
+    weight = _delay_weight(constants.delay, dt, max_delay)
+    return Plant(nominal, constants, values, weight, np.asarray(dt))
+
+
+def start_memory(
+    plant: Plant,
+    batch_shape: tuple[int, ...],
+    xp: Any = np,
+    noise: Array | None = None,
+) -> Memory:
+    """Return the memory of plants that hovered until now.
+
+    Args:
+        plant: the plant.
+        batch_shape: leading shape of the states that will be flown.
+        xp: numpy or jax.numpy.
+        noise: (*batch_shape, 3) normal draws for the random wind at the start; without them it
+            starts from none.
+    """
+    hover = Command(xp.full(batch_shape, GRAVITY), xp.zeros((*batch_shape, 3)))
+    speed = wanted_speed(plant, hover, xp.zeros((*batch_shape, 3)))
+    packed = xp.concatenate([hover.thrust[..., None], hover.rate_b], axis=-1)
+    length = plant.delay_weight.shape[-1]
+    command = xp.broadcast_to(packed[..., None], (*batch_shape, 4, length))
+    still = xp.zeros((*batch_shape, 3))
+    wind = {}
+    for name, value in plant.effects.items():
+        start = EFFECTS[name].gust
+        if start:
+            wind[name] = still if noise is None else start(value, noise) + still
+    return Memory(speed, command, wind)
+
+
+def uses_noise(plant: Plant) -> bool:
+    """Return whether an effect of `plant` needs normal draws at every step."""
+    return any(EFFECTS[name].gust for name in plant.effects)
+
+
+def body_constants(plant: Plant) -> Constants:
+    """Return the true constants: a world needs mass, inertia, gravity_w and com_offset_b."""
+    return plant.constants
+
+
+def plant_step(
+    plant: Plant,
+    memory: Memory,
+    motion: Motion,
+    command: Command,
+    time_s: Array,
+    noise: Array | None = None,
+    voltage_drop: Array | None = None,
+) -> tuple[Memory, Wrench]:
+    """Return the memory after one step of `plant.dt` and the wrench to hold during it.
+
+    Args:
+        plant: the plant.
+        memory: from `start_memory` or the step before.
+        motion: at the start of the step.
+        command: held during the step.
+        time_s: (...,) since the start of the flight [s].
+        noise: (..., 3) normal draws for random wind; without them there is none.
+        voltage_drop: (...,) battery voltage at the start of the flight minus now [V].
+    """
+    memory, command = delayed(plant, memory, command)
+    wanted = wanted_speed(plant, command, motion.rate_b)
+    spin = follow(memory.rotor_speed, wanted, plant.constants.time_constant, plant.dt)
+    memory = memory._replace(rotor_speed=spin.end)
+    return spin_step(plant, memory, motion, spin, time_s, noise, voltage_drop)
+
+
+def delayed(plant: Plant, memory: Memory, command: Command) -> tuple[Memory, Command]:
+    """Return the memory that has `command`, and the mean of the command that acts in this step.
+
+    A delay that is no multiple of the step gives the mean of the two commands that share the
+    step, so that it can be fitted by gradients.
+    """
+    if plant.delay_weight.shape[-1] == 0:
+        return memory, command
+    xp = command.rate_b.__array_namespace__()
+    packed = xp.concatenate([command.thrust[..., None], command.rate_b], axis=-1)
+    history = xp.concatenate([packed[..., None], memory.command[..., :-1]], axis=-1)
+    acting = xp.matmul(history, xp.asarray(plant.delay_weight)[..., :, None])[..., 0]
+    return memory._replace(command=history), Command(acting[..., 0], acting[..., 1:])
+
+
+def wanted_speed(plant: Plant, command: Command, rate_b: Array) -> Array:
+    """Return the rotor speeds (..., 4) [rad/s] that the rate loop and the mixer ask for."""
+    nominal = plant.nominal
+    torque_b = rate_torque(command.rate_b, rate_b, plant.constants.rate_gain, nominal.inertia)
+    thrust = mix(nominal.unmixer, nominal.thrust_max, nominal.mass * command.thrust, torque_b)
+    return speed_command(thrust, nominal.thrust_coefficient)
+
+
+def spin_step(
+    plant: Plant,
+    memory: Memory,
+    motion: Motion,
+    spin: Spin,
+    time_s: Array,
+    noise: Array | None = None,
+    voltage_drop: Array | None = None,
+) -> tuple[Memory, Wrench]:
+    """Return memory and wrench for given rotor speeds, as where they were measured.
+
+    The arguments are those of `plant_step`; `spin` stands for the command and `rotors.steady`
+    makes one from measured speeds.
+    """
+    xp = motion.vel_w.__array_namespace__()
+    constants = plant.constants
+    air_vel_w, winds = motion.vel_w, dict(memory.wind)
+    still = xp.zeros_like(air_vel_w)
+    for name, value in plant.effects.items():
+        if EFFECTS[name].wind:
+            before = memory.wind.get(name, still)
+            wind_w = EFFECTS[name].wind(value, Gust(before, air_vel_w, noise, plant.dt))
+            air_vel_w = air_vel_w - wind_w
+            if name in memory.wind:
+                winds[name] = wind_w
+    flow = Flow(
+        constants=constants,
+        pos_w=motion.pos_w,
+        rot_w=motion.rot_w,
+        air_vel_b=(motion.rot_w * air_vel_w[..., :, None]).sum(axis=-2),
+        rate_b=motion.rate_b,
+        rotor_speed=spin.mean,
+        spin=plant.nominal.spin,
+        time_s=time_s,
+        voltage_drop=voltage_drop,
+    )
+    thrust = constants.thrust_coefficient * spin.mean_square
+    for name, value in plant.effects.items():
+        change = EFFECTS[name].thrust
+        thrust = change(value, flow, thrust) if change else thrust
+    force_b = thrust.sum(axis=-1)[..., None] * constants.thrust_axis_b
+    arm = constants.rotor_position_b
+    about_z = -(flow.spin * constants.torque_coefficient * spin.mean_square).sum(axis=-1)
+    torque_b = xp.stack(
+        [(arm[..., 1] * thrust).sum(axis=-1), -(arm[..., 0] * thrust).sum(axis=-1), about_z],
+        axis=-1,
+    )
+    for name, value in plant.effects.items():
+        push, twist = EFFECTS[name].force, EFFECTS[name].torque
+        force_b = force_b + push(value, flow) if push else force_b
+        torque_b = torque_b + twist(value, flow) if twist else torque_b
+    return memory._replace(wind=winds), Wrench(force_b, torque_b)
+
+
+def accelerations(plant: Plant, motion: Motion, wrench: Wrench) -> tuple[Array, Array]:
+    """Return dv/dt in the world (..., 3) [m/s^2] and dw/dt in body axes (..., 3) [rad/s^2]."""
+    constants = plant.constants
+    force_w = (motion.rot_w * wrench.force_b[..., None, :]).sum(axis=-1)
+    spin_b = constants.inertia * motion.rate_b
+    torque_b = wrench.torque_b - cross(motion.rate_b, spin_b)
+    return force_w / constants.mass[..., None] + constants.gravity_w, torque_b / constants.inertia
+
+
+def _arrays(values: Any) -> Any:
+    """Turn the numbers and tuples of an effect's values into float arrays; leave JAX's be."""
+    return type(values)(
+        *(
+            value if hasattr(value, "__array_namespace__") else np.asarray(value, dtype=float)
+            for value in values
+        )
+    )
+
+
+def _delay_weight(delay: Array, dt: float, max_delay: float) -> Array:
+    """Return each remembered command's share (..., L): linear between the two nearest steps."""
+    xp = delay.__array_namespace__()
+    # A delay of 0.03 s is 15 steps of 0.002 s in spite of rounding.
+    length = math.ceil(max_delay / dt - 1e-9) + 1 if max_delay > 0.0 else 0
+    age = np.arange(length)
+    steps = (delay / dt)[..., None]
+    whole = xp.floor(steps + 1e-9)
+    part = steps - whole
+    return xp.where(age == whole, 1.0 - part, 0.0) + xp.where(age == whole + 1.0, part, 0.0)
