@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 
 import numpy as np
 
 from tracks.families import circular, ellipse, random, zigzag
 from tracks.families.layout import Layout
+from tracks.names import unknown_name
 from tracks.scene import Counts
 from tracks.track import Track
 
@@ -66,8 +66,5 @@ def random_track(difficulty: float, rng: np.random.Generator) -> Track:
 
 def check_family(family: str) -> None:
     """Raise a ValueError that names the nearest family where `family` is unknown."""
-    if family in FAMILIES:
-        return
-    near = difflib.get_close_matches(str(family), FAMILIES, 1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise ValueError(f"track family {family!r} is unknown, known are {', '.join(FAMILIES)}{hint}")
+    if family not in FAMILIES:
+        raise unknown_name("track family", str(family), FAMILIES)
