@@ -1,0 +1,128 @@
+"""Every setting of a training run, as frozen dataclasses that the command line reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from policies.spec import PolicySpec
+
+
+@dataclass(frozen=True)
+class PointMassConfig:
+    """The simulator's dynamics and their randomisation, drawn per world (Zhang et al. 2025)."""
+
+    lag_mean: float = 12.0
+    """Mean rate at which the acceleration follows the command [1/s]."""
+    lag_std: float = 1.2
+    """Its standard deviation over worlds [1/s]."""
+    drag: tuple[float, float] = (0.30, 0.45)
+    """Range of the linear drag in body axes [1/s]."""
+    wind_std: tuple[float, float, float] = (1.0, 1.0, 0.2)
+    """Standard deviation of the constant wind over worlds [m/s]."""
+    time_step_std: float = 0.1
+    """Standard deviation of a world's time step as a share of the policy's period [1]."""
+    action_delay: tuple[float, float] = (0.0, 1.0)
+    """Range of the delay after which a command acts [policy periods, at most 2]."""
+    state_delay: int = 0
+    """Age of the state that the policy sees [policy periods]."""
+    image_delay: int = 1
+    """Age of the image that the policy sees [policy periods]."""
+    depth_noise: float = 0.02
+    """Standard deviation of the noise on the encoded inverse depth [1]."""
+    fov_scale: tuple[float, float] = (0.95, 1.05)
+    """Range of a run's field of view as a share of the camera's, drawn per iteration [1]."""
+    heading_rate: float = 6.0
+    """Rate at which the heading follows the direction to the gate [1/s]."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of Su et al. 2026, Sec. III-C3, and the strength of the attractive field."""
+
+    clearance: float = 3.0
+    """Weight of L_clearance, with the paper's lambda_C [1]."""
+    collide: float = 3.0
+    """Weight of L_collide, with the paper's lambda_C [1]."""
+    acceleration: float = 1e-2
+    """lambda_a [s^4/m^2]."""
+    jerk: float = 1e-3
+    """lambda_j [s^6/m^2]."""
+    progress: float = 0.4
+    """lambda_p of L_p [s/m]."""
+    progress_norm: float = 0.0
+    """Weight of L_p^norm, the ablation's direction-only progress [1]."""
+    projection: float = 0.0
+    """lambda_proj of L_proj, the scalar substitute for the field [1/m^2]."""
+    projection_decay: float = 0.5
+    """beta_3 of L_proj [1/m]."""
+    barrier_height: float = 2.0
+    """beta_1 of L_clearance [1]."""
+    barrier_slope: float = -32.0
+    """beta_2 of L_clearance [1/m]."""
+    safety_radius_m: float = 0.15
+    """r_q, the drone's radius with its margin [m]."""
+    field_gain: float = 0.42
+    """Gradient per step, of the loss before averaging over time and batch, that u_A adds at the
+    centre of a 1 m gate to a velocity across it [1/m]; 0 turns the field off."""
+    field_decay: float = 0.3
+    """lambda_A, how slowly u_A falls with distance [1]."""
+    gradient_decay: float = 0.916
+    """alpha, the rate at which gradients of position and velocity fade back in time [1/s]."""
+    path_samples: int = 4
+    """Points of every step's path at which the nearest obstacle is looked up."""
+
+
+@dataclass(frozen=True)
+class EpisodeConfig:
+    """The worlds of one iteration."""
+
+    batch: int = 64
+    """Worlds per iteration, over all devices."""
+    steps: int = 150
+    """Policy periods per rollout."""
+    difficulty: tuple[float, float] = (0.0, 1.0)
+    """Range of the tracks' difficulty."""
+    easy_until: float = 0.0
+    """Share of training during which the range of difficulty grows from its lower end."""
+    rest_share: float = 0.4
+    """Share of worlds that start at rest at the track's start; the others start on the way."""
+    start_speed: float = 6.0
+    """Largest speed of a world that starts on the way [m/s]."""
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """AdamW with a cosine schedule."""
+
+    iterations: int = 2000
+    """Gradient steps."""
+    rate: float = 1e-3
+    """Peak learning rate."""
+    rate_end: float = 1e-5
+    """Learning rate at the end."""
+    warmup: int = 20
+    """Iterations of linear warm-up."""
+    weight_decay: float = 1e-2
+    """AdamW's decoupled weight decay."""
+    clip: float = 0.0
+    """Largest global norm of a gradient; 0 does not clip."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A training run."""
+
+    spec: PolicySpec = field(default_factory=PolicySpec)
+    """Rate, camera and encodings of the policy."""
+    physics: PointMassConfig = field(default_factory=PointMassConfig)
+    """Dynamics and their randomisation."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """Weights of the loss and of the field."""
+    episode: EpisodeConfig = field(default_factory=EpisodeConfig)
+    """Worlds and horizon."""
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    """Optimiser and its schedule."""
+    seed: int = 0
+    """Seed of the parameters, the tracks and the randomisation."""
+    devices: int = 0
+    """JAX devices to share the batch; 0 takes all that divide it."""

@@ -1,0 +1,102 @@
+"""The gradient of a rollout: the loop first, then the encoder on all images at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+
+from policies import delta_network, network
+from suite.train.config import TrainConfig
+from suite.train.rollout import StepRecord, make_rollout
+from suite.train.worlds import Worlds
+
+CHUNK = 320
+"""Images encoded at a time in the backward pass: small enough to stay in the cache."""
+
+
+def _chunk(count: int) -> int:
+    """Return the largest divisor of count that is at most CHUNK."""
+    return max(size for size in range(1, min(count, CHUNK) + 1) if count % size == 0)
+
+
+def encoder_gradient(
+    params: network.Params, images: jax.Array, cotangents: jax.Array
+) -> network.Params:
+    """Return the encoder's gradient summed over all images, in chunks.
+
+    Args:
+        params: the policy's parameters.
+        images: (N, height, width).
+        cotangents: (N, hidden) gradient of the loss with respect to the embeddings.
+    """
+    size = _chunk(images.shape[0])
+
+    def body(total: network.Params, part: tuple[jax.Array, jax.Array]) -> tuple:
+        image, cotangent = part
+        _, pull = jax.vjp(lambda p: network.encode(p, image), params)
+        return jax.tree.map(jnp.add, total, pull(cotangent)[0]), None
+
+    zero = jax.tree.map(jnp.zeros_like, params)
+    split = (images.reshape(-1, size, *images.shape[1:]),
+             cotangents.reshape(-1, size, cotangents.shape[-1]))
+    return jax.lax.scan(body, zero, split)[0]
+
+
+def make_gradient(
+    config: TrainConfig,
+) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
+    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) on one device."""
+    rollout = make_rollout(config)
+    width = config.spec.hidden_size
+
+    def frozen_encode(params: network.Params, image: jax.Array) -> jax.Array:
+        return jax.lax.stop_gradient(network.encode(params, image))
+
+    def gradient(
+        params: network.Params,
+        worlds: Worlds,
+        key: jax.Array,
+        delta: delta_network.Params | None,
+    ) -> tuple[network.Params, jax.Array, StepRecord]:
+        nudge = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], width))
+        (loss, records), (direct, cotangents) = jax.value_and_grad(
+            rollout, argnums=(0, 1), has_aux=True
+        )(params, nudge, worlds, key, frozen_encode, delta)
+        images = records.image.reshape(-1, *records.image.shape[2:])
+        through_images = encoder_gradient(params, images, cotangents.reshape(-1, width))
+        return jax.tree.map(jnp.add, direct, through_images), loss, records
+
+    return gradient
+
+
+def shard_gradient(config: TrainConfig, mesh: Mesh) -> Callable[..., tuple]:
+    """Return the gradient shared by the devices of `mesh`, each with its part of the worlds.
+
+    Returns:
+        gradient(params, worlds, key, delta) -> (gradient, loss, records without images); the
+        gradient and the loss are means over all worlds, the records are gathered.
+    """
+    local = make_gradient(config)
+    axis = mesh.axis_names[0]
+
+    def part(
+        params: network.Params, worlds: Worlds, key: jax.Array, delta: delta_network.Params | None
+    ) -> tuple:
+        key = jax.random.fold_in(key, jax.lax.axis_index(axis))
+        gradient, loss, records = local(params, worlds, key, delta)
+        records = records._replace(image=jnp.zeros((config.episode.steps, 1)))
+        return jax.lax.pmean(gradient, axis), jax.lax.pmean(loss, axis), records
+
+    worlds_spec = P(axis)
+    records_spec = P(None, axis)
+    return jax.shard_map(
+        part,
+        mesh=mesh,
+        in_specs=(P(), worlds_spec, P(), P()),
+        out_specs=(P(), P(), records_spec),
+        check_vma=False,
+    )

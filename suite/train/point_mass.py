@@ -1,0 +1,115 @@
+"""The differentiable point mass with first-order lag (Zhang et al. 2025; Su et al. 2026, III-B).
+
+Only position, velocity and acceleration carry gradients; attitude follows the thrust direction and
+carries none.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from policies.observation import to_world
+
+GRAVITY = 9.81
+"""[m/s^2]."""
+
+
+class Constants(NamedTuple):
+    """What is drawn once per world."""
+
+    lag: jax.Array
+    """(B,) rate at which the acceleration follows the command [1/s]."""
+    drag: jax.Array
+    """(B, 3) linear drag in body axes [1/s]."""
+    wind_w: jax.Array
+    """(B, 3) [m/s]."""
+    time_step: jax.Array
+    """(B,) [s]."""
+    delay: jax.Array
+    """(B,) delay of a command in time steps, within [0, 2]."""
+
+
+class Body(NamedTuple):
+    """State of the point mass."""
+
+    pos_w: jax.Array
+    """(B, 3) [m]."""
+    vel_w: jax.Array
+    """(B, 3) [m/s]."""
+    thrust_w: jax.Array
+    """(B, 3) lagged commanded net acceleration, drag not counted [m/s^2]."""
+    acc_w: jax.Array
+    """(B, 3) net acceleration [m/s^2]."""
+    rot_w: jax.Array
+    """(B, 3, 3) body to world."""
+    heading_w: jax.Array
+    """(B, 3) unit, horizontal: where the nose should point."""
+    commands_w: jax.Array
+    """(B, 2, 3) the last commands, latest first [m/s^2]."""
+
+
+def attitude(thrust_w: jax.Array, heading_w: jax.Array) -> jax.Array:
+    """Return body to world (B, 3, 3): z along the specific force, x towards the heading."""
+    force = thrust_w + jnp.asarray([0.0, 0.0, GRAVITY])
+    size = jnp.linalg.norm(force, axis=-1, keepdims=True)
+    up = jnp.where(size > 1e-3, force / jnp.maximum(size, 1e-3), jnp.asarray([0.0, 0.0, 1.0]))
+    left = jnp.cross(up, heading_w)
+    left = left / jnp.maximum(jnp.linalg.norm(left, axis=-1, keepdims=True), 1e-6)
+    return jnp.stack([jnp.cross(left, up), left, up], axis=-1)
+
+
+def start(pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> Body:
+    """Return a body that hovers or coasts at vel_w, upright."""
+    zero = jnp.zeros_like(pos_w)
+    rot_w = attitude(zero, heading_w)
+    commands = jnp.zeros((pos_w.shape[0], 2, 3), pos_w.dtype)
+    return Body(pos_w, vel_w, zero, zero, rot_w, heading_w, commands)
+
+
+def _fade(x: jax.Array, factor: jax.Array) -> jax.Array:
+    """Return x, with its gradient multiplied by factor (gradient decay of Zhang et al. 2025)."""
+    return x * factor + jax.lax.stop_gradient(x * (1 - factor))
+
+
+def step(
+    body: Body,
+    constants: Constants,
+    action_b: jax.Array,
+    target_w: jax.Array,
+    heading_rate: float,
+    gradient_decay: float,
+) -> Body:
+    """Advance one policy period under the wanted net acceleration action_b (B, 3) [m/s^2].
+
+    The command acts `delay` steps late; between two commands the mean over the step is taken.
+    target_w (B, 3) is the gate that the nose turns to.
+    """
+    dt = constants.time_step[:, None]
+    command = to_world(jax.lax.stop_gradient(body.rot_w), action_b)
+    history = jnp.concatenate([command[:, None], body.commands_w], axis=1)
+    age = jnp.arange(3.0)
+    share = jnp.maximum(0.0, 1.0 - jnp.abs(constants.delay[:, None] - age))
+    wanted = (share[..., None] * history).sum(1)
+
+    keep = jnp.exp(-constants.lag[:, None] * dt)
+    thrust = wanted * (1 - keep) + body.thrust_w * keep
+    rot = jax.lax.stop_gradient(body.rot_w)
+    air_b = (rot * (body.vel_w - constants.wind_w)[..., :, None]).sum(-2)
+    acc = thrust - to_world(rot, constants.drag * air_b)
+    fade = jnp.exp(-gradient_decay * dt)
+    pos, vel = _fade(body.pos_w, fade), _fade(body.vel_w, fade)
+    pos = pos + vel * dt + 0.5 * body.acc_w * dt * dt
+    vel = vel + 0.5 * (body.acc_w + acc) * dt
+
+    flat = jnp.asarray([1.0, 1.0, 0.0])
+    towards = jax.lax.stop_gradient(target_w - pos) * flat
+    towards = towards / jnp.maximum(jnp.linalg.norm(towards, axis=-1, keepdims=True), 1e-3)
+    blend = jnp.exp(-heading_rate * dt)
+    heading = body.heading_w * blend + towards * (1 - blend)
+    size = jnp.linalg.norm(heading, axis=-1, keepdims=True)
+    heading = jnp.where(size > 1e-3, heading / jnp.maximum(size, 1e-3), body.heading_w)
+    rot = attitude(jax.lax.stop_gradient(thrust), heading)
+    return Body(pos, vel, thrust, acc, rot, heading, history[:, :2])

@@ -1,0 +1,194 @@
+"""One rollout of the policy in the point mass, with the loss of every step.
+
+The image carries no gradient to the state (Zhang et al. 2025), so the encoder can leave the
+differentiated loop: the embeddings enter as constants plus `nudge`, a zero whose gradient is the
+loss's gradient with respect to the embeddings. Obstacles, field and gates are looked up on values
+without gradient for the same reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from policies import delta_network, network
+from policies.observation import encode_depth, state_vector, to_body
+from suite.train import losses, point_mass
+from suite.train.config import TrainConfig
+from suite.train.worlds import Worlds
+from tracks.camera import pixel_rays_b
+from tracks.clearance import nearest_obstacle
+from tracks.crossing import crossing
+from tracks.depth import depth_image
+from tracks.scene import Counts, Gates
+
+SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
+"""Solids of each kind that a training image shows, nearest first; the judge shows all."""
+NEAR = Counts(boxes=8, cylinders=4, capsules=3, spheres=3)
+"""Solids of each kind among which the nearest obstacle is looked for."""
+BEYOND_M = 10.0
+"""After the last gate the target is this far behind it, so that nothing is gained by braking."""
+BODY_RADIUS_M = 0.08
+"""Closer than this to a surface counts as a collision in the curves [m]."""
+
+
+class Memory(NamedTuple):
+    """What a world carries from step to step."""
+
+    body: point_mass.Body
+    target: jax.Array
+    """(B,) gates passed, counted from the track's first."""
+    hidden: jax.Array
+    action_b: jax.Array
+    embeddings: jax.Array
+    """(B, image_delay, hidden) the images on their way, oldest first."""
+    states: jax.Array
+    """(B, state_delay, 12) the states on their way, oldest first."""
+    delta_hidden: jax.Array
+
+
+class StepRecord(NamedTuple):
+    """What a step leaves behind, (B, ...) each."""
+
+    image: jax.Array
+    terms: losses.Terms
+    speed: jax.Array
+    clearance: jax.Array
+    """Smallest signed distance on the step's path [m]."""
+    passed: jax.Array
+    pos_w: jax.Array
+
+
+def target_gate(gates: Gates, target: jax.Array) -> tuple[Gates, jax.Array]:
+    """Return each world's current gate (B, ...) and the point to fly to (B, 3)."""
+    count = gates.center_w.shape[1]
+    index = jnp.minimum(target, count - 1)
+    gate = jax.tree.map(lambda array: jax.vmap(lambda rows, i: rows[i])(array, index), gates)
+    beyond = jnp.where(target >= count, BEYOND_M, 0.0)[:, None]
+    return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
+
+
+def _queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return (the oldest entry, the queue after it left and `new` joined)."""
+    line = jnp.concatenate([waiting, new[:, None]], axis=1)
+    return line[:, 0], line[:, 1:]
+
+
+def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepRecord]]:
+    """Return rollout(params, nudge, worlds, key, encode, delta) -> (loss, records).
+
+    `encode(params, image)` gives the embeddings; `nudge` is (T, B, hidden); `delta` is the frozen
+    Delta Action network's parameters or None. The loss is the mean over steps and worlds; records
+    are (T, B, ...).
+    """
+    spec, physics, weights = config.spec, config.physics, config.loss
+    rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
+
+    def look(worlds: Worlds, body: point_mass.Body, key: jax.Array) -> jax.Array:
+        # Scaling the rays across the optical axis changes the field of view; every world of an
+        # iteration shares it, so that the rays stay one array.
+        axis = rays.mean(0)
+        wide = axis + (rays - axis) * worlds.fov_scale[0]
+        depth = depth_image(
+            worlds.scene, body.pos_w, body.rot_w, wide, spec.camera.range_m, SEEN
+        )
+        image = encode_depth(spec.depth, depth, spec.camera.range_m)
+        image = image + physics.depth_noise * jax.random.normal(key, image.shape)
+        return image.reshape(-1, spec.camera.height, spec.camera.width)
+
+    def act(
+        params: network.Params,
+        memory: Memory,
+        embedding: jax.Array,
+        target_w: jax.Array,
+    ) -> tuple[jax.Array, Memory]:
+        body = memory.body
+        state = state_vector(body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b)
+        state, states = _queue(memory.states, state)
+        embedding, embeddings = _queue(memory.embeddings, embedding)
+        action, hidden = network.recur(params, memory.hidden, embedding, state)
+        memory = memory._replace(
+            hidden=hidden, action_b=action, embeddings=embeddings, states=states
+        )
+        return action, memory
+
+    def judge(
+        worlds: Worlds, before: point_mass.Body, body: point_mass.Body, target: jax.Array
+    ) -> tuple[losses.Terms, jax.Array, jax.Array]:
+        gate, target_w = target_gate(worlds.scene.gates, target)
+        share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
+        path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
+        distance, away = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path), NEAR)
+        barrier, collide = losses.obstacle_terms(weights, distance, away, path, body.vel_w)
+        size, change = losses.smoothness_terms(
+            weights, body.acc_w, before.acc_w, worlds.constants.time_step
+        )
+        lateral = to_body(gate.rot_w, body.pos_w - gate.center_w)[..., 1:]
+        terms = losses.Terms(
+            clearance=weights.clearance * barrier,
+            collide=weights.collide * collide,
+            acceleration=size,
+            jerk=change,
+            progress=losses.progress_term(weights, body.pos_w, body.vel_w, target_w, lateral),
+            guidance=losses.guidance_term(weights, gate, body.pos_w, body.vel_w),
+        )
+        held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
+        passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
+        passed = passed & (target < worlds.scene.gates.center_w.shape[1])
+        return terms, distance.min(-1), passed
+
+    def rollout(
+        params: network.Params,
+        nudge: jax.Array,
+        worlds: Worlds,
+        key: jax.Array,
+        encode: Callable[[network.Params, jax.Array], jax.Array],
+        delta: delta_network.Params | None = None,
+    ) -> tuple[jax.Array, StepRecord]:
+        steps, batch, width = nudge.shape
+        body = point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w)
+        memory = Memory(
+            body=body,
+            target=worlds.target,
+            hidden=jnp.zeros((batch, width)),
+            action_b=jnp.zeros((batch, 3)),
+            embeddings=jnp.zeros((batch, physics.image_delay, width)),
+            states=jnp.zeros((batch, physics.state_delay, 12)).at[:, :, 8].set(1.0),
+            delta_hidden=delta_network.start(batch),
+        )
+
+        def step(
+            memory: Memory, inputs: tuple[jax.Array, jax.Array]
+        ) -> tuple[Memory, StepRecord]:
+            nudge_now, key_now = inputs
+            before = memory.body
+            image = look(worlds, jax.lax.stop_gradient(before), key_now)
+            _, target_w = target_gate(worlds.scene.gates, memory.target)
+            embedding = encode(params, image) + nudge_now
+            action, memory = act(params, memory, embedding, target_w)
+            if delta is not None:
+                vel_b = to_body(jax.lax.stop_gradient(before.rot_w), before.vel_w)
+                correction, delta_hidden = delta_network.step(
+                    delta, memory.delta_hidden, vel_b, before.rot_w[:, 2], action
+                )
+                action = action + correction
+                memory = memory._replace(delta_hidden=delta_hidden)
+            body = point_mass.step(
+                before, worlds.constants, action, target_w,
+                physics.heading_rate, weights.gradient_decay,
+            )
+            terms, clearance, passed = judge(worlds, before, body, memory.target)
+            record = StepRecord(
+                image, terms, jnp.linalg.norm(body.vel_w, axis=-1), clearance, passed, body.pos_w
+            )
+            return memory._replace(body=body, target=memory.target + passed), record
+
+        keys = jax.random.split(key, steps)
+        _, records = jax.lax.scan(step, memory, (nudge, keys))
+        loss = sum(term.mean() for term in records.terms)
+        return loss, jax.lax.stop_gradient(records)
+
+    return rollout

@@ -1,0 +1,130 @@
+"""The worlds of one iteration: fresh tracks, start states and randomised constants (numpy).
+
+A pure function of (config, iteration), so a resumed run sees the worlds that it would have seen.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from suite.train.config import TrainConfig
+from suite.train.point_mass import Constants
+from tracks.families import MAX_COUNTS, random_track
+from tracks.scene import Array, Scene, stack
+from tracks.track import Track
+
+
+class Worlds(NamedTuple):
+    """A batch of worlds, (B, ...), ready for the device."""
+
+    scene: Scene
+    pos_w: Array
+    """(B, 3) start [m]."""
+    vel_w: Array
+    """(B, 3) [m/s]."""
+    heading_w: Array
+    """(B, 3) unit, horizontal."""
+    target: Array
+    """(B,) index of the first gate to pass."""
+    constants: Constants
+    fov_scale: Array
+    """(B,) this iteration's field of view as a share of the camera's."""
+
+
+def difficulty_range(config: TrainConfig, iteration: int) -> tuple[float, float]:
+    """Return the range of difficulty at an iteration: it grows over `easy_until` of the run."""
+    low, high = config.episode.difficulty
+    whole = config.episode.easy_until * config.optimizer.iterations
+    share = 1.0 if whole <= 0 else min(1.0, iteration / whole)
+    return low, low + share * (high - low)
+
+
+def _clearance(track: Track, point_w: np.ndarray) -> float:
+    """Return a lower bound of the distance to the obstacles other than gate frames [m]."""
+    scene = track.scene
+    bars = scene.gates.opening_g.shape[0] * scene.gates.opening_g.shape[1]
+    centers = np.concatenate(
+        [
+            scene.boxes.center_w[bars:],
+            scene.cylinders.center_w,
+            scene.capsules.center_w,
+            scene.spheres.center_w,
+        ]
+    )
+    radii = np.concatenate(
+        [
+            np.linalg.norm(scene.boxes.half_size[bars:], axis=-1),
+            np.hypot(scene.cylinders.radius, scene.cylinders.half_length),
+            scene.capsules.radius + scene.capsules.half_length,
+            scene.spheres.radius,
+        ]
+    )
+    if len(radii) == 0:
+        return np.inf
+    return float((np.linalg.norm(centers - point_w, axis=-1) - radii).min())
+
+
+def _on_the_way(
+    track: Track, speed_limit: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return position, velocity and next gate somewhere between two gates, clear of obstacles."""
+    gates = track.scene.gates
+    best = (-np.inf, track.start_pos_w, 0)
+    for _ in range(6):
+        target = int(rng.integers(0, len(gates.center_w)))
+        behind = track.start_pos_w if target == 0 else gates.center_w[target - 1]
+        share = rng.uniform(0.1, 0.7)
+        point = behind + share * (gates.center_w[target] - behind)
+        point = point + rng.normal(0, 0.25, 3)
+        point[2] = max(point[2], 0.4)
+        room = _clearance(track, point)
+        if room > best[0]:
+            best = (room, point, target)
+        if room > 0.5:
+            break
+    _, point, target = best
+    towards = gates.center_w[target] - point
+    towards = towards / max(np.linalg.norm(towards), 1e-6)
+    sideways = rng.normal(0, 0.25, 3)
+    return point, rng.uniform(0, speed_limit) * (towards + sideways), target
+
+
+def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
+    """Return the worlds of an iteration."""
+    rng = np.random.default_rng([config.seed, iteration])
+    episode, physics = config.episode, config.physics
+    batch = episode.batch
+    low, high = difficulty_range(config, iteration)
+    tracks, starts = [], []
+    for _ in range(batch):
+        track = random_track(rng.uniform(low, high), rng)
+        tracks.append(track)
+        if rng.uniform() < episode.rest_share:
+            starts.append((track.start_pos_w, np.zeros(3), 0))
+        else:
+            starts.append(_on_the_way(track, episode.start_speed, rng))
+    pos, vel, target = (np.stack(column) for column in zip(*starts, strict=True))
+    gate = np.stack([t.scene.gates.center_w[i] for t, i in zip(tracks, target, strict=True)])
+    yaw = np.arctan2(gate[:, 1] - pos[:, 1], gate[:, 0] - pos[:, 0]) + rng.normal(0, 0.2, batch)
+    period = 1.0 / config.spec.rate_hz
+    stretch = np.clip(1 + physics.time_step_std * rng.standard_normal(batch), 0.5, 1.5)
+    lag = physics.lag_mean + physics.lag_std * rng.standard_normal(batch)
+    constants = Constants(
+        lag=np.clip(lag, 0.2 * physics.lag_mean, None),
+        drag=rng.uniform(*physics.drag, (batch, 3)),
+        wind_w=rng.standard_normal((batch, 3)) * np.asarray(physics.wind_std),
+        time_step=period * stretch,
+        delay=rng.uniform(*physics.action_delay, batch),
+    )
+    constants = Constants(*(np.asarray(x, np.float32) for x in constants))
+    return Worlds(
+        scene=stack([track.scene for track in tracks], MAX_COUNTS),
+        pos_w=pos.astype(np.float32),
+        vel_w=vel.astype(np.float32),
+        heading_w=np.stack([np.cos(yaw), np.sin(yaw), np.zeros(batch)], -1).astype(np.float32),
+        target=target.astype(np.int32),
+        constants=constants,
+        fov_scale=np.full(batch, rng.uniform(*physics.fov_scale), np.float32),
+    )
