@@ -7,34 +7,31 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from eval.flight import Flight
 from eval.trial import TrialResult
-from eval.view.outline import outline, solid_points
+from eval.view import colours
+from eval.view.colours import SPEED_MAP, hexed
+from eval.view.solids import outline, track_solids
 from tracks.files import replacing_file
 from tracks.track import Track
 
 Shown = tuple[Track, Flight | None, TrialResult | None]
 """A track, and where one was flown, the flight and how it ended."""
 
-# Gates are numbered from 0, as in the names of what was collided with ("gate 3 frame").
-AHEAD, PASSED = "#d9822b", "#2a8f5b"
-"""Colours of gates that were not passed and of those that were."""
-SOLID_FACE, SOLID_EDGE = "#c9ced6", "#8a93a0"
-CRASH, START = "#d02f2f", "#1f3b73"
-SPEED_MAP = ListedColormap(colormaps["plasma"](np.linspace(0, 0.9, 256)))
-"""Colours of the speed, without the yellow that is hard to see on white."""
 TOP, SIDE = (0, 1), (0, 2)
 """Axes of the world that a view shows, across and up."""
 MARGIN_M = 1.0
 PATH_WIDTH = 2.2
+PASSED, CRASH, START, GREY = map(
+    hexed, (colours.PASSED, colours.CRASH, colours.START, colours.SOLID_EDGE)
+)
 
 
 def write_picture(
@@ -71,7 +68,7 @@ def write_picture(
     top.set_ylabel("y [m], from above")
     side.set_ylabel("z [m], from the side")
     side.set_xlabel("x [m]")
-    side.axhline(0, color=SOLID_EDGE, linewidth=1.2, zorder=1)
+    side.axhline(0, color=GREY, linewidth=1.2, zorder=1)
     figure.suptitle(_title(track), fontsize=13, fontweight="bold", x=0.02, ha="left")
     if result is not None:
         top.set_title(_outcome(result), fontsize=10, loc="left", color="#444444")
@@ -124,27 +121,31 @@ def _draw(
 ) -> None:
     track, flight, result = shown
     gates = track.scene.gates
-    bars = gates.opening_g.shape[0] * gates.opening_g.shape[1]
     passed = 0 if flight is None else int(flight.gate.max())
     if result is not None:
         passed = result.gates_passed
-    solids = list(solid_points(track.scene))
+    solids = track_solids(track)
+    obstacles = [solid.vertices for solid in solids if solid.gate is None]
     # What is nearer to the eye is drawn later: higher from above, lower y from the side.
-    eye = [points[:, 2].max() if view == TOP else -points[:, 1].min() for points in solids[bars:]]
-    obstacles = [outline(solids[bars + k][:, view]) for k in np.argsort(eye)]
+    obstacles.sort(key=lambda at: at[:, 2].max() if view == TOP else -at[:, 1].min())
     axes.add_collection(
-        PolyCollection(obstacles, facecolor=SOLID_FACE, edgecolor=SOLID_EDGE, lw=0.6, alpha=0.75)
+        PolyCollection(
+            [outline(at[:, view]) for at in obstacles],
+            facecolor=hexed(colours.SOLID),
+            edgecolor=hexed(colours.SOLID_EDGE),
+            lw=0.6,
+            alpha=0.75,
+        )
     )
-    each = gates.opening_g.shape[1]
-    frames = [outline(points[:, view]) for points in solids[:bars]]
-    colours = [PASSED if k // each < passed else AHEAD for k in range(bars)]
+    bars = [solid for solid in solids if solid.gate is not None]
+    colour = [_gate_colour(bar.gate, passed) for bar in bars]
+    frames = [outline(bar.vertices[:, view]) for bar in bars]
     axes.add_collection(
-        PolyCollection(frames, facecolor=colours, edgecolor=colours, lw=0.8, zorder=3)
+        PolyCollection(frames, facecolor=colour, edgecolor=colour, lw=0.8, zorder=3)
     )
     if view == TOP:
         for number, (center, rot) in enumerate(zip(gates.center_w, gates.rot_w, strict=True)):
-            colour = PASSED if number < passed else AHEAD
-            _number(axes, number, center[:2], rot[:2, 0], colour, small)
+            _number(axes, number, center[:2], rot[:2, 0], _gate_colour(number, passed), small)
     if flight is not None:
         _draw_path(axes, flight, view, speed, small)
     start = track.start_pos_w[list(view)]
@@ -158,6 +159,11 @@ def _draw(
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=7 if small else 9)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _gate_colour(number: int | None, passed: int) -> str:
+    ahead = number is None or number >= passed
+    return hexed(colours.AHEAD) if ahead else PASSED
 
 
 def _draw_path(
@@ -185,6 +191,7 @@ def _number(
     along = along / max(float(np.linalg.norm(along)), 1e-9)
     across = np.array([-along[1], along[0]])
     label = center + 0.75 * across
+    # Numbered from 0, as in the names of what was collided with ("gate 3 frame").
     axes.annotate(
         str(number),
         (label[0], label[1]),
@@ -211,7 +218,7 @@ def _mark_end(axes: Axes, end: np.ndarray, ended_by: str, size: float) -> None:
 
 
 def _limits(track: Track, flight: Flight | None) -> tuple[np.ndarray, np.ndarray]:
-    points = [track.start_pos_w[None], *solid_points(track.scene)]
+    points = [track.start_pos_w[None], *(solid.vertices for solid in track_solids(track))]
     if flight is not None:
         points.append(flight.pos_w[np.isfinite(flight.pos_w).all(axis=1)])
     every = np.concatenate(points)
@@ -222,8 +229,8 @@ def _limits(track: Track, flight: Flight | None) -> tuple[np.ndarray, np.ndarray
 
 
 def _speed_range(flights: Sequence[Flight | None]) -> Normalize:
-    tops = [np.nanmax(np.linalg.norm(f.vel_w, axis=1)) for f in flights if f is not None]
-    return Normalize(0.0, max([1.0, *map(float, tops)]))
+    speeds = [np.linalg.norm(flight.vel_w, axis=1) for flight in flights if flight is not None]
+    return Normalize(0.0, max(map(colours.top_speed, speeds), default=1.0))
 
 
 def _colour_bar(figure: Figure, axes: list[Axes], speed: Normalize) -> None:

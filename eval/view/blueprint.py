@@ -1,0 +1,91 @@
+"""How a recording opens: one tab a trial, its track, what the drone saw, and plots over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import rerun.blueprint as rrb
+
+TIMELINE = "time"
+"""The timeline of a trial, seconds from its start."""
+
+
+class Tab(NamedTuple):
+    """What the layout of one trial needs."""
+
+    root: str
+    """Entity path of the trial."""
+    title: str
+    has_depth: bool
+    low_w: np.ndarray
+    """(3,) lower corner of what is to be seen [m]."""
+    high_w: np.ndarray
+    """(3,) upper corner [m]."""
+
+
+def layout(tabs: Sequence[Tab]) -> rrb.Blueprint:
+    """Return the blueprint of a recording with these trials."""
+    parts = [_tab(tab) for tab in tabs]
+    return rrb.Blueprint(
+        parts[0] if len(parts) == 1 else rrb.Tabs(*parts, active_tab=0),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+def _tab(tab: Tab) -> rrb.Vertical:
+    world = f"{tab.root}/world"
+    overview = rrb.Spatial3DView(
+        origin=world,
+        # The back-projected depth would hide the track, so it is left to the view from behind.
+        contents=["$origin/**", "- $origin/drone/camera/**"],
+        name="track",
+        background=[245, 246, 248],
+        line_grid=False,
+        eye_controls=_overview(tab),
+    )
+    beside: list[rrb.View] = [
+        rrb.Spatial3DView(
+            origin=world,
+            contents=["$origin/**", "- $origin/path"],
+            name="behind the drone",
+            background=[245, 246, 248],
+            line_grid=False,
+            eye_controls=rrb.EyeControls3D(tracking_entity=f"{world}/drone"),
+        )
+    ]
+    if tab.has_depth:
+        camera = f"{world}/drone/camera"
+        beside.append(rrb.Spatial2DView(origin=camera, name="depth image it saw"))
+    plots = [
+        ("speed", "speed [m/s]"),
+        ("thrust", "thrust command [m/s²]"),
+        ("rates", "body rates [rad/s]"),
+        ("action", "policy's action, body [m/s²]"),
+        ("rotors", "rotor speeds [rad/s]"),
+    ]
+    series = [rrb.TimeSeriesView(origin=f"{tab.root}/{name}", name=title) for name, title in plots]
+    return rrb.Vertical(
+        rrb.Horizontal(overview, rrb.Vertical(*beside), column_shares=[2.2, 1.0]),
+        rrb.Horizontal(*series[:3]),
+        rrb.Horizontal(*series[3:], rrb.TextLogView(origin=f"{tab.root}/events", name="events")),
+        row_shares=[3.0, 1.0, 1.0],
+        name=tab.title,
+    )
+
+
+def _overview(tab: Tab) -> rrb.EyeControls3D:
+    """Return an eye that looks down on all of the track, from its long side."""
+    middle, size = (tab.low_w + tab.high_w) / 2, tab.high_w - tab.low_w
+    away = np.array([0.0, -1.0, 0.75]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.75])
+    distance = 0.62 * float(np.max(size)) + 0.25 * float(np.min(size[:2])) + 1.0
+    return rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=middle + distance * away / np.linalg.norm(away),
+        look_target=middle,
+        eye_up=[0.0, 0.0, 1.0],
+    )

@@ -1,0 +1,39 @@
+"""The colours that pictures, recordings and videos share."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import ListedColormap
+
+AHEAD, PASSED = (217, 130, 43), (42, 143, 91)
+"""Gates that were not passed and gates that were, 0-255."""
+CRASH, START = (208, 47, 47), (31, 59, 115)
+SOLID, SOLID_EDGE = (201, 206, 214), (138, 147, 160)
+DRONE = (40, 44, 52)
+AXES = ((220, 60, 60), (60, 160, 70), (60, 100, 220))
+"""x, y and z."""
+
+SPEED_MAP = ListedColormap(colormaps["plasma"](np.linspace(0, 0.9, 256)))
+"""Colours of the speed, without the yellow that is hard to see on white."""
+DEPTH_MAP = colormaps["turbo"]
+
+
+def hexed(colour: tuple[int, int, int]) -> str:
+    """Return a colour as matplotlib takes it, "#rrggbb"."""
+    return "#" + "".join(f"{part:02x}" for part in colour)
+
+
+def speed_colours(speed: np.ndarray, top: float) -> np.ndarray:
+    """Return colours (..., 3) uint8 of speeds (...) where `top` is the fastest shown [m/s]."""
+    return SPEED_MAP(np.clip(speed / top, 0, 1), bytes=True)[..., :3]
+
+
+def top_speed(speed: np.ndarray) -> float:
+    """Return the speed that the colours end at, at least 1 [m/s]."""
+    return max(1.0, float(np.nanmax(speed)))
+
+
+def depth_colours(depth_m: np.ndarray, range_m: float) -> np.ndarray:
+    """Return colours (..., 3) uint8 of planar depths (...): near is red, far is blue."""
+    return DEPTH_MAP(1 - np.clip(depth_m / range_m, 0, 1), bytes=True)[..., :3]

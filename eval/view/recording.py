@@ -1,0 +1,262 @@
+"""Recordings of trials that the rerun viewer opens, laid out; Parquet is the record, this a view.
+
+With `blueprint.py` the only file that touches rerun, whose interface moves every few releases
+(0.41 here). Columns of a whole flight are sent at once, which is far faster than step by step.
+
+Entities of trial k stand below `/trial_k`: `world/ground`, `world/obstacles/NAME`, `world/gates/N`,
+`world/path`, `world/start`, `world/end`, `world/drone` (moving, with `body`, `rotors` and
+`camera/depth`), and the series `speed`, `thrust`, `rates`, `action`, `rotors` and `events`, all on
+the timeline `time` in seconds from the trial's start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import rerun as rr
+
+from eval.flight import Flight
+from eval.trial import TrialResult
+from eval.view import colours
+from eval.view.blueprint import TIMELINE, Tab, layout
+from eval.view.solids import flat_normals, joined, track_solids
+from tracks.camera import Camera, optical_axis_b
+from tracks.files import replacing_file
+from tracks.provenance import stamp
+from tracks.track import Track
+
+APPLICATION = "diffracing-suite"
+SCHEMA = 1
+"""Version of the recording's entities, in its properties."""
+GROUND = (226, 228, 224)
+GROUND_MARGIN_M = 3.0
+DRONE_HALF_SIZE = (0.064, 0.064, 0.025)
+"""The body that is drawn unless told otherwise [m]."""
+ROTOR_RADIUS_M = 0.0635
+ROTORS_B = ((0.075, -0.10, 0.03), (-0.075, -0.10, 0.03), (-0.075, 0.10, 0.03), (0.075, 0.10, 0.03))
+"""Where rotors are drawn, body [m]."""
+
+Rollout = tuple[Track, Flight, TrialResult]
+
+
+class Drone(NamedTuple):
+    """What the drone looks like and sees through."""
+
+    half_size: tuple[float, float, float] = DRONE_HALF_SIZE
+    """Half extents of the body's box [m]."""
+    rotors_b: tuple[tuple[float, float, float], ...] = ROTORS_B
+    """Positions of the rotors in body axes [m]."""
+    camera: Camera = Camera()
+    """The camera that the flight's depth images come from."""
+
+
+def write_recording(
+    path: str | Path, rollouts: Sequence[Rollout], drone: Drone | None = None
+) -> Path:
+    """Write trials as a rerun recording (.rrd) that opens laid out; no viewer or network needed.
+
+    Args:
+        path: file to write, ending in `.rrd`.
+        rollouts: track, flight and outcome of each trial; each gets a tab.
+        drone: what the drone looks like and sees through, the defaults otherwise.
+
+    Raises:
+        ValueError: where there is no rollout or one flew nothing.
+        OSError: where the file cannot be written; nothing is left under its name.
+    """
+    if not rollouts:
+        raise ValueError("a recording needs at least one rollout; got none")
+    drone = drone or Drone()
+    tabs = [_tab(k, *rollout) for k, rollout in enumerate(rollouts)]
+    # Nothing goes out until the file is named, so that it holds the blueprint first.
+    recording = rr.RecordingStream(APPLICATION)
+    with replacing_file(path) as beside:
+        recording.save(beside, default_blueprint=layout(tabs))
+        try:
+            about = stamp(SCHEMA, rollouts[0][2].seed)
+            texts = {key: str(value) for key, value in about.items() if value is not None}
+            recording.send_property("suite", rr.AnyValues(drop_untyped_nones=True, **texts))
+            for tab, (track, flight, result) in zip(tabs, rollouts, strict=True):
+                world = f"{tab.root}/world"
+                recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+                _log_track(recording, world, tab, track, flight)
+                _log_path(recording, world, flight)
+                _log_marks(recording, world, track, result)
+                _log_drone(recording, f"{world}/drone", flight, drone)
+                _log_series(recording, tab.root, flight)
+                _log_events(recording, f"{tab.root}/events", flight, result)
+            recording.flush()
+        finally:
+            recording.disconnect()
+    return Path(path)
+
+
+def _tab(number: int, track: Track, flight: Flight, result: TrialResult) -> Tab:
+    if not len(flight.time_s):
+        raise ValueError(f"rollout {number} ({track.family} seed {track.seed}) has no rows")
+    every = [solid.vertices for solid in track_solids(track)]
+    points = np.concatenate([*every, track.start_pos_w[None], _finite(flight.pos_w)])
+    title = f"{track.family} level {track.level} seed {track.seed}: {result.ended_by}"
+    low_w, high_w = points.min(axis=0), points.max(axis=0)
+    return Tab(f"/trial_{number}", title, _has_depth(flight), low_w, high_w)
+
+
+def _has_depth(flight: Flight) -> bool:
+    return flight.depth_m is not None and len(flight.depth_m) > 0
+
+
+def _finite(points: np.ndarray) -> np.ndarray:
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def _times(time_s: np.ndarray) -> list[rr.TimeColumn]:
+    # Whole nanoseconds, as the file holds them: rounding there would be down.
+    return [rr.TimeColumn(TIMELINE, duration=np.round(time_s * 1e9).astype("timedelta64[ns]"))]
+
+
+def _mesh(
+    vertices: np.ndarray, faces: np.ndarray, colour: tuple[int, int, int] | None
+) -> rr.Mesh3D:
+    """Return a mesh with flat faces: every triangle has its own corners and normals."""
+    corners = vertices[faces]
+    return rr.Mesh3D(
+        vertex_positions=corners.reshape(-1, 3),
+        triangle_indices=np.arange(len(faces) * 3).reshape(-1, 3),
+        vertex_normals=np.repeat(flat_normals(corners), 3, axis=0),
+        albedo_factor=colour,
+    )
+
+
+def _log_track(
+    recording: rr.RecordingStream, world: str, tab: Tab, track: Track, flight: Flight
+) -> None:
+    low, high = tab.low_w - GROUND_MARGIN_M, tab.high_w + GROUND_MARGIN_M
+    edge = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+    ground = _mesh(np.insert(edge, 2, 0.0, 1), np.array([[0, 1, 2], [0, 2, 3]]), GROUND)
+    recording.log(f"{world}/ground", ground, static=True)
+    solids = track_solids(track)
+    for number in range(len(track.scene.gates.center_w)):
+        entity = f"{world}/gates/{number}"
+        frame = joined([solid for solid in solids if solid.gate == number])
+        recording.log(entity, _mesh(*frame, None), static=True)
+        passed = np.flatnonzero(flight.gate > number)
+        time = np.array([flight.time_s[0], *flight.time_s[passed[:1]]])
+        colour = [colours.AHEAD, colours.PASSED][: len(time)]
+        recording.send_columns(entity, _times(time), rr.Mesh3D.columns(albedo_factor=colour))
+    for solid in solids:
+        if solid.gate is None:
+            entity = f"{world}/obstacles/{rr.escape_entity_path_part(solid.name)}"
+            mesh = _mesh(solid.vertices, solid.faces, colours.SOLID)
+            recording.log(entity, mesh, static=True)
+
+
+def _log_path(recording: rr.RecordingStream, world: str, flight: Flight) -> None:
+    speed = np.linalg.norm(flight.vel_w, axis=1)
+    pieces = np.stack([flight.pos_w[:-1], flight.pos_w[1:]], axis=1)
+    good = np.isfinite(pieces).all(axis=(1, 2)) & np.isfinite(speed[:-1])
+    colour = colours.speed_colours(speed[:-1], colours.top_speed(speed))
+    path = rr.LineStrips3D(pieces[good], colors=colour[good], radii=0.025)
+    recording.log(f"{world}/path", path, static=True)
+
+
+def _log_marks(
+    recording: rr.RecordingStream, world: str, track: Track, result: TrialResult
+) -> None:
+    start = rr.Points3D([track.start_pos_w], radii=0.08, colors=[colours.START], labels=["start"])
+    recording.log(f"{world}/start", start, static=True)
+    ended = result.ended_by
+    if result.collided_with:
+        ended += f" with {result.collided_with}"
+    colour = colours.PASSED if result.ended_by == "finished" else colours.CRASH
+    end = [[result.pos_x, result.pos_y, result.pos_z]]
+    mark = rr.Points3D(end, radii=0.12, colors=[colour], labels=[ended])
+    recording.log(f"{world}/end", mark, static=True)
+
+
+def _log_drone(recording: rr.RecordingStream, entity: str, flight: Flight, drone: Drone) -> None:
+    columns = rr.Transform3D.columns(
+        translation=flight.pos_w, quaternion=np.roll(flight.quat_wxyz, -1, axis=1)
+    )
+    recording.send_columns(entity, _times(flight.time_s), columns)
+    body = rr.Boxes3D(half_sizes=[drone.half_size], colors=[colours.DRONE], fill_mode="solid")
+    recording.log(f"{entity}/body", body, static=True)
+    rotors = np.array(drone.rotors_b)
+    discs = rr.Ellipsoids3D(
+        centers=rotors,
+        half_sizes=np.tile([ROTOR_RADIUS_M, ROTOR_RADIUS_M, 0.006], (len(rotors), 1)),
+        # The two in front are told by their colour.
+        colors=[colours.AHEAD if x > 0 else colours.SOLID_EDGE for x in rotors[:, 0]],
+        fill_mode="solid",
+    )
+    recording.log(f"{entity}/rotors", discs, static=True)
+    if not _has_depth(flight):
+        return
+    camera = drone.camera
+    forward = optical_axis_b(camera)
+    right = np.array([0.0, -1.0, 0.0])
+    mount = np.stack([right, np.cross(forward, right), forward], axis=1)
+    focal = np.array([camera.width, camera.height]) / 2
+    focal = focal / np.tan(np.deg2rad(np.array(camera.fov_deg)) / 2)
+    eye = f"{entity}/camera"
+    recording.log(eye, rr.Transform3D(mat3x3=mount), static=True)
+    pinhole = rr.Pinhole(
+        focal_length=focal,
+        width=camera.width,
+        height=camera.height,
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=0.4,
+    )
+    recording.log(eye, pinhole, static=True)
+    _log_depth(recording, f"{eye}/depth", flight, camera)
+
+
+def _log_depth(recording: rr.RecordingStream, entity: str, flight: Flight, camera: Camera) -> None:
+    frames = np.ascontiguousarray(flight.depth_m, dtype=np.float32)
+    constant = rr.DepthImage.from_fields(
+        format=rr.components.ImageFormat(
+            width=frames.shape[2], height=frames.shape[1], channel_datatype="F32"
+        ),
+        meter=1.0,
+        depth_range=[0.0, camera.range_m],
+        colormap="turbo",
+    )
+    recording.log(entity, constant, static=True)
+    times = _times(flight.time_s[np.asarray(flight.policy_step, dtype=bool)])
+    buffers = frames.view(np.uint8).reshape(len(frames), -1)
+    recording.send_columns(entity, times, rr.DepthImage.columns(buffer=buffers))
+
+
+def _log_series(recording: rr.RecordingStream, root: str, flight: Flight) -> None:
+    step = np.asarray(flight.policy_step, dtype=bool)
+    axes = list(colours.AXES)
+    pale = [tuple(int(part * 0.5 + 127) for part in colour) for colour in axes]
+    grey = [colours.SOLID_EDGE]
+    speed = np.linalg.norm(flight.vel_w, axis=1)
+    every = slice(None)
+    series = [
+        ("speed", speed[:, None], every, ["|vel_w|"], [colours.START]),
+        ("thrust/command", flight.thrust_cmd[:, None], every, ["c"], [colours.CRASH]),
+        ("rates/measured", flight.rate_b, every, ["x", "y", "z"], axes),
+        ("rates/command", flight.rate_cmd_b, every, ["x cmd", "y cmd", "z cmd"], pale),
+        ("action", flight.action_b, step, ["x", "y", "z"], axes),
+        ("rotors", flight.rotor_speed, every, ["1", "2", "3", "4"], [*axes, *grey]),
+    ]
+    for name, values, rows, names, colour in series:
+        entity = f"{root}/{name}"
+        recording.log(entity, rr.SeriesLines(names=names, colors=colour), static=True)
+        columns = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)[rows])
+        recording.send_columns(entity, _times(flight.time_s[rows]), columns)
+
+
+def _log_events(
+    recording: rr.RecordingStream, entity: str, flight: Flight, result: TrialResult
+) -> None:
+    rows = np.flatnonzero(np.diff(flight.gate)) + 1
+    texts = [f"gate {flight.gate[row] - 1} passed" for row in rows]
+    ended = f"{result.ended_by} with {result.collided_with}"
+    texts.append(ended if result.collided_with else result.ended_by)
+    time = np.append(flight.time_s[rows], flight.time_s[-1])
+    recording.send_columns(entity, _times(time), rr.TextLog.columns(text=texts))

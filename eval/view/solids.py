@@ -1,0 +1,69 @@
+"""A track's solids, the frames of its gates apart from the obstacles."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tracks.meshes import solid_meshes
+from tracks.track import Track
+
+
+class Solid(NamedTuple):
+    """One convex solid as triangles in the world frame."""
+
+    name: str
+    gate: int | None
+    """Number of the gate whose frame it is a bar of, or None."""
+    vertices: np.ndarray
+    """(V, 3) [m]."""
+    faces: np.ndarray
+    """(F, 3) indices of vertices, counter-clockwise from outside."""
+
+
+def track_solids(track: Track) -> list[Solid]:
+    """Return every solid of `track`: the bars of the gates' frames first, then the obstacles."""
+    gates = track.scene.gates.opening_g.shape[0]
+    # Bars come first in a scene and share their gate's name, so the first names are the gates'.
+    number = {name: k for k, name in enumerate(list(dict.fromkeys(track.names))[:gates])}
+    return [
+        Solid(name, number.get(name), np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        for name, mesh in solid_meshes(track)
+    ]
+
+
+def joined(solids: list[Solid]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices (V, 3) and faces (F, 3) of several solids as one mesh."""
+    offset = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
+    faces = [solid.faces + begin for solid, begin in zip(solids, offset, strict=False)]
+    return np.concatenate([solid.vertices for solid in solids]), np.concatenate(faces)
+
+
+def flat_normals(corners: np.ndarray) -> np.ndarray:
+    """Return the unit normals (F, 3) of triangles (F, 3, 3), zero where one has no area."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+
+
+def outline(points: np.ndarray) -> np.ndarray:
+    """Return the corners (k, 2) of the convex hull of `points` (n, 2), counter-clockwise.
+
+    Andrew's monotone chain (1979), which takes points on one line, too.
+    """
+    ordered = np.unique(np.asarray(points, dtype=np.float64), axis=0)
+    if len(ordered) < 3:
+        return ordered
+    return np.array(_half_hull(ordered)[:-1] + _half_hull(ordered[::-1])[:-1])
+
+
+def _half_hull(ordered: np.ndarray) -> list[np.ndarray]:
+    hull: list[np.ndarray] = []
+    for point in ordered:
+        while len(hull) >= 2:
+            one, two = hull[-1] - hull[-2], point - hull[-2]
+            if one[0] * two[1] - one[1] * two[0] > 0:
+                break
+            hull.pop()
+        hull.append(point)
+    return hull
