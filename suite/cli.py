@@ -14,13 +14,16 @@ import sys
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from types import FrameType
+from types import FrameType, ModuleType
+from typing import Any
 
 from suite.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 
 COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
+    "effects": "the physical effects that a vehicle file may hold",
     "info": "versions, devices, memory and commit, for bug reports",
+    "tracks": "list the track families, or draw a track as a picture",
 }
 """Name -> one-line summary; the command NAME lives in suite/commands/NAME.py."""
 
@@ -80,19 +83,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
 
 
-def _run(name: str, args: list[str]) -> int:
+def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
+    """Return the module of the command `name` and its configuration from `args`.
+
+    Raises:
+        SystemExit: after --help (code 0), and for options that cannot be read (code 2).
+    """
     import tyro
 
+    command = importlib.import_module(f"suite.commands.{name}")
+    plain_flags = (tyro.conf.FlagCreatePairsOff,)
+    config = tyro.cli(command.Config, prog=f"suite {name}", args=args, config=plain_flags)
+    return command, config
+
+
+def _run(name: str, args: list[str]) -> int:
     from suite.console import Console, stdout_kept_clean
 
-    command = importlib.import_module(f"suite.commands.{name}")
     try:
-        config = tyro.cli(
-            command.Config,
-            prog=f"suite {name}",
-            args=args,
-            config=(tyro.conf.FlagCreatePairsOff,),
-        )
+        command, config = parse(name, args)
     except SystemExit as stop:
         return int(stop.code or 0)
     with stdout_kept_clean() if config.json else nullcontext():

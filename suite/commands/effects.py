@@ -1,0 +1,67 @@
+"""`suite effects`: the catalogue of physical effects that a vehicle file may hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import tyro
+
+from suite.console import Console
+
+if TYPE_CHECKING:
+    from eval.effects.interface import Effect
+
+
+@dataclass(frozen=True)
+class Config:
+    """List the physical effects that a vehicle file may hold, or describe one."""
+
+    name: tyro.conf.Positional[str] = ""
+    """Which effect; without it, all are listed."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """List the catalogue, or describe `config.name`.
+
+    Raises:
+        ValueError: for a name that is not in the catalogue.
+    """
+    from eval.effects import EFFECTS, find_effect
+
+    if not config.name:
+        width = max(map(len, EFFECTS))
+        for effect in EFFECTS.values():
+            console.say(f"{effect.name:<{width}}  {effect.summary}")
+        return {"effects": {name: _facts(effect) for name, effect in EFFECTS.items()}}
+    effect = find_effect(config.name)
+    console.say(f"{effect.name}: {effect.summary}")
+    console.say(f"  {effect.equation}")
+    console.say(f"  source: {effect.source}")
+    for parameter in effect.parameters:
+        count = f" x {parameter.size}" if parameter.size else ""
+        low, high = parameter.typical
+        given = "" if parameter.required else ", may be left out"
+        console.say(
+            f"  {parameter.name}{count} [{parameter.unit}]: usually {low:g} to {high:g}{given}"
+        )
+    return {"effects": {effect.name: _facts(effect)}}
+
+
+def _facts(effect: Effect) -> dict[str, Any]:
+    return {
+        "summary": effect.summary,
+        "equation": effect.equation,
+        "source": effect.source,
+        "parameters": {
+            p.name: {
+                "unit": p.unit,
+                "components": p.size or 1,
+                "typical": p.typical,
+                "required": p.required,
+            }
+            for p in effect.parameters
+        },
+    }

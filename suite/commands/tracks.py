@@ -1,0 +1,72 @@
+"""`suite tracks`: what can be flown, and a picture of one track."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from suite.choices import is_track_file, parse_levels
+from suite.console import Console
+
+
+@dataclass(frozen=True)
+class Config:
+    """List the track families, or draw one track as a picture."""
+
+    track: tyro.conf.Positional[str] = ""
+    """A family's name or a track file (.toml); without it, the families are listed."""
+    difficulty: str = "0"
+    """Level, 0 to 9; several as 0,3,9 or 0-3 or all."""
+    seed: int = 0
+    """The track's seed."""
+    out: Path = Path("runs/tracks")
+    """Folder for the pictures (PNG)."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """List the families, or draw `config.track` at each level.
+
+    Raises:
+        ValueError: for an unknown family, a level out of range, or a bad track file.
+    """
+    if not config.track:
+        return _list(console)
+    from eval.view.picture import write_picture
+    from tracks.families import check_family, make_track
+
+    drawn = []
+    if is_track_file(config.track):
+        from tracks.custom import read_track
+
+        tracks = [read_track(Path(config.track))]
+    else:
+        check_family(config.track)
+        levels = parse_levels(config.difficulty)
+        tracks = [make_track(config.track, level, config.seed) for level in levels]
+    for track in tracks:
+        name = Path(track.family).stem
+        picture = config.out / f"{name}-{track.level}-{track.seed}.png"
+        write_picture(picture, track)
+        gates, solids = len(track.scene.gates.center_w), len(set(track.names))
+        console.say(f"{picture}: {gates} gates, {solids - gates} obstacles")
+        drawn.append({"picture": picture, "gates": gates, "obstacles": solids - gates})
+    return {"tracks": drawn}
+
+
+def _list(console: Console) -> dict[str, Any]:
+    from tracks.families import FAMILIES, JUDGED
+
+    families = {}
+    for name, make in FAMILIES.items():
+        about = (sys.modules[make.__module__].__doc__ or "").split("\n\n")[0]
+        families[name] = {"about": " ".join(about.split()), "judged": name in JUDGED}
+        console.say(f"{name:<10}{families[name]['about']}")
+    console.say()
+    console.say("levels 0 (easy) to 9 (hard); suite tracks NAME --difficulty 9 draws one")
+    return {"families": families}
