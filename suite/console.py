@@ -7,12 +7,21 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
 PLAIN_PERIOD_S = 10.0
 """Where standard error is no terminal, progress is a plain line this often [s]."""
 
-Update = Callable[[float, str], None]
-"""update(done, note): how much of the total is done, and a few words to show beside it."""
+
+class Update(Protocol):
+    """The function to call as work goes on."""
+
+    def __call__(self, done: float, note: str = "") -> None:
+        """Show that `done` of the total is done, with a few words beside it."""
+        ...
 
 
 class Console:
@@ -21,6 +30,13 @@ class Console:
     def say(self, text: str = "") -> None:
         """Print a line of the command's result (on standard error under --json)."""
         print(text, flush=True)
+
+    def show(self, table: RenderableType) -> None:
+        """Print a rich table; as wide as it needs where standard output is no terminal."""
+        from rich.console import Console as RichConsole
+
+        wide = None if sys.stdout.isatty() else 200
+        RichConsole(file=sys.stdout, width=wide).print(table)
 
     def note(self, text: str) -> None:
         """Print a line about the work itself, on standard error."""

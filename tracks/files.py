@@ -120,10 +120,12 @@ def to_json(value: Any, indent: int | None = None) -> str:
 
 def plain(value: Any) -> Any:
     """Return `value` made of dicts, lists, strings, finite numbers, booleans and None only."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+    if isinstance(value, type):
+        return value.__qualname__
+    if dataclasses.is_dataclass(value):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if hasattr(value, "_asdict"):
-        return plain(value._asdict())
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return {name: plain(entry) for name, entry in zip(value._fields, value, strict=True)}
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
@@ -132,6 +134,5 @@ def plain(value: Any) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    return str(value)
+    tolist = getattr(value, "tolist", None)
+    return plain(tolist()) if tolist else str(value)

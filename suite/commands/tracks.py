@@ -42,9 +42,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     drawn = []
     if is_track_file(config.track):
-        from tracks.custom import read_track
+        from tracks.custom import load_track
 
-        tracks = [read_track(Path(config.track))]
+        tracks = [load_track(Path(config.track))]
     else:
         check_family(config.track)
         levels = parse_levels(config.difficulty)

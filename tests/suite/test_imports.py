@@ -20,7 +20,7 @@ def _imported(path, top_level_only=False):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}:{node.lineno}: imports are absolute"
-            yield node.module
+            yield node.module or ""
 
 
 @pytest.mark.parametrize("room", ROOMS)
