@@ -128,7 +128,7 @@ def make_plant(
     )
     for name, value in values.items():
         change = EFFECTS[name].constants
-        constants = change(value, constants) if change else constants
+        constants = constants if change is None else change(value, constants)
     nominal = Nominal(
         mass=np.asarray(vehicle.mass),
         inertia=np.asarray(vehicle.inertia),
@@ -171,14 +171,14 @@ def start_memory(
     wind = {}
     for name, value in plant.effects.items():
         start = EFFECTS[name].gust
-        if start:
+        if start is not None:
             wind[name] = still if noise is None else start(value, noise) + still
     return Memory(speed, command, wind)
 
 
 def uses_noise(plant: Plant) -> bool:
     """Return whether an effect of `plant` needs normal draws at every step."""
-    return any(EFFECTS[name].gust for name in plant.effects)
+    return any(EFFECTS[name].gust is not None for name in plant.effects)
 
 
 def body_constants(plant: Plant) -> Constants:
@@ -255,9 +255,10 @@ def spin_step(
     air_vel_w, winds = motion.vel_w, dict(memory.wind)
     still = xp.zeros_like(air_vel_w)
     for name, value in plant.effects.items():
-        if EFFECTS[name].wind:
+        blow = EFFECTS[name].wind
+        if blow is not None:
             before = memory.wind.get(name, still)
-            wind_w = EFFECTS[name].wind(value, Gust(before, air_vel_w, noise, plant.dt))
+            wind_w = blow(value, Gust(before, air_vel_w, noise, plant.dt))
             air_vel_w = air_vel_w - wind_w
             if name in memory.wind:
                 winds[name] = wind_w
@@ -275,7 +276,7 @@ def spin_step(
     thrust = constants.thrust_coefficient * spin.mean_square
     for name, value in plant.effects.items():
         change = EFFECTS[name].thrust
-        thrust = change(value, flow, thrust) if change else thrust
+        thrust = thrust if change is None else change(value, flow, thrust)
     force_b = thrust.sum(axis=-1)[..., None] * constants.thrust_axis_b
     arm = constants.rotor_position_b
     about_z = -(flow.spin * constants.torque_coefficient * spin.mean_square).sum(axis=-1)
@@ -285,8 +286,8 @@ def spin_step(
     )
     for name, value in plant.effects.items():
         push, twist = EFFECTS[name].force, EFFECTS[name].torque
-        force_b = force_b + push(value, flow) if push else force_b
-        torque_b = torque_b + twist(value, flow) if twist else torque_b
+        force_b = force_b if push is None else force_b + push(value, flow)
+        torque_b = torque_b if twist is None else torque_b + twist(value, flow)
     return memory._replace(wind=winds), Wrench(force_b, torque_b)
 
 

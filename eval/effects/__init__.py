@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from eval.effects import (
     accelerometer_bias,
@@ -32,8 +33,11 @@ from eval.effects import (
     translational_lift,
     weak_motor,
 )
-from eval.effects.interface import Array, Effect
+from eval.effects.interface import Array, Effect, neutral
 from tracks.names import unknown_name
+
+if TYPE_CHECKING:
+    from eval.vehicle import Vehicle
 
 # In the order in which they act: what scales a thrust stands after what adds to it, and random
 # wind after the steady wind that it is relative to.
@@ -94,3 +98,14 @@ def apply_log_faults(effects: Mapping[str, object], log: Mapping[str, Array]) ->
         if effect.log is not None and effect.name in effects:
             log.update(effect.log(effects[effect.name], log))
     return log
+
+
+def all_values(vehicle: Vehicle) -> dict[str, Any]:
+    """Return values of every effect by name: the vehicle's own, and neutral ones for the others.
+
+    The result is a pytree of plain numbers: one model with it holds the whole catalogue.
+    """
+    return {
+        name: vehicle.effects.get(name, neutral(effect, vehicle))
+        for name, effect in EFFECTS.items()
+    }
