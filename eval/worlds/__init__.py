@@ -1,0 +1,101 @@
+"""Worlds: where trials are flown. The table of names; modules are imported when asked for.
+
+A world flies the trials in a fixed number of slots and knows nothing of policies: it is given
+actions and hands back what a policy needs to see.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from eval.trial import Progress, TrialSpec
+from tracks.names import unknown_name
+from tracks.track import Track
+
+WORLDS = {
+    "mujoco": "eval.worlds.mujoco:MujocoWorld",
+    "plain": "eval.worlds.plain:PlainWorld",
+    "mjx": "eval.worlds.mjx:MjxWorld",
+}
+"""Name to module and class."""
+
+
+class View(NamedTuple):
+    """What can be observed in each slot, (N, ...); rows of empty slots hold anything finite."""
+
+    pos_w: np.ndarray
+    """(N, 3) [m]."""
+    rot_w: np.ndarray
+    """(N, 3, 3) body to world."""
+    vel_w: np.ndarray
+    """(N, 3) [m/s]."""
+    gate_w: np.ndarray
+    """(N, 3) centre of the next gate [m]."""
+    depth_m: np.ndarray
+    """(N, H, W) planar depth, clipped to the camera's range [m]."""
+
+
+class Rows(NamedTuple):
+    """States to record at one physics step: rows of a flight log, for the slots in `due`."""
+
+    due: np.ndarray
+    """(N,) bool."""
+    time_s: np.ndarray
+    """(N,)."""
+    pos_w: np.ndarray
+    quat_wxyz: np.ndarray
+    vel_w: np.ndarray
+    rate_b: np.ndarray
+    thrust_cmd: np.ndarray
+    rate_cmd_b: np.ndarray
+    rotor_speed: np.ndarray
+    gate: np.ndarray
+
+
+class World(Protocol):
+    """A fixed number of slots, each flying one trial at a time."""
+
+    name: str
+    slots: int
+    dt: float
+    """Length of a physics step [s]."""
+
+    @property
+    def progress(self) -> Progress:
+        """Where the trial in each slot stands, numpy arrays (N, ...)."""
+        ...
+
+    def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
+        """Start trials from (slot, track, trial); their states at time 0 are judged."""
+        ...
+
+    def view(self, wanted: np.ndarray) -> View:
+        """Return what can be observed now; images only of the slots in `wanted` (N,) bool."""
+        ...
+
+    def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
+        """Fly each slot's action (N, 3) for its number of physics steps (N,).
+
+        A trial that ends stays where it ended. With `record` the rows come back: before every
+        new command, and the state in which a trial ended.
+        """
+        ...
+
+    def touched(self, slot: int) -> str:
+        """Return the name of the solid that the trial in `slot` collided with."""
+        ...
+
+
+def world_class(name: str) -> Any:
+    """Return the class of the world `name`.
+
+    Raises:
+        ValueError: where there is no such world.
+    """
+    if name not in WORLDS:
+        raise unknown_name("world", name, WORLDS)
+    module, attribute = WORLDS[name].split(":")
+    return getattr(importlib.import_module(module), attribute)

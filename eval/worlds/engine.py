@@ -1,0 +1,90 @@
+"""What the two worlds on MuJoCo's C engine share: the model of a trial, its rays, its contacts."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from eval.quadrotor_model import add_quadrotor, set_true_inertia
+from eval.vehicle import Vehicle
+from tracks.camera import Camera, pixel_rays_b
+from tracks.mujoco_scene import add_scene, solid_name
+from tracks.scene import Counts
+from tracks.track import Track
+
+BODY = 1
+"""Number of the quadrotor's body: the first after the world, as the scene has no bodies."""
+NO_ERROR = mujoco.mjtDisableBit.mjDSBL_AUTORESET
+"""The judge finds states that are none and ends the trial; MuJoCo shall not reset them first."""
+
+
+def compile_model(track: Track, vehicle: Vehicle, dt: float, to: Counts) -> mujoco.MjModel:
+    """Return the model of a vehicle on a track, padded so that all trials share one layout.
+
+    Args:
+        track: what is flown through.
+        vehicle: what flies.
+        dt: length of a physics step [s].
+        to: how many solids of each kind the model holds.
+    """
+    spec = mujoco.MjSpec()
+    spec.option.timestep = dt
+    spec.option.disableflags |= NO_ERROR
+    add_scene(spec, track.scene, track.names, track.mesh_sizes, to)
+    add_quadrotor(spec, vehicle)
+    model = spec.compile()
+    set_true_inertia(model, vehicle)
+    return model
+
+
+class Eye:
+    """A depth camera on MuJoCo's own rays."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self._rays_b = pixel_rays_b(camera)
+        longest = float(np.linalg.norm(self._rays_b, axis=-1).max())
+        self._cutoff = camera.range_m * longest
+
+    def image(
+        self, model: mujoco.MjModel, data: mujoco.MjData, pos_w: np.ndarray, rot_w: np.ndarray
+    ) -> np.ndarray:
+        """Return the planar depth image (H, W) [m] from pos_w (3,) and rot_w (3, 3).
+
+        The quadrotor itself is not seen. The solids' places must be computed in `data`. Rays have
+        an optical-axis component of 1, so the ray parameter is the planar depth; rays that hit
+        nothing read as the range.
+        """
+        rays_w = (self._rays_b[:, None, :] * rot_w).sum(-1)
+        count = len(rays_w)
+        geom, depth = np.empty(count, np.int32), np.empty(count)
+        mujoco.mj_multiRay(
+            model,
+            data,
+            pos_w,
+            rays_w.ravel(),
+            None,
+            True,
+            BODY,
+            geom,
+            depth,
+            None,
+            count,
+            self._cutoff,
+        )
+        depth = np.where(geom < 0, self.camera.range_m, depth)
+        depth = np.minimum(depth, self.camera.range_m)
+        return depth.reshape(self.camera.height, self.camera.width)
+
+
+def contact_name(model: mujoco.MjModel, data: mujoco.MjData) -> str:
+    """Return the name of the solid that the quadrotor is deepest in; `data` holds the contacts."""
+    deepest = min(data.contact, key=lambda contact: contact.dist)
+    own = [int(model.geom_bodyid[geom]) == BODY for geom in deepest.geom]
+    return solid_name(model.geom(int(deepest.geom[1 if own[0] else 0])).name)
+
+
+def start_state(track: Track) -> np.ndarray:
+    """Return the free joint's (7,) position and quaternion wxyz at the start of `track`."""
+    half = track.start_yaw / 2
+    return np.array([*track.start_pos_w, np.cos(half), 0.0, 0.0, np.sin(half)])

@@ -1,0 +1,79 @@
+"""What a world with slots keeps for each: the courses, the progress, the random numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.trial import Course, TrialSpec
+from tracks.families import MAX_COUNTS
+from tracks.scene import Counts, Gates, counts
+from tracks.track import Track
+
+Array = Any
+
+
+def select(mask: Array, new: Any, old: Any) -> Any:
+    """Return `new` in the rows where `mask` (N,) and `old` elsewhere.
+
+    Both are arrays (N, ...), or alike nested tuples and dicts of such.
+    """
+    if isinstance(new, dict):
+        return {name: select(mask, new[name], old[name]) for name in new}
+    if isinstance(new, tuple):
+        parts = [select(mask, a, b) for a, b in zip(new, old, strict=True)]
+        return type(new)(*parts) if hasattr(new, "_fields") else tuple(parts)
+    xp = mask.__array_namespace__()
+    return xp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
+
+
+class Layout(NamedTuple):
+    """What the scenes of all trials are padded to, so that any of them fits any slot."""
+
+    solids: Counts
+    gates: int
+    corners: int
+    """Of an opening."""
+
+
+def layout_of(tracks: Iterable[Track]) -> Layout:
+    """Return the smallest layout that holds every track and every track of the families."""
+    layout = Layout(MAX_COUNTS, 8, 4)
+    for track in tracks:
+        opening = track.scene.gates.opening_g
+        solids = (max(pair) for pair in zip(counts(track.scene), layout.solids, strict=True))
+        layout = Layout(
+            Counts(*solids),
+            max(layout.gates, opening.shape[0]),
+            max(layout.corners, opening.shape[1]),
+        )
+    return layout
+
+
+def empty_course(slots: int, layout: Layout) -> Course:
+    """Return the course of slots without a trial: gates that nothing crosses."""
+    n, g = slots, layout.gates
+    gates = Gates(
+        np.zeros((n, g, 3)),
+        np.tile(np.eye(3), (n, g, 1, 1)),
+        np.zeros((n, g, layout.corners, 2)),
+        np.zeros((n, g)),
+        np.zeros((n, g)),
+    )
+    return Course(gates, np.ones(n, np.int32))
+
+
+def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
+    """Return `gates` with the last gate and each opening's last corner repeated."""
+    more = corners - gates.opening_g.shape[1]
+    opening = np.concatenate([gates.opening_g, np.repeat(gates.opening_g[:, -1:], more, 1)], 1)
+    index = np.minimum(np.arange(number), len(gates.center_w) - 1)
+    return Gates(*(field[index] for field in gates._replace(opening_g=opening)))
+
+
+def noise_of(trial: TrialSpec, steps: int) -> np.ndarray:
+    """Return standard normal draws (steps, 3) for a trial's gusts, set by the trial alone."""
+    key = [trial.seed, trial.difficulty, *trial.track.encode(), 1]
+    return np.random.default_rng(np.random.SeedSequence(key)).standard_normal((steps, 3))

@@ -1,0 +1,76 @@
+"""Policies for tests of the judge: one that flies by the state alone, one with a real network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from policies.spec import PolicySpec
+
+
+@dataclass
+class Pursuit:
+    """Steers the velocity towards the next gate's centre; sees no obstacle."""
+
+    speed: float = 4.0
+    gain: float = 3.0
+    spec: PolicySpec = field(default_factory=PolicySpec)
+    name: str = "pursuit"
+
+    def start(self, n):
+        return np.zeros((n, 3), np.float32)
+
+    def act(self, hidden, state, image, fresh):
+        vel, up, gate = state[:, :3], state[:, 3:6], state[:, 6:9]
+        hidden = np.where(fresh[:, None], np.float32(0), hidden)
+        distance = np.sqrt((gate * gate).sum(-1, keepdims=True))
+        ahead = gate / np.maximum(distance, 1e-3)
+        # Close to the centre its direction swings round; fly straight on instead.
+        flat = np.sqrt((vel * vel).sum(-1, keepdims=True))
+        ahead = np.where((distance < 0.4) & (flat > 1), vel / np.maximum(flat, 1e-3), ahead)
+        action = self.gain * (self.speed * ahead - vel)
+        return np.clip(action, -12, 12).astype(np.float32), hidden
+
+
+@dataclass
+class Steady:
+    """Always wants the same acceleration in body axes."""
+
+    action_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    spec: PolicySpec = field(default_factory=PolicySpec)
+    name: str = "steady"
+
+    def start(self, n):
+        return np.zeros((n, 1), np.float32)
+
+    def act(self, hidden, state, image, fresh):
+        return np.tile(np.float32(self.action_b), (len(state), 1)), hidden
+
+
+class RandomNetwork:
+    """The CNN-GRU of the policies with random parameters, added to a pursuit so that it flies."""
+
+    name = "random-network"
+
+    def __init__(self, seed=0, share=3.0):
+        import jax
+
+        from policies.network import init, step
+
+        self.spec = PolicySpec()
+        self._params = init(jax.random.key(seed), self.spec)
+        self._step = jax.jit(step)
+        self._pursuit = Pursuit()
+        self._share = share
+
+    def start(self, n):
+        return np.zeros((n, self.spec.hidden_size), np.float32)
+
+    def act(self, hidden, state, image, fresh):
+        hidden = np.where(fresh[:, None], np.float32(0), hidden)
+        extra, hidden = self._step(self._params, hidden, state, image)
+        action, _ = self._pursuit.act(np.zeros((len(state), 3)), state, image, fresh)
+        return action + np.float32(self._share) * np.tanh(100 * np.asarray(extra)), np.asarray(
+            hidden
+        )
