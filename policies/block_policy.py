@@ -1,0 +1,120 @@
+"""A model of any kind as a `Policy`: rows go through it in blocks of one size.
+
+A trial's outcome may depend on its row alone, not on the rows beside it nor on how many there are.
+Matrix products of another size add up in another order, so the model only ever sees full blocks,
+padded with zeros. Where that is not enough (some kernels treat the last rows of a block
+otherwise), rows are sent through one by one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from policies.errors import PolicyError
+from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
+
+Model = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""(state, image, hidden) to (action, hidden) for exactly one block of rows, float32 arrays."""
+
+BLOCK = 64
+"""Rows that go through a model at a time, unless the model itself is of a fixed batch."""
+
+
+@final
+@dataclass(frozen=True)
+class BlockPolicy:
+    """A `Policy` around a model that takes a fixed number of rows."""
+
+    name: str
+    """What tables call it."""
+    spec: PolicySpec
+    """The rate, camera and scaling it expects of the world."""
+    model: Model
+    """The network."""
+    hidden_shape: tuple[int, ...]
+    """Shape of one row's recurrent state; (0,) for a policy without memory."""
+    block: int = BLOCK
+    """Rows the model is called with."""
+    rows: int = BLOCK
+    """Rows of a block that are used, the first ones: `block`, or 1."""
+
+    def start(self, n: int) -> np.ndarray:
+        """Return the recurrent state at the start of n trials: zeros."""
+        return np.zeros((n, *self.hidden_shape), np.float32)
+
+    def act(
+        self, hidden: np.ndarray, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return (action_b (n, 3) [m/s^2], hidden'); see `policies.policy.Policy.act`."""
+        hidden = np.where(np.reshape(fresh, (-1, *[1] * len(self.hidden_shape))), 0, hidden)
+        inputs = [np.asarray(x, np.float32) for x in (state, image, hidden)]
+        if len(state) == self.rows == self.block:
+            return self.model(*inputs)
+        actions = np.empty((len(state), ACTION_SIZE), np.float32)
+        remembered = np.empty_like(inputs[2])
+        for low in range(0, len(state), self.rows):
+            used = slice(low, min(low + self.rows, len(state)))
+            action, after = self.model(*(self._padded(x[used]) for x in inputs))
+            actions[used] = action[: used.stop - low]
+            remembered[used] = after[: used.stop - low]
+        return actions, remembered
+
+    def _padded(self, rows: np.ndarray) -> np.ndarray:
+        if len(rows) == self.block:
+            return rows
+        block = np.zeros((self.block, *rows.shape[1:]), np.float32)
+        block[: len(rows)] = rows
+        return block
+
+
+def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
+    """Try a model that was just loaded, and return the policy in a form whose rows stand alone.
+
+    The trial is of random rows, twice, then in another order among other neighbours. Where a
+    row's answer changed with its place, the policy that comes back sends rows one by one.
+
+    Args:
+        policy: as it was loaded.
+        where: the file it came from, for the message.
+
+    Raises:
+        PolicyError: where the outputs have wrong shapes, or the same inputs give another answer.
+    """
+    rng = np.random.default_rng(0)
+    n = policy.block
+    camera = policy.spec.camera
+    state = rng.normal(size=(n, STATE_SIZE)).astype(np.float32)
+    image = rng.normal(size=(n, camera.height, camera.width)).astype(np.float32)
+    hidden = rng.uniform(-1, 1, (n, *policy.hidden_shape)).astype(np.float32)
+    first = policy.model(state, image, hidden)
+    expected = ((n, ACTION_SIZE), (n, *policy.hidden_shape))
+    for name, value, shape in zip(("action", "hidden"), first, expected, strict=True):
+        if value.shape != shape or value.dtype != np.float32:
+            raise PolicyError(
+                f"{where}: output {name!r} is {value.dtype} {value.shape} for {n} rows, expected "
+                f"float32 {shape}; see docs/policies.md"
+            )
+    if not _same(first, policy.model(state, image, hidden)):
+        raise PolicyError(
+            f"{where}: the same inputs gave two answers; export the policy in evaluation mode, "
+            "without dropout and sampling"
+        )
+    for _ in range(3):
+        order = rng.permutation(n)
+        kept = rng.random(n) < 0.5
+        shuffled = [np.where(kept.reshape(-1, *[1] * (x.ndim - 1)), x[order], 2 * x) for x in
+                    (state, image, hidden)]  # fmt: skip
+        moved = policy.model(*shuffled)
+        if not _same([x[order][kept] for x in first], [x[kept] for x in moved]):
+            return dataclasses.replace(policy, rows=1)
+    return policy
+
+
+def _same(one: list[np.ndarray] | tuple[np.ndarray, ...], other: object) -> bool:
+    pairs = zip(one, other, strict=True)  # type: ignore[call-overload]
+    return all(a.tobytes() == b.tobytes() for a, b in pairs)

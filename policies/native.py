@@ -1,0 +1,41 @@
+"""Our checkpoints as `Policy`: the CNN-GRU compiled by JAX, on whichever device JAX has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from policies import network
+from policies.block_policy import BlockPolicy, proven
+from policies.policy_file import load_policy_checkpoint
+from policies.spec import PolicySpec
+
+
+def load_native(folder: Path, name: str) -> BlockPolicy:
+    """Return the policy of a checkpoint.
+
+    Raises:
+        PolicyError: where the checkpoint is damaged or of another kind.
+    """
+    checkpoint = load_policy_checkpoint(folder)
+    return proven(native_policy(checkpoint.params, checkpoint.spec, name), str(folder))
+
+
+def native_policy(params: Mapping[str, Any], spec: PolicySpec, name: str) -> BlockPolicy:
+    """Return the policy that a network's parameters make."""
+    held = jax.tree.map(jax.numpy.asarray, dict(params))
+    step = jax.jit(network.step)
+
+    def model(
+        state: np.ndarray, image: np.ndarray, hidden: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        # Accelerators multiply in fewer bits unless told; a policy flies alike on all of them.
+        with jax.default_matmul_precision("highest"):
+            action, after = step(held, hidden, state, image)
+        return np.asarray(action), np.asarray(after)
+
+    return BlockPolicy(name, spec, model, (spec.hidden_size,))

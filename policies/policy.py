@@ -1,0 +1,116 @@
+"""The `Policy` that the judge flies, and `load_policy`, which makes one from a name or a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from policies import shipped
+from policies.errors import PolicyError
+from policies.spec import PolicySpec
+from tracks.names import closest, unknown_name
+
+Hidden = Any
+"""What a policy remembers of n trials; only the policy itself looks inside."""
+
+SUFFIXES = {
+    ".pt2": "torch exported program",
+    ".pt": "TorchScript, needs trust",
+    ".onnx": "ONNX",
+}
+"""Kinds of policy file by suffix; a folder is a checkpoint of ours."""
+
+
+class Policy(Protocol):
+    """Flies n trials at once; a row's answer depends on nothing but that row, to the bit."""
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        ...
+
+    @property
+    def spec(self) -> PolicySpec:
+        """The rate, camera and scaling it expects of the world."""
+        ...
+
+    def start(self, n: int) -> Hidden:
+        """Return what it remembers at the start of n trials: nothing."""
+        ...
+
+    def act(
+        self, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
+    ) -> tuple[np.ndarray, Hidden]:
+        """Return the actions for one observation of n trials.
+
+        Args:
+            hidden: from `start` or the last `act`.
+            state: (n, 12) float32 from `observation.state_vector`.
+            image: (n, height, width) float32 from `observation.encode_depth`.
+            fresh: (n,) bool, rows whose memory is cleared first since a new trial starts there.
+
+        Returns:
+            action_b (n, 3) float32, the wanted net acceleration in current body axes [m/s^2],
+            unchecked, and the new memory.
+        """
+        ...
+
+
+def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
+    """Return a policy to fly.
+
+    Args:
+        name_or_path: the name of a shipped policy, a checkpoint's folder, or a file: .pt2 (torch
+            exported program), .onnx, .pt (TorchScript).
+        trust: also load what can run code on this machine while it is being loaded. Without it
+            only checkpoints of ours, ONNX of standard operators and torch programs of known
+            operators are.
+
+    Raises:
+        PolicyError: for an unknown name, or a file that cannot be used or is not safe; the message
+            says why and what to do.
+    """
+    text = str(name_or_path)
+    if text in shipped.names():
+        from policies.native import load_native
+
+        return load_native(shipped.folder(text), text)
+    path = Path(name_or_path)
+    if path.is_dir():
+        from policies.native import load_native
+
+        return load_native(path, path.resolve().name)
+    if not path.exists():
+        raise _missing(text, path)
+    if path.suffix == ".onnx":
+        from policies.onnx_file import load_onnx
+
+        return load_onnx(path)
+    if path.suffix == ".pt2":
+        from policies.torch_file import load_program
+
+        return load_program(path, trust)
+    if path.suffix == ".pt":
+        from policies.torch_file import load_script
+
+        return load_script(path, trust)
+    kinds = ", ".join(f"{suffix} ({kind})" for suffix, kind in SUFFIXES.items())
+    within = path.name in ("weights.safetensors", "config.json")
+    hint = f"give its folder instead: {path.parent}" if within else "export it (docs/policies.md)"
+    raise PolicyError(
+        f"{path}: not a policy file; allowed are a checkpoint's folder, {kinds}; {hint}"
+    )
+
+
+def _missing(text: str, path: Path) -> PolicyError:
+    """Return the error for something that is neither a shipped name nor there."""
+    looks_like_path = len(path.parts) > 1 or path.suffix in SUFFIXES
+    if not looks_like_path:
+        error = unknown_name("policy", text, shipped.names())
+        return PolicyError(f"{error} A checkpoint's folder or a policy file will do, too.")
+    beside = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
+    guess = closest(path.name, beside)
+    meant = f" Did you mean {path.parent / guess}?" if guess else ""
+    return PolicyError(f"{path}: no such file or folder.{meant}")
