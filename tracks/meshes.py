@@ -41,7 +41,14 @@ def named_meshes(track: Track) -> dict[str, trimesh.Trimesh]:
     parts: dict[str, list[trimesh.Trimesh]] = {}
     for name, mesh in solid_meshes(track):
         parts.setdefault(name, []).append(mesh)
-    return {name: trimesh.util.concatenate(meshes) for name, meshes in parts.items()}
+    return {name: _joined(meshes) for name, meshes in parts.items()}
+
+
+def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
 
 
 def _transform(center_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
@@ -72,7 +79,7 @@ def _capsule(radius: float, half_length: float) -> trimesh.Trimesh:
 def _rods(rods: Rods, make: Callable[[float, float], trimesh.Trimesh]) -> list[trimesh.Trimesh]:
     meshes = []
     for center_w, axis_w, radius, half_length in zip(*rods, strict=True):
-        matrix = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis_w)
+        matrix = np.array(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis_w))
         matrix[:3, 3] = center_w
         meshes.append(make(radius, half_length).apply_transform(matrix))
     return meshes

@@ -1,10 +1,13 @@
 """A scene as MuJoCo geoms in the world body.
 
 Every solid collides, so that MuJoCo's rays see it too; geoms of the world body never collide with
-one another. Geoms come in the order of `Track.names`, then the padding, then the ground.
+one another. Geoms come kind by kind in the order of `Track.names`, each kind followed by its
+padding, and the ground last.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -62,9 +65,7 @@ def add_scene(
     world = spec.worldbody
     geom = mujoco.mjtGeom
 
-    def add(
-        kind: int, shape: mujoco.mjtGeom, pos: np.ndarray, quat: np.ndarray, size: np.ndarray
-    ) -> None:
+    def add(kind: int, shape: Any, pos: np.ndarray, quat: np.ndarray, size: np.ndarray) -> None:
         for number in range(len(pos)):
             world.add_geom(
                 name=give_name(kind, number),

@@ -1,0 +1,50 @@
+"""Convex closed parts of a mesh file: what MuJoCo collides and the depth image shows alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+_VOLUME_TOLERANCE = 1e-3
+"""A part may miss this share of its convex hull's volume (rounding of stored corners)."""
+
+
+def load_convex_parts(path: Path) -> list[np.ndarray]:
+    """Return the connected parts of a mesh file, each as triangles (M, 3, 3) in file units.
+
+    Raises:
+        ValueError: where the file cannot be read, or a part is open or not convex, naming both.
+    """
+    # Here, so that tracks without meshes do not pay for the import.
+    import trimesh
+
+    if not path.is_file():
+        raise ValueError(f"{path}: no such mesh file")
+    try:
+        mesh = trimesh.load_mesh(path)
+    except Exception as error:  # the loaders raise whatever they like on a damaged file
+        raise ValueError(f"{path}: cannot be read as a mesh ({error})") from None
+    if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+        raise ValueError(f"{path}: holds no triangles or corners that are not finite")
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    parts = mesh.split(only_watertight=False)
+    for number, part in enumerate(parts):
+        _check(path, number, len(parts), part)
+    return [np.asarray(part.triangles, float) for part in parts]
+
+
+def _check(path: Path, number: int, total: int, part: object) -> None:
+    import trimesh
+
+    assert isinstance(part, trimesh.Trimesh)
+    where = f"{path}: part {number} of {total} ({len(part.faces)} triangles)"
+    if not part.is_watertight:
+        raise ValueError(f"{where} is not closed; close its surface")
+    hull = part.convex_hull.volume
+    if abs(abs(part.volume) - hull) > _VOLUME_TOLERANCE * hull:
+        raise ValueError(
+            f"{where} is not convex: it fills {abs(part.volume) / hull:.0%} of its convex hull, "
+            "which is what MuJoCo would collide; split it into convex parts (a convex "
+            "decomposition), each a connected part of its own"
+        )
