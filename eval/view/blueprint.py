@@ -41,7 +41,7 @@ def _tab(tab: Tab) -> rrb.Vertical:
     world = f"{tab.root}/world"
     overview = rrb.Spatial3DView(
         origin=world,
-        # The back-projected depth would hide the track, so it is left to the view from behind.
+        # Back-projected depth would hide the track, so it is left to the view from behind.
         contents=["$origin/**", "- $origin/drone/camera/**"],
         name="track",
         background=[245, 246, 248],
@@ -50,12 +50,18 @@ def _tab(tab: Tab) -> rrb.Vertical:
     )
     beside: list[rrb.View] = [
         rrb.Spatial3DView(
-            origin=world,
-            contents=["$origin/**", "- $origin/path"],
+            # In the drone's frame, so that the eye is carried along and turns with it.
+            origin=f"{world}/drone",
+            contents=[f"{world}/**", "- $origin/pin"],
             name="behind the drone",
             background=[245, 246, 248],
             line_grid=False,
-            eye_controls=rrb.EyeControls3D(tracking_entity=f"{world}/drone"),
+            eye_controls=rrb.EyeControls3D(
+                kind=rrb.Eye3DKind.Orbital,
+                position=[-1.1, 0.0, 0.45],
+                look_target=[0.6, 0.0, 0.15],
+                eye_up=[0.0, 0.0, 1.0],
+            ),
         )
     ]
     if tab.has_depth:
@@ -82,7 +88,7 @@ def _overview(tab: Tab) -> rrb.EyeControls3D:
     """Return an eye that looks down on all of the track, from its long side."""
     middle, size = (tab.low_w + tab.high_w) / 2, tab.high_w - tab.low_w
     away = np.array([0.0, -1.0, 0.75]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.75])
-    distance = 0.62 * float(np.max(size)) + 0.25 * float(np.min(size[:2])) + 1.0
+    distance = 0.57 * float(np.max(size[:2])) + 0.2 * float(np.min(size[:2])) + 1.0
     return rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital,
         position=middle + distance * away / np.linalg.norm(away),
