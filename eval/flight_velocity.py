@@ -13,7 +13,7 @@ import numpy as np
 
 HALF_WINDOW_S = 0.05
 """Positions this near to a row take part [s]; slower logs use the five nearest rows."""
-GAP_STEPS = 3.5
+GAP_STEPS = 6.0
 """Rows further away than this many median steps (and the half window) take no part."""
 
 
