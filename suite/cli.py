@@ -23,6 +23,7 @@ COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
     "effects": "the physical effects that a vehicle file may hold",
     "info": "versions, devices, memory and commit, for bug reports",
+    "train": "train a policy by backpropagation through the point mass",
     "tracks": "list the track families, or draw a track as a picture",
 }
 """Name -> one-line summary; the command NAME lives in suite/commands/NAME.py."""

@@ -68,6 +68,9 @@ class LossConfig:
     """lambda_A, how slowly u_A falls with distance [1]."""
     gradient_decay: float = 0.916
     """alpha, the rate at which gradients of position and velocity fade back in time [1/s]."""
+    crash_depth_m: float = 0.3
+    """A world that gets deeper than this into a solid leaves the loss for the rest of the rollout:
+    from there on its gradients say nothing about flying [m]."""
     path_samples: int = 4
     """Points of every step's path at which the nearest obstacle is looked up."""
 
@@ -104,7 +107,9 @@ class OptimizerConfig:
     """Iterations of linear warm-up."""
     weight_decay: float = 1e-2
     """AdamW's decoupled weight decay."""
-    clip: float = 0.0
+    memory: float = 0.99
+    """Adam's beta_2: short, because the first crashes' gradients are ten times all later ones."""
+    clip: float = 1.0
     """Largest global norm of a gradient; 0 does not clip."""
 
 

@@ -41,8 +41,10 @@ def encoder_gradient(
         return jax.tree.map(jnp.add, total, pull(cotangent)[0]), None
 
     zero = jax.tree.map(jnp.zeros_like, params)
-    split = (images.reshape(-1, size, *images.shape[1:]),
-             cotangents.reshape(-1, size, cotangents.shape[-1]))
+    split = (
+        images.reshape(-1, size, *images.shape[1:]),
+        cotangents.reshape(-1, size, cotangents.shape[-1]),
+    )
     return jax.lax.scan(body, zero, split)[0]
 
 

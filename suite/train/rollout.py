@@ -48,6 +48,8 @@ class Memory(NamedTuple):
     states: jax.Array
     """(B, state_delay, 12) the states on their way, oldest first."""
     delta_hidden: jax.Array
+    alive: jax.Array
+    """(B,) 1 until the world has crashed deep into a solid, then 0."""
 
 
 class StepRecord(NamedTuple):
@@ -92,9 +94,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
         # iteration shares it, so that the rays stay one array.
         axis = rays.mean(0)
         wide = axis + (rays - axis) * worlds.fov_scale[0]
-        depth = depth_image(
-            worlds.scene, body.pos_w, body.rot_w, wide, spec.camera.range_m, SEEN
-        )
+        depth = depth_image(worlds.scene, body.pos_w, body.rot_w, wide, spec.camera.range_m, SEEN)
         image = encode_depth(spec.depth, depth, spec.camera.range_m)
         image = image + physics.depth_noise * jax.random.normal(key, image.shape)
         return image.reshape(-1, spec.camera.height, spec.camera.width)
@@ -158,11 +158,10 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
             embeddings=jnp.zeros((batch, physics.image_delay, width)),
             states=jnp.zeros((batch, physics.state_delay, 12)).at[:, :, 8].set(1.0),
             delta_hidden=delta_network.start(batch),
+            alive=jnp.ones(batch),
         )
 
-        def step(
-            memory: Memory, inputs: tuple[jax.Array, jax.Array]
-        ) -> tuple[Memory, StepRecord]:
+        def step(memory: Memory, inputs: tuple[jax.Array, jax.Array]) -> tuple[Memory, StepRecord]:
             nudge_now, key_now = inputs
             before = memory.body
             image = look(worlds, jax.lax.stop_gradient(before), key_now)
@@ -177,14 +176,21 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
                 action = action + correction
                 memory = memory._replace(delta_hidden=delta_hidden)
             body = point_mass.step(
-                before, worlds.constants, action, target_w,
-                physics.heading_rate, weights.gradient_decay,
+                before,
+                worlds.constants,
+                action,
+                target_w,
+                physics.heading_rate,
+                weights.gradient_decay,
             )
             terms, clearance, passed = judge(worlds, before, body, memory.target)
+            terms = losses.Terms(*(term * memory.alive for term in terms))
+            alive = memory.alive * (clearance > -weights.crash_depth_m)
             record = StepRecord(
                 image, terms, jnp.linalg.norm(body.vel_w, axis=-1), clearance, passed, body.pos_w
             )
-            return memory._replace(body=body, target=memory.target + passed), record
+            target = memory.target + passed
+            return memory._replace(body=body, target=target, alive=alive), record
 
         keys = jax.random.split(key, steps)
         _, records = jax.lax.scan(step, memory, (nudge, keys))

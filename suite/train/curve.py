@@ -1,0 +1,37 @@
+"""The curve of a run: one JSON object a line, cut back to the checkpoint when a run resumes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tracks.files import to_json, write_text
+
+CURVE = "metrics.jsonl"
+
+
+def append(folder: Path, rows: list[dict[str, Any]]) -> None:
+    """Add rows to the curve in `folder`."""
+    with (folder / CURVE).open("a", encoding="utf-8") as file:
+        file.writelines(to_json(row) + "\n" for row in rows)
+
+
+def read(folder: Path) -> list[dict[str, Any]]:
+    """Return the whole rows of the curve; a last line cut short by a kill is left out."""
+    path = folder / CURVE
+    if not path.exists():
+        return []
+    rows = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            break
+    return rows
+
+
+def cut(folder: Path, iteration: int) -> None:
+    """Drop the rows from `iteration` on: they are computed again."""
+    kept = [row for row in read(folder) if row["iteration"] < iteration]
+    write_text(folder / CURVE, "".join(to_json(row) + "\n" for row in kept))

@@ -1,0 +1,59 @@
+"""Settings of a run changed by name: `loss.progress=1.2`."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+from collections.abc import Iterable
+from typing import TypeVar
+
+from tracks.names import unknown_name
+
+T = TypeVar("T")
+
+
+def override(config: T, changes: Iterable[str]) -> T:
+    """Return `config` with every change "field.field=value" made.
+
+    Raises:
+        ValueError: naming the setting, what is wrong with it and what is allowed.
+    """
+    for change in changes:
+        path, separator, text = change.partition("=")
+        if not separator:
+            raise ValueError(f"--set {change!r}: write FIELD=VALUE, such as loss.progress=0.4")
+        config = _changed(config, path.strip().split("."), text.strip(), change)
+    return config
+
+
+def _changed(config: T, path: list[str], text: str, change: str) -> T:
+    if not dataclasses.is_dataclass(config) or isinstance(config, type):
+        raise ValueError(f"--set {change!r}: {path[0]!r} is below a setting that has no parts")
+    name, *rest = path
+    names = [field.name for field in dataclasses.fields(config)]
+    if name not in names:
+        raise unknown_name(f"--set {change!r}: setting", name, names)
+    old = getattr(config, name)
+    if rest:
+        return dataclasses.replace(config, **{name: _changed(old, rest, text, change)})
+    if dataclasses.is_dataclass(old):
+        parts = ", ".join(field.name for field in dataclasses.fields(old))
+        raise ValueError(f"--set {change!r}: {name!r} has parts, set one of {parts}")
+    return dataclasses.replace(config, **{name: _value(old, text, change)})
+
+
+def _value(old: object, text: str, change: str) -> object:
+    try:
+        value = ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        value = text
+    if isinstance(old, tuple) and isinstance(value, (tuple, list)) and len(value) == len(old):
+        return tuple(_value(a, repr(b), change) for a, b in zip(old, value, strict=True))
+    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not type(old):
+        raise ValueError(
+            f"--set {change!r}: {text!r} does not fit, the setting is like {old!r} "
+            f"({type(old).__name__})"
+        )
+    return value

@@ -1,0 +1,96 @@
+"""One gradient step: the gradient over all devices, AdamW, and the numbers of the curve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh
+
+from policies import delta_network, network
+from suite.train.config import OptimizerConfig, TrainConfig
+from suite.train.gradient import shard_gradient
+from suite.train.rollout import BODY_RADIUS_M, StepRecord
+from suite.train.worlds import Worlds
+
+
+class TrainState(NamedTuple):
+    """All that a run carries from one iteration to the next."""
+
+    params: network.Params
+    optimizer: optax.OptState
+    iteration: jax.Array
+    """Gradient steps done, a scalar."""
+
+
+def make_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
+    """Return AdamW with warm-up, cosine decay and optional clipping by global norm."""
+    rate = optax.warmup_cosine_decay_schedule(
+        0.0, config.rate, config.warmup, max(config.iterations, config.warmup + 1), config.rate_end
+    )
+    adamw = optax.adamw(rate, b2=config.memory, weight_decay=config.weight_decay)
+    if config.clip <= 0:
+        return adamw
+    return optax.chain(optax.clip_by_global_norm(config.clip), adamw)
+
+
+def start_state(config: TrainConfig, params: network.Params | None = None) -> TrainState:
+    """Return the state before the first iteration, from fresh or given parameters."""
+    if params is None:
+        params = network.init(jax.random.key(config.seed), config.spec)
+    return TrainState(params, make_optimizer(config.optimizer).init(params), jnp.zeros((), int))
+
+
+def device_mesh(config: TrainConfig) -> Mesh:
+    """Return the mesh of devices that share a batch.
+
+    Raises:
+        ValueError: where the devices asked for are not there or do not divide the batch.
+    """
+    have, batch = jax.devices(), config.episode.batch
+    count = config.devices or max(n for n in range(1, len(have) + 1) if batch % n == 0)
+    if not 0 < count <= len(have):
+        raise ValueError(f"devices is {count}, allowed is 0 (all) to {len(have)}")
+    if batch % count:
+        raise ValueError(f"episode.batch is {batch}, not a multiple of the {count} devices")
+    return Mesh(np.array(have[:count]), ("worlds",))
+
+
+def summarize(loss: jax.Array, gradient: network.Params, records: StepRecord) -> dict:
+    """Return the numbers of the curve as scalars."""
+    numbers = {
+        "loss": loss,
+        "gradient_norm": optax.global_norm(gradient),
+        "gates": records.passed.sum(0).mean(),
+        "collided": (records.clearance.min(0) < BODY_RADIUS_M).mean(),
+        "speed": records.speed.mean(),
+        "speed_max": records.speed.max(0).mean(),
+    }
+    return numbers | {f"loss_{k}": v.mean() for k, v in records.terms._asdict().items()}
+
+
+def make_update(
+    config: TrainConfig, mesh: Mesh, delta: delta_network.Params | None = None
+) -> Callable[[TrainState, Worlds], tuple[TrainState, dict]]:
+    """Return update(state, worlds) -> (state', numbers of the curve), compiled on first call.
+
+    `delta` is a frozen Delta Action network whose correction is added to every action.
+    """
+    optimizer = make_optimizer(config.optimizer)
+    gradient_of = shard_gradient(config, mesh)
+    seed = jax.random.key(np.uint32(config.seed))
+
+    @jax.jit
+    def update(state: TrainState, worlds: Worlds) -> tuple[TrainState, dict]:
+        key = jax.random.fold_in(seed, state.iteration)
+        gradient, loss, records = gradient_of(state.params, worlds, key, delta)
+        change, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
+        params = optax.apply_updates(state.params, change)
+        state = TrainState(params, optimizer_state, state.iteration + 1)
+        return state, summarize(loss, gradient, records)
+
+    return update
