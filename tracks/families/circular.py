@@ -34,7 +34,8 @@ def make(d: float, rng: np.random.Generator) -> Layout:
     gates = flight_order(gates, first)
     back = gates.center_w[-1] - gates.center_w[0]
     length = float(np.linalg.norm(back))
-    distance = rng.uniform(min(2.0, length / 2), min(4.0, length - _ROOM_BEHIND_M))
+    most = min(4.0, length - _ROOM_BEHIND_M)
+    distance = rng.uniform(min(2.0, most), most)
     start_pos_w = gates.center_w[0] + back * distance / length
 
     def site(rng: np.random.Generator, stretch: np.ndarray) -> np.ndarray:

@@ -38,7 +38,8 @@ def make(d: float, rng: np.random.Generator) -> Layout:
     gates = flight_order(gates, pick_stretch(rng, gates.center_w, 2.0 + _ROOM_AHEAD_M))
     ahead = gates.center_w[0] - gates.center_w[-1]
     length = float(np.linalg.norm(ahead))
-    past = rng.uniform(min(2.0, length / 2), min(3.0, length - _ROOM_AHEAD_M))
+    most = min(3.0, length - _ROOM_AHEAD_M)
+    past = rng.uniform(min(2.0, most), most)
     start_pos_w = gates.center_w[-1] + ahead * past / length
 
     stretches = np.arange(GATE_COUNT - 1)

@@ -1,0 +1,83 @@
+"""The training distribution covers the judged families' shapes, and its tracks can be flown."""
+
+import numpy as np
+import pytest
+
+from tracks.families import make_track, random_track
+from tracks.families.random import is_free
+
+
+@pytest.fixture(scope="module")
+def tracks():
+    rng = np.random.default_rng(5)
+    return [random_track(d, rng) for d in np.linspace(0, 1, 600)]
+
+
+def shape_numbers(track):
+    """Return (turns at gates 0 to 6, spacing, yaw against the way in) of a track."""
+    gates = track.scene.gates
+    point = np.concatenate([track.start_pos_w[None], gates.center_w])[:, :2]
+    way = np.diff(point, axis=0)
+    heading = np.arctan2(way[:, 1], way[:, 0])
+    normal = gates.rot_w[:, :2, 0]
+    approach = np.sum(normal * way, -1) / np.linalg.norm(way, axis=-1)
+    turn = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi
+    return turn, np.linalg.norm(way[1:], axis=-1), approach
+
+
+def test_no_stretch_runs_through_another_gates_frame(tracks):
+    for track in tracks[::4]:
+        gates = track.scene.gates
+        point = np.concatenate([track.start_pos_w[None], gates.center_w])[:, :2]
+        for k, (begin, end) in enumerate(zip(point, point[1:], strict=False)):
+            for share in np.linspace(0, 1, 30):
+                gap = np.linalg.norm(begin + share * (end - begin) - gates.center_w[:, :2], axis=-1)
+                others = np.setdiff1d(np.arange(8), [k - 1, k])
+                assert gap[others].min() > 1.5
+        assert is_free(gates, track.start_pos_w)
+
+
+def test_a_track_through_its_own_gate_is_not_free():
+    track = make_track("circular", 0, 3)
+    gates = track.scene.gates
+    center = gates.center_w.copy()
+    center[3] = (center[6] + center[7]) / 2
+    assert is_free(gates, track.start_pos_w)
+    assert not is_free(gates._replace(center_w=center), track.start_pos_w)
+
+
+def test_sizes_and_spacings_stay_in_their_ranges(tracks):
+    for track in tracks:
+        gates = track.scene.gates
+        turn, spacing, approach = shape_numbers(track)
+        side = np.ptp(gates.opening_g, axis=1)
+        assert np.all((side > 0.75 - 1e-9) & (side < 1.3 + 1e-9))
+        assert np.all((spacing > 2.5 - 1e-9) & (spacing < 7 + 1e-9))
+        assert np.all(approach > np.cos(np.deg2rad(95)))
+        assert np.all(gates.center_w[:, 2] - side[:, 1] / 2 - gates.frame_width > -1e-9)
+        assert np.all((gates.center_w[:, 2] >= 0.8) & (gates.center_w[:, 2] <= 2.2))
+        assert 2 <= np.linalg.norm(track.start_pos_w[:2] - gates.center_w[0, :2]) <= 4
+
+
+def test_lines_circles_of_both_directions_and_u_turns_all_occur(tracks):
+    totals = np.array([shape_numbers(t)[0].sum() for t in tracks])
+    sharpest = np.array([np.abs(shape_numbers(t)[0]).max() for t in tracks])
+    steady = np.array([np.ptp(shape_numbers(t)[0]) for t in tracks])
+    quarter = np.deg2rad(45) * 7
+    circles = steady < np.deg2rad(70)
+    assert np.mean(np.abs(totals) < np.deg2rad(60)) > 0.15
+    assert np.mean(circles & (totals > 0.7 * quarter)) > 0.03
+    assert np.mean(circles & (totals < -0.7 * quarter)) > 0.03
+    assert np.mean(sharpest > np.deg2rad(110)) > 0.1
+    headings = [np.arctan2(*t.scene.gates.rot_w[0, 1::-1, 0]) for t in tracks]
+    assert np.ptp(headings) > 6
+
+
+def test_density_runs_from_none_to_beyond_level_9(tracks):
+    hardest = max(len(make_track("zigzag", 9, seed).names) - 60 for seed in range(5))
+    numbers = np.array([len(t.names) - 32 for t in tracks])
+    assert np.mean(numbers == 0) > 0.1
+    in_air = [sum("ground" not in n for n in t.names[32:]) for t in tracks]
+    assert max(in_air) > 49 > hardest - 30
+    easy, hard = numbers[:150], numbers[-150:]
+    assert hard.mean() > 1.4 * easy.mean()
