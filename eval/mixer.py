@@ -36,7 +36,8 @@ def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> A
     """
     xp = torque_b.__array_namespace__()
     per_force, per_yaw = unmixer[:, 0], unmixer[:, 3]
-    level = xp.matmul(torque_b[..., :2], xp.asarray(unmixer[:, 1:3]).T)
+    # Written out: a matrix product may round a row differently at another batch size.
+    level = torque_b[..., 0, None] * unmixer[:, 1] + torque_b[..., 1, None] * unmixer[:, 2]
     yaw = torque_b[..., 2, None] * per_yaw
     exact = force_z[..., None] * per_force + level + yaw
     outside = xp.any((exact < 0.0) | (exact > thrust_max), axis=-1, keepdims=True)
