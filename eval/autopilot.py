@@ -13,7 +13,7 @@ from eval.attitude import action_to_force, attitude_command, blend_heading, leve
 from eval.effects.interface import GRAVITY
 from eval.plant import Command, Motion, Plant, Wrench, make_plant, plant_step, start_memory
 from eval.vehicle import Controller, Vehicle
-from eval.worlds.slots import select
+from eval.worlds.slots import packed, select
 
 Array = Any
 ATTITUDE_HZ = 100.0
@@ -62,7 +62,7 @@ def start_autopilot(cockpit: Cockpit, motion: Motion, noise: Array | None = None
     n = motion.pos_w.shape[0]
     memory = start_memory(cockpit.plant, (n,), xp, noise)
     hover = Command(xp.full((n,), GRAVITY), xp.zeros((n, 3)))
-    return Autopilot(memory, hover, level_heading(motion.rot_w))
+    return packed(Autopilot(memory, hover, level_heading(motion.rot_w)))
 
 
 def fly_step(
@@ -95,4 +95,4 @@ def fly_step(
     memory, wrench = plant_step(
         cockpit.plant, pilot.memory, motion, command, step * cockpit.dt, noise
     )
-    return Autopilot(memory, command, heading_w), wrench
+    return packed(Autopilot(memory, command, heading_w)), wrench

@@ -20,7 +20,7 @@ from eval.guard import ActionLimits, guard_action
 from eval.recorder import Recorder
 from eval.trial import DIVERGED, ENDINGS, FINISHED, FLYING, Rules, TrialResult, TrialSpec
 from eval.vehicle import Vehicle
-from eval.worlds import World, world_class
+from eval.worlds import PLAIN, World, world_class
 from eval.worlds.slots import layout_of
 from policies.observation import encode_depth, state_vector
 from policies.policy import Policy
@@ -102,6 +102,8 @@ def fly(
     for trial in trials:
         if trial.track not in (tracks or {}):
             check_family(trial.track)
+    if world == PLAIN and record:
+        raise ValueError("world 'plain' records no flights; record in 'mujoco', which flies alike")
     task = _Task(policy, vehicle, world, options, record, tracks or {})
     results: dict[int, TrialResult] = {}
 
@@ -136,12 +138,27 @@ def _fly_share(
 ) -> None:
     """Fly numbered trials in this process."""
     policy = task.policy if hasattr(task.policy, "act") else task.policy()
+    if task.world == PLAIN:
+        for index, trial in share:
+            track = _track(task, trial)
+            options = task.options
+            result = world_class(PLAIN)(
+                policy, trial, track, task.vehicle, options.rules, options.limits, options.slots
+            )
+            emit(index, result, None)
+        return
     layout = layout_of(task.tracks.values())
     world = world_class(task.world)(
         task.vehicle, policy.spec.camera, layout, task.options.rules,
         slots=task.options.slots, threads=task.options.threads,
     )  # fmt: skip
     _Table(task, policy, world).run(share, emit)
+
+
+def _track(task: _Task, trial: TrialSpec) -> Track:
+    if trial.track in task.tracks:
+        return task.tracks[trial.track]
+    return make_track(trial.track, trial.difficulty, trial.seed)
 
 
 class _Table:
@@ -196,14 +213,9 @@ class _Table:
             self._fresh[slot] = True
             if self._recorder:
                 self._recorder.start(slot)
-            entries.append((slot, self._track(trial), trial))
+            entries.append((slot, _track(self._task, trial), trial))
         if entries:
             self._world.load(entries)
-
-    def _track(self, trial: TrialSpec) -> Track:
-        if trial.track in self._task.tracks:
-            return self._task.tracks[trial.track]
-        return make_track(trial.track, trial.difficulty, trial.seed)
 
     def _decide_and_fly(self) -> None:
         """Ask the policy once and fly its answers until its next decision."""

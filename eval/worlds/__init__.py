@@ -15,12 +15,14 @@ from eval.trial import Progress, TrialSpec
 from tracks.names import unknown_name
 from tracks.track import Track
 
+PLAIN = "plain"
+"""The world without slots: `eval.worlds.plain.fly_trial`, one trial after the other."""
 WORLDS = {
     "mujoco": "eval.worlds.mujoco:MujocoWorld",
-    "plain": "eval.worlds.plain:PlainWorld",
     "mjx": "eval.worlds.mjx:MjxWorld",
+    PLAIN: "eval.worlds.plain:fly_trial",
 }
-"""Name to module and class."""
+"""Name to module and class (`World`)."""
 
 
 class View(NamedTuple):
@@ -90,7 +92,7 @@ class World(Protocol):
 
 
 def world_class(name: str) -> Any:
-    """Return the class of the world `name`.
+    """Return the class of the world `name` (for `PLAIN` the function).
 
     Raises:
         ValueError: where there is no such world.

@@ -29,7 +29,7 @@ from eval.trial import (
 from eval.vehicle import Vehicle
 from eval.worlds import Rows, View
 from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
-from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates, select
+from eval.worlds.slots import Layout, empty_course, noise_of, packed, pad_gates, select
 from tracks.camera import Camera
 from tracks.track import Track
 
@@ -123,7 +123,7 @@ class MujocoWorld:
         fresh = start_autopilot(self._cockpit, motion, noise)
         started = np.zeros(self.slots, bool)
         started[ids] = True
-        self._pilot = select(started, fresh, getattr(self, "_pilot", fresh))
+        self._pilot = packed(select(started, fresh, getattr(self, "_pilot", fresh)))
         self._progress = select(started, start_progress(motion.pos_w), self._progress)
         self._judge(started, np.zeros(self.slots, bool))
 
@@ -188,7 +188,7 @@ class MujocoWorld:
             pilot, (force_b, torque_b) = fly_step(
                 self._cockpit, self._pilot, motion, action_b, gate_w, step, self._draws(step)
             )
-            self._pilot = select(flying, pilot, self._pilot)
+            self._pilot = packed(select(flying, pilot, self._pilot))
             if record:
                 due = flying & (step % self._cockpit.attitude_every == 0)
                 rows += self._rows(due, speed_before)

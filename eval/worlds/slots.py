@@ -29,6 +29,21 @@ def select(mask: Array, new: Any, old: Any) -> Any:
     return xp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
 
 
+def packed(tree: Any) -> Any:
+    """Return nested tuples and dicts of numpy arrays with every array laid out row by row.
+
+    numpy adds up in an order that depends on how an array lies in memory, and a concatenation
+    lies as its parts do; without this a row's last bit could depend on the rows beside it.
+    Arrays of JAX have one layout and are passed on.
+    """
+    if isinstance(tree, dict):
+        return {name: packed(part) for name, part in tree.items()}
+    if isinstance(tree, tuple):
+        parts = [packed(part) for part in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    return np.ascontiguousarray(tree) if isinstance(tree, np.ndarray) else tree
+
+
 class Layout(NamedTuple):
     """What the scenes of all trials are padded to, so that any of them fits any slot."""
 

@@ -22,7 +22,7 @@ class Pursuit:
         return np.zeros((n, 3), np.float32)
 
     def act(self, hidden, state, image, fresh):
-        vel, up, gate = state[:, :3], state[:, 3:6], state[:, 6:9]
+        vel, gate = state[:, :3], state[:, 6:9]
         hidden = np.where(fresh[:, None], np.float32(0), hidden)
         distance = np.sqrt((gate * gate).sum(-1, keepdims=True))
         ahead = gate / np.maximum(distance, 1e-3)
