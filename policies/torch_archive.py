@@ -12,6 +12,7 @@ import io
 import json
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,31 +67,44 @@ def safe_archive(path: Path) -> SafeArchive:
     """
     try:
         files = dict(_entries(path))
-    except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, RuntimeError) as error:
         raise PolicyError(f"{path}: not a whole .pt2 archive ({error}); export it again") from None
     except OSError as error:
         raise PolicyError(f"{path}: cannot be read ({error.strerror}); check the file") from None
-    program = _json(path, files, _PROGRAM)
-    configs = {name: _json(path, files, name) for name in _CONFIGS}
-    program["guards_code"] = []
-    _without_metadata(program)
-    for target in _targets(program):
-        _check_target(path, target)
-    for name, table in ((_PROGRAM, program), *configs.items()):
-        _check_strings(f"{path}: {name}", table, "")
-    kept = {name: files[name] for name in _MARKS if name in files}
-    for name, config in configs.items():
-        folder = name.rsplit("/", 1)[0]
-        for entry in config.get("config", {}).values():
-            kept |= {f"{folder}/{p}": files[f"{folder}/{p}"] for p in [_payload(path, entry)]
-                     if f"{folder}/{p}" in files}  # fmt: skip
-        kept[name] = json.dumps(config).encode()
-    kept |= {_PROGRAM: json.dumps(program).encode(), _SAMPLES: b""}
+    try:
+        kept = _harmless(path, files)
+    except RecursionError:
+        raise PolicyError(f"{path}: nested too deep; export it again") from None
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in kept.items():
             archive.writestr(f"policy/{name}", data)
     return SafeArchive(buffer.getvalue(), files.get(f"extra/{KEY}"))
+
+
+def _harmless(path: Path, files: dict[str, bytes]) -> dict[str, bytes]:
+    """Return the entries that reach torch, each checked; what is not needed stays out."""
+    program = _json(path, files, _PROGRAM)
+    # Guards are lines of Python; shapes are checked on our side instead.
+    program["guards_code"] = []
+    _without_metadata(program)
+    for target in _targets(program):
+        _check_target(path, target)
+    _check_strings(f"{path}: {_PROGRAM}", program, "")
+    kept = {name: files[name] for name in _MARKS if name in files}
+    kept |= {_PROGRAM: json.dumps(program).encode(), _SAMPLES: b""}
+    for name in _CONFIGS:
+        config = _json(path, files, name)
+        _check_strings(f"{path}: {name}", config, "")
+        folder = name.rsplit("/", 1)[0]
+        weights = config.get("config")
+        for entry in weights.values() if isinstance(weights, dict) else ():
+            payload = f"{folder}/{_payload(path, entry)}"
+            if payload not in files:
+                raise PolicyError(f"{path}: {payload} is missing; export it again")
+            kept[payload] = files[payload]
+        kept[name] = json.dumps(config).encode()
+    return kept
 
 
 def _entries(path: Path) -> Iterator[tuple[str, bytes]]:
@@ -108,7 +122,7 @@ def _json(path: Path, files: dict[str, bytes], name: str) -> dict[str, Any]:
         raise PolicyError(f"{path}: {name} is missing; write the file with torch.export.save")
     try:
         data = json.loads(files[name])
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise PolicyError(f"{path}: {name}: not JSON ({error}); export it again") from None
     if not isinstance(data, dict):
         raise PolicyError(f"{path}: {name}: expected an object; export it again")
@@ -166,7 +180,8 @@ def _check_strings(where: str, value: Any, key: str) -> None:
         if len(value) > 2000 or not _SPECIAL.get(key, _NAME).fullmatch(text):
             raise PolicyError(
                 f"{where}: {key or 'key'} {value[:60]!r} is not a plain name; export "
-                "forward(state, image, hidden) with positional inputs, or pass --trust if you trust the file"
+                "forward(state, image, hidden) with positional inputs, or pass --trust if you "
+                "trust who made the file"
             )
 
 

@@ -1,0 +1,120 @@
+"""A row's answer depends on that row alone, to the bit, in every kind of policy."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from policies.block_policy import BlockPolicy, proven
+from policies.errors import PolicyError
+from policies.policy import load_policy
+from policies.spec import PolicySpec
+
+
+@pytest.fixture(scope="module", params=["native", "torch", "onnx"])
+def policy(request, checkpoint, exported):
+    files = {"native": checkpoint, "torch": "tiny.pt2", "onnx": "tiny.onnx"}
+    return load_policy(exported / files[request.param])
+
+
+def observe(seed, n):
+    rng = np.random.default_rng(seed)
+    state = rng.normal(size=(n, 12)).astype(np.float32)
+    image = rng.uniform(-0.3, 9.4, (n, 24, 32)).astype(np.float32)
+    return rng.uniform(-1, 1, (n, 64)).astype(np.float32), state, image
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 150), data=st.data())
+def test_neither_place_nor_neighbours_nor_number_matter(policy, seed, n, data):
+    hidden, state, image = observe(seed, 150)
+    fresh = np.random.default_rng(seed).random(150) < 0.3
+    alone = policy.act(hidden, state, image, fresh)
+    order = np.random.default_rng(seed + 1).permutation(150)[:n]
+    others = observe(seed + 2, n)
+    kept = np.random.default_rng(seed + 3).random(n) < data.draw(st.sampled_from([0.1, 0.9]))
+    mixed = [
+        np.where(kept.reshape(-1, *[1] * (mine.ndim - 1)), mine[order], other)
+        for mine, other in zip((hidden, state, image), others, strict=True)
+    ]
+    for mine, found in zip(alone, policy.act(*mixed, fresh[order]), strict=True):
+        assert mine[order][kept].tobytes() == found[kept].tobytes()
+
+
+def test_a_fresh_row_has_forgotten(policy):
+    hidden, state, image = observe(0, 4)
+    fresh = np.array([True, False, True, False])
+    with_memory, _ = policy.act(hidden, state, image, fresh)
+    without, _ = policy.act(policy.start(4), state, image, np.zeros(4, bool))
+    assert (with_memory[fresh] == without[fresh]).all()
+    assert (with_memory[~fresh] != without[~fresh]).all()
+
+
+def test_the_answers_have_the_shapes_promised(policy):
+    hidden, state, image = observe(0, 3)
+    action, after = policy.act(hidden, state, image, np.zeros(3, bool))
+    assert (action.shape, action.dtype, after.shape) == ((3, 3), np.float32, (3, 64))
+    action, after = policy.act(policy.start(0), state[:0], image[:0], np.zeros(0, bool))
+    assert (action.shape, after.shape) == ((0, 3), (0, 64))
+
+
+def place_dependent(state, image, hidden):
+    """Adds in another order in the second half, as a kernel for leftover rows may."""
+    half = len(state) // 2
+    action = np.cumsum(state, 1)[:, -1:] + image[:, 0, :3]
+    action[half:] = np.cumsum(state[half:, ::-1], 1)[:, -1:] + image[half:, 0, :3]
+    return action, hidden
+
+
+def neighbour_dependent(state, image, hidden):
+    return state[:, :3] - state[:, :3].mean(0), hidden
+
+
+@pytest.mark.parametrize("model", [place_dependent, neighbour_dependent])
+@pytest.mark.parametrize("block", [64, 7])
+def test_a_model_whose_rows_lean_on_each_other_is_fed_one_by_one(model, block):
+    policy = proven(BlockPolicy("x", PolicySpec(), model, (0,), block, block), "x")
+    assert (policy.rows, policy.block) == (1, block)
+    _, state, image = observe(0, 20)
+    none = np.zeros(20, bool)
+    action, _ = policy.act(policy.start(20), state, image, none)
+    turned, _ = policy.act(policy.start(20), state[::-1], image[::-1], none)
+    assert action[::-1].tobytes() == turned.tobytes()
+
+
+def test_a_model_that_rolls_dice_or_has_wrong_outputs_is_refused():
+    rng = np.random.default_rng(0)
+    base = BlockPolicy("x", PolicySpec(), lambda s, i, h: (s[:, :3], h), (0,))
+    assert proven(base, "here") == base
+    for model, said in [
+        (lambda s, i, h: (rng.random((64, 3), np.float32), h), "two answers"),
+        (lambda s, i, h: (s[:, :4], h), r"here: output 'action' is float32 \(64, 4\)"),
+        (lambda s, i, h: (s[:, :3].astype(float), h), "is float64"),
+        (lambda s, i, h: (s[:, :3], s), "output 'hidden'"),
+    ]:
+        with pytest.raises(PolicyError, match=said):
+            proven(dataclasses.replace(base, model=model), "here")
+
+
+def test_thread_counts_do_not_change_our_network(checkpoint, tmp_path):
+    """XLA's pool may split the work any way; the bits have to stay."""
+    script = (
+        "import sys, hashlib, numpy as np\n"
+        "from policies.policy import load_policy\n"
+        "p, r = load_policy(sys.argv[1]), np.random.default_rng(0)\n"
+        "s, i = r.normal(size=(64, 12)), r.normal(size=(64, 24, 32))\n"
+        "a, h = p.act(p.start(64), s, i, np.ones(64, bool))\n"
+        "print(hashlib.sha256(a.tobytes() + h.tobytes()).hexdigest(), p.rows)\n"
+    )
+    found = set()
+    for flags in ("", "--xla_cpu_multi_thread_eigen=false"):
+        environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+        command = [sys.executable, "-c", script, str(checkpoint)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        found.add(done.stdout)
+    assert len(found) == 1 and found.pop().endswith(" 64\n")
