@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.effects.interface import GRAVITY, Array, Constants, Flow, Gust
+from eval.effects.interface import GRAVITY, Array, Constants, Flow, Gust, as_arrays
 from eval.mixer import mix, mixer_matrix
 from eval.rate_loop import cross, rate_torque
 from eval.rotors import Spin, follow, speed_command
@@ -111,7 +111,7 @@ def make_plant(
     """
     values = dict(vehicle.effects) if effects is None else effects
     # The table's order is the order in which effects act.
-    values = {name: _arrays(values[name]) for name in EFFECTS if name in values}
+    values = {name: as_arrays(values[name]) for name in EFFECTS if name in values}
     rotors = vehicle.rotors
     constants = Constants(
         mass=np.asarray(vehicle.mass),
@@ -298,16 +298,6 @@ def accelerations(plant: Plant, motion: Motion, wrench: Wrench) -> tuple[Array, 
     spin_b = constants.inertia * motion.rate_b
     torque_b = wrench.torque_b - cross(motion.rate_b, spin_b)
     return force_w / constants.mass[..., None] + constants.gravity_w, torque_b / constants.inertia
-
-
-def _arrays(values: Any) -> Any:
-    """Turn the numbers and tuples of an effect's values into float arrays; leave JAX's be."""
-    return type(values)(
-        *(
-            value if hasattr(value, "__array_namespace__") else np.asarray(value, dtype=float)
-            for value in values
-        )
-    )
 
 
 def _delay_weight(delay: Array, dt: float, max_delay: float) -> Array:

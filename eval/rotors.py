@@ -6,6 +6,9 @@ from typing import Any, NamedTuple
 
 Array = Any
 
+NEGLIGIBLE = 1e-6
+"""Thrusts below this are none [N]."""
+
 
 class Spin(NamedTuple):
     """What the rotors do during one physics step; means are exact for a constant command."""
@@ -21,8 +24,9 @@ class Spin(NamedTuple):
 def speed_command(thrust: Array, thrust_coefficient: float) -> Array:
     """Return the speeds (..., 4) [rad/s] that nominally give `thrust` (..., 4) >= 0 [N]."""
     xp = thrust.__array_namespace__()
-    # The root's slope is infinite at zero thrust and would turn gradients into NaN.
-    pushes = thrust > 0.0
+    # A rotor at its lower limit is asked for zero or for what rounding left of it, where the
+    # root's slope has no bound; gradients would drown in it.
+    pushes = thrust > NEGLIGIBLE
     return xp.where(pushes, xp.sqrt(xp.where(pushes, thrust, 1.0) / thrust_coefficient), 0.0)
 
 

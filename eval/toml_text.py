@@ -17,8 +17,8 @@ def to_toml(table: Mapping[str, Any], prefix: str = "") -> str:
     for key, entry in table.items():
         if isinstance(entry, Mapping):
             inside = to_toml(entry, f"{prefix}{key}.")
-            plain = any(not isinstance(value, Mapping) for value in entry.values())
-            head = f"\n[{prefix}{key}]\n" if plain else ""
+            only_tables = entry and all(isinstance(value, Mapping) for value in entry.values())
+            head = "" if only_tables else f"\n[{prefix}{key}]\n"
             lines.append(head + inside)
     return "".join(lines)
 

@@ -146,7 +146,7 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
             "fov_deg": list(camera.fov_deg),
             "range": camera.range_m,
         },
-        "effects": effects,
+        **({"effects": effects} if effects else {}),
     }
 
 
@@ -293,6 +293,6 @@ def _numbers(key: str, value: Any, size: int) -> Any:
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, tuple) or hasattr(value, "__len__"):
+    if isinstance(value, (tuple, list)) or getattr(value, "ndim", 0) > 0:
         return [_plain(entry) for entry in value]
     return float(value)

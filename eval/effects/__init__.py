@@ -33,7 +33,7 @@ from eval.effects import (
     translational_lift,
     weak_motor,
 )
-from eval.effects.interface import Array, Effect, neutral
+from eval.effects.interface import Array, Effect, as_arrays, neutral
 from tracks.names import unknown_name
 
 if TYPE_CHECKING:
@@ -103,9 +103,9 @@ def apply_log_faults(effects: Mapping[str, object], log: Mapping[str, Array]) ->
 def all_values(vehicle: Vehicle) -> dict[str, Any]:
     """Return values of every effect by name: the vehicle's own, and neutral ones for the others.
 
-    The result is a pytree of plain numbers: one model with it holds the whole catalogue.
+    The result is a pytree of numpy arrays: one model with it holds the whole catalogue.
     """
     return {
-        name: vehicle.effects.get(name, neutral(effect, vehicle))
+        name: as_arrays(vehicle.effects.get(name, neutral(effect, vehicle)))
         for name, effect in EFFECTS.items()
     }

@@ -170,6 +170,17 @@ def neutral(effect: Effect, vehicle: Vehicle) -> Values:
     return effect.values(*(value(parameter) for parameter in effect.parameters))
 
 
+def as_arrays(values: Values) -> Values:
+    """Return an effect's `values` with numbers and tuples as float arrays; JAX arrays stay."""
+
+    def convert(value: Any) -> Array:
+        if hasattr(value, "__array_namespace__"):
+            return value
+        return np.asarray(value, dtype=float)
+
+    return type(values)(*(convert(value) for value in values))
+
+
 def per_axis(value: Array) -> Array:
     """Return scalars (...,) as (..., 1), to multiply vectors (..., 3) or rotors (..., 4)."""
     return value[..., None]
