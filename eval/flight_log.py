@@ -19,6 +19,7 @@ from eval.flight import Flight
 from eval.flight_check import GROUPS, KNOWN, FlightLogError, check_columns
 from eval.flight_file import read_columns, write_columns
 from eval.flight_velocity import velocity_from_position
+from eval.rotation import quat_to_rot
 from tracks.files import to_json
 from tracks.provenance import stamp
 
@@ -83,13 +84,7 @@ class FlightLog:
     @property
     def rot_w(self) -> np.ndarray:
         """(T, 3, 3) body to world; NaN where the quaternion is missing."""
-        w, x, y, z = self.quat_wxyz.T
-        matrix = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return np.moveaxis(np.array(matrix), -1, 0)
+        return quat_to_rot(self.quat_wxyz)
 
     @property
     def whole(self) -> np.ndarray:

@@ -34,9 +34,12 @@ STATE = ("time", "pos", "quat", "rate")
 def columns(rows=150, groups=(*STATE, "vel", "cmd_thrust", "cmd_rate")):
     """The columns of a well-formed log."""
     rng = np.random.default_rng(0)
-    made = {name: rng.normal(size=rows) for group in groups for name in GROUPS[group]}
-    made["time"] = 0.01 * np.arange(rows)
-    quat = Rotation.random(rows, random_state=1).as_quat(scalar_first=True)
+    made: dict[str, np.ndarray] = {
+        name: rng.normal(size=rows) for group in groups for name in GROUPS[group]
+    }
+    made["time"] = np.arange(rows) / 100
+    quat = rng.normal(size=(rows, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     return made | dict(zip(GROUPS["quat"], quat.T, strict=True))
 
 

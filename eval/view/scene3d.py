@@ -1,0 +1,145 @@
+"""A small painter of flat-shaded triangles and lines, so that a video needs no GPU and no GL.
+
+Faces are drawn from the farthest to the nearest (the painter's algorithm; Newell et al. 1972),
+which is right for the small convex solids of a track but for rare overlaps.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from eval.view.solids import flat_normals
+
+NEAR_M = 0.05
+"""What is nearer to the eye than this is cut off [m]."""
+FOG_M = 45.0
+"""Distance at which a colour has faded all the way it does [m]."""
+FOG_SHARE = 0.65
+SKY, GROUND, GRID = (232, 238, 245), (214, 217, 212), (200, 204, 200)
+LIGHT_W = np.array([0.35, -0.45, 0.82])
+GRID_REACH_M = 24
+
+
+class View(NamedTuple):
+    """A pinhole camera anywhere in the world."""
+
+    eye_w: np.ndarray
+    """(3,) [m]."""
+    axes_w: np.ndarray
+    """(3, 3) rows right, down and forward."""
+    focal: float
+    """[pixels]."""
+    size: tuple[int, int]
+    """Width and height [pixels]."""
+
+
+class Faces(NamedTuple):
+    """Triangles to draw."""
+
+    corners_w: np.ndarray
+    """(F, 3, 3) [m], counter-clockwise from outside."""
+    colour: np.ndarray
+    """(F, 3) 0-255, before shading."""
+
+
+class Lines(NamedTuple):
+    """Pieces of a line to draw."""
+
+    ends_w: np.ndarray
+    """(L, 2, 3) [m]."""
+    colour: np.ndarray
+    """(L, 3) 0-255."""
+    width_m: float
+
+
+def look_at(eye_w: np.ndarray, target_w: np.ndarray, fov_deg: float, size: tuple[int, int]) -> View:
+    """Return the level camera at `eye_w` that looks at `target_w`; `fov_deg` is across."""
+    forward = (target_w - eye_w) / np.linalg.norm(target_w - eye_w)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= max(float(np.linalg.norm(right)), 1e-9)
+    axes = np.stack([right, np.cross(forward, right), forward])
+    return View(eye_w, axes, size[0] / 2 / np.tan(np.deg2rad(fov_deg) / 2), size)
+
+
+def to_camera(view: View, points_w: np.ndarray) -> np.ndarray:
+    """Return points (..., 3) in camera axes: right, down, forward [m]."""
+    return (points_w - view.eye_w) @ view.axes_w.T
+
+
+def to_pixels(view: View, points_c: np.ndarray) -> np.ndarray:
+    """Return the pixels (..., 2) of points in camera axes (..., 3) in front of the eye."""
+    middle = np.array(view.size) / 2
+    return middle + view.focal * points_c[..., :2] / points_c[..., 2:]
+
+
+def paint(view: View, faces: Faces, lines: Lines) -> Image.Image:
+    """Return the picture of sky, ground, faces and lines."""
+    image = Image.new("RGB", view.size, SKY)
+    draw = ImageDraw.Draw(image)
+    _paint_ground(draw, view)
+    normals = flat_normals(faces.corners_w)
+    front = np.einsum("fi,fi->f", faces.corners_w[:, 0] - view.eye_w, normals) < 0
+    corners = to_camera(view, faces.corners_w[front])
+    light = LIGHT_W / np.linalg.norm(LIGHT_W)
+    shade = 0.72 + 0.28 * (normals[front] @ light)
+    colour = faces.colour[front] * shade[:, None]
+    ends = to_camera(view, lines.ends_w)
+    shapes = [*corners, *ends]
+    distance = np.concatenate([_distance(corners), _distance(ends)])
+    colour = _fade(np.concatenate([colour, lines.colour]), distance)
+    near = np.concatenate([corners[..., 2].min(axis=1), ends[..., 2].min(axis=1)])
+    far = np.concatenate([corners[..., 2].max(axis=1), ends[..., 2].max(axis=1)])
+    for k in np.argsort(-distance):
+        if far[k] <= NEAR_M:
+            continue
+        shape = shapes[k] if near[k] > NEAR_M else _clip(shapes[k])
+        pixels = to_pixels(view, shape)
+        fill = (int(colour[k, 0]), int(colour[k, 1]), int(colour[k, 2]))
+        if len(shapes[k]) == 2:
+            width = max(2, round(view.focal * lines.width_m / float(distance[k])))
+            draw.line(pixels.ravel().tolist(), fill=fill, width=width)
+        else:
+            draw.polygon(pixels.ravel().tolist(), fill=fill)
+    return image
+
+
+def _distance(shapes_c: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(shapes_c.mean(axis=1), axis=-1)
+
+
+def _fade(colour: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    share = FOG_SHARE * np.clip(distance / FOG_M, 0, 1)[:, None]
+    return np.clip((1 - share) * colour + share * np.array(SKY), 0, 255)
+
+
+def _paint_ground(draw: ImageDraw.ImageDraw, view: View) -> None:
+    reach = 500.0
+    square = np.array([[-reach, -reach], [reach, -reach], [reach, reach], [-reach, reach]])
+    ground = np.insert(square + view.eye_w[:2], 2, 0.0, axis=1)
+    shape = _clip(to_camera(view, ground))
+    if len(shape) >= 3:
+        draw.polygon(to_pixels(view, shape).ravel().tolist(), fill=GROUND)
+    middle = np.round(view.eye_w[:2])
+    for offset in range(-GRID_REACH_M, GRID_REACH_M + 1):
+        for axis in (0, 1):
+            ends = np.zeros((2, 3))
+            ends[:, axis] = middle[axis] + offset
+            ends[:, 1 - axis] = middle[1 - axis] + np.array([-GRID_REACH_M, GRID_REACH_M])
+            line = _clip(to_camera(view, ends))
+            if len(line) >= 2:
+                draw.line(to_pixels(view, line[:2]).ravel().tolist(), fill=GRID, width=2)
+
+
+def _clip(shape_c: np.ndarray) -> np.ndarray:
+    """Return what of a polygon (k, 3) is in front of the eye (Sutherland, Hodgman 1974)."""
+    kept = []
+    for here, after in zip(shape_c, np.roll(shape_c, -1, axis=0), strict=True):
+        if here[2] > NEAR_M:
+            kept.append(here)
+        if (here[2] > NEAR_M) != (after[2] > NEAR_M):
+            part = (NEAR_M * 1.001 - here[2]) / (after[2] - here[2])
+            kept.append(here + part * (after - here))
+    return np.array(kept).reshape(-1, 3)

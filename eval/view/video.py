@@ -1,0 +1,266 @@
+"""A short video of a trial from behind the drone, with the depth image it saw.
+
+The frames are painted by `scene3d.py`, so neither a display nor a GPU is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import gaussian_filter1d
+
+from eval.flight import Flight
+from eval.rotation import quat_to_rot
+from eval.trial import TrialResult
+from eval.view import colours
+from eval.view.scene3d import Faces, Lines, look_at, paint
+from eval.view.solids import track_solids
+from tracks.files import replacing_file
+from tracks.track import Track
+
+ENDINGS = (".mp4", ".gif")
+OVERSAMPLING = 2
+"""Frames are painted this much larger and then reduced, which smooths edges."""
+ARM_M, ROTOR_RADIUS_M = 0.12, 0.0635
+DEPTH_RANGE_M = 10.0
+TRAIL_S = 1.6
+"""How long the path is shown behind the drone [s]."""
+
+
+@dataclass(frozen=True)
+class VideoOptions:
+    """How a video looks."""
+
+    size: tuple[int, int] = (960, 540)
+    """Width and height, even numbers [pixels]."""
+    fps: int = 30
+    """Frames a second, at real speed."""
+    slowdown: float = 1.0
+    """2 plays at half speed."""
+    fov_deg: float = 78.0
+    """Field of view across [deg]."""
+    behind_m: float = 1.5
+    """Distance of the eye behind the drone [m]."""
+    above_m: float = 0.55
+    """Height of the eye above the drone [m]."""
+    hold_s: float = 1.0
+    """How long the last frame stays [s]."""
+
+
+def frame_times(flight: Flight, options: VideoOptions) -> np.ndarray:
+    """Return the time of each frame in the flight [s], the held ones at the end included."""
+    end = float(flight.time_s[-1])
+    times = np.arange(float(flight.time_s[0]), end, 1 / (options.fps * options.slowdown))
+    return np.concatenate([times, np.full(max(1, round(options.hold_s * options.fps)), end)])
+
+
+def write_video(
+    path: str | Path,
+    track: Track,
+    flight: Flight,
+    result: TrialResult,
+    options: VideoOptions | None = None,
+    on_frame: Callable[[int], None] | None = None,
+) -> Path:
+    """Write a video of a trial as MP4 (H.264) or GIF, by the ending of `path`.
+
+    Args:
+        path: file to write, ending in `.mp4` or `.gif`.
+        track: what was flown through.
+        flight: what was flown; its depth images are shown where there are any.
+        result: how it ended.
+        options: size and speed.
+        on_frame: called with the number of frames that are done, of `len(frame_times(...))`.
+
+    Raises:
+        ValueError: where the ending is another, the size odd, or the flight has no two rows.
+        OSError: where the file cannot be written; nothing is left under its name.
+    """
+    path, options = Path(path), options or VideoOptions()
+    kind = path.suffix.lower()
+    if kind not in ENDINGS:
+        raise ValueError(f"{path}: ending {path.suffix!r}; a video ends in .mp4 or .gif")
+    if options.size[0] % 2 or options.size[1] % 2 or min(options.size) < 64:
+        raise ValueError(f"size {options.size}; both must be even and 64 or more")
+    if len(flight.time_s) < 2:
+        raise ValueError(f"{path}: a flight of {len(flight.time_s)} rows; a video needs two")
+    frames = video_frames(track, flight, result, options)
+    with replacing_file(path) as beside:
+        if kind == ".gif":
+            _write_gif(beside, frames, options, on_frame)
+        else:
+            _write_mp4(beside, frames, options, on_frame)
+    return path
+
+
+def video_frames(
+    track: Track, flight: Flight, result: TrialResult, options: VideoOptions
+) -> Iterator[Image.Image]:
+    """Yield the frames of a video, one for each of `frame_times`."""
+    solids = track_solids(track)
+    corners = np.concatenate([solid.vertices[solid.faces] for solid in solids])
+    gate = np.repeat(
+        [-1 if solid.gate is None else solid.gate for solid in solids],
+        [len(solid.faces) for solid in solids],
+    )
+    times = frame_times(flight, options)
+    speed = np.linalg.norm(flight.vel_w, axis=1)
+    top = colours.top_speed(speed)
+    pieces = np.stack([flight.pos_w[:-1], flight.pos_w[1:]], axis=1)
+    path_colour = colours.speed_colours(speed[:-1], top)
+    rot_w = quat_to_rot(flight.quat_wxyz)
+    eye_w, target_w = _chase(flight, rot_w, options)
+    decided = np.flatnonzero(flight.policy_step)
+    big = (options.size[0] * OVERSAMPLING, options.size[1] * OVERSAMPLING)
+    for time in times:
+        k = int(np.searchsorted(flight.time_s, time, side="right")) - 1
+        pos, eye, target = (_at(flight, values, time) for values in (flight.pos_w, eye_w, target_w))
+        next_gate = int(flight.gate[k])
+        body = _drone_faces(pos, rot_w[k])
+        faces = Faces(
+            np.concatenate([corners, body.corners_w]),
+            np.concatenate([_track_colour(gate, next_gate), body.colour]),
+        )
+        shown = (flight.time_s[:-1] > time - TRAIL_S) & (flight.time_s[1:] <= time)
+        lines = Lines(pieces[shown], path_colour[shown], 0.03)
+        image = paint(look_at(eye, target, options.fov_deg, big), faces, lines)
+        image = image.reduce(OVERSAMPLING)
+        image_number = int(np.searchsorted(decided, k, side="right")) - 1
+        if flight.depth_m is not None and 0 <= image_number < len(flight.depth_m):
+            _inset(image, flight.depth_m[image_number])
+        ended = time >= flight.time_s[-1]
+        _write_on(image, track, result, float(time), float(speed[k]), next_gate, ended)
+        yield image
+
+
+def _at(flight: Flight, values: np.ndarray, time: float) -> np.ndarray:
+    return np.array([np.interp(time, flight.time_s, column) for column in values.T])
+
+
+def _chase(
+    flight: Flight, rot_w: np.ndarray, options: VideoOptions
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the eye is and what it looks at for every row, (T, 3) each [m]."""
+    step = max(float(np.median(np.diff(flight.time_s))), 1e-6)
+    # The heading helps out where the drone stands still.
+    way = flight.vel_w[:, :2] + 0.5 * rot_w[:, :2, 0]
+    way = gaussian_filter1d(np.nan_to_num(way), 0.25 / step, axis=0, mode="nearest")
+    way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-6)
+    ahead = np.insert(way, 2, 0.0, axis=1)
+    smooth = gaussian_filter1d(np.nan_to_num(flight.pos_w), 0.06 / step, axis=0, mode="nearest")
+    up = np.array([0.0, 0.0, options.above_m])
+    eye = smooth - options.behind_m * ahead + up
+    eye[:, 2] = np.maximum(eye[:, 2], 0.15)
+    return eye, smooth + 1.2 * ahead + 0.15 * up
+
+
+def _track_colour(gate: np.ndarray, next_gate: int) -> np.ndarray:
+    colour = np.tile(np.array(colours.SOLID, dtype=float), (len(gate), 1))
+    colour[gate >= 0] = 0.55 * np.array(colours.AHEAD) + 0.45 * 255
+    colour[gate == next_gate] = colours.AHEAD
+    colour[(gate >= 0) & (gate < next_gate)] = colours.PASSED
+    return colour
+
+
+def _drone_faces(pos_w: np.ndarray, rot_w: np.ndarray) -> Faces:
+    """Return a body and four rotors, the front ones orange."""
+    x, y, z = 0.064, 0.064, 0.025
+    box = np.array([[i * x, j * y, k * z] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    body = [box[[q[0], q[a], q[a + 1]]] for q in quads for a in (1, 2)]
+    angle = np.linspace(0, 2 * np.pi, 13)
+    ring = ROTOR_RADIUS_M * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    parts, colour = list(body), [colours.DRONE] * len(body)
+    for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        middle = np.array([i * ARM_M / np.sqrt(2), j * ARM_M / np.sqrt(2), 0.03])
+        for a, b in zip(ring[:-1], ring[1:], strict=True):
+            parts += [np.array([middle, middle + a, middle + b])]
+            parts += [np.array([middle, middle + b, middle + a])]  # seen from below, too
+            colour += [colours.AHEAD if i > 0 else colours.SOLID_EDGE] * 2
+    return Faces(pos_w + np.array(parts) @ rot_w.T, np.array(colour, dtype=float))
+
+
+def _inset(image: Image.Image, depth_m: np.ndarray) -> None:
+    width = image.width // 5
+    height = width * depth_m.shape[0] // depth_m.shape[1]
+    small = Image.fromarray(colours.depth_colours(depth_m, DEPTH_RANGE_M))
+    at = (image.width - width - 12, 12)
+    image.paste(small.resize((width, height), Image.Resampling.NEAREST), at)
+    corner = (at[0] + width, at[1] + height)
+    ImageDraw.Draw(image).rectangle([at[0] - 1, at[1] - 1, *corner], outline=colours.DRONE)
+
+
+def _write_on(
+    image: Image.Image,
+    track: Track,
+    result: TrialResult,
+    time: float,
+    speed: float,
+    passed: int,
+    ended: bool,
+) -> None:
+    draw = ImageDraw.Draw(image)
+    font = ImageFont.load_default(size=image.height // 27)
+    gates = len(track.scene.gates.center_w)
+    title = f"{track.family}  level {track.level}  seed {track.seed}"
+    draw.text((14, 10), title, fill=colours.DRONE, font=font)
+    status = f"{time:5.2f} s    {speed:4.1f} m/s    gates {passed}/{gates}"
+    draw.text((14, image.height * 0.93), status, fill=colours.DRONE, font=font)
+    if ended:
+        text = result.ended_by
+        if result.collided_with:
+            text += f" with {result.collided_with}"
+        colour = colours.PASSED if result.ended_by == "finished" else colours.CRASH
+        large = ImageFont.load_default(size=image.height // 14)
+        where = (image.width / 2, image.height * 0.2)
+        draw.text(where, text, fill=colour, font=large, anchor="mm")
+
+
+def _write_mp4(
+    path: Path,
+    frames: Iterator[Image.Image],
+    options: VideoOptions,
+    on_frame: Callable[[int], None] | None,
+) -> None:
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        options.size,
+        fps=options.fps,
+        codec="libx264",
+        macro_block_size=2,
+        quality=None,  # pyright: ignore[reportArgumentType] -- None leaves it to -crf
+        # Plays while it still loads, and in every browser.
+        output_params=["-crf", "22", "-movflags", "+faststart"],
+        ffmpeg_log_level="error",
+    )
+    writer.send(None)
+    try:
+        for number, frame in enumerate(frames, start=1):
+            writer.send(frame.tobytes())
+            if on_frame is not None:
+                on_frame(number)
+    finally:
+        writer.close()
+
+
+def _write_gif(
+    path: Path,
+    frames: Iterator[Image.Image],
+    options: VideoOptions,
+    on_frame: Callable[[int], None] | None,
+) -> None:
+    indexed: list[Image.Image] = []
+    for number, frame in enumerate(frames, start=1):
+        palette = indexed[0] if indexed else None
+        colour_count = 128
+        image = frame.quantize(colour_count) if palette is None else frame.quantize(palette=palette)
+        indexed.append(image)
+        if on_frame is not None:
+            on_frame(number)
+    duration = round(1000 / options.fps)
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
