@@ -28,7 +28,7 @@ def load_convex_parts(path: Path) -> list[np.ndarray]:
     if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
         raise ValueError(f"{path}: holds no triangles or corners that are not finite")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    parts = mesh.split(only_watertight=False)
+    parts = mesh.split(only_watertight=False, repair=False)
     for number, part in enumerate(parts):
         _check(path, number, len(parts), part)
     return [np.asarray(part.triangles, float) for part in parts]
