@@ -59,12 +59,18 @@ def write_trials(
     import pyarrow.parquet as pq
 
     schema = pa.schema(
-        [pa.field(name, _column_type(kind)) for name, kind in TrialResult.__annotations__.items()],
+        [pa.field(name, _column_type(kind)) for name, kind in _kinds().items()],
         metadata={"suite": to_json(header)},
     )
     columns = {name: [getattr(result, name) for result in results] for name in TrialResult._fields}
     with replacing_file(path) as beside:
         pq.write_table(pa.table(columns, schema=schema), beside)
+
+
+def _kinds() -> dict[str, str]:
+    """Return the type of each field as written; a named tuple wraps it in a ForwardRef."""
+    annotations = TrialResult.__annotations__.items()
+    return {name: getattr(kind, "__forward_arg__", kind) for name, kind in annotations}
 
 
 def _column_type(kind: str) -> Any:
@@ -186,7 +192,7 @@ class Journal:
 
 def _result(entry: dict[str, Any]) -> TrialResult:
     values = dict(entry)
-    for name, kind in TrialResult.__annotations__.items():
+    for name, kind in _kinds().items():
         if kind == "float" and values[name] is None:  # JSON has no NaN
             values[name] = math.nan
     return TrialResult(**values)
