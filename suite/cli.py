@@ -21,10 +21,14 @@ from suite.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 
 COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
+    "collect": "fly a policy and record every flight as a log",
     "effects": "the physical effects that a vehicle file may hold",
+    "eval": "judge policies: success rates, speeds and lap times, with intervals",
+    "export": "write a policy as torch program and ONNX",
     "info": "versions, devices, memory and commit, for bug reports",
-    "train": "train a policy by backpropagation through the point mass",
     "tracks": "list the track families, or draw a track as a picture",
+    "train": "train a policy by backpropagation through the point mass",
+    "view": "a recording, pictures and a video of trials",
 }
 """Name -> one-line summary; the command NAME lives in suite/commands/NAME.py."""
 

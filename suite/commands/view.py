@@ -1,0 +1,119 @@
+"""`suite view`: look at the trials of a run, or at a policy's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from suite.choices import at_least
+from suite.console import Console
+
+if TYPE_CHECKING:
+    from eval.trial import TrialSpec
+    from eval.view.recording import Rollout
+    from suite.evaluate import Judgement
+
+
+@dataclass(frozen=True)
+class Config:
+    """Fly trials of a run again and write a rerun recording, pictures and a video of them."""
+
+    run: tyro.conf.Positional[str]
+    """The --out of a suite eval, a shipped policy's name, a checkpoint's folder, or a policy
+    file."""
+    pick: Literal["first", "failed", "passed"] = "first"
+    """Which trials of the run: the first ones, or the first that failed or passed."""
+    count: int = 3
+    """How many trials at most."""
+    track: str = "all"
+    """For a policy: the tracks, as in suite eval."""
+    difficulty: str = "3"
+    """For a policy: the levels, as in suite eval."""
+    vehicle: str = "reference"
+    """For a policy: a shipped vehicle's name or a vehicle file (.toml)."""
+    seed: int = 0
+    """For a policy: the trials' seed."""
+    out: Path = Path("runs/view")
+    """Folder for the pictures (PNG) and the video."""
+    rerun: Path | None = None
+    """The recording (.rrd); by default trials.rrd in the folder."""
+    video: bool = False
+    """Also write a video (MP4) of the first trial; takes about its length."""
+    trust: bool = False
+    """Also load policy files that can run code on this machine."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Fly the chosen trials again and write what there is to see.
+
+    Raises:
+        ValueError: where `config.run` is neither a run nor a policy, or no trial is to be seen.
+    """
+    at_least("--count", config.count, 1)
+    at_least("--seed", config.seed, 0)
+    recording = config.rerun or config.out / "trials.rrd"
+    if recording.suffix != ".rrd":
+        raise ValueError(f"--rerun {recording}: a recording's name must end in .rrd")
+    judgement, trials = _chosen(config)
+    from eval.vehicle_file import load_vehicle
+    from eval.view.picture import write_picture
+    from eval.view.recording import write_recording
+    from suite.replay import drone_of, fly_again
+
+    console.note(f"flying {len(trials)} trials again")
+    rollouts = fly_again(judgement, trials)
+    write_recording(recording, rollouts, drone_of(load_vehicle(judgement.vehicle)))
+    written = [recording]
+    for rollout in rollouts:
+        written.append(write_picture(config.out / f"{_name(rollout)}.png", *rollout))
+        result = rollout[2]
+        hit = f" with {result.collided_with}" if result.collided_with else ""
+        console.say(
+            f"{_name(rollout)}: {result.gates_passed} gates, {result.ended_by}{hit} after "
+            f"{result.time_s:.1f} s"
+        )
+    if config.video:
+        from eval.view.video import write_video
+
+        written.append(write_video(config.out / f"{_name(rollouts[0])}.mp4", *rollouts[0]))
+    for path in written:
+        console.say(f"written: {path}")
+    console.say(f"open the recording with: rerun {recording}")
+    return {"written": written, "trials": [result for _, _, result in rollouts]}
+
+
+def _name(rollout: Rollout) -> str:
+    result = rollout[2]
+    return f"{Path(result.track).stem}-{result.difficulty}-{result.seed}"
+
+
+def _chosen(config: Config) -> tuple[Judgement, list[TrialSpec]]:
+    from suite.evaluate import Judgement
+    from suite.replay import first_trials, read_judgement
+
+    folder = Path(config.run)
+    if not (folder / "trials.parquet").is_file():
+        judgement = Judgement(
+            policies=(config.run,),
+            track=config.track,
+            difficulty=config.difficulty,
+            seed=config.seed,
+            vehicle=config.vehicle,
+            trust=config.trust,
+        )
+        return judgement, first_trials(judgement)[: config.count]
+    from eval.results import read_trials
+
+    judgement = read_judgement(folder)
+    results = read_trials(folder / "trials.parquet")
+    results = [result for result in results if result.policy == results[0].policy]
+    if config.pick != "first":
+        results = [result for result in results if result.success == (config.pick == "passed")]
+    if not results:
+        raise ValueError(f"--pick {config.pick}: {folder} holds no such trial")
+    return judgement, [result.trial for result in results[: config.count]]

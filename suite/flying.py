@@ -1,0 +1,130 @@
+"""What the commands that fly have in common: who flies, which trials, on what."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from suite.choices import is_track_file
+from suite.provenance import usable_cores
+
+if TYPE_CHECKING:
+    from eval.judge import JudgeOptions
+    from eval.trial import TrialSpec
+    from policies.policy import Policy
+    from tracks.track import Track
+
+TRIALS_A_PROCESS = 128
+"""Fewer trials than this are not worth another process, which takes seconds to start."""
+SECONDS_A_TRIAL = 0.08
+"""Of one core, for a trial of about 8 s on 70 solids."""
+START_SECONDS = 6.0
+"""To import, compile the policy and the first scenes."""
+PROCESS_BYTES = 1.0e9
+"""Memory of one process that flies 64 trials at once."""
+
+
+def default_policy() -> str:
+    """Return the name of the policy that flies when none is given.
+
+    Raises:
+        ValueError: where no policy is shipped.
+    """
+    from policies import shipped
+
+    names = shipped.names()
+    if not names:
+        raise ValueError("no policy is shipped with this version; give one with --policy")
+    return shipped.DEFAULT if shipped.DEFAULT in names else names[0]
+
+
+def policy_digest(name_or_path: str) -> str:
+    """Return the SHA-256 of a policy's file, or of all files of its folder by name, as hex."""
+    from policies import shipped
+
+    path = shipped.folder(name_or_path) if name_or_path in shipped.names() else Path(name_or_path)
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+def labels(policies: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Return what tables call each policy: its name, or what was asked for where names clash."""
+    if len(set(policies)) < len(policies):
+        twice = next(p for p in policies if list(policies).count(p) > 1)
+        raise ValueError(f"--policy {twice} is given twice; give each policy once")
+    return [
+        asked if list(names).count(name) > 1 else name
+        for asked, name in zip(policies, names, strict=True)
+    ]
+
+
+def trial_list(
+    tracks: Sequence[str], levels: Sequence[int], trials: int, seed: int
+) -> list[TrialSpec]:
+    """Return the trials of every track at every level, with the seeds seed, seed + 1, ...
+
+    A track from a file has no levels: it is flown once a seed.
+    """
+    from eval.trial import TrialSpec
+
+    seeds = range(seed, seed + trials)
+    return [
+        TrialSpec(track, level, number)
+        for track in tracks
+        for level in ([0] if is_track_file(track) else levels)
+        for number in seeds
+    ]
+
+
+def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
+    """Return the tracks of those `names` that are files.
+
+    Raises:
+        ValueError: for a bad file, with its key.
+    """
+    from tracks.custom import load_track
+
+    return {name: load_track(name) for name in names if is_track_file(name)}
+
+
+def options_for(trials: int, processes: int | None, world: str) -> JudgeOptions:
+    """Return how `trials` are flown; `processes` None takes what is worth it."""
+    from eval.judge import JudgeOptions
+
+    if processes is None:
+        worth = max(1, trials // TRIALS_A_PROCESS)
+        processes = 1 if world == "mjx" else min(usable_cores(), worth)
+    return JudgeOptions(processes=processes)
+
+
+def who_flies(
+    policy: Policy, name_or_path: str, trust: bool, processes: int | None
+) -> Policy | Callable[[], Policy]:
+    """Return the loaded policy, or for several processes how each of them loads its own."""
+    from policies.policy import load_policy
+
+    return policy if processes == 1 else partial(load_policy, name_or_path, trust)
+
+
+def track_of(tracks: Mapping[str, Track], trial: TrialSpec) -> Track:
+    """Return the track that a trial is flown on."""
+    from tracks.families import make_track
+
+    if trial.track in tracks:
+        return tracks[trial.track]
+    return make_track(trial.track, trial.difficulty, trial.seed)
+
+
+def about_policy(name_or_path: str, policy: Policy) -> dict[str, Any]:
+    """Return what a result file says of a policy: name, source and digest."""
+    return {
+        "name": policy.name,
+        "source": str(name_or_path),
+        "sha256": policy_digest(str(name_or_path)),
+    }
