@@ -122,11 +122,16 @@ def fly(
     return [results[index] for index in range(len(trials))]
 
 
+def _is_policy(policy: object) -> bool:
+    """Return whether this is a policy and not a function or class that makes one."""
+    return hasattr(policy, "act") and not isinstance(policy, type)
+
+
 def _process_count(task: _Task, trials: int) -> int:
     if task.options.processes is not None:
         return max(1, min(task.options.processes, trials))
     # A process takes seconds to start, and a policy object may not be of the kind that travels.
-    if task.world == "mjx" or hasattr(task.policy, "act") or trials < 4 * task.options.slots:
+    if task.world == "mjx" or _is_policy(task.policy) or trials < 4 * task.options.slots:
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -137,7 +142,7 @@ def _fly_share(
     emit: Callable[[int, TrialResult, Flight | None], None],
 ) -> None:
     """Fly numbered trials in this process."""
-    policy = task.policy if hasattr(task.policy, "act") else task.policy()
+    policy = task.policy if _is_policy(task.policy) else task.policy()
     if task.world == PLAIN:
         for index, trial in share:
             track = _track(task, trial)

@@ -146,7 +146,7 @@ class Journal:
             try:
                 entry = json.loads(line)
                 result = None if number == 0 else _result(entry)
-            except (ValueError, TypeError) as error:
+            except ValueError as error:
                 raise ValueError(
                     f"{self.path}: line {number + 1} is not a trial ({error}); move the file away "
                     "to start again"
@@ -190,9 +190,11 @@ class Journal:
         self.close()
 
 
-def _result(entry: dict[str, Any]) -> TrialResult:
+def _result(entry: Any) -> TrialResult:
+    if not isinstance(entry, dict) or entry.keys() != set(TrialResult._fields):
+        raise ValueError("its keys are not those of a trial")
     values = dict(entry)
-    for name, kind in _kinds().items():
+    for name, kind in TrialResult.__annotations__.items():
         if kind == "float" and values[name] is None:  # JSON has no NaN
             values[name] = math.nan
     return TrialResult(**values)

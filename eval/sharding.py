@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copyreg
 import multiprocessing
-import pickle
 import signal
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
+from multiprocessing.reduction import ForkingPickler
+from types import MappingProxyType
 from typing import Any
 
 Emit = Callable[..., None]
@@ -32,8 +34,9 @@ def fly_in_processes(work: Work, task: Any, items: list[Any], processes: int, em
         RuntimeError: where a process died or its work failed otherwise.
         KeyboardInterrupt: passed on after the processes have been ended.
     """
+    copyreg.pickle(MappingProxyType, _reduce_view)  # a vehicle's effects are one
     try:
-        pickle.dumps(task)
+        ForkingPickler.dumps(task)
     except Exception as error:
         raise ValueError(
             f"cannot be sent to other processes ({error}); give a function that makes the policy, "
@@ -57,6 +60,14 @@ def fly_in_processes(work: Work, task: Any, items: list[Any], processes: int, em
             worker.terminate()
         for worker in workers:
             worker.join()
+
+
+def _view(entries: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    return MappingProxyType(entries)
+
+
+def _reduce_view(view: MappingProxyType[Any, Any]) -> tuple[Any, ...]:
+    return _view, (dict(view),)
 
 
 def _receive(pipes: list[Connection], workers: list[Any], emit: Emit) -> None:

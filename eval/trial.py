@@ -88,6 +88,8 @@ class Rules:
     """A body faster than this [m/s] has diverged."""
     rate_limit: float = 1e4
     """A body turning faster than this [rad/s] has diverged."""
+    wrench_limit: float = 1e6
+    """A force [N] or torque [N m] on the body beyond this has diverged."""
 
 
 class Course(NamedTuple):
@@ -135,10 +137,16 @@ def next_gate(course: Course, number: Array) -> Gates:
 def has_diverged(rules: Rules, pos_w: Array, vel_w: Array, rate_b: Array) -> Array:
     """Return which states (N, 3) are not finite or beyond any flight, (N,) bool."""
     xp = pos_w.__array_namespace__()
-    fast = (xp.abs(vel_w) <= rules.speed_limit).all(-1) & (xp.abs(rate_b) <= rules.rate_limit).all(
-        -1
-    )
-    return ~(xp.isfinite(pos_w).all(-1) & fast)  # a comparison with NaN is false
+    speed_fits = (xp.abs(vel_w) <= rules.speed_limit).all(-1)  # a comparison with NaN is false
+    rate_fits = (xp.abs(rate_b) <= rules.rate_limit).all(-1)
+    return ~(xp.isfinite(pos_w).all(-1) & speed_fits & rate_fits)
+
+
+def is_wrench(rules: Rules, force_b: Array, torque_b: Array) -> Array:
+    """Return which forces and torques (N, 3) are finite and within any flight's, (N,) bool."""
+    xp = force_b.__array_namespace__()
+    both = xp.concatenate([force_b, torque_b], axis=-1)
+    return (xp.abs(both) <= rules.wrench_limit).all(-1)  # a comparison with NaN is false
 
 
 def judge_state(

@@ -22,6 +22,7 @@ from eval.trial import (
     Rules,
     TrialSpec,
     has_diverged,
+    is_wrench,
     judge_state,
     next_gate,
     start_progress,
@@ -192,7 +193,7 @@ class MujocoWorld:
             if record:
                 due = flying & (step % self._cockpit.attitude_every == 0)
                 rows += self._rows(due, speed_before)
-            bad = ~(np.isfinite(force_b).all(-1) & np.isfinite(torque_b).all(-1))
+            bad = ~is_wrench(self._rules, force_b, torque_b)
             go = flying & ~bad
             self._applied[:, :3] = (motion.rot_w * force_b[:, None, :]).sum(-1)
             self._applied[:, 3:] = torque_b

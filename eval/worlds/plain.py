@@ -66,11 +66,10 @@ def fly_trial(
         # Judge the state that the last step led to.
         motion = _motion(data)
         pos_w = motion.pos_w[0]
-        speed = float(np.sqrt((motion.vel_w[0] ** 2).sum()))
         if not _is_flight(motion, rules):
             ended_by = "diverged"
             break
-        speeds.append(speed)
+        speeds.append(float(np.sqrt((motion.vel_w[0] ** 2).sum())))
         if data.ncon > 0:
             ended_by, collided_with = "collision", contact_name(model, data)
         else:
@@ -108,7 +107,7 @@ def fly_trial(
         noise = draws[None, step + 1] if len(draws) > 1 else None
         pilot, wrench = fly_step(cockpit, pilot, motion, action_b, gate_w, np.array([step]), noise)
         step += 1
-        if not np.isfinite([wrench.force_b, wrench.torque_b]).all():
+        if not (np.abs([wrench.force_b, wrench.torque_b]) <= rules.wrench_limit).all():
             ended_by = "diverged"
             break
         data.qfrc_applied[:3] = (motion.rot_w * wrench.force_b[:, None, :]).sum(-1)[0]

@@ -49,28 +49,28 @@ class Steady:
 
 
 class RandomNetwork:
-    """The CNN-GRU of the policies with random parameters, added to a pursuit so that it flies."""
+    """The CNN-GRU of the policies with random parameters, on top of a pursuit so that it flies."""
 
     name = "random-network"
 
     def __init__(self, seed=0, share=3.0):
         import jax
 
-        from policies.network import init, step
+        from policies.block_policy import proven
+        from policies.native import native_policy
+        from policies.network import init
 
         self.spec = PolicySpec()
-        self._params = init(jax.random.key(seed), self.spec)
-        self._step = jax.jit(step)
+        params = init(jax.random.key(seed), self.spec)
+        params["action.weight"] *= 100.0
+        self._network = proven(native_policy(params, self.spec, self.name), "test")
         self._pursuit = Pursuit()
         self._share = share
 
     def start(self, n):
-        return np.zeros((n, self.spec.hidden_size), np.float32)
+        return self._network.start(n)
 
     def act(self, hidden, state, image, fresh):
-        hidden = np.where(fresh[:, None], np.float32(0), hidden)
-        extra, hidden = self._step(self._params, hidden, state, image)
+        extra, hidden = self._network.act(hidden, state, image, fresh)
         action, _ = self._pursuit.act(np.zeros((len(state), 3)), state, image, fresh)
-        return action + np.float32(self._share) * np.tanh(100 * np.asarray(extra)), np.asarray(
-            hidden
-        )
+        return action + np.float32(self._share) * np.tanh(extra), hidden

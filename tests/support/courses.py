@@ -1,0 +1,30 @@
+"""Small tracks made by hand, for tests of the judge."""
+
+import numpy as np
+
+from tracks.scene import Boxes, Gates, Scene, Spheres, no_rods
+from tracks.track import Track
+
+
+def straight(distances=(2.0, 4.0), wall_at=None, height=1.5, name="straight"):
+    """Return gates without frames on the x axis, and a wall across it."""
+    n = len(distances)
+    half = 0.5
+    opening = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    gates = Gates(
+        np.array([[x, 0.0, height] for x in distances]),
+        np.tile(np.eye(3), (n, 1, 1)),
+        np.tile(opening, (n, 1, 1)),
+        np.full(n, 0.2),
+        np.full(n, 0.05),
+    )
+    walls = [] if wall_at is None else [[wall_at, 0.0, height]]
+    boxes = Boxes(
+        np.array(walls).reshape(-1, 3),
+        np.tile(np.eye(3), (len(walls), 1, 1)),
+        np.tile([0.05, 1.0, 1.0], (len(walls), 1)),
+    )
+    spheres = Spheres(np.zeros((0, 3)), np.zeros(0))
+    scene = Scene(gates, boxes, no_rods(), no_rods(), spheres, np.zeros((0, 3, 3)))
+    names = ("the wall",) * len(walls)
+    return Track(name, 0, 0, 0.0, scene, np.array([0.0, 0.0, height]), 0.0, names)
