@@ -1,5 +1,7 @@
 """The families have the numbers they promise, from (family, level, seed) alone."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -17,7 +19,9 @@ def arrays(track: Track) -> list[np.ndarray]:
     return [*parts, track.start_pos_w, np.array([track.start_yaw, track.difficulty])]
 
 
-def tracks_of(family: str, levels=LEVELS, seeds=SEEDS) -> list[Track]:
+def tracks_of(
+    family: str, levels: Sequence[int] = LEVELS, seeds: Sequence[int] = SEEDS
+) -> list[Track]:
     return [make_track(family, level, seed) for level in levels for seed in seeds]
 
 
@@ -295,7 +299,8 @@ def unreachable_gates(track: Track, step: float = 0.2, body: float = 0.2) -> lis
         height = part @ normals.T - np.sum(normals * corner, axis=-1)
         if height.size:
             free[tuple(box)] &= height.max(-1) > body
-    labels, _ = ndimage.label(free)
+    labels = np.zeros(free.shape, np.int32)
+    ndimage.label(free, output=labels)
 
     def label(point: np.ndarray) -> int:
         return int(labels[tuple(np.round((point - low) / step).astype(int))])

@@ -44,7 +44,7 @@ def test_the_field_is_the_line_integral(opening):
     rng = np.random.default_rng(len(opening))
     point_g = rng.uniform(-2, 2, (60, 3))
     point_g = point_g[away_from_rim(opening, point_g)]
-    rot_w, center_w = Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3)
+    rot_w, center_w = Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3)
     point_w = center_w + point_g @ rot_w.T
     field = magnetic_field(center_w, rot_w, opening, point_w)
     expected = by_line_integral(center_w, rot_w, opening, point_w)
@@ -95,7 +95,7 @@ def test_divergence_is_zero_and_so_is_curl_off_the_wire(seed):
 
 
 def test_far_away_it_is_a_dipole():
-    direction = Rotation.random(20, random_state=3).as_matrix()[:, 0]
+    direction = Rotation.from_quat(np.random.default_rng(3).normal(size=(20, 4))).as_matrix()[:, 0]
     near, far = (magnetic_field(*UPRIGHT, SQUARE, r * direction) for r in (20.0, 40.0))
     ratio = np.linalg.norm(near, axis=-1) / np.linalg.norm(far, axis=-1)
     assert np.allclose(ratio, 8, rtol=0.01)
@@ -107,7 +107,7 @@ def test_far_away_it_is_a_dipole():
 @given(seeds)
 def test_turning_everything_turns_the_field(seed):
     rng = np.random.default_rng(seed)
-    turn, shift = Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3)
+    turn, shift = Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3)
     point = rng.uniform(-2, 2, (20, 3))
     field = magnetic_field(*UPRIGHT, SQUARE, point)
     turned = magnetic_field(shift, turn, SQUARE, point @ turn.T + shift)
@@ -129,8 +129,9 @@ def test_both_libraries_and_any_leading_shape():
     rng = np.random.default_rng(2)
     point = rng.uniform(-3, 3, (6, 3))
     field = magnetic_field(*UPRIGHT, SQUARE, point)
-    shaped = [np.broadcast_to(a, (2, 3, *a.shape)) for a in (*UPRIGHT, SQUARE)]
-    assert np.allclose(magnetic_field(*shaped, point.reshape(2, 3, 3)).reshape(6, 3), field)
+    center, rot, corners = (np.broadcast_to(a, (2, 3, *a.shape)) for a in (*UPRIGHT, SQUARE))
+    shaped = magnetic_field(center, rot, corners, point.reshape(2, 3, 3))
+    assert np.allclose(shaped.reshape(6, 3), field)
     batched = jax.vmap(lambda p: magnetic_field(jnp.zeros(3), jnp.eye(3), jnp.asarray(SQUARE), p))
     assert np.allclose(batched(jnp.asarray(point)), field, rtol=2e-3, atol=1e-8)
 
