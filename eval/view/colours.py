@@ -31,7 +31,7 @@ def speed_colours(speed: np.ndarray, top: float) -> np.ndarray:
 
 def top_speed(speed: np.ndarray) -> float:
     """Return the speed that the colours end at, at least 1 [m/s]."""
-    return max(1.0, float(np.nanmax(speed)))
+    return max(1.0, float(np.nanmax(speed, initial=1.0)))
 
 
 def depth_colours(depth_m: np.ndarray, range_m: float) -> np.ndarray:

@@ -120,6 +120,8 @@ def _draw(
     axes: Axes, shown: Shown, view: tuple[int, int], speed: Normalize, small: bool = False
 ) -> None:
     track, flight, result = shown
+    if flight is not None and not len(flight.time_s):
+        flight = None  # a trial that ended at its first step
     gates = track.scene.gates
     passed = 0 if flight is None else int(flight.gate.max())
     if result is not None:
@@ -229,7 +231,7 @@ def _limits(track: Track, flight: Flight | None) -> tuple[np.ndarray, np.ndarray
 
 
 def _speed_range(flights: Sequence[Flight | None]) -> Normalize:
-    speeds = [np.linalg.norm(flight.vel_w, axis=1) for flight in flights if flight is not None]
+    speeds = [np.linalg.norm(flight.vel_w, axis=1) for flight in flights if flight]
     return Normalize(0.0, max(map(colours.top_speed, speeds), default=1.0))
 
 

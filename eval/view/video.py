@@ -5,7 +5,9 @@ The frames are painted by `scene3d.py`, so neither a display nor a GPU is needed
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,8 +89,9 @@ def write_video(
         raise ValueError(f"{path}: ending {path.suffix!r}; a video ends in .mp4 or .gif")
     if options.size[0] % 2 or options.size[1] % 2 or min(options.size) < 64:
         raise ValueError(f"size {options.size}; both must be even and 64 or more")
+    flight = _finite_part(flight)
     if len(flight.time_s) < 2:
-        raise ValueError(f"{path}: a flight of {len(flight.time_s)} rows; a video needs two")
+        raise ValueError(f"{path}: a flight of {len(flight.time_s)} usable rows; two are needed")
     frames = video_frames(track, flight, result, options)
     with replacing_file(path) as beside:
         if kind == ".gif":
@@ -136,6 +139,16 @@ def video_frames(
         ended = time >= flight.time_s[-1]
         _write_on(image, track, result, float(time), float(speed[k]), next_gate, ended)
         yield image
+
+
+def _finite_part(flight: Flight) -> Flight:
+    """Return the flight up to the first row that is not finite: where it diverged."""
+    state = np.concatenate([flight.pos_w, flight.quat_wxyz, flight.vel_w], axis=1)
+    bad = np.flatnonzero(~np.isfinite(state).all(axis=1))
+    if not len(bad):
+        return flight
+    rows = {name: getattr(flight, name)[: bad[0]] for name in Flight._fields[:-2]}
+    return flight._replace(**rows)
 
 
 def _at(flight: Flight, values: np.ndarray, time: float) -> np.ndarray:
@@ -227,25 +240,31 @@ def _write_mp4(
     options: VideoOptions,
     on_frame: Callable[[int], None] | None,
 ) -> None:
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        options.size,
-        fps=options.fps,
-        codec="libx264",
-        macro_block_size=2,
-        quality=None,  # pyright: ignore[reportArgumentType] -- None leaves it to -crf
-        # Plays while it still loads, and in every browser.
-        output_params=["-crf", "22", "-movflags", "+faststart"],
-        ffmpeg_log_level="error",
-    )
-    writer.send(None)
-    try:
-        for number, frame in enumerate(frames, start=1):
-            writer.send(frame.tobytes())
-            if on_frame is not None:
-                on_frame(number)
-    finally:
-        writer.close()
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+    size = f"{options.size[0]}x{options.size[1]}"
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(options.fps)]
+    # yuv420p and the index in front: plays in every browser, and while it still loads.
+    command += ["-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "22"]
+    command += ["-movflags", "+faststart", str(path)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe) as encoder:
+        assert encoder.stdin is not None and encoder.stderr is not None
+        try:
+            for number, frame in enumerate(frames, start=1):
+                encoder.stdin.write(frame.tobytes())
+                if on_frame is not None:
+                    on_frame(number)
+        except BrokenPipeError:
+            pass  # the encoder has given up and says why
+        except BaseException:
+            encoder.kill()
+            raise
+        finally:
+            with suppress(BrokenPipeError):
+                encoder.stdin.close()
+        reason = encoder.stderr.read().decode(errors="replace").strip()
+    if encoder.returncode:
+        raise OSError(f"{path.name}: the video encoder failed: {reason}")
 
 
 def _write_gif(
