@@ -1,7 +1,9 @@
-"""A convolution whose gradient is matrix products.
+"""A convolution whose gradient is a few large matrix products.
 
-XLA's CPU convolution gradients are slow, so the weight gradient is taken on explicit patches and
-the input gradient is a forward convolution with the flipped kernel.
+XLA's CPU gradients of small convolutions run at a tenth of the machine's matrix-product rate or
+less. Here a row of pixels, all its channels side by side, is one vector: a kernel row maps it to an
+output row by a banded matrix, so both gradients are products of matrices some hundreds wide. Two
+to three times the arithmetic of the convolution, at many times its speed.
 """
 
 from __future__ import annotations
@@ -12,21 +14,34 @@ import jax.numpy as jnp
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
 
 
-def _convolve(x: jax.Array, kernel: jax.Array, padding: str | list[tuple[int, int]]) -> jax.Array:
-    return jax.lax.conv_general_dilated(x, kernel, (1, 1), padding, dimension_numbers=_LAYOUT)
-
-
-def patches(x: jax.Array, rows: int, columns: int) -> jax.Array:
-    """Return the valid windows of x (N, H, W, C): (N, H', W', rows * columns * C)."""
-    height, width = x.shape[1] - rows + 1, x.shape[2] - columns + 1
-    shifted = [x[:, i : i + height, j : j + width] for i in range(rows) for j in range(columns)]
-    return jnp.concatenate(shifted, axis=-1)
-
-
 @jax.custom_vjp
 def conv_valid(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """Convolve x (N, H, W, C) with kernel (h, w, C, D), stride 1, no padding."""
-    return _convolve(x, kernel, "VALID")
+    return jax.lax.conv_general_dilated(x, kernel, (1, 1), "VALID", dimension_numbers=_LAYOUT)
+
+
+def _as_rows(x: jax.Array) -> jax.Array:
+    """Return (N, H, W, C) as (H, N, W * C), so that a range of rows is one block of memory."""
+    return x.transpose(1, 0, 2, 3).reshape(x.shape[1], x.shape[0], -1)
+
+
+def _banded(kernel_row: jax.Array, width: int) -> jax.Array:
+    """Return the matrix (W * C, W' * D) by which a kernel row (w, C, D) maps an input row."""
+    taps, inputs, outputs = kernel_row.shape
+    places = width - taps + 1
+    columns = [
+        jnp.pad(kernel_row, ((place, places - 1 - place), (0, 0), (0, 0)))
+        for place in range(places)
+    ]
+    return jnp.stack(columns, axis=2).reshape(width * inputs, places * outputs)
+
+
+def _fold(banded: jax.Array, taps: int, inputs: int, outputs: int) -> jax.Array:
+    """Return the gradient of a kernel row (w, C, D) from that of its banded matrix."""
+    width = banded.shape[0] // inputs
+    places = width - taps + 1
+    split = banded.reshape(width, inputs, places, outputs)
+    return sum(split[place : place + taps, :, place] for place in range(places))
 
 
 def _forward(x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
@@ -37,12 +52,20 @@ def _backward(
     saved: tuple[jax.Array, jax.Array], grad: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     x, kernel = saved
-    rows, columns, inputs, outputs = kernel.shape
-    windows = patches(x, rows, columns).reshape(-1, rows * columns * inputs)
-    kernel_grad = (windows.T @ grad.reshape(-1, outputs)).reshape(kernel.shape)
-    flipped = kernel[::-1, ::-1].transpose(0, 1, 3, 2)
-    full = [(rows - 1, rows - 1), (columns - 1, columns - 1)]
-    return _convolve(grad, flipped, full), kernel_grad
+    count, height, width, inputs = x.shape
+    reach, taps, _, outputs = kernel.shape
+    rows_out = height - reach + 1
+    x_rows, grad_rows = _as_rows(x), _as_rows(grad)
+    flat_grad = grad_rows.reshape(rows_out * count, -1)
+    kernel_grad, x_grad = [], jnp.zeros_like(x_rows)
+    for row in range(reach):
+        seen = x_rows[row : row + rows_out].reshape(rows_out * count, -1)
+        kernel_grad.append(_fold(seen.T @ flat_grad, taps, inputs, outputs))
+        back = flat_grad @ _banded(kernel[row], width).T
+        back = back.reshape(rows_out, count, -1)
+        x_grad = x_grad + jnp.pad(back, ((row, reach - 1 - row), (0, 0), (0, 0)))
+    x_grad = x_grad.reshape(height, count, width, inputs).transpose(1, 0, 2, 3)
+    return x_grad, jnp.stack(kernel_grad)
 
 
 conv_valid.defvjp(_forward, _backward)
