@@ -71,8 +71,10 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
     from eval.flight_log import log_from_flight, write_flight
     from eval.judge import Record, fly
     from eval.vehicle_file import load_vehicle
+    from eval.worlds import world_class
     from policies.policy import load_policy
 
+    world_class(collection.world)
     at_least("--trials", collection.trials, 1)
     at_least("--seed", collection.seed, 0)
     names = parse_tracks(collection.track)

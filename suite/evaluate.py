@@ -81,8 +81,10 @@ def evaluate(judgement: Judgement, out: Path, console: Console) -> dict[str, Any
     from eval.results import write_results
     from eval.table import markdown_table, rich_tables, summarise
     from eval.vehicle_file import load_vehicle
+    from eval.worlds import world_class
     from policies.policy import load_policy
 
+    world_class(judgement.world)
     at_least("--trials", judgement.trials, 1)
     at_least("--seed", judgement.seed, 0)
     names = parse_tracks(judgement.track)
