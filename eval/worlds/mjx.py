@@ -1,0 +1,327 @@
+"""The world `mjx`: many trials at once in JAX, for accelerators.
+
+MuJoCo's JAX engine moves the free body; its contacts are off, since they cost ten times as much as
+all else and a trial ends at the first of them: collisions are found by signed distance, images by
+analytic rays. Everything between two decisions of the policy is one compiled function. States are
+float32, so a flight drifts from the `mujoco` world's; a trial's outcome still depends on nothing
+but the trial.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from eval.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
+from eval.plant import Motion, body_constants, uses_noise
+from eval.quadrotor_model import add_quadrotor, set_true_inertia
+from eval.trial import (
+    DIVERGED,
+    FLYING,
+    Course,
+    Progress,
+    Rules,
+    TrialSpec,
+    has_diverged,
+    is_wrench,
+    judge_state,
+    next_gate,
+    start_progress,
+)
+from eval.vehicle import Vehicle
+from eval.worlds import Rows, View
+from eval.worlds.engine import start_state
+from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates, select
+from eval.worlds.touch import NEAR, TOUCH_M, gaps
+from tracks.camera import Camera, pixel_rays_b
+from tracks.cull import nearest_solids
+from tracks.depth import depth_image
+from tracks.mujoco_scene import GROUND
+from tracks.scene import Scene, pad, stack
+from tracks.track import Track
+
+Array = Any
+
+
+class Flying(NamedTuple):
+    """The state of all slots on the device."""
+
+    qpos: Array
+    """(N, 7)."""
+    qvel: Array
+    """(N, 6)."""
+    pilot: Autopilot
+    progress: Progress
+
+
+class MjxWorld:
+    """Slots of one compiled program."""
+
+    name = "mjx"
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        camera: Camera,
+        layout: Layout,
+        rules: Rules,
+        slots: int,
+        threads: int = 1,
+    ) -> None:
+        """Make the world; the arguments are those of `MujocoWorld`, `threads` is left to JAX."""
+        self.slots = slots
+        self._layout, self._rules, self._camera = layout, rules, camera
+        self._cockpit = make_cockpit(vehicle)
+        self.dt = self._cockpit.dt
+        self._model = mjx.put_model(_free_body(vehicle, self.dt))
+        self._half_size = np.asarray(vehicle.body.half_size)
+        self._middle_b = -np.asarray(body_constants(self._cockpit.plant).com_offset_b)
+        self._rays_b = jnp.asarray(pixel_rays_b(camera), jnp.float32)
+        self._has_noise = uses_noise(self._cockpit.plant)
+        self._noise = [np.zeros((1, 3), np.float32)] * slots
+        self._course = empty_course(slots, layout)
+        self._tracks: list[Track | None] = [None] * slots
+        self._scene: Scene | None = None
+        self._on_device: tuple[Course, Scene] | None = None
+        nothing = Motion(
+            jnp.zeros((slots, 3)), jnp.tile(jnp.eye(3), (slots, 1, 1)), jnp.zeros((slots, 3)),
+            jnp.zeros((slots, 3)),
+        )  # fmt: skip
+        progress = start_progress(nothing.pos_w)
+        progress = progress._replace(ended=jnp.full(slots, -1, jnp.int32))
+        qpos = jnp.tile(jnp.asarray([0.0, 0, 0, 1, 0, 0, 0]), (slots, 1))
+        pilot = start_autopilot(self._cockpit, nothing, self._start_noise())
+        self._state = Flying(qpos, jnp.zeros((slots, 6)), pilot, progress)
+
+    @property
+    def progress(self) -> Progress:
+        """Where the trial in each slot stands."""
+        return jax.tree.map(np.asarray, self._state.progress)
+
+    def _start_noise(self) -> np.ndarray | None:
+        return np.stack([draws[0] for draws in self._noise]) if self._has_noise else None
+
+    def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
+        """Start trials from (slot, track, trial)."""
+        started = np.zeros(self.slots, bool)
+        qpos = np.array(self._state.qpos)
+        for slot, track, trial in entries:
+            started[slot], self._tracks[slot] = True, track
+            gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
+            one = stack([track.scene._replace(gates=gates)], self._layout.solids)
+            if self._scene is None:
+                self._scene = jax.tree.map(lambda a: np.repeat(a, self.slots, axis=0), one)
+            for every, new in zip(jax.tree.leaves(self._scene), jax.tree.leaves(one), strict=True):
+                every[slot] = new[0]
+            for field, value in zip(self._course.gates, gates, strict=True):
+                field[slot] = value
+            self._course.count[slot] = len(track.scene.gates.center_w)
+            qpos[slot] = start_state(track)
+            if self._has_noise:
+                steps = round(self._rules.time_limit_s / self.dt) + 2
+                self._noise[slot] = noise_of(trial, steps).astype(np.float32)
+        # A copy: on a CPU JAX may go on looking at the array it is given.
+        self._on_device = jax.tree.map(lambda a: jnp.array(a), (self._course, self._scene))
+        self._state = self._start(
+            self._state, jnp.array(qpos), jnp.array(started), self._start_noise(), *self._on_device
+        )
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _start(
+        self,
+        state: Flying,
+        qpos: Array,
+        started: Array,
+        noise: Array | None,
+        course: Course,
+        scene: Scene,
+    ) -> Flying:
+        motion = _motion(qpos, jnp.zeros_like(state.qvel))
+        pilot = start_autopilot(self._cockpit, motion, noise)
+        fresh = Flying(qpos, jnp.zeros_like(state.qvel), pilot, start_progress(motion.pos_w))
+        state = select(started, fresh, state)
+        near = nearest_solids(scene, motion.pos_w, NEAR)
+        return self._judge(state, started, jnp.zeros_like(started), course, near)
+
+    def _judge(
+        self, state: Flying, which: Array, bad: Array, course: Course, near: Scene
+    ) -> Flying:
+        """Judge the current states of the slots in `which`; lost ones come back at rest."""
+        pos_w, rot_w, vel_w, rate_b = _motion(state.qpos, state.qvel)
+        diverged = bad | has_diverged(self._rules, pos_w, vel_w, rate_b)
+        gap = gaps(near, pos_w, rot_w, self._half_size, self._middle_b)
+        contact = (gap <= jnp.where(jnp.arange(gap.shape[1]) < gap.shape[1] - 1, TOUCH_M, 0)).any(
+            -1
+        )
+        judged = judge_state(
+            self._rules, state.progress, course, self.dt, pos_w, rot_w, vel_w, contact, diverged
+        )
+        progress = select(which, judged, state.progress)
+        lost = progress.ended == DIVERGED
+        rest = jnp.asarray([0.0, 0, 0, 1, 0, 0, 0])
+        qpos = jnp.where(lost[:, None], rest, state.qpos)
+        return Flying(qpos, jnp.where(lost[:, None], 0.0, state.qvel), state.pilot, progress)
+
+    def touched(self, slot: int) -> str:
+        """Return the name of the solid that the trial in `slot` collided with."""
+        track = self._tracks[slot]
+        assert track is not None
+        gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
+        scene = pad(track.scene._replace(gates=gates), self._layout.solids)
+        scene = jax.tree.map(lambda a: jnp.asarray(a[None], jnp.float32), scene)
+        pos_w, rot_w, _, _ = _motion(self._state.qpos[slot][None], self._state.qvel[slot][None])
+        gap = np.asarray(_gaps(scene, pos_w, rot_w, self._half_size, self._middle_b))[0]
+        return _solid_names(track, self._layout)[int(gap.argmin())]
+
+    def view(self, wanted: np.ndarray) -> View:
+        """Return what can be observed now."""
+        assert self._on_device is not None
+        course, scene = self._on_device
+        seen = self._look(self._state, course, scene)
+        return View(*(np.asarray(part, np.float64) for part in seen))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _look(self, state: Flying, course: Course, scene: Scene) -> View:
+        pos_w, rot_w, vel_w, _ = _motion(state.qpos, state.qvel)
+        depth = depth_image(scene, pos_w, rot_w, self._rays_b, self._camera.range_m)
+        depth = depth.reshape(self.slots, self._camera.height, self._camera.width)
+        return View(pos_w, rot_w, vel_w, next_gate(course, state.progress.gates).center_w, depth)
+
+    def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
+        """Fly each slot's action (N, 3) for its number of physics steps (N,)."""
+        assert self._on_device is not None
+        most = int(steps.max(initial=0))
+        noise = None
+        if self._has_noise:
+            first = np.asarray(self._state.progress.step) + 1
+            index = first + np.arange(most)[:, None]
+            noise = np.stack(
+                [draws[np.minimum(index[:, slot], len(draws) - 1)]
+                 for slot, draws in enumerate(self._noise)], axis=1,
+            )  # fmt: skip
+        self._state, rows = self._fly(
+            self._state, jnp.asarray(action_b, jnp.float32), jnp.asarray(steps), noise,
+            *self._on_device, most, record,
+        )  # fmt: skip
+        if not record:
+            return []
+        each = [jax.tree.map(np.asarray, part) for part in rows]
+        return [
+            Rows(*(field[k] for field in part)) for k in range(most) for part in each
+            if part.due[k].any()
+        ]  # fmt: skip
+
+    @functools.partial(jax.jit, static_argnums=(0, 7, 8))
+    def _fly(
+        self,
+        state: Flying,
+        action_b: Array,
+        steps: Array,
+        noise: Array | None,
+        course: Course,
+        scene: Scene,
+        most: int,
+        record: bool,
+    ) -> tuple[Flying, tuple[Rows, Rows] | None]:
+        near = nearest_solids(scene, state.qpos[:, :3], NEAR)
+
+        def one(state: Flying, inputs: tuple[Array, Array | None]) -> tuple[Flying, Any]:
+            done, draws = inputs
+            flying = (steps > done) & (state.progress.ended == FLYING)
+            motion, step = _motion(state.qpos, state.qvel), state.progress.step
+            gate_w = next_gate(course, state.progress.gates).center_w
+            pilot, (force_b, torque_b) = fly_step(
+                self._cockpit, state.pilot, motion, action_b, gate_w, step, draws
+            )
+            pilot = select(flying, pilot, state.pilot)
+            bad = ~is_wrench(self._rules, force_b, torque_b)
+            force_w = (motion.rot_w * force_b[:, None, :]).sum(-1)
+            applied = jnp.concatenate([force_w, torque_b], axis=-1)
+            qpos, qvel = self._integrate(state.qpos, state.qvel, applied)
+            go = flying & ~bad
+            moved = Flying(
+                jnp.where(go[:, None], qpos, state.qpos),
+                jnp.where(go[:, None], qvel, state.qvel),
+                pilot,
+                state.progress._replace(step=step + flying.astype(jnp.int32)),
+            )
+            after = self._judge(moved, flying, bad, course, near)
+            if not record:
+                return after, None
+            before = state._replace(pilot=pilot)
+            due = flying & (step % self._cockpit.attitude_every == 0)
+            ended = flying & (after.progress.ended != FLYING) & (after.progress.ended != DIVERGED)
+            return after, (
+                self._rows(due, before, state.pilot.memory.rotor_speed),
+                self._rows(ended, after, pilot.memory.rotor_speed),
+            )
+
+        return jax.lax.scan(one, state, (jnp.arange(most), noise))
+
+    def _integrate(self, qpos: Array, qvel: Array, applied: Array) -> tuple[Array, Array]:
+        """Return the state after one step of the free body."""
+        still = mjx.make_data(self._model)
+
+        def one(qpos: Array, qvel: Array, applied: Array) -> tuple[Array, Array]:
+            data = still.replace(qpos=qpos, qvel=qvel, qfrc_applied=applied)
+            data = mjx.step(self._model, data)
+            return data.qpos, data.qvel
+
+        return jax.vmap(one)(qpos, qvel, applied)
+
+    def _rows(self, due: Array, state: Flying, rotor_speed: Array) -> Rows:
+        command = state.pilot.command
+        return Rows(
+            due, state.progress.step * self.dt, state.qpos[:, :3], state.qpos[:, 3:],
+            state.qvel[:, :3], state.qvel[:, 3:], command.thrust, command.rate_b, rotor_speed,
+            state.progress.gates,
+        )  # fmt: skip
+
+
+_gaps = jax.jit(gaps)
+
+
+def _free_body(vehicle: Vehicle, dt: float) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.option.timestep = dt
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    add_quadrotor(spec, vehicle)
+    model = spec.compile()
+    set_true_inertia(model, vehicle)
+    return model
+
+
+def _motion(qpos: Array, qvel: Array) -> Motion:
+    """Return the motion (N, ...) of free joints; the quaternion is normalised on the way."""
+    quat = qpos[:, 3:]
+    w, x, y, z = (quat / jnp.sqrt((quat * quat).sum(-1, keepdims=True))).T
+    rot_w = jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        axis=-2,
+    )
+    return Motion(qpos[:, :3], rot_w, qvel[:, :3], qvel[:, 3:])
+
+
+def _solid_names(track: Track, layout: Layout) -> list[str]:
+    """Return a name for every column of `gaps` on the padded scene."""
+    names, left = [], list(track.names)
+    scene = track.scene
+    kinds = (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)
+    for kind, room in zip(kinds, layout.solids, strict=False):
+        real = len(kind[0])
+        names += left[:real] + ["parked"] * (room - real)
+        left = left[real:]
+    for mesh, size in zip(left, track.mesh_sizes, strict=True):
+        names += [mesh] * size
+    names += ["parked"] * (layout.solids.triangles - len(scene.triangles))
+    return [*names, GROUND]
