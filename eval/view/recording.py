@@ -64,7 +64,7 @@ def write_recording(
         drone: what the drone looks like and sees through, the defaults otherwise.
 
     Raises:
-        ValueError: where there is no rollout or one flew nothing.
+        ValueError: where there is no rollout.
         OSError: where the file cannot be written; nothing is left under its name.
     """
     if not rollouts:
@@ -83,10 +83,11 @@ def write_recording(
                 world = f"{tab.root}/world"
                 recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
                 _log_track(recording, world, tab, track, flight)
-                _log_path(recording, world, flight)
                 _log_marks(recording, world, track, result)
-                _log_drone(recording, f"{world}/drone", flight, drone)
-                _log_series(recording, tab.root, flight)
+                if len(flight.time_s):  # none where a trial ended at its first step
+                    _log_path(recording, world, flight)
+                    _log_drone(recording, f"{world}/drone", flight, drone)
+                    _log_series(recording, tab.root, flight)
                 _log_events(recording, f"{tab.root}/events", flight, result)
             recording.flush()
         finally:
@@ -95,8 +96,6 @@ def write_recording(
 
 
 def _tab(number: int, track: Track, flight: Flight, result: TrialResult) -> Tab:
-    if not len(flight.time_s):
-        raise ValueError(f"rollout {number} ({track.family} seed {track.seed}) has no rows")
     every = [solid.vertices for solid in track_solids(track)]
     points = np.concatenate([*every, track.start_pos_w[None], _finite(flight.pos_w)])
     title = f"{track.family} level {track.level} seed {track.seed}: {result.ended_by}"
@@ -143,7 +142,7 @@ def _log_track(
         frame = joined([solid for solid in solids if solid.gate == number])
         recording.log(entity, _mesh(*frame, None), static=True)
         passed = np.flatnonzero(flight.gate > number)
-        time = np.array([flight.time_s[0], *flight.time_s[passed[:1]]])
+        time = np.array([0.0, *flight.time_s[passed[:1]]])
         colour = [colours.AHEAD, colours.PASSED][: len(time)]
         recording.send_columns(entity, _times(time), rr.Mesh3D.columns(albedo_factor=colour))
     for solid in solids:
@@ -263,5 +262,5 @@ def _log_events(
     texts = [f"gate {flight.gate[row] - 1} passed" for row in rows]
     ended = f"{result.ended_by} with {result.collided_with}"
     texts.append(ended if result.collided_with else result.ended_by)
-    time = np.append(flight.time_s[rows], flight.time_s[-1])
+    time = np.append(flight.time_s[rows], result.time_s)
     recording.send_columns(entity, _times(time), rr.TextLog.columns(text=texts))

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
@@ -20,7 +21,7 @@ from eval.flight import Flight
 from eval.rotation import quat_to_rot
 from eval.trial import TrialResult
 from eval.view import colours
-from eval.view.scene3d import Faces, Lines, look_at, paint
+from eval.view.scene3d import SKY, Faces, Lines, look_at, paint
 from eval.view.solids import track_solids
 from tracks.files import replacing_file
 from tracks.track import Track
@@ -221,9 +222,11 @@ def _write_on(
     font = ImageFont.load_default(size=image.height // 27)
     gates = len(track.scene.gates.center_w)
     title = f"{track.family}  level {track.level}  seed {track.seed}"
-    draw.text((14, 10), title, fill=colours.DRONE, font=font)
+    # A pale edge keeps words readable on a dark gate.
+    edge: dict[str, Any] = {"stroke_width": max(1, image.height // 270), "stroke_fill": SKY}
+    draw.text((14, 10), title, fill=colours.DRONE, font=font, **edge)
     status = f"{time:5.2f} s    {speed:4.1f} m/s    gates {passed}/{gates}"
-    draw.text((14, image.height * 0.93), status, fill=colours.DRONE, font=font)
+    draw.text((14, image.height * 0.93), status, fill=colours.DRONE, font=font, **edge)
     if ended:
         text = result.ended_by
         if result.collided_with:
@@ -231,7 +234,7 @@ def _write_on(
         colour = colours.PASSED if result.ended_by == "finished" else colours.CRASH
         large = ImageFont.load_default(size=image.height // 14)
         where = (image.width / 2, image.height * 0.2)
-        draw.text(where, text, fill=colour, font=large, anchor="mm")
+        draw.text(where, text, fill=colour, font=large, anchor="mm", **edge)
 
 
 def _write_mp4(
