@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from eval.effects.interface import E3, GRAVITY
+from eval.effects.interface import GRAVITY
 from eval.plant import Command
 from eval.rate_loop import cross
 from eval.vehicle import Controller
@@ -30,7 +30,8 @@ def action_to_force(action_b: Array, rot_w: Array) -> Array:
         action_b: (..., 3) wanted net acceleration in the body axes of this moment [m/s^2].
         rot_w: (..., 3, 3) body to world, of the same moment.
     """
-    return (rot_w * action_b[..., None, :]).sum(axis=-1) + GRAVITY * E3
+    xp = action_b.__array_namespace__()
+    return (rot_w * action_b[..., None, :]).sum(axis=-1) + xp.asarray([0.0, 0.0, GRAVITY])
 
 
 def attitude_command(
@@ -51,7 +52,7 @@ def attitude_command(
     force_b = (rot_w * force_w[..., :, None]).sum(axis=-2)
     heading_b = (rot_w * heading_w[..., :, None]).sum(axis=-2)
     size = xp.sqrt(xp.maximum(xp.sum(force_b**2, axis=-1, keepdims=True), LEAST_FORCE**2))
-    up_b = xp.where(size > LEAST_FORCE, force_b / size, E3)
+    up_b = xp.where(size > LEAST_FORCE, force_b / size, xp.asarray([0.0, 0.0, 1.0]))
     tilt = _tilt_error(xp, up_b)
     yaw = _heading_error(xp, up_b, heading_b)
     error = xp.stack([tilt[0], tilt[1], yaw], axis=-1)

@@ -8,6 +8,9 @@ import numpy as np
 
 Array = Any
 
+NEGLIGIBLE = 1e-9
+"""Thrusts below this are rounding [N]."""
+
 
 def mixer_matrix(position_b: Array, spin: Array, torque_per_thrust: float) -> np.ndarray:
     """Return the matrix (4, 4) from rotor thrusts [N] to (force along z, torque about x, y, z).
@@ -50,6 +53,8 @@ def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> A
     without_yaw = xp.clip(force[..., None] * per_force + level, 0.0, thrust_max)
     room = xp.where(yaw > 0.0, thrust_max - without_yaw, without_yaw)
     asked = xp.abs(yaw)
-    share = xp.where(asked > room, room / xp.where(asked > room, asked, 1.0), 1.0)
+    # What is asked beyond the room by rounding alone is left to the clip.
+    beyond = asked > xp.maximum(room, NEGLIGIBLE)
+    share = xp.where(beyond, room / xp.where(beyond, asked, 1.0), 1.0)
     limited = without_yaw + xp.min(share, axis=-1, keepdims=True) * yaw
     return xp.where(outside, xp.clip(limited, 0.0, thrust_max), exact)

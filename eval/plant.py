@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.effects import EFFECTS
+from eval.effects import EFFECTS, find_effect
 from eval.effects.interface import GRAVITY, Array, Constants, Flow, Gust, as_arrays
 from eval.mixer import mix, mixer_matrix
 from eval.rate_loop import cross, rate_torque
@@ -108,10 +108,12 @@ def make_plant(
             them, also with leading batch axes (one vehicle a trial).
         max_delay: room to remember commands [s]; needed where a delay is traced, otherwise
             exactly what the delay needs.
+
+    Raises:
+        ValueError: for an effect that is not in the catalogue.
     """
-    values = dict(vehicle.effects) if effects is None else effects
-    # The table's order is the order in which effects act.
-    values = {name: as_arrays(values[name]) for name in EFFECTS if name in values}
+    given = dict(vehicle.effects) if effects is None else effects
+    values = {find_effect(name).name: as_arrays(value) for name, value in given.items()}
     rotors = vehicle.rotors
     constants = Constants(
         mass=np.asarray(vehicle.mass),
@@ -126,7 +128,7 @@ def make_plant(
         rate_gain=np.asarray(vehicle.controller.rate_gain),
         delay=np.asarray(0.0),
     )
-    for name, value in values.items():
+    for name, value in _in_order(values):
         change = EFFECTS[name].constants
         constants = constants if change is None else change(value, constants)
     nominal = Nominal(
@@ -169,7 +171,7 @@ def start_memory(
     command = xp.broadcast_to(packed[..., None], (*batch_shape, 4, length))
     still = xp.zeros((*batch_shape, 3))
     wind = {}
-    for name, value in plant.effects.items():
+    for name, value in _in_order(plant.effects):
         start = EFFECTS[name].gust
         if start is not None:
             wind[name] = still if noise is None else start(value, noise) + still
@@ -254,7 +256,7 @@ def spin_step(
     constants = plant.constants
     air_vel_w, winds = motion.vel_w, dict(memory.wind)
     still = xp.zeros_like(air_vel_w)
-    for name, value in plant.effects.items():
+    for name, value in _in_order(plant.effects):
         blow = EFFECTS[name].wind
         if blow is not None:
             before = memory.wind.get(name, still)
@@ -274,7 +276,7 @@ def spin_step(
         voltage_drop=voltage_drop,
     )
     thrust = constants.thrust_coefficient * spin.mean_square
-    for name, value in plant.effects.items():
+    for name, value in _in_order(plant.effects):
         change = EFFECTS[name].thrust
         thrust = thrust if change is None else change(value, flow, thrust)
     force_b = thrust.sum(axis=-1)[..., None] * constants.thrust_axis_b
@@ -284,7 +286,7 @@ def spin_step(
         [(arm[..., 1] * thrust).sum(axis=-1), -(arm[..., 0] * thrust).sum(axis=-1), about_z],
         axis=-1,
     )
-    for name, value in plant.effects.items():
+    for name, value in _in_order(plant.effects):
         push, twist = EFFECTS[name].force, EFFECTS[name].torque
         force_b = force_b if push is None else force_b + push(value, flow)
         torque_b = torque_b if twist is None else torque_b + twist(value, flow)
@@ -298,6 +300,11 @@ def accelerations(plant: Plant, motion: Motion, wrench: Wrench) -> tuple[Array, 
     spin_b = constants.inertia * motion.rate_b
     torque_b = wrench.torque_b - cross(motion.rate_b, spin_b)
     return force_w / constants.mass[..., None] + constants.gravity_w, torque_b / constants.inertia
+
+
+def _in_order(effects: dict[str, Any]) -> list[tuple[str, Any]]:
+    """Return the effects in the table's order, in which they act; JAX sorts dicts by name."""
+    return [(name, effects[name]) for name in EFFECTS if name in effects]
 
 
 def _delay_weight(delay: Array, dt: float, max_delay: float) -> Array:

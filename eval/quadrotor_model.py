@@ -85,6 +85,8 @@ def set_true_inertia(model: mujoco.MjModel, vehicle: Vehicle) -> None:
     """
     constants = body_constants(make_plant(vehicle, 1.0 / vehicle.controller.frequency))
     model.body(BODY).inertia[:] = constants.inertia
+    # For a lone free body MuJoCo steps with constants that it derived from the inertia.
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def _possible(inertia: np.ndarray) -> np.ndarray:

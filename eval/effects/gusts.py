@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from eval.effects.interface import Array, Effect, Gust, Parameter, per_axis
 
-VERTICAL = np.array([1.0, 1.0, 0.5])
-"""Intensity along world x, y, z over the horizontal intensity [1]."""
+VERTICAL = 0.5
+"""Vertical intensity over the horizontal one [1]."""
 
 
 class Gusts(NamedTuple):
@@ -23,7 +21,8 @@ class Gusts(NamedTuple):
 
 def start_of(values: Gusts, noise: Array) -> Array:
     """Return a stationary draw of the wind (..., 3) [m/s] from normal draws `noise` (..., 3)."""
-    return per_axis(values.intensity) * VERTICAL * noise
+    xp = noise.__array_namespace__()
+    return per_axis(values.intensity) * xp.asarray([1.0, 1.0, VERTICAL]) * noise
 
 
 def wind_of(values: Gusts, gust: Gust) -> Array:

@@ -20,8 +20,6 @@ Array = Any  # numpy.ndarray or jax.Array
 
 GRAVITY = 9.81
 """Magnitude of gravity [m/s^2]."""
-E3 = np.array([0.0, 0.0, 1.0])
-"""Body z axis in body axes; world z axis in the world."""
 
 
 class Constants(NamedTuple):
@@ -184,6 +182,12 @@ def as_arrays(values: Values) -> Values:
 def per_axis(value: Array) -> Array:
     """Return scalars (...,) as (..., 1), to multiply vectors (..., 3) or rotors (..., 4)."""
     return value[..., None]
+
+
+def along_z(value: Array) -> Array:
+    """Return value e3 (..., 3) for `value` (...,)."""
+    xp = value.__array_namespace__()
+    return xp.stack([xp.zeros_like(value), xp.zeros_like(value), value], axis=-1)
 
 
 def cross_e3(vector: Array) -> Array:

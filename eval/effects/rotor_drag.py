@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.effects.interface import E3, Array, Effect, Flow, Parameter, per_axis
+from eval.effects.interface import Array, Effect, Flow, Parameter, along_z, per_axis
 
 
 class RotorDrag(NamedTuple):
@@ -16,7 +16,7 @@ class RotorDrag(NamedTuple):
 
 def force_of(values: RotorDrag, flow: Flow) -> Array:
     """Return -k (sum Omega_i) (v_b - (v_b . e3) e3) (..., 3) [N]."""
-    in_plane = flow.air_vel_b * (1.0 - E3)
+    in_plane = flow.air_vel_b - along_z(flow.air_vel_b[..., 2])
     return -per_axis(values.coefficient * flow.rotor_speed.sum(axis=-1)) * in_plane
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.effects.interface import E3, Array, Effect, Flow, Parameter, per_axis
+from eval.effects.interface import Array, Effect, Flow, Parameter, along_z
 
 
 class TranslationalLift(NamedTuple):
@@ -17,7 +17,7 @@ class TranslationalLift(NamedTuple):
 def force_of(values: TranslationalLift, flow: Flow) -> Array:
     """Return m k (v_bx^2 + v_by^2) e3 (..., 3) [N], with the true mass."""
     sideways = flow.air_vel_b[..., 0] ** 2 + flow.air_vel_b[..., 1] ** 2
-    return per_axis(flow.constants.mass * values.coefficient * sideways) * E3
+    return along_z(flow.constants.mass * values.coefficient * sideways)
 
 
 EFFECT = Effect(
