@@ -310,6 +310,12 @@ def test_the_video_shows_drone_depth_and_gates():
     assert share(frames[0], colours.AHEAD, 50) > 3e-3
     assert share(frames[0], colours.DRONE, 12) > 5e-4
     assert share(frames[-1], colours.PASSED, 2) > 5e-4  # the word at the end
+    greens = []
+    for frame in frames[:-1]:
+        red, green, blue = np.moveaxis(np.asarray(frame, dtype=int)[100:, :], -1, 0)
+        greens.append(((green > 1.5 * red) & (green > 1.2 * blue)).mean())
+    # No gate is green before it was passed; just behind it the eye sees it green.
+    assert greens[0] == 0 < max(greens[2:])
     without = next(video_frames(*rollout("finished", None, False), VideoOptions((480, 270), 5)))
     differs = np.abs(np.asarray(frames[0], dtype=int) - np.asarray(without)).max(axis=-1) > 3
     rows, cols = np.nonzero(differs)
