@@ -1,6 +1,7 @@
 """Recordings, pictures and videos show what was flown, and are read back to see that."""
 
 import subprocess
+import sys
 from functools import cache
 
 import imageio_ffmpeg
@@ -180,7 +181,8 @@ def test_a_recording_opens_laid_out(recorded):
 
 def test_the_rerun_command_finds_the_recording_sound(recorded):
     path, _ = recorded
-    done = subprocess.run(["rerun", "rrd", "verify", path], capture_output=True, text=True)
+    command = [sys.executable, "-m", "rerun", "rrd", "verify", path]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
