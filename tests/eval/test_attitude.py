@@ -1,5 +1,7 @@
 """From an action to a command: frames, limits, and every attitude that has no obvious answer."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -93,6 +95,24 @@ def test_following_the_rates_arrives(direction, start, heading):
     flat = heading_w - (heading_w @ up_w) * up_w
     if np.linalg.norm(flat) > 0.01:
         assert rot_w[:, 0] @ flat / np.linalg.norm(flat) > 0.999
+
+
+@given(DIRECTIONS, st.lists(st.floats(-3.1, 3.1), min_size=3, max_size=3), ANGLES)
+def test_the_error_is_the_turn_to_the_goal(direction, start, heading):
+    """The tilt by the shortest arc and then the yaw lead exactly to where it was asked to be."""
+    size = np.linalg.norm(direction)
+    up_w = direction / size if size > 0.1 else np.array([0.0, 0.0, 1.0])
+    heading_w = np.array([np.cos(heading), np.sin(heading), 0.0])
+    rot_w = exp_rot(np.array(start))
+    unlimited = replace(CONTROLLER, rate_max=(100.0, 100.0, 100.0))
+    rate = attitude_command(unlimited, 12.0 * up_w, rot_w, heading_w).rate_b
+    tilt, yaw = np.array([rate[0] / 8.0, rate[1] / 8.0, 0.0]), np.array([0.0, 0.0, rate[2] / 4.0])
+    tilted = rot_w @ exp_rot(tilt)
+    np.testing.assert_allclose(tilted[:, 2], up_w, atol=1e-5)
+    flat = heading_w - (heading_w @ up_w) * up_w
+    if np.linalg.norm(flat) > 0.01 and up_w @ rot_w[:, 2] > -0.999:
+        turned = tilted @ exp_rot(yaw)
+        np.testing.assert_allclose(turned[:, 0], flat / np.linalg.norm(flat), atol=1e-4)
 
 
 def test_tilt_is_corrected_whatever_the_heading():
