@@ -13,7 +13,7 @@ from tracks.depth import depth_image
 from tracks.families import FAMILIES, MAX_COUNTS, make_track
 from tracks.gates import yaw_rotation
 from tracks.mujoco_scene import add_scene
-from tracks.scene import Scene, counts, stack
+from tracks.scene import Boxes, Scene, counts, stack
 from tracks.track import Track
 
 CAMERA = Camera()
@@ -129,6 +129,24 @@ def test_culling_that_keeps_enough_changes_nothing():
     some = have._replace(boxes=have.boxes - 12, cylinders=8, capsules=6, spheres=6)
     culled = render(batch(track, POSES), *args, CAMERA.range_m, limits=some)
     assert np.allclose(culled, whole, atol=1e-4)
+
+
+def test_culling_keeps_what_only_reaches_into_view():
+    """A long box whose middle is out of view is kept before a far one in the middle of it."""
+    boxes = Boxes(
+        jnp.array([[[3.0, 5.0, 50.0], [6.0, 0.0, 51.0], [8.0, -1.0, 52.0]]]),
+        jnp.tile(jnp.eye(3), (1, 3, 1, 1)),
+        jnp.array([[[0.1, 4.5, 0.3], [0.2, 0.2, 0.2], [0.2, 0.2, 0.2]]]),
+    )
+    scene = batch(make_track("zigzag", 0, 0), 1)._replace(boxes=boxes)
+    args = (jnp.array([[0.0, 0.0, 50.0]]), jnp.eye(3)[None], jnp.asarray(RAYS), CAMERA.range_m)
+    limits = MAX_COUNTS._replace(boxes=2)
+    whole = render(scene, *args)
+    culled = render(scene, *args, limits=limits)
+    near = np.asarray(whole) < 7
+    assert 20 < near.sum() < 400 and np.any((whole > 7) & (whole < 9))
+    assert np.allclose(culled[near], whole[near], atol=1e-5)
+    assert np.all(culled[~near] > 7)
 
 
 def test_a_wall_ahead_has_the_same_planar_depth_in_every_pixel():

@@ -89,6 +89,27 @@ def test_every_track_is_well_formed(family):
         )
 
 
+def test_the_difficulty_is_anywhere_within_its_level():
+    share = np.array([t.difficulty * 10 - t.level for t in tracks_of("zigzag")])
+    assert share.min() < 0.1 and share.max() > 0.9 and abs(share.mean() - 0.5) < 0.1
+
+
+def test_things_on_the_ground_lie_or_stand_on_it():
+    seen = {"cylinder": 0, "capsule": 0}
+    for track in tracks_of("circular", [9]):
+        scene = track.scene
+        rods = [*zip(*scene.cylinders, strict=True), *zip(*scene.capsules, strict=True)]
+        first = len(scene.boxes.center_w)
+        for name, (center, axis, radius, half) in zip(track.names[first:], rods, strict=False):
+            if name.startswith("ground cylinder"):
+                assert np.allclose(axis, [0, 0, 1]) and center[2] == half
+                seen["cylinder"] += 1
+            elif name.startswith("ground capsule"):
+                assert abs(axis[2]) < 1e-9 and center[2] == radius
+                seen["capsule"] += 1
+    assert min(seen.values()) > 5
+
+
 def test_the_bound_on_solids_is_tight():
     most = np.max([counts(t.scene) for f in FAMILIES for t in tracks_of(f, [8, 9], range(60))], 0)
     assert most[0] == MAX_COUNTS.boxes
@@ -149,23 +170,20 @@ def test_about_half_of_the_closed_tracks_are_reversed():
         assert 70 < sum(turns) < 130
 
 
-def test_ellipse_has_two_apexes_and_two_straights():
+def test_ellipse_has_two_apexes_and_two_straights_flown_along_the_tangent():
     for track in tracks_of("ellipse"):
-        d, noise = track.difficulty, 0.2 + 0.8 * track.difficulty
-        x, y = track.scene.gates.center_w[:, :2].T
+        d, gates = track.difficulty, track.scene.gates
         half_x, half_y = 2.5 * (3.14 + 1.66 * d), 2.5 * (1.41 - 0.61 * d)
-        nominal_x = np.array([half_x, 5, 0, -5, -half_x, -5, 0, 5])
-        nominal_y = half_y * np.sqrt(1 - (nominal_x / half_x) ** 2)
-        nominal_y *= [0, 1, 1, 1, 0, -1, -1, -1]
-        fits = [
-            np.max(np.abs([np.roll(nominal_x, s) - x, np.roll(w * nominal_y, s) - y]))
-            for s in range(8)
-            for w in (1, -1)
-        ] + [
-            np.max(np.abs([np.roll(nominal_x[::-1], s) - x, np.roll(nominal_y[::-1], s) - y]))
-            for s in range(8)
-        ]
-        assert min(fits) <= noise + 1e-9
+        x = np.array([half_x, 5, 0, -5, -half_x, -5, 0, 5])
+        y = half_y * np.sqrt(1 - (x / half_x) ** 2) * [0, 1, 1, 1, 0, -1, -1, -1]
+        both_ways = [(np.stack([x, way * y], -1), way) for way in (1, -1)]
+        fits = [(np.roll(xy, s, axis=0), way) for xy, way in both_ways for s in range(8)]
+        error = [np.abs(xy - gates.center_w[:, :2]).max() for xy, _ in fits]
+        assert min(error) <= 0.2 + 0.8 * d + 1e-9
+        xy, way = fits[int(np.argmin(error))]
+        tangent = np.arctan2(way * xy[:, 0] / half_x**2, -way * xy[:, 1] / half_y**2)
+        off = (yaw_of(track) - tangent + np.pi) % (2 * np.pi) - np.pi
+        assert np.all(np.abs(off) <= np.deg2rad(30) * d + 1e-9)
 
 
 @pytest.mark.parametrize(("family", "near", "far"), [("circular", 2, 4), ("ellipse", 2, 3)])
@@ -262,10 +280,18 @@ def test_gates_and_start_are_free_of_obstacles(family):
         share = np.clip((points - track.start_pos_w) @ way / (way @ way), 0, 1)
         gap = points - track.start_pos_w - share[:, None] * way
         assert np.linalg.norm(gap, axis=-1).min() > 0.5
-        for solid in (track.scene.boxes, track.scene.cylinders, track.scene.spheres):
-            center = solid.center_w[32:] if solid is track.scene.boxes else solid.center_w
-            gap = center[:, None, :2] - gates.center_w[None, :, :2]
-            assert np.all(np.linalg.norm(gap, axis=-1) >= 1.5)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_obstacles_keep_their_distance_from_all_gates(family):
+    nearest = np.inf
+    for track in tracks_of(family):
+        scene = track.scene
+        solids = (scene.cylinders, scene.capsules, scene.spheres)
+        center = np.concatenate([scene.boxes.center_w[32:], *(kind.center_w for kind in solids)])
+        gap = center[:, None, :2] - scene.gates.center_w[None, :, :2]
+        nearest = min(nearest, np.linalg.norm(gap, axis=-1).min(initial=np.inf))
+    assert 1.5 <= nearest < 1.6
 
 
 @pytest.mark.parametrize("family", FAMILIES)
