@@ -27,6 +27,7 @@ COMMANDS: dict[str, str] = {
     "export": "write a policy as torch program and ONNX",
     "info": "versions, devices, memory and commit, for bug reports",
     "tracks": "list the track families, or draw a track as a picture",
+    "delta": "fit the Delta Action Model to recorded flights",
     "train": "train a policy by backpropagation through the point mass",
     "view": "a recording, pictures and a video of trials",
 }

@@ -11,9 +11,8 @@ import tyro
 from suite.console import Console
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
-from suite.train.presets import PRESETS
+from suite.train.presets import preset
 from tracks.files import plain
-from tracks.names import unknown_name
 
 
 @dataclass(frozen=True)
@@ -44,9 +43,7 @@ def resolve(config: Config) -> TrainConfig:
     Raises:
         ValueError: for an unknown preset or setting, naming what is allowed.
     """
-    if config.preset not in PRESETS:
-        raise unknown_name("preset", config.preset, PRESETS)
-    run = replace(PRESETS[config.preset](), seed=config.seed)
+    run = replace(preset(config.preset), seed=config.seed)
     if config.iterations is not None:
         run = replace(run, optimizer=replace(run.optimizer, iterations=config.iterations))
     return override(run, config.set)

@@ -12,6 +12,7 @@ from suite.train.config import (
     PointMassConfig,
     TrainConfig,
 )
+from tracks.names import unknown_name
 
 
 def racer() -> TrainConfig:
@@ -47,3 +48,14 @@ def gpu() -> TrainConfig:
 
 PRESETS = {"racer": racer, "paper": paper, "small": small, "gpu": gpu}
 """Name -> function that returns the configuration; the docstring is its description."""
+
+
+def preset(name: str) -> TrainConfig:
+    """Return the recipe called `name`.
+
+    Raises:
+        ValueError: where there is none, with the names there are.
+    """
+    if name not in PRESETS:
+        raise unknown_name("preset", name, PRESETS)
+    return PRESETS[name]()

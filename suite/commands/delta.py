@@ -1,0 +1,61 @@
+"""`suite delta`: fit the Delta Action Model to recorded flights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from suite.console import Console
+
+
+@dataclass(frozen=True)
+class Config:
+    """Fit the Delta Action Model by gradients through the point mass."""
+
+    flights: tyro.conf.Positional[tuple[Path, ...]]
+    """Flight logs, or folders of them, as `suite collect` writes them."""
+    out: Path = Path("runs/delta")
+    """Folder for the checkpoint delta/, delta.json and table.md."""
+    preset: str = "racer"
+    """The training recipe whose point mass is corrected."""
+    held_out: float = 0.25
+    """Share of the flights that take no part in the fit."""
+    iterations: int = 1500
+    """Gradient steps."""
+    seed: int = 0
+    """Seed of the network, the split and the batches."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Fit, and show the errors on held-out flights beside those of the plain point mass.
+
+    Raises:
+        ValueError: for an unknown preset or logs that cannot be used.
+    """
+    from suite.delta.fit import FitConfig
+    from suite.delta.run import fit_delta, table
+    from suite.train.presets import preset
+    from tracks.files import plain
+
+    fitting = replace(
+        FitConfig(),
+        held_out=config.held_out,
+        iterations=config.iterations,
+        seed=config.seed,
+    )
+    physics = preset(config.preset).physics
+    result = fit_delta(fitting, physics, config.flights, config.out, console)
+    console.say(table(result, fitting.horizon_s))
+    console.say(f"delta: {config.out / 'delta'}")
+    return {
+        "delta": str(config.out / "delta"),
+        **{
+            name: plain(getattr(result, name))
+            for name in ("point_mass", "fitted_point_mass", "delta_action")
+        },
+    }

@@ -1,0 +1,1 @@
+"""Fitting the Delta Action Model to recorded flights (Su et al. 2026, Sec. III-D)."""

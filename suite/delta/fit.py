@@ -1,0 +1,190 @@
+"""The Delta Action Model fitted by gradients through the point mass, and its rivals.
+
+Held-out flights take no part in any fit. Beside the model stand the point mass as the trainer has
+it, and one whose lag, drag and delay were fitted to the same flights: the correction has to beat
+plain system identification to be worth its network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from policies import delta_network
+from suite.delta.replay import Plant, nominal_plant, replay
+from suite.delta.windows import Windows
+from suite.train.config import PointMassConfig
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """The fit."""
+
+    horizon_s: float = 1.0
+    """Length of a replayed window [s]."""
+    stride_s: float = 0.2
+    """Time between the starts of windows [s]."""
+    held_out: float = 0.25
+    """Share of the flights that take no part in the fit."""
+    iterations: int = 1500
+    """Gradient steps."""
+    batch: int = 256
+    """Windows per gradient step."""
+    rate: float = 5e-3
+    """Peak learning rate; it falls to zero as a cosine."""
+    velocity_weight: float = 0.3
+    """Weight of the velocity's error beside the position's [s]."""
+    size_weight: float = 1e-3
+    """Weight of the correction's size, so that it is no larger than it must be [s^2]."""
+    seed: int = 0
+    """Seed of the network, the split and the batches."""
+
+
+class Errors(NamedTuple):
+    """Mean distance between replay and record at the end of a window, over windows."""
+
+    position_m: float
+    """[m]."""
+    velocity_m_s: float
+    """[m/s]."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The fitted model and how it compares on held-out flights."""
+
+    params: dict[str, np.ndarray]
+    """Of the Delta Action network."""
+    identified: Plant
+    """The point mass whose lag, drag and delay were fitted."""
+    point_mass: Errors
+    """Held-out errors of the point mass as the trainer has it."""
+    fitted_point_mass: Errors
+    """Held-out errors with fitted lag, drag and delay."""
+    delta_action: Errors
+    """Held-out errors with the Delta Action Model."""
+    curve: list[dict[str, float]]
+    """Rows of iteration, fit error and held-out error [m]."""
+
+
+def window_errors(plant: Plant, windows: Windows, delta: Any) -> tuple[jax.Array, jax.Array]:
+    """Return position [m] and velocity [m/s] errors at the end of every window, (N,) each."""
+    pos, vel, _ = replay(plant, windows, delta)
+    return (
+        jnp.linalg.norm(pos[:, -1] - windows.pos_w[:, -1], axis=-1),
+        jnp.linalg.norm(vel[:, -1] - windows.vel_w[:, -1], axis=-1),
+    )
+
+
+def _loss(config: FitConfig, plant: Plant, windows: Windows, delta: Any) -> jax.Array:
+    pos, vel, correction = replay(plant, windows, delta)
+
+    def mean_norm(vector: jax.Array) -> jax.Array:
+        return jnp.sqrt((vector * vector).sum(-1) + 1e-8).mean()
+
+    apart = mean_norm(pos - windows.pos_w[:, 1:])
+    apart += config.velocity_weight * mean_norm(vel - windows.vel_w[:, 1:])
+    return apart + config.size_weight * (correction * correction).sum(-1).mean()
+
+
+def _descend(
+    config: FitConfig,
+    loss: Callable[[Any, Windows], jax.Array],
+    start: Any,
+    windows: Windows,
+    iterations: int,
+    watch: Callable[[int, Any], None],
+) -> Any:
+    optimizer = optax.adam(optax.cosine_decay_schedule(config.rate, iterations))
+
+    @jax.jit
+    def update(variables: Any, state: Any, batch: Windows) -> tuple[Any, Any]:
+        gradient = jax.grad(loss)(variables, batch)
+        change, state = optimizer.update(gradient, state)
+        return optax.apply_updates(variables, change), state
+
+    rng = np.random.default_rng(config.seed)
+    count = len(windows.time_step)
+    variables, state = start, optimizer.init(start)
+    for iteration in range(iterations):
+        chosen = rng.choice(count, min(config.batch, count), replace=False)
+        batch = Windows(*(array[chosen] for array in windows))
+        variables, state = update(variables, state, batch)
+        watch(iteration, variables)
+    return variables
+
+
+def identify(config: FitConfig, physics: PointMassConfig, windows: Windows) -> Plant:
+    """Return the point mass whose lag, drag and delay replay `windows` best."""
+    plant = nominal_plant(physics)
+    start = (jnp.log(plant.lag), plant.drag, plant.delay)
+
+    def as_plant(variables: Any) -> Plant:
+        lag, drag, delay = variables
+        return Plant(jnp.exp(lag), drag, jnp.clip(delay, 0.0, 2.0))
+
+    def loss(variables: Any, batch: Windows) -> jax.Array:
+        return _loss(config, as_plant(variables), batch, None)
+
+    # The rate suits a network's weights; four plain numbers move the same distance in fewer steps.
+    iterations = max(1, config.iterations // 3)
+    best = _descend(config, loss, start, windows, iterations, lambda *_: None)
+    return as_plant(best)
+
+
+def fit(
+    config: FitConfig,
+    physics: PointMassConfig,
+    known: Windows,
+    held_out: Windows,
+    show: Callable[[int, str], None] = lambda *_: None,
+) -> Fit:
+    """Fit the Delta Action Model to `known` and judge it on `held_out`.
+
+    Args:
+        config: the fit.
+        physics: the trainer's point mass, whose middle is corrected.
+        known: windows of the flights that are fitted.
+        held_out: windows of flights that take no part.
+        show: called with (iteration, words) as it goes.
+    """
+    plant = nominal_plant(physics)
+    errors = jax.jit(window_errors)
+    curve: list[dict[str, float]] = []
+    every = max(1, config.iterations // 50)
+
+    def loss(params: delta_network.Params, batch: Windows) -> jax.Array:
+        return _loss(config, plant, batch, params)
+
+    def watch(iteration: int, params: delta_network.Params) -> None:
+        if iteration % every and iteration + 1 < config.iterations:
+            return
+        row = {
+            "iteration": iteration,
+            "fit_m": float(errors(plant, known, params)[0].mean()),
+            "held_out_m": float(errors(plant, held_out, params)[0].mean()),
+        }
+        curve.append(row)
+        show(iteration + 1, f"1 s error {row['fit_m']:.3f} m, held out {row['held_out_m']:.3f} m")
+
+    def judged(plant: Plant, params: Any) -> Errors:
+        pos, vel = errors(plant, held_out, params)
+        return Errors(float(pos.mean()), float(vel.mean()))
+
+    start = delta_network.init(jax.random.key(config.seed))
+    params = _descend(config, loss, start, known, config.iterations, watch)
+    identified = identify(config, physics, known)
+    return Fit(
+        params={name: np.asarray(value) for name, value in params.items()},
+        identified=Plant(*(np.asarray(value) for value in identified)),
+        point_mass=judged(plant, None),
+        fitted_point_mass=judged(identified, None),
+        delta_action=judged(plant, params),
+        curve=curve,
+    )

@@ -1,0 +1,90 @@
+"""Recorded actions flown again in the point mass, corrected or not."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from policies import delta_network
+from policies.observation import to_body, to_world
+from suite.delta.windows import Windows
+from suite.train import point_mass
+from suite.train.config import PointMassConfig
+
+
+class Plant(NamedTuple):
+    """Constants of the replayed point mass, scalars and one vector."""
+
+    lag: jax.Array
+    """Rate at which the acceleration follows the command [1/s]."""
+    drag: jax.Array
+    """(3,) linear drag in body axes [1/s]."""
+    delay: jax.Array
+    """Delay of a command in decisions."""
+
+
+def nominal_plant(config: PointMassConfig) -> Plant:
+    """Return the middle of the trainer's ranges."""
+    low, high = config.drag
+    return Plant(
+        jnp.asarray(config.lag_mean),
+        jnp.full(3, (low + high) / 2),
+        jnp.asarray(sum(config.action_delay) / 2),
+    )
+
+
+def replay(
+    plant: Plant, windows: Windows, delta: delta_network.Params | None
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return pos_w, vel_w (N, T, 3) after every decision, and the corrections (N, T, 3).
+
+    The state is the simulated one throughout (Eq. delta_action_loss); only the nose direction,
+    which the point mass does not decide, follows the record.
+    """
+    count = windows.action_b.shape[0]
+    rot_w = jnp.asarray(windows.rot_w)
+    air_b = to_body(rot_w, windows.vel_w[:, 0])
+    thrust_w = windows.acc_w + to_world(rot_w, plant.drag * air_b)
+    body = point_mass.Body(
+        pos_w=windows.pos_w[:, 0],
+        vel_w=windows.vel_w[:, 0],
+        thrust_w=thrust_w,
+        acc_w=windows.acc_w,
+        rot_w=rot_w,
+        heading_w=windows.heading_w[:, 0],
+        commands_w=windows.commands_w,
+    )
+
+    def step(
+        carry: tuple[point_mass.Body, jax.Array], inputs: tuple[jax.Array, ...]
+    ) -> tuple[tuple[point_mass.Body, jax.Array], tuple[jax.Array, ...]]:
+        body, hidden = carry
+        action, heading, time_step = inputs
+        correction = jnp.zeros_like(action)
+        if delta is not None:
+            vel_b = to_body(body.rot_w, body.vel_w)
+            correction, hidden = delta_network.step(delta, hidden, vel_b, body.rot_w[:, 2], action)
+        constants = point_mass.Constants(
+            lag=jnp.broadcast_to(plant.lag, count),
+            drag=jnp.broadcast_to(plant.drag, (count, 3)),
+            wind_w=jnp.zeros((count, 3)),
+            time_step=time_step,
+            delay=jnp.broadcast_to(plant.delay, count),
+        )
+        body = point_mass.step(body, constants, action + correction, body.pos_w, 0.0, 0.0)
+        body = body._replace(
+            heading_w=heading,
+            rot_w=point_mass.attitude(jax.lax.stop_gradient(body.thrust_w), heading),
+        )
+        return (body, hidden), (body.pos_w, body.vel_w, correction)
+
+    by_step = (
+        jnp.swapaxes(windows.action_b, 0, 1),
+        jnp.swapaxes(windows.heading_w, 0, 1)[1:],
+        jnp.swapaxes(windows.time_step, 0, 1),
+    )
+    start = (body, delta_network.start(count))
+    _, (pos, vel, correction) = jax.lax.scan(step, start, by_step)
+    return tuple(jnp.swapaxes(array, 0, 1) for array in (pos, vel, correction))
