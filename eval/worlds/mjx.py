@@ -9,14 +9,15 @@ but the trial.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import io
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from eval.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
 from eval.plant import Motion, body_constants, uses_noise
@@ -45,6 +46,9 @@ from tracks.depth import depth_image
 from tracks.mujoco_scene import GROUND
 from tracks.scene import Scene, pad, stack
 from tracks.track import Track
+
+with contextlib.redirect_stdout(io.StringIO()):  # its import prints what optional parts are missing
+    from mujoco import mjx
 
 Array = Any
 

@@ -1,0 +1,108 @@
+"""The race as a standard `dm_control.rl.control.Environment`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from dm_control import mujoco as dm_mujoco
+from dm_control.mujoco import wrapper
+from dm_control.rl import control
+from dm_env import specs
+
+from eval.envs.race import ACTION_LIMIT, Race
+from eval.trial import Rules
+from eval.vehicle import Vehicle
+from eval.vehicle_file import load_vehicle
+from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
+from tracks.families import make_track
+from tracks.track import Track
+
+
+class RacePhysics(dm_mujoco.Physics):
+    """MuJoCo's physics in which every step goes through the quadrotor's plant."""
+
+    race: Race
+    reward: float
+
+    def step(self, nstep: int = 1) -> None:
+        """Fly the action that the task has set for `nstep` physics steps."""
+        self.reward = self.race.advance(self.data.ptr, self.action_b, nstep)
+
+    action_b: np.ndarray = np.zeros(ACTION_SIZE)
+    """(3,) set by the task before a step [m/s^2]."""
+
+
+class RaceTask(control.Task):
+    """Gates in order; reward and ends as in `eval.envs.race`."""
+
+    def initialize_episode(self, physics: RacePhysics) -> None:
+        """Put the quadrotor at the start."""
+        physics.race.place(physics.data.ptr)
+
+    def before_step(self, action: np.ndarray, physics: RacePhysics) -> None:
+        """Take the wanted net acceleration in body axes (3,) [m/s^2]."""
+        physics.action_b = np.asarray(action, float)
+
+    def after_step(self, physics: RacePhysics) -> None:
+        """Do nothing: the judge has judged every step."""
+
+    def action_spec(self, physics: RacePhysics) -> specs.BoundedArray:
+        """Return the bounds of an action [m/s^2]."""
+        bound = np.full(ACTION_SIZE, ACTION_LIMIT)
+        return specs.BoundedArray((ACTION_SIZE,), np.float64, -bound, bound, "acceleration_b")
+
+    def observation_spec(self, physics: RacePhysics) -> dict[str, specs.Array]:
+        """Return the shapes of what policies see."""
+        camera = physics.race.spec.camera
+        return {
+            "state": specs.Array((STATE_SIZE,), np.float32, "state"),
+            "image": specs.Array((camera.height, camera.width), np.float32, "image"),
+        }
+
+    def get_observation(self, physics: RacePhysics) -> dict[str, np.ndarray]:
+        """Return what policies see."""
+        return physics.race.observation(physics.data.ptr)
+
+    def get_reward(self, physics: RacePhysics) -> float:
+        """Return the reward of the last step."""
+        return physics.reward
+
+    def get_termination(self, physics: RacePhysics) -> float | None:
+        """Return the discount of an ended episode (1 where time was over), None while it goes."""
+        ended = physics.race.ended_by
+        if ended is None:
+            return None
+        return 1.0 if ended == "timeout" else 0.0
+
+
+def load(
+    family: str = "zigzag",
+    level: int = 0,
+    seed: int = 0,
+    track: Track | None = None,
+    vehicle: Vehicle | None = None,
+    spec: PolicySpec | None = None,
+    rules: Rules | None = None,
+    **environment: Any,
+) -> control.Environment:
+    """Return the environment of one track.
+
+    Args:
+        family: of the track.
+        level: 0 to 9.
+        seed: of the track.
+        track: flown instead of the family's.
+        vehicle: what flies; `eval/vehicles/reference.toml` where it is left out.
+        spec: rate, camera and encoding of the observation; the rate is met to a whole number of
+            physics steps.
+        rules: when an episode ends.
+        environment: passed on to `dm_control.rl.control.Environment`.
+    """
+    track = track or make_track(family, level, seed)
+    race = Race(track, vehicle or load_vehicle("reference"), spec or PolicySpec(), rules or Rules())
+    physics = RacePhysics.from_model(wrapper.MjModel(race.model))
+    physics.race = race
+    return control.Environment(
+        physics, RaceTask(), n_sub_steps=race.steps_a_decision, **environment
+    )

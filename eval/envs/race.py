@@ -1,0 +1,167 @@
+"""One race on MuJoCo's plain C engine, driven action by action: what both environments wrap."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from eval.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
+from eval.guard import ActionLimits, guard_action
+from eval.plant import Motion, uses_noise
+from eval.trial import (
+    ENDINGS,
+    FINISHED,
+    FLYING,
+    Course,
+    Progress,
+    Rules,
+    TrialSpec,
+    has_diverged,
+    is_wrench,
+    judge_state,
+    next_gate,
+    start_progress,
+)
+from eval.vehicle import Vehicle
+from eval.worlds.engine import BODY, Eye, compile_model, start_state
+from eval.worlds.slots import layout_of, noise_of
+from policies.observation import encode_depth, state_vector
+from policies.spec import PolicySpec
+from tracks.scene import Gates
+from tracks.track import Track
+
+ACTION_LIMIT = 20.0
+"""Largest component of an action [m/s^2]."""
+STATE_LIMIT = 1e4
+"""Components of the state observation are clipped to this; flights stay far below."""
+GATE_REWARD = 1.0
+"""For a gate passed; progress earns 1 a metre besides."""
+CRASH_REWARD = -5.0
+"""For an end other than all gates passed or time over."""
+
+
+class Race:
+    """A trial by the judge's rules; the caller owns the model's data."""
+
+    def __init__(self, track: Track, vehicle: Vehicle, spec: PolicySpec, rules: Rules) -> None:
+        """Compile the model of `vehicle` on `track`."""
+        self.spec, self.rules = spec, rules
+        self.cockpit = make_cockpit(vehicle)
+        layout = layout_of([track])
+        self.model = compile_model(track, vehicle, self.cockpit.dt, layout.solids)
+        self.steps_a_decision = max(1, round(1 / (spec.rate_hz * self.cockpit.dt)))
+        self._start = start_state(track)
+        gates = Gates(*(np.asarray(field)[None] for field in track.scene.gates))
+        self._course = Course(gates, np.array([gates.center_w.shape[1]], np.int32))
+        self._draws: np.ndarray | None = None
+        if uses_noise(self.cockpit.plant):
+            trial = TrialSpec(track.family, track.level, track.seed)
+            steps = round(rules.time_limit_s / self.cockpit.dt)
+            self._draws = noise_of(trial, steps + self.steps_a_decision + 2)
+        self._eye = Eye(spec.camera)
+        self._pilot: Autopilot
+        self.progress: Progress
+        self.action_b = np.zeros((1, 3))
+
+    @property
+    def ended_by(self) -> str | None:
+        """One of `eval.trial.ENDINGS`, or None while it goes on."""
+        code = int(self.progress.ended[0])
+        return None if code == FLYING else ENDINGS[code - 1]
+
+    def place(self, data: mujoco.MjData) -> None:
+        """Put the quadrotor at the start, hovering; `data` has just been reset."""
+        data.qpos[:], data.qvel[:] = self._start, 0.0
+        mujoco.mj_step1(self.model, data)
+        motion = _motion(data)
+        noise = None if self._draws is None else self._draws[:1]
+        self._pilot = start_autopilot(self.cockpit, motion, noise)
+        self.progress = start_progress(motion.pos_w)
+        self.action_b = np.zeros((1, 3))
+        self._judge(data, bad_wrench=False)
+
+    def advance(self, data: mujoco.MjData, action_b: np.ndarray, steps: int) -> float:
+        """Fly `action_b` (3,) [m/s^2] for physics steps, or until the end; return the reward.
+
+        `data` holds what `mj_step1` computes, as `place` and this leave it.
+        """
+        limits = ActionLimits(size=ACTION_LIMIT * 3**0.5)
+        answer = np.asarray(action_b, float)[None]
+        guarded = guard_action(limits, answer, self.action_b, 0.0, "of the environment's user")
+        self.action_b = guarded.action_b
+        reward = 0.0
+        for _ in range(steps):
+            if self.progress.ended[0] != FLYING:
+                break
+            before = self.progress
+            motion, step = _motion(data), before.step
+            gate_w = next_gate(self._course, before.gates).center_w
+            noise = None if self._draws is None else self._draws[step + 1]
+            self._pilot, (force_b, torque_b) = fly_step(
+                self.cockpit, self._pilot, motion, self.action_b, gate_w, step, noise
+            )
+            good = bool(is_wrench(self.rules, force_b, torque_b)[0])
+            if good:
+                data.qfrc_applied[:3] = (motion.rot_w * force_b[:, None, :]).sum(-1)[0]
+                data.qfrc_applied[3:] = torque_b[0]
+                mujoco.mj_step2(self.model, data)
+            self.progress = before._replace(step=step + np.int32(1))
+            if good and not has_diverged(self.rules, *_state(data))[0]:
+                mujoco.mj_step1(self.model, data)
+                self._judge(data, bad_wrench=False)
+            else:
+                self._judge(data, bad_wrench=True)
+            after = self.progress
+            nearer = _distance(gate_w, before.pos_w) - _distance(gate_w, after.pos_w)
+            reward += nearer + GATE_REWARD * float(after.gates[0] - before.gates[0])
+        if self.ended_by not in (None, "finished", "timeout"):
+            reward += CRASH_REWARD
+        return reward
+
+    def _judge(self, data: mujoco.MjData, bad_wrench: bool) -> None:
+        motion = _motion(data)
+        with np.errstate(invalid="ignore", over="ignore"):
+            self.progress = judge_state(
+                self.rules,
+                self.progress,
+                self._course,
+                self.cockpit.dt,
+                motion.pos_w,
+                motion.rot_w,
+                motion.vel_w,
+                np.array([data.ncon > 0]),
+                np.array([bad_wrench]),
+            )
+
+    def observation(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        """Return what a policy sees: `state` (12,) and `image` (H, W), float32."""
+        pos_w, rot_w, vel_w, _ = _motion(data)
+        gate_w = next_gate(self._course, self.progress.gates).center_w
+        if self.ended_by == "diverged":
+            pos_w, rot_w, vel_w = self.progress.pos_w, np.eye(3)[None], np.zeros((1, 3))
+        state = state_vector(pos_w, vel_w, rot_w, gate_w, self.action_b)[0]
+        depth = self._eye.image(self.model, data, pos_w[0], rot_w[0])
+        image = encode_depth(self.spec.depth, depth, self.spec.camera.range_m)
+        return {
+            "state": np.clip(state, -STATE_LIMIT, STATE_LIMIT).astype(np.float32),
+            "image": image.astype(np.float32),
+        }
+
+    @property
+    def finished(self) -> bool:
+        """Whether all gates were passed."""
+        return int(self.progress.ended[0]) == FINISHED
+
+
+def _motion(data: mujoco.MjData) -> Motion:
+    rot_w = data.xmat[BODY].reshape(1, 3, 3).copy()
+    pos_w, velocity = data.qpos[None, :3].copy(), data.qvel[None].copy()
+    return Motion(pos_w, rot_w, velocity[:, :3], velocity[:, 3:])
+
+
+def _state(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return data.qpos[None, :3], data.qvel[None, :3], data.qvel[None, 3:]
+
+
+def _distance(a_w: np.ndarray, b_w: np.ndarray) -> float:
+    return float(np.sqrt(((a_w - b_w) ** 2).sum()))
