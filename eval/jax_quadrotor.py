@@ -6,6 +6,7 @@ starts from, its commands, and the values of every effect of its plant, delay an
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -33,7 +34,7 @@ class Rollout(NamedTuple):
     """(...) after the last step, to fly on from."""
 
 
-def fit_plant(vehicle: Vehicle, effects: dict[str, Any], dt: float | None = None) -> Plant:
+def fit_plant(vehicle: Vehicle, effects: Mapping[str, Any], dt: float | None = None) -> Plant:
     """Return a plant that holds every effect of the catalogue at once.
 
     Args:
@@ -41,7 +42,7 @@ def fit_plant(vehicle: Vehicle, effects: dict[str, Any], dt: float | None = None
         effects: values to use in their place, by name; may be traced.
         dt: length of a step [s]; 1 / controller.frequency if not given.
     """
-    values = all_values(vehicle) | effects
+    values = {**all_values(vehicle), **effects}
     return make_plant(vehicle, dt or 1.0 / vehicle.controller.frequency, values, MAX_DELAY)
 
 

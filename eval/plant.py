@@ -8,6 +8,7 @@ arrays, so that it can be built inside a differentiated function.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,7 +97,7 @@ class Plant(NamedTuple):
 def make_plant(
     vehicle: Vehicle,
     dt: float,
-    effects: dict[str, Any] | None = None,
+    effects: Mapping[str, Any] | None = None,
     max_delay: float | None = None,
 ) -> Plant:
     """Return the plant of `vehicle` for steps of `dt` [s].
@@ -302,7 +303,7 @@ def accelerations(plant: Plant, motion: Motion, wrench: Wrench) -> tuple[Array, 
     return force_w / constants.mass[..., None] + constants.gravity_w, torque_b / constants.inertia
 
 
-def _in_order(effects: dict[str, Any]) -> list[tuple[str, Any]]:
+def _in_order(effects: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Return the effects in the table's order, in which they act; JAX sorts dicts by name."""
     return [(name, effects[name]) for name in EFFECTS if name in effects]
 

@@ -1,6 +1,6 @@
 """The vehicle file (TOML): read, checked by key, written.
 
-What a file may hold is in docs; every refusal names the file, the key, the value and what is
+What a file may hold is in docs/vehicle.md; every refusal names the file, the key, the value and what is
 allowed.
 """
 

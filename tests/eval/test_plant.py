@@ -155,7 +155,9 @@ def reference_flight(vehicle, command_of, duration, start):
         asked = np.linalg.solve(allocation, [vehicle.mass * thrust, *torque])
         assert np.all((asked > 0) & (asked < vehicle.rotors.thrust_max))
         push = k_t * speed**2
-        twist = sum(np.cross(hub, [0, 0, f]) for hub, f in zip(hubs, push, strict=True))
+        twist = np.sum(
+            [np.cross(hub, [0, 0, f]) for hub, f in zip(hubs, push, strict=True)], axis=0
+        )
         twist = twist + [0, 0, -(spin * k_q * speed**2).sum()]
         turn = np.linalg.solve(inertia, twist - np.cross(rate, inertia @ rate))
         acc = attitude.apply([0, 0, push.sum() / vehicle.mass]) + [0, 0, -9.81]
