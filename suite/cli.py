@@ -42,7 +42,7 @@ def overview() -> str:
         "",
         "Train drone racing policies through a point mass and judge them in MuJoCo.",
         "",
-        *(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items()),
+        *(f"  {name:<{width}}  {summary}" for name, summary in sorted(COMMANDS.items())),
         "",
         "suite COMMAND --help says what a command takes; suite --version, the version.",
     ]
