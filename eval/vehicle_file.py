@@ -1,7 +1,7 @@
 """The vehicle file (TOML): read, checked by key, written.
 
-What a file may hold is in docs/vehicle.md; every refusal names the file, the key, the value and what is
-allowed.
+What a file may hold is in docs/vehicle.md; every refusal names the file, the key, the value and
+what is allowed.
 """
 
 from __future__ import annotations

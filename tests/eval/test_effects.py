@@ -15,6 +15,7 @@ from eval.effects.interface import neutral
 from eval.plant import (
     Command,
     Motion,
+    Wrench,
     accelerations,
     make_plant,
     plant_step,
@@ -377,7 +378,7 @@ def test_numpy_and_jax_agree_on_the_whole_catalogue():
 
     def fly(xp):
         state = Motion(*(xp.asarray(field) for field in motion))
-        memory = start_memory(plant, (n,), xp, xp.asarray(noise[0]))
+        memory, acting = start_memory(plant, (n,), xp, xp.asarray(noise[0])), Wrench(state, state)
         for k in range(12):
             command = Command(xp.asarray(commands[0][k]), xp.asarray(commands[1][k]))
             memory, acting = plant_step(
@@ -401,12 +402,12 @@ def test_parameters_with_a_batch_axis_are_one_vehicle_each():
     together = make_plant(PLAIN, 0.002, stacked, max_delay=0.04)
     motion = Motion(*(np.stack([field] * 3) for field in MOVING))
     command = Command(np.full(3, 12.0), np.tile([1.0, -1.0, 0.2], (3, 1)))
-    memory, acting = start_memory(together, (3,)), None
+    memory, acting = start_memory(together, (3,)), Wrench(None, None)
     for k in range(25):
         memory, acting = plant_step(together, memory, motion, command, np.full(3, 0.1 * k))
     for i, vehicle in enumerate(drawn):
         alone = make_plant(vehicle, 0.002, max_delay=0.04)
-        own, one = start_memory(alone, ()), None
+        own, one = start_memory(alone, ()), Wrench(None, None)
         for k in range(25):
             own, one = plant_step(
                 alone, own, MOVING, Command(command.thrust[i], command.rate_b[i]), 0.1 * k

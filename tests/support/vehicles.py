@@ -1,6 +1,7 @@
 """Vehicles for tests, described here and not read from the shipped files."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ PLAIN = Vehicle(
 """Rotors without lag, no effects."""
 
 
-def with_effects(vehicle=PLAIN, **values):
+def with_effects(vehicle: Vehicle = PLAIN, **values: Any) -> Vehicle:
     """Return `vehicle` with effects, each given as a tuple of its parameters."""
     effects = {name: EFFECTS[name].values(*parameters) for name, parameters in values.items()}
     return replace(vehicle, effects=effects)
