@@ -52,25 +52,11 @@ def overview() -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line (`argv` without the program's name) and return the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
-    if args[:1] == ["help"]:
-        args = [*args[1:2], "--help"]
-    if not args or args[0] in ("-h", "--help"):
-        print(overview(), file=sys.stdout if args else sys.stderr)
-        return DONE if args else UNUSABLE
-    if args[0] == "--version":
-        from tracks.version import VERSION
-
-        print(f"suite {VERSION}")
-        return DONE
-    name, *rest = args
-    if name not in COMMANDS:
-        from tracks.names import unknown_name
-
-        _complain(f"{unknown_name('command', name, COMMANDS)} See suite --help.")
-        return UNUSABLE
     try:
         with _termination_as_interrupt():
-            return _run(name, rest)
+            code = _dispatch(args)
+            sys.stdout.flush()
+            return code
     except KeyboardInterrupt:
         _complain("interrupted; what was finished is kept")
         return INTERRUPTED
@@ -87,6 +73,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         code, message = known
         _complain(message)
         return code
+
+
+def _dispatch(args: list[str]) -> int:
+    if args[:1] == ["help"]:
+        args = [*args[1:2], "--help"]
+    if not args or args[0] in ("-h", "--help"):
+        print(overview(), file=sys.stdout if args else sys.stderr)
+        return DONE if args else UNUSABLE
+    if args[0] == "--version":
+        from tracks.version import VERSION
+
+        print(f"suite {VERSION}")
+        return DONE
+    name, *rest = args
+    if name not in COMMANDS:
+        from tracks.names import unknown_name
+
+        raise unknown_name("command", name, COMMANDS)
+    return _run(name, rest)
 
 
 def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
