@@ -4,6 +4,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -126,7 +127,7 @@ def test_ground_effect_is_felt_by_each_rotor_at_its_own_height():
 def test_constant_wind_acts_through_drag_only():
     near(added(constant_wind=((1.0, 0.0, 0.0),))[0], 0.0)
     still = Motion(np.zeros(3), YAWED, np.zeros(3), np.zeros(3))
-    wind = {"constant_wind": ((1.0, 0.0, 0.5),), "linear_drag": ((0.3, 0.2, 0.1),)}
+    wind: dict[str, Any] = {"constant_wind": ((1.0, 0.0, 0.5),), "linear_drag": ((0.3, 0.2, 0.1),)}
     # Facing world y, the wind along world x comes from the left and blows to the right.
     near(added(still, **wind)[0], [0.0, -0.15, 0.0375])
 
@@ -232,11 +233,12 @@ def test_torque_trim():
 
 def test_inertia_scale_and_rate_gain():
     start, command = at_rest(), Command(np.array(9.81), np.array([1.0, -1.0, 0.5]))
-    for effects, expected in (
+    cases: list[tuple[dict[str, Any], list[float]]] = [
         ({}, [20.0, -20.0, 4.0]),
         ({"inertia_scale": ((0.8, 1.25, 2.0),)}, [25.0, -16.0, 2.0]),
         ({"rate_gain": ((0.5, 1.5, 2.0),)}, [10.0, -30.0, 8.0]),
-    ):
+    ]
+    for effects, expected in cases:
         plant = make_plant(with_effects(**effects), 0.002)
         _, acting = plant_step(plant, start_memory(plant, ()), start, command, 0.0)
         near(accelerations(plant, start, acting)[1], expected)
