@@ -26,8 +26,13 @@ class Bounds(NamedTuple):
 def bounds(scene: Scene) -> list[tuple[str, Bounds]]:
     """Return the bounding spheres of every kind, under its field's name in `Scene`."""
     rods = [
-        (name, Bounds(rod.center_w, jnp.hypot(rod.radius, rod.half_length) if flat else rod.radius
-                      + rod.half_length))
+        (
+            name,
+            Bounds(
+                rod.center_w,
+                jnp.hypot(rod.radius, rod.half_length) if flat else rod.radius + rod.half_length,
+            ),
+        )
         for name, rod, flat in (
             ("cylinders", scene.cylinders, True),
             ("capsules", scene.capsules, False),

@@ -85,8 +85,9 @@ def _cylinder(solid: tuple[Array, ...], rays: Array) -> Array:
 def _capsule(solid: tuple[Array, ...], rays: Array) -> Array:
     origin, axis, radius, half = solid
     offset = axis * half[:, None]
-    ends = jnp.minimum(_sphere((origin - offset, radius), rays),
-                       _sphere((origin + offset, radius), rays))
+    ends = jnp.minimum(
+        _sphere((origin - offset, radius), rays), _sphere((origin + offset, radius), rays)
+    )
     return jnp.minimum(_entry(*_tube(solid, rays)), ends)
 
 
@@ -163,7 +164,10 @@ def depth_image(
     origin = (pos_w[:, None] - scene.spheres.center_w) @ rot_w
     depth = _closest(depth, _sphere, (origin, scene.spheres.radius), rays)
     corners = (scene.triangles - pos_w[:, None, None]) @ rot_w[:, None]
-    triangle = (corners[:, :, 0], corners[:, :, 1] - corners[:, :, 0],
-                corners[:, :, 2] - corners[:, :, 0])
+    triangle = (
+        corners[:, :, 0],
+        corners[:, :, 1] - corners[:, :, 0],
+        corners[:, :, 2] - corners[:, :, 0],
+    )
     depth = _closest(depth, _triangle, triangle, rays)
     return jnp.minimum(depth, range_m)
