@@ -1,5 +1,8 @@
 """The race as a standard `dm_control.rl.control.Environment`."""
 
+# pyright: reportIncompatibleMethodOverride=false
+# dm_control's own abstract methods are annotated as returning None.
+
 from __future__ import annotations
 
 from typing import Any

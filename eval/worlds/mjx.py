@@ -87,6 +87,7 @@ class MjxWorld:
         self._half_size = np.asarray(vehicle.body.half_size)
         self._middle_b = -np.asarray(body_constants(self._cockpit.plant).com_offset_b)
         self._rays_b = jnp.asarray(pixel_rays_b(camera), jnp.float32)
+        self._most = 0
         self._has_noise = uses_noise(self._cockpit.plant)
         self._noise = [np.zeros((1, 3), np.float32)] * slots
         self._course = empty_course(slots, layout)
@@ -131,9 +132,10 @@ class MjxWorld:
                 steps = round(self._rules.time_limit_s / self.dt) + 2
                 self._noise[slot] = noise_of(trial, steps).astype(np.float32)
         # A copy: on a CPU JAX may go on looking at the array it is given.
-        self._on_device = jax.tree.map(lambda a: jnp.array(a), (self._course, self._scene))
+        on_device = jax.tree.map(lambda a: jnp.array(a), (self._course, self._scene))
+        self._on_device = on_device
         self._state = self._start(
-            self._state, jnp.array(qpos), jnp.array(started), self._start_noise(), *self._on_device
+            self._state, jnp.array(qpos), jnp.array(started), self._start_noise(), *on_device
         )
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -163,14 +165,17 @@ class MjxWorld:
         contact = (gap <= jnp.where(jnp.arange(gap.shape[1]) < gap.shape[1] - 1, TOUCH_M, 0)).any(
             -1
         )
-        judged = judge_state(
+        verdict = judge_state(
             self._rules, state.progress, course, self.dt, pos_w, rot_w, vel_w, contact, diverged
         )
-        progress = select(which, judged, state.progress)
+        progress = select(which, verdict, state.progress)
         lost = progress.ended == DIVERGED
         rest = jnp.asarray([0.0, 0, 0, 1, 0, 0, 0])
         qpos = jnp.where(lost[:, None], rest, state.qpos)
-        return Flying(qpos, jnp.where(lost[:, None], 0.0, state.qvel), state.pilot, progress)
+        qvel = jnp.where(lost[:, None], 0.0, state.qvel)
+        judged = Flying(qpos, qvel, state.pilot, progress)
+        # Types of their own: one that Python's numbers gave would compile everything twice.
+        return jax.tree.map(lambda a: a.astype(a.dtype), judged)
 
     def touched(self, slot: int) -> str:
         """Return the name of the solid that the trial in `slot` collided with."""
@@ -200,7 +205,8 @@ class MjxWorld:
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
         """Fly each slot's action (N, 3) for its number of physics steps (N,)."""
         assert self._on_device is not None
-        most = int(steps.max(initial=0))
+        # Decisions are a step more or less apart; one length means one compiled program.
+        self._most = most = max(self._most, int(steps.max(initial=0)))
         noise = None
         if self._has_noise:
             first = np.asarray(self._state.progress.step) + 1

@@ -15,8 +15,11 @@ from tracks.scene import Array, Counts, Scene
 
 NEAR = Counts(boxes=12, cylinders=4, capsules=4, spheres=4)
 """Solids looked at: the nearest of each kind, found anew once a decision of the policy."""
-ROUNDS = 8
-"""Projections to and fro."""
+ROUNDS = 12
+"""Projections to and fro; bodies that merely graze one another may be seen a few steps later."""
+REACH = 1.5
+"""Length of a projection over the way to the surface: beyond 1 the rounds converge faster, from 2
+on they may not."""
 TOUCH_M = 1e-3
 """Nearer than this is touching: as near as the rounds come, and half a step's way at 1 m/s [m]."""
 _KINDS = ("boxes", "cylinders", "capsules", "spheres", "triangles")
@@ -71,10 +74,13 @@ def _gap(alone: Scene, kind: str, middle_w: Array, rot_w: Array, half_size: Arra
         local = jnp.clip(local, -half_size, half_size)
         return middle + (rot * local[..., None, :]).sum(-1)
 
-    point = into_box(places.mean(-2)[:, :, 0] if kind == "triangles" else places[:, :, 0])
-    nearest = jnp.full(point.shape[:-1], jnp.inf, point.dtype)
-    for _ in range(ROUNDS):
+    start = into_box(places.mean(-2)[:, :, 0] if kind == "triangles" else places[:, :, 0])
+
+    def there_and_back(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        point, nearest = carry
         distance, away = distances(alone, point)
         nearest = jnp.minimum(nearest, distance[..., 0])
-        point = into_box(point - distance[..., :1] * away[..., 0, :])
-    return jnp.minimum(nearest, distances(alone, point)[0][..., 0])
+        return into_box(point - REACH * distance[..., :1] * away[..., 0, :]), nearest
+
+    nearest = jnp.full(start.shape[:-1], jnp.inf, start.dtype)
+    return jax.lax.fori_loop(0, ROUNDS, there_and_back, (start, nearest))[1]

@@ -50,7 +50,7 @@ def test_step_before_reset_is_refused():
 class TestDmControl(test_utils.EnvironmentTestMixin, absltest.TestCase):
     """dm_env's own conformance tests."""
 
-    def make_object_under_test(self):
+    def make_object_under_test(self, **unused):
         return load(rules=Rules(time_limit_s=0.5))
 
     def make_action_sequence(self):
@@ -80,7 +80,7 @@ def test_environments_fly_what_the_judge_flies(trial):
 
     env = RaceEnv(trial.track, trial.difficulty, trial.seed, spec=EVEN, rules=rules)
     observation, _ = env.reset()
-    over, total = False, 0.0
+    over, terminated, info, total = False, False, {}, 0.0
     while not over:
         observation, reward, terminated, truncated, info = env.step(
             pursue(policy, observation) / ACTION_LIMIT
@@ -90,7 +90,7 @@ def test_environments_fly_what_the_judge_flies(trial):
     assert terminated == (expected.ended_by != "timeout")
     end = np.array([expected.pos_x, expected.pos_y, expected.pos_z])
     # The action was divided and multiplied on its way.
-    assert env._race.progress.pos_w[0] == pytest.approx(end, abs=1e-5)
+    assert env._race is not None and env._race.progress.pos_w[0] == pytest.approx(end, abs=1e-5)
 
     other = load(*trial, spec=EVEN, rules=rules)
     step = other.reset()
@@ -107,7 +107,7 @@ def test_a_crash_costs_and_progress_pays():
     env = RaceEnv("zigzag", 0, 0)
     env.reset()
     down = np.array([0, 0, -1], np.float32)
-    rewards, over = [], False
+    rewards, over, info = [], False, {}
     while not over:
         _, reward, over, _, info = env.step(down)
         rewards.append(reward)

@@ -56,7 +56,8 @@ def pairs(both, only_first, only_second, neither):
 def test_paired_success_published(table, value, low, high):
     found = paired_success(*pairs(*table))
     assert found[:3] == pytest.approx((value, low, high), abs=6e-4)
-    turned = paired_success(*reversed(pairs(*table)))
+    first, second = pairs(*table)
+    turned = paired_success(second, first)
     assert turned[:3] == pytest.approx((-found.value, -found.high, -found.low))
 
 

@@ -45,7 +45,7 @@ class Steady:
         return np.zeros((n, 1), np.float32)
 
     def act(self, hidden, state, image, fresh):
-        return np.tile(np.float32(self.action_b), (len(state), 1)), hidden
+        return np.tile(np.array(self.action_b, np.float32), (len(state), 1)), hidden
 
 
 class RandomNetwork:
