@@ -1,0 +1,67 @@
+"""A trainer small enough for tests: few worlds, few steps, a narrow network, gate frames only."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from policies import network
+from policies.spec import PolicySpec
+from suite.train.config import (
+    EpisodeConfig,
+    LossConfig,
+    OptimizerConfig,
+    PointMassConfig,
+    TrainConfig,
+)
+from suite.train.worlds import Worlds, sample_worlds
+from tracks.camera import Camera
+from tracks.scene import Rods, Scene, Spheres
+
+SPEC = PolicySpec(camera=Camera(width=20, height=20), hidden_size=8)
+
+
+def small_config(batch=4, steps=6, physics=None, loss=None, optimizer=None, **episode):
+    """Return a run of a second; `physics`, `loss` and `optimizer` are settings by name."""
+    return TrainConfig(
+        spec=SPEC,
+        physics=PointMassConfig(**{"depth_noise": 0.0, **(physics or {})}),
+        loss=LossConfig(**(loss or {})),
+        episode=EpisodeConfig(batch=batch, steps=steps, **episode),
+        optimizer=OptimizerConfig(**{"iterations": 6, "warmup": 1, **(optimizer or {})}),
+    )
+
+
+def boxes_only(scene: Scene) -> Scene:
+    """Return a batched scene without its round solids, which compiles in a fraction of the time."""
+    rods = Rods(*(array[:, :0] for array in scene.cylinders))
+    spheres = Spheres(*(array[:, :0] for array in scene.spheres))
+    return scene._replace(cylinders=rods, capsules=rods, spheres=spheres)
+
+
+def boxes_worlds(config: TrainConfig, iteration: int = 0) -> Worlds:
+    """Return the worlds of an iteration with their boxes only."""
+    worlds = sample_worlds(config, iteration)
+    return worlds._replace(scene=boxes_only(worlds.scene))
+
+
+def doubled(tree):
+    """Return a tree with its float arrays as float64; call where JAX has 64 bits enabled."""
+    return jax.tree.map(
+        lambda x: jnp.asarray(x, float) if np.asarray(x).dtype.kind == "f" else x, tree
+    )
+
+
+def fresh_params(spec: PolicySpec = SPEC, seed: int = 0, lively: float = 30.0):
+    """Return parameters whose actions are of some m/s^2 instead of the start's near zero."""
+    params = network.init(jax.random.key(seed), spec)
+    params["action.weight"] *= lively
+    return params
+
+
+def largest_difference(tree, expected):
+    """Return the largest difference of any array relative to the largest entry of its like."""
+    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(expected), strict=True)
+    return max(
+        float(np.abs(np.asarray(a) - np.asarray(b)).max() / (np.abs(np.asarray(b)).max() + 1e-12))
+        for a, b in pairs
+    )
