@@ -72,6 +72,22 @@ def bootstrap_median(
     return Interval(float(np.median(values)), float(low), float(high))
 
 
+def bootstrap_mean(
+    values: np.ndarray, seed: int = 0, confidence: float = CONFIDENCE, resamples: int = 4000
+) -> Interval:
+    """Return the mean of values (n,) with its percentile bootstrap interval (Efron 1979).
+
+    NaN in all three where there is no value; the same seed gives the same interval.
+    """
+    values = np.asarray(values, float)
+    if not len(values):
+        return Interval(float("nan"), float("nan"), float("nan"))
+    draws = np.random.default_rng(seed).integers(0, len(values), (resamples, len(values)))
+    means = values[draws].mean(axis=1)
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return Interval(float(values.mean()), float(low), float(high))
+
+
 def paired_bootstrap(
     first: np.ndarray, second: np.ndarray, seed: int = 0, confidence: float = CONFIDENCE
 ) -> Interval:

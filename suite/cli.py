@@ -26,6 +26,7 @@ COMMANDS: dict[str, str] = {
     "eval": "judge policies: success rates, speeds and lap times, with intervals",
     "export": "write a policy as torch program and ONNX",
     "info": "versions, devices, memory and commit, for bug reports",
+    "loop": "train, fly, record, fit the Delta Action Model, fine-tune, fly again",
     "tracks": "list the track families, or draw a track as a picture",
     "delta": "fit the Delta Action Model to recorded flights",
     "train": "train a policy by backpropagation through the point mass",

@@ -62,13 +62,13 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
 
     Returns:
         What flights.json holds: the stamp, what was collected, and the flights as rows of results
-        with their `file` (null for a flight under one second, which is no log).
+        with their `file` (null for a flight that is no log: under one second, or refused with a
+        warning because its numbers break a rule of flight logs).
 
     Raises:
         ValueError: for anything in `collection` that cannot be used, or where `out` holds the
             flights of another collection.
     """
-    from eval.flight_log import log_from_flight, write_flight
     from eval.judge import Record, fly
     from eval.vehicle_file import load_vehicle
     from eval.worlds import world_class
@@ -103,9 +103,7 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
         def keep(result: TrialResult, flight: Flight | None) -> None:
             name = None
             if flight is not None and result.time_s >= SHORTEST_S:
-                track = Path(result.track).stem
-                name = f"{track}-{result.difficulty}-{result.seed}.parquet"
-                write_flight(out / name, log_from_flight(flight, name))
+                name = _write_log(out, result, flight, console)
             rows[result.trial] = {"file": name, **result._asdict()}
             write_list()
             update(len(rows), result.ended_by)
@@ -127,8 +125,25 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
     seconds = sum(row["time_s"] for row in logs)
     console.say(f"{len(logs)} flights, {seconds:.0f} s, in {out}")
     if len(logs) < len(rows):
-        console.say(f"{len(rows) - len(logs)} flights ended within {SHORTEST_S:g} s: no logs")
+        short = sum(row["time_s"] < SHORTEST_S for row in rows.values())
+        console.say(
+            f"{len(rows) - len(logs)} without a log, {short} of them under {SHORTEST_S:g} s"
+        )
     return {**found, "out": str(out)}
+
+
+def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console) -> str | None:
+    """Return the name of the log that was written, None with a warning where it is refused."""
+    from eval.flight_check import FlightLogError
+    from eval.flight_log import log_from_flight, write_flight
+
+    name = f"{Path(result.track).stem}-{result.difficulty}-{result.seed}.parquet"
+    try:
+        write_flight(out / name, log_from_flight(flight, name))
+    except FlightLogError as error:
+        console.note(f"warning: no log of this flight: {error}")
+        return None
+    return name
 
 
 def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, dict[str, Any]]:

@@ -78,13 +78,20 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             f"{result.time_s:.1f} s"
         )
     if config.video:
-        from eval.view.video import write_video
-
-        written.append(write_video(config.out / f"{_name(rollouts[0])}.mp4", *rollouts[0]))
+        written.append(_video(config.out / f"{_name(rollouts[0])}.mp4", rollouts[0], console))
     for path in written:
         console.say(f"written: {path}")
     console.say(f"open the recording with: rerun {recording}")
     return {"written": written, "trials": [result for _, _, result in rollouts]}
+
+
+def _video(path: Path, rollout: Rollout, console: Console) -> Path:
+    from eval.view.video import VideoOptions, frame_times, write_video
+
+    options, flight = VideoOptions(), rollout[1]
+    frames = len(frame_times(flight, options)) if len(flight.time_s) else 0
+    with console.progress("video", frames) as show:
+        return write_video(path, *rollout, options, show)
 
 
 def _name(rollout: Rollout) -> str:

@@ -46,6 +46,28 @@ def gpu() -> TrainConfig:
     )
 
 
+def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
+    """Return how a policy that `config` trained is fine-tuned, under a Delta Action Model or not.
+
+    The steps are smaller, since the policy flies already, and the tracks are new ones.
+
+    Args:
+        config: how the policy was trained.
+        share: gradient steps, as a share of that training's.
+    """
+    optimizer = config.optimizer
+    return replace(
+        config,
+        episode=replace(config.episode, easy_until=0.0),
+        optimizer=replace(
+            optimizer,
+            iterations=max(1, round(share * optimizer.iterations)),
+            rate=0.3 * optimizer.rate,
+        ),
+        seed=config.seed + 1,
+    )
+
+
 PRESETS = {"racer": racer, "paper": paper, "small": small, "gpu": gpu}
 """Name -> function that returns the configuration; the docstring is its description."""
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+import eval.flight_log
 import eval.judge
 import policies.policy
 from eval.flight_log import read_flight
@@ -211,6 +212,28 @@ def test_a_flight_of_under_a_second_is_no_log(pilots, tmp_path, capfd):
     (row,) = json.loads((out / "flights.json").read_text())["flights"]
     assert row["file"] is None and row["time_s"] < 1
     assert not list(out.glob("*.parquet"))
+
+
+def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
+    pilots, tmp_path, monkeypatch, capfd
+):
+    log_from_flight = eval.flight_log.log_from_flight
+
+    def broken(flight, name):
+        log = log_from_flight(flight, name)
+        if name.endswith("-7.parquet"):
+            log.rate_b[4, 0] = 300.0
+        return log
+
+    monkeypatch.setattr(eval.flight_log, "log_from_flight", broken)
+    out = tmp_path / "flights"
+    args = ["collect", "--policy", pilots["pursuit"], "--track", "zigzag", "--difficulty", "0"]
+    assert cli.main([*args, "--trials", "2", "--seed", "7", "--out", str(out)]) == 0
+    flights = json.loads((out / "flights.json").read_text())["flights"]
+    assert [row["file"] for row in flights] == [None, "zigzag-0-8.parquet"]
+    said = capfd.readouterr()
+    assert "zigzag-0-7.parquet: column rate_x, row 5: 300" in said.err
+    assert "1 flights without a log, 0 of them" in said.out
 
 
 def test_export_refuses_what_is_not_ours(tmp_path, capsys):

@@ -1,0 +1,72 @@
+"""`suite loop`: train, fly, record, fit the Delta Action Model, fine-tune, fly again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from suite.console import Console
+
+
+@dataclass(frozen=True)
+class Config:
+    """Close the loop and show what the Delta Action Model changes, on the same seeds.
+
+    The same command again goes on where it was stopped.
+    """
+
+    preset: str = "racer"
+    """The recipe: racer (the shipped policy's), small, gpu or paper."""
+    policy: str | None = None
+    """Start from this policy instead of training one: a shipped name or a checkpoint's folder."""
+    track: str = "all"
+    """zigzag, circular, ellipse, all of these, or a list with commas."""
+    difficulty: str = "0,3"
+    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
+    trials: int | None = None
+    """Trials of each policy on every track at every level; by default 50, or 20 with small."""
+    flights: int | None = None
+    """Recorded flights on every track at every level; by default 20, or 8 with small."""
+    vehicle: str = "reference"
+    """A shipped vehicle's name or a vehicle file (.toml)."""
+    seed: int = 0
+    """Seed of the training and of the first trial; recorded flights begin 100,000 above."""
+    iterations: int | None = None
+    """Gradient steps of the training, instead of the preset's."""
+    finetune_iterations: int | None = None
+    """Gradient steps of each fine-tuning, instead of a share of the training's."""
+    fit_iterations: int | None = None
+    """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with small."""
+    set: tuple[str, ...] = ()
+    """Change settings of the recipe by name, such as loss.progress=0.4 episode.batch=128."""
+    out: Path = Path("runs/loop")
+    """Folder of the loop; a loop that stands there is gone on with."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Run the loop, or the rest of it.
+
+    Raises:
+        ValueError: for anything that cannot be used, before the first stage.
+    """
+    from suite.loop.config import resolve
+    from suite.loop.run import run_loop
+
+    resolved = resolve(
+        recipe=config.preset,
+        policy=config.policy,
+        track=config.track,
+        difficulty=config.difficulty,
+        trials=config.trials,
+        flights=config.flights,
+        vehicle=config.vehicle,
+        seed=config.seed,
+        iterations=config.iterations,
+        finetune_iterations=config.finetune_iterations,
+        fit_iterations=config.fit_iterations,
+        changes=config.set,
+    )
+    return run_loop(resolved, config.out, console)
