@@ -233,7 +233,7 @@ def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
     assert [row["file"] for row in flights] == [None, "zigzag-0-8.parquet"]
     said = capfd.readouterr()
     assert "zigzag-0-7.parquet: column rate_x, row 5: 300" in said.err
-    assert "1 flights without a log, 0 of them" in said.out
+    assert "1 without a log, 0 of them under 1 s" in said.out
 
 
 def test_export_refuses_what_is_not_ours(tmp_path, capsys):
