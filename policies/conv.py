@@ -8,6 +8,8 @@ to three times the arithmetic of the convolution, at many times its speed.
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
@@ -41,16 +43,14 @@ def _fold(banded: jax.Array, taps: int, inputs: int, outputs: int) -> jax.Array:
     width = banded.shape[0] // inputs
     places = width - taps + 1
     split = banded.reshape(width, inputs, places, outputs)
-    return sum(split[place : place + taps, :, place] for place in range(places))
+    return functools.reduce(jnp.add, (split[at : at + taps, :, at] for at in range(places)))
 
 
 def _forward(x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
     return conv_valid(x, kernel), (x, kernel)
 
 
-def _backward(
-    saved: tuple[jax.Array, jax.Array], grad: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _backward(saved: tuple[jax.Array, jax.Array], grad: jax.Array) -> tuple[jax.Array, jax.Array]:
     x, kernel = saved
     count, height, width, inputs = x.shape
     reach, taps, _, outputs = kernel.shape

@@ -51,12 +51,17 @@ def resolve(config: Config) -> TrainConfig:
 
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Train and say where the policy is and how the curve ended."""
+    import jax
+
     from policies.delta_file import load_delta
     from policies.policy_file import load_policy_checkpoint
     from suite.train.run import train
 
-    params = None if config.from_ is None else load_policy_checkpoint(config.from_).params
-    delta = None if config.delta is None else load_delta(config.delta).params
+    params, delta = None, None
+    if config.from_ is not None:
+        params = jax.tree.map(jax.numpy.asarray, load_policy_checkpoint(config.from_).params)
+    if config.delta is not None:
+        delta = jax.tree.map(jax.numpy.asarray, load_delta(config.delta).params)
     outcome = train(resolve(config), config.out, console, params, delta)
     last = outcome.last
     console.say(

@@ -182,7 +182,7 @@ def fit(
     identified = identify(config, physics, known)
     return Fit(
         params={name: np.asarray(value) for name, value in params.items()},
-        identified=Plant(*(np.asarray(value) for value in identified)),
+        identified=identified,
         point_mass=judged(plant, None),
         fitted_point_mass=judged(identified, None),
         delta_action=judged(plant, params),

@@ -48,13 +48,13 @@ def replay(
     air_b = to_body(rot_w, windows.vel_w[:, 0])
     thrust_w = windows.acc_w + to_world(rot_w, plant.drag * air_b)
     body = point_mass.Body(
-        pos_w=windows.pos_w[:, 0],
-        vel_w=windows.vel_w[:, 0],
+        pos_w=jnp.asarray(windows.pos_w[:, 0]),
+        vel_w=jnp.asarray(windows.vel_w[:, 0]),
         thrust_w=thrust_w,
-        acc_w=windows.acc_w,
+        acc_w=jnp.asarray(windows.acc_w),
         rot_w=rot_w,
-        heading_w=windows.heading_w[:, 0],
-        commands_w=windows.commands_w,
+        heading_w=jnp.asarray(windows.heading_w[:, 0]),
+        commands_w=jnp.asarray(windows.commands_w),
     )
 
     def step(
@@ -86,5 +86,6 @@ def replay(
         jnp.swapaxes(windows.time_step, 0, 1),
     )
     start = (body, delta_network.start(count))
-    _, (pos, vel, correction) = jax.lax.scan(step, start, by_step)
-    return tuple(jnp.swapaxes(array, 0, 1) for array in (pos, vel, correction))
+    _, (pos_w, vel_w, correction_b) = jax.lax.scan(step, start, by_step)
+    pos_w, vel_w = jnp.swapaxes(pos_w, 0, 1), jnp.swapaxes(vel_w, 0, 1)
+    return pos_w, vel_w, jnp.swapaxes(correction_b, 0, 1)

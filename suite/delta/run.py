@@ -34,7 +34,9 @@ def flight_files(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
-def split(logs: Sequence[FlightLog], share: float, seed: int) -> tuple[list, list]:
+def split(
+    logs: Sequence[FlightLog], share: float, seed: int
+) -> tuple[list[FlightLog], list[FlightLog]]:
     """Return (flights to fit, held-out flights), at least one of each.
 
     Raises:
@@ -65,17 +67,18 @@ def fit_delta(
     for warning in warnings:
         console.note(f"warning: {warning}")
     known, held = split(logs, config.held_out, config.seed)
-    cut = [cut_windows(part, config.horizon_s, config.stride_s) for part in (known, held)]
-    work = config.iterations * config.batch * cut[0].action_b.shape[1]
+    windows = cut_windows(known, config.horizon_s, config.stride_s)
+    held_windows = cut_windows(held, config.horizon_s, config.stride_s)
+    work = config.iterations * config.batch * windows.action_b.shape[1]
     announce(console, "fitting the Delta Action Model", Estimate(20 + work / 1.5e5, 8e8))
     with console.progress("fitting", config.iterations) as show:
-        result = fit(config, physics, *cut, show)
+        result = fit(config, physics, windows, held_windows, show)
     held_out = [log.name for log in held]
     write_run_record(out, config, config.seed)
     summary = {
         "horizon_s": config.horizon_s,
         "held_out": held_out,
-        "windows": {"fit": len(cut[0].acc_w), "held_out": len(cut[1].acc_w)},
+        "windows": {"fit": len(windows.acc_w), "held_out": len(held_windows.acc_w)},
         "point_mass": result.point_mass,
         "fitted_point_mass": result.fitted_point_mass,
         "delta_action": result.delta_action,

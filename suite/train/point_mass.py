@@ -12,23 +12,24 @@ import jax
 import jax.numpy as jnp
 
 from policies.observation import to_world
+from tracks.scene import Array
 
 GRAVITY = 9.81
 """[m/s^2]."""
 
 
 class Constants(NamedTuple):
-    """What is drawn once per world."""
+    """What is drawn once per world, by numpy or JAX."""
 
-    lag: jax.Array
+    lag: Array
     """(B,) rate at which the acceleration follows the command [1/s]."""
-    drag: jax.Array
+    drag: Array
     """(B, 3) linear drag in body axes [1/s]."""
-    wind_w: jax.Array
+    wind_w: Array
     """(B, 3) [m/s]."""
-    time_step: jax.Array
+    time_step: Array
     """(B,) [s]."""
-    delay: jax.Array
+    delay: Array
     """(B,) delay of a command in time steps, within [0, 2]."""
 
 

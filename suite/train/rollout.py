@@ -8,6 +8,7 @@ without gradient for the same reason.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -194,7 +195,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
 
         keys = jax.random.split(key, steps)
         _, records = jax.lax.scan(step, memory, (nudge, keys))
-        loss = sum(term.mean() for term in records.terms)
+        loss = functools.reduce(jnp.add, (term.mean() for term in records.terms))
         return loss, jax.lax.stop_gradient(records)
 
     return rollout

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -60,8 +60,10 @@ def device_mesh(config: TrainConfig) -> Mesh:
     return Mesh(np.array(have[:count]), ("worlds",))
 
 
-def summarize(loss: jax.Array, gradient: network.Params, records: StepRecord) -> dict:
-    """Return the numbers of the curve as scalars."""
+def curve_numbers(
+    loss: jax.Array, gradient: network.Params, records: StepRecord
+) -> dict[str, jax.Array]:
+    """Return the numbers of the curve, scalars each: a row of metrics.jsonl."""
     numbers = {
         "loss": loss,
         "gradient_norm": optax.global_norm(gradient),
@@ -75,7 +77,7 @@ def summarize(loss: jax.Array, gradient: network.Params, records: StepRecord) ->
 
 def make_update(
     config: TrainConfig, mesh: Mesh, delta: delta_network.Params | None = None
-) -> Callable[[TrainState, Worlds], tuple[TrainState, dict]]:
+) -> Callable[[TrainState, Worlds], tuple[TrainState, dict[str, jax.Array]]]:
     """Return update(state, worlds) -> (state', numbers of the curve), compiled on first call.
 
     `delta` is a frozen Delta Action network whose correction is added to every action.
@@ -85,12 +87,13 @@ def make_update(
     seed = jax.random.key(np.uint32(config.seed))
 
     @jax.jit
-    def update(state: TrainState, worlds: Worlds) -> tuple[TrainState, dict]:
+    def update(state: TrainState, worlds: Worlds) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(seed, state.iteration)
         gradient, loss, records = gradient_of(state.params, worlds, key, delta)
         change, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
-        params = optax.apply_updates(state.params, change)
+        # optax types any tree of parameters; it gives back the one it was given.
+        params = cast(network.Params, optax.apply_updates(state.params, change))
         state = TrainState(params, optimizer_state, state.iteration + 1)
-        return state, summarize(loss, gradient, records)
+        return state, curve_numbers(loss, gradient, records)
 
     return update

@@ -78,7 +78,8 @@ def test_obstacle_terms_are_the_papers():
 def test_the_terms_of_a_step_are_means_over_its_path():
     config, path = LossConfig(barrier_slope=-8.0), around(4, seed=2)
     vel = jnp.asarray([[1.0, 2.0, -1.0]])
-    whole = obstacle_terms(config, *nearest(one_of_each(), path), path, vel)
+    distance, away = nearest(one_of_each(), path)
+    whole = obstacle_terms(config, distance, away, path, vel)
     for term, parts in zip(whole, terms_at(path, vel, config), strict=True):
         assert float(term[0]) == pytest.approx(float(parts.mean()))
 
@@ -137,8 +138,7 @@ def test_progress_is_the_papers_and_differentiates():
     np.testing.assert_allclose(
         progress_term(config, pos, vel, target, lateral), expected, atol=1e-9
     )
-    for weights in ({}, {"progress": 0.0, "progress_norm": 0.7}):
-        varied = LossConfig(**weights)
+    for varied in (LossConfig(), LossConfig(progress=0.0, progress_norm=0.7)):
         check_grads(
             lambda p, v, c=varied: progress_term(c, p, v, target, lateral),
             (pos, vel), order=1, modes=["rev"], atol=1e-6, rtol=1e-6,
@@ -200,20 +200,19 @@ def test_the_field_enters_as_minus_its_vector_with_the_strength_it_says():
     np.testing.assert_array_equal(term, np.zeros(20))
     pull = pull_at(config, gates, pos, vel)
 
-    corners = [np.array(x) for x in (gates.center_w, gates.rot_w, gates.opening_g)]
-    center, sideways = corners[0][:1], corners[1][:1, :, 1]
-    unit_gates = [x[:1] for x in corners]
-    at_center = attractive_field(magnetic_field(*unit_gates, center), sideways, config.field_decay)
-    u_a = attractive_field(
-        magnetic_field(*corners, np.array(pos)), np.array(vel), config.field_decay
-    )
+    centers, rot, opening = (np.array(x) for x in (gates.center_w, gates.rot_w, gates.opening_g))
+    center, sideways = centers[:1], rot[:1, :, 1]
+    unit_field = magnetic_field(center, rot[:1], opening[:1], center)
+    at_center = attractive_field(unit_field, sideways, config.field_decay)
+    field = magnetic_field(centers, rot, opening, np.array(pos))
+    u_a = attractive_field(field, np.array(vel), config.field_decay)
     expected = 0.42 * u_a / np.linalg.norm(at_center)
     far = np.linalg.norm(expected, axis=-1) < 0.42 * MAX_PULL
     assert far.sum() > 15
     np.testing.assert_allclose(pull[far], expected[far], rtol=1e-6)
     middle = jnp.tile(jnp.asarray(center), (20, 1))
     at = pull_at(config, gates, middle, jnp.tile(jnp.asarray(sideways), (20, 1)))
-    np.testing.assert_allclose(at[0], 0.42 * corners[1][0, :, 0], atol=1e-6)
+    np.testing.assert_allclose(at[0], 0.42 * rot[0, :, 0], atol=1e-6)
 
 
 def test_the_field_is_held_near_the_wires_and_carries_no_gradient_itself():

@@ -91,7 +91,9 @@ def test_attitude_carries_no_gradient():
     fixed, body = constants(2), some_body(2)
 
     def of_rotation(rot_w):
-        after = point_mass.step(body._replace(rot_w=rot_w), fixed, ACTION, TARGET, 6.0, 0.0)
+        after = point_mass.step(
+            body._replace(rot_w=rot_w), fixed, jnp.asarray(ACTION), TARGET, 6.0, 0.0
+        )
         return sum(x.sum() for x in (after.pos_w, after.vel_w, after.thrust_w, after.acc_w))
 
     def to_attitude(action, pos, thrust):
@@ -168,12 +170,11 @@ def test_a_delayed_command_is_the_one_of_steps_before():
         1.0: body.commands_w[:, 0],
         2.0: body.commands_w[:, 1],
     }
+    action, keep = jnp.ones((1, 3)) @ jnp.asarray(ROLL), np.exp(-12.0 * 0.033)
     for delay, command in commands.items():
-        action = jnp.ones((1, 3)) @ jnp.asarray(ROLL)
         now = point_mass.step(
             body, fixed._replace(delay=jnp.array([delay])), action, TARGET[:1], 6.0, 0.0
         )
-        keep = np.exp(-12.0 * 0.033)
         np.testing.assert_allclose(
             now.thrust_w, command * (1 - keep) + body.thrust_w * keep, atol=1e-9
         )
