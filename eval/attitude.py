@@ -11,10 +11,9 @@ from typing import Any
 
 from eval.effects.interface import GRAVITY
 from eval.plant import Command
-from eval.rate_loop import cross
 from eval.vehicle import Controller
-
-Array = Any
+from tracks.rotation import cross, to_local, to_world
+from tracks.scene import Array
 
 HEADING_RATE = 6.0
 """Of the first-order blend of the heading [1/s]."""
@@ -31,7 +30,7 @@ def action_to_force(action_b: Array, rot_w: Array) -> Array:
         rot_w: (..., 3, 3) body to world, of the same moment.
     """
     xp = action_b.__array_namespace__()
-    return (rot_w * action_b[..., None, :]).sum(axis=-1) + xp.asarray([0.0, 0.0, GRAVITY])
+    return to_world(rot_w, action_b) + xp.asarray([0.0, 0.0, GRAVITY])
 
 
 def attitude_command(
@@ -49,8 +48,8 @@ def attitude_command(
         heading_w: (..., 3) unit vector, horizontal.
     """
     xp = force_w.__array_namespace__()
-    force_b = (rot_w * force_w[..., :, None]).sum(axis=-2)
-    heading_b = (rot_w * heading_w[..., :, None]).sum(axis=-2)
+    force_b = to_local(rot_w, force_w)
+    heading_b = to_local(rot_w, heading_w)
     size = xp.sqrt(xp.maximum(xp.sum(force_b**2, axis=-1, keepdims=True), LEAST_FORCE**2))
     up_b = xp.where(size > LEAST_FORCE, force_b / size, xp.asarray([0.0, 0.0, 1.0]))
     tilt = _tilt_error(xp, up_b)

@@ -14,8 +14,8 @@ from eval.effects.interface import GRAVITY
 from eval.plant import Command, Motion, Plant, Wrench, make_plant, plant_step, start_memory
 from eval.vehicle import Controller, Vehicle
 from eval.worlds.slots import packed, select
+from tracks.scene import Array
 
-Array = Any
 ATTITUDE_HZ = 100.0
 """Frequency of the attitude loop and of flight logs [Hz]."""
 

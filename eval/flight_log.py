@@ -19,9 +19,9 @@ from eval.flight import Flight
 from eval.flight_check import GROUPS, KNOWN, FlightLogError, check_columns
 from eval.flight_file import read_columns, write_columns
 from eval.flight_velocity import velocity_from_position
-from eval.rotation import quat_to_rot
 from tracks.files import to_json
 from tracks.provenance import stamp
+from tracks.rotation import quat_to_rot
 
 SCHEMA = 1
 """Version of the flight log's layout, in the metadata of every file we write."""

@@ -16,8 +16,7 @@ from eval.effects import all_values
 from eval.plant import Command, Memory, Motion, Plant, make_plant, plant_step, start_memory
 from eval.rigid_body import euler_step
 from eval.vehicle import Vehicle
-
-Array = Any
+from tracks.scene import Array
 
 MAX_DELAY = 0.1
 """Room for a command delay that is fitted [s]; the upper bound of `command_delay`."""

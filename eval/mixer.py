@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-Array = Any
+from tracks.scene import Array
 
 NEGLIGIBLE = 1e-9
 """Thrusts below this are rounding [N]."""

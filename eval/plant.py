@@ -16,9 +16,10 @@ import numpy as np
 from eval.effects import EFFECTS, find_effect
 from eval.effects.interface import GRAVITY, Array, Constants, Flow, Gust, as_arrays
 from eval.mixer import mix, mixer_matrix
-from eval.rate_loop import cross, rate_torque
+from eval.rate_loop import rate_torque
 from eval.rotors import Spin, follow, speed_command
 from eval.vehicle import Vehicle
+from tracks.rotation import to_local
 
 
 class Command(NamedTuple):
@@ -269,7 +270,7 @@ def spin_step(
         constants=constants,
         pos_w=motion.pos_w,
         rot_w=motion.rot_w,
-        air_vel_b=(motion.rot_w * air_vel_w[..., :, None]).sum(axis=-2),
+        air_vel_b=to_local(motion.rot_w, air_vel_w),
         rate_b=motion.rate_b,
         rotor_speed=spin.mean,
         spin=plant.nominal.spin,
@@ -292,15 +293,6 @@ def spin_step(
         force_b = force_b if push is None else force_b + push(value, flow)
         torque_b = torque_b if twist is None else torque_b + twist(value, flow)
     return memory._replace(wind=winds), Wrench(force_b, torque_b)
-
-
-def accelerations(plant: Plant, motion: Motion, wrench: Wrench) -> tuple[Array, Array]:
-    """Return dv/dt in the world (..., 3) [m/s^2] and dw/dt in body axes (..., 3) [rad/s^2]."""
-    constants = plant.constants
-    force_w = (motion.rot_w * wrench.force_b[..., None, :]).sum(axis=-1)
-    spin_b = constants.inertia * motion.rate_b
-    torque_b = wrench.torque_b - cross(motion.rate_b, spin_b)
-    return force_w / constants.mass[..., None] + constants.gravity_w, torque_b / constants.inertia
 
 
 def _in_order(effects: Mapping[str, Any]) -> list[tuple[str, Any]]:

@@ -2,17 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-Array = Any
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Return a x b (..., 3); numpy's own is several times slower on small arrays."""
-    xp = a.__array_namespace__()
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return xp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+from tracks.rotation import cross
+from tracks.scene import Array
 
 
 def rate_torque(rate_cmd_b: Array, rate_b: Array, gain: Array, inertia: Array) -> Array:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from eval.plant import Motion, Plant, Wrench
+from tracks.rotation import cross, exp_rot, to_world
+from tracks.scene import Array
 
-from eval.plant import Motion, Plant, Wrench, accelerations
-from eval.rotation import exp_rot
 
-Array = Any
+def accelerations(plant: Plant, motion: Motion, wrench: Wrench) -> tuple[Array, Array]:
+    """Return dv/dt in the world (..., 3) [m/s^2] and dw/dt in body axes (..., 3) [rad/s^2]."""
+    constants = plant.constants
+    force_w = to_world(motion.rot_w, wrench.force_b)
+    spin_b = constants.inertia * motion.rate_b
+    torque_b = wrench.torque_b - cross(motion.rate_b, spin_b)
+    return force_w / constants.mass[..., None] + constants.gravity_w, torque_b / constants.inertia
 
 
 def euler_step(plant: Plant, motion: Motion, wrench: Wrench) -> Motion:

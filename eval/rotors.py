@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-Array = Any
+from tracks.scene import Array
 
 NEGLIGIBLE = 1e-6
 """Thrusts below this are none [N]."""

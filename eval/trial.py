@@ -6,12 +6,10 @@ The rules are pure functions of arrays over many trials (N rows) and take numpy 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from tracks.crossing import NEAR_RADIUS_M, crossing, is_near
-from tracks.scene import Gates
-
-Array = Any
+from tracks.scene import Array, Gates
 
 FLYING = 0
 """The code in `Progress.ended` of a trial that goes on."""

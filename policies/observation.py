@@ -2,21 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from policies.spec import DepthEncoding
-
-Array = Any
-
-
-def to_body(rot_w: Array, vector_w: Array) -> Array:
-    """Turn world vectors (..., 3) into body axes; rot_w (..., 3, 3) maps body to world."""
-    return (rot_w * vector_w[..., :, None]).sum(-2)
-
-
-def to_world(rot_w: Array, vector_b: Array) -> Array:
-    """Turn body vectors (..., 3) into world axes; rot_w (..., 3, 3) maps body to world."""
-    return (rot_w * vector_b[..., None, :]).sum(-1)
+from tracks.rotation import to_local
+from tracks.scene import Array
 
 
 def state_vector(
@@ -36,8 +24,8 @@ def state_vector(
         next gate's centre in body axes [m] and the last action [m/s^2].
     """
     xp = rot_w.__array_namespace__()
-    parts = [to_body(rot_w, vel_w), rot_w[..., 2, :], to_body(rot_w, gate_w - pos_w), last_action_b]
-    return xp.concatenate(parts, axis=-1)
+    vel_b, gate_b = to_local(rot_w, vel_w), to_local(rot_w, gate_w - pos_w)
+    return xp.concatenate([vel_b, rot_w[..., 2, :], gate_b, last_action_b], axis=-1)
 
 
 def encode_depth(encoding: DepthEncoding, depth_m: Array, range_m: float) -> Array:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
+from tracks.rotation import to_local
 from tracks.scene import Array
 
 NEAR_RADIUS_M = 0.35
 """Yu et al. 2025 count a gate as passed within this distance of its centre [m]."""
-
-
-def _to_gate(center_w: Array, rot_w: Array, point_w: Array) -> Array:
-    return (rot_w * (point_w - center_w)[..., :, None]).sum(-2)
 
 
 def is_inside(opening_g: Array, point_g: Array) -> Array:
@@ -38,7 +35,7 @@ def crossing(
         crossed in flight direction outside of it.
     """
     xp = before_w.__array_namespace__()
-    before, after = _to_gate(center_w, rot_w, before_w), _to_gate(center_w, rot_w, after_w)
+    before, after = to_local(rot_w, before_w - center_w), to_local(rot_w, after_w - center_w)
     crosses = (before[..., 0] < 0) & (after[..., 0] >= 0)
     travel = after[..., 0] - before[..., 0]
     share = -before[..., 0] / xp.where(crosses, travel, 1.0)

@@ -14,6 +14,7 @@ import numpy as np
 
 from tracks.convex_parts import load_convex_parts
 from tracks.gates import frame_boxes, rectangle, regular_polygon
+from tracks.rotation import quat_to_rot
 from tracks.scene import Boxes, Gates, Rods, Scene, Spheres
 from tracks.toml_table import Table, read_toml
 from tracks.track import Track
@@ -160,14 +161,7 @@ def rotation(table: Table) -> np.ndarray:
     Pitch is positive nose up, roll positive right side down, body axes forward-left-up.
     """
     if table.has("quat_wxyz"):
-        w, x, y, z = _unit(table, "quat_wxyz", table.vector("quat_wxyz", 4))
-        return np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        return quat_to_rot(_unit(table, "quat_wxyz", table.vector("quat_wxyz", 4)))
     turned = np.deg2rad([table.number(f"{angle}_deg", 0.0) for angle in ("yaw", "pitch", "roll")])
     (cy, cp, cr), (sy, sp, sr) = np.cos(turned), np.sin(turned)
     yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from tracks.files import replacing_file, write_text
+from tracks.rotation import rot_to_quat
 from tracks.scene import Array, Scene
 from tracks.track import Track
 
@@ -52,21 +53,6 @@ def save_track(track: Track, path: str | os.PathLike[str]) -> None:
     write_text(path, "\n".join(text) + "\n")
 
 
-def quat_wxyz(rot: np.ndarray) -> np.ndarray:
-    """Return the quaternion (4,) wxyz, w >= 0, of a rotation (3, 3) (Bar-Itzhack 2000)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.asarray(rot, float)
-    symmetric = np.array(
-        [
-            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-        ]
-    )
-    quat = np.linalg.eigh(symmetric)[1][:, -1]
-    return -quat if quat[0] < 0 else quat
-
-
 def _gates(scene: Scene) -> Iterable[str]:
     for center, rot, opening, width, depth in zip(*scene.gates, strict=True):
         repeated = (np.diff(opening, axis=0) == 0).all(axis=-1)
@@ -74,7 +60,7 @@ def _gates(scene: Scene) -> Iterable[str]:
         yield from _table(
             "gates",
             center=center,
-            quat_wxyz=quat_wxyz(rot),
+            quat_wxyz=rot_to_quat(rot),
             polygon=corners,
             frame_width=width,
             frame_depth=depth,
@@ -85,7 +71,7 @@ def _boxes(scene: Scene, names: list[str], first: int) -> Iterable[str]:
     rows = (field[first:] for field in scene.boxes)
     for name, center, rot, half_size in zip(names, *rows, strict=True):
         yield from _table(
-            "boxes", name=name, center=center, quat_wxyz=quat_wxyz(rot), size=2 * half_size
+            "boxes", name=name, center=center, quat_wxyz=rot_to_quat(rot), size=2 * half_size
         )
 
 

@@ -6,6 +6,7 @@ in flight direction. Any polygon serves; a round gate is a polygon of many edges
 
 from __future__ import annotations
 
+from tracks.rotation import to_local, to_world
 from tracks.scene import Array
 
 _TINY = 1e-9
@@ -33,7 +34,7 @@ def magnetic_field(
         current: C_I; the field scales with it [m].
     """
     xp = point_w.__array_namespace__()
-    point_g = (rot_w * (point_w - center_w)[..., :, None]).sum(-2)
+    point_g = to_local(rot_w, point_w - center_w)
     corners = xp.concatenate([xp.zeros_like(opening_g[..., :1]), opening_g], axis=-1)
     start = corners - point_g[..., None, :]
     end = xp.roll(corners, -1, axis=-2) - point_g[..., None, :]
@@ -46,7 +47,7 @@ def magnetic_field(
     square = xp.maximum((perpendicular * perpendicular).sum(-1), 1e-12)
     strength = current * (unit * ends).sum(-1) / square
     field_g = (strength[..., None] * xp.linalg.cross(unit, perpendicular)).sum(-2)
-    return (rot_w * field_g[..., None, :]).sum(-1)
+    return to_world(rot_w, field_g)
 
 
 def attractive_field(

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tracks.gates import yaw_rotation
+from tracks.rotation import quat_to_rot
 from tracks.scene import Boxes, Gates, Rods, Spheres
 
 BOX, CYLINDER, CAPSULE, SPHERE = range(4)
@@ -215,12 +216,4 @@ def _place(
 def _random_rotations(rng: np.random.Generator, n: int) -> np.ndarray:
     """Return `n` uniformly distributed rotations, (n, 3, 3), from normal quaternions."""
     quat = rng.normal(size=(n, 4))
-    w, x, y, z = (quat / np.linalg.norm(quat, axis=-1, keepdims=True)).T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        axis=-2,
-    )
+    return quat_to_rot(quat / np.linalg.norm(quat, axis=-1, keepdims=True))

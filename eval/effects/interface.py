@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from tracks.scene import Array
+
 if TYPE_CHECKING:
     from eval.vehicle import Vehicle
 
-Array = Any  # numpy.ndarray or jax.Array
 
 GRAVITY = 9.81
 """Magnitude of gravity [m/s^2]."""

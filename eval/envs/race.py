@@ -27,6 +27,7 @@ from eval.worlds.engine import BODY, Eye, compile_model, start_state
 from eval.worlds.slots import layout_of, noise_of
 from policies.observation import encode_depth, state_vector
 from policies.spec import PolicySpec
+from tracks.rotation import to_world
 from tracks.scene import Gates
 from tracks.track import Track
 
@@ -102,7 +103,7 @@ class Race:
             )
             good = bool(is_wrench(self.rules, force_b, torque_b)[0])
             if good:
-                data.qfrc_applied[:3] = (motion.rot_w * force_b[:, None, :]).sum(-1)[0]
+                data.qfrc_applied[:3] = to_world(motion.rot_w, force_b)[0]
                 data.qfrc_applied[3:] = torque_b[0]
                 mujoco.mj_step2(self.model, data)
             self.progress = before._replace(step=step + np.int32(1))

@@ -18,12 +18,12 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter1d
 
 from eval.flight import Flight
-from eval.rotation import quat_to_rot
 from eval.trial import TrialResult
 from eval.view import colours
 from eval.view.scene3d import SKY, Faces, Lines, look_at, paint
 from eval.view.solids import track_solids
 from tracks.files import replacing_file
+from tracks.rotation import quat_to_rot
 from tracks.track import Track
 
 ENDINGS = (".mp4", ".gif")

@@ -44,13 +44,12 @@ from tracks.camera import Camera, pixel_rays_b
 from tracks.cull import nearest_solids
 from tracks.depth import depth_image
 from tracks.mujoco_scene import GROUND
-from tracks.scene import Scene, pad, stack
+from tracks.rotation import quat_to_rot, to_world
+from tracks.scene import Array, Scene, pad, stack
 from tracks.track import Track
 
 with contextlib.redirect_stdout(io.StringIO()):  # its import prints what optional parts are missing
     from mujoco import mjx
-
-Array = Any
 
 
 class Flying(NamedTuple):
@@ -251,7 +250,7 @@ class MjxWorld:
             )
             pilot = select(flying, pilot, state.pilot)
             bad = ~is_wrench(self._rules, force_b, torque_b)
-            force_w = (motion.rot_w * force_b[:, None, :]).sum(-1)
+            force_w = to_world(motion.rot_w, force_b)
             applied = jnp.concatenate([force_w, torque_b], axis=-1)
             qpos, qvel = self._integrate(state.qpos, state.qvel, applied)
             go = flying & ~bad
@@ -310,15 +309,7 @@ def _free_body(vehicle: Vehicle, dt: float) -> mujoco.MjModel:
 def _motion(qpos: Array, qvel: Array) -> Motion:
     """Return the motion (N, ...) of free joints; the quaternion is normalised on the way."""
     quat = qpos[:, 3:]
-    w, x, y, z = (quat / jnp.sqrt((quat * quat).sum(-1, keepdims=True))).T
-    rot_w = jnp.stack(
-        [
-            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        axis=-2,
-    )
+    rot_w = quat_to_rot(quat / jnp.sqrt((quat * quat).sum(-1, keepdims=True)))
     return Motion(qpos[:, :3], rot_w, qvel[:, :3], qvel[:, 3:])
 
 

@@ -32,6 +32,7 @@ from eval.worlds import Rows, View
 from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
 from eval.worlds.slots import Layout, empty_course, noise_of, packed, pad_gates, select
 from tracks.camera import Camera
+from tracks.rotation import to_world
 from tracks.track import Track
 
 _TO_CONTACTS = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -195,7 +196,7 @@ class MujocoWorld:
                 rows += self._rows(due, speed_before)
             bad = ~is_wrench(self._rules, force_b, torque_b)
             go = flying & ~bad
-            self._applied[:, :3] = (motion.rot_w * force_b[:, None, :]).sum(-1)
+            self._applied[:, :3] = to_world(motion.rot_w, force_b)
             self._applied[:, 3:] = torque_b
             self._batch.step(np.flatnonzero(go).astype(np.int32), stage=_TO_CONTACTS)
             self._progress = self._progress._replace(step=step + flying)

@@ -19,6 +19,7 @@ from eval.worlds.slots import layout_of, noise_of
 from policies.observation import encode_depth, state_vector
 from policies.policy import Policy
 from tracks.crossing import crossing, is_near
+from tracks.rotation import to_world
 from tracks.track import Track
 
 
@@ -110,7 +111,7 @@ def fly_trial(
         if not (np.abs([wrench.force_b, wrench.torque_b]) <= rules.wrench_limit).all():
             ended_by = "diverged"
             break
-        data.qfrc_applied[:3] = (motion.rot_w * wrench.force_b[:, None, :]).sum(-1)[0]
+        data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
         data.qfrc_applied[3:] = wrench.torque_b[0]
         mujoco.mj_step2(model, data)
         mujoco.mj_step1(model, data)

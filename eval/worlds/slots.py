@@ -9,10 +9,8 @@ import numpy as np
 
 from eval.trial import Course, TrialSpec
 from tracks.families import MAX_COUNTS
-from tracks.scene import Counts, Gates, counts
+from tracks.scene import Array, Counts, Gates, counts
 from tracks.track import Track
-
-Array = Any
 
 
 def select(mask: Array, new: Any, old: Any) -> Any:

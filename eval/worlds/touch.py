@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from tracks.clearance import distances
+from tracks.rotation import to_local, to_world
 from tracks.scene import Array, Counts, Scene
 
 NEAR = Counts(boxes=12, cylinders=4, capsules=4, spheres=4)
@@ -39,7 +40,7 @@ def gaps(scene: Scene, pos_w: Array, rot_w: Array, half_size: Array, middle_b: A
         In the order boxes, cylinders, capsules, spheres, triangles, ground. How deep bodies are in
         one another is not measured.
     """
-    middle_w = pos_w + (rot_w * middle_b).sum(-1)
+    middle_w = pos_w + to_world(rot_w, middle_b)
     found = [_gap(_only(scene, kind), kind, middle_w, rot_w, half_size) for kind in _KINDS]
     reach = (jnp.abs(rot_w[:, 2]) * half_size).sum(-1)
     ground = (middle_w[:, 2] - reach)[:, None]
@@ -70,9 +71,9 @@ def _gap(alone: Scene, kind: str, middle_w: Array, rot_w: Array, half_size: Arra
     middle = middle_w[:, None]
 
     def into_box(point_w: Array) -> Array:
-        local = (rot * (point_w - middle)[..., :, None]).sum(-2)
+        local = to_local(rot, point_w - middle)
         local = jnp.clip(local, -half_size, half_size)
-        return middle + (rot * local[..., None, :]).sum(-1)
+        return middle + to_world(rot, local)
 
     start = into_box(places.mean(-2)[:, :, 0] if kind == "triangles" else places[:, :, 0])
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from policies import delta_network
-from policies.observation import to_body, to_world
 from suite.delta.windows import Windows
 from suite.train import point_mass
 from suite.train.config import PointMassConfig
+from tracks.rotation import to_local, to_world
 
 
 class Plant(NamedTuple):
@@ -45,7 +45,7 @@ def replay(
     """
     count = windows.action_b.shape[0]
     rot_w = jnp.asarray(windows.rot_w)
-    air_b = to_body(rot_w, windows.vel_w[:, 0])
+    air_b = to_local(rot_w, windows.vel_w[:, 0])
     thrust_w = windows.acc_w + to_world(rot_w, plant.drag * air_b)
     body = point_mass.Body(
         pos_w=jnp.asarray(windows.pos_w[:, 0]),
@@ -64,7 +64,7 @@ def replay(
         action, heading, time_step = inputs
         correction = jnp.zeros_like(action)
         if delta is not None:
-            vel_b = to_body(body.rot_w, body.vel_w)
+            vel_b = to_local(body.rot_w, body.vel_w)
             correction, hidden = delta_network.step(delta, hidden, vel_b, body.rot_w[:, 2], action)
         constants = point_mass.Constants(
             lag=jnp.broadcast_to(plant.lag, count),

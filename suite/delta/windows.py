@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.flight_log import FlightLog
-from eval.rotation import quat_to_rot
+from tracks.rotation import quat_to_rot
 
 HISTORY = 2
 """Decisions before a window whose commands may still be on their way into it."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from policies.observation import to_world
+from tracks.rotation import to_local, to_world
 from tracks.scene import Array
 
 GRAVITY = 9.81
@@ -98,7 +98,7 @@ def step(
     keep = jnp.exp(-constants.lag[:, None] * dt)
     thrust = wanted * (1 - keep) + body.thrust_w * keep
     rot = jax.lax.stop_gradient(body.rot_w)
-    air_b = (rot * (body.vel_w - constants.wind_w)[..., :, None]).sum(-2)
+    air_b = to_local(rot, body.vel_w - constants.wind_w)
     acc = thrust - to_world(rot, constants.drag * air_b)
     fade = jnp.exp(-gradient_decay * dt)
     pos, vel = _fade(body.pos_w, fade), _fade(body.vel_w, fade)

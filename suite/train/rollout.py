@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from policies import delta_network, network
-from policies.observation import encode_depth, state_vector, to_body
+from policies.observation import encode_depth, state_vector
 from suite.train import losses, point_mass
 from suite.train.config import TrainConfig
 from suite.train.worlds import Worlds
@@ -24,6 +24,7 @@ from tracks.camera import pixel_rays_b
 from tracks.clearance import nearest_obstacle
 from tracks.crossing import crossing
 from tracks.depth import depth_image
+from tracks.rotation import to_local
 from tracks.scene import Counts, Gates
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
@@ -127,7 +128,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
         size, change = losses.smoothness_terms(
             weights, body.acc_w, before.acc_w, worlds.constants.time_step
         )
-        lateral = to_body(gate.rot_w, body.pos_w - gate.center_w)[..., 1:]
+        lateral = to_local(gate.rot_w, body.pos_w - gate.center_w)[..., 1:]
         terms = losses.Terms(
             clearance=weights.clearance * barrier,
             collide=weights.collide * collide,
@@ -170,7 +171,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
             embedding = encode(params, image) + nudge_now
             action, memory = act(params, memory, embedding, target_w)
             if delta is not None:
-                vel_b = to_body(jax.lax.stop_gradient(before.rot_w), before.vel_w)
+                vel_b = to_local(jax.lax.stop_gradient(before.rot_w), before.vel_w)
                 correction, delta_hidden = delta_network.step(
                     delta, memory.delta_hidden, vel_b, before.rot_w[:, 2], action
                 )

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from eval.attitude import action_to_force, attitude_command, blend_heading, level_heading
-from eval.rotation import exp_rot
 from eval.vehicle import Controller
+from tracks.rotation import exp_rot
 
 CONTROLLER = Controller(rate_gain=(20.0, 20.0, 8.0), frequency=500.0)
 NORTH = np.array([1.0, 0.0, 0.0])

@@ -17,13 +17,13 @@ from eval.plant import (
     Command,
     Motion,
     Wrench,
-    accelerations,
     make_plant,
     plant_step,
     spin_step,
     start_memory,
     uses_noise,
 )
+from eval.rigid_body import accelerations
 from eval.rotors import steady
 from tests.support.vehicles import PLAIN, at_rest, drawn_effects, with_effects
 

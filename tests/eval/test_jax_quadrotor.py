@@ -11,9 +11,9 @@ from eval.jax_quadrotor import fit_plant, hold, rollout
 from eval.plant import Command, Motion, Wrench, make_plant, plant_step, start_memory
 from eval.quadrotor_model import add_quadrotor, set_true_inertia
 from eval.rigid_body import euler_step
-from eval.rotation import quat_to_rot
 from eval.vehicle_file import load_vehicle
 from tests.support.vehicles import PLAIN, at_rest, drawn_effects, with_effects, with_lag
+from tracks.rotation import quat_to_rot
 
 
 @pytest.fixture(autouse=True)

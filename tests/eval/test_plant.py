@@ -9,9 +9,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from eval.mixer import mix, mixer_matrix
-from eval.plant import Command, Motion, accelerations, make_plant, plant_step, start_memory
-from eval.rigid_body import euler_step
-from eval.rotation import exp_rot, quat_to_rot, rot_to_quat
+from eval.plant import Command, Motion, make_plant, plant_step, start_memory
+from eval.rigid_body import accelerations, euler_step
 from eval.rotors import follow, speed_command
 from tests.support.vehicles import PLAIN, at_rest, with_effects, with_lag
 
@@ -206,25 +205,3 @@ def test_flight_converges_to_an_independent_integration_with_order_one():
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert errors[-1] < 0.01
     assert np.all((orders > 0.8) & (orders < 1.3)), (errors, orders)
-
-
-VECTORS = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
-
-
-@given(VECTORS)
-def test_rotations_against_scipy(vector):
-    expected = Rotation.from_rotvec(vector)
-    rot = exp_rot(vector)
-    np.testing.assert_allclose(rot, expected.as_matrix(), atol=1e-12)
-    x, y, z, w = expected.as_quat()
-    np.testing.assert_allclose(quat_to_rot(np.array([w, x, y, z])), rot, atol=1e-12)
-    quat = rot_to_quat(rot)
-    assert abs(quat @ [w, x, y, z]) == pytest.approx(1.0)
-    assert quat[0] >= 0.0
-
-
-def test_small_rotations_are_exact_and_differentiable():
-    tiny = np.array([3e-5, -2e-5, 1e-5])
-    np.testing.assert_allclose(exp_rot(tiny), Rotation.from_rotvec(tiny).as_matrix(), atol=1e-16)
-    slope = jax.jacobian(exp_rot)(jax.numpy.zeros(3))
-    np.testing.assert_allclose(slope[..., 2], [[0, -1, 0], [1, 0, 0], [0, 0, 0]], atol=1e-6)

@@ -14,7 +14,6 @@ from hypothesis.extra import numpy as npst
 from PIL import Image, ImageSequence
 from scipy.spatial import ConvexHull
 
-from eval.rotation import quat_to_rot
 from eval.view import colours
 from eval.view.picture import write_grid, write_picture
 from eval.view.recording import Drone, write_recording
@@ -23,6 +22,7 @@ from eval.view.solids import flat_normals, joined, outline, track_solids
 from eval.view.video import VideoOptions, frame_times, video_frames, write_video
 from tests.support.flights import result_of, small_track, smooth_flight
 from tracks.camera import Camera, pixel_rays_b
+from tracks.rotation import quat_to_rot
 
 SMALL = VideoOptions(size=(160, 96), fps=10, hold_s=0.3)
 NO_LINES = Lines(np.zeros((0, 2, 3)), np.zeros((0, 3)), 0.01)

@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from tracks.custom import load_track
-from tracks.custom_save import quat_wxyz, save_track
+from tracks.custom_save import save_track
 from tracks.families import FAMILIES, make_track
 
 GATE = """
@@ -98,18 +95,6 @@ def test_meshes_and_polygons_come_back(tmp_path, root):
 
     middles = [np.sort(t.scene.triangles.mean(1), axis=0) for t in (track, again)]
     assert np.allclose(*middles, rtol=0, atol=1e-7)
-
-
-@given(st.integers(0, 10_000))
-def test_quaternions_are_scipys(seed):
-    rotation = Rotation.from_quat(np.random.default_rng(seed).normal(size=4))
-    expected = rotation.as_quat(canonical=True, scalar_first=True)
-    assert np.allclose(quat_wxyz(rotation.as_matrix()), expected)
-    half_turn = Rotation.from_rotvec(np.pi * np.eye(3)[seed % 3])
-    quat = quat_wxyz(half_turn.as_matrix())
-    assert np.allclose(
-        Rotation.from_quat(quat, scalar_first=True).as_matrix(), half_turn.as_matrix()
-    )
 
 
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])

@@ -1,10 +1,40 @@
-"""Rotations: quaternions, matrices and the exponential map, for numpy and JAX arrays."""
+"""Rotations: vectors turned, quaternions, matrices and the exponential map (numpy and JAX).
+
+Products are written out and summed over the last axes: a matrix product may round a row differently
+at another batch size, and a trial's outcome must not depend on the trials beside it.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from tracks.scene import Array
 
-Array = Any
+
+def to_world(rot_w: Array, vector: Array) -> Array:
+    """Return vectors (..., 3) in the axes of a body or gate turned to world axes.
+
+    Args:
+        rot_w: (..., 3, 3) body or gate to world.
+        vector: (..., 3) in its axes.
+    """
+    return (rot_w * vector[..., None, :]).sum(-1)
+
+
+def to_local(rot_w: Array, vector_w: Array) -> Array:
+    """Return world vectors (..., 3) in the axes of a body or gate.
+
+    Args:
+        rot_w: (..., 3, 3) body or gate to world.
+        vector_w: (..., 3).
+    """
+    return (rot_w * vector_w[..., :, None]).sum(-2)
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return a x b (..., 3); numpy's own is several times slower on small arrays."""
+    xp = a.__array_namespace__()
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return xp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def quat_to_rot(quat_wxyz: Array) -> Array:
