@@ -18,7 +18,7 @@ TRIALS = [
     for level in (1, 6)
     for seed in (0, 1)
 ]
-RULES = Rules(time_limit_s=3.0)
+RULES = Rules(time_limit_s=2.0)
 
 
 def results(trials, slots=64, threads=1, processes=1, policy=None):

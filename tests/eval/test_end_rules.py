@@ -74,7 +74,7 @@ def test_timeout(world):
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_gates_in_the_short_window(world):
-    result = one(Pursuit(3.0), straight((2.0, 8.0)), world, Rules(short_window_s=1.5))
+    result = one(Pursuit(3.0), straight((1.0, 3.5)), world, Rules(short_window_s=1.1))
     assert (result.gates_passed, result.gates_8s) == (2, 1)
 
 
@@ -94,11 +94,11 @@ def test_diverged_ends_that_trial_only(world, monkeypatch, tmp_path):
 
     def broken(cockpit, pilot, motion, action_b, gate_w, step, noise=None):
         pilot, wrench = original(cockpit, pilot, motion, action_b, gate_w, step, noise)
-        ill = (motion.pos_w[:, 0] > 0.5) & (gate_w[:, 0] > 5.0)
+        ill = (motion.pos_w[:, 0] > 0.5) & (gate_w[:, 0] > 2.0)
         wrench.force_b[ill] = np.nan
         return pilot, wrench
 
-    well, ill = straight((2.0, 4.0), name="well"), straight((6.0, 8.0), name="ill")
+    well, ill = straight((0.8, 1.6), name="well"), straight((2.4, 3.2), name="ill")
     trials = [TrialSpec("well", 0, 0), TrialSpec("ill", 0, 0), TrialSpec("well", 0, 1)]
     tracks, options = {"well": well, "ill": ill}, JudgeOptions(slots=4)
     before = fly(Pursuit(3.0), trials, VEHICLE, world, options, tracks=tracks)

@@ -75,7 +75,7 @@ def judged(policy, trial, rules):
 
 @pytest.mark.parametrize("trial", [TrialSpec("ellipse", 0, 0), TrialSpec("circular", 9, 1)])
 def test_environments_fly_what_the_judge_flies(trial):
-    rules, policy = Rules(time_limit_s=4.0), Pursuit(spec=EVEN)
+    rules, policy = Rules(time_limit_s=2.5), Pursuit(spec=EVEN)
     expected = judged(policy, trial, rules)
 
     env = RaceEnv(trial.track, trial.difficulty, trial.seed, spec=EVEN, rules=rules)

@@ -45,7 +45,7 @@ def both(trials, rules=None, record=None):
 @pytest.fixture(scope="module")
 def few():
     trials = [TrialSpec(t, 9, s) for t in ("zigzag", "circular", "ellipse") for s in range(4)]
-    return both(trials, Rules(time_limit_s=3.0), Record(depth=True))
+    return both(trials, Rules(time_limit_s=2.2), Record(depth=True))
 
 
 def test_states_and_images_agree(few):
