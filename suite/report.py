@@ -50,7 +50,7 @@ class Picture:
     png: bytes
     """The file's bytes."""
     caption: str
-    """Below it; also what is read out in its place."""
+    """Below it, where there is one; also what is read out in its place."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,8 @@ def _part(part: Part) -> str:
     if isinstance(part, Picture):
         data, caption = base64.b64encode(part.png).decode("ascii"), escape(part.caption)
         image = f'<img src="data:image/png;base64,{data}" alt="{caption}">'
-        return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
+        below = f"<figcaption>{caption}</figcaption>" if caption else ""
+        return f"<figure>{image}{below}</figure>"
     if isinstance(part, Links):
         entries = "".join(
             f'<li><a href="{escape(path)}">{escape(path)}</a> {escape(words)}</li>'

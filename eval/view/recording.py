@@ -70,7 +70,8 @@ def write_recording(
     if not rollouts:
         raise ValueError("a recording needs at least one rollout; got none")
     drone = drone or Drone()
-    tabs = [_tab(k, *rollout) for k, rollout in enumerate(rollouts)]
+    several = len({result.policy for _, _, result in rollouts}) > 1
+    tabs = [_tab(k, *rollout, several) for k, rollout in enumerate(rollouts)]
     # Nothing goes out until the file is named, so that it holds the blueprint first.
     recording = rr.RecordingStream(APPLICATION)
     with replacing_file(path) as beside:
@@ -95,10 +96,12 @@ def write_recording(
     return Path(path)
 
 
-def _tab(number: int, track: Track, flight: Flight, result: TrialResult) -> Tab:
+def _tab(number: int, track: Track, flight: Flight, result: TrialResult, several: bool) -> Tab:
     every = [solid.vertices for solid in track_solids(track)]
     points = np.concatenate([*every, track.start_pos_w[None], _finite(flight.pos_w)])
     title = f"{track.family} level {track.level} seed {track.seed}: {result.ended_by}"
+    if several:
+        title = f"{result.policy}, {title}"
     low_w, high_w = points.min(axis=0), points.max(axis=0)
     return Tab(f"/trial_{number}", title, _has_depth(flight), low_w, high_w)
 

@@ -27,10 +27,9 @@ from tracks.provenance import git_commit
 from tracks.version import VERSION
 
 READING = (
-    "Every policy flies the same trials in a MuJoCo quadrotor that training has never seen, and "
-    "flies without the Delta Action Model. Tuned without delta is the control: as many "
-    "iterations on the same tracks, in the uncorrected point mass. Coloured differences are those "
-    "whose interval does not hold zero."
+    "All three policies fly the same trials in the MuJoCo quadrotor, without the Delta Action "
+    "Model. Tuned without delta is the control: as many iterations on the same tracks, in the "
+    "uncorrected point mass. Coloured differences are those whose interval does not hold zero."
 )
 FILES = (
     ("table.md", "the tables on this page"),
@@ -82,7 +81,7 @@ def write_loop_report(
             ),
             _delta(out),
             _training(out, config),
-            _flights(out),
+            *_flights(out),
             _run(out, config, seconds),
         ],
     )
@@ -134,17 +133,18 @@ def _training(out: Path, config: LoopConfig) -> Section:
     return Section("Training", [words, Picture(chart, "Thin: each iteration. Thick: means.")])
 
 
-def _flights(out: Path) -> Section:
-    captions = {BEFORE: "Before fine-tuning.", WITH: "The same trials, tuned with delta."}
-    pictures = [
-        Picture((out / "replays" / f"{variant}.png").read_bytes(), captions[variant])
-        for variant in SHOWN
-    ]
-    words = (
-        "The first seed of every track at the easiest and the hardest level, from above. "
-        "Gates that were passed are green; a star is a finished trial, a cross where it ended."
-    )
-    return Section("Flights", [words, *pictures])
+def _flights(out: Path) -> list[Section]:
+    words = {
+        BEFORE: "The first seed of every track at the easiest and the hardest level, from above. "
+        "Gates that were passed are green; a star is a finished trial, a cross where it ended.",
+        WITH: "The same trials.",
+    }
+    titles = {BEFORE: "Flights before fine-tuning", WITH: "Flights, fine-tuned with delta"}
+    sections = []
+    for variant in SHOWN:
+        png = (out / "replays" / f"{variant}.png").read_bytes()
+        sections.append(Section(titles[variant], [words[variant], Picture(png, "")]))
+    return sections
 
 
 def _run(out: Path, config: LoopConfig, seconds: Mapping[str, float]) -> Section:
