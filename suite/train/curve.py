@@ -18,16 +18,21 @@ def append(folder: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def read(folder: Path) -> list[dict[str, Any]]:
-    """Return the whole rows of the curve; a last line cut short by a kill is left out."""
+    """Return the whole rows of the curve, each iteration once.
+
+    A last line cut short by a kill is left out, as are rows that an interrupted save wrote twice.
+    """
     path = folder / CURVE
     if not path.exists():
         return []
     rows = []
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
-            rows.append(json.loads(line))
+            row = json.loads(line)
         except ValueError:
             break
+        if not rows or row["iteration"] > rows[-1]["iteration"]:
+            rows.append(row)
     return rows
 
 

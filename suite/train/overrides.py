@@ -51,7 +51,7 @@ def _value(old: object, text: str, change: str) -> object:
         return tuple(_value(a, repr(b), change) for a, b in zip(old, value, strict=True))
     if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if type(value) is not type(old):
+    if type(value) is not type(old) or isinstance(old, tuple):
         raise ValueError(
             f"--set {change!r}: {text!r} does not fit, the setting is like {old!r} "
             f"({type(old).__name__})"

@@ -7,8 +7,10 @@ run draws the curve that it would have drawn without the stop.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 
 from policies import delta_network, network
 from policies.checkpoint import load_arrays, read_config, save_arrays
@@ -29,7 +32,7 @@ from suite.train import curve
 from suite.train.config import TrainConfig
 from suite.train.update import TrainState, device_mesh, make_update, start_state
 from suite.train.worlds import sample_worlds
-from tracks.files import plain
+from tracks.files import plain, recover_folder
 
 SAVE_PERIOD_S = 30.0
 """Time between checkpoints [s]."""
@@ -79,24 +82,43 @@ def train(
         delta: a frozen Delta Action network to train under.
 
     Raises:
-        ValueError: where the folder holds a run of another configuration.
+        ValueError: where the folder holds a run of another configuration, start or delta.
         WorkFailed: where the loss or the parameters stop being finite.
     """
     mesh = device_mesh(config)
-    state = _resume(config, folder, start_state(config, params))
+    origin = {"config": plain(config), "from": _digest(params), "delta": _digest(delta)}
+    state = _resume(origin, folder, start_state(config, params))
+    # Placed as the update returns it: placed otherwise, the second step would compile it again.
+    state = jax.device_put(state, NamedSharding(mesh, PartitionSpec()))
     first, total = int(state.iteration), config.optimizer.iterations
     if first < total:
         announce(console, f"training to {folder}", estimate(config))
         write_run_record(folder, config, config.seed)
-        state = _iterate(config, folder, console, state, make_update(config, mesh, delta))
+        update = make_update(config, mesh, delta)
+        state = _iterate(config, origin, folder, console, state, update)
     rows = curve.read(folder)
     last = rows[-max(1, len(rows) // 10) :]
     means = {key: float(np.mean([row[key] for row in last])) for key in last[0]}
     return Outcome(folder / "policy", int(state.iteration), means)
 
 
+def _digest(params: Mapping[str, Any] | None) -> str | None:
+    """Return what tells one network's parameters from another's; None for none."""
+    if params is None:
+        return None
+    digest = hashlib.sha256()
+    for name in sorted(params):
+        digest.update(name.encode() + np.asarray(params[name], order="C").tobytes())
+    return digest.hexdigest()
+
+
 def _iterate(
-    config: TrainConfig, folder: Path, console: Console, state: TrainState, update: Any
+    config: TrainConfig,
+    origin: dict[str, Any],
+    folder: Path,
+    console: Console,
+    state: TrainState,
+    update: Any,
 ) -> TrainState:
     total, frames = config.optimizer.iterations, config.episode.batch * config.episode.steps
     first = int(state.iteration)
@@ -107,7 +129,7 @@ def _iterate(
     def save() -> None:
         curve.append(folder, rows)
         rows.clear()
-        _save(config, folder, state)
+        _save(config, origin, folder, state)
 
     try:
         with console.progress("training", total) as show:
@@ -118,9 +140,11 @@ def _iterate(
                 worlds = sample_worlds(config, iteration + 1)
                 row = {key: float(value) for key, value in numbers.items()}
                 _check_finite(iteration, row, folder)
-                state = after
                 speed = frames / (time.monotonic() - started)
+                # The row comes first: an interrupt between the two leaves one too many, which
+                # resuming cuts, and not one too few.
                 rows.append({"iteration": iteration, **row, "steps_per_s": round(speed)})
+                state = after
                 show(iteration + 1, _note(row, speed))
                 if time.monotonic() - saved_at > SAVE_PERIOD_S:
                     save()
@@ -146,8 +170,8 @@ def _check_finite(iteration: int, row: dict[str, float], folder: Path) -> None:
         )
 
 
-def _save(config: TrainConfig, folder: Path, state: TrainState) -> None:
-    described = {"config": plain(config), "iteration": int(state.iteration)}
+def _save(config: TrainConfig, origin: dict[str, Any], folder: Path, state: TrainState) -> None:
+    described = {**origin, "iteration": int(state.iteration)}
     save_policy(folder / "policy", state.params, config.spec, seed=config.seed, training=described)
     # The state comes last: what it says is done has its policy and its curve on the disk.
     save_arrays(
@@ -159,18 +183,19 @@ def _save(config: TrainConfig, folder: Path, state: TrainState) -> None:
     )
 
 
-def _resume(config: TrainConfig, folder: Path, fresh: TrainState) -> TrainState:
+def _resume(origin: dict[str, Any], folder: Path, fresh: TrainState) -> TrainState:
     place = folder / "state"
+    recover_folder(place)
     if not place.exists():
         folder.mkdir(parents=True, exist_ok=True)
         curve.cut(folder, 0)
         return fresh
-    theirs = read_config(place)["training"]["config"]
-    ours = plain(config)
-    if theirs != ours:
-        changed = [key for key in ours if theirs.get(key) != ours[key]]
+    theirs = read_config(place)["training"]
+    options = [f"--{key}" for key in ("from", "delta") if theirs.get(key) != origin[key]]
+    settings = [k for k, v in origin["config"].items() if theirs["config"].get(k) != v]
+    if options or settings:
         raise ValueError(
-            f"{folder} holds a run of another configuration (it differs in {', '.join(changed)}); "
+            f"{folder} holds another run (it differs in {', '.join(options + settings)}); "
             "give another --out, or remove the folder to start over"
         )
     stored = load_arrays(place, kind="training")
