@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from eval.attitude import action_to_force, attitude_command, blend_heading, level_heading
 from eval.effects.interface import GRAVITY
 from eval.plant import Command, Motion, Plant, Wrench, make_plant, plant_step, start_memory
+from eval.tree_rows import packed, select
 from eval.vehicle import Controller, Vehicle
-from eval.worlds.slots import packed, select
 from tracks.scene import Array
 
 ATTITUDE_HZ = 100.0

@@ -157,7 +157,7 @@ def _fly_share(
         task.vehicle, policy.spec.camera, layout, task.options.rules,
         slots=task.options.slots, threads=task.options.threads,
     )  # fmt: skip
-    _Table(task, policy, world).run(share, emit)
+    _Slots(task, policy, world).run(share, emit)
 
 
 def _track(task: _Task, trial: TrialSpec) -> Track:
@@ -166,7 +166,7 @@ def _track(task: _Task, trial: TrialSpec) -> Track:
     return make_track(trial.track, trial.difficulty, trial.seed)
 
 
-class _Table:
+class _Slots:
     """The slots of a world with the trial and the policy's memory in each."""
 
     def __init__(self, task: _Task, policy: Policy, world: World) -> None:

@@ -7,10 +7,9 @@ import numpy as np
 
 from eval.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
 from eval.guard import ActionLimits, guard_action
-from eval.plant import Motion, uses_noise
+from eval.plant import uses_noise
 from eval.trial import (
     ENDINGS,
-    FINISHED,
     FLYING,
     Course,
     Progress,
@@ -23,7 +22,7 @@ from eval.trial import (
     start_progress,
 )
 from eval.vehicle import Vehicle
-from eval.worlds.engine import BODY, Eye, compile_model, start_state
+from eval.worlds.engine import Eye, compile_model, motion_of, start_state
 from eval.worlds.slots import layout_of, noise_of
 from policies.observation import encode_depth, state_vector
 from policies.spec import PolicySpec
@@ -74,7 +73,7 @@ class Race:
         """Put the quadrotor at the start, hovering; `data` has just been reset."""
         data.qpos[:], data.qvel[:] = self._start, 0.0
         mujoco.mj_step1(self.model, data)
-        motion = _motion(data)
+        motion = motion_of(data)
         noise = None if self._draws is None else self._draws[:1]
         self._pilot = start_autopilot(self.cockpit, motion, noise)
         self.progress = start_progress(motion.pos_w)
@@ -95,7 +94,7 @@ class Race:
             if self.progress.ended[0] != FLYING:
                 break
             before = self.progress
-            motion, step = _motion(data), before.step
+            motion, step = motion_of(data), before.step
             gate_w = next_gate(self._course, before.gates).center_w
             noise = None if self._draws is None else self._draws[step + 1]
             self._pilot, (force_b, torque_b) = fly_step(
@@ -120,7 +119,7 @@ class Race:
         return reward
 
     def _judge(self, data: mujoco.MjData, bad_wrench: bool) -> None:
-        motion = _motion(data)
+        motion = motion_of(data)
         with np.errstate(invalid="ignore", over="ignore"):
             self.progress = judge_state(
                 self.rules,
@@ -136,7 +135,7 @@ class Race:
 
     def observation(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
         """Return what a policy sees: `state` (12,) and `image` (H, W), float32."""
-        pos_w, rot_w, vel_w, _ = _motion(data)
+        pos_w, rot_w, vel_w, _ = motion_of(data)
         gate_w = next_gate(self._course, self.progress.gates).center_w
         if self.ended_by == "diverged":
             pos_w, rot_w, vel_w = self.progress.pos_w, np.eye(3)[None], np.zeros((1, 3))
@@ -147,17 +146,6 @@ class Race:
             "state": np.clip(state, -STATE_LIMIT, STATE_LIMIT).astype(np.float32),
             "image": image.astype(np.float32),
         }
-
-    @property
-    def finished(self) -> bool:
-        """Whether all gates were passed."""
-        return int(self.progress.ended[0]) == FINISHED
-
-
-def _motion(data: mujoco.MjData) -> Motion:
-    rot_w = data.xmat[BODY].reshape(1, 3, 3).copy()
-    pos_w, velocity = data.qpos[None, :3].copy(), data.qvel[None].copy()
-    return Motion(pos_w, rot_w, velocity[:, :3], velocity[:, 3:])
 
 
 def _state(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

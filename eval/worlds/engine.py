@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from eval.plant import Motion
 from eval.quadrotor_model import add_quadrotor, set_true_inertia
 from eval.vehicle import Vehicle
 from tracks.camera import Camera, pixel_rays_b
@@ -14,7 +15,7 @@ from tracks.track import Track
 
 BODY = 1
 """Number of the quadrotor's body: the first after the world, as the scene has no bodies."""
-NO_ERROR = mujoco.mjtDisableBit.mjDSBL_AUTORESET
+NO_AUTORESET = mujoco.mjtDisableBit.mjDSBL_AUTORESET
 """The judge finds states that are none and ends the trial; MuJoCo shall not reset them first."""
 
 
@@ -29,7 +30,7 @@ def compile_model(track: Track, vehicle: Vehicle, dt: float, to: Counts) -> mujo
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = dt
-    spec.option.disableflags |= NO_ERROR
+    spec.option.disableflags |= NO_AUTORESET
     add_scene(spec, track.scene, track.names, track.mesh_sizes, to)
     add_quadrotor(spec, vehicle)
     model = spec.compile()
@@ -75,6 +76,13 @@ class Eye:
         depth = np.where(geom < 0, self.camera.range_m, depth)
         depth = np.minimum(depth, self.camera.range_m)
         return depth.reshape(self.camera.height, self.camera.width)
+
+
+def motion_of(data: mujoco.MjData) -> Motion:
+    """Return the quadrotor's state as a batch of one; `data` holds what `mj_step1` computes."""
+    rot_w = data.xmat[BODY].reshape(1, 3, 3).copy()
+    pos_w, velocity = data.qpos[None, :3].copy(), data.qvel[None].copy()
+    return Motion(pos_w, rot_w, velocity[:, :3], velocity[:, 3:])
 
 
 def contact_name(model: mujoco.MjModel, data: mujoco.MjData) -> str:

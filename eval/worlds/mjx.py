@@ -22,6 +22,7 @@ import numpy as np
 from eval.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
 from eval.plant import Motion, body_constants, uses_noise
 from eval.quadrotor_model import add_quadrotor, set_true_inertia
+from eval.tree_rows import select
 from eval.trial import (
     DIVERGED,
     FLYING,
@@ -38,7 +39,7 @@ from eval.trial import (
 from eval.vehicle import Vehicle
 from eval.worlds import Rows, View
 from eval.worlds.engine import start_state
-from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates, select
+from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
 from eval.worlds.touch import NEAR, TOUCH_M, gaps
 from tracks.camera import Camera, pixel_rays_b
 from tracks.cull import nearest_solids

@@ -15,6 +15,7 @@ from mujoco.batch import Batch
 
 from eval.autopilot import fly_step, make_cockpit, start_autopilot
 from eval.plant import Motion, uses_noise
+from eval.tree_rows import packed, select
 from eval.trial import (
     DIVERGED,
     FLYING,
@@ -30,7 +31,7 @@ from eval.trial import (
 from eval.vehicle import Vehicle
 from eval.worlds import Rows, View
 from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
-from eval.worlds.slots import Layout, empty_course, noise_of, packed, pad_gates, select
+from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
 from tracks.camera import Camera
 from tracks.rotation import to_world
 from tracks.track import Track

@@ -14,7 +14,7 @@ from eval.guard import ActionLimits, guard_action
 from eval.plant import Motion, uses_noise
 from eval.trial import Rules, TrialResult, TrialSpec
 from eval.vehicle import Vehicle
-from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
+from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import layout_of, noise_of
 from policies.observation import encode_depth, state_vector
 from policies.policy import Policy
@@ -56,7 +56,7 @@ def fly_trial(
     if uses_noise(cockpit.plant):
         draws = noise_of(trial, round(rules.time_limit_s / dt) + 2)
     eye, hidden = Eye(spec.camera), policy.start(rows)
-    pilot = start_autopilot(cockpit, _motion(data), draws[:1] if len(draws) > 1 else None)
+    pilot = start_autopilot(cockpit, motion_of(data), draws[:1] if len(draws) > 1 else None)
     action_b, bad, limited, decisions = np.zeros((1, 3)), 0, 0, 0
     passed = passed_8s = passed_035 = 0
     speeds: list[float] = []
@@ -65,7 +65,7 @@ def fly_trial(
 
     while True:
         # Judge the state that the last step led to.
-        motion = _motion(data)
+        motion = motion_of(data)
         pos_w = motion.pos_w[0]
         if not _is_flight(motion, rules):
             ended_by = "diverged"
@@ -139,13 +139,6 @@ def fly_trial(
         limited_actions=limited,
         late_actions=0,
     )
-
-
-def _motion(data: mujoco.MjData) -> Motion:
-    """Return the state as a batch of one."""
-    rot_w = data.xmat[BODY].reshape(1, 3, 3).copy()
-    pos_w, velocity = data.qpos[None, :3].copy(), data.qvel[None].copy()
-    return Motion(pos_w, rot_w, velocity[:, :3], velocity[:, 3:])
 
 
 def _is_flight(motion: Motion, rules: Rules) -> bool:
