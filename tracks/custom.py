@@ -29,7 +29,7 @@ def load_track(path: str | os.PathLike[str]) -> Track:
     Raises:
         ValueError: naming the file, the key, its value and what is allowed, where something is
             missing, unknown, of the wrong shape or impossible (a gate below the ground, an
-            opening or a mesh that is not convex).
+            opening or a mesh that is not convex, a start inside a solid).
     """
     top = read_toml(Path(path))
     top.whole("schema", 1, least=1, most=1)
@@ -63,7 +63,9 @@ def load_track(path: str | os.PathLike[str]) -> Track:
     solid_names = (*box_names, *cylinder_names, *capsule_names, *sphere_names, *mesh_names)
     sizes = tuple(len(mesh) for mesh in meshes)
     all_names = (*frame_names, *solid_names)
-    return Track(name, 0, 0, 0.0, scene, start_pos_w, start_yaw, all_names, sizes)
+    track = Track(name, 0, 0, 0.0, scene, start_pos_w, start_yaw, all_names, sizes)
+    _refuse_start_inside(top, track)
+    return track
 
 
 class _Names:
@@ -179,9 +181,11 @@ def _unit(table: Table, key: str, vector: np.ndarray) -> np.ndarray:
 
 def _start(top: Table, gates: Gates) -> tuple[np.ndarray, float]:
     ahead = gates.rot_w[0, :, 0] * [1.0, 1.0, 0.0]
-    ahead = ahead / max(np.linalg.norm(ahead), 1e-9)
-    pos_w = gates.center_w[0] - _START_BEHIND_M * ahead
+    level = np.linalg.norm(ahead)
+    pos_w = gates.center_w[0] - _START_BEHIND_M * ahead / max(level, 1e-9)
     table = top.table("start") if top.has("start") else Table(top.path, "start", {})
+    if level < 1e-6 and not table.has("position"):
+        raise table.error("position", None, "a position: gate 0 is flown straight up or down")
     pos_w = table.vector("position", 3, pos_w.tolist())
     if pos_w[2] <= 0:
         raise table.error("position", pos_w.tolist(), "a position above the ground (z > 0)")
@@ -189,6 +193,18 @@ def _start(top: Table, gates: Gates) -> tuple[np.ndarray, float]:
     yaw_deg = table.number("yaw_deg", float(np.rad2deg(np.arctan2(to_gate[1], to_gate[0]))))
     table.close()
     return pos_w, float(np.deg2rad(yaw_deg))
+
+
+def _refuse_start_inside(top: Table, track: Track) -> None:
+    # Here, so that only those who read a track pay for the import of trimesh.
+    from tracks.meshes import solid_meshes
+
+    for name, mesh in solid_meshes(track):
+        # All solids are convex: inside is on one side of every face, whichever way they are wound.
+        side = np.sum((track.start_pos_w - mesh.triangles[:, 0]) * mesh.face_normals, axis=-1)
+        if np.all(side < 0) or np.all(side > 0):
+            allowed = f"a position outside of every solid; this one is inside {name!r}"
+            raise top.error("start.position", track.start_pos_w.tolist(), allowed)
 
 
 def _box(table: Table) -> tuple:

@@ -167,6 +167,17 @@ BAD = {
     ),
     "reserved": (GATE + '[[spheres]]\nname = "ground"\ncenter=[0,0,0]\nradius=1\n', "'ground'"),
     "start": ("[start]\nposition = [0, 0, -1]\n" + GATE, "start.position.*above the ground"),
+    "start in a box": (
+        "[start]\nposition = [0, 0, 1]\n" + GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[3,3,3]\n",
+        "start.position is .*inside 'box 0'",
+    ),
+    "start in a capsule": (
+        "[start]\nposition = [0, 0, 1]\n"
+        + GATE
+        + "[[capsules]]\ncenter=[0,0,0]\nradius=1\nlength=1\n",
+        "inside 'capsule 0'",
+    ),
+    "gate above, no start": (GATE + "pitch_deg = 90\n", "start.position is None.*straight up"),
     "start key": ("[start]\nyaw = 1\n" + GATE, r"key 'yaw' in \[start\]"),
     "no mesh": (GATE + '[[meshes]]\nfile = "none.stl"\n', "none.stl: no such mesh file"),
 }
@@ -179,6 +190,18 @@ def test_a_bad_file_is_refused_by_name(tmp_path, case):
     with pytest.raises(ValueError, match=said) as caught:
         load_track(path)
     assert str(tmp_path) in str(caught.value)
+
+
+def test_a_start_inside_a_mesh_is_refused_however_it_is_wound(tmp_path):
+    place = "[start]\nposition = [0.4, 0, 1]\n"
+    path = write(tmp_path, place + GATE + '[[meshes]]\nfile = "part.obj"\nposition=[0,0,1]\n')
+    box = trimesh.creation.box((1, 1, 1))
+    for faces in (box.faces, box.faces[:, ::-1]):
+        trimesh.Trimesh(box.vertices, faces, process=False).export(tmp_path / "part.obj")
+        with pytest.raises(ValueError, match="inside 'mesh 0'"):
+            load_track(path)
+    path = write(tmp_path, path.read_text().replace("0.4, 0, 1", "0.6, 0, 1"))
+    assert load_track(path).start_pos_w[0] == 0.6
 
 
 def test_a_missing_file_is_named(tmp_path):
