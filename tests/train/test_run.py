@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 
 import jax
 import numpy as np
@@ -21,9 +22,23 @@ from tests.support.training import boxes_worlds, fresh_params, small_config
 CONFIG = small_config(physics={"depth_noise": 0.02})
 
 
+make_update = run.make_update
+
+
+@cache
+def compiled_update(config, mesh):
+    return make_update(config, mesh)
+
+
+def update_of(config, mesh, delta=None):
+    """Return the trainer's update, compiled once for all tests."""
+    return compiled_update(config, mesh) if delta is None else make_update(config, mesh, delta)
+
+
 @pytest.fixture(autouse=True)
 def _small_scenes(monkeypatch):
     monkeypatch.setattr(run, "sample_worlds", boxes_worlds)
+    monkeypatch.setattr(run, "make_update", update_of)
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +47,7 @@ def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "sample_worlds", boxes_worlds)
+        patch.setattr(run, "make_update", update_of)
         run.train(CONFIG, folder, Console())
     return folder
 
@@ -128,10 +144,9 @@ def test_a_kill_between_the_two_renames_of_the_state_loses_nothing(whole, tmp_pa
     (part / "replaced").mkdir(parents=True)
     os.replace(tmp_path / "state", part / "state")
     done = []
-    real = run.make_update
 
     def counted(*args):
-        update = real(*args)
+        update = update_of(*args)
         return lambda *a: (done.append(0), update(*a))[1]
 
     monkeypatch.setattr(run, "make_update", counted)
@@ -181,19 +196,16 @@ def test_a_bare_machine_trains_and_a_real_kill_while_saving_loses_nothing(whole,
     assert_same_run(tmp_path, whole)
 
 
-@pytest.mark.parametrize("broken", ["lag", "drag"])
-def test_numbers_that_are_not_finite_stop_the_run_before_they_are_kept(
-    broken, tmp_path, monkeypatch
-):
+def test_numbers_that_are_not_finite_stop_the_run_before_they_are_kept(tmp_path, monkeypatch):
     def worlds(config, iteration):
         good = boxes_worlds(config, iteration)
         if iteration < 2:
             return good
-        value = getattr(good.constants, broken) * np.float32(np.nan)
-        return good._replace(constants=good.constants._replace(**{broken: value}))
+        lag = good.constants.lag * np.float32(np.nan)
+        return good._replace(constants=good.constants._replace(lag=lag))
 
     monkeypatch.setattr(run, "sample_worlds", worlds)
-    with pytest.raises(WorkFailed, match="diverged at iteration 2: loss, .* not finite"):
+    with pytest.raises(WorkFailed, match="diverged at iteration 2: .*loss, .* not finite"):
         run.train(CONFIG, tmp_path, Console())
     stored = load_arrays(tmp_path / "state", kind="training")
     assert stored.config["training"]["iteration"] == 2
@@ -262,10 +274,18 @@ def test_two_devices_give_the_gradient_of_one(root):
     assert float(done.stdout) < 1e-4
 
 
-def test_thirty_iterations_on_an_easy_course_reduce_the_loss(tmp_path):
-    optimizer = {"iterations": 30, "rate": 3e-3, "warmup": 3}
-    config = small_config(8, 24, optimizer=optimizer, difficulty=(0.0, 0.0))
-    run.train(config, tmp_path, Console())
-    found = [row["loss"] for row in curve.read(tmp_path)]
-    print(found, [row["speed"] for row in curve.read(tmp_path)])
-    assert np.mean(found[-6:]) < np.mean(found[:6]) - 0.3
+def test_thirty_iterations_on_an_easy_course_reduce_the_loss(tmp_path, monkeypatch):
+    """Eight worlds without obstacles, the same every time: there is nothing to gain but speed."""
+    optimizer = {"iterations": 30, "rate": 1e-2, "warmup": 3}
+    config = small_config(8, 24, optimizer=optimizer, difficulty=(0.0, 0.0), rest_share=1.0)
+    worlds = boxes_worlds(config)
+    boxes = worlds.scene.boxes
+    gone = boxes._replace(center_w=boxes.center_w - np.float32([0, 0, 1000]))
+    worlds = worlds._replace(scene=worlds.scene._replace(boxes=gone))
+    monkeypatch.setattr(run, "sample_worlds", lambda *_: worlds)
+    run.train(config, tmp_path, Console(), fresh_params())
+    found = curve.read(tmp_path)
+    losses = [row["loss"] for row in found]
+    assert losses[0] - losses[-1] > 0.04
+    assert np.mean(np.diff(losses) < 0) > 0.8
+    assert found[-1]["speed"] > 1.1 * found[0]["speed"]
