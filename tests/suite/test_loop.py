@@ -92,6 +92,9 @@ def test_the_loop_leaves_tables_report_and_recording(whole):
         assert (out / name).stat().st_size > 100, name
     for name in STAGES:
         assert (out / name / "stage.json").is_file(), name
+    recording = (out / "recording.rrd").read_bytes()
+    assert b"before, zigzag level 0 seed 4" in recording
+    assert b"tuned with delta, zigzag level 0 seed 4" in recording
     found = json.loads((out / "loop.json").read_text())
     assert set(found) >= {"schema", "suite_version", "git_commit", "seed", "comparison", "delta"}
     assert [line["track"] for line in found["comparison"]] == ["zigzag", "all"]
