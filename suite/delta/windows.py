@@ -26,7 +26,7 @@ class Windows(NamedTuple):
     rot_w: np.ndarray
     """(N, 3, 3) measured at the start, body to world."""
     heading_w: np.ndarray
-    """(N, T + 1, 3) measured nose direction, unit and level."""
+    """(N, T + 1, 3) level direction that the nose follows, unit."""
     action_b: np.ndarray
     """(N, T, 3) the actions flown [m/s^2]."""
     commands_w: np.ndarray
@@ -35,10 +35,16 @@ class Windows(NamedTuple):
     """(N, T) time between decisions [s]."""
 
 
-def _level(forward_w: np.ndarray) -> np.ndarray:
-    flat = forward_w * [1.0, 1.0, 0.0]
-    size = np.linalg.norm(flat, axis=-1, keepdims=True)
-    return np.where(size > 1e-3, flat / np.maximum(size, 1e-3), [1.0, 0.0, 0.0])
+def _heading(rot_w: np.ndarray) -> np.ndarray:
+    """Return the level direction (..., 3) from which `point_mass.attitude` makes the same nose.
+
+    That is the one square to body y; body x laid flat points elsewhere once the body is rolled.
+    """
+    left, up = rot_w[..., 1], rot_w[..., 2]
+    ahead = np.stack([left[..., 1], -left[..., 0], np.zeros_like(left[..., 0])], axis=-1)
+    ahead = ahead * np.where(up[..., 2:] < 0, -1.0, 1.0)
+    size = np.linalg.norm(ahead, axis=-1, keepdims=True)
+    return np.where(size > 1e-3, ahead / np.maximum(size, 1e-3), [1.0, 0.0, 0.0])
 
 
 def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -> Windows:
@@ -81,7 +87,7 @@ def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[
     gap = (log.time_s[at + 1] - time)[:, None]
     acc = (log.vel_w[at + 1] - log.vel_w[at]) / gap
     command = (rot @ action[at][:, :, None])[:, :, 0]
-    heading = _level(rot[:, :, 0])
+    heading = _heading(rot)
     if len(at) < HISTORY + 3:
         return []
     period = float(np.median(np.diff(time)))
