@@ -8,7 +8,7 @@ plain system identification to be worth its network.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +20,10 @@ from policies import delta_network
 from suite.delta.replay import Plant, nominal_plant, replay
 from suite.delta.windows import Windows
 from suite.train.config import PointMassConfig
+
+
+IDENTIFY_RATE = 3e-2
+"""Least learning rate of lag, drag and delay: they have further to go than a network's weights."""
 
 
 @dataclass(frozen=True)
@@ -132,9 +136,9 @@ def identify(config: FitConfig, physics: PointMassConfig, windows: Windows) -> P
     def loss(variables: Any, batch: Windows) -> jax.Array:
         return _loss(config, as_plant(variables), batch, None)
 
-    # The rate suits a network's weights; four plain numbers move the same distance in fewer steps.
     iterations = max(1, config.iterations // 3)
-    best = _descend(config, loss, start, windows, iterations, lambda *_: None)
+    faster = replace(config, rate=max(config.rate, IDENTIFY_RATE))
+    best = _descend(faster, loss, start, windows, iterations, lambda *_: None)
     return as_plant(best)
 
 
