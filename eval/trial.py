@@ -71,6 +71,11 @@ class TrialResult(NamedTuple):
         """The trial that this is the result of."""
         return TrialSpec(self.track, self.difficulty, self.seed)
 
+    @property
+    def ending(self) -> str:
+        """How it ended, for people: "collision with gate 3 frame"."""
+        return self.ended_by + (f" with {self.collided_with}" if self.collided_with else "")
+
 
 @dataclass(frozen=True)
 class Rules:
@@ -109,7 +114,9 @@ class Progress(NamedTuple):
     gates: Array
     """Gates crossed in order: also the number of the next gate, int32."""
     gates_8s: Array
+    """Gates crossed within `Rules.short_window_s`, int32."""
     gates_035: Array
+    """Gates by the baseline's rule, int32."""
     v_max: Array
     """[m/s]."""
     v_sum: Array

@@ -249,10 +249,7 @@ def _title(track: Track) -> str:
 
 
 def _outcome(result: TrialResult, short: bool = False) -> str:
-    ended = result.ended_by
-    if result.collided_with:
-        ended += f" with {result.collided_with}"
-    text = f"{ended} after {result.time_s:.2f} s, {result.gates_passed} gates passed"
+    text = f"{result.ending} after {result.time_s:.2f} s, {result.gates_passed} gates passed"
     if short:
         return text
     text += f", v_max {result.v_max:.1f} m/s, mean {result.v_mean:.1f} m/s"

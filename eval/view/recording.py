@@ -169,12 +169,9 @@ def _log_marks(
 ) -> None:
     start = rr.Points3D([track.start_pos_w], radii=0.08, colors=[colours.START], labels=["start"])
     recording.log(f"{world}/start", start, static=True)
-    ended = result.ended_by
-    if result.collided_with:
-        ended += f" with {result.collided_with}"
     colour = colours.PASSED if result.ended_by == "finished" else colours.CRASH
     end = [[result.pos_x, result.pos_y, result.pos_z]]
-    mark = rr.Points3D(end, radii=0.12, colors=[colour], labels=[ended])
+    mark = rr.Points3D(end, radii=0.12, colors=[colour], labels=[result.ending])
     recording.log(f"{world}/end", mark, static=True)
 
 
@@ -263,7 +260,6 @@ def _log_events(
 ) -> None:
     rows = np.flatnonzero(np.diff(flight.gate)) + 1
     texts = [f"gate {flight.gate[row] - 1} passed" for row in rows]
-    ended = f"{result.ended_by} with {result.collided_with}"
-    texts.append(ended if result.collided_with else result.ended_by)
+    texts.append(result.ending)
     time = np.append(flight.time_s[rows], result.time_s)
     recording.send_columns(entity, _times(time), rr.TextLog.columns(text=texts))

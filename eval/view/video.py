@@ -1,18 +1,16 @@
 """A short video of a trial from behind the drone, with the depth image it saw.
 
-The frames are painted by `scene3d.py`, so neither a display nor a GPU is needed.
+The frames are painted by `scene3d.py` and encoded by `video_file.py`, so neither a display nor a
+GPU is needed.
 """
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import imageio_ffmpeg
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter1d
@@ -22,6 +20,7 @@ from eval.trial import TrialResult
 from eval.view import colours
 from eval.view.scene3d import SKY, Faces, Lines, look_at, paint
 from eval.view.solids import track_solids
+from eval.view.video_file import write_gif, write_mp4
 from tracks.files import replacing_file
 from tracks.rotation import quat_to_rot
 from tracks.track import Track
@@ -96,9 +95,9 @@ def write_video(
     frames = video_frames(track, flight, result, options)
     with replacing_file(path) as beside:
         if kind == ".gif":
-            _write_gif(beside, frames, options, on_frame)
+            write_gif(beside, frames, options.fps, on_frame)
         else:
-            _write_mp4(beside, frames, options, on_frame)
+            write_mp4(beside, frames, options.size, options.fps, on_frame)
     return path
 
 
@@ -228,61 +227,7 @@ def _write_on(
     status = f"{time:5.2f} s    {speed:4.1f} m/s    gates {passed}/{gates}"
     draw.text((14, image.height * 0.93), status, fill=colours.DRONE, font=font, **edge)
     if ended:
-        text = result.ended_by
-        if result.collided_with:
-            text += f" with {result.collided_with}"
         colour = colours.PASSED if result.ended_by == "finished" else colours.CRASH
         large = ImageFont.load_default(size=image.height // 14)
         where = (image.width / 2, image.height * 0.2)
-        draw.text(where, text, fill=colour, font=large, anchor="mm", **edge)
-
-
-def _write_mp4(
-    path: Path,
-    frames: Iterator[Image.Image],
-    options: VideoOptions,
-    on_frame: Callable[[int], None] | None,
-) -> None:
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
-    size = f"{options.size[0]}x{options.size[1]}"
-    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(options.fps)]
-    # yuv420p and the index in front: plays in every browser, and while it still loads.
-    command += ["-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "22"]
-    command += ["-movflags", "+faststart", str(path)]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe) as encoder:
-        assert encoder.stdin is not None and encoder.stderr is not None
-        try:
-            for number, frame in enumerate(frames, start=1):
-                encoder.stdin.write(frame.tobytes())
-                if on_frame is not None:
-                    on_frame(number)
-        except BrokenPipeError:
-            pass  # the encoder has given up and says why
-        except BaseException:
-            encoder.kill()
-            raise
-        finally:
-            with suppress(BrokenPipeError):
-                encoder.stdin.close()
-        reason = encoder.stderr.read().decode(errors="replace").strip()
-    if encoder.returncode:
-        raise OSError(f"{path.name}: the video encoder failed: {reason}")
-
-
-def _write_gif(
-    path: Path,
-    frames: Iterator[Image.Image],
-    options: VideoOptions,
-    on_frame: Callable[[int], None] | None,
-) -> None:
-    indexed: list[Image.Image] = []
-    for number, frame in enumerate(frames, start=1):
-        palette = indexed[0] if indexed else None
-        colour_count = 128
-        image = frame.quantize(colour_count) if palette is None else frame.quantize(palette=palette)
-        indexed.append(image)
-        if on_frame is not None:
-            on_frame(number)
-    duration = round(1000 / options.fps)
-    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
+        draw.text(where, result.ending, fill=colour, font=large, anchor="mm", **edge)

@@ -1,0 +1,77 @@
+"""Frames encoded as a video file: MP4 through ffmpeg, or GIF."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import imageio_ffmpeg
+from PIL import Image
+
+COLOURS = 128
+"""Colours of a GIF's palette."""
+
+
+def write_mp4(
+    path: Path,
+    frames: Iterable[Image.Image],
+    size: tuple[int, int],
+    fps: int,
+    on_frame: Callable[[int], None] | None = None,
+) -> None:
+    """Write frames of `size` (width, height) as H.264 through ffmpeg's own pipe.
+
+    Args:
+        path: file to write, ending in `.mp4`.
+        frames: one after the other; only one is held at a time.
+        size: even numbers [pixels].
+        fps: frames a second.
+        on_frame: called with the number of frames that are done.
+
+    Raises:
+        OSError: where ffmpeg fails, with what it says.
+    """
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(fps)]
+    # yuv420p and the index in front: plays in every browser, and while it still loads.
+    command += ["-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "22"]
+    command += ["-movflags", "+faststart", str(path)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe) as encoder:
+        assert encoder.stdin is not None and encoder.stderr is not None
+        try:
+            for number, frame in enumerate(frames, start=1):
+                encoder.stdin.write(frame.tobytes())
+                if on_frame is not None:
+                    on_frame(number)
+        except BrokenPipeError:
+            pass  # the encoder has given up and says why
+        except BaseException:
+            encoder.kill()
+            raise
+        finally:
+            with suppress(BrokenPipeError):
+                encoder.stdin.close()
+        reason = encoder.stderr.read().decode(errors="replace").strip()
+    if encoder.returncode:
+        raise OSError(f"{path.name}: the video encoder failed: {reason}")
+
+
+def write_gif(
+    path: Path,
+    frames: Iterable[Image.Image],
+    fps: int,
+    on_frame: Callable[[int], None] | None = None,
+) -> None:
+    """Write frames as GIF, all with the colours of the first; the arguments are `write_mp4`'s."""
+    indexed: list[Image.Image] = []
+    for number, frame in enumerate(frames, start=1):
+        palette = indexed[0] if indexed else None
+        image = frame.quantize(COLOURS) if palette is None else frame.quantize(palette=palette)
+        indexed.append(image)
+        if on_frame is not None:
+            on_frame(number)
+    duration = round(1000 / fps)
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
