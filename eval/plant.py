@@ -86,7 +86,8 @@ class Plant(NamedTuple):
 
     nominal: Nominal
     constants: Constants
-    """With every effect that changes one."""
+    """The true ones, with every effect that changes one; a world needs mass, inertia, gravity_w
+    and com_offset_b."""
     effects: dict[str, Any]
     """Values of all effects, as arrays, by name."""
     delay_weight: Array
@@ -183,11 +184,6 @@ def start_memory(
 def uses_noise(plant: Plant) -> bool:
     """Return whether an effect of `plant` needs normal draws at every step."""
     return any(EFFECTS[name].gust is not None for name in plant.effects)
-
-
-def body_constants(plant: Plant) -> Constants:
-    """Return the true constants: a world needs mass, inertia, gravity_w and com_offset_b."""
-    return plant.constants
 
 
 def plant_step(

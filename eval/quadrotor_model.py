@@ -12,7 +12,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from eval.plant import body_constants, make_plant
+from eval.plant import make_plant
 from eval.vehicle import Vehicle
 
 BODY = "quadrotor"
@@ -42,7 +42,7 @@ def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
     Raises:
         ValueError: where an effect leaves no mass.
     """
-    constants = body_constants(make_plant(vehicle, 1.0 / vehicle.controller.frequency))
+    constants = make_plant(vehicle, 1.0 / vehicle.controller.frequency).constants
     spec.option.gravity = constants.gravity_w
     body = spec.worldbody.add_body(name=BODY)
     body.add_freejoint(name=BODY)
@@ -83,7 +83,7 @@ def set_true_inertia(model: mujoco.MjModel, vehicle: Vehicle) -> None:
     fitted or assumed `inertia_scale` of a flat quadrotor easily does by a few percent; its
     dynamics do not mind.
     """
-    constants = body_constants(make_plant(vehicle, 1.0 / vehicle.controller.frequency))
+    constants = make_plant(vehicle, 1.0 / vehicle.controller.frequency).constants
     model.body(BODY).inertia[:] = constants.inertia
     # For a lone free body MuJoCo steps with constants that it derived from the inertia.
     mujoco.mj_setConst(model, mujoco.MjData(model))

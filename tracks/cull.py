@@ -18,19 +18,24 @@ class Bounds(NamedTuple):
     """Bounding spheres of one kind of solid."""
 
     center_w: Array
-    """(B, N, 3) [m]."""
+    """(..., N, 3) [m]."""
     radius: Array
-    """(B, N) [m]."""
+    """(..., N) [m]."""
 
 
 def bounds(scene: Scene) -> list[tuple[str, Bounds]]:
-    """Return the bounding spheres of every kind, under its field's name in `Scene`."""
+    """Return the bounding spheres of every kind, under its field's name in `Scene`.
+
+    Takes numpy and JAX arrays, with any leading batch shape.
+    """
+    half = scene.boxes.half_size
+    xp = half.__array_namespace__()
     rods = [
         (
             name,
             Bounds(
                 rod.center_w,
-                jnp.hypot(rod.radius, rod.half_length) if flat else rod.radius + rod.half_length,
+                xp.hypot(rod.radius, rod.half_length) if flat else rod.radius + rod.half_length,
             ),
         )
         for name, rod, flat in (
@@ -38,9 +43,8 @@ def bounds(scene: Scene) -> list[tuple[str, Bounds]]:
             ("capsules", scene.capsules, False),
         )
     ]
-    half = scene.boxes.half_size
     return [
-        ("boxes", Bounds(scene.boxes.center_w, jnp.sqrt((half * half).sum(-1)))),
+        ("boxes", Bounds(scene.boxes.center_w, xp.sqrt((half * half).sum(-1)))),
         *rods,
         ("spheres", Bounds(scene.spheres.center_w, scene.spheres.radius)),
     ]

@@ -9,6 +9,8 @@ from __future__ import annotations
 from tracks.rotation import to_local, to_world
 from tracks.scene import Array
 
+CURRENT = 2e-5
+"""C_I, as the paper has it [m]."""
 _TINY = 1e-9
 
 
@@ -18,7 +20,7 @@ def _norm(vector: Array) -> Array:
 
 
 def magnetic_field(
-    center_w: Array, rot_w: Array, opening_g: Array, point_w: Array, current: float = 2e-5
+    center_w: Array, rot_w: Array, opening_g: Array, point_w: Array, current: float = CURRENT
 ) -> Array:
     """Return the field B (..., 3) at point_w, in the world frame (Eq. mag_segment, mag_total).
 

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 from eval.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
-from eval.plant import Motion, body_constants, uses_noise
+from eval.plant import Motion, uses_noise
 from eval.quadrotor_model import add_quadrotor, set_true_inertia
 from eval.tree_rows import select
 from eval.trial import (
@@ -85,7 +85,7 @@ class MjxWorld:
         self.dt = self._cockpit.dt
         self._model = mjx.put_model(_free_body(vehicle, self.dt))
         self._half_size = np.asarray(vehicle.body.half_size)
-        self._middle_b = -np.asarray(body_constants(self._cockpit.plant).com_offset_b)
+        self._middle_b = -np.asarray(self._cockpit.plant.constants.com_offset_b)
         self._rays_b = jnp.asarray(pixel_rays_b(camera), jnp.float32)
         self._most = 0
         self._has_noise = uses_noise(self._cockpit.plant)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from suite.train.config import LossConfig
-from tracks.field import attractive_field, magnetic_field
+from tracks.field import CURRENT, attractive_field, magnetic_field
 from tracks.scene import Gates
 
 UNIT_FIELD = 11.313708498984761
@@ -83,7 +83,7 @@ def guidance_term(
     held_pos, held_vel = jax.lax.stop_gradient(pos_w), jax.lax.stop_gradient(vel_w)
     field = magnetic_field(gates.center_w, gates.rot_w, gates.opening_g, held_pos)
     pull = attractive_field(field, held_vel, config.field_decay)
-    unit = (2e-5 * UNIT_FIELD) ** (1 - config.field_decay)
+    unit = (CURRENT * UNIT_FIELD) ** (1 - config.field_decay)
     pull = pull / unit
     pull = pull * jnp.minimum(1.0, MAX_PULL / _norm(pull))[:, None]
     return -config.field_gain * (jax.lax.stop_gradient(pull) * (pos_w - held_pos)).sum(-1)

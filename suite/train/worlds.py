@@ -11,6 +11,7 @@ import numpy as np
 
 from suite.train.config import TrainConfig
 from suite.train.point_mass import Constants
+from tracks.cull import Bounds, bounds
 from tracks.families import MAX_COUNTS, random_track
 from tracks.scene import Array, Scene, stack
 from tracks.track import Track
@@ -43,27 +44,12 @@ def difficulty_range(config: TrainConfig, iteration: int) -> tuple[float, float]
 
 def _clearance(track: Track, point_w: np.ndarray) -> float:
     """Return a lower bound of the distance to the obstacles other than gate frames [m]."""
-    scene = track.scene
-    bars = scene.gates.opening_g.shape[0] * scene.gates.opening_g.shape[1]
-    centers = np.concatenate(
-        [
-            scene.boxes.center_w[bars:],
-            scene.cylinders.center_w,
-            scene.capsules.center_w,
-            scene.spheres.center_w,
-        ]
-    )
-    radii = np.concatenate(
-        [
-            np.linalg.norm(scene.boxes.half_size[bars:], axis=-1),
-            np.hypot(scene.cylinders.radius, scene.cylinders.half_length),
-            scene.capsules.radius + scene.capsules.half_length,
-            scene.spheres.radius,
-        ]
-    )
-    if len(radii) == 0:
-        return np.inf
-    return float((np.linalg.norm(centers - point_w, axis=-1) - radii).min())
+    bars = track.scene.gates.opening_g.shape[0] * track.scene.gates.opening_g.shape[1]
+    spheres = dict(bounds(track.scene))
+    spheres["boxes"] = Bounds(*(field[bars:] for field in spheres["boxes"]))
+    away = np.concatenate([ball.center_w for ball in spheres.values()]) - point_w
+    radius = np.concatenate([ball.radius for ball in spheres.values()])
+    return float((np.linalg.norm(away, axis=-1) - radius).min(initial=np.inf))
 
 
 def _on_the_way(
