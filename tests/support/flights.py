@@ -113,3 +113,20 @@ def result_of(track, flight, ended_by="finished"):
         limited_actions=0,
         late_actions=0,
     )
+
+
+def small_log():
+    t = np.array([0.0, 0.01, 0.02, 0.03, 0.04])
+    half = 0.5 * t  # turns about z at 1 rad/s
+    quat = np.stack([np.cos(half), 0 * t, 0 * t, np.sin(half)], axis=-1)
+    quat[3:] *= -1.0  # the same attitude, told with the other sign
+    steady_rate = np.tile([0.0, 0.0, 1.0], (5, 1))
+    return {
+        "time_s": t,
+        "pos_w": np.stack([3.0 * t, 0 * t, 1 + 0 * t], axis=-1),
+        "vel_w": np.stack([3.0 + 2.0 * t, 0 * t, 0 * t], axis=-1),
+        "quat_wxyz": quat,
+        "rate_b": steady_rate,
+        "acc_b": np.tile([0.0, 0.0, 9.81], (5, 1)),
+        "thrust_cmd": 10.0 + t,
+    }
