@@ -25,6 +25,7 @@ COMMANDS: dict[str, str] = {
     "effects": "the physical effects that a vehicle file may hold",
     "eval": "judge policies: success rates, speeds and lap times, with intervals",
     "export": "write a policy as torch program and ONNX",
+    "import": "a flight of PX4, Betaflight, a Crazyflie, ROS 2 or a table as a flight log",
     "info": "versions, devices, memory and commit, for bug reports",
     "loop": "train, fly, record, fit the Delta Action Model, fine-tune, fly again",
     "tracks": "list the track families, or draw a track as a picture",

@@ -80,6 +80,13 @@ class Table:
             raise self.error(key, value, "a text that is not empty")
         return value
 
+    def texts(self, key: str) -> list[str]:
+        """Return a list of texts, none of them empty."""
+        value = self._get(key, _REQUIRED, "a list of texts")
+        if not isinstance(value, list) or not all(isinstance(v, str) and v for v in value):
+            raise self.error(key, value, "a list of texts that are not empty")
+        return value
+
     def vector(
         self, key: str, size: int, default: Iterable[float] = _REQUIRED, above: float = -math.inf
     ) -> np.ndarray:

@@ -1,0 +1,67 @@
+"""Flight logs of other programs as flight logs of ours: one file a format, and the table of them.
+
+    imported = import_log("log.ulg")
+    write_flight("flight.parquet", imported.log)
+
+A format is a module with `read(path, options) -> Recording`. docs/import.md says what each reads.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from eval.flight_log import FlightLog
+    from eval.importers.findings import Finding
+    from eval.importers.options import ImportOptions
+
+FORMATS: dict[str, str] = {
+    "px4": "PX4 ULog (.ulg)",
+    "betaflight": "CSV of blackbox_decode; needs --pose",
+    "crazyflie": "log of the Crazyflie's micro SD card deck",
+    "table": "CSV or Parquet, described by a mapping file (--map)",
+    "mcap": "MCAP with ROS 2 messages (pip install 'diffracing-suite[mcap]')",
+}
+"""Name -> what it reads; format NAME is read by eval/importers/NAME_format.py."""
+
+
+class ImportedLog(NamedTuple):
+    """A flight of another program."""
+
+    log: FlightLog
+    """In our columns, units and frames."""
+    findings: tuple[Finding, ...]
+    """What was checked, corrected and doubted."""
+
+
+def import_log(
+    path: str | os.PathLike[str],
+    format: str | None = None,
+    options: ImportOptions | None = None,
+) -> ImportedLog:
+    """Read a log of another program, check it, and bring it to our columns, units and frames.
+
+    Args:
+        path: the file.
+        format: a name of `FORMATS`; by default told by the file's first bytes.
+        options: see `eval.importers.options`.
+
+    Raises:
+        FlightLogError: for a file that cannot be used; it names the file and the reason.
+        ValueError: for an unknown format, or a mapping file that cannot be used.
+    """
+    from eval.importers.assemble import assemble
+    from eval.importers.detect import detect
+    from eval.importers.options import ImportOptions
+    from tracks.names import unknown_name
+
+    told = options or ImportOptions()
+    file = Path(path)
+    name = format or detect(file, told)
+    if name not in FORMATS:
+        raise unknown_name("format", name, FORMATS)
+    module = importlib.import_module(f"eval.importers.{name}_format")
+    return ImportedLog(*assemble(module.read(file, told), name, told))

@@ -1,0 +1,113 @@
+"""From a recording to a checked flight log: the part that all formats share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eval.flight_check import GROUPS, FlightLogError
+from eval.flight_log import FlightLog, log_from_columns
+from eval.importers.attitude_check import check_attitude
+from eval.importers.findings import Finding, said
+from eval.importers.motion_check import (
+    check_accelerometer,
+    check_frames,
+    check_rate_command,
+    check_velocity,
+)
+from eval.importers.motors import order_motors
+from eval.importers.options import ImportOptions
+from eval.importers.rows import rows_from
+from eval.importers.signals import Recording, median_step
+from eval.importers.thrust import thrust_command
+from eval.importers.units_check import check_units
+
+SLOW_HZ = 40.0
+"""Positions or attitudes that come more rarely than this are worth a word."""
+
+
+def assemble(
+    recording: Recording, format: str, options: ImportOptions
+) -> tuple[FlightLog, tuple[Finding, ...]]:
+    """Return `recording` as a flight log, and what its checks found.
+
+    Raises:
+        FlightLogError: where something a log needs is missing or breaks a rule.
+    """
+    findings = list(recording.findings)
+    if options.pose is not None:
+        from eval.importers.pose import with_pose
+
+        recording, more = with_pose(recording, options)
+        findings += more
+    _need(recording)
+    recording, more = check_units(recording, options.fix)
+    findings += more
+    findings += _rates(recording)
+    rows = rows_from(recording, options.rate_hz, options.start_s, options.end_s)
+    findings += check_attitude(rows, options.fix)
+    findings += check_velocity(rows, options.fix)
+    findings += check_frames(rows, options.fix)
+    findings += check_accelerometer(rows, options.fix)
+    findings += check_rate_command(rows, options.fix)
+    findings += order_motors(rows, recording.motor_side, options.vehicle)
+    findings += thrust_command(rows, options)
+    findings += _pair(rows)
+    columns = _columns(rows)
+    if "cmd_thrust" not in columns and "motor_1" not in columns:
+        lines = "".join(f"\n{line}" for line in said(tuple(findings)))
+        reason = f"neither a thrust and rate command nor motor speeds could be read{lines}"
+        raise FlightLogError(recording.name, None, None, reason)
+    about = {
+        **recording.about,
+        "source": format,
+        "imported_from": recording.name.replace("\\", "/").rsplit("/", 1)[-1],
+        "findings": [finding._asdict() for finding in findings],
+    }
+    if options.vehicle is not None:
+        about["vehicle"] = options.vehicle.name
+    log = log_from_columns(columns, about, recording.name)
+    return log, tuple(findings)
+
+
+def _need(recording: Recording) -> None:
+    names = {"pos": "position", "quat": "attitude", "rate": "gyro"}
+    missing = [text for name, text in names.items() if name not in recording.signals]
+    if missing:
+        hint = "" if missing == ["gyro"] else "; --pose FILE brings position and attitude"
+        reason = f"holds no {' and no '.join(missing)}{hint}"
+        raise FlightLogError(recording.name, None, None, reason)
+
+
+def _rates(recording: Recording) -> list[Finding]:
+    findings = []
+    for name, subject in (("pos", "position"), ("quat", "attitude")):
+        time_s = recording.signals[name].time_s
+        step = median_step(time_s)
+        if step > 1.0 / SLOW_HZ:
+            text = f"at {1 / step:.3g} Hz, interpolated between; log it faster where you can"
+            findings.append(Finding("note", subject, text))
+        holes = int(np.sum(np.diff(time_s) > max(0.1, 5.0 * step)))
+        if holes:
+            longest = float(np.max(np.diff(time_s)))
+            text = f"{holes} holes, the longest {longest:.2g} s: left empty"
+            findings.append(Finding("note", subject, text))
+    return findings
+
+
+def _pair(rows: dict[str, np.ndarray]) -> list[Finding]:
+    """Leave out half a command, in place: a thrust without rates, or rates without a thrust."""
+    for one, other in (("cmd_thrust", "cmd_rate"), ("cmd_rate", "cmd_thrust")):
+        if one in rows and other not in rows:
+            del rows[one]
+            return [Finding("note", "command", f"{one} is left out, as {other} is not there")]
+    return []
+
+
+def _columns(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    columns = {"time": rows["time"]}
+    for group, names in GROUPS.items():
+        if group != "time" and group in rows:
+            columns |= dict(zip(names, rows[group].T, strict=True))
+    if "throttle" in rows:
+        columns["throttle"] = rows["throttle"][:, 0]
+    return columns

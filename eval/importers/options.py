@@ -1,0 +1,34 @@
+"""What a person may tell an import."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from eval.vehicle import Vehicle
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """How to read a log; the defaults fit most files."""
+
+    pose: Path | None = None
+    """A CSV or Parquet file with position and attitude from elsewhere (motion capture)."""
+    pose_map: Path | None = None
+    """Mapping file (TOML) of `pose`; without it, its columns are named as in a flight log."""
+    map: Path | None = None
+    """Mapping file (TOML): columns, units and frames of a table; topics of an MCAP file."""
+    vehicle: Vehicle | None = None
+    """Sets the order of the motors, and scales normalised thrust to its full thrust."""
+    full_thrust: float | None = None
+    """Thrust per mass at full throttle [m/s^2]; goes before the vehicle's."""
+    motor_poles: int = 14
+    """Magnets on a motor's bell, to turn Betaflight's eRPM into revolutions."""
+    rate_hz: float = 250.0
+    """At most this many rows a second; faster signals are averaged over a row's period."""
+    start_s: float = 0.0
+    """Leave out what is earlier than this after the first row [s]."""
+    end_s: float | None = None
+    """Leave out what is later than this after the first row [s]."""
+    fix: bool = True
+    """Correct what the evidence shows overwhelmingly; otherwise only say it."""

@@ -1,0 +1,99 @@
+"""What an importer hands over: signals in the flight log's units and frames, each at its own rate.
+
+Signals are named as the groups of columns in `eval/flight_check.py` (pos, quat, vel, rate,
+cmd_thrust, cmd_rate, motor, motor_cmd, acc, voltage), and besides `throttle`: normalised
+collective thrust from 0 to 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.flight_check import FlightLogError
+from eval.importers.findings import Finding
+
+BACKWARDS_MAX = 0.05
+"""A signal with a larger share of rows whose time does not increase is refused."""
+
+
+class Signal(NamedTuple):
+    """Samples of one signal."""
+
+    time_s: np.ndarray
+    """(N,) increasing [s]."""
+    value: np.ndarray
+    """(N, C) in the flight log's unit and frame."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a file holds."""
+
+    name: str
+    """The file, for messages."""
+    signals: Mapping[str, Signal]
+    """By name; see the head of this file."""
+    findings: tuple[Finding, ...] = ()
+    """What was noticed while reading."""
+    motor_side: tuple[tuple[float, float], ...] | None = None
+    """For the file's motors 1 to 4: where they are, (x forward, y left), in any length unit."""
+    about: Mapping[str, Any] = field(default_factory=dict)
+    """What the file says of itself: firmware, airframe, start."""
+
+
+def signal(
+    time_s: np.ndarray, value: np.ndarray, name: str, what: str
+) -> tuple[Signal | None, Finding | None]:
+    """Return the finite samples of increasing time, and what there is to say about the others.
+
+    Args:
+        time_s: (N,) [s], NaN where unknown.
+        value: (N,) or (N, C); rows with a NaN are left out.
+        name: the file, for messages.
+        what: the signal, for messages.
+
+    Raises:
+        FlightLogError: where time goes back too often: two flights in one file, or a wrong column.
+    """
+    time_s = np.asarray(time_s, dtype=np.float64)
+    value = np.asarray(value, dtype=np.float64).reshape(len(time_s), -1)
+    known = np.isfinite(time_s) & np.isfinite(value).all(axis=1)
+    time_s, value = time_s[known], value[known]
+    if not len(time_s):
+        return None, None
+    forward = np.ones(len(time_s), dtype=bool)
+    forward[1:] = time_s[1:] > np.maximum.accumulate(time_s)[:-1]
+    back = int(np.sum(~forward))
+    if back > BACKWARDS_MAX * len(time_s):
+        row = int(np.argmin(forward)) + 1
+        reason = (
+            f"time does not increase in {back} of {len(time_s)} samples of {what!r}; "
+            "cut the file to one flight, and check which column is the time"
+        )
+        raise FlightLogError(name, "time", row, reason)
+    note = f"{back} samples of {what!r} whose time does not increase are left out"
+    finding = Finding("note", "time", note) if back else None
+    return Signal(time_s[forward], value[forward]), finding
+
+
+def collect(
+    parts: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str
+) -> tuple[dict[str, Signal], tuple[Finding, ...]]:
+    """Return the signals of `parts` (name to time and values) that hold samples, and findings."""
+    signals, findings = {}, []
+    for what, (time_s, value) in parts.items():
+        made, finding = signal(time_s, value, name, what)
+        if made is not None:
+            signals[what] = made
+        if finding is not None:
+            findings.append(finding)
+    return signals, tuple(findings)
+
+
+def median_step(time_s: np.ndarray) -> float:
+    """Return the median distance of samples [s]; infinite for fewer than two."""
+    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf

@@ -1,0 +1,107 @@
+"""`suite import`: flight logs of other programs as flight logs of ours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from suite.console import Console
+
+
+@dataclass(frozen=True)
+class Config:
+    """Read a log of PX4, Betaflight, a Crazyflie, ROS 2 (MCAP) or a table, check and convert it."""
+
+    file: tyro.conf.Positional[Path]
+    """The log."""
+    format: str = ""
+    """px4, betaflight, crazyflie, table or mcap; by default told by the file's first bytes."""
+    out: Path = Path("flight.parquet")
+    """The flight log to write (.parquet or .csv)."""
+    map: Path | None = None
+    """Mapping file (TOML): columns, units and frames of a table; topics of an MCAP file."""
+    pose: Path | None = None
+    """CSV or Parquet with position and attitude from elsewhere; its clock is aligned by itself."""
+    pose_map: Path | None = None
+    """Mapping file (TOML) of --pose."""
+    vehicle: str = ""
+    """A shipped vehicle's name or a vehicle file: order of the motors, full thrust."""
+    full_thrust: float | None = None
+    """Thrust per mass at full throttle [m/s^2], where the log has normalised thrust."""
+    motor_poles: int = 14
+    """Magnets on a motor's bell (Betaflight's eRPM)."""
+    rate: float = 250.0
+    """At most this many rows a second."""
+    start: float = 0.0
+    """Leave out what is earlier [s after the first row]."""
+    end: float | None = None
+    """Leave out what is later [s after the first row]."""
+    no_fix: bool = False
+    """Say what looks wrong, but correct nothing."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Import as `config` says, and say what was found.
+
+    Raises:
+        ValueError: for a file, a mapping or an option that cannot be used.
+    """
+    from eval.flight_log import write_flight
+    from eval.importers import import_log
+    from eval.importers.findings import said
+    from eval.importers.options import ImportOptions
+    from eval.vehicle_file import load_vehicle
+
+    _check(config)
+    options = ImportOptions(
+        pose=config.pose,
+        pose_map=config.pose_map,
+        map=config.map,
+        vehicle=load_vehicle(config.vehicle) if config.vehicle else None,
+        full_thrust=config.full_thrust,
+        motor_poles=config.motor_poles,
+        rate_hz=config.rate,
+        start_s=config.start,
+        end_s=config.end,
+        fix=not config.no_fix,
+    )
+    log, findings = import_log(config.file, config.format or None, options)
+    write_flight(config.out, log)
+    for line in said(findings):
+        console.say(line)
+    for warning in log.warnings:
+        console.say(f"note      file: {warning}")
+    rows = len(log.time_s)
+    console.say(
+        f"{rows} rows, {log.duration_s:.1f} s, up to {_top(log.speed):.1f} m/s: {config.out}"
+    )
+    return {
+        "flight": str(config.out),
+        "rows": rows,
+        "duration_s": log.duration_s,
+        "findings": [finding._asdict() for finding in findings],
+    }
+
+
+def _check(config: Config) -> None:
+    if config.out.suffix.lower() not in (".parquet", ".csv"):
+        raise ValueError(f"--out is {str(config.out)!r}; its ending must be .parquet or .csv")
+    if not 1.0 <= config.rate <= 10_000.0:
+        raise ValueError(f"--rate is {config.rate:g}; allowed are 1 to 10000 rows a second")
+    if config.full_thrust is not None and not 0.0 < config.full_thrust < 1000.0:
+        raise ValueError(f"--full-thrust is {config.full_thrust:g}; above 0 and below 1000 m/s^2")
+    if config.start < 0 or (config.end is not None and config.end <= config.start):
+        raise ValueError(f"--start {config.start:g} --end {config.end}: 0 <= start < end, in s")
+    if config.pose_map is not None and config.pose is None:
+        raise ValueError("--pose-map describes the file of --pose, which is not given")
+
+
+def _top(speed: Any) -> float:
+    import numpy as np
+
+    return float(np.nanmax(speed)) if np.isfinite(speed).any() else float("nan")
