@@ -7,7 +7,6 @@ is shared between trials.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,13 +17,14 @@ import numpy as np
 from eval.flight import Flight
 from eval.guard import ActionLimits, guard_action
 from eval.recorder import Recorder
-from eval.trial import DIVERGED, ENDINGS, FINISHED, FLYING, Rules, TrialResult, TrialSpec
+from eval.sharding import fly_in_processes, usable_cores
+from eval.trial import DIVERGED, ENDINGS, FINISHED, FLYING, Rules, TrialResult, TrialSpec, track_of
 from eval.vehicle import Vehicle
 from eval.worlds import PLAIN, World, world_class
 from eval.worlds.slots import layout_of
 from policies.observation import encode_depth, state_vector
 from policies.policy import Policy
-from tracks.families import check_family, make_track
+from tracks.families import check_family
 from tracks.track import Track
 
 OnResult = Callable[[TrialResult, Flight | None], None]
@@ -114,8 +114,6 @@ def fly(
 
     processes = _process_count(task, len(trials))
     if processes > 1:
-        from eval.sharding import fly_in_processes
-
         fly_in_processes(_fly_share, task, list(enumerate(trials)), processes, keep)
     else:
         _fly_share(task, list(enumerate(trials)), keep)
@@ -133,7 +131,7 @@ def _process_count(task: _Task, trials: int) -> int:
     # A process takes seconds to start, and a policy object may not be of the kind that travels.
     if task.world == "mjx" or _is_policy(task.policy) or trials < 4 * task.options.slots:
         return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return usable_cores()
 
 
 def _fly_share(
@@ -145,7 +143,7 @@ def _fly_share(
     policy = task.policy if _is_policy(task.policy) else task.policy()
     if task.world == PLAIN:
         for index, trial in share:
-            track = _track(task, trial)
+            track = track_of(task.tracks, trial)
             options = task.options
             result = world_class(PLAIN)(
                 policy, trial, track, task.vehicle, options.rules, options.limits, options.slots
@@ -158,12 +156,6 @@ def _fly_share(
         slots=task.options.slots, threads=task.options.threads,
     )  # fmt: skip
     _Slots(task, policy, world).run(share, emit)
-
-
-def _track(task: _Task, trial: TrialSpec) -> Track:
-    if trial.track in task.tracks:
-        return task.tracks[trial.track]
-    return make_track(trial.track, trial.difficulty, trial.seed)
 
 
 class _Slots:
@@ -218,7 +210,7 @@ class _Slots:
             self._fresh[slot] = True
             if self._recorder:
                 self._recorder.start(slot)
-            entries.append((slot, _track(self._task, trial), trial))
+            entries.append((slot, track_of(self._task.tracks, trial), trial))
         if entries:
             self._world.load(entries)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copyreg
 import multiprocessing
+import os
 import signal
 import traceback
 from collections.abc import Callable
@@ -14,6 +15,13 @@ from typing import Any
 
 Emit = Callable[..., None]
 Work = Callable[[Any, list[Any], Emit], None]
+
+
+def usable_cores() -> int:
+    """Return how many processor cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def fly_in_processes(work: Work, task: Any, items: list[Any], processes: int, emit: Emit) -> None:

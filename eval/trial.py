@@ -5,11 +5,14 @@ The rules are pure functions of arrays over many trials (N rows) and take numpy 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from tracks.crossing import NEAR_RADIUS_M, crossing, is_near
+from tracks.families import make_track
 from tracks.scene import Array, Gates
+from tracks.track import Track
 
 FLYING = 0
 """The code in `Progress.ended` of a trial that goes on."""
@@ -75,6 +78,13 @@ class TrialResult(NamedTuple):
     def ending(self) -> str:
         """How it ended, for people: "collision with gate 3 frame"."""
         return self.ended_by + (f" with {self.collided_with}" if self.collided_with else "")
+
+
+def track_of(tracks: Mapping[str, Track], trial: TrialSpec) -> Track:
+    """Return the track that `trial` is flown on: one of the custom `tracks`, or its family's."""
+    if trial.track in tracks:
+        return tracks[trial.track]
+    return make_track(trial.track, trial.difficulty, trial.seed)
 
 
 @dataclass(frozen=True)

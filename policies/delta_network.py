@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from policies.gru import gru_update
 from policies.network import leaky_relu
 from policies.spec import ACTION_SIZE
 
@@ -64,11 +65,7 @@ def step(
     x = jnp.concatenate([vel_b, row3, action_b], axis=-1) * jnp.asarray(INPUT_SCALE)
     x = leaky_relu(x @ params["input.weight"] + params["input.bias"])
     gates_x = x @ params["gru.weight_input"] + params["gru.bias"]
-    gates_h = hidden @ params["gru.weight_hidden"]
-    reset_x, update_x, new_x = jnp.split(gates_x, 3, axis=-1)
-    reset_h, update_h, new_h = jnp.split(gates_h, 3, axis=-1)
-    reset = jax.nn.sigmoid(reset_x + reset_h)
-    update = jax.nn.sigmoid(update_x + update_h)
-    new = jnp.tanh(new_x + reset * (new_h + params["gru.bias_new"]))
-    hidden = new + update * (hidden - new)
+    # Of the two biases of a gate only the new one's differ: the reset stands between them.
+    bias_h = jnp.pad(params["gru.bias_new"], (2 * HIDDEN, 0))
+    hidden = gru_update(gates_x, hidden @ params["gru.weight_hidden"] + bias_h, hidden)
     return hidden @ params["output.weight"] + params["output.bias"], hidden

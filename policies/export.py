@@ -34,14 +34,12 @@ def export_policy(
         ValueError: for an unknown format.
         OSError: where the disk refuses; no half file is left.
     """
-    text = str(name_or_folder)
-    is_shipped = text in shipped.names()
-    if not is_shipped and not Path(name_or_folder).is_dir():
+    folder = shipped.locate(name_or_folder)
+    if not folder.is_dir():
         raise PolicyError(
-            f"{text}: not a shipped policy ({', '.join(shipped.names()) or 'none'}) and not a "
-            "checkpoint's folder; only policies of ours can be exported"
+            f"{name_or_folder}: not a shipped policy ({', '.join(shipped.names()) or 'none'}) and "
+            "not a checkpoint's folder; only policies of ours can be exported"
         )
-    folder = shipped.folder(text) if is_shipped else Path(name_or_folder)
     chosen = list(formats)
     for wanted in chosen:
         if wanted not in _WRITERS:

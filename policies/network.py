@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from policies.conv import conv_valid
+from policies.gru import gru_update
 from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
 
 Params = dict[str, jax.Array]
@@ -79,12 +80,7 @@ def recur(
     x = leaky_relu(embedding + state @ params["state.weight"] + params["state.bias"])
     gates_x = x @ params["gru.weight_input"] + params["gru.bias_input"]
     gates_h = hidden @ params["gru.weight_hidden"] + params["gru.bias_hidden"]
-    reset_x, update_x, new_x = jnp.split(gates_x, 3, axis=-1)
-    reset_h, update_h, new_h = jnp.split(gates_h, 3, axis=-1)
-    reset = jax.nn.sigmoid(reset_x + reset_h)
-    update = jax.nn.sigmoid(update_x + update_h)
-    new = jnp.tanh(new_x + reset * new_h)
-    hidden = new + update * (hidden - new)
+    hidden = gru_update(gates_x, gates_h, hidden)
     return leaky_relu(hidden) @ params["action.weight"], hidden
 
 

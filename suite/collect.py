@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from eval.flight_check import DURATION_MIN
 from suite.choices import at_least, parse_levels, parse_tracks
 from suite.console import Console
 from suite.estimate import Estimate, announce
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from eval.flight import Flight
     from eval.trial import TrialResult, TrialSpec
 
-SHORTEST_S = 1.0
-"""Shorter flights are no logs and are left out [s]."""
 LIST = "flights.json"
 """Name of the list of flights in the output folder."""
 
@@ -102,7 +101,7 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
 
         def keep(result: TrialResult, flight: Flight | None) -> None:
             name = None
-            if flight is not None and result.time_s >= SHORTEST_S:
+            if flight is not None and result.time_s >= DURATION_MIN:
                 name = _write_log(out, result, flight, console)
             rows[result.trial] = {"file": name, **result._asdict()}
             write_list()
@@ -125,9 +124,9 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
     seconds = sum(row["time_s"] for row in logs)
     console.say(f"{len(logs)} flights, {seconds:.0f} s, in {out}")
     if len(logs) < len(rows):
-        short = sum(row["time_s"] < SHORTEST_S for row in rows.values())
+        short = sum(row["time_s"] < DURATION_MIN for row in rows.values())
         console.say(
-            f"{len(rows) - len(logs)} without a log, {short} of them under {SHORTEST_S:g} s"
+            f"{len(rows) - len(logs)} without a log, {short} of them under {DURATION_MIN:g} s"
         )
     return {**found, "out": str(out)}
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from eval.sharding import usable_cores
 from suite.choices import is_track_file
-from suite.provenance import usable_cores
 
 if TYPE_CHECKING:
     from eval.judge import JudgeOptions
@@ -45,7 +44,7 @@ def policy_digest(name_or_path: str) -> str:
     """Return the SHA-256 of a policy's file, or of all files of its folder by name, as hex."""
     from policies import shipped
 
-    path = shipped.folder(name_or_path) if name_or_path in shipped.names() else Path(name_or_path)
+    path = shipped.locate(name_or_path)
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     digest = hashlib.sha256()
     for file in files:
@@ -110,15 +109,6 @@ def who_flies(
     from policies.policy import load_policy
 
     return policy if processes == 1 else partial(load_policy, name_or_path, trust)
-
-
-def track_of(tracks: Mapping[str, Track], trial: TrialSpec) -> Track:
-    """Return the track that a trial is flown on."""
-    from tracks.families import make_track
-
-    if trial.track in tracks:
-        return tracks[trial.track]
-    return make_track(trial.track, trial.difficulty, trial.seed)
 
 
 def about_policy(name_or_path: str, policy: Policy) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from eval.sharding import usable_cores
 from tracks.files import write_json
 from tracks.provenance import stamp
 
@@ -53,13 +54,6 @@ def machine() -> dict[str, Any]:
         "cores": usable_cores(),
         "memory_bytes": pages,
     }
-
-
-def usable_cores() -> int:
-    """Return how many cores this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _processor() -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from suite.choices import parse_levels, parse_tracks
 from suite.console import Console
 from suite.evaluate import Judgement
-from suite.flying import custom_tracks, default_policy, track_of, trial_list
+from suite.flying import custom_tracks, default_policy, trial_list
 
 if TYPE_CHECKING:
     from eval.flight import Flight
@@ -56,6 +56,7 @@ def fly_again(
     """
     from eval.guard import ActionLimits
     from eval.judge import JudgeOptions, Record, fly
+    from eval.trial import track_of
     from eval.vehicle_file import load_vehicle
     from policies.policy import load_policy
 

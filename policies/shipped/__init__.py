@@ -15,6 +15,11 @@ def names() -> list[str]:
     return sorted(path.parent.name for path in _HERE.glob("*/config.json"))
 
 
+def locate(name_or_path: str | Path) -> Path:
+    """Return a shipped policy's folder by its name, and anything else as the path it is."""
+    return folder(str(name_or_path)) if str(name_or_path) in names() else Path(name_or_path)
+
+
 def folder(name: str) -> Path:
     """Return the checkpoint's folder of a shipped policy.
 

@@ -139,15 +139,14 @@ def checkpoint_folder(policy: str) -> Path:
     """
     from policies import shipped
 
-    if policy in shipped.names():
-        return shipped.folder(policy)
-    if not (Path(policy) / "config.json").is_file():
+    folder = shipped.locate(policy)
+    if not (folder / "config.json").is_file():
         names = ", ".join(shipped.names()) or "none"
         raise ValueError(
             f"--policy {policy}: the loop fine-tunes and so needs a checkpoint's folder, such as "
             f"the policy/ in the --out of suite train, or a shipped policy's name ({names})"
         )
-    return Path(policy)
+    return folder
 
 
 def _with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:

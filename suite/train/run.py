@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
+from eval.sharding import usable_cores
 from policies import delta_network, network
 from policies.checkpoint import load_arrays, read_config, save_arrays
 from policies.policy_file import save_policy
@@ -27,7 +28,7 @@ from policies.tree_arrays import tree_from_arrays, tree_to_arrays
 from suite.console import Console
 from suite.errors import WorkFailed
 from suite.estimate import Estimate, announce
-from suite.provenance import usable_cores, write_run_record
+from suite.provenance import write_run_record
 from suite.train import curve
 from suite.train.config import TrainConfig
 from suite.train.update import TrainState, device_mesh, make_update, start_state
