@@ -91,7 +91,8 @@ def with_pose(
     turn_deg = np.rad2deg(np.linalg.norm(_vector(alignment.turn)))
     text = (
         f"its clock is {alignment.offset_s:+.4f} s (± {1e3 * alignment.offset_sd_s:.2g} ms) "
-        f"from the log's and runs {1e6 * alignment.drift:+.0f} ppm off; rates correlate by {alignment.correlation:.3f}"
+        f"from the log's and runs {1e6 * alignment.drift:+.0f} ppm off; "
+        f"rates correlate by {alignment.correlation:.3f}"
     )
     findings = [*pose.findings, *unit, Finding("ok", "pose clock", text), *reading]
     if turn_deg > TURN_DEG:
@@ -170,7 +171,7 @@ def align(quat: Signal, rate: Signal, name: str) -> Alignment:
     # From the middle outwards: over a long flight the drift alone is more than can be followed.
     while True:
         near = np.abs(centre_s - middle) <= reach
-        for _ in range(8):
+        for _ in range(20):
             result, change = _refine(centre_s[near], by_pose[near], rate, middle, result)
             if np.all(np.abs(change) < [1e-7, 1e-9]):
                 break
@@ -200,7 +201,7 @@ def _refine(
         return fit, np.zeros(2)
     at, seen, since = at[inside], by_pose[inside], (centre_s - middle)[inside, None]
     gyro = averaged(rate.time_s, rate.value, at, SPAN_S)
-    step = 1e-3
+    step = 0.5 * SPAN_S  # the slope of a shorter piece is mostly noise
     later = averaged(rate.time_s, rate.value, at + step, SPAN_S)
     sooner = averaged(rate.time_s, rate.value, at - step, SPAN_S)
     slope = (later - sooner) / (2.0 * step)

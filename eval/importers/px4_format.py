@@ -86,9 +86,10 @@ def _load(path: Path) -> Any:
     from pyulog import ULog
 
     try:
-        # pyulog prints what it makes of damaged files; the finding below says it once.
-        with contextlib.redirect_stdout(io.StringIO()):
-            return ULog(str(path), list(TOPICS))
+        # pyulog prints what it makes of damaged files (a finding says it once), and leaves a file
+        # that it opened itself open where it fails.
+        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
+            return ULog(file, list(TOPICS))
     except Exception as error:
         reason = f"a ULog file that cannot be read ({type(error).__name__}: {error})"
         raise FlightLogError(str(path), None, None, reason) from None

@@ -1,0 +1,404 @@
+"""A smooth flight that is known exactly, written as other programs write their logs.
+
+Every writer follows the public description of its format and shares no code with the importers.
+"""
+
+import csv
+import struct
+from typing import NamedTuple
+from zlib import crc32
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+GRAVITY = np.array([0.0, 0.0, 9.81])
+FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+class Truth(NamedTuple):
+    """The flight at some times, z-up world and forward-left-up body."""
+
+    time: np.ndarray
+    pos: np.ndarray
+    rot: np.ndarray
+    vel: np.ndarray
+    rate: np.ndarray
+    thrust: np.ndarray
+    cmd_rate: np.ndarray
+    motor: np.ndarray
+    acc: np.ndarray
+    voltage: np.ndarray
+
+    @property
+    def quat(self):
+        """(T, 4) wxyz."""
+        return Rotation.from_matrix(self.rot).as_quat(scalar_first=True)
+
+
+def fly(time):
+    """The flight at `time` (T,) [s]: turns about all axes, speeds to 5 m/s, one hover height."""
+    time = np.asarray(time, dtype=float)
+    pos, vel, acc = (_path(time, order) for order in range(3))
+    rot = _attitude(time)
+    h = 1e-4
+    after, before = Rotation.from_matrix(_attitude(time + h)), _attitude(time - h)
+    rate = (Rotation.from_matrix(before).inv() * after).as_rotvec() / (2 * h)
+    thrust = np.linalg.norm(acc + GRAVITY, axis=1)
+    cmd_rate = rate + 0.1 * np.sin(3 * time)[:, None] * np.array([1.0, 0.5, -0.5])
+    motor = 700.0 + 100.0 * np.sin(time[:, None] * [1.0, 1.3, 1.7, 2.1]) + [0.0, 200, 400, 600]
+    felt = np.einsum("tji,tj->ti", rot, acc + GRAVITY)
+    voltage = 16.0 - 0.05 * time
+    return Truth(time, pos, rot, vel, rate, thrust, cmd_rate, motor, felt, voltage)
+
+
+def _path(time, order):
+    waves = np.array([[2.5, 1.3, 0.2], [2.0, 1.9, 1.1], [0.6, 1.6, 0.5]])
+    size, speed, phase = waves[:, 0], waves[:, 1], waves[:, 2]
+    angle = time[:, None] * speed + phase
+    value = size * speed**order * np.sin(angle + order * np.pi / 2)
+    return value + (np.array([3.0, -1.0, 2.0]) if order == 0 else 0.0)
+
+
+def _attitude(time):
+    up = _path(time, 2) + GRAVITY
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    yaw = 0.8 * np.sin(0.9 * time) + 0.4
+    ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
+    left = np.cross(up, ahead)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    return np.stack([np.cross(left, up), left, up], axis=-1)
+
+
+def ned(vector):
+    """Vectors (T, 3) from north-west-up to north-east-down, or from FLU to FRD."""
+    return vector @ FLIP
+
+
+def ned_quat(truth):
+    """Attitudes (T, 4) wxyz from a forward-right-down body to north-east-down."""
+    return Rotation.from_matrix(FLIP @ truth.rot @ FLIP).as_quat(scalar_first=True)
+
+
+class UlogWriter:
+    """A ULog file, message by message (docs.px4.io, ULog File Format)."""
+
+    SIZES = {"uint64_t": "Q", "float": "f", "int32_t": "i", "uint8_t": "B", "bool": "?"}
+
+    def __init__(self):
+        self.bytes = b"ULog\x01\x12\x35" + struct.pack("<BQ", 1, 112574307)
+        self._message("B", bytes(40))
+        self._ids = 0
+        self.data = []
+
+    def _message(self, kind, payload):
+        self.bytes += struct.pack("<HB", len(payload), ord(kind)) + payload
+
+    def parameter(self, name, value):
+        """Write a float parameter."""
+        key = f"float {name}".encode()
+        self._message("P", bytes([len(key)]) + key + struct.pack("<f", value))
+
+    def nested(self, name, fields):
+        """Write the definition of a type that topics may hold."""
+        self._message("F", (f"{name}:" + "".join(f"{t} {n};" for t, n in fields)).encode())
+
+    def topic(self, name, fields, rows, code, multi_id=0):
+        """Define `name`, and keep its packed `rows` for the data section; they start with time."""
+        if multi_id == 0:
+            self.nested(name, [("uint64_t", "timestamp"), *fields])
+        number = self._ids
+        self._ids += 1
+        self.data.append(("A", 0, bytes([multi_id]) + struct.pack("<H", number) + name.encode()))
+        for row in rows:
+            payload = struct.pack("<HQ", number, row[0]) + struct.pack("<" + code, *row[1:])
+            self.data.append(("D", row[0], payload))
+
+    def write(self, path):
+        """Write the file: subscriptions, then the data by time."""
+        for kind, _, payload in sorted(self.data, key=lambda m: (m[0] == "D", m[1])):
+            self._message(kind, payload)
+        path.write_bytes(self.bytes)
+
+
+def write_ulog(path, span=(0.0, 8.0), rate=200.0, esc=True, full_thrust=30.0, start_us=5_000_000):
+    """PX4 with attitude at `rate`, positions at half of it, commands at 100 Hz, ESCs at 50 Hz."""
+
+    def at(hz):
+        truth = fly(np.arange(span[0], span[1], 1 / hz))
+        return truth, np.round(truth.time * 1e6).astype(int) + start_us
+
+    log = UlogWriter()
+    log.nested("esc_report", [("int32_t", "esc_rpm"), ("uint8_t", "actuator_function")])
+    # Hubs (x forward, y right) in PX4's usual order.
+    for k, (x, y) in enumerate([(0.1, 0.1), (-0.1, -0.1), (0.1, -0.1), (-0.1, 0.1)]):
+        log.parameter(f"CA_ROTOR{k}_PX", x)
+        log.parameter(f"CA_ROTOR{k}_PY", y)
+    log.parameter("THR_MDL_FAC", 1.0)
+    fast, t = at(rate)
+    stamped = ("uint64_t", "timestamp_sample")
+    # Published 300 us after it was measured.
+    rows = [(k + 300, k, *q) for k, q in zip(t, ned_quat(fast), strict=True)]
+    log.topic("vehicle_attitude", [stamped, ("float[4]", "q")], rows, "Qffff")
+    rows = [(k + 250, k, *v) for k, v in zip(t, ned(fast.rate), strict=True)]
+    log.topic("vehicle_angular_velocity", [stamped, ("float[3]", "xyz")], rows, "Qfff")
+    rows = [(k, *v) for k, v in zip(t, ned(fast.acc), strict=True)]
+    log.topic("sensor_combined", [("float[3]", "accelerometer_m_s2")], rows, "fff")
+    slow, t = at(rate / 2)
+    names = ["x", "y", "z", "vx", "vy", "vz"]
+    both = np.concatenate([ned(slow.pos), ned(slow.vel)], axis=1)
+    fields = [stamped, *(("float", n) for n in names), ("bool", "xy_valid"), ("bool", "z_valid")]
+    rows = [(k, k, *v, True, True) for k, v in zip(t, both, strict=True)]
+    log.topic("vehicle_local_position", fields, rows, "Q6f??")
+    slow, t = at(100.0)
+    wanted = ned(slow.cmd_rate)
+    rows = [
+        (k, *w, 0.0, 0.0, -c / full_thrust) for k, w, c in zip(t, wanted, slow.thrust, strict=True)
+    ]
+    fields = [("float", n) for n in ("roll", "pitch", "yaw")] + [("float[3]", "thrust_body")]
+    log.topic("vehicle_rates_setpoint", fields, rows, "6f")
+    if esc:
+        slow, t = at(50.0)
+        # Truth is front right, rear right, rear left, front left; PX4: FR, RL, FL, RR.
+        rpm = np.round(slow.motor[:, [0, 2, 3, 1]] * 60 / (2 * np.pi)).astype(int)
+        # Wired the other way round: esc[0] drives Motor4.
+        rows = [
+            (k, *(v for m in (3, 2, 1, 0) for v in (r[m], 101 + m)))
+            for k, r in zip(t, rpm, strict=True)
+        ]
+        log.topic("esc_status", [("esc_report[4]", "esc")], rows, "iBiBiBiB")
+    slow, t = at(5.0)
+    rows = [(k, v) for k, v in zip(t, slow.voltage, strict=True)]
+    log.topic("battery_status", [("float", "voltage_v")], rows, "f")
+    log.write(path)
+    return path
+
+
+BLACKBOX_HEADER = (
+    "loopIteration, time (us), axisP[0], axisP[1], axisP[2], rcCommand[0], rcCommand[1], "
+    "rcCommand[2], rcCommand[3], setpoint[0], setpoint[1], setpoint[2], setpoint[3], "
+    "vbatLatest (V), amperageLatest (A), gyroADC[0], gyroADC[1], gyroADC[2], accSmooth[0], "
+    "accSmooth[1], accSmooth[2], motor[0], motor[1], motor[2], motor[3], eRPM[0], eRPM[1], "
+    "eRPM[2], eRPM[3], energyCumulative (mAh), flightModeFlags (flags), stateFlags (flags)"
+)
+
+
+def write_blackbox(path, span=(0.0, 20.0), rate=1000.0, full_thrust=30.0, poles=14, gain=1):
+    """A CSV as `blackbox_decode` prints it: whole deg/s, hundreds of electrical turns a minute."""
+    truth = fly(np.arange(span[0], span[1], 1 / rate))
+    degrees = np.rad2deg(1.0)
+    gyro = np.round(truth.rate * degrees * gain).astype(int)
+    wanted = np.round(truth.cmd_rate * degrees).astype(int)
+    throttle = np.round(truth.thrust / full_thrust * 1000).astype(int)
+    acc = np.round(truth.acc / 9.81 * 2048).astype(int)
+    # Betaflight: rear right, front right, rear left, front left.
+    erpm = truth.motor[:, [1, 0, 2, 3]] * 60 / (2 * np.pi) * poles / 2 / 100
+    erpm = np.round(erpm).astype(int)
+    lines = [BLACKBOX_HEADER]
+    for k in range(len(truth.time)):
+        time_us = 52_000_000 + round(truth.time[k] * 1e6)
+        cells = [k, time_us, 1, -2, 3, 0, 0, 0, 1500, *wanted[k], throttle[k]]
+        cells += [f"{truth.voltage[k]:.1f}", "12.34", *gyro[k], *acc[k], 900, 900, 900, 900]
+        cells += [*erpm[k], 12, "ANGLE_MODE|AIR_MODE", "SMALL_ANGLE"]
+        lines.append(", ".join(f"{cell:>3}" for cell in cells))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_mocap(path, span=(0.0, 20.0), rate=120.0, offset=0.0, drift=0.0, noise=0.0, turn=None):
+    """Poses at flight times `span` on another clock: flight = offset + (1 + drift) * its time."""
+    time = np.arange(span[0], span[1], 1 / rate)
+    truth = fly(time)
+    rng = np.random.default_rng(7)
+    rot = Rotation.from_matrix(truth.rot)
+    if turn is not None:
+        rot = rot * turn
+    rot = rot * Rotation.from_rotvec(noise * rng.normal(size=(len(time), 3)))
+    quat = rot.as_quat(scalar_first=True)
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        names = ["pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z"]
+        table.writerow(["time", *names])
+        stamps = (time - offset) / (1 + drift)
+        table.writerows(np.column_stack([stamps, truth.pos, quat]).tolist())
+    return path
+
+
+def write_usd(path, span=(0.0, 8.0), rate=100.0, version=2, compressed=False, crc=True):
+    """A log of the uSD deck: one event at a fixed rate, one rare one, CRC at the end."""
+    truth = fly(np.arange(span[0], span[1], 1 / rate))
+    degrees = np.rad2deg(1.0)
+    columns = {}
+    if compressed:
+        for k, axis in enumerate("xyz"):
+            columns[f"stateEstimateZ.{axis}(h)"] = np.round(truth.pos[:, k] * 1000).astype(int)
+            columns[f"stateEstimateZ.v{axis}(h)"] = np.round(truth.vel[:, k] * 1000).astype(int)
+        columns["stateEstimateZ.quat(I)"] = [pack_quaternion(q) for q in truth.quat]
+        for name, k, sign in (("Roll", 0, 1), ("Pitch", 1, -1), ("Yaw", 2, 1)):
+            milli = np.round(sign * truth.rate[:, k] * 1000).astype(int)
+            columns[f"stateEstimateZ.rate{name}(h)"] = milli
+    else:
+        for k, axis in enumerate("xyz"):
+            columns[f"stateEstimate.{axis}(f)"] = truth.pos[:, k]
+            columns[f"stateEstimate.v{axis}(f)"] = truth.vel[:, k]
+            columns[f"gyro.{axis}(f)"] = truth.rate[:, k] * degrees
+            columns[f"acc.{axis}(f)"] = truth.acc[:, k] / 9.81
+        for k, part in enumerate("wxyz"):
+            columns[f"stateEstimate.q{part}(f)"] = truth.quat[:, k]
+    wanted = truth.cmd_rate * degrees * [1, -1, 1]
+    for k, name in enumerate(("rollRate", "pitchRate", "yawRate")):
+        columns[f"controller.{name}(f)"] = wanted[:, k]
+    columns["controller.cmd_thrust(f)"] = truth.thrust / 30.0 * 65535
+    for k in range(4):
+        rpm = np.round(truth.motor[:, k] * 60 / (2 * np.pi)).astype(int)
+        columns[f"rpm.m{k + 1}(H)"] = rpm
+    data = b"\xbc" + struct.pack("<HH", version, 2)
+    data += struct.pack("<H", 7) + b"fixedFrequency\0" + struct.pack("<H", len(columns))
+    data += b"".join(name.encode() + b"\0" for name in columns)
+    data += struct.pack("<H", 9) + b"power\0" + struct.pack("<H", 1) + b"pm.vbat(f)\0"
+    code = "<" + "".join(name[-2] for name in columns)
+    stamp = (lambda t: struct.pack("<Q", round(t * 1e6) + 9_000_000)) if version == 2 else None
+    stamp = stamp or (lambda t: struct.pack("<I", round(t * 1e3) + 9_000))
+    for k, row in enumerate(zip(*columns.values(), strict=True)):
+        data += struct.pack("<H", 7) + stamp(truth.time[k]) + struct.pack(code, *row)
+        if k % 20 == 0:
+            data += struct.pack("<H", 9) + stamp(truth.time[k])
+            data += struct.pack("<f", truth.voltage[k])
+    path.write_bytes(data + struct.pack("<I", crc32(data)) if crc else data)
+    return path
+
+
+def pack_quaternion(wxyz):
+    """The firmware's 32-bit form of a quaternion: the largest of xyzw left out."""
+    parts = [*wxyz[1:], wxyz[0]]
+    largest = int(np.argmax(np.abs(parts)))
+    word = largest
+    for k in range(4):
+        if k != largest:
+            negative = (parts[k] < 0) != (parts[largest] < 0)
+            size = int(511 * abs(parts[k]) / np.sqrt(0.5) + 0.5)
+            word = (word << 10) | (int(negative) << 9) | size
+    return word
+
+
+_DEFINITIONS = """
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+================================================================================
+MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
+================================================================================
+MSG: geometry_msgs/PoseWithCovariance
+geometry_msgs/Pose pose
+float64[36] covariance
+================================================================================
+MSG: geometry_msgs/Twist
+geometry_msgs/Vector3 linear
+geometry_msgs/Vector3 angular
+================================================================================
+MSG: geometry_msgs/TwistWithCovariance
+geometry_msgs/Twist twist
+float64[36] covariance
+"""
+_ODOMETRY = """std_msgs/Header header
+string child_frame_id
+geometry_msgs/PoseWithCovariance pose
+geometry_msgs/TwistWithCovariance twist
+"""
+_IMU = """std_msgs/Header header
+geometry_msgs/Quaternion orientation
+float64[9] orientation_covariance
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+float64[9] linear_acceleration_covariance
+"""
+_TARGET = """std_msgs/Header header
+uint8 type_mask
+geometry_msgs/Quaternion orientation
+geometry_msgs/Vector3 body_rate
+float32 thrust
+"""
+
+
+def write_mcap(path, span=(0.0, 6.0), imu=200.0, odometry=100.0, full_thrust=30.0, motion=True):
+    """ROS 2: odometry (twist in the body), imu and mavros' attitude target, CDR in MCAP."""
+    from mcap_ros2.writer import Writer
+
+    origin = 1_700_000_000 * 10**9
+
+    def header(t):
+        when = origin + round(t * 1e9)
+        return {"stamp": {"sec": when // 10**9, "nanosec": when % 10**9}, "frame_id": "odom"}
+
+    def xyz(v):
+        return dict(zip("xyz", map(float, v), strict=True))
+
+    def quaternion(q):
+        return dict(zip("wxyz", map(float, q), strict=True))
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        schema = writer.register_msgdef("nav_msgs/msg/Odometry", _ODOMETRY + _DEFINITIONS)
+        truth = fly(np.arange(span[0], span[1], 1 / odometry))
+        for k, t in enumerate(truth.time if motion else ()):
+            body = truth.rot[k].T @ truth.vel[k]
+            pose = {"position": xyz(truth.pos[k]), "orientation": quaternion(truth.quat[k])}
+            twist = {"linear": xyz(body), "angular": xyz(truth.rate[k])}
+            message = {
+                "header": header(t),
+                "child_frame_id": "base_link",
+                "pose": {"pose": pose, "covariance": [0.0] * 36},
+                "twist": {"twist": twist, "covariance": [0.0] * 36},
+            }
+            writer.write_message("/odom", schema, message, origin + round(t * 1e9))
+            if k % 10 == 0:
+                writer.write_message("/odom_slow", schema, message, origin + round(t * 1e9))
+        schema = writer.register_msgdef("sensor_msgs/msg/Imu", _IMU + _DEFINITIONS)
+        truth = fly(np.arange(span[0], span[1], 1 / imu))
+        for k, t in enumerate(truth.time):
+            message = {
+                "header": header(t),
+                "orientation": quaternion([1, 0, 0, 0]),
+                "orientation_covariance": [0.0] * 9,
+                "angular_velocity": xyz(truth.rate[k]),
+                "angular_velocity_covariance": [0.0] * 9,
+                "linear_acceleration": xyz(truth.acc[k]),
+                "linear_acceleration_covariance": [0.0] * 9,
+            }
+            writer.write_message("/imu", schema, message, origin + round(t * 1e9))
+        schema = writer.register_msgdef("mavros_msgs/msg/AttitudeTarget", _TARGET + _DEFINITIONS)
+        truth = fly(np.arange(span[0], span[1], 1 / 50.0))
+        for k, t in enumerate(truth.time):
+            message = {
+                "header": header(t),
+                "type_mask": 0,
+                "orientation": quaternion([1, 0, 0, 0]),
+                "body_rate": xyz(truth.cmd_rate[k]),
+                "thrust": float(truth.thrust[k] / full_thrust),
+            }
+            writer.write_message("/target", schema, message, origin + round(t * 1e9))
+        writer.finish()
+    return path
