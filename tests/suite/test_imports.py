@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,31 @@ def test_imports_go_one_way(room):
         if name.split(".")[0] in to_the_right
     ]
     assert not wrong
+
+
+def _module(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def test_no_two_files_import_each_other():
+    """Imports inside functions count, those for type checkers alone do not."""
+    modules = {_module(path) for path in FILES}
+    graph = {}
+    for path in FILES:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
+                node.body = []
+        used = {
+            name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+            for name in (f"{node.module}.{alias.name}", node.module)
+        }
+        graph[_module(path)] = (used & modules) - {_module(path)}
+    TopologicalSorter(graph).prepare()  # raises where there is a circle, and names it
 
 
 def test_rooms_open_empty_and_their_folders_without_a_heavy_library():
