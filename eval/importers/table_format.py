@@ -94,8 +94,9 @@ def read(path: Path, options: ImportOptions) -> Recording:
 
 def read_table(path: Path, map_path: Path | None) -> Recording:
     """Return what the table at `path` holds; see `read`."""
+    told = None if map_path is None else read_map(map_path)
     columns, _, warnings = read_columns(path)
-    mapping = own_columns(columns) if map_path is None else read_map(map_path)
+    mapping = told or own_columns(columns)
     name = str(path)
     values = {signal: _values(columns, c, name) for signal, c in mapping.columns.items()}
     if "time" not in values:

@@ -11,6 +11,8 @@ from zlib import crc32
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tests.support.ros_messages import DEFINITIONS, IMU, ODOMETRY, TARGET
+
 GRAVITY = np.array([0.0, 0.0, 9.81])
 FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -280,69 +282,6 @@ def pack_quaternion(wxyz):
     return word
 
 
-_DEFINITIONS = """
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-================================================================================
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-================================================================================
-MSG: geometry_msgs/Pose
-geometry_msgs/Point position
-geometry_msgs/Quaternion orientation
-================================================================================
-MSG: geometry_msgs/PoseWithCovariance
-geometry_msgs/Pose pose
-float64[36] covariance
-================================================================================
-MSG: geometry_msgs/Twist
-geometry_msgs/Vector3 linear
-geometry_msgs/Vector3 angular
-================================================================================
-MSG: geometry_msgs/TwistWithCovariance
-geometry_msgs/Twist twist
-float64[36] covariance
-"""
-_ODOMETRY = """std_msgs/Header header
-string child_frame_id
-geometry_msgs/PoseWithCovariance pose
-geometry_msgs/TwistWithCovariance twist
-"""
-_IMU = """std_msgs/Header header
-geometry_msgs/Quaternion orientation
-float64[9] orientation_covariance
-geometry_msgs/Vector3 angular_velocity
-float64[9] angular_velocity_covariance
-geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance
-"""
-_TARGET = """std_msgs/Header header
-uint8 type_mask
-geometry_msgs/Quaternion orientation
-geometry_msgs/Vector3 body_rate
-float32 thrust
-"""
-
-
 def write_mcap(path, span=(0.0, 6.0), imu=200.0, odometry=100.0, full_thrust=30.0, motion=True):
     """ROS 2: odometry (twist in the body), imu and mavros' attitude target, CDR in MCAP."""
     from mcap_ros2.writer import Writer
@@ -361,7 +300,7 @@ def write_mcap(path, span=(0.0, 6.0), imu=200.0, odometry=100.0, full_thrust=30.
 
     with path.open("wb") as file:
         writer = Writer(file)
-        schema = writer.register_msgdef("nav_msgs/msg/Odometry", _ODOMETRY + _DEFINITIONS)
+        schema = writer.register_msgdef("nav_msgs/msg/Odometry", ODOMETRY + DEFINITIONS)
         truth = fly(np.arange(span[0], span[1], 1 / odometry))
         for k, t in enumerate(truth.time if motion else ()):
             body = truth.rot[k].T @ truth.vel[k]
@@ -376,7 +315,7 @@ def write_mcap(path, span=(0.0, 6.0), imu=200.0, odometry=100.0, full_thrust=30.
             writer.write_message("/odom", schema, message, origin + round(t * 1e9))
             if k % 10 == 0:
                 writer.write_message("/odom_slow", schema, message, origin + round(t * 1e9))
-        schema = writer.register_msgdef("sensor_msgs/msg/Imu", _IMU + _DEFINITIONS)
+        schema = writer.register_msgdef("sensor_msgs/msg/Imu", IMU + DEFINITIONS)
         truth = fly(np.arange(span[0], span[1], 1 / imu))
         for k, t in enumerate(truth.time):
             message = {
@@ -389,7 +328,7 @@ def write_mcap(path, span=(0.0, 6.0), imu=200.0, odometry=100.0, full_thrust=30.
                 "linear_acceleration_covariance": [0.0] * 9,
             }
             writer.write_message("/imu", schema, message, origin + round(t * 1e9))
-        schema = writer.register_msgdef("mavros_msgs/msg/AttitudeTarget", _TARGET + _DEFINITIONS)
+        schema = writer.register_msgdef("mavros_msgs/msg/AttitudeTarget", TARGET + DEFINITIONS)
         truth = fly(np.arange(span[0], span[1], 1 / 50.0))
         for k, t in enumerate(truth.time):
             message = {
