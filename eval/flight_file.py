@@ -40,13 +40,17 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[st
         reason = f"cannot be read: {error.strerror or error}"
         raise FlightLogError(str(path), None, None, reason) from None
     if not head:
-        raise FlightLogError(str(path), None, None, "the file is empty")
+        raise FlightLogError(str(path), None, None, "the file is empty; record or copy it again")
     if head.startswith(PARQUET_MAGIC):
         return _read_parquet(path)
     if path.suffix.lower() in (".parquet", ".pq"):
-        raise FlightLogError(str(path), None, None, "not a Parquet file (or cut at its start)")
+        raise FlightLogError(
+            str(path), None, None, "not a Parquet file (or cut at its start); copy it again"
+        )
     if b"\0" in head:
-        raise FlightLogError(str(path), None, None, "neither a Parquet file nor CSV")
+        raise FlightLogError(
+            str(path), None, None, "neither a Parquet file nor CSV; suite import reads others"
+        )
     return _read_csv(path)
 
 

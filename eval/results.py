@@ -98,7 +98,9 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
     try:
         rows = pq.read_table(path).to_pylist()
     except (pa.ArrowInvalid, OSError) as error:
-        raise ValueError(f"{path}: not a readable Parquet file ({error})") from error
+        raise ValueError(
+            f"{path}: not a readable Parquet file ({error}); run suite eval again"
+        ) from error
     missing = [name for name in TrialResult._fields if rows and name not in rows[0]]
     if missing:
         raise ValueError(f"{path}: no column {missing[0]!r}; is it a trials.parquet of this suite?")

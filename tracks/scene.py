@@ -127,12 +127,14 @@ def pad(scene: Scene, to: Counts) -> Scene:
     """Return `scene` with parked solids added until it holds `to` of each kind.
 
     Raises:
-        ValueError: where the scene already holds more than `to` of a kind.
+        ValueError: where the scene already holds more than `to` of a kind, naming both numbers.
     """
     have = counts(scene)
     for kind, n, limit in zip(Counts._fields, have, to, strict=True):
         if n > limit:
-            raise ValueError(f"scene has {n} {kind}, more than the {limit} it is padded to")
+            raise ValueError(
+                f"scene has {n} {kind}, more than the {limit} it is padded to; pad to more"
+            )
     more = to.boxes - have.boxes
     boxes = Boxes(
         np.concatenate([scene.boxes.center_w, _parked(more)]),

@@ -46,15 +46,23 @@ class Rows(NamedTuple):
     due: np.ndarray
     """(N,) bool."""
     time_s: np.ndarray
-    """(N,)."""
+    """(N,) since each trial's start [s]."""
     pos_w: np.ndarray
+    """(N, 3) centre of mass [m]."""
     quat_wxyz: np.ndarray
+    """(N, 4) body to world."""
     vel_w: np.ndarray
+    """(N, 3) [m/s]."""
     rate_b: np.ndarray
+    """(N, 3) [rad/s]."""
     thrust_cmd: np.ndarray
+    """(N,) per nominal mass [m/s^2]."""
     rate_cmd_b: np.ndarray
+    """(N, 3) [rad/s]."""
     rotor_speed: np.ndarray
+    """(N, 4) [rad/s]."""
     gate: np.ndarray
+    """(N,) number of the next gate."""
 
 
 class World(Protocol):

@@ -42,6 +42,11 @@ def replay(
 
     The state is the simulated one throughout (Eq. delta_action_loss); only the nose direction,
     which the point mass does not decide, follows the record.
+
+    Args:
+        plant: constants of the point mass.
+        windows: the record, N windows of T decisions.
+        delta: parameters of the Delta Action network; None leaves the actions as they are.
     """
     count = windows.action_b.shape[0]
     rot_w = jnp.asarray(windows.rot_w)

@@ -35,7 +35,9 @@ def encoder_gradient(
     """
     size = _chunk(images.shape[0])
 
-    def body(total: network.Params, part: tuple[jax.Array, jax.Array]) -> tuple:
+    def body(
+        total: network.Params, part: tuple[jax.Array, jax.Array]
+    ) -> tuple[network.Params, None]:
         image, cotangent = part
         _, pull = jax.vjp(lambda p: network.encode(p, image), params)
         return jax.tree.map(jnp.add, total, pull(cotangent)[0]), None
@@ -75,7 +77,9 @@ def make_gradient(
     return gradient
 
 
-def shard_gradient(config: TrainConfig, mesh: Mesh) -> Callable[..., tuple]:
+def shard_gradient(
+    config: TrainConfig, mesh: Mesh
+) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
     """Return the gradient shared by the devices of `mesh`, each with its part of the worlds.
 
     Returns:
@@ -87,7 +91,7 @@ def shard_gradient(config: TrainConfig, mesh: Mesh) -> Callable[..., tuple]:
 
     def part(
         params: network.Params, worlds: Worlds, key: jax.Array, delta: delta_network.Params | None
-    ) -> tuple:
+    ) -> tuple[network.Params, jax.Array, StepRecord]:
         key = jax.random.fold_in(key, jax.lax.axis_index(axis))
         gradient, loss, records = local(params, worlds, key, delta)
         records = records._replace(image=jnp.zeros((config.episode.steps, 1)))

@@ -59,18 +59,27 @@ def obstacle_terms(
 
 
 def progress_term(
-    config: LossConfig, pos_w: jax.Array, vel_w: jax.Array, target_w: jax.Array, lateral: jax.Array
+    config: LossConfig,
+    pos_w: jax.Array,
+    vel_w: jax.Array,
+    target_w: jax.Array,
+    lateral_g: jax.Array,
 ) -> jax.Array:
     """Return L_p with the ablation's variants L_p^norm and L_proj, weighted, (B,).
 
-    lateral (B, 2) is the position in the target gate's y-z plane [m].
+    Args:
+        config: weights and decay.
+        pos_w: (B, 3) [m].
+        vel_w: (B, 3) [m/s].
+        target_w: (B, 3) the point to fly to [m].
+        lateral_g: (B, 2) the position in the target gate's y-z plane [m].
     """
     to_gate = target_w - pos_w
     distance = _norm(to_gate)
     towards = (vel_w * to_gate).sum(-1) / distance
     total = -config.progress * towards - config.progress_norm * towards / (_norm(vel_w) + 1e-3)
     near = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(distance))
-    return total + config.projection * (lateral * lateral).sum(-1) * near
+    return total + config.projection * (lateral_g * lateral_g).sum(-1) * near
 
 
 def guidance_term(
@@ -79,6 +88,12 @@ def guidance_term(
     """Return the term whose position gradient is -field_gain u_A / u_A(centre of a 1 m gate).
 
     At the wires the field has no bound, so its pull is held to MAX_PULL times field_gain.
+
+    Args:
+        config: gain and decay of the field.
+        gates: each world's target gate, (B, ...).
+        pos_w: (B, 3) the only input that the gradient goes to [m].
+        vel_w: (B, 3) [m/s].
     """
     held_pos, held_vel = jax.lax.stop_gradient(pos_w), jax.lax.stop_gradient(vel_w)
     field = magnetic_field(gates.center_w, gates.rot_w, gates.opening_g, held_pos)
@@ -92,7 +107,14 @@ def guidance_term(
 def smoothness_terms(
     config: LossConfig, acc_w: jax.Array, acc_before_w: jax.Array, time_step: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the weighted L_a and L_j (B,)."""
+    """Return the weighted L_a and L_j (B,).
+
+    Args:
+        config: their weights.
+        acc_w: (B, 3) net acceleration [m/s^2].
+        acc_before_w: (B, 3) that of the step before [m/s^2].
+        time_step: (B,) [s].
+    """
     jerk = (acc_w - acc_before_w) / time_step[:, None]
     size, change = (acc_w * acc_w).sum(-1), (jerk * jerk).sum(-1)
     return config.acceleration * size, config.jerk * change

@@ -53,7 +53,12 @@ class Body(NamedTuple):
 
 
 def attitude(thrust_w: jax.Array, heading_w: jax.Array) -> jax.Array:
-    """Return body to world (B, 3, 3): z along the specific force, x towards the heading."""
+    """Return body to world (B, 3, 3): z along the specific force, x towards the heading.
+
+    Args:
+        thrust_w: (B, 3) net acceleration that the thrust makes with gravity [m/s^2].
+        heading_w: (B, 3) unit, horizontal.
+    """
     force = thrust_w + jnp.asarray([0.0, 0.0, GRAVITY])
     size = jnp.linalg.norm(force, axis=-1, keepdims=True)
     up = jnp.where(size > 1e-3, force / jnp.maximum(size, 1e-3), jnp.asarray([0.0, 0.0, 1.0]))
@@ -63,7 +68,7 @@ def attitude(thrust_w: jax.Array, heading_w: jax.Array) -> jax.Array:
 
 
 def start(pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> Body:
-    """Return a body that hovers or coasts at vel_w, upright."""
+    """Return a body that hovers or coasts at vel_w (B, 3) [m/s] in pos_w (B, 3) [m], upright."""
     zero = jnp.zeros_like(pos_w)
     rot_w = attitude(zero, heading_w)
     commands = jnp.zeros((pos_w.shape[0], 2, 3), pos_w.dtype)
@@ -83,10 +88,17 @@ def step(
     heading_rate: float,
     gradient_decay: float,
 ) -> Body:
-    """Advance one policy period under the wanted net acceleration action_b (B, 3) [m/s^2].
+    """Return the body one policy period later.
 
     The command acts `delay` steps late; between two commands the mean over the step is taken.
-    target_w (B, 3) is the gate that the nose turns to.
+
+    Args:
+        body: now.
+        constants: of each world.
+        action_b: (B, 3) wanted net acceleration in the body axes of now [m/s^2].
+        target_w: (B, 3) the gate that the nose turns to [m].
+        heading_rate: of the first-order turn of the nose [1/s].
+        gradient_decay: rate at which gradients of position and velocity fade back in time [1/s].
     """
     dt = constants.time_step[:, None]
     command = to_world(jax.lax.stop_gradient(body.rot_w), action_b)

@@ -44,12 +44,15 @@ class Memory(NamedTuple):
     target: jax.Array
     """(B,) gates passed, counted from the track's first."""
     hidden: jax.Array
+    """(B, hidden) of the policy."""
     action_b: jax.Array
+    """(B, 3) the policy's last action, without correction [m/s^2]."""
     embeddings: jax.Array
     """(B, image_delay, hidden) the images on their way, oldest first."""
     states: jax.Array
     """(B, state_delay, 12) the states on their way, oldest first."""
     delta_hidden: jax.Array
+    """(B, 32) of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 until the world has crashed deep into a solid, then 0."""
 
@@ -58,12 +61,17 @@ class StepRecord(NamedTuple):
     """What a step leaves behind, (B, ...) each."""
 
     image: jax.Array
+    """(B, height, width) encoded, with its noise."""
     terms: losses.Terms
+    """Weighted, zero for worlds that have crashed."""
     speed: jax.Array
+    """[m/s]."""
     clearance: jax.Array
     """Smallest signed distance on the step's path [m]."""
     passed: jax.Array
+    """Bool: a gate was crossed in this step."""
     pos_w: jax.Array
+    """(B, 3) at the step's end [m]."""
 
 
 def target_gate(gates: Gates, target: jax.Array) -> tuple[Gates, jax.Array]:

@@ -22,7 +22,9 @@ class TrainState(NamedTuple):
     """All that a run carries from one iteration to the next."""
 
     params: network.Params
+    """The policy's."""
     optimizer: optax.OptState
+    """Of AdamW."""
     iteration: jax.Array
     """Gradient steps done, a scalar."""
 
