@@ -7,7 +7,7 @@ with the encoder inside the loop, and backward through it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -16,11 +16,23 @@ from suite.bench import torch_scene
 from suite.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
 from suite.train.losses import MAX_PULL, UNIT_FIELD
-from suite.train.point_mass import GRAVITY, Body, Constants
+from suite.train.point_mass import GRAVITY, Constants
 from suite.train.rollout import BEYOND_M
 from suite.train.worlds import Worlds
 from tracks.camera import pixel_rays_b
 from tracks.scene import Gates
+
+
+class Body(NamedTuple):
+    """State of the point mass as tensors; shapes and units are `suite.train.point_mass.Body`'s."""
+
+    pos_w: Tensor
+    vel_w: Tensor
+    thrust_w: Tensor
+    acc_w: Tensor
+    rot_w: Tensor
+    heading_w: Tensor
+    commands_w: Tensor
 
 
 def to_torch(tree: Any) -> Any:

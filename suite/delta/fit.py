@@ -21,7 +21,6 @@ from suite.delta.replay import Plant, nominal_plant, replay
 from suite.delta.windows import Windows
 from suite.train.config import PointMassConfig
 
-
 IDENTIFY_RATE = 3e-2
 """Least learning rate of lag, drag and delay: they have further to go than a network's weights."""
 

@@ -12,16 +12,17 @@ from suite.delta.windows import Windows
 from suite.train import point_mass
 from suite.train.config import PointMassConfig
 from tracks.rotation import to_local, to_world
+from tracks.scene import Array
 
 
 class Plant(NamedTuple):
     """Constants of the replayed point mass, scalars and one vector."""
 
-    lag: jax.Array
+    lag: Array
     """Rate at which the acceleration follows the command [1/s]."""
-    drag: jax.Array
+    drag: Array
     """(3,) linear drag in body axes [1/s]."""
-    delay: jax.Array
+    delay: Array
     """Delay of a command in decisions."""
 
 

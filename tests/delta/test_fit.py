@@ -21,7 +21,7 @@ CONFIG = FitConfig(horizon_s=0.6, iterations=240, batch=64, rate=1e-2)
 
 def test_lag_drag_and_delay_of_a_point_mass_are_identified():
     """Far from the middle: a rival that is fitted by half would flatter the network."""
-    truth = Plant(np.float32(6.0), np.float32([0.1, 0.6, 0.25]), np.float32(1.6))
+    truth = Plant(np.float32(6.0), np.array([0.1, 0.6, 0.25], np.float32), np.float32(1.6))
     windows = cut_windows(fly(truth, 6), 0.6, 0.15)
     config = FitConfig(horizon_s=0.6, iterations=900, batch=64)
     found = identify(config, PHYSICS, windows)
@@ -32,7 +32,7 @@ def test_lag_drag_and_delay_of_a_point_mass_are_identified():
 
 def push(vel_b, action_b):
     """A vehicle that gives nine tenths of what is asked and is pushed to its left."""
-    return -0.1 * action_b + np.float32([0.0, 0.8, -0.5])
+    return -0.1 * action_b + np.array([0.0, 0.8, -0.5], np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +41,9 @@ def logs():
 
 
 def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(logs):
-    cut = [cut_windows(part, 0.6, 0.15) for part in (logs[:6], logs[6:])]
+    known, held_out = (cut_windows(part, 0.6, 0.15) for part in (logs[:6], logs[6:]))
     shown = []
-    result = fit(CONFIG, PHYSICS, *cut, lambda *words: shown.append(words))
+    result = fit(CONFIG, PHYSICS, known, held_out, lambda *words: shown.append(words))
     assert result.point_mass.position_m > 0.1
     assert result.delta_action.position_m < 0.3 * result.point_mass.position_m
     assert result.delta_action.velocity_m_s < 0.4 * result.point_mass.velocity_m_s

@@ -38,7 +38,7 @@ def test_flights_of_the_point_mass_replay_as_they_were_flown(delay):
 
 def test_drag_at_the_start_is_that_of_the_step_before():
     """The log has the drag of now, the point mass that of a step ago: centimetres over 1 s."""
-    plant = Plant(np.float32(10.0), np.float32([0.3, 0.4, 0.5]), np.float32(0.5))
+    plant = Plant(np.float32(10.0), np.array([0.3, 0.4, 0.5], np.float32), np.float32(0.5))
     windows = cut_windows(fly(plant), 1.0, 0.2)
     pos, vel = errors(plant, windows)
     assert pos < 0.03 and vel < 0.03
@@ -68,7 +68,7 @@ def test_a_fresh_delta_changes_nothing_and_a_constant_one_acts_as_the_action():
     np.testing.assert_array_equal(plain[0], same[0])
     assert not np.any(same[2])
     delta["output.bias"] = jnp.asarray([1.0, -0.5, 0.2])
-    shifted = windows._replace(action_b=windows.action_b + np.float32([1.0, -0.5, 0.2]))
+    shifted = windows._replace(action_b=windows.action_b + np.array([1.0, -0.5, 0.2], np.float32))
     pos, _, correction = jax.jit(replay)(plant, windows, delta)
     np.testing.assert_allclose(correction[:, 0], np.tile([1.0, -0.5, 0.2], (len(pos), 1)))
     np.testing.assert_allclose(pos, jax.jit(replay)(plant, shifted, None)[0], atol=1e-5)

@@ -64,6 +64,7 @@ def test_the_work_of_a_step_is_what_xla_counts():
 
     def flops(f, *args):
         cost = jax.jit(f).lower(*args).compile().cost_analysis()
+        assert cost is not None
         return cost["flops"]
 
     encoder = flops(network.encode, params, image)

@@ -280,7 +280,7 @@ def test_thirty_iterations_on_an_easy_course_reduce_the_loss(tmp_path, monkeypat
     config = small_config(8, 24, optimizer=optimizer, difficulty=(0.0, 0.0), rest_share=1.0)
     worlds = boxes_worlds(config)
     boxes = worlds.scene.boxes
-    gone = boxes._replace(center_w=boxes.center_w - np.float32([0, 0, 1000]))
+    gone = boxes._replace(center_w=boxes.center_w - np.array([0, 0, 1000], np.float32))
     worlds = worlds._replace(scene=worlds.scene._replace(boxes=gone))
     monkeypatch.setattr(run, "sample_worlds", lambda *_: worlds)
     run.train(config, tmp_path, Console(), fresh_params())
