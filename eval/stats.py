@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import comb, sqrt
 from statistics import NormalDist
 from typing import NamedTuple
@@ -63,13 +64,7 @@ def bootstrap_median(
 
     NaN in all three where there is no value; the same seed gives the same interval.
     """
-    values = np.asarray(values, float)
-    if not len(values):
-        return Interval(float("nan"), float("nan"), float("nan"))
-    draws = np.random.default_rng(seed).integers(0, len(values), (resamples, len(values)))
-    medians = np.median(values[draws], axis=1)
-    low, high = np.quantile(medians, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Interval(float(np.median(values)), float(low), float(high))
+    return _bootstrap(np.median, values, seed, confidence, resamples)
 
 
 def bootstrap_mean(
@@ -79,13 +74,23 @@ def bootstrap_mean(
 
     NaN in all three where there is no value; the same seed gives the same interval.
     """
+    return _bootstrap(np.mean, values, seed, confidence, resamples)
+
+
+def _bootstrap(
+    statistic: Callable[..., np.ndarray],
+    values: np.ndarray,
+    seed: int,
+    confidence: float,
+    resamples: int,
+) -> Interval:
     values = np.asarray(values, float)
     if not len(values):
         return Interval(float("nan"), float("nan"), float("nan"))
     draws = np.random.default_rng(seed).integers(0, len(values), (resamples, len(values)))
-    means = values[draws].mean(axis=1)
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Interval(float(values.mean()), float(low), float(high))
+    found = statistic(values[draws], axis=1)
+    low, high = np.quantile(found, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return Interval(float(statistic(values)), float(low), float(high))
 
 
 def paired_bootstrap(

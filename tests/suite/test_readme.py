@@ -1,9 +1,11 @@
-"""The commands in the README and the docs: all are read by the program, the marked ones are run.
+"""README and docs: commands are read by the program, marked ones run, links and imports hold.
 
 A fenced sh block below the comment ``<!-- run -->`` is run, in an empty folder. Every other
 `suite` line must be one that the command line accepts, and every `make` line a target.
 """
 
+import ast
+import importlib
 import os
 import re
 import shlex
@@ -18,6 +20,13 @@ from suite import cli
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"(<!-- run -->\n+)?```sh\n(.*?)```", re.DOTALL)
+PYTHON = [
+    pytest.param(body, id=f"{page.name}-{number}")
+    for page in PAGES
+    for number, body in enumerate(
+        re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    )
+]
 BLOCKS = [
     pytest.param(bool(marked), body, id=f"{page.name}-{number}")
     for page in PAGES
@@ -72,6 +81,14 @@ def test_marked_commands_run(body, tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("body", PYTHON)
+def test_python_on_a_page_imports_what_there_is(body):
+    for node in ast.walk(ast.parse(body)):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            module = importlib.import_module(node.module)
+            assert all(hasattr(module, alias.name) for alias in node.names), node.module
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
