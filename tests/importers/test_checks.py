@@ -231,6 +231,15 @@ def test_faster_signals_are_averaged_and_commands_hold_their_mean(tmp_path):
     np.testing.assert_allclose(np.asarray(log.rate_cmd_b)[:-1], middle[:-1], atol=0.01)
 
 
+def test_a_command_that_stops_is_not_held_for_long(tmp_path):
+    good = flight()
+    before = good["time"] < 5.0
+    path = write(tmp_path / "log.csv", good, {"cmd_rate": before, "cmd_thrust": before})
+    log, _ = import_log(path)
+    missing = np.isnan(np.asarray(log.thrust_cmd))
+    assert missing[log.time_s > 5.6].all() and not missing[log.time_s < 5.4].any()
+
+
 def test_two_flights_in_one_file_are_refused(tmp_path):
     good = flight(end=3.0)
     twice = {name: np.concatenate([value, value]) for name, value in good.items()}

@@ -203,6 +203,7 @@ def test_mcap_equals_the_flight(tmp_path):
     _near(np.asarray(log.rate_cmd_b)[::4], truth.cmd_rate[::4], 1e-9)
     _near(np.asarray(log.thrust_cmd)[::4], truth.thrust[::4], 1e-5)
     assert "/odom_slow" in _text(findings, "topics")
+    assert {"corrected", "doubt"}.isdisjoint(_levels(findings).values())
 
 
 def test_mcap_topics_are_chosen_by_a_map(tmp_path):
