@@ -11,11 +11,11 @@ from policies.spec import PolicySpec
 class PointMassConfig:
     """The simulator's dynamics and their randomisation, drawn per world.
 
-    The model is that of Zhang et al. 2025 (the preset `paper` has its numbers); the lag and delay
-    are those of an attitude loop of 8 1/s over a rate loop of 20 1/s, give or take.
+    The model is that of Zhang et al. 2025 (the preset `paper` has its numbers), with lag, drag and
+    delay drawn from wider ranges.
     """
 
-    lag_mean: float = 8.0
+    lag_mean: float = 12.0
     """Mean rate at which the acceleration follows the command [1/s]."""
     lag_std: float = 2.0
     """Its standard deviation over worlds [1/s]."""
@@ -25,7 +25,7 @@ class PointMassConfig:
     """Standard deviation of the constant wind over worlds [m/s]."""
     time_step_std: float = 0.1
     """Standard deviation of a world's time step as a share of the policy's period [1]."""
-    action_delay: tuple[float, float] = (0.5, 1.5)
+    action_delay: tuple[float, float] = (0.0, 1.5)
     """Range of the delay after which a command acts [policy periods, at most 2]."""
     state_delay: int = 0
     """Age of the state that the policy sees [policy periods]."""
@@ -50,9 +50,9 @@ class LossConfig:
     """Weight of L_clearance, with the paper's lambda_C [1]."""
     collide: float = 0.2
     """Weight of L_collide; the paper's lambda_C of 3 stops the drone in front of gates [1]."""
-    acceleration: float = 8e-3
+    acceleration: float = 1e-2
     """lambda_a [s^4/m^2]."""
-    jerk: float = 5e-4
+    jerk: float = 1e-3
     """lambda_j [s^6/m^2]."""
     progress: float = 1.2
     """lambda_p of L_p [s/m]."""
