@@ -183,3 +183,14 @@ def test_a_delayed_command_is_the_one_of_steps_before():
     )
     between = body.commands_w.mean(1) * (1 - keep) + body.thrust_w * keep
     np.testing.assert_allclose(half.thrust_w, between, atol=1e-9)
+
+
+def test_a_steady_acceleration_is_followed_exactly():
+    fixed = constants(1, drag=(0.0, 0.0, 0.0), delay=0.0)
+    body, held = some_body(1), jnp.array(ACTION[:1] @ ROLL.T)
+    body = body._replace(thrust_w=held, acc_w=held)
+    after = point_mass.step(body, fixed, jnp.array(ACTION[:1]), TARGET[:1], 6.0, 0.0)
+    dt = 0.033
+    expected = body.pos_w + body.vel_w * dt + 0.5 * held * dt**2
+    np.testing.assert_allclose(after.pos_w, expected, atol=1e-12)
+    np.testing.assert_allclose(after.vel_w, body.vel_w + held * dt, atol=1e-12)
