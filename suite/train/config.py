@@ -19,7 +19,7 @@ class PointMassConfig:
     """Mean rate at which the acceleration follows the command [1/s]."""
     lag_std: float = 2.0
     """Its standard deviation over worlds [1/s]."""
-    drag: tuple[float, float] = (0.1, 0.45)
+    drag: tuple[float, float] = (0.1, 0.8)
     """Range of the linear drag in body axes [1/s]."""
     wind_std: tuple[float, float, float] = (1.0, 1.0, 0.2)
     """Standard deviation of the constant wind over worlds [m/s]."""
@@ -104,7 +104,7 @@ class EpisodeConfig:
 class OptimizerConfig:
     """AdamW with a cosine schedule."""
 
-    iterations: int = 2400
+    iterations: int = 2000
     """Gradient steps."""
     rate: float = 2e-3
     """Peak learning rate."""
