@@ -121,10 +121,10 @@ class Baseline:
         upright = torch.zeros(count, 12)
         upright[:, 8] = 1.0
         states = [upright] * physics.state_delay
-        hidden = torch.zeros(count, config.spec.hidden_size)
+        hidden = worlds.hidden
         action, target, alive = zero, worlds.target.long(), torch.ones(count)
         total = torch.zeros(())
-        for _ in range(config.episode.steps):
+        for number in range(config.episode.steps):
             gate, target_w = self.target_gate(worlds.scene.gates, target)
             images.append(self.look(worlds, body))
             seen = [to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w)]
@@ -133,7 +133,7 @@ class Baseline:
             before, body = body, step(body, worlds.constants, action, target_w, config)
             loss, clearance = self.judge(worlds, before, body, gate, target_w)
             total = total + (loss * alive).mean()
-            alive = alive * (clearance > -config.loss.crash_depth_m)
+            alive = alive * (clearance > -config.loss.crash_depth_m) * (number + 1 < worlds.stop)
             passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
             target = target + (passed & (target < worlds.scene.gates.center_w.shape[1]))
         return total / config.episode.steps

@@ -94,8 +94,12 @@ class EpisodeConfig:
     """Range of the tracks' difficulty."""
     easy_until: float = 0.0
     """Share of training during which the range of difficulty grows from its lower end."""
-    rest_share: float = 0.4
-    """Share of worlds that start at rest at the track's start; the others start on the way."""
+    rest_share: float = 0.3
+    """Share of worlds that start at rest at the track's start; the others start on the way, with a
+    recurrent state from a random step of the last rollout."""
+    stop_from: float = 0.33
+    """Worlds that start at rest leave the loss at a random step from this share of `steps` on, so
+    that the policy cannot count the steps left and go for broke at the end; 1: none leaves."""
     start_speed: float = 6.0
     """Largest speed of a world that starts on the way [m/s]."""
 

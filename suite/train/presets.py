@@ -46,7 +46,7 @@ def paper() -> TrainConfig:
             field_gain=64 * 150 * 2.807e-3,
             crash_depth_m=math.inf,
         ),
-        episode=EpisodeConfig(steps=150),
+        episode=EpisodeConfig(steps=150, rest_share=1.0, stop_from=1.0),
         optimizer=OptimizerConfig(iterations=50_000, rate=1e-3, memory=0.999, clip=0.0, warmup=0),
     )
 

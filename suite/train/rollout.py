@@ -72,6 +72,10 @@ class StepRecord(NamedTuple):
     """Bool: a gate was crossed in this step."""
     pos_w: jax.Array
     """(B, 3) at the step's end [m]."""
+    hidden: jax.Array
+    """(B, hidden) recurrent state after the step."""
+    alive: jax.Array
+    """1 where the step counted in the loss, else 0."""
 
 
 def target_gate(gates: Gates, target: jax.Array) -> tuple[Gates, jax.Array]:
@@ -163,7 +167,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
         memory = Memory(
             body=body,
             target=worlds.target,
-            hidden=jnp.zeros((batch, width)),
+            hidden=jnp.asarray(worlds.hidden),
             action_b=jnp.zeros((batch, 3)),
             embeddings=jnp.zeros((batch, physics.image_delay, width)),
             states=jnp.zeros((batch, physics.state_delay, 12)).at[:, :, 8].set(1.0),
@@ -171,8 +175,10 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
             alive=jnp.ones(batch),
         )
 
-        def step(memory: Memory, inputs: tuple[jax.Array, jax.Array]) -> tuple[Memory, StepRecord]:
-            nudge_now, key_now = inputs
+        def step(
+            memory: Memory, inputs: tuple[jax.Array, jax.Array, jax.Array]
+        ) -> tuple[Memory, StepRecord]:
+            nudge_now, key_now, number = inputs
             before = memory.body
             image = look(worlds, jax.lax.stop_gradient(before), key_now)
             _, target_w = target_gate(worlds.scene.gates, memory.target)
@@ -196,14 +202,22 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
             terms, clearance, passed = judge(worlds, before, body, memory.target)
             terms = losses.Terms(*(term * memory.alive for term in terms))
             alive = memory.alive * (clearance > -weights.crash_depth_m)
+            alive = alive * (number + 1 < worlds.stop)
             record = StepRecord(
-                image, terms, jnp.linalg.norm(body.vel_w, axis=-1), clearance, passed, body.pos_w
+                image=image,
+                terms=terms,
+                speed=jnp.linalg.norm(body.vel_w, axis=-1),
+                clearance=clearance,
+                passed=passed,
+                pos_w=body.pos_w,
+                hidden=memory.hidden,
+                alive=memory.alive,
             )
             target = memory.target + passed
             return memory._replace(body=body, target=target, alive=alive), record
 
         keys = jax.random.split(key, steps)
-        _, records = jax.lax.scan(step, memory, (nudge, keys))
+        _, records = jax.lax.scan(step, memory, (nudge, keys, jnp.arange(steps)))
         loss = functools.reduce(jnp.add, (term.mean() for term in records.terms))
         return loss, jax.lax.stop_gradient(records)
 

@@ -27,6 +27,8 @@ class TrainState(NamedTuple):
     """Of AdamW."""
     iteration: jax.Array
     """Gradient steps done, a scalar."""
+    hidden: jax.Array
+    """(B, hidden) recurrent states from random steps of the last rollout."""
 
 
 def make_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
@@ -44,7 +46,9 @@ def start_state(config: TrainConfig, params: network.Params | None = None) -> Tr
     """Return the state before the first iteration, from fresh or given parameters."""
     if params is None:
         params = network.init(jax.random.key(config.seed), config.spec)
-    return TrainState(params, make_optimizer(config.optimizer).init(params), jnp.zeros((), int))
+    hidden = jnp.zeros((config.episode.batch, config.spec.hidden_size))
+    optimizer = make_optimizer(config.optimizer).init(params)
+    return TrainState(params, optimizer, jnp.zeros((), int), hidden)
 
 
 def device_mesh(config: TrainConfig) -> Mesh:
@@ -77,6 +81,18 @@ def curve_numbers(
     return numbers | {f"loss_{k}": v.mean() for k, v in records.terms._asdict().items()}
 
 
+def sample_hidden(key: jax.Array, records: StepRecord, before: jax.Array) -> jax.Array:
+    """Return the recurrent states (B, hidden) of a random step of each world.
+
+    A world that had left the loss by that step keeps the state `before`.
+    """
+    steps, batch = records.alive.shape
+    step = jax.random.randint(key, (batch,), 0, steps)
+    world = jnp.arange(batch)
+    taken = records.alive[step, world] > 0
+    return jnp.where(taken[:, None], records.hidden[step, world], before)
+
+
 def make_update(
     config: TrainConfig, mesh: Mesh, delta: delta_network.Params | None = None
 ) -> Callable[[TrainState, Worlds], tuple[TrainState, dict[str, jax.Array]]]:
@@ -91,11 +107,13 @@ def make_update(
     @jax.jit
     def update(state: TrainState, worlds: Worlds) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(seed, state.iteration)
+        worlds = worlds._replace(hidden=state.hidden * worlds.remembers[:, None])
         gradient, loss, records = gradient_of(state.params, worlds, key, delta)
         change, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
         # optax types any tree of parameters; it gives back the one it was given.
         params = cast(network.Params, optax.apply_updates(state.params, change))
-        state = TrainState(params, optimizer_state, state.iteration + 1)
+        hidden = sample_hidden(jax.random.fold_in(key, config.episode.batch), records, state.hidden)
+        state = TrainState(params, optimizer_state, state.iteration + 1, hidden)
         return state, curve_numbers(loss, gradient, records)
 
     return update

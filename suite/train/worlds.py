@@ -30,6 +30,12 @@ class Worlds(NamedTuple):
     target: Array
     """(B,) index of the first gate to pass."""
     constants: Constants
+    hidden: Array
+    """(B, hidden) the policy's recurrent state at the start, zero for worlds that start at rest."""
+    remembers: Array
+    """(B,) 1 where a world starts on the way, with a recurrent state from an earlier rollout."""
+    stop: Array
+    """(B,) step at which a world leaves the loss."""
     fov_scale: Array
     """(B,) this iteration's field of view as a share of the camera's."""
 
@@ -84,10 +90,11 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     batch = episode.batch
     low, high = difficulty_range(config, iteration)
     tracks, starts = [], []
-    for _ in range(batch):
+    rests = rng.uniform(size=batch) < episode.rest_share
+    for rest in rests:
         track = random_track(rng.uniform(low, high), rng)
         tracks.append(track)
-        if rng.uniform() < episode.rest_share:
+        if rest:
             starts.append((track.start_pos_w, np.zeros(3), 0))
         else:
             starts.append(_on_the_way(track, episode.start_speed, rng))
@@ -95,6 +102,7 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     gate = np.stack([t.scene.gates.center_w[i] for t, i in zip(tracks, target, strict=True)])
     yaw = np.arctan2(gate[:, 1] - pos[:, 1], gate[:, 0] - pos[:, 0]) + rng.normal(0, 0.2, batch)
     period = 1.0 / config.spec.rate_hz
+    earliest = max(1, round(episode.stop_from * episode.steps))
     stretch = np.clip(1 + physics.time_step_std * rng.standard_normal(batch), 0.5, 1.5)
     lag = physics.lag_mean + physics.lag_std * rng.standard_normal(batch)
     constants = Constants(
@@ -112,5 +120,8 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         heading_w=np.stack([np.cos(yaw), np.sin(yaw), np.zeros(batch)], -1).astype(np.float32),
         target=target.astype(np.int32),
         constants=constants,
+        hidden=np.zeros((batch, config.spec.hidden_size), np.float32),
+        remembers=np.where(rests, 0.0, 1.0).astype(np.float32),
+        stop=np.where(rests, rng.integers(earliest, episode.steps + 1, batch), episode.steps),
         fov_scale=np.full(batch, rng.uniform(*physics.fov_scale), np.float32),
     )
