@@ -21,12 +21,15 @@ SPEC = PolicySpec(camera=Camera(width=20, height=20), hidden_size=8)
 
 
 def small_config(batch=4, steps=6, physics=None, loss=None, optimizer=None, **episode):
-    """Return a run of a second; `physics`, `loss` and `optimizer` are settings by name."""
+    """Return a run of a second in which every world counts to the end, unless `stop_from` is given.
+
+    `physics`, `loss` and `optimizer` are settings by name.
+    """
     return TrainConfig(
         spec=SPEC,
         physics=PointMassConfig(**{"depth_noise": 0.0, **(physics or {})}),
         loss=LossConfig(**(loss or {})),
-        episode=EpisodeConfig(batch=batch, steps=steps, **episode),
+        episode=EpisodeConfig(**{"batch": batch, "steps": steps, "stop_from": 1.0, **episode}),
         optimizer=OptimizerConfig(**{"iterations": 6, "warmup": 1, **(optimizer or {})}),
     )
 
