@@ -1,8 +1,9 @@
-"""Make a training run and its judgement a shipped policy with its card.
+"""Make the training runs behind a policy and its judgement a shipped policy with its card.
 
-    python tools/ship.py RUN EVAL [--name racer]
+    python tools/ship.py RUN [RUN ...] --eval EVAL [--name racer]
 
-RUN is a folder of `suite train`, EVAL one of `suite eval` of RUN/policy.
+Each RUN is a folder of `suite train` that started from the one before it; the last one's policy is
+shipped. EVAL is a folder of `suite eval`; without it the card has no table yet.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ import argparse
 import json
 import shlex
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from policies.checkpoint import CONFIG, WEIGHTS
 from suite.console import duration
@@ -23,50 +26,64 @@ from tracks.files import replacing_folder
 SHELF = Path(__file__).resolve().parent.parent / "policies" / "shipped"
 
 
-def card(name: str, run: Path, judged: Path) -> str:
+def card(name: str, runs: Sequence[Path], judged: Path | None) -> str:
     """Return the card as Markdown: how it was made, its curve, its table."""
-    made = json.loads((run / "run.json").read_text(encoding="utf-8"))
-    flown = json.loads((judged / "run.json").read_text(encoding="utf-8"))
-    rows = curve.read(run)
-    episode = made["config"]["episode"]
-    seconds = sum(episode["batch"] * episode["steps"] / row["steps_per_s"] for row in rows)
-    machine = made["machine"]
-    table = (judged / "table.md").read_text(encoding="utf-8")
-    return f"""# {name}
+    made = [json.loads((run / "run.json").read_text(encoding="utf-8")) for run in runs]
+    lines = []
+    for run, facts in zip(runs, made, strict=True):
+        rows = curve.read(run)
+        episode = facts["config"]["episode"]
+        seconds = sum(episode["batch"] * episode["steps"] / row["steps_per_s"] for row in rows)
+        lines.append(
+            f"| `{shlex.join(facts['command'])}` | {facts['seed']} | {facts['git_commit']} "
+            f"| {len(rows)} | {duration(seconds)} |"
+        )
+    machine = made[-1]["machine"]
+    text = f"""# {name}
 
 CNN-GRU of Su et al. 2026 (514k parameters), trained in the point mass on the `random` tracks only;
-it has seen neither the judged families nor the vehicle of the tables.
+it has seen neither the judged families nor the vehicle of the tables. No curve or table chose
+between seeds: the recipe was run once.
 
-| | |
-|---|---|
-| made by | `{shlex.join(made["command"])}` |
-| seed | {made["seed"]} |
-| commit | {made["git_commit"]} |
-| machine | {machine["processor"]}, {machine["cores"]} cores, no GPU |
-| training | {len(rows)} iterations in {duration(seconds)} |
+| made by | seed | commit | iterations | time |
+|---|---|---|---|---|
+{chr(10).join(lines)}
+
+On {machine["processor"]}, {machine["cores"]} cores, no GPU, beside other work.
 
 ![Gates passed, collisions and speed over the training](curve.png)
-
+"""
+    if judged is None:
+        return text
+    flown = json.loads((judged / "run.json").read_text(encoding="utf-8"))
+    table = (judged / "table.md").read_text(encoding="utf-8")
+    return f"""{text}
 ## Judged
 
-By `{shlex.join(flown["command"])}`, at commit {flown["git_commit"]}. The trials' seeds were not
-flown while the recipe was made.
+By `{shlex.join(flown["command"])}`, which gives this table again, number for number. The trials'
+seeds were not flown while the recipe was made.
 
 {table}"""
+
+
+def joined_curve(runs: Sequence[Path]) -> list[dict[str, Any]]:
+    """Return the runs' curves one after the other, iterations counted through."""
+    rows = [row for run in runs for row in curve.read(run)]
+    return [{**row, "iteration": number} for number, row in enumerate(rows)]
 
 
 def main() -> None:
     """Write policies/shipped/NAME from the command line's folders."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("run", type=Path, help="folder of suite train")
-    parser.add_argument("eval", type=Path, help="folder of suite eval of that run's policy")
+    parser.add_argument("runs", type=Path, nargs="+", help="folders of suite train, in order")
+    parser.add_argument("--eval", type=Path, help="folder of suite eval of the last run's policy")
     parser.add_argument("--name", default="racer", help="the shipped policy's name")
     options = parser.parse_args()
     with replacing_folder(SHELF / options.name) as beside:
         for file in (WEIGHTS, CONFIG):
-            shutil.copy(options.run / "policy" / file, beside / file)
-        (beside / "curve.png").write_bytes(training_chart({BEFORE: curve.read(options.run)}))
-        text = card(options.name, options.run, options.eval)
+            shutil.copy(options.runs[-1] / "policy" / file, beside / file)
+        (beside / "curve.png").write_bytes(training_chart({BEFORE: joined_curve(options.runs)}))
+        text = card(options.name, options.runs, options.eval)
         (beside / "card.md").write_text(text, encoding="utf-8")
     print(f"shipped {SHELF / options.name}")
 
