@@ -42,8 +42,9 @@ def card(name: str, runs: Sequence[Path], judged: Path | None) -> str:
     text = f"""# {name}
 
 CNN-GRU of Su et al. 2026 (514k parameters), trained in the point mass on the `random` tracks only;
-it has seen neither the judged families nor the vehicle of the tables. No curve or table chose
-between seeds: the recipe was run once.
+it has seen neither the judged families nor the vehicle of the tables. The recipe's numbers were
+chosen by looking at flights of earlier recipes on the judged tracks and vehicle, at other seeds
+(50,000 on); the recipe was then run once, at one training seed.
 
 | made by | seed | commit | iterations | time |
 |---|---|---|---|---|
@@ -60,8 +61,8 @@ On {machine["processor"]}, {machine["cores"]} cores, no GPU, beside other work.
     return f"""{text}
 ## Judged
 
-By `{shlex.join(flown["command"])}`, which gives this table again, number for number. The trials'
-seeds were not flown while the recipe was made.
+By `{shlex.join(flown["command"])}`, which gives this table again, number for
+number. The trials' seeds were not flown while the recipe was made.
 
 {table}"""
 
