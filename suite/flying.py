@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 TRIALS_A_PROCESS = 128
 """Fewer trials than this are not worth another process, which takes seconds to start."""
-SECONDS_A_TRIAL = 0.08
-"""Of one core, for a trial of about 8 s on 70 solids."""
+SECONDS_A_TRIAL = 0.15
+"""Of one core, for a trial of about 13 s on 70 solids."""
 START_SECONDS = 6.0
 """To import, compile the policy and the first scenes."""
 PROCESS_BYTES = 1.0e9

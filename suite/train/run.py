@@ -37,7 +37,7 @@ from tracks.files import plain, recover_folder
 
 SAVE_PERIOD_S = 30.0
 """Time between checkpoints [s]."""
-STEPS_PER_CORE_S = 2500.0
+STEPS_PER_CORE_S = 5000.0
 """Gradient steps a second that one processor core makes, for the estimate."""
 COMPILE_S = 15.0
 """Time to compile, for the estimate [s]."""
@@ -61,7 +61,7 @@ def estimate(config: TrainConfig) -> Estimate:
     frames = episode.batch * episode.steps
     pixels = config.spec.camera.height * config.spec.camera.width
     on_cpu = jax.default_backend() == "cpu"
-    speed = STEPS_PER_CORE_S * usable_cores() if on_cpu else 100 * STEPS_PER_CORE_S
+    speed = STEPS_PER_CORE_S * usable_cores() if on_cpu else 50 * STEPS_PER_CORE_S
     seconds = COMPILE_S + config.optimizer.iterations * frames / speed
     return Estimate(seconds, 8e8 + frames * (2 * pixels + 24 * config.spec.hidden_size) * 4.0)
 
