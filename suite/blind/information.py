@@ -106,9 +106,7 @@ def signatures(
     plant = window_plant(nominal, _changed(nominal, flown, steps))
     motion = Motion(*(np.broadcast_to(f, (len(flown), *f.shape)) for f in windows.motion))
     channels = replay(windows, plant, motion, has_voltage=has_voltage)
-    moved = dict(
-        zip(flown, whitened(sensors, channels, base) / steps[:, None, None], strict=True)
-    )
+    moved = dict(zip(flown, whitened(sensors, channels, base) / steps[:, None, None], strict=True))
     for column in columns:
         if column not in moved:
             moved[column] = whitened(sensors, _faulty(column, base), base) / FAULT_STEP
@@ -116,9 +114,7 @@ def signatures(
     return columns, without_start(basis, stacked)
 
 
-def start_of(
-    nominal: Vehicle, windows: Windows, sensors: Sensors
-) -> tuple[np.ndarray, Channels]:
+def start_of(nominal: Vehicle, windows: Windows, sensors: Sensors) -> tuple[np.ndarray, Channels]:
     """Return the basis of what an unknown start explains, and the stretches of `nominal`."""
     plant = window_plant(nominal)
     base = replay(windows, plant, has_voltage=bool(sensors.voltage))
@@ -171,7 +167,11 @@ def detectable(info: Information, effect: str, direction: np.ndarray) -> float:
 
 
 def left_over(
-    info: Information, truth: Mapping[str, np.ndarray], instead_of: str, other: str, nominal: Vehicle
+    info: Information,
+    truth: Mapping[str, np.ndarray],
+    instead_of: str,
+    other: str,
+    nominal: Vehicle,
 ) -> float:
     """Return the log-likelihood ratio that is left where `other` is fitted for `instead_of`.
 

@@ -128,9 +128,7 @@ def fly(
         if step % period == 0:
             now = Reference(*(part[step // period] for part in wanted))
             _check(motion, now, time_s)
-            summed_w = np.clip(
-                summed_w + period * dt * (now.pos_w - motion.pos_w), -1.0, 1.0
-            )
+            summed_w = np.clip(summed_w + period * dt * (now.pos_w - motion.pos_w), -1.0, 1.0)
             command = steer(nominal, gains, now, motion, summed_w)
         power = (memory.rotor_speed**2).sum(-1) / hover - 1.0
         drop = FALL_V_PER_S * time_s + SAG_V * power
