@@ -17,6 +17,21 @@ FULL = {"null": 100, "outside": 40, "pair": 20, "blurred": 15, "separated": 15}
 """Cases of a full set besides the single effects."""
 SETS = {"tuning": 1_000_000, "published": 2_000_000}
 """Seeds of the two sets; the published one is run once."""
+ROTORPY_EFFECTS = (
+    "quadratic_drag",
+    "rotor_drag",
+    "inflow",
+    "translational_lift",
+    "blade_flapping",
+    "motor_lag",
+    "thrust_scale",
+    "mass_offset",
+    "com_offset",
+    "inertia_scale",
+)
+"""Effects that RotorPy's own equations have."""
+ROTORPY_NULLS = 10
+"""Cases of its set that hide nothing."""
 NEEDS_DRAG = ("constant_wind", "gusts")
 """Effects that a vehicle without drag does not feel."""
 
@@ -39,6 +54,8 @@ class Case:
     """Of everything else: the set's seed and the case's number within its kind."""
     separation: int = -1
     """Number of the entry of `SEPARATIONS`, where there is one."""
+    simulator: str = "mujoco"
+    """Who flies it: mujoco or rotorpy."""
 
 
 def full_count() -> int:
@@ -67,6 +84,28 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     order = rng.permutation(len(cases))
     digits = max(len(str(len(cases))), 3)
     return {f"case_{i + 1:0{digits}d}": cases[at] for i, at in enumerate(order)}
+
+
+def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
+    """Return the smaller set that RotorPy flies: its effects at both multiples, and nulls.
+
+    Args:
+        seed: of the set.
+        count: about how many; all if not given.
+    """
+    rng = np.random.default_rng([seed, 1])
+    singles = [((name,), multiple) for multiple in MULTIPLES for name in ROTORPY_EFFECTS]
+    everything: list[tuple[tuple[str, ...], float]] = [*singles, *([((), 0.0)] * ROTORPY_NULLS)]
+    order = rng.permutation(len(everything))[: count or len(everything)]
+    cases = {}
+    for i, index in enumerate(order):
+        hidden, multiple = everything[index]
+        sensors = str(rng.choice(["capture", "estimator", "full"]))
+        kind, number = ("single" if hidden else "null"), (seed, 50_000 + int(index))
+        cases[f"case_{i + 1:03d}"] = Case(
+            kind, hidden, multiple, "bare", sensors, number, simulator="rotorpy"
+        )
+    return cases
 
 
 def _singles(rng: np.random.Generator, seed: int, share: float) -> list[Case]:

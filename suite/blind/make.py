@@ -1,9 +1,8 @@
 """A set of cases on disk: what the diagnosis may see, and apart from it the answers.
 
-OUT/set.json                  what the set is drawn from
-OUT/cases/case_001/           vehicle.toml, flight_1.parquet, ...: all that a diagnosis sees
-OUT/answers/case_001.json     what is hidden
-OUT/manifest.json             hashes of all of them
+`OUT/set.json` says what the set is drawn from. `OUT/cases/case_001/` has vehicle.toml and
+flight_1.parquet and so on, which is all that a diagnosis sees; `OUT/answers/case_001.json`, what is
+hidden; `OUT/manifest.json`, the hashes of all of them.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any
 from eval.flight_log import write_flight
 from eval.vehicle_file import save_vehicle
 from suite.blind.build import build
-from suite.blind.cases import draw_cases
+from suite.blind.cases import draw_cases, draw_rotorpy_cases
 from suite.blind.strength import TABLE
 from suite.console import Console
 from suite.errors import WorkFailed
@@ -39,7 +38,9 @@ class Manifest:
     """By case: why it could not be made."""
 
 
-def make_set(out: Path, seed: int, count: int | None, console: Console) -> Manifest:
+def make_set(
+    out: Path, seed: int, count: int | None, console: Console, simulator: str = "mujoco"
+) -> Manifest:
     """Make the cases that `out` does not have yet, and the manifest.
 
     Args:
@@ -47,12 +48,14 @@ def make_set(out: Path, seed: int, count: int | None, console: Console) -> Manif
         seed: of the set.
         count: about how many cases; all if None.
         console: for progress.
+        simulator: `mujoco`, or `rotorpy` for the smaller set of another simulator.
 
     Raises:
-        ValueError: where `out` holds a set of another seed, count or table of strengths.
+        ValueError: where `out` holds a set of another seed, count, simulator or table of strengths.
     """
-    _same_set(out, {"seed": seed, "count": count, "strengths": _hash(TABLE)})
-    cases = draw_cases(seed, count)
+    about = {"seed": seed, "count": count, "simulator": simulator, "strengths": _hash(TABLE)}
+    _same_set(out, about)
+    cases = draw_cases(seed, count) if simulator == "mujoco" else draw_rotorpy_cases(seed, count)
     failed: dict[str, str] = {}
     with console.progress("cases", len(cases)) as update:
         for done, (name, case) in enumerate(cases.items()):

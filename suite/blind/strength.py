@@ -123,7 +123,7 @@ def detectable_along(vehicle: str, sensors: str, effect: str, direction: np.ndar
 
 
 def table_text() -> str:
-    """Return the table for people: each component alone, just detectable, in its unit (Markdown)."""
+    """Return the table (Markdown): each component alone, just detectable, in its unit."""
     from eval.effects import EFFECTS
 
     vehicles = [(v, s) for v in vehicle_names() for s in SENSORS]

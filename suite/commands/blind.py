@@ -29,6 +29,8 @@ class Config:
     """Of a set of your own, in place of the two."""
     count: int | None = None
     """About how many cases, every kind with its share; all 242 if not given."""
+    simulator: Literal["mujoco", "rotorpy"] = "mujoco"
+    """Who flies the cases; rotorpy makes a smaller set (pip install diffracing-suite[rotorpy])."""
     effects: tuple[str, ...] = ()
     """For plan: names that your data could not tell apart."""
     json: bool = False
@@ -50,7 +52,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         from suite.blind.make import make_set
 
         seed = SETS[config.set] if config.seed is None else config.seed
-        return _made(make_set(config.out, seed, config.count, console), config, console)
+        made = make_set(config.out, seed, config.count, console, config.simulator)
+        return _made(made, config, console)
     if config.what == "run":
         from suite.blind.run import by_command, run_set
         from suite.cli import COMMANDS

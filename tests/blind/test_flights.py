@@ -125,7 +125,7 @@ def test_drag_is_in_the_flight_as_worked_by_hand():
 
 @pytest.mark.parametrize("name", OUTSIDE)
 def test_physics_outside_the_catalogue_moves_the_vehicle(name):
-    way = replace(EIGHT, duration_s=1.2)
+    way = Trajectory("climb", duration_s=2.0, speed=3.0, size=1.0)
     plain = fly(BARE, BARE, [way])[0]
     moved = fly(BARE, BARE, [way], extra=make_outside(name, OUTSIDE[name].usual, BARE.mass))[0]
     pushed = (
