@@ -18,6 +18,7 @@ from suite.blind.information import (
     THRESHOLD,
     Information,
     alternatives,
+    detectable,
     information,
     left_over,
     signatures,
@@ -84,6 +85,8 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
     table = "capture" if case.separation >= 0 else case.sensors
     for name in case.hidden:
         change, multiple = draw_change(rng, nominal, table, name, case.multiple)
+        if case.separation >= 0:
+            change, multiple = _blurred_strength(case, nominal, name, change), case.multiple
         changes[name], multiples[name] = change, multiple
         effects[name] = changed_values(nominal, table, name, change, rng)
     truth = with_effects(nominal, effects)
@@ -132,6 +135,17 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
     if case.hidden:
         answer["verdict"] = "named"
     return _built(case, nominal, truth, sensors, ways, flights, answer, rng)
+
+
+def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarray) -> np.ndarray:
+    """Return `change` scaled to `case.multiple` times what the gentle flights alone can show.
+
+    Gentle flights show less than those of the table, and a change that nothing shows has no name.
+    """
+    sensors = SENSORS["capture"]
+    ways = SEPARATIONS[case.separation].blurred
+    info = information(nominal, fly(nominal, nominal, [*ways, *ways], sensors.rate_hz), sensors)
+    return case.multiple * detectable(info, name, change) * change
 
 
 def _outside(

@@ -39,6 +39,8 @@ REQUIRED = 2.0
 and must be among the alternatives."""
 ALLOWED = THRESHOLD
 """A name that leaves less than this may be among the alternatives; one that leaves more may not."""
+MOSTLY = 0.25
+"""A name may stand for another only where it leaves less than this share of what that explains."""
 GUST_DRAWS = 24
 """Simulated draws of random wind."""
 
@@ -207,13 +209,15 @@ def alternatives(
     """Return for each true effect the names that may stand for it, with what they leave over."""
     found: dict[str, dict[str, float]] = {}
     for name in truth:
+        rows = info.rows_of(name)
+        whole = 0.5 * truth[name] @ info.matrix[np.ix_(rows, rows)] @ truth[name]
         found[name] = {}
         for other in EFFECTS:
             silent = other == "accelerometer_bias" and not has_acc
             if other in truth or other == "gusts" or silent:
                 continue
             rest = left_over(info, truth, name, other, nominal)
-            if rest < ALLOWED:
+            if rest < min(ALLOWED, MOSTLY * whole):
                 found[name][other] = rest
     return found
 
