@@ -174,6 +174,7 @@ def left_over(
     instead_of: str,
     other: str,
     nominal: Vehicle,
+    one: int | None = None,
 ) -> float:
     """Return the log-likelihood ratio that is left where `other` is fitted for `instead_of`.
 
@@ -183,11 +184,14 @@ def left_over(
         instead_of: the true effect that is left out; the other true ones are fitted too.
         other: the effect that takes its place, within its physical bounds.
         nominal: the given vehicle.
+        one: use only this one of the columns of `other`.
     """
     from scipy.optimize import lsq_linear
 
     kept = [row for name in truth if name != instead_of for row in info.rows_of(name)]
     mine, theirs = info.rows_of(instead_of), info.rows_of(other)
+    if one is not None:
+        theirs = theirs[one : one + 1]
     used = [*mine, *theirs, *kept]
     matrix = info.matrix[np.ix_(used, used)]
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
@@ -216,7 +220,9 @@ def alternatives(
             silent = other == "accelerometer_bias" and not has_acc
             if other in truth or other == "gusts" or silent:
                 continue
-            rest = left_over(info, truth, name, other, nominal)
+            # All four rotors together imitate a thrust scale; a weak motor is one of them.
+            single = range(4) if other == "weak_motor" else (None,)
+            rest = min(left_over(info, truth, name, other, nominal, one) for one in single)
             if rest < min(ALLOWED, MOSTLY * whole):
                 found[name][other] = rest
     return found
