@@ -21,6 +21,7 @@ from suite.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 
 COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
+    "blind": "test cases with hidden effects for the diagnosis: make, run, score",
     "collect": "fly a policy and record every flight as a log",
     "effects": "the physical effects that a vehicle file may hold",
     "eval": "judge policies: success rates, speeds and lap times, with intervals",

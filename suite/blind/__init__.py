@@ -1,0 +1,1 @@
+"""Test cases with hidden effects: made from seeds, diagnosed without their answers, scored."""

@@ -1,0 +1,245 @@
+"""One case from its description: flights with what it hides, their logs, and the answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from eval.flight_log import FlightLog
+from eval.vehicle import Vehicle
+from suite.blind.cases import Case
+from suite.blind.hidden import changed_values, draw_change, true_parameters, with_effects
+from suite.blind.information import (
+    ALLOWED,
+    REQUIRED,
+    THRESHOLD,
+    Information,
+    alternatives,
+    detectable,
+    information,
+    left_over,
+    signatures,
+    start_of,
+)
+from suite.blind.outside import KINDS, make_outside
+from suite.blind.rotorpy_flight import fly_rotorpy
+from suite.blind.sensors import SENSORS, Sensors, log_of
+from suite.blind.strength import given_vehicle
+from suite.blind.windows import EVERY_S, cut, replay, whitened, window_plant, without_start
+from suite.errors import WorkFailed
+from suite.plans.separating import SEPARATIONS
+from suite.plans.simulate import FlightFailed, Recording, fly
+from suite.plans.trajectory import Trajectory, long_flights, ordinary_flights
+
+ROTORPY_FLIGHTS = 4
+"""Of the ordinary flights, for RotorPy is slow; its table of strengths has one more."""
+TRIES = 6
+"""Draws of flights and strengths before a case is given up."""
+
+
+@dataclass(frozen=True)
+class Built:
+    """A case as it is written."""
+
+    nominal: Vehicle
+    """Given to the diagnosis."""
+    truth: Vehicle
+    """Flown."""
+    trajectories: tuple[Trajectory, ...]
+    logs: tuple[FlightLog, ...]
+    recordings: tuple[Recording, ...]
+    """Without noise."""
+    answer: dict[str, Any]
+    """Locked away."""
+
+
+def build(case: Case) -> Built:
+    """Return the case: the same to the bit for the same description.
+
+    Raises:
+        WorkFailed: where no draw of flights and strengths gave sound flights.
+    """
+    reasons = []
+    for attempt in range(TRIES):
+        try:
+            return _attempt(case, np.random.default_rng([*case.seed, attempt]))
+        except (FlightFailed, _Unsuitable) as error:
+            reasons.append(str(error))
+    raise WorkFailed(f"{case.kind} {case.hidden}: no sound flights in {TRIES} draws: {reasons[-1]}")
+
+
+class _Unsuitable(Exception):
+    """This draw is not what the case is for."""
+
+
+def _attempt(case: Case, rng: np.random.Generator) -> Built:
+    nominal, sensors = given_vehicle(case.vehicle), SENSORS[case.sensors]
+    ways = _trajectories(case, rng)
+    if case.kind == "outside":
+        return _outside(case, nominal, sensors, ways, rng)
+    changes, multiples, effects = {}, {}, {}
+    # A pair's truth must not hang on what is logged of it.
+    table = "capture" if case.separation >= 0 else case.sensors
+    for name in case.hidden:
+        change, multiple = draw_change(rng, nominal, table, name, case.multiple)
+        if case.separation >= 0:
+            change, multiple = _blurred_strength(case, nominal, name, change), case.multiple
+        changes[name], multiples[name] = change, multiple
+        effects[name] = changed_values(nominal, table, name, change, rng)
+    truth = with_effects(nominal, effects)
+    has_voltage = bool(sensors.voltage)
+    if case.separation >= 0 and "battery_sag" in effects:
+        effects["battery_sag"] = effects["battery_sag"]._replace(per_volt=0.0)
+        if has_voltage:
+            # Per volt what the battery would lose a second at the rate at which its voltage falls.
+            rate = effects["battery_sag"].rate
+            effects["battery_sag"] = effects["battery_sag"]._replace(rate=0.0, per_volt=rate / 0.02)
+            changes["battery_sag"] = changes["battery_sag"] / 0.02
+        truth = with_effects(nominal, effects)
+    if case.simulator == "rotorpy":
+        ways = ways[:ROTORPY_FLIGHTS]
+        flights = fly_rotorpy(nominal, truth, ways, sensors.rate_hz)
+    else:
+        flights = fly(nominal, truth, ways, sensors.rate_hz, rng=rng, has_voltage=has_voltage)
+    answer: dict[str, Any] = {"kind": case.kind, "verdict": "no_gap", "effects": []}
+    named = {name: change for name, change in changes.items() if name != "gusts"}
+    info = None
+    if named:
+        stride = 4 if max(way.duration_s for way in ways) > 30.0 else 1
+        windows = cut(flights, every_s=stride * EVERY_S)
+        found = information(nominal, (), sensors, windows)
+        info = Information(found.columns, stride * found.matrix)
+        if case.kind == "pair":
+            _check_pair(info, named, nominal)
+    for name in case.hidden:
+        entry: dict[str, Any] = {
+            "name": name,
+            "parameters": true_parameters(name, effects[name], has_voltage),
+            "multiple": multiples[name],
+            "sigma": None,
+            "required": [],
+            "allowed": [],
+        }
+        if info is not None and name in named:
+            rows = info.rows_of(name)
+            ratio = named[name] @ info.matrix[np.ix_(rows, rows)] @ named[name]
+            entry["sigma"] = float(np.sqrt(ratio))
+            rests = alternatives(info, named, nominal, bool(sensors.acc))[name]
+            entry["required"] = [other for other, rest in rests.items() if rest < REQUIRED]
+            entry["allowed"] = [other for other, rest in rests.items() if rest < ALLOWED]
+            entry["left_over"] = rests
+        answer["effects"].append(entry)
+    if case.hidden:
+        answer["verdict"] = "named"
+    return _built(case, nominal, truth, sensors, ways, flights, answer, rng)
+
+
+def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarray) -> np.ndarray:
+    """Return `change` scaled to `case.multiple` times what the gentle flights alone can show.
+
+    Gentle flights show less than those of the table, and a change that nothing shows has no name.
+    """
+    sensors = SENSORS["capture"]
+    ways = SEPARATIONS[case.separation].blurred
+    info = information(nominal, fly(nominal, nominal, [*ways, *ways], sensors.rate_hz), sensors)
+    return case.multiple * detectable(info, name, change) * change
+
+
+def _outside(
+    case: Case,
+    nominal: Vehicle,
+    sensors: Sensors,
+    ways: Sequence[Trajectory],
+    rng: np.random.Generator,
+) -> Built:
+    """Build a case whose physics no effect describes.
+
+    Its strength is worked out on a flight at the usual strength: `case.multiple` times what can
+    just be detected after the whole catalogue was fitted to it.
+    """
+    name = case.hidden[0]
+    kind = KINDS[name]
+    trial = fly(
+        nominal, nominal, ways, sensors.rate_hz, make_outside(name, kind.usual, nominal.mass)
+    )
+    rest = unnameable(nominal, trial, sensors)
+    wanted = case.multiple * kind.usual * np.sqrt(THRESHOLD / max(rest, 1e-9))
+    strength = float(np.clip(wanted, 0.2 * kind.usual, kind.most))
+    extra = make_outside(name, strength, nominal.mass)
+    flights = fly(nominal, nominal, ways, sensors.rate_hz, extra)
+    rest = unnameable(nominal, flights, sensors)
+    pushed = np.concatenate([flight.extra.force_b for flight in flights]) / nominal.mass
+    answer = {
+        "kind": case.kind,
+        "verdict": "unknown",
+        "effects": [],
+        "outside": {
+            "name": name,
+            "strength": strength,
+            "unit": kind.unit,
+            "multiple": float(np.sqrt(rest / THRESHOLD)),
+            "rms_m_s2": float(np.sqrt((pushed**2).sum(-1).mean())),
+        },
+    }
+    return _built(case, nominal, nominal, sensors, ways, flights, answer, rng)
+
+
+def unnameable(nominal: Vehicle, flights: Sequence[Recording], sensors: Sensors) -> float:
+    """Return the log-likelihood ratio that the whole catalogue, fitted together, leaves over."""
+    windows = cut(flights)
+    basis, base = start_of(nominal, windows, sensors)
+    plant = window_plant(nominal)
+    with_it = replay(windows, plant, outside=True, has_voltage=bool(sensors.voltage))
+    seen = without_start(basis, whitened(sensors, with_it, base)).ravel()
+    _, columns = signatures(nominal, windows, sensors)
+    flat = columns.reshape(len(columns), -1).T
+    size = np.linalg.norm(flat, axis=0)
+    flat = flat[:, size > 0.0] / size[size > 0.0]
+    fitted = np.linalg.lstsq(flat, seen, rcond=1e-6)[0]
+    return float(0.5 * ((seen - flat @ fitted) ** 2).sum())
+
+
+def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
+    if case.separation >= 0:
+        entry = SEPARATIONS[case.separation]
+        added = entry.separating if case.kind == "separated" else ()
+        return [*entry.blurred, *entry.blurred, *added]
+    if "battery_sag" in case.hidden:
+        return long_flights(rng)
+    return ordinary_flights(rng)
+
+
+def _check_pair(info: Information, named: dict[str, np.ndarray], nominal: Vehicle) -> None:
+    """Refuse two effects of which either could be left out: that is another kind of case."""
+    first, second = named
+    for mine, other in ((first, second), (second, first)):
+        alone = left_over(info, {mine: named[mine]}, mine, other, nominal)
+        if alone < 2.0 * THRESHOLD:
+            raise _Unsuitable(f"{other} explains most of {mine}")
+
+
+def _built(
+    case: Case,
+    nominal: Vehicle,
+    truth: Vehicle,
+    sensors: Sensors,
+    ways: Sequence[Trajectory],
+    flights: Sequence[Recording],
+    answer: dict[str, Any],
+    rng: np.random.Generator,
+) -> Built:
+    logs = tuple(
+        log_of(flight, truth, sensors, rng, f"flight_{index + 1}")
+        for index, flight in enumerate(flights)
+    )
+    answer = {
+        **answer,
+        "case": asdict(case),
+        "trajectories": [asdict(way) for way in ways],
+        # Without it the hash of a short answer could be guessed.
+        "salt": rng.bytes(16).hex(),
+    }
+    return Built(nominal, truth, tuple(ways), logs, tuple(flights), answer)

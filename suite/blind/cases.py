@@ -1,0 +1,156 @@
+"""Which cases a set has: drawn from its seed, in an order that says nothing of what they hide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from suite.blind.outside import KINDS
+from suite.blind.strength import vehicle_names
+from suite.plans.separating import SEPARATIONS
+
+MULTIPLES = (2.0, 6.0)
+"""Strengths of single effects, in the strength at which each can just be detected."""
+FULL = {"null": 100, "outside": 40, "pair": 20, "blurred": 15, "separated": 15}
+"""Cases of a full set besides the single effects."""
+SETS = {"tuning": 1_000_000, "published": 2_000_000}
+"""Seeds of the two sets; the published one is run once."""
+ROTORPY_EFFECTS = (
+    "quadratic_drag",
+    "rotor_drag",
+    "inflow",
+    "translational_lift",
+    "blade_flapping",
+    "motor_lag",
+    "thrust_scale",
+    "mass_offset",
+    "com_offset",
+    "inertia_scale",
+)
+"""Effects that RotorPy's own equations have."""
+ROTORPY_NULLS = 10
+"""Cases of its set that hide nothing."""
+NEEDS_DRAG = ("constant_wind", "gusts")
+"""Effects that a vehicle without drag does not feel."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a case hides, before strengths and flights are worked out."""
+
+    kind: str
+    """single, null, outside, pair, blurred or separated."""
+    hidden: tuple[str, ...]
+    """Effects, or one kind of physics outside the catalogue."""
+    multiple: float
+    """Of the detectable strength."""
+    vehicle: str
+    """Given to the diagnosis."""
+    sensors: str
+    """What is logged."""
+    seed: tuple[int, int]
+    """Of everything else: the set's seed and the case's number within its kind."""
+    separation: int = -1
+    """Number of the entry of `SEPARATIONS`, where there is one."""
+    simulator: str = "mujoco"
+    """Who flies it: mujoco or rotorpy."""
+
+
+def full_count() -> int:
+    """Return the number of cases of a full set."""
+    return len(EFFECTS) * len(MULTIPLES) + sum(FULL.values())
+
+
+def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
+    """Return the cases of a set by name (`case_001`, ...).
+
+    Args:
+        seed: of the set.
+        count: about how many; every kind keeps its share, and at least one. All if not given.
+
+    Raises:
+        ValueError: for a count below 1.
+    """
+    if count is not None and count < 1:
+        raise ValueError(f"count = {count}: must be at least 1")
+    share = 1.0 if count is None else min(count / full_count(), 1.0)
+    rng = np.random.default_rng([seed, 0])
+    cases = _singles(rng, seed, share)
+    for kind, number in FULL.items():
+        for index in range(max(round(share * number), 1)):
+            cases.append(_drawn(rng, kind, index, seed))
+    order = rng.permutation(len(cases))
+    digits = max(len(str(len(cases))), 3)
+    return {f"case_{i + 1:0{digits}d}": cases[at] for i, at in enumerate(order)}
+
+
+def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
+    """Return the smaller set that RotorPy flies: its effects at both multiples, and nulls.
+
+    Args:
+        seed: of the set.
+        count: about how many; all if not given.
+    """
+    rng = np.random.default_rng([seed, 1])
+    singles = [((name,), multiple) for multiple in MULTIPLES for name in ROTORPY_EFFECTS]
+    everything: list[tuple[tuple[str, ...], float]] = [*singles, *([((), 0.0)] * ROTORPY_NULLS)]
+    order = rng.permutation(len(everything))[: count or len(everything)]
+    cases = {}
+    for i, index in enumerate(order):
+        hidden, multiple = everything[index]
+        sensors = str(rng.choice(["capture", "estimator", "full"]))
+        kind, number = ("single" if hidden else "null"), (seed, 50_000 + int(index))
+        cases[f"case_{i + 1:03d}"] = Case(
+            kind, hidden, multiple, "bare", sensors, number, simulator="rotorpy"
+        )
+    return cases
+
+
+def _singles(rng: np.random.Generator, seed: int, share: float) -> list[Case]:
+    wanted = [(name, multiple) for multiple in MULTIPLES for name in EFFECTS]
+    keep = max(round(share * len(wanted)), 1)
+    chosen = sorted(rng.permutation(len(wanted))[:keep])
+    found = []
+    for index in chosen:
+        name, multiple = wanted[index]
+        vehicle, sensors = _equipment(rng, (name,))
+        found.append(Case("single", (name,), multiple, vehicle, sensors, (seed, 10_000 + index)))
+    return found
+
+
+def _drawn(rng: np.random.Generator, kind: str, index: int, seed: int) -> Case:
+    number = (seed, 20_000 + 1_000 * list(FULL).index(kind) + index)
+    if kind == "outside":
+        name = list(KINDS)[index % len(KINDS)]
+        vehicle, sensors = _equipment(rng, ())
+        return Case(kind, (name,), float(rng.choice([3.0, 6.0])), vehicle, sensors, number)
+    if kind == "pair":
+        pool = [name for name in EFFECTS if name not in ("gusts", "battery_sag")]
+        first, second = (pool[i] for i in rng.choice(len(pool), 2, replace=False))
+        vehicle, sensors = _equipment(rng, (first, second))
+        return Case(kind, (first, second), MULTIPLES[1], vehicle, sensors, number)
+    if kind in ("blurred", "separated"):
+        # The same pairs with the same truth in both kinds: a stream of their own by index.
+        own = np.random.default_rng([seed, 3, index])
+        entry = index % len(SEPARATIONS)
+        pair = SEPARATIONS[entry].pair
+        name = pair[int(own.integers(2))]
+        vehicle, _ = _equipment(own, pair)
+        measured = {"motor", "voltage"} & set(SEPARATIONS[entry].measure)
+        sensors = "full" if kind == "separated" and measured else "capture"
+        number = (seed, 30_000 + index)
+        return Case(kind, (name,), MULTIPLES[0], vehicle, sensors, number, entry)
+    vehicle, sensors = _equipment(rng, ())
+    return Case(kind, (), 0.0, vehicle, sensors, number)
+
+
+def _equipment(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[str, str]:
+    vehicle = str(rng.choice(vehicle_names()))
+    sensors = str(rng.choice(["capture", "estimator", "full"]))
+    if set(names) & set(NEEDS_DRAG):
+        vehicle = "dragged"
+    if "accelerometer_bias" in names and sensors == "capture":
+        sensors = "estimator"
+    return vehicle, sensors

@@ -1,0 +1,101 @@
+"""How strong what a case hides is, and the vehicle that has it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from eval.effects import EFFECTS, all_values
+from eval.effects.interface import at
+from eval.vehicle import Vehicle
+from suite.blind.strength import GUST_LENGTH_M, columns_in_table, detectable_along
+
+INSIDE = 0.98
+"""Share of the way to a physical bound that a strength may go."""
+
+
+def draw_change(
+    rng: np.random.Generator,
+    nominal: Vehicle,
+    sensors: str,
+    effect: str,
+    multiple: float,
+) -> tuple[np.ndarray, float]:
+    """Return the change of each of the effect's columns, and the multiple that came of it.
+
+    The direction is drawn; the strength along it is `multiple` times the detectable one, cut
+    where it would pass a physical bound.
+
+    Raises:
+        ValueError: where the flights of the table do not show the effect at all.
+    """
+    columns = columns_in_table(nominal.name, sensors, effect)
+    room = np.array([_room(nominal, effect, *column) for column in columns])
+    if effect == "weak_motor":
+        direction = -np.eye(len(columns))[rng.integers(len(columns))]
+    else:
+        sign = rng.choice([-1.0, 1.0], len(columns))
+        # Where there is no way down from the given value, or none that is usual, it goes up.
+        upwards = (room[:, 0] > -1e-9) | np.array([c[0] == "time_constant" for c in columns])
+        upwards |= effect in ("linear_drag", "quadratic_drag")
+        direction = rng.uniform(0.5, 1.0, len(columns)) * np.where(upwards, 1.0, sign)
+    unit = detectable_along(nominal.name, sensors, effect, direction)
+    if not np.isfinite(unit):
+        raise ValueError(
+            f"{effect} cannot be seen on vehicle {nominal.name!r} with sensors {sensors!r}; "
+            "draw another vehicle or other sensors"
+        )
+    change = multiple * unit * direction
+    limit = INSIDE * np.where(change > 0.0, room[:, 1], room[:, 0])
+    moving = np.abs(change) > 0.0
+    cut = float(np.min(np.abs(limit[moving] / change[moving]), initial=1.0))
+    return min(cut, 1.0) * change, min(cut, 1.0) * multiple
+
+
+def changed_values(
+    nominal: Vehicle, sensors: str, effect: str, change: np.ndarray, rng: np.random.Generator
+) -> Any:
+    """Return the effect's values (plain numbers): the given vehicle's plus `change`."""
+    given = all_values(nominal)[effect]
+    fields = {key: np.array(value, dtype=float) for key, value in given._asdict().items()}
+    columns = columns_in_table(nominal.name, sensors, effect)
+    for (parameter, component), step in zip(columns, change, strict=True):
+        value = fields[parameter]
+        value[(component,) if value.ndim else ()] += step
+    if effect == "gusts":
+        fields["length"] = np.array(GUST_LENGTH_M)
+    if effect == "com_offset":
+        # Cannot be seen, so it may be anything.
+        fields["offset"][2] = rng.uniform(-0.005, 0.005)
+    plain = {k: tuple(v.tolist()) if v.ndim else float(v) for k, v in fields.items()}
+    return type(given)(**plain)
+
+
+def with_effects(nominal: Vehicle, effects: Mapping[str, Any]) -> Vehicle:
+    """Return the vehicle that is flown: `nominal` with `effects` in place of its own."""
+    return replace(nominal, effects=MappingProxyType({**nominal.effects, **effects}))
+
+
+def true_parameters(effect: str, values: Any, has_voltage: bool) -> dict[str, Any]:
+    """Return what a diagnosis should find: totals, with null for what no flight can tell."""
+    found: dict[str, Any] = {}
+    for parameter in EFFECTS[effect].parameters:
+        value = getattr(values, parameter.name)
+        sags = effect == "battery_sag" and (parameter.name == "per_volt") != has_voltage
+        if not parameter.fitted or sags:
+            continue
+        if parameter.size:
+            value = [None if i in parameter.unseen else v for i, v in enumerate(value)]
+        found[parameter.name] = value
+    return found
+
+
+def _room(nominal: Vehicle, effect: str, parameter: str, component: int) -> tuple[float, float]:
+    spec = next(p for p in EFFECTS[effect].parameters if p.name == parameter)
+    value = getattr(all_values(nominal)[effect], parameter)
+    given = float(value[component]) if value.ndim else float(value)
+    return at(spec.low, nominal) - given, at(spec.high, nominal) - given

@@ -1,0 +1,147 @@
+"""A set of cases on disk: what the diagnosis may see, and apart from it the answers.
+
+`OUT/set.json` says what the set is drawn from. `OUT/cases/case_001/` has vehicle.toml and
+flight_1.parquet and so on, which is all that a diagnosis sees; `OUT/answers/case_001.json`, what is
+hidden; `OUT/manifest.json`, the hashes of all of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from eval.flight_log import write_flight
+from eval.vehicle_file import save_vehicle
+from suite.blind.build import build
+from suite.blind.cases import draw_cases, draw_rotorpy_cases
+from suite.blind.strength import TABLE
+from suite.console import Console
+from suite.errors import WorkFailed
+from tracks.files import replacing_folder, write_json
+from tracks.provenance import stamp
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The files of a set."""
+
+    cases: dict[str, dict[str, str]]
+    """By case: SHA-256 of each file that the diagnosis sees."""
+    answers: dict[str, str]
+    """By case: SHA-256 of its answer."""
+    failed: dict[str, str] = field(default_factory=dict)
+    """By case: why it could not be made."""
+
+
+def make_set(
+    out: Path, seed: int, count: int | None, console: Console, simulator: str = "mujoco"
+) -> Manifest:
+    """Make the cases that `out` does not have yet, and the manifest.
+
+    Args:
+        out: folder of the set.
+        seed: of the set.
+        count: about how many cases; all if None.
+        console: for progress.
+        simulator: `mujoco`, or `rotorpy` for the smaller set of another simulator.
+
+    Raises:
+        ValueError: where `out` holds a set of another seed, count, simulator or table of strengths.
+    """
+    about = {"seed": seed, "count": count, "simulator": simulator, "strengths": _hash(TABLE)}
+    _same_set(out, about)
+    cases = draw_cases(seed, count) if simulator == "mujoco" else draw_rotorpy_cases(seed, count)
+    failed: dict[str, str] = {}
+    with console.progress("cases", len(cases)) as update:
+        for done, (name, case) in enumerate(cases.items()):
+            folder, answer = out / "cases" / name, out / "answers" / f"{name}.json"
+            if not (folder.is_dir() and answer.is_file()):
+                try:
+                    built = build(case)
+                except WorkFailed as error:
+                    failed[name] = str(error)
+                    continue
+                # The answer first: a case that is there has one.
+                write_json(answer, {**stamp(SCHEMA, seed), **built.answer})
+                with replacing_folder(folder) as beside:
+                    save_vehicle(built.nominal, beside / "vehicle.toml")
+                    for log in built.logs:
+                        write_flight(beside / f"{log.name}.parquet", log)
+            update(done + 1, name)
+    made = [name for name in cases if name not in failed]
+    manifest = Manifest(
+        {
+            name: {path.name: _hash(path) for path in sorted((out / "cases" / name).iterdir())}
+            for name in made
+        },
+        {name: _hash(out / "answers" / f"{name}.json") for name in made},
+        {name: "not made" for name in failed},
+    )
+    write_json(out / "manifest.json", {**stamp(SCHEMA, seed), **_fields(manifest)})
+    # The reasons say what was hidden.
+    write_json(out / "answers" / "failed.json", failed)
+    return manifest
+
+
+def load_manifest(out: Path) -> Manifest:
+    """Return the manifest of the set in `out`.
+
+    Raises:
+        ValueError: where there is none.
+    """
+    path = out / "manifest.json"
+    if not path.is_file():
+        raise ValueError(f"{path}: missing; make the set first with `suite blind make`")
+    table = json.loads(path.read_text(encoding="utf-8"))
+    return Manifest(table["cases"], table["answers"], table["failed"])
+
+
+def open_answers(out: Path) -> dict[str, dict[str, Any]]:
+    """Return the answers by case, after checking that nobody changed them or the cases.
+
+    Raises:
+        ValueError: for a file that is not the one that was made.
+    """
+    manifest = load_manifest(out)
+    answers = {}
+    for name, files in manifest.cases.items():
+        for file, digest in files.items():
+            _check(out / "cases" / name / file, digest)
+        path = out / "answers" / f"{name}.json"
+        _check(path, manifest.answers[name])
+        answers[name] = json.loads(path.read_text(encoding="utf-8"))
+    return answers
+
+
+def _check(path: Path, digest: str) -> None:
+    if not path.is_file() or _hash(path) != digest:
+        raise ValueError(
+            f"{path}: not the file that the manifest was made with; make the set again elsewhere"
+        )
+
+
+def _same_set(out: Path, wanted: dict[str, Any]) -> None:
+    path = out / "set.json"
+    if path.is_file():
+        there = json.loads(path.read_text(encoding="utf-8"))
+        for key, value in wanted.items():
+            if there.get(key) != value:
+                raise ValueError(
+                    f"{path}: {key} is {there.get(key)!r} there, {value!r} here; "
+                    "give another --out, or the same options to go on"
+                )
+        return
+    write_json(path, {**stamp(SCHEMA, wanted["seed"]), **wanted})
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _fields(manifest: Manifest) -> dict[str, Any]:
+    return {"cases": manifest.cases, "answers": manifest.answers, "failed": manifest.failed}

@@ -1,0 +1,70 @@
+"""A diagnosis run over the cases of a set, one after another in this process."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from suite.blind.make import load_manifest
+from suite.console import Console
+from suite.errors import WorkFailed
+from tracks.files import write_json
+
+Diagnose = Callable[[Sequence[Path], Path, Path], None]
+"""Takes flight logs, the vehicle file and an output folder, and writes `diagnosis.json` there."""
+CRASHED = 500
+"""Characters of an error that are kept."""
+
+
+def run_set(out: Path, diagnose: Diagnose, console: Console, into: Path | None = None) -> int:
+    """Diagnose every case that was not diagnosed yet; return how many there are now.
+
+    Results go to `into` (OUT/results if not given), one folder a case, with `seconds.json`
+    beside `diagnosis.json`. A case that fails gets `error.json` and is tried again next time.
+    """
+    results = into or out / "results"
+    names = list(load_manifest(out).cases)
+    with console.progress("diagnoses", len(names)) as update:
+        for done, name in enumerate(names):
+            folder, case = results / name, out / "cases" / name
+            if not (folder / "seconds.json").is_file():
+                _one(diagnose, case, folder)
+            update(done + 1, name)
+    return sum((results / name / "seconds.json").is_file() for name in names)
+
+
+def _one(diagnose: Diagnose, case: Path, folder: Path) -> None:
+    flights = sorted(case.glob("flight_*.parquet"), key=lambda path: int(path.stem.split("_")[1]))
+    error = folder / "error.json"
+    start = time.perf_counter()
+    try:
+        diagnose(flights, case / "vehicle.toml", folder)
+        json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    # Whatever a diagnosis dies of is a result of this case, and no reason to lose the others.
+    except Exception as reason:
+        write_json(error, {"error": f"{type(reason).__name__}: {reason}"[:CRASHED]})
+        return
+    error.unlink(missing_ok=True)
+    write_json(folder / "seconds.json", {"seconds": time.perf_counter() - start})
+
+
+def by_command(flights: Sequence[Path], vehicle: Path, out: Path) -> None:
+    """Diagnose by `suite diagnose`, in this process.
+
+    Raises:
+        WorkFailed: where the command does not end well.
+    """
+    import contextlib
+    import io
+
+    from suite.cli import main
+
+    said = io.StringIO()
+    args = [*map(str, flights), "--vehicle", str(vehicle), "--out", str(out)]
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        code = main(["diagnose", *args])
+    if code:
+        last = said.getvalue().strip().splitlines()[-1:]
+        raise WorkFailed(f"suite diagnose ended with code {code}: {' '.join(last)}")

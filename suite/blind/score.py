@@ -1,0 +1,276 @@
+"""Diagnoses against the answers: what was named, what was not there, and how well it fits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from eval.stats import wilson
+from suite.blind.make import load_manifest, open_answers
+from tracks.files import write_json, write_text
+from tracks.provenance import stamp
+
+SCHEMA = 1
+GAP_LIMIT = 1.1
+"""Of the gap after over the noise floor."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One case scored."""
+
+    case: str
+    kind: str
+    hidden: tuple[str, ...]
+    multiple: float
+    verdict: str
+    """Of the diagnosis; `failed` where there is none."""
+    named: tuple[tuple[str, ...], ...]
+    """Sets of names of the diagnosis, the first name of each first."""
+    found: bool
+    """Every hidden effect has its name, in the right set."""
+    extra: int
+    """Named effects of which no name is true."""
+    covered: tuple[bool, ...]
+    """For each component with an interval: does it hold the truth?"""
+    gap_ratio: float | None
+    """Gap after over noise floor."""
+    seconds: float | None
+
+    @property
+    def exact(self) -> bool:
+        """Every hidden effect has its name, and nothing else was named."""
+        return self.found and self.extra == 0
+
+
+@dataclass(frozen=True)
+class Share:
+    """A line of the table: so many of so many, with a 95 % Wilson interval."""
+
+    what: str
+    count: int
+    of: int
+    low: float
+    high: float
+    wanted: str
+    """What the suite aims at."""
+
+
+def score_case(
+    name: str, answer: Mapping[str, Any], diagnosis: Mapping[str, Any] | None, seconds: float | None
+) -> Verdict:
+    """Return how `diagnosis` (None where it failed) does against `answer`."""
+    truths: Sequence[Mapping[str, Any]] = answer["effects"]
+    hidden = tuple(truth["name"] for truth in truths)
+    outside = answer.get("outside")
+    multiple = max((truth["multiple"] for truth in truths), default=0.0)
+    if outside:
+        hidden, multiple = (outside["name"],), outside["multiple"]
+    effects = [] if diagnosis is None else diagnosis.get("effects", [])
+    sets = tuple((e["name"], *e.get("alternatives", [])) for e in effects)
+    pairs = _matched(truths, sets)
+    right = [_is_right(truths[t], sets[e]) for t, e in pairs.items()]
+    names = {truth["name"] for truth in truths}
+    covered: list[bool] = []
+    for t, e in pairs.items():
+        if sets[e][0] == truths[t]["name"]:
+            covered += _covered(truths[t]["parameters"], effects[e].get("parameters", {}))
+    gap = (diagnosis or {}).get("gap") or {}
+    floor, after = gap.get("noise_floor"), gap.get("after")
+    return Verdict(
+        name,
+        answer["kind"],
+        hidden,
+        float(multiple),
+        "failed" if diagnosis is None else str(diagnosis["verdict"]),
+        sets,
+        bool(truths) and len(right) == len(truths) and all(right),
+        sum(not names & set(group) for group in sets) + _doubles(sets, pairs, names),
+        tuple(covered),
+        after / floor if floor and after is not None and sets else None,
+        seconds,
+    )
+
+
+def score_set(out: Path, results: Path | None = None) -> list[Verdict]:
+    """Return all cases of the set in `out`, scored against its answers.
+
+    Raises:
+        ValueError: where the set is not what was made.
+    """
+    folder = results or out / "results"
+    scored = []
+    for name, answer in open_answers(out).items():
+        diagnosis = _read(folder / name / "diagnosis.json")
+        timing = _read(folder / name / "seconds.json")
+        # Without its time a diagnosis did not end well, whatever it left behind.
+        good = diagnosis if timing else None
+        scored.append(score_case(name, answer, good, timing["seconds"] if timing else None))
+    return scored
+
+
+def shares(verdicts: Sequence[Verdict]) -> list[Share]:
+    """Return the lines of the table that are shares, empty ones left out."""
+    by = {kind: [v for v in verdicts if v.kind == kind] for kind in {v.kind for v in verdicts}}
+    single, null = by.get("single", []), by.get("null", [])
+    told = ("unknown", "partly")
+    gaps = [v for v in verdicts if v.found and "gusts" not in v.hidden and v.gap_ratio is not None]
+    intervals = [inside for v in verdicts for inside in v.covered]
+    multiples = sorted({2.0, 6.0})
+    lines = [
+        ("single effects: named, nothing else", [v.exact for v in single], "95 %"),
+        *(
+            (
+                f"  of these at {m:g} times detectable",
+                [v.exact for v in single if _near(v.multiple, multiples) == m],
+                "",
+            )
+            for m in multiples
+        ),
+        ("single effects: named, others perhaps too", [v.found for v in single], ""),
+        ("single effects: verdict `named`", [v.verdict == "named" for v in single], ""),
+        ("nulls: something named", [bool(v.named) for v in null], "at most 2 of 100"),
+        ("nulls: verdict `no_gap`", [v.verdict == "no_gap" for v in null], ""),
+        (
+            "outside the catalogue: `unknown` or `partly`",
+            [v.verdict in told for v in by.get("outside", [])],
+            "85 %",
+        ),
+        ("pairs: both named", [v.found for v in by.get("pair", [])], "80 %"),
+        ("pairs: both named, nothing else", [v.exact for v in by.get("pair", [])], ""),
+        ("inseparable: the right set", [v.exact for v in by.get("blurred", [])], "95 %"),
+        ("the same with separating flights", [v.exact for v in by.get("separated", [])], "95 %"),
+        ("cases with a spurious extra name", [v.extra > 0 for v in verdicts if v.hidden], ""),
+        ("95 % intervals that hold the truth", intervals, "90-98 %"),
+        (
+            f"gap after within {GAP_LIMIT} of the noise floor, where named",
+            [v.gap_ratio <= GAP_LIMIT for v in gaps if v.gap_ratio is not None],
+            "all",
+        ),
+        ("diagnosis failed", [v.verdict == "failed" for v in verdicts], "none"),
+    ]
+    return [_share(what, flags, wanted) for what, flags, wanted in lines if flags]
+
+
+def report(out: Path, verdicts: Sequence[Verdict]) -> str:
+    """Write `table.md` and `table.json` into `out` and return the table (Markdown)."""
+    lines = ["| | | 95 % interval | wanted |", "|---|---|---|---|"]
+    counted = shares(verdicts)
+    for s in counted:
+        rate = f"{s.count} of {s.of} ({100 * s.count / s.of:.0f} %)"
+        lines.append(f"| {s.what} | {rate} | {100 * s.low:.0f}-{100 * s.high:.0f} % | {s.wanted} |")
+    times = [v.seconds for v in verdicts if v.seconds is not None]
+    ratios = [v.gap_ratio for v in verdicts if v.found and v.gap_ratio is not None]
+    for what, values, unit in (
+        ("seconds a case, median", times, "s"),
+        ("gap after over noise floor where named, median", ratios, ""),
+    ):
+        if values:
+            lines.append(f"| {what} | {median(values):.3g} {unit} | | |")
+    wrong = [v for v in verdicts if not _as_hoped(v)]
+    lines += ["", f"{len(wrong)} of {len(verdicts)} cases are not as hoped:", ""]
+    lines += [
+        "| case | kind | hidden | x detectable | verdict | named |",
+        "|---|---|---|---|---|---|",
+    ]
+    for v in wrong:
+        named = "; ".join(" or ".join(group) for group in v.named) or "–"
+        lines.append(
+            f"| {v.case} | {v.kind} | {', '.join(v.hidden) or '–'} | {v.multiple:.1f} "
+            f"| {v.verdict} | {named} |"
+        )
+    failed = load_manifest(out).failed
+    if failed:
+        lines += ["", f"Not made: {', '.join(failed)}."]
+    text = "\n".join(lines) + "\n"
+    write_text(out / "table.md", text)
+    summary = {
+        **stamp(SCHEMA, None),
+        "shares": counted,
+        "seconds_median": median(times) if times else None,
+        "cases": verdicts,
+    }
+    write_json(out / "table.json", summary)
+    return text
+
+
+def _matched(
+    truths: Sequence[Mapping[str, Any]], sets: Sequence[tuple[str, ...]]
+) -> dict[int, int]:
+    """Return for each true effect the named one that stands for it, each used once.
+
+    First names go before alternatives, so that two sets with a name in common find their own.
+    """
+    pairs: dict[int, int] = {}
+    for first_only in (True, False):
+        for t, truth in enumerate(truths):
+            for e, group in enumerate(sets):
+                names = group[:1] if first_only else group
+                if t not in pairs and e not in pairs.values() and truth["name"] in names:
+                    pairs[t] = e
+    return pairs
+
+
+def _is_right(truth: Mapping[str, Any], group: tuple[str, ...]) -> bool:
+    others = set(group) - {truth["name"]}
+    return set(truth["required"]) <= others <= set(truth["allowed"]) | set(truth["required"])
+
+
+def _doubles(sets: Sequence[tuple[str, ...]], pairs: dict[int, int], names: set[str]) -> int:
+    """Return how many sets name something true that another set stands for already."""
+    used = set(pairs.values())
+    return sum(e not in used and bool(names & set(group)) for e, group in enumerate(sets))
+
+
+def _covered(truth: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[bool]:
+    table = _weak_motor_as_list(found)
+    for name, value in truth.items():
+        interval = (table.get(name) or {}).get("ci95")
+        if interval is None:
+            continue
+        values = value if isinstance(value, list) else [value]
+        intervals = interval if isinstance(value, list) else [interval]
+        for one, span in zip(values, intervals, strict=False):
+            if one is not None and span is not None and None not in span:
+                yield bool(span[0] <= one <= span[1])
+
+
+def _weak_motor_as_list(found: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return parameters with `index` and `scale` of weak rotors as a scale for each rotor."""
+    if "index" not in found or "scale" not in found:
+        return found
+    index, interval = found["index"]["value"], found["scale"].get("ci95")
+    if not isinstance(index, list):
+        index, interval = [index], [interval]
+    spans: list[Any] = [None] * 4
+    for number, span in zip(index, interval or [], strict=False):
+        spans[int(number) - 1] = span
+    return {"scale": {"ci95": spans}}
+
+
+def _as_hoped(v: Verdict) -> bool:
+    if v.kind == "null":
+        return v.verdict == "no_gap"
+    if v.kind == "outside":
+        return v.verdict in ("unknown", "partly")
+    return v.exact
+
+
+def _near(value: float, steps: Sequence[float]) -> float:
+    return min(steps, key=lambda step: abs(step - value))
+
+
+def _share(what: str, flags: Sequence[bool], wanted: str) -> Share:
+    interval = wilson(sum(flags), len(flags))
+    return Share(what, sum(flags), len(flags), interval.low, interval.high, wanted)
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None

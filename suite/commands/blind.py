@@ -1,0 +1,105 @@
+"""`suite blind`: test cases with hidden effects for the diagnosis, made, diagnosed and scored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from suite.console import Console
+
+if TYPE_CHECKING:
+    from suite.blind.make import Manifest
+
+
+@dataclass(frozen=True)
+class Config:
+    """Make cases with hidden effects, run the diagnosis on them, score it against the answers."""
+
+    what: tyro.conf.Positional[Literal["make", "run", "score", "strengths", "plan"]]
+    """Make a set, run `suite diagnose` on it, score it; make the table of strengths anew; or say
+    which flights separate --effects."""
+    out: Path = Path("runs/blind")
+    """Folder of the set; the same command again goes on where it stopped."""
+    set: Literal["tuning", "published"] = "tuning"
+    """Which seeds: the published ones are run once."""
+    seed: int | None = None
+    """Of a set of your own, in place of the two."""
+    count: int | None = None
+    """About how many cases, every kind with its share; all 242 if not given."""
+    simulator: Literal["mujoco", "rotorpy"] = "mujoco"
+    """Who flies the cases; rotorpy makes a smaller set (pip install diffracing-suite[rotorpy])."""
+    effects: tuple[str, ...] = ()
+    """For plan: names that your data could not tell apart."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Do `config.what`.
+
+    Raises:
+        ValueError: for a folder that holds another set, or names that are not in the catalogue.
+    """
+    if config.what == "plan":
+        return _plan(config, console)
+    if config.what == "strengths":
+        return _strengths(console)
+    if config.what == "make":
+        from suite.blind.cases import SETS
+        from suite.blind.make import make_set
+
+        seed = SETS[config.set] if config.seed is None else config.seed
+        made = make_set(config.out, seed, config.count, console, config.simulator)
+        return _made(made, config, console)
+    if config.what == "run":
+        from suite.blind.run import by_command, run_set
+        from suite.cli import COMMANDS
+
+        if "diagnose" not in COMMANDS:
+            raise ValueError("this version has no `suite diagnose`; run_set takes any function")
+        done = run_set(config.out, by_command, console)
+        console.say(f"{done} cases diagnosed; score them with `suite blind score`")
+        return {"diagnosed": done, "out": str(config.out)}
+    from suite.blind.score import report, score_set, shares
+    from tracks.files import plain
+
+    verdicts = score_set(config.out)
+    console.say(report(config.out, verdicts))
+    return {"out": str(config.out), "shares": plain(shares(verdicts)), "cases": plain(verdicts)}
+
+
+def _made(manifest: Manifest, config: Config, console: Console) -> dict[str, Any]:
+    from tracks.files import plain
+
+    count = len(manifest.cases)
+    console.say(f"{count} cases in {config.out / 'cases'}, answers in {config.out / 'answers'}")
+    for name in manifest.failed:
+        console.note(f"warning: {name} could not be made; why is in answers/failed.json")
+    return {"out": str(config.out), "made": count, "failed": plain(manifest.failed)}
+
+
+def _strengths(console: Console) -> dict[str, Any]:
+    from suite.blind.strength import make_table, save_table, table_size, table_text
+
+    with console.progress("strengths", table_size()) as update:
+        path = save_table(make_table(update))
+    console.say(table_text())
+    return {"table": str(path)}
+
+
+def _plan(config: Config, console: Console) -> dict[str, Any]:
+    from eval.effects import find_effect
+    from suite.plans.separating import plan_for, separations_of
+    from tracks.files import plain
+
+    names = [find_effect(name).name for name in config.effects]
+    if len(names) < 2:
+        raise ValueError(f"--effects {names}: give at least two names that are to be separated")
+    for entry in separations_of(names):
+        console.say(f"{' or '.join(entry.pair)}: {entry.words}")
+    for way in plan_for(names):
+        console.say(f"  {way.kind}, {way.duration_s:g} s, to {way.speed:g} m/s, yaw {way.turn}")
+    return {"flights": plain(plan_for(names))}

@@ -1,0 +1,1 @@
+"""Commanded trajectories, flown in simulation, and which of them tell which effects apart."""
