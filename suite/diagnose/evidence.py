@@ -30,7 +30,9 @@ class Frame(NamedTuple):
     upper: np.ndarray
     """(W, 12, 12) from the start to `start`'s coordinates."""
     slow: np.ndarray
-    """(W, M, L) orthonormal: slow errors of pose, velocity and rates, without the start's."""
+    """(W, M, 12 L) slow errors of pose, velocity and rates, less what the start explains."""
+    slow_freedom: np.ndarray
+    """(W, 12) expected energy along them where there is noise only, by channel."""
     freedom: np.ndarray
     """(W,) measured numbers less the start's."""
 
@@ -45,7 +47,7 @@ class Sums(NamedTuple):
     error: np.ndarray
     """(W,) residual' residual."""
     slow: np.ndarray
-    """(W, 12) energy of slow errors over its expectation, by channel of pose, velocity, rates."""
+    """(W, 12) energy of slow errors, by channel of pose, velocity and rates."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +74,11 @@ def make_frame(linear: Linear, sigma: np.ndarray, windows: Windows) -> Frame:
         for channel in range(12):
             basis[:, :, channel, channel, degree] = power * (weight[:, :, channel] > 0)
     flat = basis.reshape(count, rows * channels, -1)
-    flat = flat - start @ (np.swapaxes(start, 1, 2) @ flat)
-    slow = np.linalg.qr(flat)[0]
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
+    slow = flat - start @ (np.swapaxes(start, 1, 2) @ flat)
+    slow_freedom = (slow**2).sum(axis=1).reshape(count, 12, SLOW + 1).sum(axis=2)
     freedom = (weight > 0).sum(axis=(1, 2)) - STATE
-    return Frame(weight, start, upper, slow, freedom)
+    return Frame(weight, start, upper, slow, slow_freedom, freedom)
 
 
 def free(frame: Frame, values: np.ndarray) -> np.ndarray:

@@ -56,9 +56,7 @@ class Model:
         def linear(theta: Any, offset: Any, windows: Any, directions: Any) -> Any:
             def along(direction: Any) -> Any:
                 tangent = (direction[: self.size], jnp.tile(direction[self.size :], (BATCH, 1)))
-                return jax.jvp(
-                    lambda t, x: predict(t, x, windows), (theta, offset), tangent
-                )
+                return jax.jvp(lambda t, x: predict(t, x, windows), (theta, offset), tangent)
 
             values, slopes = jax.vmap(along, out_axes=(None, -1))(directions)
             return values, slopes
@@ -163,9 +161,7 @@ def _predict(
             spin = follow(speed, wanted, plant.constants.time_constant, plant.dt)
         memory = Memory(spin.end, jnp.zeros((len(speed), 4, 0)), {})
         time_s = windows.start_s + index * dt
-        _, wrench = spin_step(
-            plant, memory, motion, spin, time_s, None, drop if voltage else None
-        )
+        _, wrench = spin_step(plant, memory, motion, spin, time_s, None, drop if voltage else None)
         after = euler_step(plant, motion, wrench)
         return (spin.end, after), (after, spin.end, wrench.force_b / plant.constants.mass)
 

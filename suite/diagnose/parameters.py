@@ -14,11 +14,7 @@ from eval.vehicle import Vehicle
 from tracks.scene import Array
 
 NOT_FITTED = ("gusts",)
-"""Random wind cannot be flown again; it is looked for in what is left (`suite/diagnose/gust.py`)."""
-KINEMATIC = ("gyro_bias", "accelerometer_bias", "clock_offset")
-"""Faults of a log, which no flight dynamics are needed to see."""
-ACTUATOR = ("motor_lag", "command_delay", "rate_gain")
-"""Effects between the command and the rotors' speed."""
+"""Random wind cannot be flown again, so no rollout can fit it."""
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,10 @@ def score(
     found, nulls = [], []
     for candidate in among:
         at = sorted({*named, *candidate.indices})
-        if float(np.trace(sums.square[:, candidate.indices][:, :, candidate.indices].sum(0))) < 1e-9:
+        if (
+            float(np.trace(sums.square[:, candidate.indices][:, :, candidate.indices].sum(0)))
+            < 1e-9
+        ):
             continue
         gain, null = gains(at)
         found.append((gain - without, candidate))

@@ -104,10 +104,15 @@ def cut(
     parts: list[Windows] = []
     warnings: list[str] = []
     for number, log in enumerate(logs):
-        rows = [_window(log, number, first, vehicle, driven_by_rotors) for first in _starts(log, stride_s)]
+        rows = [
+            _window(log, number, first, vehicle, driven_by_rotors)
+            for first in _starts(log, stride_s)
+        ]
         rows = [row for row in rows if row is not None]
         if not rows:
-            warnings.append(f"{log.name}: no stretch of {LENGTH_S + WARM_S + HISTORY_S:g} s without a hole")
+            warnings.append(
+                f"{log.name}: no stretch of {LENGTH_S + WARM_S + HISTORY_S:g} s without a hole"
+            )
         parts += rows
     if not parts:
         return None, warnings
