@@ -92,7 +92,7 @@ class Model:
         else:
             chosen = everything[indices]
             groups = []
-            for first in range(0, len(indices), FEW):
+            for first in range(0, max(len(indices), 1), FEW):
                 rows = np.zeros((FEW, self.size + STATE))
                 part = chosen[first : first + FEW]
                 rows[: len(part)] = part

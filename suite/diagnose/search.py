@@ -100,7 +100,7 @@ def search(
     state, last = fit(model, windows, frame, state, indices) if indices else (state, sums)
     _judge_rivals(model, windows, frame, named, state, last, among, fold, say)
     indices = indices_of([n.candidate for n in named])
-    state, last = fit(model, windows, frame, state, indices)
+    state, last = fit(model, windows, frame, state, indices, rounds=3 if indices else 0)
     after = last.slow / frame.slow_freedom
     return Finding(named, state, last, indices, sigma, frame, first, slow_before, after)
 
