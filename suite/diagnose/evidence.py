@@ -85,7 +85,7 @@ def free(frame: Frame, values: np.ndarray) -> np.ndarray:
     """Return `values` (W, N, 19[, K]) whitened and freed from the start, (W, M[, K])."""
     extra = values.ndim - frame.weight.ndim
     weight = frame.weight.reshape(*frame.weight.shape, *[1] * extra)
-    flat = (values * weight).reshape(len(values), -1, *values.shape[3:])
+    flat = (values * weight).reshape(len(values), frame.start.shape[1], *values.shape[3:])
     if not extra:
         return flat - np.einsum("wmi,wni,wn->wm", frame.start, frame.start, flat, optimize=True)
     return flat - frame.start @ (np.swapaxes(frame.start, 1, 2) @ flat)

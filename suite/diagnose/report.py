@@ -57,7 +57,7 @@ def page(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Report:
 
 
 CHART = (
-    "Error of 0.5 s rollouts on held-out data over its noise floor, by speed at the start: "
+    "Slow error of 1 s rollouts on held-out data over its noise floor, by speed at the start: "
     "with the vehicle file as given, and with what was named."
 )
 
