@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.evidence import make_frame, sums_of
+from suite.diagnose.evidence import make_frame, rotor_spread, sums_of
 from suite.diagnose.model import STATE, Linear, Model
 from suite.diagnose.windows import SLICES, Windows
 
@@ -76,16 +76,19 @@ def _errors(
     row = np.abs(np.asarray(windows.row_s) - horizon).argmin(axis=1)
     at = np.arange(len(row))
     error = linear.residual[at, row][:, :12]
-    slope = linear.slope[at, row][:, :12, -STATE:]
-    known = np.where(np.isfinite(sigma), sigma, 0.0)[:12]
-    floor = np.sqrt(known**2 + ((slope * known) ** 2).sum(axis=-1))
+    size = linear.offset.shape[1]
+    slope = linear.slope[at, row][:, :12, -size:]
+    own = np.where(np.isfinite(sigma), sigma, 0.0)[:12]
+    rotors = np.full(size - STATE, rotor_spread(windows) if size > STATE else 0.0)
+    known = np.concatenate([own, rotors])
+    floor = np.sqrt(own**2 + ((slope * known) ** 2).sum(axis=-1))
     return error, np.maximum(floor, 1e-12)
 
 
 def _true_starts(model: Model, theta: np.ndarray, windows: Windows) -> np.ndarray:
     """Return where windows start if the log's clock is off by the model's offset."""
     late = model.space.effects(theta)["clock_offset"].offset
-    offset = np.zeros((len(windows.flight), STATE))
+    offset = np.zeros((len(windows.flight), model.free))
     offset[:, :3] = late * windows.vel_w
     offset[:, 3:6] = late * windows.rate_b
     rows = np.minimum(8, np.asarray(windows.seen)[:, :, 0].sum(axis=1) - 1)

@@ -20,6 +20,8 @@ from tracks.rotation import exp_rot
 
 STATE = 12
 """Numbers of the state in which a window starts: pos_w, rotation vector, vel_w, rate_b."""
+KNOTS = 11
+"""Places in a window between which errors of measured rotor speeds run straight."""
 BATCH = 16
 """Windows a call: one shape, compiled once."""
 FEW = 8
@@ -33,6 +35,8 @@ class Linear(NamedTuple):
     """(W, N, 19) measured - simulated; zero where nothing was measured."""
     slope: np.ndarray
     """(W, N, 19, K) of the simulated values."""
+    offset: np.ndarray
+    """(W, F) of what is free in each window, where the residuals were taken."""
 
 
 class Model:
@@ -51,6 +55,8 @@ class Model:
         """
         self.space = space
         self.size = len(space.entries)
+        self.free = STATE + (4 * KNOTS if driven_by_rotors else 0)
+        """Numbers F that are free in each window: its start, and the rotor speeds' errors."""
         predict = partial(_predict, vehicle, space, driven_by_rotors, voltage)
 
         def linear(theta: Any, offset: Any, windows: Any, directions: Any) -> Any:
@@ -65,7 +71,7 @@ class Model:
         self._linear: Callable[..., Any] = jax.jit(linear)
 
     def residual(self, theta: np.ndarray, offset: np.ndarray, windows: Windows) -> np.ndarray:
-        """Return measured - simulated (W, N, 19) from starts moved by `offset` (W, 12)."""
+        """Return measured - simulated (W, N, 19) from starts moved by `offset` (W, F)."""
         with jax.enable_x64(True):
             parts = [
                 np.asarray(self._predict(theta, x, w))[:count]
@@ -78,7 +84,7 @@ class Model:
     ) -> Linear:
         """Return residuals and slopes along the numbers at `indices`, or along all and the start.
 
-        With `indices` None the directions are all numbers and then the 12 of the start.
+        With `indices` None the directions are all numbers and then the F free ones.
         """
         with jax.enable_x64(True):
             return self._linearise(theta, offset, windows, indices)
@@ -86,14 +92,14 @@ class Model:
     def _linearise(
         self, theta: np.ndarray, offset: np.ndarray, windows: Windows, indices: list[int] | None
     ) -> Linear:
-        everything = np.eye(self.size + STATE)
+        everything = np.eye(self.size + self.free)
         if indices is None:
             groups = [everything]
         else:
             chosen = everything[indices]
             groups = []
             for first in range(0, max(len(indices), 1), FEW):
-                rows = np.zeros((FEW, self.size + STATE))
+                rows = np.zeros((FEW, self.size + self.free))
                 part = chosen[first : first + FEW]
                 rows[: len(part)] = part
                 groups.append(rows)
@@ -102,8 +108,8 @@ class Model:
             answers = [self._linear(theta, x, w, group) for group in groups]
             values.append(np.asarray(answers[0][0])[:count])
             slopes.append(np.concatenate([np.asarray(a[1])[:count] for a in answers], axis=-1))
-        width = self.size + STATE if indices is None else len(indices)
-        return Linear(-np.concatenate(values), np.concatenate(slopes)[..., :width])
+        width = self.size + self.free if indices is None else len(indices)
+        return Linear(-np.concatenate(values), np.concatenate(slopes)[..., :width], offset)
 
 
 def _batches(offset: np.ndarray, windows: Windows) -> Any:
@@ -134,7 +140,7 @@ def _predict(
         windows.pos_w + offset[:, :3],
         jnp.matmul(windows.rot_w, exp_rot(offset[:, 3:6])),
         windows.vel_w + offset[:, 6:9],
-        windows.rate_b - gyro + offset[:, 9:],
+        windows.rate_b - gyro + offset[:, 9:STATE],
     )
 
     def ask(order: Any, rate_b: Any) -> Any:
@@ -165,9 +171,13 @@ def _predict(
         after = euler_step(plant, motion, wrench)
         return (spin.end, after), (after, spin.end, wrench.force_b / plant.constants.mass)
 
+    measured_speed = jnp.asarray(windows.rotor_speed)
+    if driven_by_rotors:
+        error = offset[:, STATE:].reshape(-1, KNOTS, 4)
+        measured_speed = measured_speed - jnp.matmul(_hats(steps), error)
     inputs = (
         order[warm:],
-        jnp.swapaxes(jnp.asarray(windows.rotor_speed), 0, 1),
+        jnp.swapaxes(measured_speed, 0, 1),
         jnp.swapaxes(jnp.asarray(windows.voltage_drop), 0, 1),
         jnp.arange(steps),
     )
@@ -204,6 +214,12 @@ def _predict(
     difference = jnp.concatenate(parts, axis=-1)
     assert difference.shape[-1] == CHANNELS
     return jnp.where(windows.seen, difference, 0.0)
+
+
+def _hats(steps: int) -> np.ndarray:
+    """Return the share (S, KNOTS) of each knot in each step, linear between knots."""
+    place = (np.arange(steps) + 0.5) / steps * (KNOTS - 1)
+    return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(KNOTS)))
 
 
 def _late(command: Any, delay: Any, dt: float, before: int) -> Any:

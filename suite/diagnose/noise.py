@@ -8,24 +8,40 @@ from suite.diagnose.windows import CHANNELS, Windows
 
 BLOCK = 20
 """Rows that a cubic is taken off: what is left of a model's error in 0.2 s is none."""
+SHORT_BLOCK = 8
 DEGREE = 3
 LEAST = np.repeat([1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2], [3, 3, 3, 3, 3, 4])
 """Noise below this is rounding and the model's steps, by channel in its unit."""
 
 
-def noise_of(residual: np.ndarray, windows: Windows) -> np.ndarray:
+def rotor_noise(windows: Windows) -> float:
+    """Return the noise of measured rotor speeds that are an input [rad/s], or too large a one.
+
+    A cubic over few rows is taken off the speeds themselves: what the rotors truly do within
+    30 ms counts as noise.
+    """
+    speeds = np.zeros(np.asarray(windows.seen).shape)
+    speeds[..., 15:] = windows.row_rotor_speed
+    seen = np.zeros(speeds.shape, dtype=bool)
+    seen[..., 15:] = np.asarray(windows.seen)[..., 9:10]
+    sigma = noise_of(speeds, windows._replace(seen=seen), SHORT_BLOCK)
+    return float(np.sqrt((sigma[15:] ** 2).mean()))
+
+
+def noise_of(residual: np.ndarray, windows: Windows, block: int = BLOCK) -> np.ndarray:
     """Return the standard deviation of the noise of each channel, (19,); NaN where none is seen.
 
     Args:
         residual: (W, N, 19) measured - simulated.
         windows: of the same rows.
+        block: rows that a cubic is taken off.
     """
     sums: list[list[float]] = [[] for _ in range(CHANNELS)]
     freedom: list[list[int]] = [[] for _ in range(CHANNELS)]
     seen = np.asarray(windows.seen)
     for w in range(len(residual)):
-        for first in range(0, residual.shape[1] - BLOCK + 1, BLOCK):
-            rows = slice(first, first + BLOCK)
+        for first in range(0, residual.shape[1] - block + 1, block):
+            rows = slice(first, first + block)
             time = np.asarray(windows.row_s)[w, rows]
             whole = seen[w, rows]
             for mask in {column.tobytes() for column in whole.T}:

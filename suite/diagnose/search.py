@@ -65,7 +65,7 @@ class Finding:
 
 def start_state(model: Model, windows: Windows) -> State:
     """Return the vehicle file's numbers and the measured starts."""
-    return State(model.space.array("start"), np.zeros((len(windows.flight), 12)))
+    return State(model.space.array("start"), np.zeros((len(windows.flight), model.free)))
 
 
 def search(

@@ -168,12 +168,14 @@ def _window(
     rows = rows[:: -(-len(rows) // ROWS)]
     blank = np.full((len(time), 4), np.nan)
     acc = blank[:, :3] if log.acc_b is None else log.acc_b
-    rotors = blank if log.rotor_speed is None or driven_by_rotors else log.rotor_speed
+    rotors = blank if log.rotor_speed is None else log.rotor_speed
     vel = np.full_like(log.vel_w, np.nan) if log.velocity_derived else log.vel_w
     rot_rows = rot_w[rows]
     measured = [log.pos_w[rows], rot_rows, vel[rows], log.rate_b[rows], acc[rows], rotors[rows]]
     attitude_seen = np.isfinite(rot_rows).all(axis=(1, 2))[:, None] & np.ones((1, 3), bool)
     seen = [attitude_seen if m.ndim == 3 else np.isfinite(m) for m in measured]
+    if driven_by_rotors:
+        seen[5] = np.zeros_like(seen[5])  # an input is no measurement
     seen[4][0] = False  # the force before the window is not simulated
     missing = ROWS - len(rows)
 

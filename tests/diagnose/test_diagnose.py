@@ -23,8 +23,8 @@ CASES = {
 }
 
 
-def flights(vehicle, seed=0, count=2, **options):
-    return [fly(vehicle, seed + k, duration_s=6.0, **options) for k in range(count)]
+def flights(vehicle, seed=0, count=3, **options):
+    return [fly(vehicle, seed + k, duration_s=7.0, **options) for k in range(count)]
 
 
 def within(entry, truth):
