@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -84,8 +85,6 @@ def diagnose(
     Raises:
         ValueError: where no flight can be used, or not in the way that was asked for.
     """
-    import time
-
     began = time.monotonic()
     by_rotors, warnings = _choose_drive(logs, drive)
     space = make_space(vehicle)
