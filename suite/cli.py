@@ -23,6 +23,7 @@ COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
     "blind": "test cases with hidden effects for the diagnosis: make, run, score",
     "collect": "fly a policy and record every flight as a log",
+    "diagnose": "name the physical effect that a vehicle file lacks, by flight logs",
     "effects": "the physical effects that a vehicle file may hold",
     "eval": "judge policies: success rates, speeds and lap times, with intervals",
     "export": "write a policy as torch program and ONNX",

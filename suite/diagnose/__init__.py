@@ -1,0 +1,1 @@
+"""Finding where flights and simulation disagree, and which physical effect is missing."""

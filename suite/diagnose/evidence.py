@@ -1,0 +1,212 @@
+"""Whitened residuals of windows, freed from the unknown state in which each window starts.
+
+A window's start is measured with the same noise as its other rows. It is left free: what 12 small
+changes of it can explain is projected out of residuals and slopes, and what stays has the
+measurement's own white noise. Where measured rotor speeds are the input, their errors are free as
+well, but for rows that say how large they may be. All that the search needs is then a few sums a
+window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from suite.diagnose.model import KNOTS, STATE, Linear, Model
+from suite.diagnose.noise import rotor_noise
+from suite.diagnose.windows import Windows
+
+SLOW = 5
+"""Degree of the polynomials in which a model's error of a window would show."""
+
+
+ROOM = 1.5
+"""Errors of rotor speeds may be this much larger, for what happens between the knots."""
+
+
+class Frame(NamedTuple):
+    """How windows are whitened and freed from their starts."""
+
+    weight: np.ndarray
+    """(W, N, 19) 1 / noise; 0 where nothing was measured."""
+    prior: np.ndarray
+    """(F - 12,) 1 / size of each error of the rotor speeds; they are M's last rows."""
+    start: np.ndarray
+    """(W, M, F) orthonormal, what the start explains of the whitened rows."""
+    upper: np.ndarray
+    """(W, F, F) from the start to `start`'s coordinates."""
+    slow: np.ndarray
+    """(W, M, 12 L) slow errors of pose, velocity and rates, less what the start explains."""
+    slow_freedom: np.ndarray
+    """(W, 12) expected energy along them where there is noise only, by channel."""
+    freedom: np.ndarray
+    """(W,) measured numbers less the start's."""
+
+
+class Sums(NamedTuple):
+    """Normal equations of each of W windows along K directions."""
+
+    square: np.ndarray
+    """(W, K, K) slope' slope."""
+    cross: np.ndarray
+    """(W, K) slope' residual."""
+    error: np.ndarray
+    """(W,) residual' residual."""
+    slow: np.ndarray
+    """(W, 12) energy of slow errors, by channel of pose, velocity and rates."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a fit stands."""
+
+    theta: np.ndarray
+    """(P,) the vector of all numbers."""
+    offset: np.ndarray
+    """(W, F) of what is free in each window, from what was measured."""
+
+
+def make_frame(linear: Linear, sigma: np.ndarray, windows: Windows) -> Frame:
+    """Return the frame of `windows` at the slopes of `linear` along what is free (its last)."""
+    weight = np.where(windows.seen, 1.0 / np.where(np.isfinite(sigma), sigma, 1.0), 0.0)
+    count, rows, channels = weight.shape
+    size = linear.offset.shape[1]
+    prior = np.full(size - STATE, 1.0 / rotor_spread(windows) if size > STATE else 1.0)
+    slope = (linear.slope[..., -size:] * weight[..., None]).reshape(count, -1, size)
+    held = np.zeros((count, size - STATE, size))
+    held[:, :, STATE:] = np.diag(prior)
+    start, upper = np.linalg.qr(np.concatenate([slope, held], axis=1))
+    upper = upper + 1e-9 * np.eye(size)
+    time = np.asarray(windows.row_s)
+    basis = np.zeros((count, rows, channels, 12, SLOW + 1))
+    for degree in range(SLOW + 1):
+        power = np.polynomial.legendre.Legendre.basis(degree)(2.0 * time - 1.0)
+        for channel in range(12):
+            basis[:, :, channel, channel, degree] = power * (weight[:, :, channel] > 0)
+    flat = basis.reshape(count, rows * channels, -1)
+    flat = np.concatenate([flat, np.zeros((count, size - STATE, flat.shape[2]))], axis=1)
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
+    slow = flat - start @ (np.swapaxes(start, 1, 2) @ flat)
+    slow_freedom = (slow**2).sum(axis=1).reshape(count, 12, SLOW + 1).sum(axis=2)
+    freedom = (weight > 0).sum(axis=(1, 2)) - STATE
+    return Frame(weight, prior, start, upper, slow, slow_freedom, freedom)
+
+
+def rotor_spread(windows: Windows) -> float:
+    """Return how far the rotor speeds' error may be off at a knot [rad/s].
+
+    White noise of rows adds up like errors that run straight between knots a tenth of a second
+    apart and are smaller by the root of the rows that each stands for.
+    """
+    rows = np.asarray(windows.seen)[..., 9].sum(axis=1).mean()
+    return ROOM * rotor_noise(windows) * float(np.sqrt((KNOTS - 1) / rows))
+
+
+def whiten(frame: Frame, values: np.ndarray) -> np.ndarray:
+    """Return `values` (W, N, 19, K) over their noise, (W, M, K), with zeros in the last rows."""
+    flat = (
+        (values * frame.weight[..., None]).reshape(len(values), -1, values.shape[3])
+        if values.shape[3]
+        else np.zeros((len(values), frame.weight[0].size, 0))
+    )
+    last = np.zeros((len(values), len(frame.prior), values.shape[3]))
+    return np.concatenate([flat, last], axis=1)
+
+
+def free(frame: Frame, white: np.ndarray) -> np.ndarray:
+    """Return `white` (W, M, K) without what the start explains."""
+    return white - frame.start @ (np.swapaxes(frame.start, 1, 2) @ white)
+
+
+def _white_residual(frame: Frame, linear: Linear) -> np.ndarray:
+    white = whiten(frame, linear.residual[..., None])
+    if len(frame.prior):
+        white[:, -len(frame.prior) :, 0] = -linear.offset[:, STATE:] * frame.prior
+    return white
+
+
+def sums_of(frame: Frame, linear: Linear, directions: int) -> Sums:
+    """Return the normal equations of `linear` along its first `directions`."""
+    residual = free(frame, _white_residual(frame, linear))[..., 0]
+    slope = free(frame, whiten(frame, linear.slope[..., :directions]))
+    turned = np.swapaxes(slope, 1, 2)
+    slow = np.einsum("wml,wm->wl", frame.slow, residual, optimize=True) ** 2
+    return Sums(
+        turned @ slope,
+        (turned @ residual[..., None])[..., 0],
+        (residual**2).sum(axis=1),
+        slow.reshape(len(slow), 12, SLOW + 1).sum(axis=2),
+    )
+
+
+def solve(
+    square: np.ndarray, cross: np.ndarray, low: np.ndarray, high: np.ndarray, scale: np.ndarray
+) -> np.ndarray:
+    """Return the change within [low, high] that lowers the error most, for one set of sums."""
+    if not len(cross):
+        return np.zeros(0)
+    matrix = square * np.outer(scale, scale)
+    ridge = 1e-9 * max(float(np.trace(matrix)) / len(matrix), 1e-12)
+    factor = np.linalg.cholesky(matrix + ridge * np.eye(len(matrix)))
+    right = np.linalg.solve(factor, cross * scale)
+    plain = np.linalg.solve(factor.T, right)
+    low, high = np.minimum(low / scale, -1e-12), np.maximum(high / scale, 1e-12)
+    if np.all((plain >= low) & (plain <= high)):
+        return plain * scale
+    return lsq_linear(factor.T, right, (low, high)).x * scale
+
+
+def fit(
+    model: Model,
+    windows: Windows,
+    frame: Frame,
+    state: State,
+    indices: list[int],
+    rounds: int = 3,
+) -> tuple[State, Sums]:
+    """Fit the numbers at `indices` and every window's start (Gauss-Newton, halved where it fails).
+
+    Returns:
+        The best state, and its sums along `indices`.
+    """
+    entries = model.space
+    low, high, scale = entries.array("low"), entries.array("high"), entries.array("step")
+    at = np.array(indices, dtype=int)
+
+    def look(state: State) -> tuple[Linear, Sums]:
+        linear = model.linearise(state.theta, state.offset, windows, indices)
+        return linear, sums_of(frame, linear, len(indices))
+
+    linear, sums = look(state)
+    for _ in range(rounds):
+        total = float(sums.error.sum())
+        change = solve(
+            sums.square.sum(0),
+            sums.cross.sum(0),
+            low[at] - state.theta[at],
+            high[at] - state.theta[at],
+            scale[at],
+        )
+        white = _white_residual(frame, linear)
+        if len(at):
+            white = white - whiten(frame, (linear.slope @ change)[..., None])
+        begin = np.linalg.solve(frame.upper, np.swapaxes(frame.start, 1, 2) @ white)[..., 0]
+        share = 1.0
+        while share > 0.1:
+            theta = state.theta.copy()
+            theta[at] = np.clip(theta[at] + share * change, low[at], high[at])
+            trial = State(theta, state.offset + share * begin)
+            new_linear, new_sums = look(trial)
+            error = float(new_sums.error.sum())
+            if np.isfinite(error) and error <= total + 1e-6:
+                break
+            share /= 2.0
+        else:
+            break
+        state, linear, sums = trial, new_linear, new_sums
+        if total - error < 0.05:
+            break
+    return state, sums

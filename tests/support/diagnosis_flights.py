@@ -1,0 +1,116 @@
+"""Flights for the diagnosis: flown in MuJoCo by a plain trajectory tracker, logged with noise."""
+
+import mujoco
+import numpy as np
+
+from eval.effects import apply_log_faults
+from eval.flight_log import FlightLog
+from eval.plant import Command, Motion, make_plant, plant_step, start_memory, uses_noise
+from eval.quadrotor_model import add_quadrotor, set_true_inertia
+from tracks.rotation import quat_to_rot
+
+NOISE = {"pos": 0.002, "att": 0.004, "vel": 0.02, "rate": 0.02, "motor": 4.0, "acc": 0.15}
+EVERY = 5
+"""Physics steps a row."""
+
+
+def reference(rng, speed):
+    """A closed curve of three sines an axis: position, velocity, acceleration at a time."""
+    size = np.array([[3.0, 0.8, 0.3], [2.5, 0.8, 0.3], [0.5, 0.25, 0.1]])
+    rate = speed / 4.0 * np.array([[1.0, 1.9, 3.1], [0.8, 1.7, 2.9], [1.1, 2.0, 3.3]])
+    rate = rate * rng.uniform(0.85, 1.15, (3, 3))
+    phase = rng.uniform(0, 2 * np.pi, (3, 3))
+
+    def at(t):
+        angle = rate * t + phase
+        pos = (size * np.sin(angle)).sum(1) + [0, 0, 1.6]
+        vel = (size * rate * np.cos(angle)).sum(1)
+        return pos, vel, -(size * rate**2 * np.sin(angle)).sum(1)
+
+    return at
+
+
+def track(at, yaw_rate, t, motion):
+    """A command that follows the curve: desired force, attitude error, body rates."""
+    pos, vel, acc = at(t)
+    wanted = acc + 4.0 * (pos - motion.pos_w) + 3.0 * (vel - motion.vel_w) + [0, 0, 9.81]
+    wanted[2] = max(wanted[2], 3.0)
+    size = np.linalg.norm(wanted)
+    if size > 24.0:
+        wanted *= 24.0 / size
+    up = wanted / np.linalg.norm(wanted)
+    thrust = max(0.0, wanted @ motion.rot_w[:, 2])
+    nose = np.array([np.cos(yaw_rate * t), np.sin(yaw_rate * t), 0.0])
+    left = np.cross(up, nose)
+    left /= np.linalg.norm(left)
+    rot = np.stack([np.cross(left, up), left, up], axis=1)
+    error = motion.rot_w.T @ rot
+    vee = 0.5 * np.array([error[2, 1] - error[1, 2], error[0, 2] - error[2, 0],
+                          error[1, 0] - error[0, 1]])  # fmt: skip
+    return Command(np.asarray(thrust), np.clip([8.0, 8.0, 4.0] * vee, -6, 6))
+
+
+def fly(vehicle, seed, duration_s=10.0, speed=5.0, noise=1.0, motors=False, acc=False, extra=None):
+    """Return the log of one flight of the true `vehicle`.
+
+    `extra(motion, t)` gives a force in the world that no effect of the catalogue makes.
+    """
+    rng = np.random.default_rng(seed)
+    spec = mujoco.MjSpec()
+    dt = 1.0 / vehicle.controller.frequency
+    spec.option.timestep = dt
+    add_quadrotor(spec, vehicle)
+    model = spec.compile()
+    set_true_inertia(model, vehicle)
+    data = mujoco.MjData(model)
+    at, yaw_rate = reference(rng, speed), rng.uniform(-0.8, 0.8)
+    plant = make_plant(vehicle, dt)
+    draw = uses_noise(plant)
+    memory = start_memory(plant, (), noise=rng.standard_normal(3) if draw else None)
+    data.qpos[:3], data.qvel[:3] = at(0.0)[:2]
+    rows, command, force = [], None, np.zeros(3)
+    for k in range(round(duration_s / dt) + 1):
+        rot = quat_to_rot(data.qpos[3:].copy())
+        motion = Motion(data.qpos[:3].copy(), rot, data.qvel[:3].copy(), data.qvel[3:].copy())
+        if k % EVERY == 0:
+            command = track(at, yaw_rate, k * dt, motion)
+            rows.append(np.concatenate([[k * dt], data.qpos, data.qvel, [command.thrust],
+                                        command.rate_b, memory.rotor_speed, force]))  # fmt: skip
+        draws = rng.standard_normal(3) if draw else None
+        memory, wrench = plant_step(plant, memory, motion, command, k * dt, draws)
+        push = np.zeros(3) if extra is None else extra(motion, k * dt)
+        force = wrench.force_b / plant.constants.mass + rot.T @ push
+        data.qfrc_applied[:3] = rot @ wrench.force_b + push * plant.constants.mass
+        data.qfrc_applied[3:] = wrench.torque_b
+        mujoco.mj_step(model, data)
+    table = np.array(rows)
+    columns = {
+        "time_s": table[:, 0], "pos_w": table[:, 1:4], "quat_wxyz": table[:, 4:8],
+        "vel_w": table[:, 8:11], "rate_b": table[:, 11:14],
+        "acc_b": table[:, 22:25] if acc else None,
+    }  # fmt: skip
+    columns = apply_log_faults(vehicle.effects, columns)
+
+    def with_noise(values, name):
+        return values + noise * NOISE[name] * rng.standard_normal(values.shape)
+
+    small = noise * NOISE["att"] * rng.standard_normal((len(table), 3)) / 2
+    q = columns["quat_wxyz"]
+    turned = q + np.stack([
+        -(q[:, 1:] * small).sum(1),
+        q[:, 0] * small[:, 0] + q[:, 2] * small[:, 2] - q[:, 3] * small[:, 1],
+        q[:, 0] * small[:, 1] + q[:, 3] * small[:, 0] - q[:, 1] * small[:, 2],
+        q[:, 0] * small[:, 2] + q[:, 1] * small[:, 1] - q[:, 2] * small[:, 0],
+    ], axis=1)  # fmt: skip
+    return FlightLog(
+        f"flight_{seed}",
+        columns["time_s"],
+        with_noise(columns["pos_w"], "pos"),
+        turned / np.linalg.norm(turned, axis=1, keepdims=True),
+        with_noise(columns["vel_w"], "vel"),
+        with_noise(columns["rate_b"], "rate"),
+        table[:, 14],
+        table[:, 15:18],
+        with_noise(table[:, 18:22], "motor") if motors else None,
+        acc_b=with_noise(columns["acc_b"], "acc") if acc else None,
+    )
