@@ -52,6 +52,7 @@ def test_bounds_hold_and_the_free_solution_is_exact():
 def test_the_noise_is_seen_under_a_models_error():
     log = fly(PLAIN, 0, duration_s=4.0)
     windows, _ = cut([log], PLAIN, False)
+    assert windows is not None
     rng = np.random.default_rng(0)
     time = np.asarray(windows.row_s)[..., None]
     residual = 0.3 * time**2 + 0.002 * rng.standard_normal(windows.seen.shape)

@@ -68,7 +68,7 @@ def fly(vehicle, seed, duration_s=10.0, speed=5.0, noise=1.0, motors=False, acc=
     draw = uses_noise(plant)
     memory = start_memory(plant, (), noise=rng.standard_normal(3) if draw else None)
     data.qpos[:3], data.qvel[:3] = at(0.0)[:2]
-    rows, command, force = [], None, np.zeros(3)
+    rows, command, force = [], Command(np.zeros(()), np.zeros(3)), np.zeros(3)
     for k in range(round(duration_s / dt) + 1):
         rot = quat_to_rot(data.qpos[3:].copy())
         motion = Motion(data.qpos[:3].copy(), rot, data.qvel[:3].copy(), data.qvel[3:].copy())
