@@ -76,7 +76,8 @@ def fly_rotorpy(
 def _one(
     nominal: Vehicle, truth: Vehicle, parameters: dict[str, Any], way: Trajectory, rate_hz: float
 ) -> Recording:
-    from rotorpy.vehicles.multirotor import Multirotor
+    # An optional extra, which need not be installed where types are checked.
+    from rotorpy.vehicles.multirotor import Multirotor  # pyright: ignore[reportMissingImports]
 
     frequency = nominal.controller.frequency
     dt, period = 1.0 / frequency, round(frequency / rate_hz)

@@ -172,8 +172,8 @@ def _window(
     vel = np.full_like(log.vel_w, np.nan) if log.velocity_derived else log.vel_w
     rot_rows = rot_w[rows]
     measured = [log.pos_w[rows], rot_rows, vel[rows], log.rate_b[rows], acc[rows], rotors[rows]]
-    turned = np.isfinite(rot_rows.reshape(len(rows), 9)).all(axis=1)
-    attitude_seen = np.repeat(turned[:, None], 3, axis=1)
+    turned = np.isfinite(rot_rows.reshape(len(rows), 9).sum(axis=1, keepdims=True))
+    attitude_seen = np.repeat(turned, 3, axis=1)
     seen = [attitude_seen if m.ndim == 3 else np.isfinite(m) for m in measured]
     if driven_by_rotors:
         seen[5] = np.zeros_like(seen[5])  # an input is no measurement

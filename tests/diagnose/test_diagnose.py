@@ -22,6 +22,8 @@ CASES = {
     "weak_motor": ("scale", (1.0, 0.96, 1.0, 1.0)),
 }
 
+SLOW = ("com_offset", "weak_motor")
+
 
 def flights(vehicle, seed=0, count=3, **options):
     return [fly(vehicle, seed + k, duration_s=7.0, **options) for k in range(count)]
@@ -40,7 +42,10 @@ def test_flights_of_the_vehicle_itself_have_no_gap():
     assert 0.8 < found["gap"]["before"] < 1.2
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    ["linear_drag", "gyro_bias", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)],
+)
 def test_an_effect_is_named_with_its_value(name):
     parameter, truth = CASES[name]
     found = answer(diagnose(flights(with_effects(LAGGED, **{name: (truth,)})), LAGGED))
