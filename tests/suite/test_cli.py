@@ -188,6 +188,8 @@ def test_ctrl_c_at_the_program_itself_is_code_130():
         "import os, signal, sys, types\n"
         "from dataclasses import make_dataclass\n"
         "from suite import cli\n"
+        # A shell that starts the tests in the background has them ignore Ctrl-C.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "module = types.ModuleType('suite.commands.wait')\n"
         "module.Config = make_dataclass('Config', [('json', bool, False)], frozen=True)\n"
         "module.run = lambda config, console: os.kill(os.getpid(), signal.SIGINT) or input()\n"
