@@ -54,7 +54,7 @@ class Memory(NamedTuple):
     delta_hidden: jax.Array
     """(B, 32) of the Delta Action network."""
     alive: jax.Array
-    """(B,) 1 until the world has crashed deep into a solid, then 0."""
+    """(B,) 1 while the world counts in the loss: until it crashes or stops, then 0."""
 
 
 class StepRecord(NamedTuple):
