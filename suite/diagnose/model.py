@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eval.jax_quadrotor import euler_step
-from eval.plant import Command, Memory, Motion, make_plant, spin_step, wanted_speed
+from eval.effects.interface import Constants
+from eval.plant import (
+    Command,
+    Memory,
+    Motion,
+    Nominal,
+    Plant,
+    assemble,
+    nominal_quadrotor,
+    spin_step,
+    wanted_speed,
+)
+from eval.rigid_body import euler_step
 from eval.rotors import follow, steady
 from eval.vehicle import Vehicle
-from suite.diagnose.parameters import Space
+from suite.diagnose.parameters import Layout, Space, effects_at
 from suite.diagnose.windows import CHANNELS, HISTORY_S, WARM_S, Windows, step_s
 from tracks.rotation import exp_rot
 
@@ -39,6 +50,15 @@ class Linear(NamedTuple):
     """(W, F) of what is free in each window, where the residuals were taken."""
 
 
+class Given(NamedTuple):
+    """What a vehicle file fixes, as arrays, so that one compiled rollout serves every vehicle."""
+
+    nominal: Nominal
+    constants: Constants
+    base: dict[str, Any]
+    """Values of every effect."""
+
+
 class Model:
     """A vehicle's compiled rollout: residuals of windows and their slopes."""
 
@@ -57,27 +77,13 @@ class Model:
         self.size = len(space.entries)
         self.free = STATE + (4 * KNOTS if driven_by_rotors else 0)
         """Numbers F that are free in each window: its start, and the rotor speeds' errors."""
-        predict = partial(_predict, vehicle, space, driven_by_rotors, voltage)
-
-        def linear(theta: Any, offset: Any, windows: Any, directions: Any) -> Any:
-            def along(direction: Any) -> Any:
-                tangent = (direction[: self.size], jnp.tile(direction[self.size :], (BATCH, 1)))
-                return jax.jvp(lambda t, x: predict(t, x, windows), (theta, offset), tangent)
-
-            values, slopes = jax.vmap(along, out_axes=(None, -1))(directions)
-            return values, slopes
-
-        self._predict: Callable[..., Any] = jax.jit(predict)
-        self._linear: Callable[..., Any] = jax.jit(linear)
+        base = {name: value for name, value in space.base.items() if name != "gusts"}
+        self._given = Given(*nominal_quadrotor(vehicle), base)
+        self._linear = _compiled(space.layout, step_s(vehicle), driven_by_rotors, voltage)
 
     def residual(self, theta: np.ndarray, offset: np.ndarray, windows: Windows) -> np.ndarray:
         """Return measured - simulated (W, N, 19) from starts moved by `offset` (W, F)."""
-        with jax.enable_x64(True):
-            parts = [
-                np.asarray(self._predict(theta, x, w))[:count]
-                for x, w, count in _batches(offset, windows)
-            ]
-        return -np.concatenate(parts)
+        return self.linearise(theta, offset, windows, []).residual
 
     def linearise(
         self, theta: np.ndarray, offset: np.ndarray, windows: Windows, indices: list[int] | None
@@ -105,7 +111,7 @@ class Model:
                 groups.append(rows)
         values, slopes = [], []
         for x, w, count in _batches(offset, windows):
-            answers = [self._linear(theta, x, w, group) for group in groups]
+            answers = [self._linear(self._given, theta, x, w, group) for group in groups]
             values.append(np.asarray(answers[0][0])[:count])
             slopes.append(np.concatenate([np.asarray(a[1])[:count] for a in answers], axis=-1))
         width = self.size + self.free if indices is None else len(indices)
@@ -119,19 +125,40 @@ def _batches(offset: np.ndarray, windows: Windows) -> Any:
         yield offset[rows], Windows(*(f[rows] for f in windows)), min(BATCH, count - first)
 
 
+@cache
+def _compiled(
+    layout: Layout, dt: float, driven_by_rotors: bool, voltage: bool
+) -> Callable[..., Any]:
+    """Return the compiled slopes: XLA takes longer over them than a diagnosis does."""
+
+    def linear(given: Given, theta: Any, offset: Any, windows: Windows, directions: Any) -> Any:
+        size = len(layout)
+
+        def fly(theta: Any, offset: Any) -> Any:
+            values = effects_at(layout, given.base, theta)
+            plant = assemble(given.nominal, given.constants, values, dt, 0.0)
+            return _predict(plant, values, driven_by_rotors, voltage, offset, windows)
+
+        def along(direction: Any) -> Any:
+            tangent = (direction[:size], jnp.tile(direction[size:], (BATCH, 1)))
+            return jax.jvp(fly, (theta, offset), tangent)
+
+        values, slopes = jax.vmap(along, out_axes=(None, -1))(directions)
+        return values, slopes
+
+    return jax.jit(linear)
+
+
 def _predict(
-    vehicle: Vehicle,
-    space: Space,
+    plant: Plant,
+    values: Mapping[str, Any],
     driven_by_rotors: bool,
     voltage: bool,
-    theta: Any,
     offset: Any,
     windows: Windows,
 ) -> Any:
     """Return simulated - measured (B, N, 19) of B windows."""
-    dt = step_s(vehicle)
-    values = space.effects(theta)
-    plant = make_plant(vehicle, dt, {k: v for k, v in values.items() if k != "gusts"}, 0.0)
+    dt = float(plant.dt)
     gyro, accelerometer = values["gyro_bias"].bias, values["accelerometer_bias"].bias
     before, warm = round(HISTORY_S / dt) + 1, round(WARM_S / dt)
     steps = windows.command.shape[1] - before - warm
