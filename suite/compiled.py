@@ -7,6 +7,7 @@ command reads what the first one compiled.
 from __future__ import annotations
 
 import os
+import platform
 from collections.abc import MutableMapping
 from pathlib import Path
 
@@ -25,4 +26,9 @@ def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
     """
     values = os.environ if environment is None else environment
     home = values.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    values.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(home) / FOLDER / "jax"))
+    # A home that machines share must not hand one's instructions to another.
+    folder = Path(home) / FOLDER / "jax" / (platform.node() or "here")
+    values.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
+    # XLA complains of its own tuning hints, which are no processor feature, at every program that
+    # it loads; what goes wrong in earnest is raised as an exception.
+    values.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
