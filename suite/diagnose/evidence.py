@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from suite.diagnose.model import KNOTS, STATE, Linear, Model
+from suite.diagnose.model import Linear, Model
 from suite.diagnose.noise import rotor_noise
+from suite.diagnose.rollout import KNOTS, STATE
 from suite.diagnose.windows import Windows
 
 SLOW = 5
@@ -121,7 +122,8 @@ def free(frame: Frame, white: np.ndarray) -> np.ndarray:
     return white - frame.start @ (np.swapaxes(frame.start, 1, 2) @ white)
 
 
-def _white_residual(frame: Frame, linear: Linear) -> np.ndarray:
+def white_residual(frame: Frame, linear: Linear) -> np.ndarray:
+    """Return the residuals of `linear` over their noise, (W, M)."""
     white = whiten(frame, linear.residual[..., None])
     if len(frame.prior):
         white[:, -len(frame.prior) :, 0] = -linear.offset[:, STATE:] * frame.prior
@@ -130,7 +132,7 @@ def _white_residual(frame: Frame, linear: Linear) -> np.ndarray:
 
 def sums_of(frame: Frame, linear: Linear, directions: int) -> Sums:
     """Return the normal equations of `linear` along its first `directions`."""
-    residual = free(frame, _white_residual(frame, linear))[..., 0]
+    residual = free(frame, white_residual(frame, linear))[..., 0]
     slope = free(frame, whiten(frame, linear.slope[..., :directions]))
     turned = np.swapaxes(slope, 1, 2)
     slow = np.einsum("wml,wm->wl", frame.slow, residual, optimize=True) ** 2
@@ -190,7 +192,7 @@ def fit(
             high[at] - state.theta[at],
             scale[at],
         )
-        white = _white_residual(frame, linear)
+        white = white_residual(frame, linear)
         if len(at):
             white = white - whiten(frame, (linear.slope @ change)[..., None])
         begin = np.linalg.solve(frame.upper, np.swapaxes(frame.start, 1, 2) @ white)[..., 0]

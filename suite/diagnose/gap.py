@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.evidence import make_frame, rotor_spread, sums_of
-from suite.diagnose.model import STATE, Linear, Model
+from suite.diagnose.model import Linear, Model
+from suite.diagnose.rollout import STATE
 from suite.diagnose.windows import SLICES, Windows
 
 HORIZONS_S = (0.1, 0.5, 1.0)
