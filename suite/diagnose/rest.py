@@ -22,6 +22,10 @@ from suite.diagnose.windows import Windows
 
 COLOURS_S = (0.3, 0.03)
 """Times for which a random push keeps its direction [s]."""
+SIZES = (0.9, 0.5, 0.1)
+"""Quantiles of the information along all directions at which a push begins to be seen."""
+SEEN = 1e-9
+"""Directions with less than this share of the largest information are not looked at."""
 NOISE_DOUBT = 0.02
 """Share by which the measured noise power may be wrong."""
 AXES = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
@@ -97,23 +101,30 @@ def rest_of(push: Push, fold: np.ndarray, seed: int = 0) -> Rest:
 
 
 def _energy(push: Push, axis: int) -> float:
-    """Return the p-value of cross' P cross, P the covariance of a random push along `axis`.
+    """Return the p-value of the energy of a random push along `axis`, over several colours.
 
-    The smaller one of a push that keeps its direction for a while and of one that does not, times
-    two. Under noise alone cross has covariance `square`; the sum is close to a gamma variable of
-    the same mean and variance (Satterthwaite 1946).
+    Along the directions in which a push of one colour is uncorrelated, before and after the data,
+    z are the pulls over their noise. What a push of size s adds is weighed as the likelihood weighs
+    it, by s^2 l / (1 + s^2 l) with l the information along the direction: a small s looks at slow
+    pushes, a large one at all. The sum of weighed squares is close to a gamma variable
+    (Satterthwaite 1946).
     """
     at = np.arange(KNOTS) * 6 + axis
     square = push.square[:, at][:, :, at]
-    cross = push.cross[:, at]
+    cross = push.cross[:, at, None]
     time = np.linspace(0.0, 1.0, KNOTS)
     found = []
     for keeps_s in COLOURS_S:
-        prior = np.exp(-np.abs(time[:, None] - time) / keeps_s)
-        value = float(np.einsum("wi,ij,wj->", cross, prior, cross))
-        product = square @ prior
-        mean = float(np.einsum("wii->", product))
-        spread = 2.0 * float(np.einsum("wij,wji->", product, product)) + (NOISE_DOUBT * mean) ** 2
-        if mean > 0.0:
+        root = np.linalg.cholesky(np.exp(-np.abs(time[:, None] - time) / keeps_s))
+        values, vectors = np.linalg.eigh(root.T @ square @ root)
+        seen = values > SEEN * max(float(values.max()), 1e-12)
+        pulls = (np.swapaxes(vectors, 1, 2) @ (root.T @ cross))[..., 0]
+        power = pulls[seen] ** 2 / values[seen]
+        for share in SIZES:
+            size = 1.0 / np.quantile(values[seen], share)
+            weight = size * values[seen] / (1.0 + size * values[seen])
+            mean = float(weight.sum())
+            spread = 2.0 * float((weight**2).sum()) + (NOISE_DOUBT * mean) ** 2
+            value = float((weight * power).sum())
             found.append(float(gamma.sf(value, mean**2 / spread, scale=spread / mean)))
     return min(1.0, len(found) * min(found)) if found else 1.0

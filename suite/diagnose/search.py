@@ -65,9 +65,8 @@ class Finding:
     frame: Frame
     first: list[Score]
     """Scores of all candidates before anything was named."""
-    slow_before: np.ndarray
-    """(W, 12) slow errors before, over their expectation."""
     slow_after: np.ndarray
+    """(W, 12) energy of slow errors that are left; `frame.slow_freedom` is what noise gives."""
     explained: float
     """Fall of the squared error, in units of the noise, that the named effects bring."""
 
@@ -85,14 +84,13 @@ def search(
     state = start_state(model, windows)
     named: list[Named] = []
     first: list[Score] = []
-    slow_before = np.zeros(0)
     while True:
         frame, sums, sigma, state = _look(model, windows, state)
         indices = indices_of([n.candidate for n in named])
         left = [c for c in among if not set(c.indices) & set(indices)]
         scores = score(sums, state.theta, model.space, indices, left, fold)
         if not first:
-            first, slow_before = scores, sums.slow / frame.slow_freedom
+            first = scores
         best = scores[0] if scores else None
         enough = best and best.p_value <= P_VALUE and best.gain > LEAST_SHARE * first[0].gain
         if best is None or not enough or len(named) >= MOST:
@@ -111,8 +109,7 @@ def search(
     state, last = fit(model, windows, frame, state, indices, rounds=3 if indices else 0)
     begin = fit(model, windows, frame, start_state(model, windows), [])[1] if indices else last
     explained = float(begin.error.sum() - last.error.sum())
-    after = last.slow / frame.slow_freedom
-    return Finding(named, state, last, indices, sigma, frame, first, slow_before, after, explained)
+    return Finding(named, state, last, indices, sigma, frame, first, last.slow, explained)
 
 
 def _settle(

@@ -15,6 +15,8 @@ from suite.diagnose.rollout import KNOTS, Flown
 
 CELLS = 4
 """Places along x and y between which a force that hangs on the place is drawn."""
+PIECES = 5
+"""Straight pieces of a curve over one number."""
 REVERSAL = 10.0
 """Change of thrust beyond which its direction is all that counts [m/s^3]."""
 
@@ -60,7 +62,7 @@ def shapes_of(knot: Flown, start_s: np.ndarray) -> Shapes:
         "the climb": vel_w[..., 2],
         "the sinking": np.maximum(-vel_w[..., 2], 0.0) ** 2,
         **{f"the velocity along body {a}": vel_b[..., i] for i, a in enumerate("xyz")},
-        **{f"the square along body {a}": speed * vel_b[..., i] for i, a in enumerate("xyz")},
+        **{f"the square along body {a}": vel_b[..., i] ** 2 for i, a in enumerate("xyz")},
         **{f"the {a} rate": rate_b[..., i] for i, a in enumerate(("roll", "pitch", "yaw"))},
         "the thrust": thrust,
         "the thrust's square": thrust**2,
@@ -85,6 +87,12 @@ def shapes_of(knot: Flown, start_s: np.ndarray) -> Shapes:
         along = scalar[..., None, None] * six
         add(f"force with {label.rstrip()}", [along[..., i, :] for i in range(3)])
         add(f"torque with {label.rstrip()}", [along[..., i, :] for i in range(3, 6)])
+    motion = [hat[..., None] * vel_b for hat in _hats(speed)]
+    add("force with the motion, by its speed", [
+        along_b[..., i, None] * six[i] for along_b in motion for i in range(3)
+    ])  # fmt: skip
+    for label, scalar in (("thrust", thrust), ("climb", vel_w[..., 2]), ("height", pos_w[..., 2])):
+        add(f"force along body z, by the {label}", [h[..., None] * six[2] for h in _hats(scalar)])
     world = np.concatenate([axes_b, np.zeros_like(axes_b)], axis=-2)
     add("force along fixed directions", [world[..., i] for i in range(3)])
     add("force with the place", [
@@ -95,6 +103,14 @@ def shapes_of(knot: Flown, start_s: np.ndarray) -> Shapes:
     add("force towards a place", [np.concatenate([away, np.zeros_like(away)], axis=-1)])
     stacked = np.stack(columns, axis=-1)
     return Shapes(stacked.reshape(len(stacked), KNOTS * 6, -1), tuple(groups))
+
+
+def _hats(scalar: np.ndarray) -> list[np.ndarray]:
+    """Return hats over what values `scalar` (W, KNOTS) takes, as many between any two."""
+    places = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, PIECES + 1)))
+    if len(places) < 2:
+        return [np.ones_like(scalar)]
+    return [np.interp(scalar, places, one) for one in np.eye(len(places))]
 
 
 def _bumps(pos_w: np.ndarray) -> list[np.ndarray]:

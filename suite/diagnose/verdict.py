@@ -40,14 +40,15 @@ def judge(finding: Finding, rest: Rest, by_rotors: bool) -> Judgement:
         rest: structure in what the named effects leave.
         by_rotors: measured rotor speeds drive the model.
     """
-    after = float(finding.slow_after.mean())
+    expected = finding.frame.slow_freedom
+    after = float(finding.slow_after.sum() / expected.sum())
     shape = rest.shapes[0] if rest.shapes else None
     shaped = shape is not None and shape.p_value <= SHAPED
     coloured = [axis for axis, p in rest.coloured.items() if p <= COLOURED and not by_rotors]
     loud = after > (STRUCTURE_BY_ROTORS if by_rotors else STRUCTURE)
     if not (loud or shaped or coloured):
         return Judgement("named" if finding.named else "no_gap", 0.0, None)
-    slow = float(((finding.slow_after - 1.0) * finding.frame.slow_freedom).sum())
+    slow = float((finding.slow_after - expected).sum())
     left = max(slow, shape.gain if shape and shaped else 0.0, 1.0)
     share = left / (left + max(finding.explained, 0.0)) if finding.named else 1.0
     where = []
@@ -63,6 +64,7 @@ def judge(finding: Finding, rest: Rest, by_rotors: bool) -> Judgement:
 
 def _loudest(finding: Finding) -> str:
     groups = ("position", "attitude", "velocity", "rates")
-    energy = np.maximum(finding.slow_after.mean(axis=0) - 1.0, 0.0)
+    expected = np.maximum(finding.frame.slow_freedom.sum(axis=0), 1e-9)
+    energy = np.maximum(finding.slow_after.sum(axis=0) / expected - 1.0, 0.0)
     names = [f"{groups[k // 3]} {'xyz'[k % 3]}" for k in np.argsort(-energy)[:3] if energy[k] > 0]
     return "errors of " + ", ".join(names)
