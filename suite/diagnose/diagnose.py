@@ -15,7 +15,7 @@ from eval.flight_log import FlightLog
 from eval.vehicle import Vehicle
 from suite.diagnose.drive import another_controller, choose_drive
 from suite.diagnose.evidence import Frame, State, fit
-from suite.diagnose.gap import Gap, measure
+from suite.diagnose.gap import Gap, measure, worse
 from suite.diagnose.intervals import errors_of
 from suite.diagnose.model import Model
 from suite.diagnose.parameters import candidates, indices_of, make_space
@@ -123,7 +123,7 @@ def diagnose(
     start = start_state(model, windows).theta
     before = measure(model, start, held, finding.sigma)
     after = measure(model, finding.state.theta, held, finding.sigma) if finding.named else before
-    if finding.named and after.rms > before.rms:
+    if finding.named and worse(before, after):
         warnings.append("what was found on the fitted flights does not hold on held-out ones")
         finding.named.clear()
     push = push_of(model, windows, finding.frame, finding.state)

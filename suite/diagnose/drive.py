@@ -50,7 +50,7 @@ def another_controller(model: Model, windows: Windows) -> bool:
         return False
     theta = model.space.array("start")
     offset = np.zeros((len(windows.flight), model.free))
-    linear = model.linearise(theta, offset, windows, None)
+    linear = model.linearise(theta, offset, windows, model.starts)
     sigma = noise_of(linear.residual, windows)
     frame = make_frame(linear, sigma, windows)
     white = np.where(windows.seen, linear.residual / np.where(np.isfinite(sigma), sigma, 1.0), 0.0)

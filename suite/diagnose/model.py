@@ -17,7 +17,7 @@ from suite.diagnose.parameters import Layout, Space, effects_at
 from suite.diagnose.rollout import KNOTS, STATE, Flown, difference, fly_windows
 from suite.diagnose.windows import Windows, step_s
 
-BATCH = 16
+BATCH = 12
 """Windows a call: one shape, compiled once."""
 FEW = 8
 """Directions of the cheaper call."""
@@ -70,6 +70,8 @@ class Model:
         self.size = len(space.entries)
         self.free = STATE + (4 * KNOTS if driven_by_rotors else 0)
         """Numbers F that are free in each window: its start, and the rotor speeds' errors."""
+        self.starts = list(range(self.size, self.size + self.free))
+        """Places of the free numbers among all directions."""
         base = {name: value for name, value in space.base.items() if name != "gusts"}
         self.given = Given(*nominal_quadrotor(vehicle), base)
         self.dt = step_s(vehicle)
@@ -96,7 +98,8 @@ class Model:
     ) -> Linear:
         """Return residuals and slopes along the numbers at `indices`, or along all and the start.
 
-        With `indices` None the directions are all numbers and then the F free ones.
+        With `indices` None the directions are all numbers and then the F free ones, whose places
+        are `starts`.
         """
         with jax.enable_x64(True):
             return self._linearise(theta, offset, windows, indices)

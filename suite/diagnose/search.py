@@ -6,13 +6,13 @@ on data with shuffled signs. A rival that explains the same windows as well is a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from suite.diagnose.evidence import Frame, State, Sums, fit, make_frame, solve, sums_of
-from suite.diagnose.model import Model
+from suite.diagnose.model import Linear, Model
 from suite.diagnose.noise import noise_of
 from suite.diagnose.parameters import Candidate, Space, indices_of
 from suite.diagnose.select import Score, folds_of, score
@@ -37,7 +37,9 @@ MOSTLY = 0.25
 ROUNDS = 3
 """Times that names and rivals are weighed anew."""
 LOOK = 25.0
-"""A rival that is worse than the name by more than this to first order is not fitted."""
+"""A candidate that is worse than the best by more than this to first order is not fitted."""
+BENT = 0.1
+"""Nor one that is worse by more than this share besides: large effects are not of first order."""
 
 
 @dataclass
@@ -85,7 +87,7 @@ def search(
     named: list[Named] = []
     first: list[Score] = []
     while True:
-        frame, sums, sigma, state = _look(model, windows, state)
+        linear, frame, sums, sigma = _look(model, windows, state)
         indices = indices_of([n.candidate for n in named])
         left = [c for c in among if not set(c.indices) & set(indices)]
         scores = score(sums, state.theta, model.space, indices, left, fold)
@@ -95,11 +97,16 @@ def search(
         enough = best and best.p_value <= P_VALUE and best.gain > LEAST_SHARE * first[0].gain
         if best is None or not enough or len(named) >= MOST:
             break
-        short = [s for s in scores if s.gain >= NEAR * best.gain][:SHORT]
         tried = []
+        fallen = {
+            s.candidate: _fallen(sums, state.theta, model.space, indices, s.candidate)
+            for s in scores
+            if s.gain >= NEAR * best.gain
+        }
+        short = [s for s in scores if _near(fallen, s.candidate)][:SHORT]
         for item in short:
             at = indices_of([*(n.candidate for n in named), item.candidate])
-            after, fitted = fit(model, windows, frame, state, at)
+            after, fitted = fit(model, windows, frame, state, at, known=linear)
             tried.append((float(fitted.error.sum()) + 2 * len(at), item, after))
             say(f"{item.candidate.label}: {float(sums.error.sum() - fitted.error.sum()):.0f}")
         _, item, state = min(tried, key=lambda t: t[0])
@@ -142,11 +149,23 @@ def _settle(
     return named, state
 
 
-def _look(model: Model, windows: Windows, state: State) -> tuple[Frame, Sums, np.ndarray, State]:
+def _look(model: Model, windows: Windows, state: State) -> tuple[Linear, Frame, Sums, np.ndarray]:
+    """Return the slopes along everything at `state`, their frame and sums, and the noise."""
     linear = model.linearise(state.theta, state.offset, windows, None)
     sigma = noise_of(linear.residual, windows)
     frame = make_frame(linear, sigma, windows)
-    return frame, sums_of(frame, linear, model.size), sigma, state
+    return linear, frame, sums_of(frame, linear, model.size), sigma
+
+
+def _near(fallen: Mapping[Candidate, float], candidate: Candidate) -> bool:
+    """Return whether `candidate` could be the best: slopes alone say too little of large effects.
+
+    Args:
+        fallen: fall of the error to first order, by candidate.
+        candidate: one of them, or any other.
+    """
+    most = max(fallen.values())
+    return fallen.get(candidate, -np.inf) >= most - LOOK - BENT * abs(most)
 
 
 def _judge_rivals(
@@ -177,13 +196,12 @@ def _judge_rivals(
             one.p_value, one.gain = own.p_value, own.gain
         # (candidate, error with it in place of the name, what it costs in numbers)
         tried = [(one.candidate, float(last.error.sum()), state, last)]
-        floor = _fallen(sums, without.theta, model.space, at, one.candidate)
+        fallen = {c: _fallen(sums, without.theta, model.space, at, c) for c in left}
         for candidate in left:
-            fall = _fallen(sums, without.theta, model.space, at, candidate)
-            if candidate == one.candidate or fall < floor - LOOK - 0.1 * abs(floor):
+            if candidate == one.candidate or not _near(fallen, candidate):
                 continue
             chosen = indices_of([*others, candidate])
-            after, sums_after = fit(model, windows, frame, without, chosen)
+            after, sums_after = fit(model, windows, frame, without, chosen, known=linear)
             tried.append((candidate, float(sums_after.error.sum()), after, sums_after))
             say(f"{one.candidate.label} or {candidate.label}: {tried[-1][1] - tried[0][1]:.1f}")
         cost = {c.label: error + len(c.indices) for c, error, _, _ in tried}
