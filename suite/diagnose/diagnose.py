@@ -193,7 +193,10 @@ def _split(logs: Sequence[FlightLog], windows: Windows) -> tuple[np.ndarray, lis
         cut_s = ONE_FLIGHT * logs[int(there[0])].duration_s
         name = logs[int(there[0])].name
         return start + 1.0 <= cut_s, [f"{name} from {cut_s:.1f} s"]
-    held = there[-max(1, round(0.2 * len(there))) :]
+    share = np.array([(flight == k).mean() for k in there])
+    # A flight that has most of all stretches is needed to fit, whenever it was flown.
+    able = there[share <= 0.5]
+    held = able[-max(1, round(0.2 * len(there))) :]
     return ~np.isin(flight, held), [logs[int(k)].name for k in held]
 
 

@@ -18,7 +18,7 @@ from suite.diagnose.parameters import Candidate, Space, indices_of
 from suite.diagnose.select import Score, folds_of, score
 from suite.diagnose.windows import Windows
 
-P_VALUE = 0.01
+P_VALUE = 0.001
 """Chance of a false name at each step of the search."""
 MOST = 4
 """Effects that are named at most."""
