@@ -13,6 +13,10 @@ from suite.diagnose.parameters import Candidate, Space
 FLIPS = 1999
 """Draws of the null."""
 FOLDS = 5
+LOUD = 50.0
+"""A gain that noise never has: what else explains as much as the best is no chance either."""
+ALIKE = 0.5
+"""Share of the best gain from which a group explains about as much."""
 FEW = 10
 """Signs of fewer windows can be shuffled in too few ways for a p-value of 1 %."""
 
@@ -81,10 +85,10 @@ def compare(
     """Return the gain of each group of columns over those `beside`, and its p-value.
 
     The null is the largest gain of all groups where the signs of whole windows are shuffled, which
-    keeps all that is coloured within a window. What the best group explains is taken off before
-    (Freedman and Lane 1983): a real effect that a few windows show would otherwise stand in the
-    null as well. Where there are fewer than `FEW` windows the null is drawn from the measured
-    noise instead.
+    keeps all that is coloured within a window. What the best group explains, with those that are
+    nearly as good where it is much, is taken off before (Freedman and Lane 1983): a real effect
+    that a few windows show would otherwise stand in the null as well. Where there are fewer than
+    `FEW` windows the null is drawn from the measured noise instead.
 
     Args:
         square: (W, K, K) normal equations, columns of like size.
@@ -129,14 +133,16 @@ def compare(
     falls = [gain(group) - without for group in groups]
     rng = np.random.default_rng(seed)
     if len(fold) >= FEW:
-        at = list(groups[int(np.argmax(falls))])
+        best = max(falls)
+        share = ALIKE if best > LOUD else 1.0
+        alike = [g for g, fall in zip(groups, falls, strict=True) if fall >= share * best]
+        at = sorted({column for group in alike for column in group})
         left = cross - square[:, :, at] @ change(square.sum(0), cross.sum(0), at)
         drawn = rng.choice([-1.0, 1.0], (FLIPS, len(fold), 1)) * left
     else:
         drawn = _noise_like(square, rng)
-    null_without = chance(beside)
-    best = np.max([chance(group) for group in groups], axis=0) - null_without
-    return falls, [float((1 + (best >= fall).sum()) / (1 + FLIPS)) for fall in falls]
+    null = np.max([chance(group) for group in groups], axis=0) - chance(beside)
+    return falls, [float((1 + (null >= fall).sum()) / (1 + FLIPS)) for fall in falls]
 
 
 def _noise_like(square: np.ndarray, rng: np.random.Generator) -> np.ndarray:
