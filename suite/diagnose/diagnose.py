@@ -114,37 +114,34 @@ def diagnose(
             f"{int(inside.sum())} stretches of 1 s to fit: too few for a null of their own, so "
             "the null is drawn from the measured noise"
         )
-    windows, rest = take(cut_, inside), take(cut_, ~inside)
+    windows, apart = take(cut_, inside), take(cut_, ~inside)
     among = candidates(space, voltage, any(log.acc_b is not None for log in logs))
     if by_rotors:
         among = [c for c in among if c.name not in ("motor_lag", "command_delay", "rate_gain")]
-    say(f"{len(windows.flight)} stretches of 1 s to fit, {len(rest.flight)} held out")
+    say(f"{len(windows.flight)} stretches of 1 s to fit, {len(apart.flight)} held out")
     known = Linear(*(part[inside] for part in linear))
     finding = search(model, windows, among, say, known)
 
     windows = finding.windows
-    held = _held_out(logs, vehicle, by_rotors, rest)
+    held = _held_out(logs, vehicle, by_rotors, apart)
     start = start_state(model, windows).theta
     before = measure(model, start, held, finding.sigma)
     after = measure(model, finding.state.theta, held, finding.sigma) if finding.named else before
     if finding.named and worse(before, after):
         warnings.append("what was found on the fitted flights does not hold on held-out ones")
-        finding.named.clear()
-    push = push_of(model, windows, finding.frame, finding.state)
-    rest = rest_of(push, folds_of(windows.flight, windows.start_s), seed)
+        finding, after = _without_names(model, finding), before
+    rest, turbulence = _left_over(model, finding, seed)
+    if turbulence and finding.named and not worse(after, before):
+        # Wind that lasts from one stretch to the next looks like many a steady number.
+        finding, after = _without_names(model, finding), before
+        rest, turbulence = _left_over(model, finding, seed)
     judgement = judge(finding, rest, by_rotors)
-    turbulence = None
-    repeats = any(shape.p_value <= SHAPED for shape in rest.shapes[:1])
-    blows = any(p <= COLOURED for axis, p in rest.coloured.items() if axis.startswith("force"))
-    if blows and not repeats:
-        turbulence = find_turbulence(model, finding.state.theta, push)
     if turbulence:
         judgement = Judgement("named", 0.0, None)
     if judgement.verdict == "unknown" and finding.named:
         labels = ", ".join(n.candidate.label for n in finding.named)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
-        finding.named.clear()
-        after = before
+        finding, after = _without_names(model, finding), before
     without: dict[str, Gap] = {}
     for one in finding.named:
         others = [n.candidate for n in finding.named if n is not one]
@@ -175,6 +172,28 @@ def diagnose(
         warnings=warnings,
         model=model,
         held=held,
+    )
+
+
+def _left_over(model: Model, finding: Finding, seed: int) -> tuple[Rest, Turbulence | None]:
+    """Return the structure in what `finding` leaves over, and the wind that may have made it."""
+    windows = finding.windows
+    push = push_of(model, windows, finding.frame, finding.state)
+    rest = rest_of(push, folds_of(windows.flight, windows.start_s), seed)
+    if not any(p <= COLOURED for axis, p in rest.coloured.items() if axis.startswith("force")):
+        return rest, None
+    turbulence = find_turbulence(model, finding.state.theta, push)
+    # Wind is one explanation and a shape over the state another: the better one counts.
+    shape = rest.shapes[0]
+    if turbulence and shape.p_value <= SHAPED and shape.gain > turbulence.ratio:
+        return rest, None
+    return rest, turbulence
+
+
+def _without_names(model: Model, finding: Finding) -> Finding:
+    """Return `finding` with nothing named, at the numbers of the vehicle file."""
+    return replace(
+        finding, named=[], indices=[], state=start_state(model, finding.windows), explained=0.0
     )
 
 

@@ -41,8 +41,12 @@ HIDDEN = {
     "frame_tilt": ((0.01, 0.008),),
     "clock_offset": (0.008,),
 }
-TOLD_APART_BY_SCALES = {"mass_offset", "thrust_scale"}
-"""These two differ only in how the body turns."""
+ALIKE = {
+    "mass_offset": {"thrust_scale"},
+    "thrust_scale": {"mass_offset"},
+    "rotor_drag": {"linear_drag"},
+}
+"""What half a minute of flight may leave open."""
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +71,7 @@ def test_an_effect_is_named_alone(name, ways):
     assert found["verdict"] in ("named", "partly"), found["unexplained"]
     assert [effect["name"] for effect in found["effects"]] == [name]
     (effect,) = found["effects"]
-    allowed = TOLD_APART_BY_SCALES if name in TOLD_APART_BY_SCALES else set()
-    assert set(effect["alternatives"]) <= allowed
+    assert set(effect["alternatives"]) <= ALIKE.get(name, set())
     if name != "gusts":
         assert found["gap"]["after"] < 1.2
     parameter = EFFECTS[name].parameters[0].name
