@@ -15,7 +15,7 @@ from eval.flight_log import FlightLog
 from eval.vehicle import Vehicle
 from suite.diagnose.drive import another_controller, choose_drive
 from suite.diagnose.evidence import Frame, State, fit, information
-from suite.diagnose.gap import Gap, measure, worse
+from suite.diagnose.gap import OVERLAP_S, Gap, measure, worse
 from suite.diagnose.intervals import errors_of
 from suite.diagnose.model import Linear, Model
 from suite.diagnose.parameters import candidates, indices_of, make_space
@@ -29,8 +29,6 @@ from suite.diagnose.windows import Windows, cut, take
 
 LOST_M = 50.0
 """A simulated stretch that ends this far from the flight says nothing [m]."""
-OVERLAP_S = 0.25
-"""From one start to the next of the rollouts that measure the gap [s]."""
 LEAST = 2
 """Stretches to fit without which nothing can be left out."""
 
