@@ -119,11 +119,11 @@ def compare(
         total, at = np.zeros(FLIPS), list(columns)
         if not at:
             return total
-        for (known, test), (inside, outside) in zip(sums, folds, strict=True):
+        for (known, test), (inside, outside) in zip(sums, drawn, strict=True):
             known, test = known[np.ix_(at, at)], test[np.ix_(at, at)]
             damp = 1e-9 * np.diag(np.diag(known)) + 1e-30 * np.eye(len(at))
-            moved = np.linalg.solve(known + damp, drawn[:, inside].sum(1)[:, at].T).T
-            pull = drawn[:, outside].sum(1)[:, at]
+            moved = np.linalg.solve(known + damp, inside[:, at].T).T
+            pull = outside[:, at]
             total += 2 * (pull * moved).sum(1) - ((moved @ test) * moved).sum(1)
         return total
 
@@ -138,9 +138,11 @@ def compare(
         alike = [g for g, fall in zip(groups, falls, strict=True) if fall >= share * best]
         at = sorted({column for group in alike for column in group})
         left = cross - square[:, :, at] @ change(square.sum(0), cross.sum(0), at)
-        drawn = rng.choice([-1.0, 1.0], (FLIPS, len(fold), 1)) * left
+        signs = rng.choice([-1.0, 1.0], (FLIPS, len(fold)))
+        drawn = [(signs[:, i] @ left[i], signs[:, o] @ left[o]) for i, o in folds]
     else:
-        drawn = _noise_like(square, rng)
+        noise = _noise_like(square, rng)
+        drawn = [(noise[:, i].sum(axis=1), noise[:, o].sum(axis=1)) for i, o in folds]
     null = np.max([chance(group) for group in groups], axis=0) - chance(beside)
     return falls, [float((1 + (null >= fall).sum()) / (1 + FLIPS)) for fall in falls]
 
