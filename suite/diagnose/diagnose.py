@@ -117,7 +117,7 @@ def diagnose(
     if by_rotors:
         among = [c for c in among if c.name not in ("motor_lag", "command_delay", "rate_gain")]
     say(f"{len(windows.flight)} stretches of 1 s to fit, {len(rest.flight)} held out")
-    finding = search(model, windows, among, say)
+    finding = search(model, windows, among, say, seed)
 
     held = _held_out(logs, vehicle, by_rotors, rest)
     start = start_state(model, windows).theta

@@ -52,6 +52,9 @@ class Named:
     """Fall of the error when it is added last."""
     rivals: list[str] = field(default_factory=list)
     """Names that explain the same."""
+    apart: dict[str, float] = field(default_factory=dict)
+    """By label of whatever was fitted in its place: how much worse it is, in units of the noise
+    and with a unit for each number."""
 
 
 @dataclass
@@ -79,9 +82,21 @@ def start_state(model: Model, windows: Windows) -> State:
 
 
 def search(
-    model: Model, windows: Windows, among: Sequence[Candidate], say: Callable[[str], None]
+    model: Model,
+    windows: Windows,
+    among: Sequence[Candidate],
+    say: Callable[[str], None],
+    seed: int = 0,
 ) -> Finding:
-    """Return what explains the gap between `model` and `windows`."""
+    """Return what explains the gap between `model` and `windows`.
+
+    Args:
+        model: with the vehicle file's numbers.
+        windows: to fit.
+        among: what may be named.
+        say: told of the steps.
+        seed: of the null's draws.
+    """
     fold = folds_of(np.asarray(windows.flight), np.asarray(windows.start_s))
     state = start_state(model, windows)
     named: list[Named] = []
@@ -90,7 +105,7 @@ def search(
         linear, frame, sums, sigma = _look(model, windows, state)
         indices = indices_of([n.candidate for n in named])
         left = [c for c in among if not set(c.indices) & set(indices)]
-        scores = score(sums, state.theta, model.space, indices, left, fold)
+        scores = score(sums, state.theta, model.space, indices, left, fold, seed)
         if not first:
             first = scores
         best = scores[0] if scores else None
@@ -111,7 +126,7 @@ def search(
             say(f"{item.candidate.label}: {float(sums.error.sum() - fitted.error.sum()):.0f}")
         _, item, state = min(tried, key=lambda t: t[0])
         named.append(Named(item.candidate, item.p_value, item.gain))
-    named, state = _settle(model, windows, frame, named, state, among, fold, say)
+    named, state = _settle(model, windows, frame, named, state, among, fold, say, seed)
     indices = indices_of([n.candidate for n in named])
     state, last = fit(model, windows, frame, state, indices, rounds=3 if indices else 0)
     begin = fit(model, windows, frame, start_state(model, windows), [])[1] if indices else last
@@ -128,6 +143,7 @@ def _settle(
     among: Sequence[Candidate],
     fold: np.ndarray,
     say: Callable[[str], None],
+    seed: int,
 ) -> tuple[list[Named], State]:
     """Refit all names jointly and judge each against its rivals, until no name changes."""
     for _ in range(ROUNDS):
@@ -136,7 +152,7 @@ def _settle(
             break
         state, last = fit(model, windows, frame, state, indices)
         before = [n.candidate for n in named]
-        state = _judge_rivals(model, windows, frame, named, state, last, among, fold, say)
+        state = _judge_rivals(model, windows, frame, named, state, last, among, fold, say, seed)
         needed = [n for n in named if n.p_value <= P_VALUE]
         if [n.candidate for n in needed] == before:
             break
@@ -178,6 +194,7 @@ def _judge_rivals(
     among: Sequence[Candidate],
     fold: np.ndarray,
     say: Callable[[str], None],
+    seed: int,
 ) -> State:
     """Set each name's evidence when added last, and its rivals; a better rival takes its place."""
     begin = model.space.array("start")
@@ -190,7 +207,7 @@ def _judge_rivals(
         linear = model.linearise(without.theta, without.offset, windows, None)
         sums = sums_of(frame, linear, model.size)
         left = [c for c in among if not set(c.indices) & set(at)]
-        scores = score(sums, without.theta, model.space, at, left, fold)
+        scores = score(sums, without.theta, model.space, at, left, fold, seed)
         own = next((s for s in scores if s.candidate == one.candidate), None)
         if own is not None:
             one.p_value, one.gain = own.p_value, own.gain
@@ -211,6 +228,7 @@ def _judge_rivals(
         explained = float(bare.error.sum()) - error
         limit = min(APART, MOSTLY * explained)
         one.candidate = best
+        one.apart = {c.label: cost[c.label] - cost[best.label] for c, *_ in tried if c != best}
         names = [c.name for c, *_ in tried if cost[c.label] - cost[best.label] <= limit]
         one.rivals = [name for name in dict.fromkeys(names) if name != best.name]
     return state

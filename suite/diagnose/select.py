@@ -25,6 +25,8 @@ class Score(NamedTuple):
     """Fall of the error on windows that were left out of its fit, summed over the folds."""
     p_value: float
     """How often the best of all candidates gains as much on data of the null."""
+    chance: float
+    """Gain that the best of all candidates reaches on data of the null once in a hundred."""
 
 
 def folds_of(flight: np.ndarray, start_s: np.ndarray) -> np.ndarray:
@@ -64,8 +66,9 @@ def score(
     square, cross = sums.square * np.outer(scale, scale), sums.cross * scale
     seen = [c for c in among if np.einsum("wjj->j", square)[list(c.indices)].sum() > 1e-9]
     groups = [tuple(sorted({*named, *c.indices})) for c in seen]
-    gains, p_values = compare(square, cross, groups, tuple(named), fold, seed, (low, high))
-    scores = [Score(*item) for item in zip(seen, gains, p_values, strict=True)]
+    found = compare(square, cross, groups, tuple(named), fold, seed, (low, high))
+    gains, p_values, chance = found
+    scores = [Score(*item, chance) for item in zip(seen, gains, p_values, strict=True)]
     return sorted(scores, key=lambda s: -s.gain)
 
 
@@ -77,11 +80,12 @@ def compare(
     fold: np.ndarray,
     seed: int,
     room: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[list[float], list[float]]:
-    """Return the gain of each group of columns over those `beside`, and its p-value.
+) -> tuple[list[float], list[float], float]:
+    """Return the gain of each group of columns over those `beside`, its p-value, and chance's gain.
 
     The null is the largest gain of all groups where the signs of whole windows are shuffled, which
-    keeps all that is coloured within a window. Where there are fewer than `FEW` windows it is
+    keeps all that is coloured within a window; chance's gain is what it exceeds once in a hundred
+    draws. Where there are fewer than `FEW` windows it is
     drawn from the measured noise instead.
 
     Args:
@@ -122,7 +126,8 @@ def compare(
     found = [gains(group) for group in groups]
     best = np.max([null - null_without for _, null in found], axis=0, initial=-np.inf)
     falls = [gain - without for gain, _ in found]
-    return falls, [float((1 + (best >= fall).sum()) / (1 + FLIPS)) for fall in falls]
+    p_values = [float((1 + (best >= fall).sum()) / (1 + FLIPS)) for fall in falls]
+    return falls, p_values, float(np.quantile(best, 0.99)) if found else 0.0
 
 
 def _noise_like(square: np.ndarray, rng: np.random.Generator) -> np.ndarray:
