@@ -28,7 +28,7 @@ class Config:
     plan: bool = False
     """Write flights that would tell apart what these could not, in OUT/plan."""
     fly: str | None = None
-    """Fly the plan in simulation with this vehicle (a file or a shipped name) and write its logs."""
+    """Fly the plan in simulation with this vehicle (a file or a shipped name); write its logs."""
     recording: bool = True
     """Write the held-out flights, measured and simulated, as a recording for rerun."""
     seed: int = 0
