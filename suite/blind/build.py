@@ -112,7 +112,8 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
         windows = cut(flights, every_s=stride * EVERY_S)
         found = information(nominal, (), sensors, windows)
         info = Information(found.columns, stride * found.matrix)
-        far = cut(flights, every_s=stride * LONG_S, horizon_s=LONG_S)
+        length = min(LONG_S, 0.5 * max(way.duration_s for way in ways))
+        far = cut(flights, every_s=stride * length, horizon_s=length)
         found = information(nominal, (), sensors, far)
         long = Information(found.columns, stride * found.matrix)
         if case.kind == "pair":

@@ -14,24 +14,25 @@ from eval.effects import EFFECTS
 from eval.flight_log import FlightLog
 from eval.vehicle import Vehicle
 from suite.diagnose.drive import another_controller, choose_drive
-from suite.diagnose.evidence import Frame, State, fit
+from suite.diagnose.evidence import Frame, State, fit, information
 from suite.diagnose.gap import Gap, measure, worse
 from suite.diagnose.intervals import errors_of
-from suite.diagnose.model import Model
+from suite.diagnose.model import Linear, Model
 from suite.diagnose.parameters import candidates, indices_of, make_space
 from suite.diagnose.rest import Rest, push_of, rest_of
 from suite.diagnose.search import Finding, search, start_state
 from suite.diagnose.select import FEW, folds_of
+from suite.diagnose.split import split
 from suite.diagnose.turbulence import Turbulence, find_turbulence
 from suite.diagnose.verdict import COLOURED, SHAPED, Judgement, judge
 from suite.diagnose.windows import Windows, cut, take
 
+LOST_M = 50.0
+"""A simulated stretch that ends this far from the flight says nothing [m]."""
 OVERLAP_S = 0.25
 """From one start to the next of the rollouts that measure the gap [s]."""
 LEAST = 2
 """Stretches to fit without which nothing can be left out."""
-ONE_FLIGHT = 0.7
-"""Share of a lone flight that is fitted; the rest is held out."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,8 @@ def diagnose(
     """Find what explains how `logs` differ from `vehicle`.
 
     Args:
-        logs: flights; the last fifth of them, at least one, is held out (of a lone flight, the
-            last 30 %).
+        logs: flights; a fifth of them, at least one, is held out (of a lone flight, the last
+            30 %).
         vehicle: the one that the simulation used.
         drive: what drives the model: "commands", "motors", or "auto".
         say: told of the search's steps.
@@ -86,23 +87,24 @@ def diagnose(
     """
     began = time.monotonic()
     by_rotors, warnings = choose_drive(logs, drive), list[str]()
+    if drive == "auto" and not by_rotors and another_controller(logs, vehicle):
+        warnings.append("the nominal rate loop does not give the measured rotor speeds; they drive")
+        by_rotors = True
     space = make_space(vehicle)
     voltage = all(log.voltage is not None for log in logs)
     model = Model(vehicle, space, by_rotors, voltage)
     cut_, notes = cut(logs, vehicle, by_rotors)
     if cut_ is None:
         raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
-    if drive == "auto" and not by_rotors and another_controller(model, cut_):
-        warnings.append("the nominal rate loop does not give the measured rotor speeds; they drive")
-        by_rotors = True
-        model = Model(vehicle, space, by_rotors, voltage)
-        cut_, notes = cut(logs, vehicle, by_rotors)
-        assert cut_ is not None
     warnings += notes
-    cut_, broken = _finite(model, cut_)
-    if broken:
+    begin = start_state(model, cut_)
+    linear = model.linearise(begin.theta, begin.offset, cut_, None)
+    good = _sound(linear)
+    if not good.all():
+        broken = int((~good).sum())
         warnings.append(f"{broken} stretches left out: the model's flight from there diverges")
-    inside, names = _split(logs, cut_)
+    cut_, linear = take(cut_, good), Linear(*(part[good] for part in linear))
+    inside, names = split(logs, cut_, information(linear, cut_, model.size))
     if inside.sum() < LEAST:
         raise ValueError(
             f"{int(inside.sum())} stretches of 1 s to fit, at least {LEAST} are needed: fly longer"
@@ -117,8 +119,10 @@ def diagnose(
     if by_rotors:
         among = [c for c in among if c.name not in ("motor_lag", "command_delay", "rate_gain")]
     say(f"{len(windows.flight)} stretches of 1 s to fit, {len(rest.flight)} held out")
-    finding = search(model, windows, among, say, seed)
+    known = Linear(*(part[inside] for part in linear))
+    finding = search(model, windows, among, say, known, seed)
 
+    windows = finding.windows
     held = _held_out(logs, vehicle, by_rotors, rest)
     start = start_state(model, windows).theta
     before = measure(model, start, held, finding.sigma)
@@ -174,27 +178,21 @@ def diagnose(
     )
 
 
-def _finite(model: Model, windows: Windows) -> tuple[Windows, int]:
-    theta = model.space.array("start")
-    residual = model.residual(theta, np.zeros((len(windows.flight), model.free)), windows)
-    good = np.isfinite(residual).all(axis=(1, 2)) & (np.abs(residual[..., :3]) < 50).all((1, 2))
+def _sound(linear: Linear) -> np.ndarray:
+    """Return which windows (W,) the model flies to their end.
+
+    Raises:
+        ValueError: where it is none.
+    """
+    residual = linear.residual
+    good = np.asarray(np.isfinite(residual).all(axis=(1, 2)))
+    good &= np.isfinite(linear.slope).all(axis=(1, 2, 3))
+    good &= (np.abs(residual[..., :3]) < LOST_M).all(axis=(1, 2))
     if not good.any():
         raise ValueError(
             "the model diverges on every flight: check the vehicle file and the frames"
         )
-    return take(windows, good), int((~good).sum())
-
-
-def _split(logs: Sequence[FlightLog], windows: Windows) -> tuple[np.ndarray, list[str]]:
-    """Return which windows are fitted, and the names of what is held out."""
-    flight, start = np.asarray(windows.flight), np.asarray(windows.start_s)
-    there = np.unique(flight)
-    if len(there) == 1:
-        cut_s = ONE_FLIGHT * logs[int(there[0])].duration_s
-        name = logs[int(there[0])].name
-        return start + 1.0 <= cut_s, [f"{name} from {cut_s:.1f} s"]
-    held = there[-max(1, round(0.2 * len(there))) :]
-    return ~np.isin(flight, held), [logs[int(k)].name for k in held]
+    return good
 
 
 def _held_out(
