@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from eval.effects import EFFECTS
-from suite.diagnose.charts import contest_chart, drift_chart, gains_chart, gap_chart, where_chart
+from suite.diagnose.charts import drift_chart, gains_chart, where_chart
 from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.proof import Proof
 from suite.diagnose.report_logs import actuators_section, logs_section, noise_section
@@ -55,7 +55,7 @@ def page(
         _candidates(diagnosis),
         _identity(diagnosis, found),
         rest_section(diagnosis, found),
-        evidence_section(diagnosis, found, proof, seed, gap_chart, contest_chart),
+        evidence_section(diagnosis, found, proof, seed),
         _written(found, toml, files),
     ]
     if found["warnings"]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from suite.diagnose.charts import COLOURS
+from suite.diagnose.charts import COLOURS, contest_chart, gap_chart
 from suite.diagnose.contest import Contest
 from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.gap import MEASURE, Gap, interval
@@ -47,12 +47,7 @@ def rest_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
 
 
 def evidence_section(
-    diagnosis: Diagnosis,
-    found: Mapping[str, Any],
-    proof: Proof,
-    seed: int,
-    gap_chart: Callable[..., bytes],
-    contest_chart: Callable[..., bytes],
+    diagnosis: Diagnosis, found: Mapping[str, Any], proof: Proof, seed: int
 ) -> Section:
     """Return the gap on flights that took no part, with its rivals."""
     gaps = [("as given", diagnosis.before, COLOURS["before"])]

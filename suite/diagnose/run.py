@@ -73,7 +73,7 @@ def diagnose_files(
         proof = replace(proof, contests=contests)
     found: dict[str, Any] = {**answer(result, wishes.seed), **as_json(proof, wishes.seed)}
     found["warnings"] = [*warnings, *found["warnings"]]
-    told = found["disagreement"]["after"] or found["disagreement"]["before"]
+    told = found["disagreement"]["after" if result.finding.named else "before"]
     if found["unexplained"]["where"] and told:
         found["unexplained"]["where"] += f"; most in {told}"
     out.mkdir(parents=True, exist_ok=True)
