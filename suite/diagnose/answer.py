@@ -17,8 +17,8 @@ SHOWN = 5
 """Shapes of the rest that are listed."""
 
 
-def answer(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the contents of diagnosis.json."""
+def answer(diagnosis: Diagnosis, seed: int = 0) -> dict[str, Any]:
+    """Return the contents of diagnosis.json; `seed` is that of the intervals' draws."""
     named = diagnosis.finding.named
     before, after = diagnosis.before, diagnosis.after
     return {
@@ -32,8 +32,8 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
             "before": before.rms,
             "after": after.rms,
             "noise_floor": 1.0,
-            "before_ci95": interval(before.score),
-            "after_ci95": interval(after.score),
+            "before_ci95": interval(before.score, seed),
+            "after_ci95": interval(after.score, seed),
             "horizon_s": HEADLINE_S,
             "held_out": diagnosis.held_out,
             "channels": {
@@ -53,6 +53,7 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
         else {
             "effect": diagnosis.control[0],
             "after": diagnosis.control[1].rms,
+            "after_ci95": interval(diagnosis.control[1].score, seed),
         },  # fmt: skip
         "unexplained": {
             "share": diagnosis.share_left,

@@ -118,7 +118,7 @@ def diagnose(
         among = [c for c in among if c.name not in ("motor_lag", "command_delay", "rate_gain")]
     say(f"{len(windows.flight)} stretches of 1 s to fit, {len(apart.flight)} held out")
     known = Linear(*(part[inside] for part in linear))
-    finding = search(model, windows, among, say, known)
+    finding = search(model, windows, among, say, known, seed)
 
     windows = finding.windows
     held = _held_out(logs, vehicle, by_rotors, apart)

@@ -51,8 +51,13 @@ class Gap(NamedTuple):
 
 def measure(model: Model, theta: np.ndarray, windows: Windows, sigma: np.ndarray) -> Gap:
     """Return the gap of `model` with the numbers `theta` on `windows`."""
-    offset = _true_starts(model, theta, windows)
+    offset = true_starts(model, theta, windows)
     linear = model.linearise(theta, offset, windows, model.starts)
+    return gap_of(linear, windows, sigma)
+
+
+def gap_of(linear: Linear, windows: Windows, sigma: np.ndarray) -> Gap:
+    """Return the gap of residuals; `linear` has the slopes along what is free, last."""
     frame = make_frame(linear, sigma, windows)
     slow = sums_of(frame, linear, 0).slow
     score = slow.sum(axis=1) / frame.slow_freedom.sum(axis=1)
@@ -108,7 +113,7 @@ def _errors(
     return error, np.maximum(floor, 1e-12)
 
 
-def _true_starts(model: Model, theta: np.ndarray, windows: Windows) -> np.ndarray:
+def true_starts(model: Model, theta: np.ndarray, windows: Windows) -> np.ndarray:
     """Return where windows start if the log's clock is off by the model's offset."""
     late = model.space.effects(theta)["clock_offset"].offset
     offset = np.zeros((len(windows.flight), model.free))

@@ -62,6 +62,9 @@ class Named:
     """Fall of the error when it is added last."""
     rivals: list[str] = field(default_factory=list)
     """Names that explain the same."""
+    apart: dict[str, float] = field(default_factory=dict)
+    """By label of what was fitted in its place: by how much it is worse, in units of the noise and
+    with a unit for each number."""
 
 
 @dataclass
@@ -96,6 +99,7 @@ def search(
     among: Sequence[Candidate],
     say: Callable[[str], None],
     known: Linear | None = None,
+    seed: int = 0,
 ) -> Finding:
     """Return what explains the gap between `model` and `windows`.
 
@@ -105,6 +109,7 @@ def search(
         among: the candidates.
         say: told of the steps.
         known: slopes along everything at the vehicle file's numbers, where they are known.
+        seed: of the null's draws.
     """
     whole, fold = windows, folds_of(np.asarray(windows.flight), np.asarray(windows.start_s))
     state = start_state(model, windows)
@@ -114,7 +119,7 @@ def search(
         linear, windows, frame, sums, sigma = _look(model, whole, state, None if named else known)
         indices = indices_of([n.candidate for n in named])
         left = [c for c in among if not set(c.indices) & set(indices)]
-        scores = score(sums, state.theta, model.space, indices, left, fold)
+        scores = score(sums, state.theta, model.space, indices, left, fold, seed)
         if not first:
             first = scores
         best = scores[0] if scores else None
@@ -135,7 +140,7 @@ def search(
             say(f"{item.candidate.label}: {float(sums.error.sum() - fitted.error.sum()):.0f}")
         _, item, state = min(tried, key=lambda t: t[0])
         named.append(Named(item.candidate, item.p_value, item.gain))
-    named, state = _settle(model, whole, windows, frame, named, state, among, fold, say)
+    named, state = _settle(model, whole, windows, frame, named, state, among, fold, say, seed)
     indices = indices_of([n.candidate for n in named])
     state, last = fit(model, windows, frame, state, indices, LAST_ROUNDS if indices else 0)
     begin = fit(model, windows, frame, start_state(model, windows), [])[1] if indices else last
@@ -153,6 +158,7 @@ def _settle(
     among: Sequence[Candidate],
     fold: np.ndarray,
     say: Callable[[str], None],
+    seed: int,
 ) -> tuple[list[Named], State]:
     """Refit all names jointly and judge each against its rivals, until no name changes.
 
@@ -166,6 +172,7 @@ def _settle(
         among: the candidates.
         fold: (W,) windows of one number are left out together.
         say: told of the steps.
+        seed: of the null's draws.
     """
     for _ in range(ROUNDS):
         indices = indices_of([n.candidate for n in named])
@@ -173,7 +180,7 @@ def _settle(
             break
         state, _ = fit(model, windows, frame, state, indices)
         before = [n.candidate for n in named]
-        state = _judge_rivals(model, whole, named, state, among, fold, say)
+        state = _judge_rivals(model, whole, named, state, among, fold, say, seed)
         needed = [n for n in named if n.p_value <= P_VALUE]
         if [n.candidate for n in needed] == before:
             break
@@ -244,6 +251,7 @@ def _judge_rivals(
     among: Sequence[Candidate],
     fold: np.ndarray,
     say: Callable[[str], None],
+    seed: int,
 ) -> State:
     """Set each name's evidence when added last, and its rivals; a better rival takes its place."""
     begin = model.space.array("start")
@@ -255,7 +263,7 @@ def _judge_rivals(
         linear, view, frame, sums, _ = _look(model, windows, without, None)
         at = indices_of(others)
         left = [c for c in among if not set(c.indices) & set(at)]
-        scores = score(sums, theta, model.space, at, left, fold)
+        scores = score(sums, theta, model.space, at, left, fold, seed)
         own = next((s for s in scores if s.candidate == one.candidate), None)
         if own is not None:
             one.p_value, one.gain = own.p_value, own.gain
@@ -273,6 +281,7 @@ def _judge_rivals(
         explained = float(sums.error.sum()) - _fallen(sums, theta, model.space, at) - least
         limit = min(APART, MOSTLY * explained)
         one.candidate = best
+        one.apart = {c.label: cost - least for cost, c, _ in tried if c != best}
         names = [c.name for cost, c, _ in tried if cost - least <= limit]
         one.rivals = [name for name in dict.fromkeys(names) if name != best.name]
     return state

@@ -29,6 +29,8 @@ class Score(NamedTuple):
     """Fall of the error on windows that were left out of its fit, summed over the folds."""
     p_value: float
     """How often the best of all candidates gains as much on data of the null."""
+    chance: float
+    """Gain that the best of all candidates reaches on data of the null once in a hundred."""
 
 
 def folds_of(flight: np.ndarray, start_s: np.ndarray) -> np.ndarray:
@@ -68,8 +70,9 @@ def score(
     square, cross = sums.square * np.outer(scale, scale), sums.cross * scale
     seen = [c for c in among if np.einsum("wjj->j", square)[list(c.indices)].sum() > 1e-9]
     groups = [tuple(sorted({*named, *c.indices})) for c in seen]
-    gains, p_values = compare(square, cross, groups, tuple(named), fold, seed, (low, high))
-    scores = [Score(*item) for item in zip(seen, gains, p_values, strict=True)]
+    found = compare(square, cross, groups, tuple(named), fold, seed, (low, high))
+    gains, p_values, chance = found
+    scores = [Score(*item, chance) for item in zip(seen, gains, p_values, strict=True)]
     return sorted(scores, key=lambda s: -s.gain)
 
 
@@ -81,14 +84,15 @@ def compare(
     fold: np.ndarray,
     seed: int,
     room: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[list[float], list[float]]:
-    """Return the gain of each group of columns over those `beside`, and its p-value.
+) -> tuple[list[float], list[float], float]:
+    """Return the gain of each group of columns over those `beside`, its p-value, and chance's gain.
 
     The null is the largest gain of all groups where the signs of whole windows are shuffled, which
     keeps all that is coloured within a window. What the best group explains, with those that are
     nearly as good where it is much, is taken off before (Freedman and Lane 1983): a real effect
     that a few windows show would otherwise stand in the null as well. Where there are fewer than
-    `FEW` windows the null is drawn from the measured noise instead.
+    `FEW` windows the null is drawn from the measured noise instead. Chance's gain is what one draw
+    in a hundred exceeds.
 
     Args:
         square: (W, K, K) normal equations, columns of like size.
@@ -128,7 +132,7 @@ def compare(
         return total
 
     if not groups:
-        return [], []
+        return [], [], 0.0
     without = gain(beside)
     falls = [gain(group) - without for group in groups]
     rng = np.random.default_rng(seed)
@@ -144,7 +148,8 @@ def compare(
         noise = _noise_like(square, rng)
         drawn = [(noise[:, i].sum(axis=1), noise[:, o].sum(axis=1)) for i, o in folds]
     null = np.max([chance(group) for group in groups], axis=0) - chance(beside)
-    return falls, [float((1 + (null >= fall).sum()) / (1 + FLIPS)) for fall in falls]
+    p_values = [float((1 + (null >= fall).sum()) / (1 + FLIPS)) for fall in falls]
+    return falls, p_values, float(np.quantile(null, 0.99))
 
 
 def _noise_like(square: np.ndarray, rng: np.random.Generator) -> np.ndarray:
