@@ -118,8 +118,8 @@ class Baseline:
         )  # fmt: skip
         camera = config.spec.camera
         images = [torch.zeros(count, camera.height, camera.width)] * physics.image_delay
-        upright = torch.zeros(count, 12)
-        upright[:, 8] = 1.0
+        upright = torch.zeros(count, config.spec.state_size)
+        upright[:, 5] = 1.0
         states = [upright] * physics.state_delay
         hidden = worlds.hidden
         action, target, alive = zero, worlds.target.long(), torch.ones(count)
@@ -128,7 +128,11 @@ class Baseline:
             gate, target_w = self.target_gate(worlds.scene.gates, target)
             images.append(self.look(worlds, body))
             seen = [to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w)]
-            states.append(torch.cat([seen[0], body.rot_w[:, 2], seen[1], action], -1))
+            numbers = [seen[0], body.rot_w[:, 2], seen[1], action]
+            if config.spec.second_gate:
+                _, second_w = self.target_gate(worlds.scene.gates, target, ahead=1)
+                numbers.append(to_local(body.rot_w, second_w - body.pos_w))
+            states.append(torch.cat(numbers, -1))
             action, hidden = self.network(states.pop(0), images.pop(0), hidden)
             before, body = body, step(body, worlds.constants, action, target_w, config)
             loss, clearance = self.judge(worlds, before, body, gate, target_w)
@@ -138,11 +142,11 @@ class Baseline:
             target = target + (passed & (target < worlds.scene.gates.center_w.shape[1]))
         return total / config.episode.steps
 
-    def target_gate(self, gates: Gates, target: Tensor) -> tuple[Gates, Tensor]:
-        """Return each world's current gate and the point to fly to (B, 3)."""
+    def target_gate(self, gates: Gates, target: Tensor, ahead: int = 0) -> tuple[Gates, Tensor]:
+        """Return each world's current gate, or the one `ahead`, and the point to fly to (B, 3)."""
         count = gates.center_w.shape[1]
         rows = torch.arange(len(target))
-        gate = Gates(*(array[rows, target.clamp(max=count - 1)] for array in gates))
+        gate = Gates(*(array[rows, (target + ahead).clamp(max=count - 1)] for array in gates))
         beyond = torch.where(target >= count, BEYOND_M, 0.0)[:, None]
         return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
 

@@ -11,7 +11,7 @@ from jax.sharding import PartitionSpec as P
 
 from policies import delta_network, network
 from suite.train.config import TrainConfig
-from suite.train.rollout import StepRecord, make_rollout
+from suite.train.rollout import Memory, StepRecord, make_rollout
 from suite.train.worlds import Worlds
 
 CHUNK = 320
@@ -21,6 +21,12 @@ CHUNK = 320
 def _chunk(count: int) -> int:
     """Return the largest divisor of count that is at most CHUNK."""
     return max(size for size in range(1, min(count, CHUNK) + 1) if count % size == 0)
+
+
+def _every(stride: int, first: jax.Array, array: jax.Array) -> jax.Array:
+    """Return one in `stride` of the rows of an array (T, ...), from row `first` on."""
+    split = array.reshape(-1, stride, *array.shape[1:])
+    return jax.lax.dynamic_index_in_dim(split, first, axis=1, keepdims=False)
 
 
 def encoder_gradient(
@@ -52,8 +58,11 @@ def encoder_gradient(
 
 def make_gradient(
     config: TrainConfig,
-) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
-    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) on one device."""
+) -> Callable[..., tuple[network.Params, jax.Array, StepRecord, Memory]]:
+    """Return gradient(params, worlds, key, delta, memory) -> (gradient, loss, records, end).
+
+    On one device; `memory` and `end` are where the worlds stand before and afterwards.
+    """
     rollout = make_rollout(config)
     width = config.spec.hidden_size
 
@@ -65,44 +74,54 @@ def make_gradient(
         worlds: Worlds,
         key: jax.Array,
         delta: delta_network.Params | None,
-    ) -> tuple[network.Params, jax.Array, StepRecord]:
+        memory: Memory | None = None,
+    ) -> tuple[network.Params, jax.Array, StepRecord, Memory]:
         nudge = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], width))
-        (loss, records), (direct, cotangents) = jax.value_and_grad(
+        (loss, (records, end)), (direct, cotangents) = jax.value_and_grad(
             rollout, argnums=(0, 1), has_aux=True
-        )(params, nudge, worlds, key, frozen_encode, delta)
-        images = records.image.reshape(-1, *records.image.shape[2:])
-        through_images = encoder_gradient(params, images, cotangents.reshape(-1, width))
-        return jax.tree.map(jnp.add, direct, through_images), loss, records
+        )(params, nudge, worlds, key, frozen_encode, delta, memory)
+        stride = config.episode.image_stride
+        first = jax.random.randint(jax.random.fold_in(key, stride), (), 0, stride)
+        images, cotangents = (
+            _every(stride, first, array).reshape(-1, *array.shape[2:])
+            for array in (records.image, stride * cotangents)
+        )
+        through_images = encoder_gradient(params, images, cotangents)
+        return jax.tree.map(jnp.add, direct, through_images), loss, records, end
 
     return gradient
 
 
 def shard_gradient(
     config: TrainConfig, mesh: Mesh
-) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
+) -> Callable[..., tuple[network.Params, jax.Array, StepRecord, Memory]]:
     """Return the gradient shared by the devices of `mesh`, each with its part of the worlds.
 
     Returns:
-        gradient(params, worlds, key, delta) -> (gradient, loss, records without images); the
-        gradient and the loss are means over all worlds, the records are gathered.
+        gradient(params, worlds, key, delta, memory) -> (gradient, loss, records without images,
+        end); the gradient and the loss are means over all worlds, the others are gathered.
     """
     local = make_gradient(config)
     axis = mesh.axis_names[0]
 
     def part(
-        params: network.Params, worlds: Worlds, key: jax.Array, delta: delta_network.Params | None
-    ) -> tuple[network.Params, jax.Array, StepRecord]:
+        params: network.Params,
+        worlds: Worlds,
+        key: jax.Array,
+        delta: delta_network.Params | None,
+        memory: Memory,
+    ) -> tuple[network.Params, jax.Array, StepRecord, Memory]:
         key = jax.random.fold_in(key, jax.lax.axis_index(axis))
-        gradient, loss, records = local(params, worlds, key, delta)
+        gradient, loss, records, end = local(params, worlds, key, delta, memory)
         records = records._replace(image=jnp.zeros((config.episode.steps, 1)))
-        return jax.lax.pmean(gradient, axis), jax.lax.pmean(loss, axis), records
+        return jax.lax.pmean(gradient, axis), jax.lax.pmean(loss, axis), records, end
 
     worlds_spec = P(axis)
     records_spec = P(None, axis)
     return jax.shard_map(
         part,
         mesh=mesh,
-        in_specs=(P(), worlds_spec, P(), P()),
-        out_specs=(P(), P(), records_spec),
+        in_specs=(P(), worlds_spec, P(), P(), worlds_spec),
+        out_specs=(P(), P(), records_spec, worlds_spec),
         check_vma=False,
     )

@@ -63,7 +63,8 @@ def progress_term(
     pos_w: jax.Array,
     vel_w: jax.Array,
     target_w: jax.Array,
-    lateral_g: jax.Array,
+    local_g: jax.Array,
+    normal_w: jax.Array,
 ) -> jax.Array:
     """Return L_p with the ablation's variants L_p^norm and L_proj, weighted, (B,).
 
@@ -72,8 +73,13 @@ def progress_term(
         pos_w: (B, 3) [m].
         vel_w: (B, 3) [m/s].
         target_w: (B, 3) the point to fly to [m].
-        lateral_g: (B, 2) the position in the target gate's y-z plane [m].
+        local_g: (B, 3) the position in the target gate's frame [m].
+        normal_w: (B, 3) the target gate's flight direction.
     """
+    if config.approach_m > 0:
+        beyond = jax.lax.stop_gradient(local_g[:, :1] > 0)
+        target_w = target_w - jnp.where(beyond, config.approach_m, 0.0) * normal_w
+    lateral_g = local_g[:, 1:]
     to_gate = target_w - pos_w
     distance = _norm(to_gate)
     towards = (vel_w * to_gate).sum(-1) / distance

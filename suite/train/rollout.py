@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,8 @@ from tracks.crossing import crossing
 from tracks.depth import depth_image
 from tracks.rotation import to_local
 from tracks.scene import Counts, Gates
+
+T = TypeVar("T")
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
 """Solids of each kind that a training image shows, nearest first; the judge shows all."""
@@ -50,11 +52,13 @@ class Memory(NamedTuple):
     embeddings: jax.Array
     """(B, image_delay, hidden) the images on their way, oldest first."""
     states: jax.Array
-    """(B, state_delay, 12) the states on their way, oldest first."""
+    """(B, state_delay, state_size) the states on their way, oldest first."""
     delta_hidden: jax.Array
     """(B, 32) of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 while the world counts in the loss: until it crashes or stops, then 0."""
+    crashed: jax.Array
+    """(B,) 1 from the step on in which the world crashed."""
 
 
 class StepRecord(NamedTuple):
@@ -78,10 +82,14 @@ class StepRecord(NamedTuple):
     """1 where the step counted in the loss, else 0."""
 
 
-def target_gate(gates: Gates, target: jax.Array) -> tuple[Gates, jax.Array]:
-    """Return each world's current gate (B, ...) and the point to fly to (B, 3)."""
+def target_gate(gates: Gates, target: jax.Array, ahead: int = 0) -> tuple[Gates, jax.Array]:
+    """Return each world's current gate (B, ...) and the point to fly to (B, 3).
+
+    With `ahead` it is the gate so many after that, or the last one where there is none, as the
+    judge has it.
+    """
     count = gates.center_w.shape[1]
-    index = jnp.minimum(target, count - 1)
+    index = jnp.minimum(target + ahead, count - 1)
     gate = jax.tree.map(lambda array: jax.vmap(lambda rows, i: rows[i])(array, index), gates)
     beyond = jnp.where(target >= count, BEYOND_M, 0.0)[:, None]
     return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
@@ -93,12 +101,42 @@ def _queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
     return line[:, 0], line[:, 1:]
 
 
-def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepRecord]]:
-    """Return rollout(params, nudge, worlds, key, encode, delta) -> (loss, records).
+def start_memory(config: TrainConfig, worlds: Worlds) -> Memory:
+    """Return what fresh worlds carry before their first step."""
+    spec, physics = config.spec, config.physics
+    batch = worlds.pos_w.shape[0]
+    upright = jnp.zeros((batch, physics.state_delay, spec.state_size)).at[:, :, 5].set(1.0)
+    return Memory(
+        body=point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w),
+        target=jnp.asarray(worlds.target),
+        hidden=jnp.asarray(worlds.hidden),
+        action_b=jnp.zeros((batch, 3)),
+        embeddings=jnp.zeros((batch, physics.image_delay, spec.hidden_size)),
+        states=upright,
+        delta_hidden=delta_network.start(batch),
+        alive=jnp.ones(batch),
+        crashed=jnp.zeros(batch),
+    )
+
+
+def pick(which: jax.Array, yes: T, no: T) -> T:
+    """Return the trees' rows: those of `yes` where `which` (B,) is not 0, else those of `no`."""
+
+    def rows(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(which.reshape(-1, *[1] * (jnp.ndim(a) - 1)) > 0, a, b)
+
+    return jax.tree.map(rows, yes, no)
+
+
+def make_rollout(
+    config: TrainConfig,
+) -> Callable[..., tuple[jax.Array, tuple[StepRecord, Memory]]]:
+    """Return rollout(params, nudge, worlds, key, encode, delta, memory) -> (loss, (records, end)).
 
     `encode(params, image)` gives the embeddings; `nudge` is (T, B, hidden); `delta` is the frozen
-    Delta Action network's parameters or None. The loss is the mean over steps and worlds; records
-    are (T, B, ...).
+    Delta Action network's parameters or None; `memory` is where the worlds stand, None for fresh
+    ones. The loss is the mean over steps and worlds; records are (T, B, ...); `end` is where the
+    worlds stand afterwards, those that stopped where they stopped.
     """
     spec, physics, weights = config.spec, config.physics, config.loss
     rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
@@ -118,9 +156,12 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
         memory: Memory,
         embedding: jax.Array,
         target_w: jax.Array,
+        second_w: jax.Array | None,
     ) -> tuple[jax.Array, Memory]:
         body = memory.body
-        state = state_vector(body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b)
+        state = state_vector(
+            body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b, second_w
+        )
         state, states = _queue(memory.states, state)
         embedding, embeddings = _queue(memory.embeddings, embedding)
         action, hidden = network.recur(params, memory.hidden, embedding, state)
@@ -132,7 +173,11 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
     def judge(
         worlds: Worlds, before: point_mass.Body, body: point_mass.Body, target: jax.Array
     ) -> tuple[losses.Terms, jax.Array, jax.Array]:
-        gate, target_w = target_gate(worlds.scene.gates, target)
+        gate, _ = target_gate(worlds.scene.gates, target)
+        held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
+        passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
+        passed = passed & (target < worlds.scene.gates.center_w.shape[1])
+        aim, aim_w = target_gate(worlds.scene.gates, target + passed * weights.pass_first)
         share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
         distance, away = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path), NEAR)
@@ -140,18 +185,17 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
         size, change = losses.smoothness_terms(
             weights, body.acc_w, before.acc_w, worlds.constants.time_step
         )
-        lateral = to_local(gate.rot_w, body.pos_w - gate.center_w)[..., 1:]
+        local = to_local(aim.rot_w, body.pos_w - aim.center_w)
         terms = losses.Terms(
             clearance=weights.clearance * barrier,
             collide=weights.collide * collide,
             acceleration=size,
             jerk=change,
-            progress=losses.progress_term(weights, body.pos_w, body.vel_w, target_w, lateral),
+            progress=losses.progress_term(
+                weights, body.pos_w, body.vel_w, aim_w, local, aim.rot_w[:, :, 0]
+            ),
             guidance=losses.guidance_term(weights, gate, body.pos_w, body.vel_w),
         )
-        held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
-        passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
-        passed = passed & (target < worlds.scene.gates.center_w.shape[1])
         return terms, distance.min(-1), passed
 
     def rollout(
@@ -161,29 +205,24 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
         key: jax.Array,
         encode: Callable[[network.Params, jax.Array], jax.Array],
         delta: delta_network.Params | None = None,
-    ) -> tuple[jax.Array, StepRecord]:
-        steps, batch, width = nudge.shape
-        body = point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w)
-        memory = Memory(
-            body=body,
-            target=worlds.target,
-            hidden=jnp.asarray(worlds.hidden),
-            action_b=jnp.zeros((batch, 3)),
-            embeddings=jnp.zeros((batch, physics.image_delay, width)),
-            states=jnp.zeros((batch, physics.state_delay, 12)).at[:, :, 8].set(1.0),
-            delta_hidden=delta_network.start(batch),
-            alive=jnp.ones(batch),
-        )
+        memory: Memory | None = None,
+    ) -> tuple[jax.Array, tuple[StepRecord, Memory]]:
+        steps = nudge.shape[0]
+        if memory is None:
+            memory = start_memory(config, worlds)
 
         def step(
             memory: Memory, inputs: tuple[jax.Array, jax.Array, jax.Array]
         ) -> tuple[Memory, StepRecord]:
             nudge_now, key_now, number = inputs
-            before = memory.body
+            earlier, before = memory, memory.body
             image = look(worlds, jax.lax.stop_gradient(before), key_now)
             _, target_w = target_gate(worlds.scene.gates, memory.target)
             embedding = encode(params, image) + nudge_now
-            action, memory = act(params, memory, embedding, target_w)
+            second_w = None
+            if spec.second_gate:
+                _, second_w = target_gate(worlds.scene.gates, memory.target, ahead=1)
+            action, memory = act(params, memory, embedding, target_w, second_w)
             if delta is not None:
                 vel_b = to_local(jax.lax.stop_gradient(before.rot_w), before.vel_w)
                 correction, delta_hidden = delta_network.step(
@@ -201,8 +240,9 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
             )
             terms, clearance, passed = judge(worlds, before, body, memory.target)
             terms = losses.Terms(*(term * memory.alive for term in terms))
-            alive = memory.alive * (clearance > -weights.crash_depth_m)
-            alive = alive * (number + 1 < worlds.stop)
+            crashes = clearance <= -weights.crash_depth_m
+            crashed = jnp.maximum(memory.crashed, memory.alive * crashes)
+            alive = memory.alive * (1 - crashed) * (number + 1 < worlds.stop)
             record = StepRecord(
                 image=image,
                 terms=terms,
@@ -214,11 +254,14 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
                 alive=memory.alive,
             )
             target = memory.target + passed
-            return memory._replace(body=body, target=target, alive=alive), record
+            memory = memory._replace(body=body, target=target)
+            if config.episode.segments > 1:
+                memory = pick(earlier.alive, memory, earlier)
+            return memory._replace(alive=alive, crashed=crashed), record
 
         keys = jax.random.split(key, steps)
-        _, records = jax.lax.scan(step, memory, (nudge, keys, jnp.arange(steps)))
+        end, records = jax.lax.scan(step, memory, (nudge, keys, jnp.arange(steps)))
         loss = functools.reduce(jnp.add, (term.mean() for term in records.terms))
-        return loss, jax.lax.stop_gradient(records)
+        return loss, jax.lax.stop_gradient((records, end))
 
     return rollout

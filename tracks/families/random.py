@@ -23,6 +23,8 @@ MAX_APPROACH = np.deg2rad(95.0)
 """Largest angle between a stretch and the direction of a gate that it joins [rad]."""
 MAX_TOTALS = PerStretch(*(np.array(n) for n in (23, 23, 10, 14)))
 """Most plates, small solids, pillars and ground objects of a track."""
+SHARP_SHARE = 0.55
+"""Probability that a track has one or two sharp turns."""
 _WALKS = 8
 _DRAWS = 12
 
@@ -38,9 +40,9 @@ class Walks(NamedTuple):
     """(W, 2) level start [m]."""
 
 
-def make(d: float, rng: np.random.Generator) -> Layout:
+def make(d: float, rng: np.random.Generator, sharp_share: float = SHARP_SHARE) -> Layout:
     """Return a random track of difficulty `d` in [0, 1]."""
-    xy, yaw, start = _walk(d, rng)
+    xy, yaw, start = _walk(d, rng, sharp_share)
     shape = GATE_COUNT
     side = np.clip(ramp(1.2, 0.85, d) + rng.uniform(-0.1, 0.1, shape), 0.75, 1.3)
     width = rng.uniform(0.13, 0.27, shape)
@@ -68,10 +70,12 @@ def _density(d: float, rng: np.random.Generator, stretches: int) -> PerStretch:
     return PerStretch(*numbers)
 
 
-def _walk(d: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _walk(
+    d: float, rng: np.random.Generator, sharp_share: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return gate centres (G, 2), yaws (G,) and the start (2,) of the first walk that is free."""
     for _ in range(_DRAWS):
-        walks = _candidates(d, rng, _drift_turns(d, rng))
+        walks = _candidates(d, rng, _drift_turns(d, rng, sharp_share))
         free = np.flatnonzero(_is_free(walks))
         if len(free):
             return walks.center[free[0]], walks.yaw[free[0]], walks.start[free[0]]
@@ -79,12 +83,12 @@ def _walk(d: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
     return straight.center[0], straight.yaw[0], straight.start[0]
 
 
-def _drift_turns(d: float, rng: np.random.Generator) -> np.ndarray:
+def _drift_turns(d: float, rng: np.random.Generator, sharp_share: float) -> np.ndarray:
     """Return how far the drift turns at each gate, (G,) [rad]."""
     sign = rng.choice([-1.0, 1.0])
     bend = np.deg2rad(rng.uniform(0, 52)) if rng.random() < 0.6 else 0.0
     turn = sign * bend + rng.normal(size=GATE_COUNT) * np.deg2rad(rng.uniform(0, 12))
-    if rng.random() < 0.55:
+    if rng.random() < sharp_share:
         corners = rng.choice(GATE_COUNT - 1, rng.integers(1, 3), replace=False)
         sharp = np.deg2rad(rng.uniform(60, ramp(120, 155, d), len(corners)))
         turn[corners] = sharp * np.where(rng.random(len(corners)) < 0.8, sign, -sign)
