@@ -135,11 +135,13 @@ class Baseline:
             states.append(torch.cat(numbers, -1))
             action, hidden = self.network(states.pop(0), images.pop(0), hidden)
             before, body = body, step(body, worlds.constants, action, target_w, config)
-            loss, clearance = self.judge(worlds, before, body, gate, target_w)
+            passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
+            passed = passed & (target < worlds.scene.gates.center_w.shape[1])
+            aim = self.target_gate(worlds.scene.gates, target + passed * config.loss.pass_first)
+            loss, clearance = self.judge(worlds, before, body, gate, *aim)
             total = total + (loss * alive).mean()
             alive = alive * (clearance > -config.loss.crash_depth_m) * (number + 1 < worlds.stop)
-            passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
-            target = target + (passed & (target < worlds.scene.gates.center_w.shape[1]))
+            target = target + passed
         return total / config.episode.steps
 
     def target_gate(self, gates: Gates, target: Tensor, ahead: int = 0) -> tuple[Gates, Tensor]:
@@ -162,7 +164,7 @@ class Baseline:
         return image.reshape(-1, camera.height, camera.width)
 
     def judge(
-        self, worlds: Worlds, before: Body, body: Body, gate: Gates, target_w: Tensor
+        self, worlds: Worlds, before: Body, body: Body, gate: Gates, aim: Gates, aim_w: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the loss of a step (B,) and the smallest distance on its path (B,)."""
         config = self.config.loss
@@ -180,11 +182,13 @@ class Baseline:
         loss = loss + config.acceleration * (body.acc_w**2).sum(-1)
         loss = loss + config.jerk * (jerk**2).sum(-1)
 
-        to_gate = target_w - body.pos_w
+        local = to_local(aim.rot_w, body.pos_w - aim.center_w).detach()
+        shift = config.approach_m * (local[:, :1] > 0)
+        to_gate = aim_w - shift * aim.rot_w[:, :, 0] - body.pos_w
         towards = (body.vel_w * to_gate).sum(-1) / _norm(to_gate)
         loss = loss - config.progress * towards
         loss = loss - config.progress_norm * towards / (_norm(body.vel_w) + 1e-3)
-        lateral = to_local(gate.rot_w, body.pos_w - gate.center_w)[:, 1:]
+        lateral = to_local(aim.rot_w, body.pos_w - aim.center_w)[:, 1:]
         near = (-config.projection_decay * _norm(to_gate).detach()).exp()
         loss = loss + config.projection * (lateral**2).sum(-1) * near
 

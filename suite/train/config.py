@@ -118,6 +118,10 @@ class EpisodeConfig:
     """Share of the worlds that start on the way which start beyond their gate, having missed it."""
     sharp_share: float = 0.55
     """Share of tracks with one or two sharp turns."""
+    density: tuple[float, float] = (0.0, 1.3)
+    """Range of the obstacles' density as a share of the judged families'."""
+    bare_share: float = 0.2
+    """Share of tracks without obstacles."""
 
 
 @dataclass(frozen=True)

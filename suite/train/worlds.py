@@ -13,6 +13,7 @@ from suite.train.config import TrainConfig
 from suite.train.point_mass import Constants
 from tracks.cull import Bounds, bounds
 from tracks.families import MAX_COUNTS, random_track
+from tracks.families.random import Mix
 from tracks.scene import Array, Scene, stack
 from tracks.track import Track
 
@@ -113,8 +114,9 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     low, high = difficulty_range(config, iteration)
     tracks, starts = [], []
     rests = rng.uniform(size=batch) < episode.rest_share
+    mix = Mix(episode.sharp_share, episode.density, episode.bare_share)
     for rest in rests:
-        track = random_track(rng.uniform(low, high), rng, episode.sharp_share)
+        track = random_track(rng.uniform(low, high), rng, mix)
         tracks.append(track)
         if rest:
             starts.append((track.start_pos_w, np.zeros(3), 0))

@@ -23,8 +23,6 @@ MAX_APPROACH = np.deg2rad(95.0)
 """Largest angle between a stretch and the direction of a gate that it joins [rad]."""
 MAX_TOTALS = PerStretch(*(np.array(n) for n in (23, 23, 10, 14)))
 """Most plates, small solids, pillars and ground objects of a track."""
-SHARP_SHARE = 0.55
-"""Probability that a track has one or two sharp turns."""
 _WALKS = 8
 _DRAWS = 12
 
@@ -40,9 +38,23 @@ class Walks(NamedTuple):
     """(W, 2) level start [m]."""
 
 
-def make(d: float, rng: np.random.Generator, sharp_share: float = SHARP_SHARE) -> Layout:
+class Mix(NamedTuple):
+    """What share of tracks is hard, besides their difficulty."""
+
+    sharp_share: float = 0.55
+    """Probability that a track has one or two sharp turns."""
+    density: tuple[float, float] = (0.0, 1.3)
+    """Range of the obstacles' density, as a share of the judged families'."""
+    bare_share: float = 0.2
+    """Probability that a track has no obstacles."""
+
+
+MIX = Mix()
+
+
+def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:
     """Return a random track of difficulty `d` in [0, 1]."""
-    xy, yaw, start = _walk(d, rng, sharp_share)
+    xy, yaw, start = _walk(d, rng, mix.sharp_share)
     shape = GATE_COUNT
     side = np.clip(ramp(1.2, 0.85, d) + rng.uniform(-0.1, 0.1, shape), 0.75, 1.3)
     width = rng.uniform(0.13, 0.27, shape)
@@ -55,12 +67,12 @@ def make(d: float, rng: np.random.Generator, sharp_share: float = SHARP_SHARE) -
 
     stretches = np.arange(GATE_COUNT - 1)
     site = straight_sites(gates, stretches, rng.uniform(2.0, 4.0))
-    return furnish(rng, gates, start_pos_w, _density(d, rng, len(stretches)), site)
+    return furnish(rng, gates, start_pos_w, _density(d, rng, len(stretches), mix), site)
 
 
-def _density(d: float, rng: np.random.Generator, stretches: int) -> PerStretch:
-    """Draw obstacle counts: none on a fifth of the tracks, up to 1.3 times the baseline's."""
-    level = rng.uniform(0, 1.3) if rng.random() < 0.8 else 0.0
+def _density(d: float, rng: np.random.Generator, stretches: int, mix: Mix) -> PerStretch:
+    """Draw obstacle counts: none on some tracks, up to more than the baseline's on others."""
+    level = rng.uniform(*mix.density) if rng.random() < 1 - mix.bare_share else 0.0
     kind = np.clip(rng.uniform(0.0, 2.0, 4), 0.3, 1.5)
     air, pillar, ground = ramp(1, 3.5, d), ramp(0.8, 1.3, d), 2.0
     mean = level * kind * np.array([air, air, pillar, ground])
