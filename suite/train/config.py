@@ -63,8 +63,6 @@ class LossConfig:
     approach_m: float = 0.0
     """Beyond the gate's plane progress is measured towards a point this far in front of the gate,
     so that a missed gate is not flown at from behind; 0: always towards its centre [m]."""
-    pass_first: bool = False
-    """Whether the step that passes a gate already measures progress towards the next one."""
     projection_decay: float = 0.5
     """beta_3 of L_proj [1/m]."""
     barrier_height: float = 2.0
@@ -110,10 +108,6 @@ class EpisodeConfig:
     that the policy cannot count the steps left and go for broke at the end; 1: none leaves."""
     start_speed: float = 6.0
     """Largest speed of a world that starts on the way [m/s]."""
-    segments: int = 1
-    """Rollouts that a world lives for: the next one goes on where the last one ended, with its
-    recurrent state and without gradients into the past, until the world crashes or is flown
-    through. 1: every rollout has fresh worlds."""
     missed_share: float = 0.0
     """Share of the worlds that start on the way which start beyond their gate, having missed it."""
     sharp_share: float = 0.55

@@ -11,7 +11,7 @@ from jax.sharding import PartitionSpec as P
 
 from policies import delta_network, network
 from suite.train.config import TrainConfig
-from suite.train.rollout import Memory, StepRecord, make_rollout
+from suite.train.rollout import StepRecord, make_rollout
 from suite.train.worlds import Worlds
 
 CHUNK = 320
@@ -58,11 +58,8 @@ def encoder_gradient(
 
 def make_gradient(
     config: TrainConfig,
-) -> Callable[..., tuple[network.Params, jax.Array, StepRecord, Memory]]:
-    """Return gradient(params, worlds, key, delta, memory) -> (gradient, loss, records, end).
-
-    On one device; `memory` and `end` are where the worlds stand before and afterwards.
-    """
+) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
+    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) on one device."""
     rollout = make_rollout(config)
     width = config.spec.hidden_size
 
@@ -74,12 +71,11 @@ def make_gradient(
         worlds: Worlds,
         key: jax.Array,
         delta: delta_network.Params | None,
-        memory: Memory | None = None,
-    ) -> tuple[network.Params, jax.Array, StepRecord, Memory]:
+    ) -> tuple[network.Params, jax.Array, StepRecord]:
         nudge = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], width))
-        (loss, (records, end)), (direct, cotangents) = jax.value_and_grad(
+        (loss, records), (direct, cotangents) = jax.value_and_grad(
             rollout, argnums=(0, 1), has_aux=True
-        )(params, nudge, worlds, key, frozen_encode, delta, memory)
+        )(params, nudge, worlds, key, frozen_encode, delta)
         stride = config.episode.image_stride
         first = jax.random.randint(jax.random.fold_in(key, stride), (), 0, stride)
         images, cotangents = (
@@ -87,41 +83,37 @@ def make_gradient(
             for array in (records.image, stride * cotangents)
         )
         through_images = encoder_gradient(params, images, cotangents)
-        return jax.tree.map(jnp.add, direct, through_images), loss, records, end
+        return jax.tree.map(jnp.add, direct, through_images), loss, records
 
     return gradient
 
 
 def shard_gradient(
     config: TrainConfig, mesh: Mesh
-) -> Callable[..., tuple[network.Params, jax.Array, StepRecord, Memory]]:
+) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
     """Return the gradient shared by the devices of `mesh`, each with its part of the worlds.
 
     Returns:
-        gradient(params, worlds, key, delta, memory) -> (gradient, loss, records without images,
-        end); the gradient and the loss are means over all worlds, the others are gathered.
+        gradient(params, worlds, key, delta) -> (gradient, loss, records without images); the
+        gradient and the loss are means over all worlds, the records are gathered.
     """
     local = make_gradient(config)
     axis = mesh.axis_names[0]
 
     def part(
-        params: network.Params,
-        worlds: Worlds,
-        key: jax.Array,
-        delta: delta_network.Params | None,
-        memory: Memory,
-    ) -> tuple[network.Params, jax.Array, StepRecord, Memory]:
+        params: network.Params, worlds: Worlds, key: jax.Array, delta: delta_network.Params | None
+    ) -> tuple[network.Params, jax.Array, StepRecord]:
         key = jax.random.fold_in(key, jax.lax.axis_index(axis))
-        gradient, loss, records, end = local(params, worlds, key, delta, memory)
+        gradient, loss, records = local(params, worlds, key, delta)
         records = records._replace(image=jnp.zeros((config.episode.steps, 1)))
-        return jax.lax.pmean(gradient, axis), jax.lax.pmean(loss, axis), records, end
+        return jax.lax.pmean(gradient, axis), jax.lax.pmean(loss, axis), records
 
     worlds_spec = P(axis)
     records_spec = P(None, axis)
     return jax.shard_map(
         part,
         mesh=mesh,
-        in_specs=(P(), worlds_spec, P(), P(), worlds_spec),
-        out_specs=(P(), P(), records_spec, worlds_spec),
+        in_specs=(P(), worlds_spec, P(), P()),
+        out_specs=(P(), P(), records_spec),
         check_vma=False,
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +26,6 @@ from tracks.crossing import crossing
 from tracks.depth import depth_image
 from tracks.rotation import to_local
 from tracks.scene import Counts, Gates
-
-T = TypeVar("T")
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
 """Solids of each kind that a training image shows, nearest first; the judge shows all."""
@@ -57,8 +55,6 @@ class Memory(NamedTuple):
     """(B, 32) of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 while the world counts in the loss: until it crashes or stops, then 0."""
-    crashed: jax.Array
-    """(B,) 1 from the step on in which the world crashed."""
 
 
 class StepRecord(NamedTuple):
@@ -101,42 +97,18 @@ def _queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
     return line[:, 0], line[:, 1:]
 
 
-def start_memory(config: TrainConfig, worlds: Worlds) -> Memory:
-    """Return what fresh worlds carry before their first step."""
-    spec, physics = config.spec, config.physics
-    batch = worlds.pos_w.shape[0]
-    upright = jnp.zeros((batch, physics.state_delay, spec.state_size)).at[:, :, 5].set(1.0)
-    return Memory(
-        body=point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w),
-        target=jnp.asarray(worlds.target),
-        hidden=jnp.asarray(worlds.hidden),
-        action_b=jnp.zeros((batch, 3)),
-        embeddings=jnp.zeros((batch, physics.image_delay, spec.hidden_size)),
-        states=upright,
-        delta_hidden=delta_network.start(batch),
-        alive=jnp.ones(batch),
-        crashed=jnp.zeros(batch),
-    )
+def _upright(batch: int, config: TrainConfig) -> jax.Array:
+    """Return the states on their way at the start, (B, state_delay, state_size): level, at rest."""
+    size = config.spec.state_size
+    return jnp.zeros((batch, config.physics.state_delay, size)).at[:, :, 5].set(1.0)
 
 
-def pick(which: jax.Array, yes: T, no: T) -> T:
-    """Return the trees' rows: those of `yes` where `which` (B,) is not 0, else those of `no`."""
-
-    def rows(a: jax.Array, b: jax.Array) -> jax.Array:
-        return jnp.where(which.reshape(-1, *[1] * (jnp.ndim(a) - 1)) > 0, a, b)
-
-    return jax.tree.map(rows, yes, no)
-
-
-def make_rollout(
-    config: TrainConfig,
-) -> Callable[..., tuple[jax.Array, tuple[StepRecord, Memory]]]:
-    """Return rollout(params, nudge, worlds, key, encode, delta, memory) -> (loss, (records, end)).
+def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepRecord]]:
+    """Return rollout(params, nudge, worlds, key, encode, delta) -> (loss, records).
 
     `encode(params, image)` gives the embeddings; `nudge` is (T, B, hidden); `delta` is the frozen
-    Delta Action network's parameters or None; `memory` is where the worlds stand, None for fresh
-    ones. The loss is the mean over steps and worlds; records are (T, B, ...); `end` is where the
-    worlds stand afterwards, those that stopped where they stopped.
+    Delta Action network's parameters or None. The loss is the mean over steps and worlds; records
+    are (T, B, ...).
     """
     spec, physics, weights = config.spec, config.physics, config.loss
     rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
@@ -177,7 +149,9 @@ def make_rollout(
         held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
         passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
         passed = passed & (target < worlds.scene.gates.center_w.shape[1])
-        aim, aim_w = target_gate(worlds.scene.gates, target + passed * weights.pass_first)
+        # A gate that was passed in this step is no goal any more: measured to it, progress would
+        # be backwards, and the drone learns to slow down in front of gates.
+        aim, aim_w = target_gate(worlds.scene.gates, target + passed)
         share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
         distance, away = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path), NEAR)
@@ -205,17 +179,25 @@ def make_rollout(
         key: jax.Array,
         encode: Callable[[network.Params, jax.Array], jax.Array],
         delta: delta_network.Params | None = None,
-        memory: Memory | None = None,
-    ) -> tuple[jax.Array, tuple[StepRecord, Memory]]:
-        steps = nudge.shape[0]
-        if memory is None:
-            memory = start_memory(config, worlds)
+    ) -> tuple[jax.Array, StepRecord]:
+        steps, batch, width = nudge.shape
+        body = point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w)
+        memory = Memory(
+            body=body,
+            target=worlds.target,
+            hidden=jnp.asarray(worlds.hidden),
+            action_b=jnp.zeros((batch, 3)),
+            embeddings=jnp.zeros((batch, physics.image_delay, width)),
+            states=_upright(batch, config),
+            delta_hidden=delta_network.start(batch),
+            alive=jnp.ones(batch),
+        )
 
         def step(
             memory: Memory, inputs: tuple[jax.Array, jax.Array, jax.Array]
         ) -> tuple[Memory, StepRecord]:
             nudge_now, key_now, number = inputs
-            earlier, before = memory, memory.body
+            before = memory.body
             image = look(worlds, jax.lax.stop_gradient(before), key_now)
             _, target_w = target_gate(worlds.scene.gates, memory.target)
             embedding = encode(params, image) + nudge_now
@@ -240,9 +222,8 @@ def make_rollout(
             )
             terms, clearance, passed = judge(worlds, before, body, memory.target)
             terms = losses.Terms(*(term * memory.alive for term in terms))
-            crashes = clearance <= -weights.crash_depth_m
-            crashed = jnp.maximum(memory.crashed, memory.alive * crashes)
-            alive = memory.alive * (1 - crashed) * (number + 1 < worlds.stop)
+            alive = memory.alive * (clearance > -weights.crash_depth_m)
+            alive = alive * (number + 1 < worlds.stop)
             record = StepRecord(
                 image=image,
                 terms=terms,
@@ -254,14 +235,11 @@ def make_rollout(
                 alive=memory.alive,
             )
             target = memory.target + passed
-            memory = memory._replace(body=body, target=target)
-            if config.episode.segments > 1:
-                memory = pick(earlier.alive, memory, earlier)
-            return memory._replace(alive=alive, crashed=crashed), record
+            return memory._replace(body=body, target=target, alive=alive), record
 
         keys = jax.random.split(key, steps)
-        end, records = jax.lax.scan(step, memory, (nudge, keys, jnp.arange(steps)))
+        _, records = jax.lax.scan(step, memory, (nudge, keys, jnp.arange(steps)))
         loss = functools.reduce(jnp.add, (term.mean() for term in records.terms))
-        return loss, jax.lax.stop_gradient((records, end))
+        return loss, jax.lax.stop_gradient(records)
 
     return rollout

@@ -14,18 +14,8 @@ from jax.sharding import Mesh
 from policies import delta_network, network
 from suite.train.config import OptimizerConfig, TrainConfig
 from suite.train.gradient import shard_gradient
-from suite.train.rollout import BODY_RADIUS_M, Memory, StepRecord, pick, start_memory
-from suite.train.worlds import Worlds, sample_worlds
-
-
-class Carry(NamedTuple):
-    """Worlds of the last rollout, for those that live on."""
-
-    worlds: Worlds
-    memory: Memory
-    """Where they stand."""
-    left: jax.Array
-    """(B,) rollouts that a world has left; 0 where it is replaced by a fresh one."""
+from suite.train.rollout import BODY_RADIUS_M, StepRecord
+from suite.train.worlds import Worlds
 
 
 class TrainState(NamedTuple):
@@ -39,8 +29,6 @@ class TrainState(NamedTuple):
     """Gradient steps done, a scalar."""
     hidden: jax.Array
     """(B, hidden) recurrent states from random steps of the last rollout."""
-    carry: Carry | None
-    """None where `episode.segments` is 1."""
 
 
 def make_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
@@ -60,43 +48,7 @@ def start_state(config: TrainConfig, params: network.Params | None = None) -> Tr
         params = network.init(jax.random.key(config.seed), config.spec)
     hidden = jnp.zeros((config.episode.batch, config.spec.hidden_size))
     optimizer = make_optimizer(config.optimizer).init(params)
-    carry = None
-    if config.episode.segments > 1:
-        worlds = jax.tree.map(jnp.asarray, sample_worlds(config, 0))
-        left = jnp.zeros(config.episode.batch, int)
-        carry = Carry(worlds, start_memory(config, worlds), left)
-    return TrainState(params, optimizer, jnp.zeros((), int), hidden, carry)
-
-
-def next_worlds(
-    config: TrainConfig, carry: Carry, fresh: Worlds, memory: Memory
-) -> tuple[Worlds, Memory]:
-    """Return the worlds of a rollout, and where they stand: those that live on, else fresh ones.
-
-    Args:
-        config: of the run.
-        carry: of the rollout before.
-        fresh: worlds for the places of those that do not live on.
-        memory: where the fresh ones stand.
-    """
-    steps = jnp.full_like(fresh.stop, config.episode.steps)
-    before = carry.worlds._replace(stop=steps, fov_scale=jnp.asarray(fresh.fov_scale))
-    stand = carry.memory._replace(alive=jnp.ones_like(memory.alive))
-    return pick(carry.left, (before, stand), (fresh, memory))
-
-
-def rollouts_left(config: TrainConfig, before: jax.Array, worlds: Worlds, end: Memory) -> jax.Array:
-    """Return how many rollouts the worlds have left (B,), after one that ended at `end`.
-
-    Args:
-        config: of the run.
-        before: (B,) what they had left before it, 0 for fresh worlds.
-        worlds: of the rollout.
-        end: where they stand.
-    """
-    left = jnp.where(before > 0, before - 1, config.episode.segments - 1)
-    over = (end.crashed > 0) | (end.target >= worlds.scene.gates.center_w.shape[1])
-    return jnp.where(over, 0, left)
+    return TrainState(params, optimizer, jnp.zeros((), int), hidden)
 
 
 def device_mesh(config: TrainConfig) -> Mesh:
@@ -156,19 +108,12 @@ def make_update(
     def update(state: TrainState, worlds: Worlds) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(seed, state.iteration)
         worlds = worlds._replace(hidden=state.hidden * worlds.remembers[:, None])
-        memory = start_memory(config, worlds)
-        if state.carry is not None:
-            worlds, memory = next_worlds(config, state.carry, worlds, memory)
-        gradient, loss, records, end = gradient_of(state.params, worlds, key, delta, memory)
-        carry = None
-        if state.carry is not None:
-            left = rollouts_left(config, state.carry.left, worlds, end)
-            carry = Carry(worlds, end, left)
+        gradient, loss, records = gradient_of(state.params, worlds, key, delta)
         change, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
         # optax types any tree of parameters; it gives back the one it was given.
         params = cast(network.Params, optax.apply_updates(state.params, change))
         hidden = sample_hidden(jax.random.fold_in(key, config.episode.batch), records, state.hidden)
-        state = TrainState(params, optimizer_state, state.iteration + 1, hidden, carry)
+        state = TrainState(params, optimizer_state, state.iteration + 1, hidden)
         return state, curve_numbers(loss, gradient, records)
 
     return update
