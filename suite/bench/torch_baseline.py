@@ -15,7 +15,7 @@ from policies.torch_twin import torch_twin
 from suite.bench import torch_scene
 from suite.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
-from suite.train.losses import MAX_PULL, UNIT_FIELD
+from suite.train.losses import APPROACH_FREE_M, MAX_PULL, UNIT_FIELD
 from suite.train.point_mass import GRAVITY, Constants
 from suite.train.rollout import BEYOND_M
 from suite.train.worlds import Worlds
@@ -183,8 +183,10 @@ class Baseline:
         loss = loss + config.jerk * (jerk**2).sum(-1)
 
         local = to_local(aim.rot_w, body.pos_w - aim.center_w).detach()
-        shift = config.approach_m * (local[:, :1] > 0)
-        to_gate = aim_w - shift * aim.rot_w[:, :, 0] - body.pos_w
+        off = local[:, 1:].norm(dim=-1) + local[:, 0].clamp(min=0)
+        ahead = (aim_w == aim.center_w).all(-1)  # past the last gate the point is no gate's centre
+        shift = ahead * (off - APPROACH_FREE_M).clamp(0.0, config.approach_m)
+        to_gate = aim_w - shift[:, None] * aim.rot_w[:, :, 0] - body.pos_w
         towards = (body.vel_w * to_gate).sum(-1) / _norm(to_gate)
         loss = loss - config.progress * towards
         loss = loss - config.progress_norm * towards / (_norm(body.vel_w) + 1e-3)

@@ -61,8 +61,9 @@ class LossConfig:
     projection: float = 0.0
     """lambda_proj of L_proj, the scalar substitute for the field [1/m^2]."""
     approach_m: float = 0.0
-    """Beyond the gate's plane progress is measured towards a point this far in front of the gate,
-    so that a missed gate is not flown at from behind; 0: always towards its centre [m]."""
+    """Where the drone is off a gate's axis or beyond its plane, progress is measured towards a
+    point on the axis before the gate, by as much as it is off, at most this far: straight to the
+    centre the frame is in the way, and the drone hovers above it; 0: always the centre [m]."""
     projection_decay: float = 0.5
     """beta_3 of L_proj [1/m]."""
     barrier_height: float = 2.0
@@ -109,7 +110,8 @@ class EpisodeConfig:
     start_speed: float = 6.0
     """Largest speed of a world that starts on the way [m/s]."""
     missed_share: float = 0.0
-    """Share of the worlds that start on the way which start beyond their gate, having missed it."""
+    """Share of the worlds that start on the way which start beside or above their gate's frame, as
+    one does that has missed it."""
     sharp_share: float = 0.55
     """Share of tracks with one or two sharp turns."""
     density: tuple[float, float] = (0.0, 1.3)

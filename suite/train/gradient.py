@@ -59,7 +59,16 @@ def encoder_gradient(
 def make_gradient(
     config: TrainConfig,
 ) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
-    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) on one device."""
+    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) on one device.
+
+    Raises:
+        ValueError: where `episode.image_stride` does not divide `episode.steps`.
+    """
+    steps, stride = config.episode.steps, config.episode.image_stride
+    if stride < 1 or steps % stride:
+        raise ValueError(
+            f"episode.image_stride is {stride}, allowed are divisors of episode.steps ({steps})"
+        )
     rollout = make_rollout(config)
     width = config.spec.hidden_size
 
@@ -76,7 +85,6 @@ def make_gradient(
         (loss, records), (direct, cotangents) = jax.value_and_grad(
             rollout, argnums=(0, 1), has_aux=True
         )(params, nudge, worlds, key, frozen_encode, delta)
-        stride = config.episode.image_stride
         first = jax.random.randint(jax.random.fold_in(key, stride), (), 0, stride)
         images, cotangents = (
             _every(stride, first, array).reshape(-1, *array.shape[2:])

@@ -58,13 +58,28 @@ def obstacle_terms(
     return barrier.mean(-1), collide.mean(-1)
 
 
+APPROACH_FREE_M = 0.3
+"""So far off its axis a gate is still flown at straight [m]."""
+
+
+def approach_shift(config: LossConfig, local_g: jax.Array) -> jax.Array:
+    """Return how far before the gate the point lies that progress is measured to, (B,) [m].
+
+    Args:
+        config: the largest shift, `approach_m`.
+        local_g: (B, 3) positions in the gates' frames [m].
+    """
+    local_g = jax.lax.stop_gradient(local_g)
+    off = _norm(local_g[:, 1:]) + jnp.maximum(local_g[:, 0], 0.0)
+    return jnp.clip(off - APPROACH_FREE_M, 0.0, config.approach_m)
+
+
 def progress_term(
     config: LossConfig,
     pos_w: jax.Array,
     vel_w: jax.Array,
     target_w: jax.Array,
-    local_g: jax.Array,
-    normal_w: jax.Array,
+    lateral_g: jax.Array,
 ) -> jax.Array:
     """Return L_p with the ablation's variants L_p^norm and L_proj, weighted, (B,).
 
@@ -73,13 +88,8 @@ def progress_term(
         pos_w: (B, 3) [m].
         vel_w: (B, 3) [m/s].
         target_w: (B, 3) the point to fly to [m].
-        local_g: (B, 3) the position in the target gate's frame [m].
-        normal_w: (B, 3) the target gate's flight direction.
+        lateral_g: (B, 2) the position in the target gate's y-z plane [m].
     """
-    if config.approach_m > 0:
-        beyond = jax.lax.stop_gradient(local_g[:, :1] > 0)
-        target_w = target_w - jnp.where(beyond, config.approach_m, 0.0) * normal_w
-    lateral_g = local_g[:, 1:]
     to_gate = target_w - pos_w
     distance = _norm(to_gate)
     towards = (vel_w * to_gate).sum(-1) / distance

@@ -97,7 +97,7 @@ def _queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
     return line[:, 0], line[:, 1:]
 
 
-def _upright(batch: int, config: TrainConfig) -> jax.Array:
+def states_at_start(batch: int, config: TrainConfig) -> jax.Array:
     """Return the states on their way at the start, (B, state_delay, state_size): level, at rest."""
     size = config.spec.state_size
     return jnp.zeros((batch, config.physics.state_delay, size)).at[:, :, 5].set(1.0)
@@ -160,14 +160,15 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
             weights, body.acc_w, before.acc_w, worlds.constants.time_step
         )
         local = to_local(aim.rot_w, body.pos_w - aim.center_w)
+        ahead = target + passed < worlds.scene.gates.center_w.shape[1]
+        shift = ahead * losses.approach_shift(weights, local)
+        goal_w = aim_w - shift[:, None] * aim.rot_w[:, :, 0]
         terms = losses.Terms(
             clearance=weights.clearance * barrier,
             collide=weights.collide * collide,
             acceleration=size,
             jerk=change,
-            progress=losses.progress_term(
-                weights, body.pos_w, body.vel_w, aim_w, local, aim.rot_w[:, :, 0]
-            ),
+            progress=losses.progress_term(weights, body.pos_w, body.vel_w, goal_w, local[:, 1:]),
             guidance=losses.guidance_term(weights, gate, body.pos_w, body.vel_w),
         )
         return terms, distance.min(-1), passed
@@ -188,7 +189,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
             hidden=jnp.asarray(worlds.hidden),
             action_b=jnp.zeros((batch, 3)),
             embeddings=jnp.zeros((batch, physics.image_delay, width)),
-            states=_upright(batch, config),
+            states=states_at_start(batch, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
         )

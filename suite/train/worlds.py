@@ -84,16 +84,16 @@ def _on_the_way(
     return point, rng.uniform(0, speed_limit) * (towards + sideways), target
 
 
-def _past_a_gate(
+def _beside_a_gate(
     track: Track, speed_limit: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return position, velocity and next gate of a drone that has just missed that gate."""
+    """Return position, velocity and next gate of a drone that has missed that gate."""
     gates = track.scene.gates
     best = (-np.inf, track.start_pos_w, 0)
     for _ in range(6):
         target = int(rng.integers(0, len(gates.center_w)))
-        angle, beside = rng.uniform(-np.pi, np.pi), rng.uniform(0.8, 2.0)
-        point_g = np.array([rng.uniform(0.0, 1.5), beside * np.cos(angle), 0.5 * np.sin(angle)])
+        angle, beside = rng.uniform(-np.pi, np.pi), rng.uniform(0.9, 1.8)
+        point_g = np.array([rng.uniform(-0.7, 1.2), beside * np.cos(angle), beside * np.sin(angle)])
         point = gates.center_w[target] + gates.rot_w[target] @ point_g
         point[2] = max(point[2], 0.4)
         room = _clearance(track, point)
@@ -102,8 +102,8 @@ def _past_a_gate(
         if room > 0.5:
             break
     _, point, target = best
-    onward = gates.rot_w[target, :, 0] + rng.normal(0, 0.4, 3) * np.array([1.0, 1.0, 0.3])
-    return point, rng.uniform(0, 0.6 * speed_limit) * onward, target
+    onward = rng.uniform(0, 0.4) * gates.rot_w[target, :, 0] + rng.normal(0, 0.08, 3)
+    return point, speed_limit * onward, target
 
 
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
@@ -121,7 +121,7 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         if rest:
             starts.append((track.start_pos_w, np.zeros(3), 0))
         elif episode.missed_share > 0 and rng.random() < episode.missed_share:
-            starts.append(_past_a_gate(track, episode.start_speed, rng))
+            starts.append(_beside_a_gate(track, episode.start_speed, rng))
         else:
             starts.append(_on_the_way(track, episode.start_speed, rng))
     pos, vel, target = (np.stack(column) for column in zip(*starts, strict=True))
