@@ -97,6 +97,8 @@ class EpisodeConfig:
     image_stride: int = 1
     """The encoder's gradient is taken from one in so many of a rollout's images, with a random
     first one, and weighted accordingly: neighbours look alike. Must divide `steps`."""
+    gates: int = 8
+    """Gates of a track, the first so many of those that it is made with, at most 8."""
     difficulty: tuple[float, float] = (0.0, 1.0)
     """Range of the tracks' difficulty."""
     easy_until: float = 0.0

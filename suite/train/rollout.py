@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from policies import delta_network, network
 from policies.observation import encode_depth, state_vector
 from suite.train import losses, point_mass
-from suite.train.config import TrainConfig
+from suite.train.config import LossConfig, TrainConfig
 from suite.train.worlds import Worlds
 from tracks.camera import pixel_rays_b
 from tracks.clearance import nearest_obstacle
@@ -97,6 +97,69 @@ def _queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
     return line[:, 0], line[:, 1:]
 
 
+def make_look(
+    config: TrainConfig,
+) -> Callable[[Worlds, point_mass.Body, jax.Array], jax.Array]:
+    """Return look(worlds, body, key) -> (B, height, width), the encoded image with its noise."""
+    spec, physics = config.spec, config.physics
+    rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
+
+    def look(worlds: Worlds, body: point_mass.Body, key: jax.Array) -> jax.Array:
+        # Scaling the rays across the optical axis changes the field of view; every world of an
+        # iteration shares it, so that the rays stay one array.
+        axis = rays.mean(0)
+        wide = axis + (rays - axis) * worlds.fov_scale[0]
+        depth = depth_image(worlds.scene, body.pos_w, body.rot_w, wide, spec.camera.range_m, SEEN)
+        image = encode_depth(spec.depth, depth, spec.camera.range_m)
+        image = image + physics.depth_noise * jax.random.normal(key, image.shape)
+        return image.reshape(-1, spec.camera.height, spec.camera.width)
+
+    return look
+
+
+def make_judge(
+    weights: LossConfig,
+) -> Callable[..., tuple[losses.Terms, jax.Array, jax.Array]]:
+    """Return judge(worlds, before, body, target) -> (terms, clearance, passed), (B,) each.
+
+    It scores the step from `before` to `body` of worlds that have passed `target` gates: the
+    weighted terms, the smallest distance to a solid on the way [m] and whether a gate was passed.
+    """
+
+    def judge(
+        worlds: Worlds, before: point_mass.Body, body: point_mass.Body, target: jax.Array
+    ) -> tuple[losses.Terms, jax.Array, jax.Array]:
+        gate, _ = target_gate(worlds.scene.gates, target)
+        count = worlds.scene.gates.center_w.shape[1]
+        held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
+        passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
+        passed = passed & (target < count)
+        # A gate that was passed in this step is no goal any more: measured to it, progress would
+        # be backwards, and the drone learns to slow down in front of gates.
+        aim, aim_w = target_gate(worlds.scene.gates, target + passed)
+        local = to_local(aim.rot_w, body.pos_w - aim.center_w)
+        shift = (target + passed < count) * losses.approach_shift(weights, local)
+        goal_w = aim_w - shift[:, None] * aim.rot_w[:, :, 0]
+        share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
+        path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
+        distance, away = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path), NEAR)
+        barrier, collide = losses.obstacle_terms(weights, distance, away, path, body.vel_w)
+        size, change = losses.smoothness_terms(
+            weights, body.acc_w, before.acc_w, worlds.constants.time_step
+        )
+        terms = losses.Terms(
+            clearance=weights.clearance * barrier,
+            collide=weights.collide * collide,
+            acceleration=size,
+            jerk=change,
+            progress=losses.progress_term(weights, body.pos_w, body.vel_w, goal_w, local[:, 1:]),
+            guidance=losses.guidance_term(weights, gate, body.pos_w, body.vel_w),
+        )
+        return terms, distance.min(-1), passed
+
+    return judge
+
+
 def states_at_start(batch: int, config: TrainConfig) -> jax.Array:
     """Return the states on their way at the start, (B, state_delay, state_size): level, at rest."""
     size = config.spec.state_size
@@ -111,17 +174,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
     are (T, B, ...).
     """
     spec, physics, weights = config.spec, config.physics, config.loss
-    rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
-
-    def look(worlds: Worlds, body: point_mass.Body, key: jax.Array) -> jax.Array:
-        # Scaling the rays across the optical axis changes the field of view; every world of an
-        # iteration shares it, so that the rays stay one array.
-        axis = rays.mean(0)
-        wide = axis + (rays - axis) * worlds.fov_scale[0]
-        depth = depth_image(worlds.scene, body.pos_w, body.rot_w, wide, spec.camera.range_m, SEEN)
-        image = encode_depth(spec.depth, depth, spec.camera.range_m)
-        image = image + physics.depth_noise * jax.random.normal(key, image.shape)
-        return image.reshape(-1, spec.camera.height, spec.camera.width)
+    look, judge = make_look(config), make_judge(weights)
 
     def act(
         params: network.Params,
@@ -141,37 +194,6 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
             hidden=hidden, action_b=action, embeddings=embeddings, states=states
         )
         return action, memory
-
-    def judge(
-        worlds: Worlds, before: point_mass.Body, body: point_mass.Body, target: jax.Array
-    ) -> tuple[losses.Terms, jax.Array, jax.Array]:
-        gate, _ = target_gate(worlds.scene.gates, target)
-        held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
-        passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
-        passed = passed & (target < worlds.scene.gates.center_w.shape[1])
-        # A gate that was passed in this step is no goal any more: measured to it, progress would
-        # be backwards, and the drone learns to slow down in front of gates.
-        aim, aim_w = target_gate(worlds.scene.gates, target + passed)
-        share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
-        path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
-        distance, away = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path), NEAR)
-        barrier, collide = losses.obstacle_terms(weights, distance, away, path, body.vel_w)
-        size, change = losses.smoothness_terms(
-            weights, body.acc_w, before.acc_w, worlds.constants.time_step
-        )
-        local = to_local(aim.rot_w, body.pos_w - aim.center_w)
-        ahead = target + passed < worlds.scene.gates.center_w.shape[1]
-        shift = ahead * losses.approach_shift(weights, local)
-        goal_w = aim_w - shift[:, None] * aim.rot_w[:, :, 0]
-        terms = losses.Terms(
-            clearance=weights.clearance * barrier,
-            collide=weights.collide * collide,
-            acceleration=size,
-            jerk=change,
-            progress=losses.progress_term(weights, body.pos_w, body.vel_w, goal_w, local[:, 1:]),
-            guidance=losses.guidance_term(weights, gate, body.pos_w, body.vel_w),
-        )
-        return terms, distance.min(-1), passed
 
     def rollout(
         params: network.Params,

@@ -15,7 +15,7 @@ from tracks.cull import Bounds, bounds
 from tracks.families import MAX_COUNTS, random_track
 from tracks.families.random import Mix
 from tracks.scene import Array, Scene, stack
-from tracks.track import Track
+from tracks.track import Track, first_gates
 
 
 class Worlds(NamedTuple):
@@ -116,7 +116,7 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     rests = rng.uniform(size=batch) < episode.rest_share
     mix = Mix(episode.sharp_share, episode.density, episode.bare_share)
     for rest in rests:
-        track = random_track(rng.uniform(low, high), rng, mix)
+        track = first_gates(random_track(rng.uniform(low, high), rng, mix), episode.gates)
         tracks.append(track)
         if rest:
             starts.append((track.start_pos_w, np.zeros(3), 0))
