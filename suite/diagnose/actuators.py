@@ -8,11 +8,11 @@ logged commands, and the nominal lag follows them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 from eval.flight_log import FlightLog
@@ -25,8 +25,12 @@ HOLE_S = 0.1
 """Where rows are further apart the rotors are started anew [s]."""
 WARM_S = 0.2
 """What is left out after each start, for the lag [s]."""
-LONGEST_S = 0.1
-"""Largest lag and delay that are fitted [s]."""
+LONGEST_LAG_S = 0.15
+LONGEST_DELAY_S = 0.06
+DELAYS = 9
+"""Delays that are tried before the best is refined."""
+ENOUGH_S = 60.0
+"""Of flight; what is logged beyond does not count [s]."""
 
 
 class Apart(NamedTuple):
@@ -41,7 +45,7 @@ class Apart(NamedTuple):
     time_constant: float
     """Of the lag that fits best [s]."""
     delay: float
-    """Before it [s]."""
+    """Of the commands, before it [s]."""
     scale: tuple[float, ...]
     """Measured over asked, by rotor, beside that lag and delay."""
     rms_fitted: float
@@ -57,11 +61,14 @@ class Apart(NamedTuple):
         return 1.0 - (self.rms / max(self.spread, 1e-9)) ** 2
 
 
+Ask = Callable[[float], np.ndarray]
+"""Delay of the commands [s] -> (S, 4) rotor speeds that are asked for in each step [rad/s]."""
+
+
 class _Stretch(NamedTuple):
     """Rows without a hole, on the vehicle's steps."""
 
-    asked: np.ndarray
-    """(S, 4) rotor speeds that are asked for in each step [rad/s]."""
+    ask: Ask
     row: np.ndarray
     """(N,) step at whose start each measured row was taken."""
     measured: np.ndarray
@@ -73,36 +80,52 @@ def actuators_apart(logs: Sequence[FlightLog], vehicle: Vehicle) -> list[Apart]:
 
     Args:
         logs: flights; those without measured rotor speeds do not count.
-        vehicle: nominal values; of its effects those of the rotors do not count.
+        vehicle: nominal values; of its effects none counts.
 
     Returns:
         None, one or two of them: what the logs allow.
     """
     found = []
-    for asked_by, ask in (("nominal rate loop", _by_rate_loop), ("logged motor commands", _logged)):
-        stretches = [part for log in logs for part in _stretches(log, vehicle, ask)]
+    for asked_by, make in (
+        ("nominal rate loop", _by_rate_loop),
+        ("logged motor commands", _logged),
+    ):
+        stretches: list[_Stretch] = []
+        for log in logs:
+            if sum(len(part.row) for part in stretches) * step_s(vehicle) < ENOUGH_S:
+                stretches += _stretches(log, vehicle, make)
         if stretches:
             found.append(_compare(asked_by, stretches, vehicle))
     return found
 
 
-def _by_rate_loop(log: FlightLog, vehicle: Vehicle, at: np.ndarray) -> np.ndarray | None:
+def _by_rate_loop(log: FlightLog, vehicle: Vehicle, at: np.ndarray) -> Ask | None:
     if log.thrust_cmd is None or log.rate_cmd_b is None:
         return None
     command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-    held = _held(command, log.time_s, at)
     rates = np.stack([_line(at, log.time_s, r) for r in log.rate_b.T], axis=-1)
     plant = make_plant(vehicle, step_s(vehicle), {})
-    return np.asarray(wanted_speed(plant, Command(held[:, 0], held[:, 1:]), rates))
+
+    def ask(delay: float) -> np.ndarray:
+        # The loop knows the rates of now; what is late is the command.
+        late = _held(command, log.time_s, at - delay)
+        return np.asarray(wanted_speed(plant, Command(late[:, 0], late[:, 1:]), rates))
+
+    return ask
 
 
-def _logged(log: FlightLog, vehicle: Vehicle, at: np.ndarray) -> np.ndarray | None:
-    if log.rotor_speed_cmd is None:
+def _logged(log: FlightLog, vehicle: Vehicle, at: np.ndarray) -> Ask | None:
+    command = log.rotor_speed_cmd
+    if command is None:
         return None
-    return _held(log.rotor_speed_cmd, log.time_s, at)
+    return lambda delay: _held(command, log.time_s, at - delay)
 
 
-def _stretches(log: FlightLog, vehicle: Vehicle, ask: Any) -> list[_Stretch]:
+def _stretches(
+    log: FlightLog,
+    vehicle: Vehicle,
+    make: Callable[[FlightLog, Vehicle, np.ndarray], Ask | None],
+) -> list[_Stretch]:
     if log.rotor_speed is None:
         return []
     dt, found = step_s(vehicle), []
@@ -115,12 +138,12 @@ def _stretches(log: FlightLog, vehicle: Vehicle, ask: Any) -> list[_Stretch]:
         if time[-1] < 4.0 * WARM_S:
             continue
         at = log.time_s[part[0]] + dt * np.arange(int(time[-1] / dt) + 1)
-        asked = ask(log, vehicle, at)
-        if asked is None or not np.isfinite(asked).all():
+        ask = make(log, vehicle, at)
+        if ask is None or not np.isfinite(ask(0.0)).all():
             continue
         row = np.round(time / dt).astype(int)
         late = (row * dt >= WARM_S) & (row <= len(at))
-        found.append(_Stretch(asked, row[late], log.rotor_speed[part[late]]))
+        found.append(_Stretch(ask, row[late], log.rotor_speed[part[late]]))
     return found
 
 
@@ -128,25 +151,38 @@ def _compare(asked_by: str, stretches: Sequence[_Stretch], vehicle: Vehicle) -> 
     dt, lag = step_s(vehicle), vehicle.rotors.time_constant
     measured = np.concatenate([part.measured for part in stretches])
 
-    def followed(time_constant: float, delay: float) -> np.ndarray:
-        return np.concatenate([_follow(part, dt, time_constant, delay) for part in stretches])
+    def followed(asked: Sequence[np.ndarray], time_constant: float) -> np.ndarray:
+        parts = zip(asked, stretches, strict=True)
+        return np.concatenate([_follow(a, part.row, dt, time_constant) for a, part in parts])
 
-    def scales(asked: np.ndarray) -> np.ndarray:
-        return (asked * measured).sum(0) / np.maximum((asked**2).sum(0), 1e-9)
+    def scales(speed: np.ndarray) -> np.ndarray:
+        return (speed * measured).sum(0) / np.maximum((speed**2).sum(0), 1e-9)
 
-    def cost(at: np.ndarray) -> float:
-        asked = followed(*np.clip(at, 0.0, LONGEST_S))
-        return float(((measured - scales(asked) * asked) ** 2).mean())
+    def best_lag(delay: float) -> tuple[float, float]:
+        """Return the mean squared error that the best lag leaves, and the lag."""
+        asked = [part.ask(delay) for part in stretches]
 
-    nominal = followed(lag, 0.0)
-    # A coarse grid first: lag and delay trade for each other, and the valley is bent.
-    starts = [(tau, late) for tau in (0.0, 0.02, 0.05) for late in (0.0, 0.02)]
-    begin = min(starts, key=lambda at: cost(np.array(at)))
-    simplex = np.array([begin, (begin[0] + 0.01, begin[1]), (begin[0], begin[1] + 0.01)])
-    options = {"initial_simplex": simplex, "xatol": 2e-4, "fatol": 1e-3, "maxiter": 80}
-    best = minimize(cost, begin, method="Nelder-Mead", options=options)
-    time_constant, delay = (float(v) for v in np.clip(best.x, 0.0, LONGEST_S))
-    fitted = followed(time_constant, delay)
+        def cost(time_constant: float) -> float:
+            speed = followed(asked, time_constant)
+            return float(((measured - scales(speed) * speed) ** 2).mean())
+
+        options = {"xatol": 1e-4}
+        best = minimize_scalar(cost, bounds=(0.0, LONGEST_LAG_S), method="bounded", options=options)
+        return min((float(best.fun), float(best.x)), (cost(0.0), 0.0))
+
+    tried = np.linspace(0.0, LONGEST_DELAY_S, DELAYS)
+    place = int(np.argmin([best_lag(delay)[0] for delay in tried]))
+    near = (tried[max(place - 1, 0)], tried[min(place + 1, DELAYS - 1)])
+    options = {"xatol": 2e-4}
+    refined = minimize_scalar(
+        lambda delay: best_lag(delay)[0], bounds=near, method="bounded", options=options
+    )
+    delay = float(refined.x)
+    if best_lag(0.0)[0] <= float(refined.fun):
+        delay = 0.0
+    _, time_constant = best_lag(delay)
+    nominal = followed([part.ask(0.0) for part in stretches], lag)
+    fitted = followed([part.ask(delay) for part in stretches], time_constant)
     scale = scales(fitted)
     thrust, turn = _wrench_difference(measured, nominal, vehicle)
     return Apart(
@@ -162,18 +198,12 @@ def _compare(asked_by: str, stretches: Sequence[_Stretch], vehicle: Vehicle) -> 
     )
 
 
-def _follow(part: _Stretch, dt: float, time_constant: float, delay: float) -> np.ndarray:
-    """Return the rotor speeds (N, 4) at the rows after the delay and the lag."""
-    steps = delay / dt
-    index = np.maximum(np.arange(len(part.asked)) - steps, 0.0)
-    low = np.floor(index).astype(int)
-    share = (index - low)[:, None]
-    late = (1.0 - share) * part.asked[low] + share * part.asked[np.minimum(low + 1, len(low) - 1)]
+def _follow(asked: np.ndarray, row: np.ndarray, dt: float, time_constant: float) -> np.ndarray:
+    """Return the rotor speeds (N, 4) at the rows after the lag."""
     left = np.exp(-dt / time_constant) if time_constant > 1e-6 else 0.0
-    follows = np.asarray(lfilter([1.0 - left], [1.0, -left], late, axis=0, zi=left * late[:1])[0])
+    follows = np.asarray(lfilter([1.0 - left], [1.0, -left], asked, axis=0, zi=left * asked[:1])[0])
     # follows[k] is the speed at the end of step k, which is the start of step k + 1.
-    speed = np.concatenate([late[:1], follows])
-    return speed[part.row]
+    return np.concatenate([asked[:1], follows])[row]
 
 
 def _wrench_difference(

@@ -1,4 +1,4 @@
-"""Broken logs end in a verdict with warnings or in an error that says what is wrong; never worse."""
+"""Broken logs end in a verdict with warnings or in an error that says what is wrong."""
 
 import json
 
