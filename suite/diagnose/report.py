@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from eval.effects import EFFECTS
@@ -11,6 +11,8 @@ from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.proof import Proof
 from suite.diagnose.report_logs import actuators_section, logs_section, noise_section
 from suite.diagnose.report_proof import evidence_section, rest_section
+from suite.diagnose.search import P_VALUE
+from suite.diagnose.select import FLIPS
 from suite.diagnose.windows import UNITS
 from suite.report import Cell, Details, Grid, Links, Part, Picture, Report, Section
 
@@ -100,21 +102,21 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
     rows = []
     for effect in found["effects"]:
         removed, chance = effect["gap_removed"], effect["p_value"]
-        for name, entry in effect["parameters"].items():
+        for label, value, span in _components(effect["parameters"]):
             rows.append(
                 [
                     Cell(effect["name"]),
                     Cell(", ".join(effect["alternatives"]) or "none"),
-                    Cell(f"{name} [{entry['unit']}]"),
-                    Cell(_number(entry["value"])),
-                    Cell(_number(entry["ci95"]) if entry["ci95"] is not None else "given"),
+                    Cell(label),
+                    Cell("not seen" if value is None else _number(value)),
+                    Cell("" if span is None else f"{_number(span[0])} to {_number(span[1])}"),
                     Cell("exempt" if removed is None else f"{100 * removed:.0f} %"),
                     Cell(f"{chance:.2g}"),
                 ]
             )
     headers = ["effect", "cannot be told from", "parameter", "total", "95 %", "of the gap", "p"]
     words = [
-        f"{effect['name']}: {EFFECTS[effect['name']].summary} {EFFECTS[effect['name']].equation}"
+        f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
         for effect in found["effects"]
     ]
     note = (
@@ -122,6 +124,17 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
         "share that this effect takes away when it is added last."
     )
     return [*words, Grid("", headers, rows, note=note)]
+
+
+def _components(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield label, value and interval of every component, None where there is none."""
+    for name, entry in parameters.items():
+        value, span, unit = entry["value"], entry["ci95"], entry["unit"]
+        if not isinstance(value, list):
+            yield f"{name} [{unit}]", value, span
+            continue
+        for k, one in enumerate(value):
+            yield f"{name} {k + 1} [{unit}]", one, span[k] if span else None
 
 
 def _where(found: Mapping[str, Any], proof: Proof) -> Section:
@@ -184,9 +197,9 @@ def _candidates(diagnosis: Diagnosis) -> Section:
     words = (
         f"All {len(scores)} candidates, each fitted alone before anything was named. The gain is "
         "the fall of the whitened squared error on stretches that its fit did not see. The null: "
-        "the signs of whole stretches are shuffled 999 times, and the best gain of all candidates "
-        "is taken each time; p is how often that is as large. One name follows another while "
-        "p is at most 0.01; then all are refitted jointly."
+        f"the signs of whole stretches are shuffled {FLIPS} times, and the best gain of all "
+        "candidates is taken each time; p is how often that is as large. One name follows another "
+        f"while p is at most {P_VALUE:g}; then all are refitted jointly."
     )
     table = "\n".join(f"{c[0].text:24}{c[1].text:>12}{c[2].text:>8}  {c[3].text}" for c in rows)
     return Section(
@@ -252,9 +265,5 @@ def _written(found: Mapping[str, Any], toml: str, files: set[str]) -> Section:
     return Section("8. What was written", parts)
 
 
-def _number(value: Any) -> str:
-    if value is None:
-        return "not seen"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_number(v) for v in value) + "]"
+def _number(value: float) -> str:
     return f"{value:.4g}"
