@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from eval.effects import EFFECTS
+from suite.diagnose.answer import components
 from suite.diagnose.charts import drift_chart, gains_chart, where_chart
 from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.proof import Proof
@@ -102,7 +103,7 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
     rows = []
     for effect in found["effects"]:
         removed, chance = effect["gap_removed"], effect["p_value"]
-        for label, value, span in _components(effect["parameters"]):
+        for label, value, span in components(effect["parameters"]):
             rows.append(
                 [
                     Cell(effect["name"]),
@@ -124,17 +125,6 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
         "share that this effect takes away when it is added last."
     )
     return [*words, Grid("", headers, rows, note=note)]
-
-
-def _components(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield label, value and interval of every component, None where there is none."""
-    for name, entry in parameters.items():
-        value, span, unit = entry["value"], entry["ci95"], entry["unit"]
-        if not isinstance(value, list):
-            yield f"{name} [{unit}]", value, span
-            continue
-        for k, one in enumerate(value):
-            yield f"{name} {k + 1} [{unit}]", one, span[k] if span else None
 
 
 def _where(found: Mapping[str, Any], proof: Proof) -> Section:
