@@ -43,6 +43,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
+    from suite.diagnose.answer import components
     from suite.diagnose.run import Wishes, diagnose_files
 
     wishes = Wishes(
@@ -53,8 +54,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         recording=config.recording,
         seed=config.seed,
     )
-    from suite.diagnose.answer import components
-
     result = diagnose_files(config.flights, config.vehicle, wishes, config.out, console)
     console.say(f"verdict: {result['verdict']}")
     for effect in result["effects"]:
