@@ -197,7 +197,7 @@ def fly_period(
             (memory, motion, time_s),
             draws,
             length=cut.physics,
-            unroll=cut.physics,
+            unroll=min(cut.physics, 2),
         )
         return (heading_w, *inner), None
 
