@@ -60,6 +60,9 @@ STAGES = 17
 """How many stages a loop has."""
 DIAGNOSED_S = 80.0
 """The diagnosis gets about this much flight, of all tracks and levels in turn [s]."""
+DRIVE = "commands"
+"""The judge's rate loop is the vehicle file's, so the diagnosis need not ask whose it is; driven by
+rotor speeds a wrong torque runs away within a second."""
 DIAGNOSIS_S = 90.0
 """How long it takes, for the estimate [s]."""
 QUADROTOR_COST = 3.0
@@ -177,7 +180,7 @@ def _diagnose(config: HiddenConfig, stages: Stages) -> dict[str, Any]:
         listed = json.loads((measured / "diagnosed.json").read_text(encoding="utf-8"))
         paths = [measured / name for name in listed["files"]]
         try:
-            diagnose_files(paths, config.vehicle, "auto", folder, stages.console)
+            diagnose_files(paths, config.vehicle, DRIVE, folder, stages.console)
         except ValueError as error:
             raise WorkFailed(f"the flights in {measured} cannot be diagnosed: {error}") from error
 
