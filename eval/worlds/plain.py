@@ -94,7 +94,11 @@ def fly_trial(
         # Ask the policy when it is its time.
         gate_w = gates.center_w[None, passed]
         if step == np.rint(decisions * (1 / (spec.rate_hz * dt))):
-            state = state_vector(motion.pos_w, motion.vel_w, motion.rot_w, gate_w, action_b)
+            second_w = gates.center_w[None, min(passed + 1, count - 1)]
+            state = state_vector(
+                motion.pos_w, motion.vel_w, motion.rot_w, gate_w, action_b,
+                second_w if spec.second_gate else None,
+            )  # fmt: skip
             depth = eye.image(model, data, pos_w, motion.rot_w[0])
             image = encode_depth(spec.depth, depth[None], spec.camera.range_m)
             fresh = np.full(rows, decisions == 0)

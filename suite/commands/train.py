@@ -64,6 +64,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     import jax
 
     from policies.delta_file import load_delta
+    from policies.network import fitted
     from policies.policy_file import load_policy_checkpoint
     from suite.train.run import train
 
@@ -71,6 +72,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     params, delta = None, None
     if config.from_ is not None:
         params = jax.tree.map(jax.numpy.asarray, load_policy_checkpoint(config.from_).params)
+        params = fitted(params, resolve(config).spec)
     if config.delta is not None:
         stored = load_delta(config.delta)
         corrects = stored.config.get("fit", {}).get("model", "point")
