@@ -75,7 +75,7 @@ def start(pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> Body:
     return Body(pos_w, vel_w, zero, zero, rot_w, heading_w, commands)
 
 
-def faded(x: jax.Array, factor: jax.Array) -> jax.Array:
+def faded(x: jax.Array, factor: jax.Array | float) -> jax.Array:
     """Return x, with its gradient multiplied by factor (gradient decay of Zhang et al. 2025)."""
     return x * factor + jax.lax.stop_gradient(x * (1 - factor))
 
