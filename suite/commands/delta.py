@@ -64,7 +64,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     else:
         quad = recipe.quadrotor
         fitted = fit_quadrotor_delta(fitting, quad, config.flights, config.out, console)
-        words = quadrotor_table(fitted, quad.vehicle.name, fitting.horizon_s)
+        words = quadrotor_table(fitted, fitting.horizon_s)
         errors = {"without": fitted.without, "delta_action": fitted.with_delta}
     console.say(words)
     console.say(f"delta: {config.out / 'delta'}")

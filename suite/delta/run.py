@@ -117,7 +117,7 @@ def fit_quadrotor_delta(
         "delta_action": result.with_delta,
         "curve": result.curve,
     }
-    words = quadrotor_table(result, quad.vehicle.name, config.horizon_s)
+    words = quadrotor_table(result, config.horizon_s)
     _write(config, held, result.params, summary, words, out)
     return result
 
@@ -147,11 +147,11 @@ def _write(
     write_text(out / "table.md", words)
 
 
-def quadrotor_table(result: Network, vehicle: str, horizon_s: float) -> str:
+def quadrotor_table(result: Network, horizon_s: float) -> str:
     """Return the held-out errors through the quadrotor as a Markdown table."""
     rows = (
-        (f"quadrotor {vehicle}", result.without),
-        ("with Delta Action Model", result.with_delta),
+        ("quadrotor of the vehicle file", result.without),
+        ("quadrotor with Delta Action Model", result.with_delta),
     )
     return _markdown(rows, horizon_s, "the quadrotor's")
 

@@ -40,6 +40,7 @@ from suite.loop.hidden_report import (
     NAMED,
     NOMINAL,
     REFERENCES,
+    TITLES,
     VARIANTS,
     named_effects,
     verdict,
@@ -69,6 +70,15 @@ QUADROTOR_COST = 3.0
 """A gradient step through the quadrotor over one through the point mass, for the estimate."""
 TUNED = (CONTROL, DELTA, NAMED, BOTH)
 """The fine-tuned policies."""
+WHOSE = {CONTROL: "the simulation's quadrotor", NAMED: "the corrected quadrotor"}
+"""What is corrected by the Delta Action Models."""
+AS = {
+    CONTROL: "as the control",
+    DELTA: "with the Delta Action Model",
+    NAMED: "with the named effect",
+    BOTH: "with both",
+}
+"""How, in words."""
 
 
 def run_hidden_loop(config: HiddenConfig, out: Path, console: Console) -> dict[str, Any]:
@@ -98,14 +108,14 @@ def run_hidden_loop(config: HiddenConfig, out: Path, console: Console) -> dict[s
     judged = {name: _judge(config, stages, name, given) for name in (NOMINAL, BEFORE)}
     record(stages, _collection(config, given))
     found = _diagnose(config, stages)
-    for name in (CONTROL, NAMED):
+    for name in WHOSE:
         _fit(config, stages, name)
     for name in TUNED:
         policies[name] = _tune(config, stages, name, given)
     for name in TUNED:
         judged[name] = _judge(config, stages, name, policies[name])
     words = "flying a few trials again for the recording and the pictures"
-    shown = {name: (LABELS[name], policies[name]) for name in (BEFORE, NAMED)}
+    shown = {name: (TITLES[name], policies[name]) for name in (BEFORE, NAMED)}
     judgement = _judgement(config, BEFORE, given)
     stages.do("replays", words, lambda folder: write_replays(judgement, shown, folder))
     results = {name: read_trials(judged[name] / "trials.parquet") for name in VARIANTS}
@@ -124,7 +134,7 @@ def estimate(config: HiddenConfig, stages: Stages) -> Estimate:
         "flights": flying(flights),
         "measured": Estimate(1 + 0.05 * flights, 0),
         "diagnosis": Estimate(DIAGNOSIS_S, 1.5e9),
-        **{f"delta-{name}": fitting for name in (CONTROL, NAMED)},
+        **{f"delta-{name}": fitting for name in WHOSE},
         **{f"tuned-{name}": tune for name in TUNED},
         **{f"eval-{name}": flying(trials) for name in VARIANTS},
         "replays": flying(12),
@@ -147,7 +157,7 @@ def _judge(config: HiddenConfig, stages: Stages, variant: str, policy: Path) -> 
     where = "the simulation's vehicle" if variant == NOMINAL else "the hidden world"
     words = f"judging the policy in {where}"
     if variant in TUNED:
-        words = f"judging the one {LABELS[variant]} in {where}, on the same seeds"
+        words = f"judging the one fine-tuned {AS[variant]}, on the same seeds"
     return judge(stages, f"eval-{variant}", words, _judgement(config, variant, policy))
 
 
@@ -217,8 +227,8 @@ def _fit(config: HiddenConfig, stages: Stages, variant: str) -> None:
                 f"{stages.out / 'measured'}: {error}; record more (--flights), with another --out"
             ) from error
 
-    whose = "the corrected vehicle" if variant == NAMED else "the simulation's vehicle"
-    folder = stages.do(f"delta-{variant}", f"fitting the Delta Action Model of {whose}", work)
+    words = f"fitting the Delta Action Model of {WHOSE[variant]}"
+    folder = stages.do(f"delta-{variant}", words, work)
     for line in (folder / "table.md").read_text(encoding="utf-8").splitlines():
         stages.console.note(f"    {line}")
 
@@ -253,8 +263,9 @@ def _conclude(
     tables = [overall_grid(stand, REFERENCES, LABELS, trials), cell_grid(stand, LABELS)]
     words = verdict(stand, found, trials)
     errors = [
-        (out / f"delta-{name}" / "table.md").read_text(encoding="utf-8")
-        for name in (CONTROL, NAMED)
+        f"Delta Action Model of {whose}\n\n"
+        + (out / f"delta-{name}" / "table.md").read_text(encoding="utf-8")
+        for name, whose in WHOSE.items()
     ]
     header = stamp(1, config.seed)
     marks = "; ".join(f"{key}: {value}" for key, value in header.items())

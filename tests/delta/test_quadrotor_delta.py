@@ -141,7 +141,7 @@ def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path):
     assert stored.config["fit"]["model"] == "quad"
     for name, value in result.params.items():
         np.testing.assert_array_equal(stored.params[name], value)
-    assert "quadrotor plain" in (tmp_path / "out" / "table.md").read_text()
+    assert "| quadrotor with Delta Action Model |" in (tmp_path / "out" / "table.md").read_text()
 
 
 def test_logs_without_actions_are_refused(logs):
