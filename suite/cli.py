@@ -32,7 +32,7 @@ COMMANDS: dict[str, str] = {
     "loop": "train, fly, record, fit the Delta Action Model, fine-tune, fly again",
     "tracks": "list the track families, or draw a track as a picture",
     "delta": "fit the Delta Action Model to recorded flights",
-    "train": "train a policy by backpropagation through the point mass",
+    "train": "train a policy by backpropagation through a point mass or a quadrotor",
     "view": "a recording, pictures and a video of trials",
 }
 """Name -> one-line summary; the command NAME lives in suite/commands/NAME.py."""
