@@ -25,7 +25,7 @@ from policies.policy_file import load_policy_checkpoint
 from suite.collect import Collection
 from suite.console import Console
 from suite.delta.run import PLANT_STEPS_S, fit_quadrotor_delta
-from suite.diagnose.run import diagnose_files
+from suite.diagnose.run import Wishes, diagnose_files
 from suite.errors import WorkFailed
 from suite.estimate import Estimate, announce
 from suite.evaluate import Judgement
@@ -189,8 +189,9 @@ def _diagnose(config: HiddenConfig, stages: Stages) -> dict[str, Any]:
     def work(folder: Path) -> None:
         listed = json.loads((measured / "diagnosed.json").read_text(encoding="utf-8"))
         paths = [measured / name for name in listed["files"]]
+        wishes = Wishes(drive=DRIVE, seed=config.seed)
         try:
-            diagnose_files(paths, config.vehicle, DRIVE, folder, stages.console)
+            diagnose_files(paths, config.vehicle, wishes, folder, stages.console)
         except ValueError as error:
             raise WorkFailed(f"the flights in {measured} cannot be diagnosed: {error}") from error
 
