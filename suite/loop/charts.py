@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from eval.stats import Interval
+from suite.charts import png, titled
 from suite.loop.compare import BEFORE, WITH, WITHOUT, Line
 
 COLOURS = {BEFORE: "#8b93a1", WITHOUT: "#e0892b", WITH: "#2463c9"}
 LABELS = {BEFORE: "before", WITHOUT: "tuned without delta", WITH: "tuned with delta"}
-GRID = "#e6e9ee"
-DPI = 130
 
 
 def comparison_chart(lines: Sequence[Line]) -> bytes:
@@ -31,7 +28,7 @@ def comparison_chart(lines: Sequence[Line]) -> bytes:
         (right, "Mean speed, median over trials [m/s]", 1, lambda line: line.v_mean),
     ):
         _dots(axes, lines, scale, pick)
-        axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
+        titled(axes, title)
         axes.set_xticks(range(len(lines)), names, fontsize=8)
         if lines[-1].difficulty is None and len(lines) > 1:
             axes.axvline(len(lines) - 1.5, color="#b8bec8", lw=0.8)
@@ -39,7 +36,7 @@ def comparison_chart(lines: Sequence[Line]) -> bytes:
     right.set_ylim(bottom=0)
     handles, labels = left.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    return _png(figure)
+    return png(figure)
 
 
 def _dots(
@@ -51,7 +48,6 @@ def _dots(
         reach = np.maximum([value - low, high - value], 0)
         style = {"fmt": "o", "ms": 5.5, "lw": 1.8, "capsize": 0}
         axes.errorbar(at, value, reach, color=COLOURS[variant], label=LABELS[variant], **style)
-    _plain(axes)
 
 
 def training_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
@@ -74,13 +70,12 @@ def training_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
             axes.plot(at, values, color=COLOURS[variant], lw=0.7, alpha=0.25)
             label = "training" if variant == BEFORE else LABELS[variant]
             axes.plot(at, _smooth(values), color=COLOURS[variant], lw=1.8, label=label)
-        axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
+        titled(axes, title)
         axes.set_xlabel("iteration", fontsize=9)
         axes.set_ylim(bottom=0)
-        _plain(axes)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    return _png(figure)
+    return png(figure)
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
@@ -112,21 +107,6 @@ def delta_chart(fitted: Mapping[str, Any]) -> bytes:
     axes.set_ylim(bottom=0)
     axes.set_xlabel("iteration of the fit", fontsize=9)
     title = f"Position error after {fitted['horizon_s']:g} s [m]"
-    axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
-    _plain(axes)
+    titled(axes, title)
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    return _png(figure)
-
-
-def _plain(axes: Axes) -> None:
-    axes.grid(color=GRID, lw=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=8)
-
-
-def _png(figure: Figure) -> bytes:
-    FigureCanvasAgg(figure)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=DPI)
-    return file.getvalue()
+    return png(figure)
