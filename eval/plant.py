@@ -117,6 +117,11 @@ def make_plant(
     """
     given = dict(vehicle.effects) if effects is None else effects
     values = {find_effect(name).name: as_arrays(value) for name, value in given.items()}
+    return assemble(*nominal_quadrotor(vehicle), values, dt, max_delay)
+
+
+def nominal_quadrotor(vehicle: Vehicle) -> tuple[Nominal, Constants]:
+    """Return what the controller believes of `vehicle`, and its constants without any effect."""
     rotors = vehicle.rotors
     constants = Constants(
         mass=np.asarray(vehicle.mass),
@@ -131,9 +136,6 @@ def make_plant(
         rate_gain=np.asarray(vehicle.controller.rate_gain),
         delay=np.asarray(0.0),
     )
-    for name, value in _in_order(values):
-        change = EFFECTS[name].constants
-        constants = constants if change is None else change(value, constants)
     nominal = Nominal(
         mass=np.asarray(vehicle.mass),
         inertia=np.asarray(vehicle.inertia),
@@ -146,10 +148,32 @@ def make_plant(
         thrust_coefficient=np.asarray(rotors.thrust_coefficient),
         spin=np.asarray(rotors.spin, dtype=float),
     )
+    return nominal, constants
+
+
+def assemble(
+    nominal: Nominal,
+    constants: Constants,
+    values: Mapping[str, Any],
+    dt: float,
+    max_delay: float | None = None,
+) -> Plant:
+    """Return the plant of a nominal quadrotor with effects; every array may be traced.
+
+    Args:
+        nominal: from `nominal_quadrotor`.
+        constants: the same.
+        values: of effects, as arrays, by name.
+        dt: length of a step [s].
+        max_delay: as `make_plant` has it.
+    """
+    for name, value in _in_order(values):
+        change = EFFECTS[name].constants
+        constants = constants if change is None else change(value, constants)
     if max_delay is None:
         max_delay = float(np.max(constants.delay))
     weight = _delay_weight(constants.delay, dt, max_delay)
-    return Plant(nominal, constants, values, weight, np.asarray(dt))
+    return Plant(nominal, constants, dict(values), weight, np.asarray(dt))
 
 
 def start_memory(

@@ -114,8 +114,10 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 
 
 def _run(name: str, args: list[str]) -> int:
+    from suite.compiled import keep_compiled
     from suite.console import Console, stdout_kept_clean
 
+    keep_compiled()
     try:
         command, config = parse(name, args)
     except SystemExit as stop:

@@ -28,7 +28,7 @@ from suite.blind.outside import KINDS, make_outside
 from suite.blind.rotorpy_flight import fly_rotorpy
 from suite.blind.sensors import SENSORS, Sensors, log_of
 from suite.blind.strength import given_vehicle
-from suite.blind.windows import EVERY_S, cut, replay, whitened, window_plant, without_start
+from suite.blind.windows import EVERY_S, LONG_S, cut, replay, whitened, window_plant, without_start
 from suite.errors import WorkFailed
 from suite.plans.separating import SEPARATIONS
 from suite.plans.simulate import FlightFailed, Recording, fly
@@ -106,12 +106,16 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
         flights = fly(nominal, truth, ways, sensors.rate_hz, rng=rng, has_voltage=has_voltage)
     answer: dict[str, Any] = {"kind": case.kind, "verdict": "no_gap", "effects": []}
     named = {name: change for name, change in changes.items() if name != "gusts"}
-    info = None
+    info = long = None
     if named:
         stride = 4 if max(way.duration_s for way in ways) > 30.0 else 1
         windows = cut(flights, every_s=stride * EVERY_S)
         found = information(nominal, (), sensors, windows)
         info = Information(found.columns, stride * found.matrix)
+        length = min(LONG_S, 0.5 * max(way.duration_s for way in ways))
+        far = cut(flights, every_s=stride * length, horizon_s=length)
+        found = information(nominal, (), sensors, far)
+        long = Information(found.columns, stride * found.matrix)
         if case.kind == "pair":
             _check_pair(info, named, nominal)
     for name in case.hidden:
@@ -123,14 +127,16 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
             "required": [],
             "allowed": [],
         }
-        if info is not None and name in named:
+        if info is not None and long is not None and name in named:
             rows = info.rows_of(name)
             ratio = named[name] @ info.matrix[np.ix_(rows, rows)] @ named[name]
             entry["sigma"] = float(np.sqrt(ratio))
             rests = alternatives(info, named, nominal, bool(sensors.acc))[name]
-            entry["required"] = [other for other, rest in rests.items() if rest < REQUIRED]
+            hidden = alternatives(long, named, nominal, bool(sensors.acc))[name]
+            entry["required"] = [o for o in rests if hidden.get(o, np.inf) < REQUIRED]
             entry["allowed"] = [other for other, rest in rests.items() if rest < ALLOWED]
             entry["left_over"] = rests
+            entry["left_over_of_long_stretches"] = hidden
         answer["effects"].append(entry)
     if case.hidden:
         answer["verdict"] = "named"

@@ -35,10 +35,10 @@ from suite.plans.simulate import Recording
 THRESHOLD = 12.5
 """Expected log-likelihood ratio at which an effect can just be detected: five sigma."""
 REQUIRED = 2.0
-"""A name that leaves less log-likelihood ratio than this (two sigma) cannot be told from the truth
-and must be among the alternatives."""
+"""A name that leaves less log-likelihood ratio than this (two sigma) on long stretches cannot be
+told from the truth and must be among the alternatives."""
 ALLOWED = THRESHOLD
-"""A name that leaves less than this may be among the alternatives; one that leaves more may not."""
+"""A name that leaves less than this on short stretches may be among them, any other may not."""
 MOSTLY = 0.25
 """A name may stand for another only where it leaves less than this share of what that explains."""
 GUST_DRAWS = 24

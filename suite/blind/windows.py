@@ -24,6 +24,8 @@ HORIZON_S = 0.5
 """Length of a stretch [s]."""
 EVERY_S = 0.5
 """From the start of one stretch to the next [s]."""
+LONG_S = 2.0
+"""Length of stretches that show what short ones hide: an error of force grows with its square."""
 ROOM_S = 0.05
 """Commands before the start of a stretch that a delay may need [s]."""
 DELAY_STEP_S = 0.004
@@ -67,10 +69,18 @@ class Channels(NamedTuple):
     rotor_speed: np.ndarray
 
 
-def cut(recordings: Sequence[Recording], every_s: float = EVERY_S) -> Windows:
-    """Return the stretches of all `recordings`, which share their physics step and log rate."""
+def cut(
+    recordings: Sequence[Recording], every_s: float = EVERY_S, horizon_s: float = HORIZON_S
+) -> Windows:
+    """Return the stretches of all `recordings`, which share their physics step and log rate.
+
+    Args:
+        recordings: flights.
+        every_s: from the start of one stretch to the next [s].
+        horizon_s: length of a stretch [s].
+    """
     dt, period = recordings[0].dt, recordings[0].period
-    steps = round(HORIZON_S / dt / period) * period
+    steps = round(horizon_s / dt / period) * period
     room = round(ROOM_S / dt)
     stride = max(round(every_s / dt / period), 1) * period
     parts: list[list[Any]] = []

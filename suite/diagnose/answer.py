@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from eval.effects import EFFECTS
 from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.gap import HEADLINE_S, MEASURE, interval
 from suite.diagnose.search import Named
 from suite.diagnose.separate import advice
+from suite.diagnose.turbulence import Turbulence
+
+SHOWN = 5
+"""Shapes of the rest that are listed."""
 
 
 def answer(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -19,7 +25,8 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
         "verdict": diagnosis.verdict,
         "effects": [
             _effect(diagnosis, name) for name in dict.fromkeys(n.candidate.name for n in named)
-        ],  # fmt: skip
+        ]
+        + _gusts(diagnosis.turbulence),  # fmt: skip
         "gap": {
             "measure": MEASURE,
             "before": before.rms,
@@ -47,7 +54,12 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
             "effect": diagnosis.control[0],
             "after": diagnosis.control[1].rms,
         },  # fmt: skip
-        "unexplained": {"share": diagnosis.share_left, "where": diagnosis.where},
+        "unexplained": {
+            "share": diagnosis.share_left,
+            "where": diagnosis.where,
+            "shapes": [shape._asdict() for shape in diagnosis.rest.shapes[:SHOWN]],
+            "coloured": diagnosis.rest.coloured,
+        },
         "separate_with": [advice(n.candidate.name, rival) for n in named for rival in n.rivals],
         "driven_by": diagnosis.driven_by,
         "seconds": diagnosis.seconds,
@@ -67,6 +79,28 @@ def _effect(diagnosis: Diagnosis, name: str) -> dict[str, Any]:
         "gap_removed": min(max(removed, 0.0), 1.0),
         "p_value": max(n.p_value for n in ones),
     }
+
+
+def _gusts(found: Turbulence | None) -> list[dict[str, Any]]:
+    """Return the entry of random wind; no rollout repeats it, so that it takes no gap away."""
+    if found is None:
+        return []
+    return [
+        {
+            "name": "gusts",
+            "alternatives": [],
+            "parameters": {
+                "intensity": {
+                    "value": found.intensity,
+                    "unit": "m/s",
+                    "ci95": list(found.intensity_ci95),
+                },
+                "length": {"value": found.length, "unit": "m", "ci95": list(found.length_ci95)},
+            },
+            "gap_removed": None,
+            "p_value": float(np.exp(-found.ratio)),
+        }
+    ]
 
 
 def _parameters(diagnosis: Diagnosis, name: str, ones: list[Named]) -> dict[str, Any]:

@@ -13,31 +13,25 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.flight_log import FlightLog
 from eval.vehicle import Vehicle
+from suite.diagnose.drive import another_controller, choose_drive
 from suite.diagnose.evidence import Frame, State, fit
-from suite.diagnose.gap import Gap, measure
+from suite.diagnose.gap import Gap, measure, worse
 from suite.diagnose.intervals import errors_of
 from suite.diagnose.model import Model
 from suite.diagnose.parameters import candidates, indices_of, make_space
+from suite.diagnose.rest import Rest, push_of, rest_of
 from suite.diagnose.search import Finding, search, start_state
+from suite.diagnose.select import FEW, folds_of
+from suite.diagnose.turbulence import Turbulence, find_turbulence
+from suite.diagnose.verdict import COLOURED, SHAPED, Judgement, judge
 from suite.diagnose.windows import Windows, cut, take
 
-STRUCTURE = 1.15
-"""Slow errors above their expectation by this factor are no noise."""
-STRUCTURE_BY_ROTORS = 1.3
-"""The same where measured rotor speeds drive the model: their noise is known less well."""
-REST = 0.1
-"""A structured rest below this share of the gap is left unsaid."""
-MOSTLY = 0.5
-"""Where what was found explains less than this share of the gap, the gap is unknown."""
 OVERLAP_S = 0.25
 """From one start to the next of the rollouts that measure the gap [s]."""
+LEAST = 2
+"""Stretches to fit without which nothing can be left out."""
 ONE_FLIGHT = 0.7
 """Share of a lone flight that is fitted; the rest is held out."""
-FEW = 10
-"""Signs of fewer stretches can be shuffled in too few ways for a p-value of 1 %."""
-FOLLOWS = 0.5
-"""Rotor speeds that the nominal rate loop predicts worse than this share of their own spread are
-another controller's: they are the input then."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +54,9 @@ class Diagnosis:
     share_left: float
     """Structured rest over the structured gap before."""
     where: str | None
+    rest: Rest
+    """Structure in what is left over."""
+    turbulence: Turbulence | None
     driven_by: str
     seconds: float
     warnings: list[str]
@@ -72,6 +69,7 @@ def diagnose(
     vehicle: Vehicle,
     drive: str = "auto",
     say: Callable[[str], None] = lambda _: None,
+    seed: int = 0,
 ) -> Diagnosis:
     """Find what explains how `logs` differ from `vehicle`.
 
@@ -81,19 +79,20 @@ def diagnose(
         vehicle: the one that the simulation used.
         drive: what drives the model: "commands", "motors", or "auto".
         say: told of the search's steps.
+        seed: of the null's draws.
 
     Raises:
         ValueError: where no flight can be used, or not in the way that was asked for.
     """
     began = time.monotonic()
-    by_rotors, warnings = _choose_drive(logs, drive)
+    by_rotors, warnings = choose_drive(logs, drive), list[str]()
     space = make_space(vehicle)
     voltage = all(log.voltage is not None for log in logs)
     model = Model(vehicle, space, by_rotors, voltage)
     cut_, notes = cut(logs, vehicle, by_rotors)
     if cut_ is None:
         raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
-    if drive == "auto" and not by_rotors and _other_controller(model, cut_):
+    if drive == "auto" and not by_rotors and another_controller(model, cut_):
         warnings.append("the nominal rate loop does not give the measured rotor speeds; they drive")
         by_rotors = True
         model = Model(vehicle, space, by_rotors, voltage)
@@ -104,13 +103,14 @@ def diagnose(
     if broken:
         warnings.append(f"{broken} stretches left out: the model's flight from there diverges")
     inside, names = _split(logs, cut_)
-    if inside.sum() < 4:
+    if inside.sum() < LEAST:
         raise ValueError(
-            f"{int(inside.sum())} stretches of 1 s to fit, at least 4 are needed: fly longer"
+            f"{int(inside.sum())} stretches of 1 s to fit, at least {LEAST} are needed: fly longer"
         )
     if inside.sum() < FEW:
         warnings.append(
-            f"{int(inside.sum())} stretches of 1 s to fit: fewer than {FEW} cannot name"
+            f"{int(inside.sum())} stretches of 1 s to fit: too few for a null of their own, so "
+            "the null is drawn from the measured noise"
         )
     windows, rest = take(cut_, inside), take(cut_, ~inside)
     among = candidates(space, voltage, any(log.acc_b is not None for log in logs))
@@ -123,14 +123,22 @@ def diagnose(
     start = start_state(model, windows).theta
     before = measure(model, start, held, finding.sigma)
     after = measure(model, finding.state.theta, held, finding.sigma) if finding.named else before
-    if finding.named and after.rms > before.rms:
+    if finding.named and worse(before, after):
         warnings.append("what was found on the fitted flights does not hold on held-out ones")
         finding.named.clear()
-    verdict, share = _verdict(finding, STRUCTURE_BY_ROTORS if by_rotors else STRUCTURE)
-    if verdict in ("no_gap", "unknown"):
-        if finding.named:
-            labels = ", ".join(n.candidate.label for n in finding.named)
-            warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
+    push = push_of(model, windows, finding.frame, finding.state)
+    rest = rest_of(push, folds_of(windows.flight, windows.start_s), seed)
+    judgement = judge(finding, rest, by_rotors)
+    turbulence = None
+    repeats = any(shape.p_value <= SHAPED for shape in rest.shapes[:1])
+    blows = any(p <= COLOURED for axis, p in rest.coloured.items() if axis.startswith("force"))
+    if blows and not repeats:
+        turbulence = find_turbulence(model, finding.state.theta, push)
+    if turbulence:
+        judgement = Judgement("named", 0.0, None)
+    if judgement.verdict == "unknown" and finding.named:
+        labels = ", ".join(n.candidate.label for n in finding.named)
+        warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
         finding.named.clear()
         after = before
     without: dict[str, Gap] = {}
@@ -145,48 +153,25 @@ def diagnose(
         without[one.candidate.label] = measure(model, theta, held, finding.sigma)
     control = _control(model, windows, finding, held) if finding.named else None
     return Diagnosis(
-        verdict=verdict,
+        verdict=judgement.verdict,
         finding=finding,
-        vehicle=_with_effects(vehicle, model, finding) if finding.named else vehicle,
+        vehicle=_with_effects(vehicle, model, finding, turbulence),
         widths=errors_of(finding.sums),
         before=before,
         after=after,
         without=without,
         control=control,
         held_out=names,
-        share_left=share,
-        where=_where(finding) if verdict in ("partly", "unknown") else None,
+        share_left=judgement.share_left,
+        where=judgement.where,
+        rest=rest,
+        turbulence=turbulence,
         driven_by="measured rotor speeds" if by_rotors else "commands",
         seconds=time.monotonic() - began,
         warnings=warnings,
         model=model,
         held=held,
     )
-
-
-def _choose_drive(logs: Sequence[FlightLog], drive: str) -> tuple[bool, list[str]]:
-    commands = all(log.thrust_cmd is not None for log in logs)
-    motors = all(log.rotor_speed is not None for log in logs)
-    if drive not in ("auto", "commands", "motors"):
-        raise ValueError(f"drive = {drive!r}; allowed: auto, commands, motors")
-    if not commands and not motors:
-        raise ValueError("some flights have commands only and some rotor speeds only: sort them")
-    if (drive == "commands" and not commands) or (drive == "motors" and not motors):
-        raise ValueError(f"drive = {drive!r}, but not every flight has them")
-    return drive == "motors" or not commands, []
-
-
-def _other_controller(model: Model, windows: Windows) -> bool:
-    seen = np.asarray(windows.seen)[..., 15:]
-    if not seen.any():
-        return False
-    theta = model.space.array("start")
-    residual = model.residual(theta, np.zeros((len(windows.flight), model.free)), windows)[..., 15:]
-    early = seen & (np.asarray(windows.row_s) < 0.1)[..., None]
-    error = residual[early]
-    spread = np.std(np.asarray(windows.row_rotor_speed)[seen])
-    good = error[np.isfinite(error)]
-    return bool(len(good) and np.median(np.abs(good - np.median(good))) > FOLLOWS * spread)
 
 
 def _finite(model: Model, windows: Windows) -> tuple[Windows, int]:
@@ -224,24 +209,6 @@ def _held_out(
     return take(many, inside)
 
 
-def _verdict(finding: Finding, limit: float) -> tuple[str, float]:
-    before, after = float(finding.slow_before.mean()), float(finding.slow_after.mean())
-    share = max(after - 1.0, 0.0) / max(before - 1.0, 1e-3)
-    structured = after > limit
-    if not finding.named:
-        return ("unknown", 1.0) if structured else ("no_gap", 0.0)
-    if structured and share > MOSTLY:
-        return "unknown", share
-    return ("partly" if structured and share > REST else "named"), min(share, 1.0)
-
-
-def _where(finding: Finding) -> str:
-    groups = ("position", "attitude", "velocity", "rates")
-    energy = np.maximum(finding.slow_after.mean(axis=0) - 1.0, 0.0)
-    names = [f"{groups[k // 3]} {'xyz'[k % 3]}" for k in np.argsort(-energy)[:3] if energy[k] > 0]
-    return ", ".join(names)
-
-
 def _control(
     model: Model, windows: Windows, finding: Finding, held: Windows
 ) -> tuple[str, Gap] | None:
@@ -257,7 +224,9 @@ def _control(
     return wrong.label, measure(model, theta, held, finding.sigma)
 
 
-def _with_effects(vehicle: Vehicle, model: Model, finding: Finding) -> Vehicle:
+def _with_effects(
+    vehicle: Vehicle, model: Model, finding: Finding, turbulence: Turbulence | None
+) -> Vehicle:
     """Return `vehicle` with the named effects in place of what it has of them."""
     fitted: dict[str, Any] = model.space.effects(finding.state.theta)
     effects = dict(vehicle.effects)
@@ -267,5 +236,7 @@ def _with_effects(vehicle: Vehicle, model: Model, finding: Finding) -> Vehicle:
             plain = np.asarray(value, dtype=float)
             values.append(tuple(plain.tolist()) if plain.ndim else float(plain))
         effects[name] = type(fitted[name])(*values)
+    if turbulence:
+        effects["gusts"] = EFFECTS["gusts"].values(turbulence.intensity, turbulence.length)
     ordered = {name: effects[name] for name in EFFECTS if name in effects}
     return replace(vehicle, effects=MappingProxyType(ordered))

@@ -15,14 +15,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from suite.diagnose.model import KNOTS, STATE, Linear, Model
+from suite.diagnose.model import Linear, Model
 from suite.diagnose.noise import rotor_noise
+from suite.diagnose.rollout import KNOTS, STATE
 from suite.diagnose.windows import Windows
 
 SLOW = 5
 """Degree of the polynomials in which a model's error of a window would show."""
-
-
+DONE = 0.05
+"""A fit has converged where another round would lower its squared error by less than this."""
 ROOM = 1.5
 """Errors of rotor speeds may be this much larger, for what happens between the knots."""
 
@@ -121,7 +122,8 @@ def free(frame: Frame, white: np.ndarray) -> np.ndarray:
     return white - frame.start @ (np.swapaxes(frame.start, 1, 2) @ white)
 
 
-def _white_residual(frame: Frame, linear: Linear) -> np.ndarray:
+def white_residual(frame: Frame, linear: Linear) -> np.ndarray:
+    """Return the residuals of `linear` over their noise, (W, M)."""
     white = whiten(frame, linear.residual[..., None])
     if len(frame.prior):
         white[:, -len(frame.prior) :, 0] = -linear.offset[:, STATE:] * frame.prior
@@ -130,7 +132,7 @@ def _white_residual(frame: Frame, linear: Linear) -> np.ndarray:
 
 def sums_of(frame: Frame, linear: Linear, directions: int) -> Sums:
     """Return the normal equations of `linear` along its first `directions`."""
-    residual = free(frame, _white_residual(frame, linear))[..., 0]
+    residual = free(frame, white_residual(frame, linear))[..., 0]
     slope = free(frame, whiten(frame, linear.slope[..., :directions]))
     turned = np.swapaxes(slope, 1, 2)
     slow = np.einsum("wml,wm->wl", frame.slow, residual, optimize=True) ** 2
@@ -166,38 +168,51 @@ def fit(
     state: State,
     indices: list[int],
     rounds: int = 3,
+    known: Linear | None = None,
 ) -> tuple[State, Sums]:
     """Fit the numbers at `indices` and every window's start (Gauss-Newton, halved where it fails).
+
+    Args:
+        model: of the windows.
+        windows: W of them.
+        frame: their noise.
+        state: where to begin.
+        indices: places of the numbers to fit.
+        rounds: Gauss-Newton steps at most.
+        known: slopes at `state` along all directions, where they are known already.
 
     Returns:
         The best state, and its sums along `indices`.
     """
-    entries = model.space
-    low, high, scale = entries.array("low"), entries.array("high"), entries.array("step")
     at = np.array(indices, dtype=int)
+    low, high, scale = (model.space.array(name)[at] for name in ("low", "high", "step"))
 
     def look(state: State) -> tuple[Linear, Sums]:
         linear = model.linearise(state.theta, state.offset, windows, indices)
         return linear, sums_of(frame, linear, len(indices))
 
-    linear, sums = look(state)
+    def step(state: State, sums: Sums) -> tuple[np.ndarray, float]:
+        """Return the change of the numbers and the fall of the error that the slopes promise."""
+        square, cross = sums.square.sum(0), sums.cross.sum(0)
+        change = solve(square, cross, low - state.theta[at], high - state.theta[at], scale)
+        return change, float(2 * cross @ change - change @ square @ change)
+
+    if known is None:
+        linear, sums = look(state)
+    else:
+        linear = known._replace(slope=known.slope[..., at])
+        sums = sums_of(frame, linear, len(indices))
+    change, promised = step(state, sums)
     for _ in range(rounds):
         total = float(sums.error.sum())
-        change = solve(
-            sums.square.sum(0),
-            sums.cross.sum(0),
-            low[at] - state.theta[at],
-            high[at] - state.theta[at],
-            scale[at],
-        )
-        white = _white_residual(frame, linear)
+        white = white_residual(frame, linear)
         if len(at):
             white = white - whiten(frame, (linear.slope @ change)[..., None])
         begin = np.linalg.solve(frame.upper, np.swapaxes(frame.start, 1, 2) @ white)[..., 0]
         share = 1.0
         while share > 0.1:
             theta = state.theta.copy()
-            theta[at] = np.clip(theta[at] + share * change, low[at], high[at])
+            theta[at] = np.clip(theta[at] + share * change, low, high)
             trial = State(theta, state.offset + share * begin)
             new_linear, new_sums = look(trial)
             error = float(new_sums.error.sum())
@@ -207,6 +222,7 @@ def fit(
         else:
             break
         state, linear, sums = trial, new_linear, new_sums
-        if total - error < 0.05:
+        change, promised = step(state, sums)
+        if promised < DONE:
             break
     return state, sums

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.evidence import make_frame, rotor_spread, sums_of
-from suite.diagnose.model import STATE, Linear, Model
+from suite.diagnose.model import Linear, Model
+from suite.diagnose.rollout import STATE
 from suite.diagnose.windows import SLICES, Windows
 
 HORIZONS_S = (0.1, 0.5, 1.0)
@@ -45,7 +46,7 @@ class Gap(NamedTuple):
 def measure(model: Model, theta: np.ndarray, windows: Windows, sigma: np.ndarray) -> Gap:
     """Return the gap of `model` with the numbers `theta` on `windows`."""
     offset = _true_starts(model, theta, windows)
-    linear = model.linearise(theta, offset, windows, None)
+    linear = model.linearise(theta, offset, windows, model.starts)
     frame = make_frame(linear, sigma, windows)
     slow = sums_of(frame, linear, 0).slow
     score = slow.sum(axis=1) / frame.slow_freedom.sum(axis=1)
@@ -58,16 +59,26 @@ def measure(model: Model, theta: np.ndarray, windows: Windows, sigma: np.ndarray
     return Gap(score, table)
 
 
+def worse(before: Gap, after: Gap, seed: int = 0) -> bool:
+    """Return whether `after` is above `before` on the same windows by more than chance."""
+    rows = _blocks(len(after.score), seed)
+    grown = (after.score - before.score)[rows].mean(axis=1)
+    return bool(np.quantile(grown, 0.025) > 0.0)
+
+
 def interval(score: np.ndarray, seed: int = 0) -> tuple[float, float]:
     """Return the 95 % interval of the root mean score, windows drawn in blocks."""
-    rng = np.random.default_rng(seed)
-    count = len(score)
-    blocks = max(1, -(-count // BLOCK))
-    first = rng.integers(0, max(count - BLOCK + 1, 1), (DRAWS, blocks))
-    rows = np.minimum(first[..., None] + np.arange(BLOCK), count - 1).reshape(DRAWS, -1)
-    drawn = np.sqrt(score[rows].mean(axis=1))
+    drawn = np.sqrt(score[_blocks(len(score), seed)].mean(axis=1))
     low, high = np.quantile(drawn, [0.025, 0.975])
     return float(low), float(high)
+
+
+def _blocks(count: int, seed: int) -> np.ndarray:
+    """Return draws (DRAWS, ...) of `count` windows in blocks of neighbours."""
+    rng = np.random.default_rng(seed)
+    first = rng.integers(0, max(count - BLOCK + 1, 1), (DRAWS, max(1, -(-count // BLOCK))))
+    rows = np.minimum(first[..., None] + np.arange(BLOCK), count - 1)
+    return rows.reshape(DRAWS, -1)
 
 
 def _errors(

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eval.jax_quadrotor import euler_step
-from eval.plant import Command, Memory, Motion, make_plant, spin_step, wanted_speed
-from eval.rotors import follow, steady
+from eval.effects.interface import Constants
+from eval.plant import Nominal, assemble, nominal_quadrotor
 from eval.vehicle import Vehicle
-from suite.diagnose.parameters import Space
-from suite.diagnose.windows import CHANNELS, HISTORY_S, WARM_S, Windows, step_s
-from tracks.rotation import exp_rot
+from suite.diagnose.parameters import Layout, Space, effects_at
+from suite.diagnose.rollout import KNOTS, STATE, Flown, difference, fly_windows
+from suite.diagnose.windows import Windows, step_s
 
-STATE = 12
-"""Numbers of the state in which a window starts: pos_w, rotation vector, vel_w, rate_b."""
-KNOTS = 11
-"""Places in a window between which errors of measured rotor speeds run straight."""
-BATCH = 16
+BATCH = 12
 """Windows a call: one shape, compiled once."""
 FEW = 8
 """Directions of the cheaper call."""
@@ -37,6 +32,24 @@ class Linear(NamedTuple):
     """(W, N, 19, K) of the simulated values."""
     offset: np.ndarray
     """(W, F) of what is free in each window, where the residuals were taken."""
+
+
+class Response(NamedTuple):
+    """What a push at each knot of W windows does, and where the model is then."""
+
+    slope: np.ndarray
+    """(W, N, 19, KNOTS * 6) of the simulated values, per m/s^2 and rad/s^2 in body axes."""
+    knot: Flown
+    """(W, KNOTS, ...) the state at the knots."""
+
+
+class Given(NamedTuple):
+    """What a vehicle file fixes, as arrays, so that one compiled rollout serves every vehicle."""
+
+    nominal: Nominal
+    constants: Constants
+    base: dict[str, Any]
+    """Values of every effect."""
 
 
 class Model:
@@ -57,34 +70,36 @@ class Model:
         self.size = len(space.entries)
         self.free = STATE + (4 * KNOTS if driven_by_rotors else 0)
         """Numbers F that are free in each window: its start, and the rotor speeds' errors."""
-        predict = partial(_predict, vehicle, space, driven_by_rotors, voltage)
-
-        def linear(theta: Any, offset: Any, windows: Any, directions: Any) -> Any:
-            def along(direction: Any) -> Any:
-                tangent = (direction[: self.size], jnp.tile(direction[self.size :], (BATCH, 1)))
-                return jax.jvp(lambda t, x: predict(t, x, windows), (theta, offset), tangent)
-
-            values, slopes = jax.vmap(along, out_axes=(None, -1))(directions)
-            return values, slopes
-
-        self._predict: Callable[..., Any] = jax.jit(predict)
-        self._linear: Callable[..., Any] = jax.jit(linear)
+        self.starts = list(range(self.size, self.size + self.free))
+        """Places of the free numbers among all directions."""
+        base = {name: value for name, value in space.base.items() if name != "gusts"}
+        self.given = Given(*nominal_quadrotor(vehicle), base)
+        self.dt = step_s(vehicle)
+        """Length of a step [s]."""
+        self._kind = (space.layout, self.dt, driven_by_rotors, voltage)
+        self._linear = _slopes(*self._kind)
 
     def residual(self, theta: np.ndarray, offset: np.ndarray, windows: Windows) -> np.ndarray:
         """Return measured - simulated (W, N, 19) from starts moved by `offset` (W, F)."""
+        return self.linearise(theta, offset, windows, []).residual
+
+    def respond(self, theta: np.ndarray, offset: np.ndarray, windows: Windows) -> Response:
+        """Return what further forces and torques along each window would do to its rows."""
+        pushed = _responses(*self._kind)
         with jax.enable_x64(True):
             parts = [
-                np.asarray(self._predict(theta, x, w))[:count]
+                jax.tree.map(lambda x, n=count: np.asarray(x)[:n], pushed(self.given, theta, x, w))
                 for x, w, count in _batches(offset, windows)
             ]
-        return -np.concatenate(parts)
+        return jax.tree.map(lambda *p: np.concatenate(p), *parts)
 
     def linearise(
         self, theta: np.ndarray, offset: np.ndarray, windows: Windows, indices: list[int] | None
     ) -> Linear:
         """Return residuals and slopes along the numbers at `indices`, or along all and the start.
 
-        With `indices` None the directions are all numbers and then the F free ones.
+        With `indices` None the directions are all numbers and then the F free ones, whose places
+        are `starts`.
         """
         with jax.enable_x64(True):
             return self._linearise(theta, offset, windows, indices)
@@ -105,7 +120,7 @@ class Model:
                 groups.append(rows)
         values, slopes = [], []
         for x, w, count in _batches(offset, windows):
-            answers = [self._linear(theta, x, w, group) for group in groups]
+            answers = [self._linear(self.given, theta, x, w, group) for group in groups]
             values.append(np.asarray(answers[0][0])[:count])
             slopes.append(np.concatenate([np.asarray(a[1])[:count] for a in answers], axis=-1))
         width = self.size + self.free if indices is None else len(indices)
@@ -119,146 +134,56 @@ def _batches(offset: np.ndarray, windows: Windows) -> Any:
         yield offset[rows], Windows(*(f[rows] for f in windows)), min(BATCH, count - first)
 
 
-def _predict(
-    vehicle: Vehicle,
-    space: Space,
-    driven_by_rotors: bool,
-    voltage: bool,
-    theta: Any,
-    offset: Any,
-    windows: Windows,
-) -> Any:
-    """Return simulated - measured (B, N, 19) of B windows."""
-    dt = step_s(vehicle)
-    values = space.effects(theta)
-    plant = make_plant(vehicle, dt, {k: v for k, v in values.items() if k != "gusts"}, 0.0)
-    gyro, accelerometer = values["gyro_bias"].bias, values["accelerometer_bias"].bias
-    before, warm = round(HISTORY_S / dt) + 1, round(WARM_S / dt)
-    steps = windows.command.shape[1] - before - warm
-    command = _late(windows.command, plant.constants.delay, dt, before)
-    motion = Motion(
-        windows.pos_w + offset[:, :3],
-        jnp.matmul(windows.rot_w, exp_rot(offset[:, 3:6])),
-        windows.vel_w + offset[:, 6:9],
-        windows.rate_b - gyro + offset[:, 9:STATE],
-    )
+@cache
+def _slopes(layout: Layout, dt: float, driven_by_rotors: bool, voltage: bool) -> Callable[..., Any]:
+    """Return the compiled slopes: XLA takes longer over them than a diagnosis does."""
+    fly = _flight(layout, dt, driven_by_rotors, voltage)
 
-    def ask(order: Any, rate_b: Any) -> Any:
-        return wanted_speed(plant, Command(order[:, 0], order[:, 1:]), rate_b)
+    def linear(given: Given, theta: Any, offset: Any, windows: Windows, directions: Any) -> Any:
+        size = len(layout)
 
-    def warm_up(speed: Any, inputs: Any) -> Any:
-        order, rate_b = inputs
-        wanted = ask(order, rate_b - gyro)
-        return follow(speed, wanted, plant.constants.time_constant, plant.dt).end, None
+        def along(direction: Any) -> Any:
+            tangent = (direction[:size], jnp.tile(direction[size:], (BATCH, 1)))
+            return jax.jvp(lambda t, x: fly(given, t, x, windows)[0], (theta, offset), tangent)
 
-    order = jnp.swapaxes(command, 0, 1)
-    warm_rate_b = jnp.swapaxes(jnp.asarray(windows.warm_rate_b), 0, 1)
-    speed, _ = jax.lax.scan(
-        warm_up, ask(order[0], warm_rate_b[0] - gyro), (order[:warm], warm_rate_b)
-    )
+        values, slopes = jax.vmap(along, out_axes=(None, -1))(directions)
+        return values, slopes
 
-    def step(carry: Any, inputs: Any) -> Any:
-        speed, motion = carry
-        order, measured, drop, index = inputs
-        if driven_by_rotors:
-            spin = steady(measured)
-        else:
-            wanted = ask(order, motion.rate_b)
-            spin = follow(speed, wanted, plant.constants.time_constant, plant.dt)
-        memory = Memory(spin.end, jnp.zeros((len(speed), 4, 0)), {})
-        time_s = windows.start_s + index * dt
-        _, wrench = spin_step(plant, memory, motion, spin, time_s, None, drop if voltage else None)
-        after = euler_step(plant, motion, wrench)
-        return (spin.end, after), (after, spin.end, wrench.force_b / plant.constants.mass)
-
-    measured_speed = jnp.asarray(windows.rotor_speed)
-    if driven_by_rotors:
-        error = offset[:, STATE:].reshape(-1, KNOTS, 4)
-        measured_speed = measured_speed - jnp.matmul(_hats(steps), error)
-    inputs = (
-        order[warm:],
-        jnp.swapaxes(measured_speed, 0, 1),
-        jnp.swapaxes(jnp.asarray(windows.voltage_drop), 0, 1),
-        jnp.arange(steps),
-    )
-    _, (flown, speeds, forces) = jax.lax.scan(step, (speed, motion), inputs)
-    track = Motion(
-        *(
-            jnp.moveaxis(jnp.concatenate([a[None], b]), 0, 1)
-            for a, b in zip(motion, flown, strict=True)
-        )
-    )
-    speeds = jnp.moveaxis(jnp.concatenate([speed[None], speeds]), 0, 1)
-    forces = jnp.moveaxis(jnp.concatenate([forces[:1], forces]), 0, 1)
-    pose = _at(windows.row_s - values["clock_offset"].offset, dt, steps)
-    now = _at(windows.row_s, dt, steps)
-    pos_w, rot_w, vel_w = _pose(track, pose, dt)
-    rate_b = _pick(track.rate_b, now, dt)
-    turn = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), rot_w)
-    attitude = 0.5 * jnp.stack(
-        [
-            turn[..., 2, 1] - turn[..., 1, 2],
-            turn[..., 0, 2] - turn[..., 2, 0],
-            turn[..., 1, 0] - turn[..., 0, 1],
-        ],
-        axis=-1,
-    )
-    parts = [
-        pos_w - windows.row_pos_w,
-        attitude,
-        vel_w - windows.row_vel_w,
-        rate_b + gyro - windows.row_rate_b,
-        _pick(forces, now, dt) + accelerometer - windows.row_acc_b,
-        _pick(speeds, now, dt) - windows.row_rotor_speed,
-    ]
-    difference = jnp.concatenate(parts, axis=-1)
-    assert difference.shape[-1] == CHANNELS
-    return jnp.where(windows.seen, difference, 0.0)
+    return jax.jit(linear)
 
 
-def _hats(steps: int) -> np.ndarray:
-    """Return the share (S, KNOTS) of each knot in each step, linear between knots."""
-    place = (np.arange(steps) + 0.5) / steps * (KNOTS - 1)
-    return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(KNOTS)))
+@cache
+def _responses(
+    layout: Layout, dt: float, driven_by_rotors: bool, voltage: bool
+) -> Callable[..., Any]:
+    fly = _flight(layout, dt, driven_by_rotors, voltage)
+
+    def respond(given: Given, theta: Any, offset: Any, windows: Windows) -> Response:
+        none = jnp.zeros((BATCH, KNOTS, 6))
+
+        def along(direction: Any) -> Any:
+            tangent = jnp.broadcast_to(direction.reshape(KNOTS, 6), none.shape)
+            return jax.jvp(lambda p: fly(given, theta, offset, windows, p)[0], (none,), (tangent,))
+
+        slopes = jax.vmap(lambda d: along(d)[1], out_axes=-1)(jnp.eye(KNOTS * 6))
+        _, flown = fly(given, theta, offset, windows)
+        ends = np.linspace(0, flown.rotor_speed.shape[1] - 1, KNOTS).round().astype(int)
+        return Response(slopes, jax.tree.map(lambda x: x[:, ends], flown))
+
+    return jax.jit(respond)
 
 
-def _late(command: Any, delay: Any, dt: float, before: int) -> Any:
-    """Return the command that acts in each step from `before` on, linear between two steps."""
-    command = jnp.asarray(command)
-    steps = delay / dt
-    whole = jnp.floor(steps + 1e-9)
-    part = steps - whole
-    index = jnp.arange(before, command.shape[1]) - whole.astype(int)
-    return (1.0 - part) * command[:, index] + part * command[:, jnp.maximum(index - 1, 0)]
+def _flight(
+    layout: Layout, dt: float, driven_by_rotors: bool, voltage: bool
+) -> Callable[..., tuple[Any, Flown]]:
+    """Return the function that flies windows: simulated - measured, and the flight itself."""
 
+    def fly(
+        given: Given, theta: Any, offset: Any, windows: Windows, push: Any = None
+    ) -> tuple[Any, Flown]:
+        values = effects_at(layout, given.base, theta)
+        plant = assemble(given.nominal, given.constants, values, dt, 0.0)
+        flown = fly_windows(plant, values, driven_by_rotors, voltage, offset, windows, push)
+        return difference(plant, values, flown, windows), flown
 
-def _at(time_s: Any, dt: float, steps: int) -> Any:
-    """Return (step before, time after it [s]) for times since the window's start."""
-    index = jnp.clip(jnp.floor(time_s / dt + 1e-6), 0, steps).astype(int)
-    return index, time_s - index * dt
-
-
-def _pick(series: Any, place: Any, dt: float) -> Any:
-    """Return `series` (B, S + 1, K) at `place`, linear between steps."""
-    index, left = place
-    following = jnp.minimum(index + 1, series.shape[1] - 1)
-    here = jnp.take_along_axis(series, index[..., None], axis=1)
-    there = jnp.take_along_axis(series, following[..., None], axis=1)
-    return here + (left / dt)[..., None] * (there - here)
-
-
-def _pose(track: Motion, place: Any, dt: float) -> tuple[Any, Any, Any]:
-    """Return position, attitude and velocity at `place`; times before the start extend back."""
-    index, left = place
-    left = left[..., None]
-    following = jnp.minimum(index + 1, track.pos_w.shape[1] - 1)
-
-    def pick(series: Any, at: Any) -> Any:
-        return jnp.take_along_axis(series, at.reshape(*at.shape, *[1] * (series.ndim - 2)), axis=1)
-
-    vel_w, rate_b = pick(track.vel_w, index), pick(track.rate_b, following)
-    acc_w = (pick(track.vel_w, following) - vel_w) / dt
-    # A step's new velocity carries the position (semi-implicit Euler).
-    pos_w = pick(track.pos_w, index) + left * pick(track.vel_w, following)
-    rot_w = jnp.matmul(pick(track.rot_w, index), exp_rot(left * rate_b))
-    return pos_w, rot_w, vel_w + left * acc_w
+    return fly

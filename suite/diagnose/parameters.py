@@ -17,6 +17,10 @@ NOT_FITTED = ("gusts",)
 """Random wind cannot be flown again, so no rollout can fit it."""
 
 
+Layout = tuple[tuple[str, str, int | None], ...]
+"""Effect, parameter and component of each number."""
+
+
 @dataclass(frozen=True)
 class Entry:
     """One number of the vector."""
@@ -61,21 +65,30 @@ class Space:
 
     def effects(self, theta: Array) -> dict[str, Any]:
         """Return the values of every effect for `theta` (P,), numpy or JAX."""
-        xp = theta.__array_namespace__()
-        values = {name: value._asdict() for name, value in self.base.items()}
-        place = {(e.effect, e.parameter, e.component): i for i, e in enumerate(self.entries)}
-        for (name, parameter, component), i in place.items():
-            if component is None:
-                values[name][parameter] = theta[i]
-            elif component == 0:
-                old = np.asarray(self.base[name]._asdict()[parameter])
-                parts = [
-                    theta[place[name, parameter, k]] if (name, parameter, k) in place
-                    else xp.asarray(old[k])
-                    for k in range(len(old))
-                ]  # fmt: skip
-                values[name][parameter] = xp.stack(parts)
-        return {name: type(self.base[name])(**fields) for name, fields in values.items()}
+        return effects_at(self.layout, self.base, theta)
+
+    @property
+    def layout(self) -> Layout:
+        """Which number of the vector is what; the same for every vehicle."""
+        return tuple((e.effect, e.parameter, e.component) for e in self.entries)
+
+
+def effects_at(layout: Layout, base: Mapping[str, Any], theta: Array) -> dict[str, Any]:
+    """Return `base` with the numbers `theta` (P,) in their places; all may be traced."""
+    xp = theta.__array_namespace__()
+    values = {name: value._asdict() for name, value in base.items()}
+    place = {entry: i for i, entry in enumerate(layout)}
+    for (name, parameter, component), i in place.items():
+        if component is None:
+            values[name][parameter] = theta[i]
+        elif component == 0:
+            old = xp.asarray(getattr(base[name], parameter))
+            parts = [
+                theta[place[name, parameter, k]] if (name, parameter, k) in place else old[k]
+                for k in range(old.shape[0])
+            ]
+            values[name][parameter] = xp.stack(parts)
+    return {name: type(base[name])(**fields) for name, fields in values.items()}
 
 
 def make_space(vehicle: Vehicle) -> Space:

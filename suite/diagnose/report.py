@@ -73,7 +73,7 @@ def _effects(found: Mapping[str, Any]) -> Grid:
                     Cell(f"{name} [{entry['unit']}]"),
                     Cell(_number(entry["value"])),
                     Cell(_number(entry["ci95"])),
-                    Cell(f"{100 * effect['gap_removed']:.0f} %"),
+                    _share(effect["gap_removed"]),
                     Cell(f"{effect['p_value']:.3g}"),
                 ]
             )
@@ -162,3 +162,7 @@ def _number(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_number(v) for v in value) + "]"
     return f"{value:.4g}"
+
+
+def _share(value: float | None) -> Cell:
+    return Cell("–" if value is None else f"{100 * value:.0f} %")
