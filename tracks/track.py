@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tracks.scene import Scene
+from tracks.scene import Boxes, Gates, Scene
 
 
 @dataclass(frozen=True)
@@ -32,3 +32,24 @@ class Track:
     gate's frame share a name ("gate 3 frame"); every other name is unique."""
     mesh_sizes: tuple[int, ...] = ()
     """Triangles of each convex mesh; `scene.triangles` holds them one mesh after another."""
+
+
+def first_gates(track: Track, count: int) -> Track:
+    """Return `track` with its first `count` gates; the obstacles stay, the later frames go.
+
+    Raises:
+        ValueError: unless the track has that many gates and one is left.
+    """
+    gates = track.scene.gates
+    whole, bars = gates.opening_g.shape[:2]
+    if not 1 <= count <= whole:
+        raise ValueError(f"{count} gates of a track that has {whole}: give 1 to {whole}")
+    if count == whole:
+        return track
+    stays = np.r_[: count * bars, whole * bars : len(track.scene.boxes.center_w)]
+    scene = track.scene._replace(
+        gates=Gates(*(field[:count] for field in gates)),
+        boxes=Boxes(*(field[stays] for field in track.scene.boxes)),
+    )
+    names = track.names[: count * bars] + track.names[whole * bars :]
+    return replace(track, scene=scene, names=names)

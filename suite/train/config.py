@@ -90,6 +90,8 @@ class EpisodeConfig:
     """Worlds per iteration, over all devices."""
     steps: int = 90
     """Policy periods per rollout."""
+    gates: int = 8
+    """Gates of a track, the first so many of those that it is made with, at most 8."""
     difficulty: tuple[float, float] = (0.0, 1.0)
     """Range of the tracks' difficulty."""
     easy_until: float = 0.0

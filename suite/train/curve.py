@@ -9,20 +9,23 @@ from typing import Any
 from tracks.files import to_json, write_text
 
 CURVE = "metrics.jsonl"
+"""A row a gradient step."""
+WATCHED = "validation.jsonl"
+"""A row each time that the policy was measured; `iteration` is of the gradient steps done."""
 
 
-def append(folder: Path, rows: list[dict[str, Any]]) -> None:
-    """Add rows to the curve in `folder`."""
-    with (folder / CURVE).open("a", encoding="utf-8") as file:
+def append(folder: Path, rows: list[dict[str, Any]], name: str = CURVE) -> None:
+    """Add rows to the curve called `name` in `folder`."""
+    with (folder / name).open("a", encoding="utf-8") as file:
         file.writelines(to_json(row) + "\n" for row in rows)
 
 
-def read(folder: Path) -> list[dict[str, Any]]:
+def read(folder: Path, name: str = CURVE) -> list[dict[str, Any]]:
     """Return the whole rows of the curve, each iteration once.
 
     A last line cut short by a kill is left out, as are rows that an interrupted save wrote twice.
     """
-    path = folder / CURVE
+    path = folder / name
     if not path.exists():
         return []
     rows = []
@@ -36,7 +39,9 @@ def read(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def cut(folder: Path, iteration: int) -> None:
+def cut(folder: Path, iteration: int, name: str = CURVE) -> None:
     """Drop the rows from `iteration` on: they are computed again."""
-    kept = [row for row in read(folder) if row["iteration"] < iteration]
-    write_text(folder / CURVE, "".join(to_json(row) + "\n" for row in kept))
+    if not (folder / name).exists():
+        return
+    kept = [row for row in read(folder, name) if row["iteration"] < iteration]
+    write_text(folder / name, "".join(to_json(row) + "\n" for row in kept))

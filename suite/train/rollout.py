@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from policies import delta_network, network
 from policies.observation import encode_depth, state_vector
 from suite.train import losses, point_mass
-from suite.train.config import TrainConfig
+from suite.train.config import LossConfig, TrainConfig
 from suite.train.worlds import Worlds
 from tracks.camera import pixel_rays_b
 from tracks.clearance import nearest_obstacle
@@ -93,14 +93,11 @@ def _queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
     return line[:, 0], line[:, 1:]
 
 
-def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepRecord]]:
-    """Return rollout(params, nudge, worlds, key, encode, delta) -> (loss, records).
-
-    `encode(params, image)` gives the embeddings; `nudge` is (T, B, hidden); `delta` is the frozen
-    Delta Action network's parameters or None. The loss is the mean over steps and worlds; records
-    are (T, B, ...).
-    """
-    spec, physics, weights = config.spec, config.physics, config.loss
+def make_look(
+    config: TrainConfig,
+) -> Callable[[Worlds, point_mass.Body, jax.Array], jax.Array]:
+    """Return look(worlds, body, key) -> (B, height, width), the encoded image with its noise."""
+    spec, physics = config.spec, config.physics
     rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
 
     def look(worlds: Worlds, body: point_mass.Body, key: jax.Array) -> jax.Array:
@@ -113,21 +110,17 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
         image = image + physics.depth_noise * jax.random.normal(key, image.shape)
         return image.reshape(-1, spec.camera.height, spec.camera.width)
 
-    def act(
-        params: network.Params,
-        memory: Memory,
-        embedding: jax.Array,
-        target_w: jax.Array,
-    ) -> tuple[jax.Array, Memory]:
-        body = memory.body
-        state = state_vector(body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b)
-        state, states = _queue(memory.states, state)
-        embedding, embeddings = _queue(memory.embeddings, embedding)
-        action, hidden = network.recur(params, memory.hidden, embedding, state)
-        memory = memory._replace(
-            hidden=hidden, action_b=action, embeddings=embeddings, states=states
-        )
-        return action, memory
+    return look
+
+
+def make_judge(
+    weights: LossConfig,
+) -> Callable[..., tuple[losses.Terms, jax.Array, jax.Array]]:
+    """Return judge(worlds, before, body, target) -> (terms, clearance, passed), (B,) each.
+
+    It scores the step from `before` to `body` of worlds that have passed `target` gates: the
+    weighted terms, the smallest distance to a solid on the way [m] and whether a gate was passed.
+    """
 
     def judge(
         worlds: Worlds, before: point_mass.Body, body: point_mass.Body, target: jax.Array
@@ -153,6 +146,35 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
         passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
         passed = passed & (target < worlds.scene.gates.center_w.shape[1])
         return terms, distance.min(-1), passed
+
+    return judge
+
+
+def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepRecord]]:
+    """Return rollout(params, nudge, worlds, key, encode, delta) -> (loss, records).
+
+    `encode(params, image)` gives the embeddings; `nudge` is (T, B, hidden); `delta` is the frozen
+    Delta Action network's parameters or None. The loss is the mean over steps and worlds; records
+    are (T, B, ...).
+    """
+    physics, weights = config.physics, config.loss
+    look, judge = make_look(config), make_judge(weights)
+
+    def act(
+        params: network.Params,
+        memory: Memory,
+        embedding: jax.Array,
+        target_w: jax.Array,
+    ) -> tuple[jax.Array, Memory]:
+        body = memory.body
+        state = state_vector(body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b)
+        state, states = _queue(memory.states, state)
+        embedding, embeddings = _queue(memory.embeddings, embedding)
+        action, hidden = network.recur(params, memory.hidden, embedding, state)
+        memory = memory._replace(
+            hidden=hidden, action_b=action, embeddings=embeddings, states=states
+        )
+        return action, memory
 
     def rollout(
         params: network.Params,

@@ -14,7 +14,7 @@ from suite.train.point_mass import Constants
 from tracks.cull import Bounds, bounds
 from tracks.families import MAX_COUNTS, random_track
 from tracks.scene import Array, Scene, stack
-from tracks.track import Track
+from tracks.track import Track, first_gates
 
 
 class Worlds(NamedTuple):
@@ -92,7 +92,7 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     tracks, starts = [], []
     rests = rng.uniform(size=batch) < episode.rest_share
     for rest in rests:
-        track = random_track(rng.uniform(low, high), rng)
+        track = first_gates(random_track(rng.uniform(low, high), rng), episode.gates)
         tracks.append(track)
         if rest:
             starts.append((track.start_pos_w, np.zeros(3), 0))

@@ -16,7 +16,7 @@ from policies.checkpoint import load_arrays, read_config
 from policies.policy_file import load_policy_checkpoint
 from suite.console import Console
 from suite.errors import WorkFailed
-from suite.train import curve, run
+from suite.train import curve, repeat, run
 from tests.support.training import boxes_worlds, fresh_params, small_config
 
 CONFIG = small_config(physics={"depth_noise": 0.02})
@@ -55,7 +55,7 @@ def whole(tmp_path_factory):
 def rows(folder):
     """Return the curve without the machine's speed."""
     found = curve.read(folder)
-    assert all(row.pop("steps_per_s") >= 0 for row in found)
+    assert all(row.pop(key) >= 0 for row in found for key in ("steps_per_s", "seconds", "cold"))
     return found
 
 
@@ -113,8 +113,8 @@ class Killed(BaseException):
 def test_a_kill_in_the_middle_of_saving_leaves_a_run_that_resumes(
     dies_in, whole, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(run, "SAVE_PERIOD_S", 0.0)
-    owner = curve if dies_in == "append" else run
+    monkeypatch.setattr(repeat, "SAVE_PERIOD_S", 0.0)
+    owner = curve if dies_in == "append" else repeat
     real, calls = getattr(owner, dies_in), []
 
     def dying(*args, **kwargs):
@@ -171,9 +171,9 @@ sys.meta_path.insert(0, Blocker())
 from pathlib import Path
 import tracks.files
 from suite.console import Console
-from suite.train import run
+from suite.train import repeat, run
 from tests.support.training import boxes_worlds, small_config
-run.sample_worlds, run.SAVE_PERIOD_S = boxes_worlds, 0.0
+run.sample_worlds, repeat.SAVE_PERIOD_S = boxes_worlds, 0.0
 real, renamed = os.replace, []
 def replace(source, target):
     if Path(target).name == "state":

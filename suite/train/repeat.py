@@ -1,0 +1,220 @@
+"""A method repeated in a folder: checkpoints that survive a kill, exact resumption, its curves.
+
+The folder holds run.json (what was run), metrics.jsonl (the curve), validation.jsonl (what was
+measured on the way), policy/ (what flies) and state/ (what resumes). An iteration depends on the
+state and its number alone, so a resumed run draws the curve that it would have drawn without the
+stop.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding
+
+from policies import network
+from policies.checkpoint import load_arrays, read_config, save_arrays
+from policies.policy_file import save_policy
+from policies.spec import PolicySpec
+from policies.tree_arrays import tree_from_arrays, tree_to_arrays
+from suite.console import Console
+from suite.errors import WorkFailed
+from suite.estimate import Estimate, announce
+from suite.provenance import write_run_record
+from suite.train import curve
+from suite.train.worlds import Worlds
+from tracks.files import recover_folder
+
+SAVE_PERIOD_S = 30.0
+"""Time between checkpoints [s]."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run came to."""
+
+    policy: Path
+    """The trained policy's checkpoint."""
+    iterations: int
+    """Gradient steps done, over all stops."""
+    last: dict[str, Any]
+    """Means over the last tenth of the curve."""
+
+
+class Watch(NamedTuple):
+    """A measurement of the policy as it learns; its time does not count as training."""
+
+    every: int
+    """Gradient steps between two; there is one before the first step and one after the last."""
+    measure: Callable[[network.Params], Mapping[str, float]]
+    """Of the policy's parameters; a row of validation.jsonl."""
+
+
+class Method(NamedTuple):
+    """What a run repeats. A state has the policy's `params` and the `iteration` to do next."""
+
+    iterations: int
+    """How often."""
+    frames: int
+    """Steps of worlds in one iteration."""
+    estimate: Estimate
+    """What the whole run will need."""
+    worlds: Callable[[int], Worlds]
+    """The fresh worlds of an iteration."""
+    make_update: Callable[[], Callable[[Any, Worlds], tuple[Any, dict[str, jax.Array]]]]
+    """Called once: update(state, worlds) -> (state', numbers of the curve)."""
+    note: Callable[[Mapping[str, float]], str]
+    """A few words for people about a row of the curve."""
+
+
+class Run(NamedTuple):
+    """Where a run lives and what tells it from others."""
+
+    config: Any
+    """The resolved configuration, a dataclass."""
+    spec: PolicySpec
+    """Of the policy."""
+    seed: int
+    """Of the run."""
+    origin: dict[str, Any]
+    """What a folder's run must have been made from for it to be resumed, "config" among it."""
+    folder: Path
+    """Where it lives."""
+    place: NamedSharding
+    """Where the update leaves its state."""
+
+
+def repeat(
+    method: Method, run: Run, fresh: Any, console: Console, watch: Watch | None = None
+) -> Outcome:
+    """Repeat a method's update from the folder's state, or the `fresh` one, to its end.
+
+    Raises:
+        ValueError: where the folder holds another run.
+        WorkFailed: where a number of the curve stops being finite.
+    """
+    folder = run.folder
+    state = jax.device_put(_resume(run.origin, folder, fresh), run.place)
+    done = int(state.iteration)
+    if done < method.iterations or _is_missing(watch, folder, done, method.iterations):
+        announce(console, f"training to {folder}", method.estimate)
+        write_run_record(folder, run.config, run.seed)
+        state = _iterate(method, run, state, console, watch)
+    rows = curve.read(folder)
+    last = rows[-max(1, len(rows) // 10) :]
+    means = {key: float(np.mean([row[key] for row in last])) for key in last[0]}
+    return Outcome(folder / "policy", int(state.iteration), means)
+
+
+def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watch | None) -> Any:
+    total, first = method.iterations, int(state.iteration)
+    rows: list[dict[str, Any]] = []
+    watched: list[dict[str, Any]] = []
+    saved_at = time.monotonic()
+    update, worlds = method.make_update(), method.worlds(first)
+
+    def save() -> None:
+        curve.append(run.folder, rows)
+        if watched:
+            curve.append(run.folder, watched, curve.WATCHED)
+        rows.clear()
+        watched.clear()
+        _save(run, state)
+
+    def look() -> None:
+        done = int(state.iteration)
+        if watch and _is_due(watch, done, total):
+            watched.append({"iteration": done, **watch.measure(state.params)})
+
+    try:
+        with console.progress("training", total) as show:
+            if _is_missing(watch, run.folder, first, total):
+                look()
+            for iteration in range(first, total):
+                started = time.monotonic()
+                after, numbers = update(state, worlds)
+                # The device works meanwhile: prepare the next iteration's worlds.
+                worlds = method.worlds(iteration + 1)
+                row = {key: float(value) for key, value in numbers.items()}
+                _check_finite(iteration, row, run.folder)
+                seconds = time.monotonic() - started
+                speed = method.frames / seconds
+                # The row comes first: an interrupt between the two leaves one too many, which
+                # resuming cuts, and not one too few. A cold iteration compiles as well.
+                clock = {"seconds": round(seconds, 4), "cold": iteration == first}
+                rows.append({"iteration": iteration, **row, "steps_per_s": round(speed), **clock})
+                state = after
+                look()
+                show(iteration + 1, f"{method.note(row)}, {speed:.0f} steps/s")
+                if time.monotonic() - saved_at > SAVE_PERIOD_S:
+                    save()
+                    saved_at = time.monotonic()
+    finally:
+        save()
+    return state
+
+
+def _is_due(watch: Watch, done: int, total: int) -> bool:
+    return done % watch.every == 0 or done == total
+
+
+def _is_missing(watch: Watch | None, folder: Path, done: int, total: int) -> bool:
+    """Say whether a measurement is due that a stop cut off."""
+    if watch is None or not _is_due(watch, done, total):
+        return False
+    rows = curve.read(folder, curve.WATCHED)
+    return not rows or rows[-1]["iteration"] < done
+
+
+def _check_finite(iteration: int, row: dict[str, float], folder: Path) -> None:
+    bad = [key for key, value in row.items() if not math.isfinite(value)]
+    if bad:
+        raise WorkFailed(
+            f"training diverged at iteration {iteration}: {', '.join(bad)} not finite. The last "
+            f"finite state is in {folder / 'state'}; lower optimizer.rate or set optimizer.clip"
+        )
+
+
+def _save(run: Run, state: Any) -> None:
+    described = {**run.origin, "iteration": int(state.iteration)}
+    policy = run.folder / "policy"
+    save_policy(policy, state.params, run.spec, seed=run.seed, training=described)
+    # The state comes last: what it says is done has its policy and its curve on the disk.
+    save_arrays(
+        run.folder / "state",
+        tree_to_arrays(state),
+        kind="training",
+        seed=run.seed,
+        extra={"training": described},
+    )
+
+
+def _resume(origin: dict[str, Any], folder: Path, fresh: Any) -> Any:
+    place = folder / "state"
+    recover_folder(place)
+    if not place.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        curve.cut(folder, 0)
+        curve.cut(folder, 0, curve.WATCHED)
+        return fresh
+    theirs = read_config(place)["training"]
+    options = [f"--{key}" for key in ("from", "delta") if theirs.get(key) != origin[key]]
+    settings = [k for k, v in origin["config"].items() if theirs["config"].get(k) != v]
+    if options or settings:
+        raise ValueError(
+            f"{folder} holds another run (it differs in {', '.join(options + settings)}); "
+            "give another --out, or remove the folder to start over"
+        )
+    stored = load_arrays(place, kind="training")
+    state = jax.tree.map(jnp.asarray, tree_from_arrays(fresh, stored.arrays, str(place)))
+    curve.cut(folder, int(state.iteration))
+    curve.cut(folder, int(state.iteration) + 1, curve.WATCHED)
+    return state
