@@ -8,7 +8,8 @@ from pathlib import Path
 from suite.console import Console
 from suite.reproduce.cache import digest
 from suite.train.config import TrainConfig
-from suite.train.run import Outcome, train
+from suite.train.repeat import Outcome
+from suite.train.run import train
 
 
 def trained(config: TrainConfig, cache: Path, console: Console) -> Outcome:

@@ -67,6 +67,7 @@ def test_table2_and_all_levels(sky, tmp_path, capfd):
     text, numbers = page(tmp_path, "seeds")
     assert numbers["spread"]["median"] == "racer"
     # A second time nothing is flown and the same is written.
+    capfd.readouterr()
     assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7", "--json") == 0
     said = json.loads(capfd.readouterr().out)
     assert said["out"].endswith("table2.md") and len(said["cells"]) == 30
@@ -130,7 +131,7 @@ def test_seeds_are_trained_once_and_compared(sky, tmp_path, monkeypatch):
     made = []
 
     def stand_in(config, folder, console):
-        from suite.train.run import Outcome
+        from suite.train.repeat import Outcome
 
         if not (folder / "policy").is_dir():
             made.append(config)
