@@ -236,7 +236,10 @@ class _Slots:
         seen = self._world.view(flying)
         if self._sensors:
             seen = self._sensors.see(seen, self._world.progress.gates, flying)
-        state = state_vector(seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, self._action_b)
+        second_w = seen.second_w if spec.second_gate else None
+        state = state_vector(
+            seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, self._action_b, second_w
+        )
         state = np.where(flying[:, None], state, 0).astype(np.float32)
         image = encode_depth(spec.depth, seen.depth_m, spec.camera.range_m).astype(np.float32)
         asked = time.perf_counter()

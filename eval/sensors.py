@@ -111,11 +111,12 @@ class Sensors:
         if noise.inverse_depth:
             seen = seen._replace(depth_m=self._images(truth.depth_m, slots))
         if noise.gate_m:
-            gate_w = np.array(truth.gate_w, float)
+            gate_w, second_w = np.array(truth.gate_w, float), np.array(truth.second_w, float)
             for slot in slots:
-                shift = self._shift_w[slot]
-                gate_w[slot] += shift[min(int(gate[slot]), len(shift) - 1)]
-            seen = seen._replace(gate_w=gate_w)
+                shift, last = self._shift_w[slot], len(self._shift_w[slot]) - 1
+                gate_w[slot] += shift[min(int(gate[slot]), last)]
+                second_w[slot] += shift[min(int(gate[slot]) + 1, last)]
+            seen = seen._replace(gate_w=gate_w, second_w=second_w)
         if noise.of_state:
             self._estimate(slots)
             error = np.where(wanted[:, None], self._error, 0.0)

@@ -16,7 +16,7 @@ from typing import final
 import numpy as np
 
 from policies.errors import PolicyError
-from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
+from policies.spec import ACTION_SIZE, PolicySpec
 
 Model = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(state, image, hidden) to (action, hidden) for exactly one block of rows, float32 arrays."""
@@ -89,7 +89,7 @@ def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
     rng = np.random.default_rng(0)
     n = policy.block
     camera = policy.spec.camera
-    state = rng.normal(size=(n, STATE_SIZE)).astype(np.float32)
+    state = rng.normal(size=(n, policy.spec.state_size)).astype(np.float32)
     image = rng.normal(size=(n, camera.height, camera.width)).astype(np.float32)
     hidden = rng.uniform(-1, 1, (n, *policy.hidden_shape)).astype(np.float32)
     first = policy.model(state, image, hidden)

@@ -11,7 +11,6 @@ from policies import shipped
 from policies.embedded_spec import KEY, embed
 from policies.errors import PolicyError
 from policies.policy_file import PolicyCheckpoint, load_policy_checkpoint
-from policies.spec import STATE_SIZE
 from tracks.files import replacing_file
 from tracks.names import unknown_name
 
@@ -68,7 +67,7 @@ def torch_program(checkpoint: PolicyCheckpoint, label: str) -> bytes:
     twin = torch_twin(checkpoint.params, spec)
     # Two rows, since torch takes sizes 0 and 1 in an example for fixed.
     example = (
-        torch.zeros(2, STATE_SIZE),
+        torch.zeros(2, spec.state_size),
         torch.zeros(2, spec.camera.height, spec.camera.width),
         torch.zeros(2, spec.hidden_size),
     )

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from policies.conv import conv_valid
 from policies.gru import gru_update
-from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
+from policies.spec import ACTION_SIZE, PolicySpec
 
 Params = dict[str, jax.Array]
 
@@ -41,8 +41,8 @@ def init(key: jax.Array, spec: PolicySpec) -> Params:
         "conv2.weight": ((3, 3, CHANNELS[0], CHANNELS[1]), 9 * CHANNELS[0]),
         "conv3.weight": ((3, 3, CHANNELS[1], CHANNELS[2]), 9 * CHANNELS[1]),
         "image.weight": ((flat_features(spec), hidden), flat_features(spec)),
-        "state.weight": ((STATE_SIZE, hidden), STATE_SIZE),
-        "state.bias": ((hidden,), STATE_SIZE),
+        "state.weight": ((spec.state_size, hidden), spec.state_size),
+        "state.bias": ((hidden,), spec.state_size),
         "gru.weight_input": ((hidden, 3 * hidden), hidden),
         "gru.weight_hidden": ((hidden, 3 * hidden), hidden),
         "gru.bias_input": ((3 * hidden,), hidden),
@@ -57,6 +57,24 @@ def init(key: jax.Array, spec: PolicySpec) -> Params:
     params["state.weight"] *= 0.5
     params["action.weight"] *= 0.01
     return params
+
+
+def fitted(params: Params, spec: PolicySpec) -> Params:
+    """Return parameters made for the paper's state as parameters for `spec`.
+
+    Numbers that `spec` adds to the state get weights of zero, so the policy acts as it did.
+
+    Raises:
+        ValueError: where the state's weights have more rows than `spec` has numbers.
+    """
+    weight = params["state.weight"]
+    missing = spec.state_size - weight.shape[0]
+    if missing < 0:
+        raise ValueError(
+            f"the policy to start from sees {weight.shape[0]} numbers, spec.second_gate = "
+            f"{spec.second_gate} has {spec.state_size}; set spec.second_gate=True"
+        )
+    return {**params, "state.weight": jnp.pad(weight, ((0, missing), (0, 0)))}
 
 
 def encode(params: Params, image: jax.Array) -> jax.Array:
@@ -92,7 +110,7 @@ def step(
     Args:
         params: from `init` or a checkpoint.
         hidden: (N, hidden) recurrent state, zero at the start of a trial.
-        state: (N, 12) from `observation.state_vector`.
+        state: (N, spec.state_size) from `observation.state_vector`.
         image: (N, height, width) from `observation.encode_depth`.
     """
     return recur(params, hidden, encode(params, image), state)

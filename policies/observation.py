@@ -1,4 +1,4 @@
-"""The observation of Su et al. 2026, Eq. 1: 12 numbers and an encoded depth image."""
+"""The observation: 12 numbers and an encoded depth image (Su et al. 2026, Eq. 1), or 15 numbers."""
 
 from __future__ import annotations
 
@@ -8,9 +8,14 @@ from tracks.scene import Array
 
 
 def state_vector(
-    pos_w: Array, vel_w: Array, rot_w: Array, gate_w: Array, last_action_b: Array
+    pos_w: Array,
+    vel_w: Array,
+    rot_w: Array,
+    gate_w: Array,
+    last_action_b: Array,
+    second_w: Array | None = None,
 ) -> Array:
-    """Return the 12 numbers that a policy sees besides the image, (..., 12).
+    """Return the numbers that a policy sees besides the image, (..., 12) or (..., 15).
 
     Args:
         pos_w: (..., 3) position [m].
@@ -18,14 +23,20 @@ def state_vector(
         rot_w: (..., 3, 3) body to world.
         gate_w: (..., 3) centre of the next gate [m].
         last_action_b: (..., 3) the previous action, in the body axes of its own time [m/s^2].
+        second_w: (..., 3) centre of the gate after the next, or of the last gate where there is
+            none after it [m]; for policies with `PolicySpec.second_gate`.
 
     Returns:
         Velocity in body axes [m/s], the third row of R (world z in body axes, free of yaw), the
-        next gate's centre in body axes [m] and the last action [m/s^2].
+        next gate's centre in body axes [m], the last action [m/s^2] and, where `second_w` is given,
+        that gate's centre in body axes [m].
     """
     xp = rot_w.__array_namespace__()
     vel_b, gate_b = to_local(rot_w, vel_w), to_local(rot_w, gate_w - pos_w)
-    return xp.concatenate([vel_b, rot_w[..., 2, :], gate_b, last_action_b], axis=-1)
+    numbers = [vel_b, rot_w[..., 2, :], gate_b, last_action_b]
+    if second_w is not None:
+        numbers.append(to_local(rot_w, second_w - pos_w))
+    return xp.concatenate(numbers, axis=-1)
 
 
 def encode_depth(encoding: DepthEncoding, depth_m: Array, range_m: float) -> Array:

@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from policies.layouts import image_weight, kernel_oihw, rows_are_outputs
 from policies.network import LEAK
-from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
+from policies.spec import ACTION_SIZE, PolicySpec
 
 OPSET = 17
 IR_VERSION = 8
@@ -31,7 +31,7 @@ def onnx_model(
     """
     camera, width = spec.camera, spec.hidden_size
     inputs = [
-        _value("state", "batch", STATE_SIZE),
+        _value("state", "batch", spec.state_size),
         _value("image", "batch", camera.height, camera.width),
         _value("hidden", "batch", width),
     ]

@@ -47,7 +47,7 @@ class Policy(Protocol):
 
         Args:
             hidden: from `start` or the last `act`.
-            state: (n, 12) float32 from `observation.state_vector`.
+            state: (n, spec.state_size) float32 from `observation.state_vector`.
             image: (n, height, width) float32 from `observation.encode_depth`.
             fresh: (n,) bool, rows whose memory is cleared first since a new trial starts there.
 

@@ -7,7 +7,7 @@ from typing import Any
 from policies.block_policy import BLOCK
 from policies.embedded_spec import KEY
 from policies.errors import PolicyError
-from policies.spec import STATE_SIZE, PolicySpec
+from policies.spec import PolicySpec
 
 INPUTS = ("state", "image", "hidden")
 """Names of a program's inputs, in order; a policy without memory leaves the last out."""
@@ -37,7 +37,7 @@ def check_inputs(
             "other axes of 'hidden' must be fixed"
         )
     image = (spec.camera.height, spec.camera.width)
-    for name, expected in (("state", (STATE_SIZE,)), ("image", image)):
+    for name, expected in (("state", (spec.state_size,)), ("image", image)):
         found = shapes[name][1:]
         free = len(found) == len(expected) and all(
             size == want or not isinstance(size, int)
@@ -46,7 +46,8 @@ def check_inputs(
         if not free:
             raise PolicyError(
                 f"{where}: input {name!r} has shape {shapes[name]}, expected (batch, "
-                f"{', '.join(map(str, expected))}); the camera's size stands in {KEY}"
+                f"{', '.join(map(str, expected))}); the camera's size and second_gate stand in "
+                f"{KEY}"
             )
     return block, tuple(hidden)
 

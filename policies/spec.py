@@ -1,6 +1,7 @@
 """What a policy expects of the world: its rate, its camera and how its inputs are scaled.
 
-The observation is the paper's (Su et al. 2026, Eq. 1): 12 numbers and a depth image.
+The observation is the paper's (Su et al. 2026, Eq. 1), 12 numbers and a depth image, unless a
+policy asks for the gate after the next one as well.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import dataclass, field
 from tracks.camera import Camera
 
 STATE_SIZE = 12
-"""Numbers in the state observation: v_b (3), third row of R (3), gate in body axes (3), u (3)."""
+"""Numbers in the paper's state: v_b (3), third row of R (3), gate in body axes (3), u (3)."""
 ACTION_SIZE = 3
 """Numbers in an action: wanted net acceleration in current body axes [m/s^2]."""
 
@@ -39,3 +40,10 @@ class PolicySpec:
     """How a depth becomes an input."""
     hidden_size: int = 192
     """Width of the embeddings and of the recurrent state."""
+    second_gate: bool = False
+    """Whether the state ends with the centre of the gate after the next one, in body axes."""
+
+    @property
+    def state_size(self) -> int:
+        """Numbers in the state observation."""
+        return STATE_SIZE + 3 * self.second_gate

@@ -81,6 +81,10 @@ def _as_type(value: Any, default: Any, where: str) -> Any:
         return tuple(_as_type(v, d, where) for v, d in zip(value, default, strict=True))
     if dataclasses.is_dataclass(default):
         return value
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise PolicyError(f"{where} is {value!r}, expected true or false")
+        return value
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not number or not math.isfinite(value):
         raise PolicyError(f"{where} is {value!r}, expected a finite number")

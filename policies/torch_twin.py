@@ -10,7 +10,7 @@ from torch import nn
 
 from policies.layouts import image_weight, kernel_oihw, rows_are_outputs
 from policies.network import CHANNELS, LEAK, flat_features
-from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
+from policies.spec import ACTION_SIZE, PolicySpec
 
 CONVOLUTIONS = ("conv1", "conv2", "conv3")
 LINEAR = ("state", "action")
@@ -27,7 +27,7 @@ class TorchTwin(nn.Module):
         self.conv2 = nn.Conv2d(CHANNELS[0], CHANNELS[1], 3, bias=False)
         self.conv3 = nn.Conv2d(CHANNELS[1], CHANNELS[2], 3, bias=False)
         self.image = nn.Linear(flat_features(spec), spec.hidden_size, bias=False)
-        self.state = nn.Linear(STATE_SIZE, spec.hidden_size)
+        self.state = nn.Linear(spec.state_size, spec.hidden_size)
         self.gru = nn.GRUCell(spec.hidden_size, spec.hidden_size)
         self.action = nn.Linear(spec.hidden_size, ACTION_SIZE, bias=False)
         self.leak = nn.LeakyReLU(LEAK)

@@ -17,7 +17,7 @@ from eval.envs.race import ACTION_LIMIT, Race
 from eval.trial import Rules
 from eval.vehicle import Vehicle
 from eval.vehicle_file import load_vehicle
-from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
+from policies.spec import ACTION_SIZE, PolicySpec
 from tracks.families import make_track
 from tracks.track import Track
 
@@ -59,7 +59,7 @@ class RaceTask(control.Task):
         """Return the shapes of what policies see."""
         camera = physics.race.spec.camera
         return {
-            "state": specs.Array((STATE_SIZE,), np.float32, "state"),
+            "state": specs.Array((physics.race.spec.state_size,), np.float32, "state"),
             "image": specs.Array((camera.height, camera.width), np.float32, "image"),
         }
 

@@ -12,7 +12,7 @@ from eval.envs.race import ACTION_LIMIT, STATE_LIMIT, Race
 from eval.trial import Rules
 from eval.vehicle import Vehicle
 from eval.vehicle_file import load_vehicle
-from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
+from policies.spec import ACTION_SIZE, PolicySpec
 from tracks.families import make_track
 
 SEEDS = 2**31
@@ -24,10 +24,10 @@ class RaceEnv(gymnasium.Env):
 
     An action is the wanted net acceleration in body axes over `eval.envs.race.ACTION_LIMIT`, each
     component from -1 to 1, as learning libraries want it; an observation is what policies see:
-    `state`, the paper's 12 numbers, and `image`, the encoded inverse depth. The reward is the
-    progress towards the next gate [m], 1 a gate, and -5 for a crash. `terminated` is every end by
-    the judge's rules but the time limit, which is `truncated`. A `reset` without a fixed track
-    draws a new one.
+    `state`, the paper's 12 numbers (15 where `spec` has `second_gate`), and `image`, the encoded
+    inverse depth. The reward is the progress towards the next gate [m], 1 a gate, and -5 for a
+    crash. `terminated` is every end by the judge's rules but the time limit, which is `truncated`.
+    A `reset` without a fixed track draws a new one.
     """
 
     metadata = {"render_modes": []}
@@ -61,7 +61,7 @@ class RaceEnv(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Dict(
             {
                 "state": gymnasium.spaces.Box(
-                    -STATE_LIMIT, STATE_LIMIT, (STATE_SIZE,), np.float32
+                    -STATE_LIMIT, STATE_LIMIT, (self._spec.state_size,), np.float32
                 ),
                 "image": gymnasium.spaces.Box(
                     # A margin for the rounding of float32.

@@ -15,7 +15,7 @@ from policies.torch_twin import torch_twin
 from suite.bench import torch_scene
 from suite.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
-from suite.train.losses import MAX_PULL, UNIT_FIELD
+from suite.train.losses import APPROACH_FREE_M, MAX_PULL, UNIT_FIELD
 from suite.train.point_mass import GRAVITY, Constants
 from suite.train.rollout import BEYOND_M
 from suite.train.worlds import Worlds
@@ -118,8 +118,8 @@ class Baseline:
         )  # fmt: skip
         camera = config.spec.camera
         images = [torch.zeros(count, camera.height, camera.width)] * physics.image_delay
-        upright = torch.zeros(count, 12)
-        upright[:, 8] = 1.0
+        upright = torch.zeros(count, config.spec.state_size)
+        upright[:, 5] = 1.0
         states = [upright] * physics.state_delay
         hidden = worlds.hidden
         action, target, alive = zero, worlds.target.long(), torch.ones(count)
@@ -128,21 +128,27 @@ class Baseline:
             gate, target_w = self.target_gate(worlds.scene.gates, target)
             images.append(self.look(worlds, body))
             seen = [to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w)]
-            states.append(torch.cat([seen[0], body.rot_w[:, 2], seen[1], action], -1))
+            numbers = [seen[0], body.rot_w[:, 2], seen[1], action]
+            if config.spec.second_gate:
+                _, second_w = self.target_gate(worlds.scene.gates, target, ahead=1)
+                numbers.append(to_local(body.rot_w, second_w - body.pos_w))
+            states.append(torch.cat(numbers, -1))
             action, hidden = self.network(states.pop(0), images.pop(0), hidden)
             before, body = body, step(body, worlds.constants, action, target_w, config)
-            loss, clearance = self.judge(worlds, before, body, gate, target_w)
+            passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
+            passed = passed & (target < worlds.scene.gates.center_w.shape[1])
+            aim = self.target_gate(worlds.scene.gates, target + passed)
+            loss, clearance = self.judge(worlds, before, body, gate, *aim)
             total = total + (loss * alive).mean()
             alive = alive * (clearance > -config.loss.crash_depth_m) * (number + 1 < worlds.stop)
-            passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
-            target = target + (passed & (target < worlds.scene.gates.center_w.shape[1]))
+            target = target + passed
         return total / config.episode.steps
 
-    def target_gate(self, gates: Gates, target: Tensor) -> tuple[Gates, Tensor]:
-        """Return each world's current gate and the point to fly to (B, 3)."""
+    def target_gate(self, gates: Gates, target: Tensor, ahead: int = 0) -> tuple[Gates, Tensor]:
+        """Return each world's current gate, or the one `ahead`, and the point to fly to (B, 3)."""
         count = gates.center_w.shape[1]
         rows = torch.arange(len(target))
-        gate = Gates(*(array[rows, target.clamp(max=count - 1)] for array in gates))
+        gate = Gates(*(array[rows, (target + ahead).clamp(max=count - 1)] for array in gates))
         beyond = torch.where(target >= count, BEYOND_M, 0.0)[:, None]
         return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
 
@@ -158,7 +164,7 @@ class Baseline:
         return image.reshape(-1, camera.height, camera.width)
 
     def judge(
-        self, worlds: Worlds, before: Body, body: Body, gate: Gates, target_w: Tensor
+        self, worlds: Worlds, before: Body, body: Body, gate: Gates, aim: Gates, aim_w: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the loss of a step (B,) and the smallest distance on its path (B,)."""
         config = self.config.loss
@@ -176,11 +182,15 @@ class Baseline:
         loss = loss + config.acceleration * (body.acc_w**2).sum(-1)
         loss = loss + config.jerk * (jerk**2).sum(-1)
 
-        to_gate = target_w - body.pos_w
+        local = to_local(aim.rot_w, body.pos_w - aim.center_w).detach()
+        off = local[:, 1:].norm(dim=-1) + local[:, 0].clamp(min=0)
+        ahead = (aim_w == aim.center_w).all(-1)  # past the last gate the point is no gate's centre
+        shift = ahead * (off - APPROACH_FREE_M).clamp(0.0, config.approach_m)
+        to_gate = aim_w - shift[:, None] * aim.rot_w[:, :, 0] - body.pos_w
         towards = (body.vel_w * to_gate).sum(-1) / _norm(to_gate)
         loss = loss - config.progress * towards
         loss = loss - config.progress_norm * towards / (_norm(body.vel_w) + 1e-3)
-        lateral = to_local(gate.rot_w, body.pos_w - gate.center_w)[:, 1:]
+        lateral = to_local(aim.rot_w, body.pos_w - aim.center_w)[:, 1:]
         near = (-config.projection_decay * _norm(to_gate).detach()).exp()
         loss = loss + config.projection * (lateral**2).sum(-1) * near
 

@@ -81,7 +81,7 @@ def work_per_step(config: TrainConfig) -> float:
     the machine's rate is a lower bound.
     """
     from policies.network import CHANNELS, flat_features
-    from policies.spec import ACTION_SIZE, STATE_SIZE
+    from policies.spec import ACTION_SIZE
 
     spec = config.spec
     rows, columns, hidden = spec.camera.height // 4, spec.camera.width // 4, spec.hidden_size
@@ -90,7 +90,7 @@ def work_per_step(config: TrainConfig) -> float:
     encoder += (rows - 2) * (columns - 2) * 9 * first * second
     encoder += (rows - 4) * (columns - 4) * 9 * second * third
     encoder += flat_features(spec) * hidden
-    recurrent = STATE_SIZE * hidden + 6 * hidden * hidden + hidden * ACTION_SIZE
+    recurrent = spec.state_size * hidden + 6 * hidden * hidden + hidden * ACTION_SIZE
     return 2.0 * (4 * encoder + 3 * recurrent)
 
 

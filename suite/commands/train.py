@@ -54,12 +54,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     import jax
 
     from policies.delta_file import load_delta
+    from policies.network import fitted
     from policies.policy_file import load_policy_checkpoint
     from suite.train.run import train
 
     params, delta = None, None
     if config.from_ is not None:
         params = jax.tree.map(jax.numpy.asarray, load_policy_checkpoint(config.from_).params)
+        params = fitted(params, resolve(config).spec)
     if config.delta is not None:
         delta = jax.tree.map(jax.numpy.asarray, load_delta(config.delta).params)
     outcome = train(resolve(config), config.out, console, params, delta)

@@ -18,6 +18,7 @@ from rich.console import RenderableType
 
 from eval.results import read_trials
 from policies.delta_file import load_delta
+from policies.network import fitted
 from policies.policy_file import load_policy_checkpoint
 from suite.collect import Collection, collect
 from suite.console import Console
@@ -193,10 +194,11 @@ def _fit(config: LoopConfig, stages: Stages) -> None:
 def _tune(config: LoopConfig, stages: Stages, variant: str, policy: Path) -> Path:
     def work(folder: Path) -> None:
         start = jax.tree.map(jnp.asarray, load_policy_checkpoint(policy).params)
+        start = fitted(start, config.tuning.spec)
         delta = None
         if variant == WITH:
-            fitted = load_delta(stages.out / "delta" / "delta").params
-            delta = jax.tree.map(jnp.asarray, fitted)
+            model = load_delta(stages.out / "delta" / "delta").params
+            delta = jax.tree.map(jnp.asarray, model)
         training.train(config.tuning, folder, stages.console, start, delta)
 
     how = "under the frozen Delta Action Model" if variant == WITH else "without it, as the control"

@@ -60,6 +60,10 @@ class LossConfig:
     """Weight of L_p^norm, the ablation's direction-only progress [1]."""
     projection: float = 0.0
     """lambda_proj of L_proj, the scalar substitute for the field [1/m^2]."""
+    approach_m: float = 0.0
+    """Where the drone is off a gate's axis or beyond its plane, progress is measured towards a
+    point on the axis before the gate, by as much as it is off, at most this far: straight to the
+    centre the frame is in the way, and the drone hovers above it; 0: always the centre [m]."""
     projection_decay: float = 0.5
     """beta_3 of L_proj [1/m]."""
     barrier_height: float = 2.0
@@ -90,6 +94,9 @@ class EpisodeConfig:
     """Worlds per iteration, over all devices."""
     steps: int = 90
     """Policy periods per rollout."""
+    image_stride: int = 1
+    """The encoder's gradient is taken from one in so many of a rollout's images, with a random
+    first one, and weighted accordingly: neighbours look alike. Must divide `steps`."""
     gates: int = 8
     """Gates of a track, the first so many of those that it is made with, at most 8."""
     difficulty: tuple[float, float] = (0.0, 1.0)
@@ -104,6 +111,15 @@ class EpisodeConfig:
     that the policy cannot count the steps left and go for broke at the end; 1: none leaves."""
     start_speed: float = 6.0
     """Largest speed of a world that starts on the way [m/s]."""
+    missed_share: float = 0.0
+    """Share of the worlds that start on the way which start beside or above their gate's frame, as
+    one does that has missed it."""
+    sharp_share: float = 0.55
+    """Share of tracks with one or two sharp turns."""
+    density: tuple[float, float] = (0.0, 1.3)
+    """Range of the obstacles' density as a share of the judged families'."""
+    bare_share: float = 0.2
+    """Share of tracks without obstacles."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,12 @@ def _chunk(count: int) -> int:
     return max(size for size in range(1, min(count, CHUNK) + 1) if count % size == 0)
 
 
+def _every(stride: int, first: jax.Array, array: jax.Array) -> jax.Array:
+    """Return one in `stride` of the rows of an array (T, ...), from row `first` on."""
+    split = array.reshape(-1, stride, *array.shape[1:])
+    return jax.lax.dynamic_index_in_dim(split, first, axis=1, keepdims=False)
+
+
 def encoder_gradient(
     params: network.Params, images: jax.Array, cotangents: jax.Array
 ) -> network.Params:
@@ -53,7 +59,16 @@ def encoder_gradient(
 def make_gradient(
     config: TrainConfig,
 ) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
-    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) on one device."""
+    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) on one device.
+
+    Raises:
+        ValueError: where `episode.image_stride` does not divide `episode.steps`.
+    """
+    steps, stride = config.episode.steps, config.episode.image_stride
+    if stride < 1 or steps % stride:
+        raise ValueError(
+            f"episode.image_stride is {stride}, allowed are divisors of episode.steps ({steps})"
+        )
     rollout = make_rollout(config)
     width = config.spec.hidden_size
 
@@ -70,8 +85,12 @@ def make_gradient(
         (loss, records), (direct, cotangents) = jax.value_and_grad(
             rollout, argnums=(0, 1), has_aux=True
         )(params, nudge, worlds, key, frozen_encode, delta)
-        images = records.image.reshape(-1, *records.image.shape[2:])
-        through_images = encoder_gradient(params, images, cotangents.reshape(-1, width))
+        first = jax.random.randint(jax.random.fold_in(key, stride), (), 0, stride)
+        images, cotangents = (
+            _every(stride, first, array).reshape(-1, *array.shape[2:])
+            for array in (records.image, stride * cotangents)
+        )
+        through_images = encoder_gradient(params, images, cotangents)
         return jax.tree.map(jnp.add, direct, through_images), loss, records
 
     return gradient

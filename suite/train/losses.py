@@ -58,6 +58,22 @@ def obstacle_terms(
     return barrier.mean(-1), collide.mean(-1)
 
 
+APPROACH_FREE_M = 0.3
+"""So far off its axis a gate is still flown at straight [m]."""
+
+
+def approach_shift(config: LossConfig, local_g: jax.Array) -> jax.Array:
+    """Return how far before the gate the point lies that progress is measured to, (B,) [m].
+
+    Args:
+        config: the largest shift, `approach_m`.
+        local_g: (B, 3) positions in the gates' frames [m].
+    """
+    local_g = jax.lax.stop_gradient(local_g)
+    off = _norm(local_g[:, 1:]) + jnp.maximum(local_g[:, 0], 0.0)
+    return jnp.clip(off - APPROACH_FREE_M, 0.0, config.approach_m)
+
+
 def progress_term(
     config: LossConfig,
     pos_w: jax.Array,

@@ -50,7 +50,7 @@ class Memory(NamedTuple):
     embeddings: jax.Array
     """(B, image_delay, hidden) the images on their way, oldest first."""
     states: jax.Array
-    """(B, state_delay, 12) the states on their way, oldest first."""
+    """(B, state_delay, state_size) the states on their way, oldest first."""
     delta_hidden: jax.Array
     """(B, 32) of the Delta Action network."""
     alive: jax.Array
@@ -78,10 +78,14 @@ class StepRecord(NamedTuple):
     """1 where the step counted in the loss, else 0."""
 
 
-def target_gate(gates: Gates, target: jax.Array) -> tuple[Gates, jax.Array]:
-    """Return each world's current gate (B, ...) and the point to fly to (B, 3)."""
+def target_gate(gates: Gates, target: jax.Array, ahead: int = 0) -> tuple[Gates, jax.Array]:
+    """Return each world's current gate (B, ...) and the point to fly to (B, 3).
+
+    With `ahead` it is the gate so many after that, or the last one where there is none, as the
+    judge has it.
+    """
     count = gates.center_w.shape[1]
-    index = jnp.minimum(target, count - 1)
+    index = jnp.minimum(target + ahead, count - 1)
     gate = jax.tree.map(lambda array: jax.vmap(lambda rows, i: rows[i])(array, index), gates)
     beyond = jnp.where(target >= count, BEYOND_M, 0.0)[:, None]
     return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
@@ -125,7 +129,17 @@ def make_judge(
     def judge(
         worlds: Worlds, before: point_mass.Body, body: point_mass.Body, target: jax.Array
     ) -> tuple[losses.Terms, jax.Array, jax.Array]:
-        gate, target_w = target_gate(worlds.scene.gates, target)
+        gate, _ = target_gate(worlds.scene.gates, target)
+        count = worlds.scene.gates.center_w.shape[1]
+        held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
+        passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
+        passed = passed & (target < count)
+        # A gate that was passed in this step is no goal any more: measured to it, progress would
+        # be backwards, and the drone learns to slow down in front of gates.
+        aim, aim_w = target_gate(worlds.scene.gates, target + passed)
+        local = to_local(aim.rot_w, body.pos_w - aim.center_w)
+        shift = (target + passed < count) * losses.approach_shift(weights, local)
+        goal_w = aim_w - shift[:, None] * aim.rot_w[:, :, 0]
         share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
         distance, away = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path), NEAR)
@@ -133,21 +147,23 @@ def make_judge(
         size, change = losses.smoothness_terms(
             weights, body.acc_w, before.acc_w, worlds.constants.time_step
         )
-        lateral = to_local(gate.rot_w, body.pos_w - gate.center_w)[..., 1:]
         terms = losses.Terms(
             clearance=weights.clearance * barrier,
             collide=weights.collide * collide,
             acceleration=size,
             jerk=change,
-            progress=losses.progress_term(weights, body.pos_w, body.vel_w, target_w, lateral),
+            progress=losses.progress_term(weights, body.pos_w, body.vel_w, goal_w, local[:, 1:]),
             guidance=losses.guidance_term(weights, gate, body.pos_w, body.vel_w),
         )
-        held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
-        passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
-        passed = passed & (target < worlds.scene.gates.center_w.shape[1])
         return terms, distance.min(-1), passed
 
     return judge
+
+
+def states_at_start(batch: int, config: TrainConfig) -> jax.Array:
+    """Return the states on their way at the start, (B, state_delay, state_size): level, at rest."""
+    size = config.spec.state_size
+    return jnp.zeros((batch, config.physics.state_delay, size)).at[:, :, 5].set(1.0)
 
 
 def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepRecord]]:
@@ -157,7 +173,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
     Delta Action network's parameters or None. The loss is the mean over steps and worlds; records
     are (T, B, ...).
     """
-    physics, weights = config.physics, config.loss
+    spec, physics, weights = config.spec, config.physics, config.loss
     look, judge = make_look(config), make_judge(weights)
 
     def act(
@@ -165,9 +181,12 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
         memory: Memory,
         embedding: jax.Array,
         target_w: jax.Array,
+        second_w: jax.Array | None,
     ) -> tuple[jax.Array, Memory]:
         body = memory.body
-        state = state_vector(body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b)
+        state = state_vector(
+            body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b, second_w
+        )
         state, states = _queue(memory.states, state)
         embedding, embeddings = _queue(memory.embeddings, embedding)
         action, hidden = network.recur(params, memory.hidden, embedding, state)
@@ -192,7 +211,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
             hidden=jnp.asarray(worlds.hidden),
             action_b=jnp.zeros((batch, 3)),
             embeddings=jnp.zeros((batch, physics.image_delay, width)),
-            states=jnp.zeros((batch, physics.state_delay, 12)).at[:, :, 8].set(1.0),
+            states=states_at_start(batch, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
         )
@@ -205,7 +224,10 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
             image = look(worlds, jax.lax.stop_gradient(before), key_now)
             _, target_w = target_gate(worlds.scene.gates, memory.target)
             embedding = encode(params, image) + nudge_now
-            action, memory = act(params, memory, embedding, target_w)
+            second_w = None
+            if spec.second_gate:
+                _, second_w = target_gate(worlds.scene.gates, memory.target, ahead=1)
+            action, memory = act(params, memory, embedding, target_w, second_w)
             if delta is not None:
                 vel_b = to_local(jax.lax.stop_gradient(before.rot_w), before.vel_w)
                 correction, delta_hidden = delta_network.step(

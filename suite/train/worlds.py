@@ -13,6 +13,7 @@ from suite.train.config import TrainConfig
 from suite.train.point_mass import Constants
 from tracks.cull import Bounds, bounds
 from tracks.families import MAX_COUNTS, random_track
+from tracks.families.random import Mix
 from tracks.scene import Array, Scene, stack
 from tracks.track import Track, first_gates
 
@@ -83,6 +84,28 @@ def _on_the_way(
     return point, rng.uniform(0, speed_limit) * (towards + sideways), target
 
 
+def _beside_a_gate(
+    track: Track, speed_limit: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return position, velocity and next gate of a drone that has missed that gate."""
+    gates = track.scene.gates
+    best = (-np.inf, track.start_pos_w, 0)
+    for _ in range(6):
+        target = int(rng.integers(0, len(gates.center_w)))
+        angle, beside = rng.uniform(-np.pi, np.pi), rng.uniform(0.9, 1.8)
+        point_g = np.array([rng.uniform(-0.7, 1.2), beside * np.cos(angle), beside * np.sin(angle)])
+        point = gates.center_w[target] + gates.rot_w[target] @ point_g
+        point[2] = max(point[2], 0.4)
+        room = _clearance(track, point)
+        if room > best[0]:
+            best = (room, point, target)
+        if room > 0.5:
+            break
+    _, point, target = best
+    onward = rng.uniform(0, 0.4) * gates.rot_w[target, :, 0] + rng.normal(0, 0.08, 3)
+    return point, speed_limit * onward, target
+
+
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     """Return the worlds of an iteration."""
     rng = np.random.default_rng([config.seed, iteration])
@@ -91,11 +114,14 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     low, high = difficulty_range(config, iteration)
     tracks, starts = [], []
     rests = rng.uniform(size=batch) < episode.rest_share
+    mix = Mix(episode.sharp_share, episode.density, episode.bare_share)
     for rest in rests:
-        track = first_gates(random_track(rng.uniform(low, high), rng), episode.gates)
+        track = first_gates(random_track(rng.uniform(low, high), rng, mix), episode.gates)
         tracks.append(track)
         if rest:
             starts.append((track.start_pos_w, np.zeros(3), 0))
+        elif episode.missed_share > 0 and rng.random() < episode.missed_share:
+            starts.append(_beside_a_gate(track, episode.start_speed, rng))
         else:
             starts.append(_on_the_way(track, episode.start_speed, rng))
     pos, vel, target = (np.stack(column) for column in zip(*starts, strict=True))

@@ -27,7 +27,7 @@ RANGE_M, RATE_HZ = 10.0, 20.0
 def view(slots, depth=4.0):
     rot_w = Rotation.from_euler("xyz", [[0.3, -0.2, 1.0]] * slots).as_matrix()
     place = np.tile([1.0, 2.0, 3.0], (slots, 1))
-    return View(place, rot_w, 2 * place, 3 * place, np.full((slots, 12, 16), depth))
+    return View(place, rot_w, 2 * place, 3 * place, 5 * place, np.full((slots, 12, 16), depth))
 
 
 def watched(noise, trials, times, gate=0, **more):
@@ -79,6 +79,17 @@ def test_a_gates_error_stays_for_the_trial_and_differs_from_gate_to_gate():
     assert np.abs(shift.mean(axis=0)).max() < 0.06
     assert np.array_equal(first, second)
     assert np.abs(np.corrcoef(shift[:, 0], (other - first + shift)[:, 0])[0, 1]) < 0.2
+
+
+def test_a_gate_is_misplaced_alike_whether_it_is_the_next_or_the_one_after():
+    shown = {gate: watched(SensorNoise(gate_m=0.3), many(2), 1, gate)[0] for gate in (3, 4, 7)}
+    truth = view(2)
+
+    def shift(gate, field):
+        return getattr(shown[gate], field) - getattr(truth, field)
+
+    assert shift(3, "second_w") == pytest.approx(shift(4, "gate_w"), abs=1e-12)
+    assert shift(7, "second_w") == pytest.approx(shift(7, "gate_w"), abs=1e-12)
 
 
 def test_the_state_wanders_as_a_first_order_process():

@@ -66,6 +66,9 @@ FUNCTIONS = {
     magnetic_field: ("*batch 3, *batch 3 3, *batch corners 2, *batch 3", "*batch 3"),
     attractive_field: ("*batch 3, *batch 3", "*batch 3"),
     state_vector: ("*batch 3, *batch 3, *batch 3 3, *batch 3, *batch 3", "*batch 12"),
+    lambda pos_w, vel_w, rot_w, gate_w, last_b, second_w: state_vector(
+        pos_w, vel_w, rot_w, gate_w, last_b, second_w
+    ): ("*batch 3, *batch 3, *batch 3 3, *batch 3, *batch 3, *batch 3", "*batch 15"),
     lambda depth_m: encode_depth(DepthEncoding(), depth_m, 10.0): (
         "*batch height width",
         "*batch height width",

@@ -48,12 +48,15 @@ def make_track(family: str, level: int, seed: int) -> Track:
     return Track(family, level, seed, d, *FAMILIES[family](d, rng))
 
 
-def random_track(difficulty: float, rng: np.random.Generator) -> Track:
+def random_track(
+    difficulty: float, rng: np.random.Generator, mix: random.Mix = random.MIX
+) -> Track:
     """Return a fresh track of the training distribution; `seed` of the result is 0.
 
     Args:
         difficulty: d in [0, 1].
         rng: source of randomness, advanced by the call.
+        mix: how many tracks have sharp turns and how many obstacles.
 
     Raises:
         ValueError: where the difficulty is outside [0, 1].
@@ -61,7 +64,7 @@ def random_track(difficulty: float, rng: np.random.Generator) -> Track:
     if not 0.0 <= difficulty <= 1.0:
         raise ValueError(f"difficulty is {difficulty!r}, allowed is 0 to 1")
     level = min(int(difficulty * 10), LEVELS[-1])
-    return Track("random", level, 0, difficulty, *random.make(difficulty, rng))
+    return Track("random", level, 0, difficulty, *random.make(difficulty, rng, mix))
 
 
 def check_family(family: str) -> None:

@@ -38,9 +38,23 @@ class Walks(NamedTuple):
     """(W, 2) level start [m]."""
 
 
-def make(d: float, rng: np.random.Generator) -> Layout:
+class Mix(NamedTuple):
+    """What share of tracks is hard, besides their difficulty."""
+
+    sharp_share: float = 0.55
+    """Probability that a track has one or two sharp turns."""
+    density: tuple[float, float] = (0.0, 1.3)
+    """Range of the obstacles' density, as a share of the judged families'."""
+    bare_share: float = 0.2
+    """Probability that a track has no obstacles."""
+
+
+MIX = Mix()
+
+
+def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:
     """Return a random track of difficulty `d` in [0, 1]."""
-    xy, yaw, start = _walk(d, rng)
+    xy, yaw, start = _walk(d, rng, mix.sharp_share)
     shape = GATE_COUNT
     side = np.clip(ramp(1.2, 0.85, d) + rng.uniform(-0.1, 0.1, shape), 0.75, 1.3)
     width = rng.uniform(0.13, 0.27, shape)
@@ -53,12 +67,12 @@ def make(d: float, rng: np.random.Generator) -> Layout:
 
     stretches = np.arange(GATE_COUNT - 1)
     site = straight_sites(gates, stretches, rng.uniform(2.0, 4.0))
-    return furnish(rng, gates, start_pos_w, _density(d, rng, len(stretches)), site)
+    return furnish(rng, gates, start_pos_w, _density(d, rng, len(stretches), mix), site)
 
 
-def _density(d: float, rng: np.random.Generator, stretches: int) -> PerStretch:
-    """Draw obstacle counts: none on a fifth of the tracks, up to 1.3 times the baseline's."""
-    level = rng.uniform(0, 1.3) if rng.random() < 0.8 else 0.0
+def _density(d: float, rng: np.random.Generator, stretches: int, mix: Mix) -> PerStretch:
+    """Draw obstacle counts: none on some tracks, up to more than the baseline's on others."""
+    level = rng.uniform(*mix.density) if rng.random() < 1 - mix.bare_share else 0.0
     kind = np.clip(rng.uniform(0.0, 2.0, 4), 0.3, 1.5)
     air, pillar, ground = ramp(1, 3.5, d), ramp(0.8, 1.3, d), 2.0
     mean = level * kind * np.array([air, air, pillar, ground])
@@ -68,10 +82,12 @@ def _density(d: float, rng: np.random.Generator, stretches: int) -> PerStretch:
     return PerStretch(*numbers)
 
 
-def _walk(d: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _walk(
+    d: float, rng: np.random.Generator, sharp_share: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return gate centres (G, 2), yaws (G,) and the start (2,) of the first walk that is free."""
     for _ in range(_DRAWS):
-        walks = _candidates(d, rng, _drift_turns(d, rng))
+        walks = _candidates(d, rng, _drift_turns(d, rng, sharp_share))
         free = np.flatnonzero(_is_free(walks))
         if len(free):
             return walks.center[free[0]], walks.yaw[free[0]], walks.start[free[0]]
@@ -79,12 +95,12 @@ def _walk(d: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
     return straight.center[0], straight.yaw[0], straight.start[0]
 
 
-def _drift_turns(d: float, rng: np.random.Generator) -> np.ndarray:
+def _drift_turns(d: float, rng: np.random.Generator, sharp_share: float) -> np.ndarray:
     """Return how far the drift turns at each gate, (G,) [rad]."""
     sign = rng.choice([-1.0, 1.0])
     bend = np.deg2rad(rng.uniform(0, 52)) if rng.random() < 0.6 else 0.0
     turn = sign * bend + rng.normal(size=GATE_COUNT) * np.deg2rad(rng.uniform(0, 12))
-    if rng.random() < 0.55:
+    if rng.random() < sharp_share:
         corners = rng.choice(GATE_COUNT - 1, rng.integers(1, 3), replace=False)
         sharp = np.deg2rad(rng.uniform(60, ramp(120, 155, d), len(corners)))
         turn[corners] = sharp * np.where(rng.random(len(corners)) < 0.8, sign, -sign)
