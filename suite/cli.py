@@ -26,6 +26,7 @@ COMMANDS: dict[str, str] = {
     "diagnose": "name the physical effect that a vehicle file lacks, by flight logs",
     "effects": "the physical effects that a vehicle file may hold",
     "eval": "judge policies: success rates, speeds and lap times, with intervals",
+    "example": "flights with a hidden effect, to try the diagnosis on",
     "export": "write a policy as torch program and ONNX",
     "import": "a flight of PX4, Betaflight, a Crazyflie, ROS 2 or a table as a flight log",
     "info": "versions, devices, memory and commit, for bug reports",
