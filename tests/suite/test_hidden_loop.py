@@ -150,6 +150,7 @@ def test_measured_flights_are_others_than_the_judged_and_noisy(whole):
     assert one.time_s[-1] - logs[0].time_s[-1] <= CONTACT_MARGIN_S + 0.011
     spread = (logs[0].pos_w - one.pos_w[:count]).std()
     assert spread == pytest.approx(Noise().pos, rel=0.2)
+    assert one.thrust_cmd is not None and one.action_b is not None
     np.testing.assert_array_equal(logs[0].thrust_cmd, one.thrust_cmd[:count])
     np.testing.assert_array_equal(logs[0].action_b, one.action_b[:count])
 

@@ -19,6 +19,7 @@ from suite.errors import WorkFailed
 from suite.loop import run as loop_run
 from suite.loop.compare import CAVEAT, Line, compare, grids, verdict
 from suite.loop.config import resolve
+from suite.loop.work import Quiet
 from suite.report import markdown, rich_table
 from suite.train.presets import finetune, preset
 from tests.support.loops import Small
@@ -148,7 +149,7 @@ def test_flights_that_cannot_be_fitted_end_the_loop_with_advice(whole, tmp_path,
         raise ValueError("no window of 1.0 s in 3 flights")
 
     monkeypatch.setattr(loop_run, "fit_delta", none)
-    stages = loop_run.Stages(tmp_path, loop_run.Quiet(), 9)
+    stages = loop_run.Stages(tmp_path, Quiet(), 9)
     config = resolve(recipe="small", trials=3)
     with pytest.raises(WorkFailed, match="no window.*--iterations"):
         loop_run._fit(config, stages)

@@ -228,6 +228,8 @@ def test_quadrotors_vary_around_the_vehicle_and_the_tracks_stay_the_same():
     one, two, again = sample_worlds(point, 3), sample_worlds(quad, 3), sample_worlds(quad, 3)
     np.testing.assert_array_equal(one.pos_w, two.pos_w)
     np.testing.assert_array_equal(one.scene.boxes.center_w, two.scene.boxes.center_w)
+    assert isinstance(two.constants, quadrotor.Constants)
+    assert isinstance(again.constants, quadrotor.Constants)
     effects = two.constants.effects
     for name, value in effects.items():
         for field, repeated in zip(value, again.constants.effects[name], strict=True):

@@ -16,7 +16,7 @@ from policies.checkpoint import load_arrays, read_config
 from policies.policy_file import load_policy_checkpoint
 from suite.console import Console
 from suite.errors import WorkFailed
-from suite.train import curve, repeat, run
+from suite.train import curve, point_mass, repeat, run
 from tests.support.training import boxes_worlds, fresh_params, small_config
 
 CONFIG = small_config(physics={"depth_noise": 0.02})
@@ -201,6 +201,7 @@ def test_numbers_that_are_not_finite_stop_the_run_before_they_are_kept(tmp_path,
         good = boxes_worlds(config, iteration)
         if iteration < 2:
             return good
+        assert isinstance(good.constants, point_mass.Constants)
         lag = good.constants.lag * np.float32(np.nan)
         return good._replace(constants=good.constants._replace(lag=lag))
 
