@@ -80,7 +80,8 @@ class Grid(NamedTuple):
 def grid(config: QuadrotorConfig, period_s: float) -> Grid:
     """Return the grid nearest to the configured frequencies for a policy period."""
     attitude_steps = max(1, round(period_s * config.attitude_hz))
-    physics = max(1, round(period_s * config.physics_hz / attitude_steps))
+    # Rows of a log are 10 ms apart but for rounding: half a step goes down, whichever way it falls.
+    physics = max(1, round(period_s * config.physics_hz / attitude_steps - 1e-6))
     return Grid(attitude_steps, physics, period_s / (attitude_steps * physics))
 
 
