@@ -19,7 +19,7 @@ from eval.plant import Memory, start_memory
 from policies import delta_network
 from suite.delta.warm import WARM_S, Warm, gather, remembered
 from suite.train.config import QuadrotorConfig
-from suite.train.quadrotor import Body, Grid, fly_period, plant_of
+from suite.train.quadrotor import Body, Grid, fly_period, plant_of, whole_steps
 from tracks.rotation import to_local
 
 
@@ -59,7 +59,7 @@ class QuadWindows(NamedTuple):
 
 def row_grid(config: QuadrotorConfig, row_s: float) -> Grid:
     """Return how a row's period is cut: one step of the attitude loop."""
-    physics = max(1, round(row_s * config.physics_hz))
+    physics = whole_steps(row_s * config.physics_hz)
     return Grid(1, physics, row_s / physics)
 
 

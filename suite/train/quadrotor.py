@@ -77,11 +77,15 @@ class Grid(NamedTuple):
     """Length of a physics step [s]."""
 
 
+def whole_steps(steps: float) -> int:
+    """Return the nearest whole number from 1 on; a half goes down, whichever way it was rounded."""
+    return max(1, round(steps - 1e-6))
+
+
 def grid(config: QuadrotorConfig, period_s: float) -> Grid:
     """Return the grid nearest to the configured frequencies for a policy period."""
-    attitude_steps = max(1, round(period_s * config.attitude_hz))
-    # Rows of a log are 10 ms apart but for rounding: half a step goes down, whichever way it falls.
-    physics = max(1, round(period_s * config.physics_hz / attitude_steps - 1e-6))
+    attitude_steps = whole_steps(period_s * config.attitude_hz)
+    physics = whole_steps(period_s * config.physics_hz / attitude_steps)
     return Grid(attitude_steps, physics, period_s / (attitude_steps * physics))
 
 
