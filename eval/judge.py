@@ -17,6 +17,7 @@ import numpy as np
 from eval.flight import Flight
 from eval.guard import ActionLimits, guard_action
 from eval.recorder import Recorder
+from eval.sensors import SensorNoise, Sensors, check_noise
 from eval.sharding import fly_in_processes, usable_cores
 from eval.trial import DIVERGED, ENDINGS, FINISHED, FLYING, Rules, TrialResult, TrialSpec, track_of
 from eval.vehicle import Vehicle
@@ -41,7 +42,7 @@ class Record:
 
 @dataclass(frozen=True)
 class JudgeOptions:
-    """How trials are flown; only `slots`, `rules` and `limits` can touch an outcome."""
+    """How trials are flown; `threads` and `processes` touch no outcome."""
 
     slots: int = 64
     """Trials in the air at once, and rows of every call of the policy."""
@@ -53,6 +54,8 @@ class JudgeOptions:
     """When a trial ends."""
     limits: ActionLimits = field(default_factory=ActionLimits)
     """What an action may be."""
+    noise: SensorNoise = field(default_factory=SensorNoise)
+    """What is wrong with the policy's observation."""
 
 
 @dataclass(frozen=True)
@@ -93,12 +96,13 @@ def fly(
         tracks: custom tracks by the name that trials call them; others are families.
 
     Raises:
-        ValueError: for an unknown world or track, a policy faster than the physics, or a policy
-            that returns something else than actions.
+        ValueError: for an unknown world or track, noise that cannot be, a policy faster than the
+            physics, or a policy that returns something else than actions.
         RuntimeError: where a process of its own died.
     """
     options = options or JudgeOptions()
     world_class(world)
+    check_noise(options.noise)
     for trial in trials:
         if trial.track not in (tracks or {}):
             check_family(trial.track)
@@ -146,7 +150,14 @@ def _fly_share(
             track = track_of(task.tracks, trial)
             options = task.options
             result = world_class(PLAIN)(
-                policy, trial, track, task.vehicle, options.rules, options.limits, options.slots
+                policy,
+                trial,
+                track,
+                task.vehicle,
+                options.rules,
+                options.limits,
+                options.slots,
+                options.noise,
             )
             emit(index, result, None)
         return
@@ -179,6 +190,8 @@ class _Slots:
         self._fresh = np.ones(n, bool)
         self._hidden = policy.start(n)
         self._recorder = Recorder(n, task.record.depth) if task.record else None
+        noise, range_m = task.options.noise, policy.spec.camera.range_m
+        self._sensors = None if noise.is_none else Sensors(noise, n, rate, range_m)
 
     def run(
         self,
@@ -210,7 +223,10 @@ class _Slots:
             self._fresh[slot] = True
             if self._recorder:
                 self._recorder.start(slot)
-            entries.append((slot, track_of(self._task.tracks, trial), trial))
+            track = track_of(self._task.tracks, trial)
+            if self._sensors:
+                self._sensors.start(slot, trial, len(track.scene.gates.center_w))
+            entries.append((slot, track, trial))
         if entries:
             self._world.load(entries)
 
@@ -218,6 +234,8 @@ class _Slots:
         """Ask the policy once and fly its answers until its next decision."""
         spec, flying = self._policy.spec, self._index >= 0
         seen = self._world.view(flying)
+        if self._sensors:
+            seen = self._sensors.see(seen, self._world.progress.gates, flying)
         second_w = seen.second_w if spec.second_gate else None
         state = state_vector(
             seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, self._action_b, second_w

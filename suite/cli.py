@@ -26,13 +26,15 @@ COMMANDS: dict[str, str] = {
     "diagnose": "name the physical effect that a vehicle file lacks, by flight logs",
     "effects": "the physical effects that a vehicle file may hold",
     "eval": "judge policies: success rates, speeds and lap times, with intervals",
+    "example": "flights with a hidden effect, to try the diagnosis on",
     "export": "write a policy as torch program and ONNX",
     "import": "a flight of PX4, Betaflight, a Crazyflie, ROS 2 or a table as a flight log",
     "info": "versions, devices, memory and commit, for bug reports",
     "loop": "train, fly, record, fit the Delta Action Model, fine-tune, fly again",
+    "reproduce": "the paper's tables and more, one document each: table2, robustness, seeds",
     "tracks": "list the track families, or draw a track as a picture",
     "delta": "fit the Delta Action Model to recorded flights",
-    "train": "train a policy by backpropagation through the point mass",
+    "train": "train a policy by backpropagation through a point mass or a quadrotor",
     "view": "a recording, pictures and a video of trials",
 }
 """Name -> one-line summary; the command NAME lives in suite/commands/NAME.py."""

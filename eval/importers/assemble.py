@@ -16,13 +16,21 @@ from eval.importers.motion_check import (
 )
 from eval.importers.motors import order_motors
 from eval.importers.options import ImportOptions
-from eval.importers.rows import rows_from
+from eval.importers.rows import HOLE_S, HOLE_STEPS, NEEDED, own_rows, row_times, rows_at, slowest
 from eval.importers.signals import Recording, median_step
 from eval.importers.thrust import thrust_command
 from eval.importers.units_check import check_units
 
 SLOW_HZ = 40.0
-"""Positions or attitudes that come more rarely than this are worth a word."""
+"""Signals that come more rarely than this are worth a word."""
+TEXTS = {
+    "pos": "position",
+    "quat": "attitude",
+    "rate": "gyro",
+    "cmd_rate": "rate command",
+    "motor": "motors",
+}
+"""Signals whose rate counts, in words."""
 
 
 def assemble(
@@ -42,8 +50,9 @@ def assemble(
     _need(recording)
     recording, more = check_units(recording, options.fix)
     findings += more
-    findings += _rates(recording)
-    rows = rows_from(recording, options.rate_hz, options.start_s, options.end_s)
+    time_s = row_times(recording, options.rate_hz, options.start_s, options.end_s)
+    findings += _rates(recording, time_s)
+    rows = rows_at(recording, time_s)
     findings += check_attitude(rows, options.fix)
     findings += check_velocity(rows, options.fix)
     findings += check_frames(rows, options.fix)
@@ -52,6 +61,8 @@ def assemble(
     findings += order_motors(rows, recording.motor_side, options.vehicle)
     findings += thrust_command(rows, options)
     findings += _pair(rows)
+    for name, own in own_rows(recording, time_s).items():
+        rows[name] = np.where(own[:, None], rows[name], np.nan)
     columns = _columns(rows)
     if "cmd_thrust" not in columns and "motor_1" not in columns:
         lines = "".join(f"\n{line}" for line in said(tuple(findings)))
@@ -70,25 +81,29 @@ def assemble(
 
 
 def _need(recording: Recording) -> None:
-    names = {"pos": "position", "quat": "attitude", "rate": "gyro"}
-    missing = [text for name, text in names.items() if name not in recording.signals]
+    missing = [TEXTS[name] for name in NEEDED if name not in recording.signals]
     if missing:
         hint = "" if missing == ["gyro"] else "; --pose FILE brings position and attitude"
         reason = f"holds no {' and no '.join(missing)}{hint}"
         raise FlightLogError(recording.name, None, None, reason)
 
 
-def _rates(recording: Recording) -> list[Finding]:
-    findings = []
-    for name, subject in (("pos", "position"), ("quat", "attitude")):
-        time_s = recording.signals[name].time_s
-        step = median_step(time_s)
+def _rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
+    """Say what sets the rows, which signals are slow, and where holes are."""
+    name = slowest(recording)
+    every = f"at {1.0 / median_step(time_s):.3g} Hz, by the {TEXTS[name]}"
+    findings = [Finding("note", "rows", every)]
+    for name, subject in TEXTS.items():
+        if name not in recording.signals:
+            continue
+        times = recording.signals[name].time_s
+        step = median_step(times)
         if step > 1.0 / SLOW_HZ:
-            text = f"at {1 / step:.3g} Hz, interpolated between; log it faster where you can"
+            text = f"comes at {1 / step:.3g} Hz only; log it faster where you can"
             findings.append(Finding("note", subject, text))
-        holes = int(np.sum(np.diff(time_s) > max(0.1, 5.0 * step)))
+        holes = int(np.sum(np.diff(times) > max(HOLE_S, HOLE_STEPS * step)))
         if holes:
-            longest = float(np.max(np.diff(time_s)))
+            longest = float(np.max(np.diff(times)))
             text = f"{holes} holes, the longest {longest:.2g} s: left empty"
             findings.append(Finding("note", subject, text))
     return findings

@@ -2,8 +2,9 @@
 
 Betaflight's body is forward-left-up already: roll right, nose down and a turn to the left are
 positive, in the gyro, the set points and the motor mixer alike. Rates are in deg/s, also where
-the header names no unit (ten times that under `blackbox_high_resolution`, which the attitude
-shows). Units that `blackbox_decode` was told to use stand in brackets after a column's name.
+the header names no unit (ten times that under `blackbox_high_resolution`: the attitude shows it,
+and `units_check.py` puts it right). Units that `blackbox_decode` was told to use stand in brackets
+after a column's name.
 Position and attitude are not logged: --pose brings them.
 """
 
@@ -32,6 +33,9 @@ _ACCELERATION = {"": 9.81 / ACC_1G, "g": 9.81, "m/s2": 1.0}
 _TIME = {"": 1e-6, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 _VOLT = {"": 0.01, "V": 1.0, "mV": 1e-3}
 """Factors to our units by the unit in the header; raw voltages of Betaflight 4 are in 10 mV."""
+MOST_V = 30.0
+"""A higher voltage is ten times too large: `blackbox_decode` divides by ten to make volts, as was
+right before Betaflight 4 (a quadrotor of more than seven cells and older firmware is rarer)."""
 _UNIT = re.compile(r"^(?P<name>.*?)(?: \((?P<unit>[^()]*)\))?$")
 _ERPM = re.compile(r"^eRPM(?:\(/100\))?\[(\d)\]$")
 
@@ -98,10 +102,19 @@ def read(path: Path, options: ImportOptions) -> Recording:
         text = "no setpoint columns: sticks are not rates, so there is no rate command"
         findings.append(Finding("doubt", "command", text))
     if box.has("vbatLatest"):
-        parts["voltage"] = box.values(["vbatLatest"], _VOLT)
+        parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), options.fix, findings)
     parts |= _motors(box, options.motor_poles, findings)
     signals, more = collect({name: (time_s, value) for name, value in parts.items()}, box.name)
     return Recording(box.name, signals, (*findings, *more), MOTOR_SIDE)
+
+
+def _volts(voltage: np.ndarray, fix: bool, findings: list[Finding]) -> np.ndarray:
+    middle = float(np.nanmedian(voltage)) if np.isfinite(voltage).any() else 0.0
+    if middle <= MOST_V:
+        return voltage
+    text = f"{middle:.4g} V in the file: ten times too much, as blackbox_decode writes Betaflight 4"
+    findings.append(Finding("corrected" if fix else "doubt", "voltage", text))
+    return voltage / 10.0 if fix else voltage
 
 
 def _motors(box: Blackbox, poles: int, findings: list[Finding]) -> dict[str, np.ndarray]:

@@ -25,7 +25,7 @@ class ImportOptions:
     motor_poles: int = 14
     """Magnets on a motor's bell, to turn Betaflight's eRPM into revolutions."""
     rate_hz: float = 250.0
-    """At most this many rows a second; faster signals are averaged over a row's period."""
+    """At most this many rows a second; faster signals are smoothed over a row's period."""
     start_s: float = 0.0
     """Leave out what is earlier than this after the first row [s]."""
     end_s: float | None = None

@@ -206,7 +206,11 @@ def _refine(
     sooner = averaged(rate.time_s, rate.value, at - step, SPAN_S)
     slope = (later - sooner) / (2.0 * step)
     turn = _kabsch(seen - seen.mean(0), gyro - gyro.mean(0))
-    rest = gyro - seen @ turn.T
+    turned = seen @ turn.T
+    # The size is left open: a gyro in other units is for `units_check.py` to find.
+    centred = turned - turned.mean(0)
+    size = float(np.sum(gyro * centred) / max(np.sum(centred**2), 1e-12))
+    rest = gyro - size * turned
     # rest = bias + slope * (error of the offset + error of the drift * since)
     columns = [slope.ravel(), (slope * since).ravel()]
     columns += [np.tile(axis, len(seen)) for axis in np.eye(3)]

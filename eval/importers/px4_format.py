@@ -28,7 +28,7 @@ import numpy as np
 from eval.flight_check import FlightLogError
 from eval.importers.detect import ULOG, read_head
 from eval.importers.findings import Finding
-from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN
+from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, turn
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 
@@ -47,6 +47,8 @@ QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 """PX4's motors 1 to 4 (x forward, y left): front right, rear left, front left, rear right."""
 FIRST_MOTOR = 101
 """`actuator_function` of Motor1."""
+BODY_FRAME = 3
+"""`velocity_frame` of a velocity in body axes."""
 RPM = 2.0 * np.pi / 60.0
 
 Topic = Mapping[str, np.ndarray]
@@ -132,13 +134,25 @@ def _local(names: Sequence[str], valid: Sequence[str]) -> Callable[[Topic], Part
 
 
 def _odometry_velocity(topic: Topic) -> Part | None:
-    """Return the velocity where it is given in the north-east-down world (frame 1)."""
+    """Return the velocity where it is in the position's world or in the body.
+
+    Frames are 1 (north-east-down), 2 (of another heading) and 3 (the body) from v1.14 on; before,
+    0, 1 and 3. Both worlds point down, and the position is in the same one.
+    """
     frame = topic.get("velocity_frame")
-    if frame is None or not np.all(np.asarray(frame) == 1):
-        return None
+    new = "pose_frame" in topic
+    world = topic.get("pose_frame" if new else "local_frame")
     value = _columns(topic, [f"velocity[{k}]" for k in range(3)])
     value = _columns(topic, ["vx", "vy", "vz"]) if value is None else value
-    return None if value is None else (_time(topic), value * HALF_TURN)
+    if frame is None or value is None:
+        return None
+    frame = np.asarray(frame)
+    if np.all(frame == BODY_FRAME):
+        quat = _columns(topic, [f"q[{k}]" for k in range(4)])
+        return None if quat is None else (_time(topic), turn(quat, value) * HALF_TURN)
+    if world is None or not np.all(np.isin(frame, (1, 2) if new else (0, 1)) & (frame == world)):
+        return None
+    return _time(topic), value * HALF_TURN
 
 
 def _odometry_position(topic: Topic) -> Part | None:
@@ -154,7 +168,10 @@ def _attitude(topic: Topic) -> Part | None:
 
 def _throttle(topic: Topic) -> Part | None:
     value = _columns(topic, ["thrust_body[2]"])
-    return None if value is None else (_time(topic), -value)
+    if value is None:
+        value = _columns(topic, ["thrust"])  # before v1.10, upwards
+        return None if value is None else (_time(topic), value)
+    return _time(topic), -value
 
 
 def _motors(topic: Topic) -> Part | None:

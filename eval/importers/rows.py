@@ -1,11 +1,14 @@
 """Signals of different rates brought onto the rows of one flight log.
 
-Rows stand at samples of the gyro (every n-th where it is faster than asked). What is measured is
-interpolated to them, never across a hole; what is faster than the rows is averaged over a row's
-period, so that vibration does not alias. A command is what was in force until the next row.
+Rows stand at the samples of the slowest of position, attitude and gyro (every n-th where it is
+faster than asked), so that each measurement is in one row and its noise in none of the others:
+what a diagnosis takes for noise must not be copied from row to row. What is faster is smoothed
+over a row's period, so that vibration does not alias. A command is its mean until the next row.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -13,8 +16,14 @@ from eval.flight_check import FlightLogError
 from eval.importers.frames import turn
 from eval.importers.signals import Recording, Signal, median_step
 
+NEEDED = ("pos", "quat", "rate")
+"""The slowest of these sets the rows."""
+LEAST_HZ = 20.0
+"""Where that is slower than this, further rows stand between its samples."""
 SMOOTH = ("pos", "quat", "vel")
 """Interpolated by a cubic spline, as they follow from accelerations; the others linearly."""
+SPARSE = ("pos", "quat", "vel", "rate", "acc")
+"""Left empty between their samples where they are slower than the rows."""
 HELD = ("cmd_thrust", "cmd_rate", "throttle", "motor_cmd")
 """Hold their value until the next sample."""
 HOLE_S = 0.1
@@ -23,38 +32,20 @@ HOLE_STEPS = 5.0
 HOLD_S = 0.5
 """A command is not held for longer than this (and ten of its own steps) [s]."""
 FAR_FASTER = 0.6
-"""Signals whose step is below this share of a row's are averaged."""
+"""Signals whose step is below this share of a row's are smoothed."""
+SLOWER = 1.5
+"""Signals whose step is above this many rows' are slower than the rows."""
 
 
-def rows_from(
-    recording: Recording, rate_hz: float, start_s: float, end_s: float | None
-) -> dict[str, np.ndarray]:
+def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """Return the rows: `time` (T,) from 0 [s] and every signal as (T, C), NaN where unknown.
+
+    Signals slower than the rows are interpolated here; `own_rows` tells where.
 
     Args:
         recording: holds at least pos, quat and rate.
-        rate_hz: at most this many rows a second.
-        start_s: first row, counted from where pos, quat and rate are all there [s].
-        end_s: last row, in the same count, or None.
-
-    Raises:
-        FlightLogError: where pos, quat and rate share less than two samples of time.
+        time_s: (T,) of the rows, on the recording's clock [s].
     """
-    needed = [recording.signals[name] for name in ("pos", "quat", "rate")]
-    first = max(s.time_s[0] for s in needed)
-    last = min(s.time_s[-1] for s in needed)
-    stop = last if end_s is None else min(last, first + end_s)
-    base = recording.signals["rate"].time_s
-    every = max(1, round(1.0 / (rate_hz * median_step(base))))
-    inside = base[(base >= first + start_s) & (base <= stop)]
-    time_s = inside[::every]
-    if len(time_s) < 2:
-        spans = ", ".join(
-            f"{name} from {s.time_s[0]:.3f} to {s.time_s[-1]:.3f} s"
-            for name, s in zip(("pos", "quat", "rate"), needed, strict=True)
-        )
-        reason = f"no time at which position, attitude and gyro are all there ({spans})"
-        raise FlightLogError(recording.name, "time", None, reason)
     rows = {"time": time_s - time_s[0]}
     for name, samples in recording.signals.items():
         if name in HELD:
@@ -65,6 +56,83 @@ def rows_from(
     on_sample = np.isin(time_s, recording.signals["quat"].time_s)[:, None]
     rows["quat"] = np.where(on_sample, rows["quat"], rows["quat"] / norm)
     return rows
+
+
+def slowest(recording: Recording) -> str:
+    """Return which of the needed signals is the slowest."""
+    return max(NEEDED, key=lambda name: median_step(recording.signals[name].time_s))
+
+
+def row_times(
+    recording: Recording, rate_hz: float, start_s: float, end_s: float | None
+) -> np.ndarray:
+    """Return the rows' times (T,) on the recording's clock [s].
+
+    Args:
+        recording: holds at least pos, quat and rate.
+        rate_hz: at most this many rows a second.
+        start_s: first row, counted from where pos, quat and rate are all there [s].
+        end_s: last row, in the same count, or None.
+
+    Raises:
+        FlightLogError: where pos, quat and rate share less than two samples of time.
+    """
+    needed = [recording.signals[name] for name in NEEDED]
+    first = max(s.time_s[0] for s in needed)
+    last = min(s.time_s[-1] for s in needed)
+    stop = last if end_s is None else min(last, first + end_s)
+    base = recording.signals[slowest(recording)].time_s
+    base = base[(base >= first) & (base <= last)]
+    step = median_step(base)
+    if step > 1.0 / LEAST_HZ and len(base) > 1:
+        parts = int(np.ceil(step * LEAST_HZ - 1e-9))
+        share = np.arange(parts) / parts
+        between = base[:-1, None] + share * np.diff(base)[:, None]
+        # A hole stays one: rows across it would hold nothing.
+        near = np.diff(base)[:, None] < HOLE_STEPS * step
+        base = np.append(between[near | (share == 0.0)], base[-1])
+        step /= parts
+    every = max(1, int(np.ceil(1.0 / (rate_hz * step) - 0.01)))
+    time_s = base[(base >= first + start_s) & (base <= stop)][::every]
+    if len(time_s) < 2:
+        spans = ", ".join(
+            f"{name} from {s.time_s[0]:.3f} to {s.time_s[-1]:.3f} s"
+            for name, s in zip(NEEDED, needed, strict=True)
+        )
+        reason = f"no time at which position, attitude and gyro are all there ({spans})"
+        raise FlightLogError(recording.name, "time", None, reason)
+    return time_s
+
+
+def own_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarray]:
+    """Return which rows a sample is for, (T,) bool, by signal that is slower than the rows.
+
+    A sample is for the row nearest to it, and for that of the slowest signal where one is within
+    half of its own step, so that there are rows in which nothing is missing.
+
+    Args:
+        recording: the signals on their own times.
+        time_s: (T,) of the rows, on the recording's clock [s].
+    """
+    row_step, found = median_step(time_s), {}
+    anchor = _nearest(time_s, recording.signals[slowest(recording)].time_s)
+    for name in SPARSE:
+        samples = recording.signals.get(name)
+        if samples is None or median_step(samples.time_s) <= SLOWER * row_step:
+            continue
+        row = _nearest(time_s, samples.time_s)
+        close = anchor[_nearest(time_s[anchor], samples.time_s)]
+        near = np.abs(time_s[close] - samples.time_s) <= 0.5 * median_step(samples.time_s)
+        inside = np.abs(time_s[row] - samples.time_s) <= row_step
+        found[name] = np.zeros(len(time_s), dtype=bool)
+        found[name][np.where(near, close, row)[near | inside]] = True
+    return found
+
+
+def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return the places in `times` that are nearest to `wanted`."""
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    return np.where(wanted - times[after - 1] <= times[after] - wanted, after - 1, after)
 
 
 def measured(samples: Signal, time_s: np.ndarray, smooth: bool) -> np.ndarray:
@@ -83,7 +151,7 @@ def measured(samples: Signal, time_s: np.ndarray, smooth: bool) -> np.ndarray:
         if smooth and len(t) >= 4:
             out[at] = _spline(t, v, time_s[at])
         elif not smooth and step < FAR_FASTER * row_step and len(t) > 1:
-            out[at] = averaged(t, v, time_s[at], row_step)
+            out[at] = smoothed(t, v, time_s[at], row_step)
         else:
             out[at] = _linear(t, v, time_s[at])
     return out
@@ -139,6 +207,28 @@ def _spline(t: np.ndarray, v: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def _linear(t: np.ndarray, v: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(at, t, column) for column in v.T], axis=1)
+
+
+def smoothed(t: np.ndarray, v: np.ndarray, at: np.ndarray, width_s: float) -> np.ndarray:
+    """Return the value (M, C) at each `at` of a parabola through the samples within `width_s`.
+
+    A mean would flatten what is curved; a parabola keeps it and averages the noise alike
+    (Savitzky and Golay 1964). Where fewer than three samples are near, lines join them.
+    """
+    first = np.searchsorted(t, at - 0.5 * width_s)
+    count = np.searchsorted(t, at + 0.5 * width_s, side="right") - first
+    moment, right = np.zeros((len(at), 5)), np.zeros((len(at), 3, v.shape[1]))
+    for offset in range(int(count.max(initial=0))):
+        k = np.minimum(first + offset, len(t) - 1)
+        u = (t[k] - at) / (0.5 * width_s)
+        powers = np.where((offset < count)[:, None], u[:, None] ** np.arange(5), 0.0)
+        moment += powers
+        right += powers[:, :3, None] * v[k][:, None, :]
+    out = _linear(t, v, at)
+    enough = np.flatnonzero(count >= 3)
+    normal = moment[enough][:, np.arange(3)[:, None] + np.arange(3)]
+    out[enough] = np.linalg.solve(normal, right[enough])[:, 0]
+    return out
 
 
 def averaged(t: np.ndarray, v: np.ndarray, at: np.ndarray, width_s: float) -> np.ndarray:

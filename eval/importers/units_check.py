@@ -19,6 +19,10 @@ from eval.importers.signals import Recording, Signal
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds in each unit that clocks count in."""
 DEG = float(np.pi / 180.0)
+ANGLES = {"rad": 1.0, "deg": DEG, "tenths": 0.1}
+"""Radians in each unit that rates count in; tenths of the unit that they are said to be in are
+what Betaflight logs under `blackbox_high_resolution`, and are looked for in seconds only."""
+TENTHS = "rates are ten times too large (blackbox_high_resolution)"
 NEAR = 2.0
 """A ratio within this factor of a candidate's speaks for it (the nearest are 10 apart)."""
 INTERVALS = 300
@@ -43,7 +47,7 @@ def check_units(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
     ratio = turned / gyro
     # Rates measured per unit of the clock: true angle = rate * unit of angle * unit of time.
     found = min(
-        ((time, angle) for time in TIMES for angle in ("rad", "deg")),
+        [(time, angle) for time in TIMES for angle in ("rad", "deg")] + [("s", "tenths")],
         key=lambda pair: abs(np.log(ratio / _scale(*pair))),
     )
     moved = _moved(recording)
@@ -60,15 +64,26 @@ def check_units(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
     if (time, angle) == ("s", "rad"):
         return recording, [Finding("ok", "units", f"{figures}: time in s, rates in rad/s")]
     text = f"{figures}: time is in {time} and rates are in {angle}/s"
+    if angle == "tenths":
+        text = f"{figures}: {TENTHS}"
     if not fix:
         return recording, [Finding("doubt", "units", text + "; left as they are")]
-    return _rescaled(recording, TIMES[time], DEG if angle == "deg" else 1.0), [
+    names = {"rate", "cmd_rate"} if angle == "tenths" and _commands_alike(recording) else {"rate"}
+    return _rescaled(recording, TIMES[time], ANGLES[angle], names), [
         Finding("corrected", "units", text)
     ]
 
 
 def _scale(time: str, angle: str) -> float:
-    return TIMES[time] * (DEG if angle == "deg" else 1.0)
+    return TIMES[time] * ANGLES[angle]
+
+
+def _commands_alike(recording: Recording) -> bool:
+    """Return whether commanded rates are about as large as the gyro's, in the same wrong unit."""
+    if "cmd_rate" not in recording.signals:
+        return False
+    size = [np.sqrt(np.mean(recording.signals[n].value ** 2)) for n in ("cmd_rate", "rate")]
+    return bool(size[0] > 0.3 * size[1])
 
 
 def _path(value: np.ndarray) -> float:
@@ -98,9 +113,9 @@ def _moved(recording: Recording) -> float | None:
     return path / travelled if travelled > 0 and path > 0.5 else None
 
 
-def _rescaled(recording: Recording, time: float, angle: float) -> Recording:
+def _rescaled(recording: Recording, time: float, angle: float, names: set[str]) -> Recording:
     signals = {}
     for name, samples in recording.signals.items():
-        scale = angle if name == "rate" else 1.0
+        scale = angle if name in names else 1.0
         signals[name] = Signal(samples.time_s * time, samples.value * scale)
     return replace(recording, signals=signals)

@@ -12,8 +12,10 @@ import numpy as np
 from eval.autopilot import fly_step, make_cockpit, start_autopilot
 from eval.guard import ActionLimits, guard_action
 from eval.plant import Motion, uses_noise
+from eval.sensors import SensorNoise, Sensors
 from eval.trial import Rules, TrialResult, TrialSpec
 from eval.vehicle import Vehicle
+from eval.worlds import View
 from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import layout_of, noise_of
 from policies.observation import encode_depth, state_vector
@@ -31,6 +33,7 @@ def fly_trial(
     rules: Rules | None = None,
     limits: ActionLimits | None = None,
     rows: int = 64,
+    noise: SensorNoise | None = None,
 ) -> TrialResult:
     """Fly one trial.
 
@@ -43,6 +46,7 @@ def fly_trial(
         limits: what an action may be; a deadline is not looked at here.
         rows: of the policy's inputs; all but the first are zero. The rows of a call to the policy
             are as many as in the batched worlds, since some policies answer otherwise then.
+        noise: what is wrong with the policy's observation.
     """
     rules, limits = rules or Rules(), limits or ActionLimits()
     cockpit = make_cockpit(vehicle)
@@ -57,6 +61,10 @@ def fly_trial(
         draws = noise_of(trial, round(rules.time_limit_s / dt) + 2)
     eye, hidden = Eye(spec.camera), policy.start(rows)
     pilot = start_autopilot(cockpit, motion_of(data), draws[:1] if len(draws) > 1 else None)
+    sensors = None
+    if noise and not noise.is_none:
+        sensors = Sensors(noise, 1, spec.rate_hz, spec.camera.range_m)
+        sensors.start(0, trial, count)
     action_b, bad, limited, decisions = np.zeros((1, 3)), 0, 0, 0
     passed = passed_8s = passed_035 = 0
     speeds: list[float] = []
@@ -95,12 +103,15 @@ def fly_trial(
         gate_w = gates.center_w[None, passed]
         if step == np.rint(decisions * (1 / (spec.rate_hz * dt))):
             second_w = gates.center_w[None, min(passed + 1, count - 1)]
-            state = state_vector(
-                motion.pos_w, motion.vel_w, motion.rot_w, gate_w, action_b,
-                second_w if spec.second_gate else None,
-            )  # fmt: skip
             depth = eye.image(model, data, pos_w, motion.rot_w[0])
-            image = encode_depth(spec.depth, depth[None], spec.camera.range_m)
+            seen = View(motion.pos_w, motion.rot_w, motion.vel_w, gate_w, second_w, depth[None])
+            if sensors:
+                seen = sensors.see(seen, np.array([passed]), np.array([True]))
+            state = state_vector(
+                seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, action_b,
+                seen.second_w if spec.second_gate else None,
+            )  # fmt: skip
+            image = encode_depth(spec.depth, seen.depth_m, spec.camera.range_m)
             fresh = np.full(rows, decisions == 0)
             answer, hidden = policy.act(hidden, _padded(state, rows), _padded(image, rows), fresh)
             guarded = guard_action(limits, np.asarray(answer)[:1], action_b, 0.0, policy.name)
@@ -109,8 +120,8 @@ def fly_trial(
             decisions += 1
 
         # Fly one step.
-        noise = draws[None, step + 1] if len(draws) > 1 else None
-        pilot, wrench = fly_step(cockpit, pilot, motion, action_b, gate_w, np.array([step]), noise)
+        blow = draws[None, step + 1] if len(draws) > 1 else None
+        pilot, wrench = fly_step(cockpit, pilot, motion, action_b, gate_w, np.array([step]), blow)
         step += 1
         if not (np.abs([wrench.force_b, wrench.torque_b]) <= rules.wrench_limit).all():
             ended_by = "diverged"

@@ -57,7 +57,16 @@ def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
     return Gates(*(field[index] for field in gates._replace(opening_g=opening)))
 
 
+GUSTS, PIXELS, GATES, STATE = range(1, 5)
+"""What a trial's random numbers are for; each use has a stream of its own."""
+
+
+def generator_of(trial: TrialSpec, use: int) -> np.random.Generator:
+    """Return the random numbers of a trial for one use, set by the two alone."""
+    key = [trial.seed, trial.difficulty, *trial.track.encode(), use]
+    return np.random.default_rng(np.random.SeedSequence(key))
+
+
 def noise_of(trial: TrialSpec, steps: int) -> np.ndarray:
     """Return standard normal draws (steps, 3) for a trial's gusts, set by the trial alone."""
-    key = [trial.seed, trial.difficulty, *trial.track.encode(), 1]
-    return np.random.default_rng(np.random.SeedSequence(key)).standard_normal((steps, 3))
+    return generator_of(trial, GUSTS).standard_normal((steps, 3))

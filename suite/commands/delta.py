@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -13,7 +13,7 @@ from suite.console import Console
 
 @dataclass(frozen=True)
 class Config:
-    """Fit the Delta Action Model by gradients through the point mass."""
+    """Fit the Delta Action Model by gradients through the point mass, or through a quadrotor."""
 
     flights: tyro.conf.Positional[tuple[Path, ...]]
     """Flight logs, or folders of them, as `suite collect` writes them."""
@@ -21,6 +21,10 @@ class Config:
     """Folder for the checkpoint delta/, delta.json and table.md."""
     preset: str = "racer"
     """The training recipe whose point mass is corrected."""
+    model: Literal["point", "quad"] = "point"
+    """What is corrected: the point mass, or the quadrotor of --vehicle with its effects."""
+    vehicle: str | None = None
+    """With --model quad: a shipped vehicle's name or a vehicle file (.toml)."""
     held_out: float = 0.25
     """Share of the flights that take no part in the fit."""
     iterations: int = 1500
@@ -38,8 +42,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for an unknown preset or logs that cannot be used.
     """
     from suite.delta.fit import FitConfig
-    from suite.delta.run import fit_delta, table
-    from suite.train.presets import preset
+    from suite.delta.run import fit_delta, fit_quadrotor_delta, quadrotor_table, table
+    from suite.train.presets import chosen_model, preset
     from tracks.files import plain
 
     fitting = replace(
@@ -48,14 +52,20 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         iterations=config.iterations,
         seed=config.seed,
     )
-    physics = preset(config.preset).physics
-    result = fit_delta(fitting, physics, config.flights, config.out, console)
-    console.say(table(result, fitting.horizon_s))
+    recipe = chosen_model(preset(config.preset), config.model, config.vehicle)
+    if recipe.quadrotor is None:
+        result = fit_delta(fitting, recipe.physics, config.flights, config.out, console)
+        words = table(result, fitting.horizon_s)
+        errors = {
+            "point_mass": result.point_mass,
+            "fitted_point_mass": result.fitted_point_mass,
+            "delta_action": result.delta_action,
+        }
+    else:
+        quad = recipe.quadrotor
+        fitted = fit_quadrotor_delta(fitting, quad, config.flights, config.out, console)
+        words = quadrotor_table(fitted, fitting.horizon_s)
+        errors = {"without": fitted.without, "delta_action": fitted.with_delta}
+    console.say(words)
     console.say(f"delta: {config.out / 'delta'}")
-    return {
-        "delta": str(config.out / "delta"),
-        **{
-            name: plain(getattr(result, name))
-            for name in ("point_mass", "fitted_point_mass", "delta_action")
-        },
-    }
+    return {"delta": str(config.out / "delta"), **plain(errors)}

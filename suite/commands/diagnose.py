@@ -43,6 +43,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
+    from suite.diagnose.answer import components
     from suite.diagnose.run import Wishes, diagnose_files
 
     wishes = Wishes(
@@ -59,8 +60,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         rivals = ", ".join(effect["alternatives"])
         same = f" (these flights cannot tell it from {rivals})" if rivals else ""
         console.say(f"  {effect['name']}{same}")
-        for name, entry in effect["parameters"].items():
-            console.say(f"    {name} = {entry['value']} {entry['unit']}, 95 %: {entry['ci95']}")
+        for label, value, span in components(effect["parameters"]):
+            if value is None:
+                console.say(f"    {label}: no flight can tell")
+            else:
+                between = f", 95 %: {span[0]:.4g} to {span[1]:.4g}" if span else ""
+                console.say(f"    {label}: {value:.4g}{between}")
     gap = result["gap"]
     console.say(f"gap on held-out flights: {gap['before']:.2f} before, {gap['after']:.2f} after; "
                 "1 is the noise floor")  # fmt: skip

@@ -30,6 +30,9 @@ class Config:
     """Recorded flights on every track at every level; by default 20, or 8 with small."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
+    world: str | None = None
+    """A vehicle file with an effect that --vehicle lacks: fly there, name the effect, fine-tune
+    through the corrected quadrotor. Without --policy the shipped one flies."""
     seed: int = 0
     """Seed of the training and of the first trial; recorded flights begin 100,000 above."""
     iterations: int | None = None
@@ -52,6 +55,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for anything that cannot be used, before the first stage.
     """
+    if config.world is not None:
+        return _run_hidden(config, config.world, console)
     from suite.loop.config import resolve
     from suite.loop.run import run_loop
 
@@ -70,3 +75,29 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         changes=config.set,
     )
     return run_loop(resolved, config.out, console)
+
+
+def _run_hidden(config: Config, world: str, console: Console) -> dict[str, Any]:
+    from suite.loop.hidden import run_hidden_loop
+    from suite.loop.hidden_config import resolve_hidden
+
+    if config.iterations is not None:
+        raise ValueError(
+            f"--iterations is {config.iterations}, but with --world nothing is trained from "
+            "scratch; say how long to fine-tune with --finetune-iterations"
+        )
+    resolved = resolve_hidden(
+        world=world,
+        recipe=config.preset,
+        policy=config.policy,
+        track=config.track,
+        difficulty=config.difficulty,
+        trials=config.trials,
+        flights=config.flights,
+        vehicle=config.vehicle,
+        seed=config.seed,
+        finetune_iterations=config.finetune_iterations,
+        fit_iterations=config.fit_iterations,
+        changes=config.set,
+    )
+    return run_hidden_loop(resolved, config.out, console)

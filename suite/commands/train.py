@@ -1,17 +1,17 @@
-"""`suite train`: a policy by backpropagation through the point mass."""
+"""`suite train`: a policy by backpropagation through a point mass or a quadrotor."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from suite.console import Console
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
-from suite.train.presets import preset
+from suite.train.presets import chosen_model, preset
 from tracks.files import plain
 
 
@@ -21,6 +21,10 @@ class Config:
 
     preset: str = "racer"
     """The recipe: racer (the shipped policy's), small, gpu or paper."""
+    model: Literal["point", "quad"] = "point"
+    """What flies in training: the point mass, or the quadrotor of --vehicle with its effects."""
+    vehicle: str | None = None
+    """With --model quad: a shipped vehicle's name or a vehicle file (.toml)."""
     out: Path = Path("runs/train")
     """Folder of the run; a run that stands there is resumed."""
     seed: int = 0
@@ -41,16 +45,22 @@ def resolve(config: Config) -> TrainConfig:
     """Return the run that the options ask for.
 
     Raises:
-        ValueError: for an unknown preset or setting, naming what is allowed.
+        ValueError: for an unknown preset, setting or vehicle, or a vehicle without its model,
+            naming what is allowed.
     """
     run = replace(preset(config.preset), seed=config.seed)
+    run = chosen_model(run, config.model, config.vehicle)
     if config.iterations is not None:
         run = replace(run, optimizer=replace(run.optimizer, iterations=config.iterations))
     return override(run, config.set)
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Train and say where the policy is and how the curve ended."""
+    """Train and say where the policy is and how the curve ended.
+
+    Raises:
+        ValueError: for options that cannot be used or do not go together.
+    """
     import jax
 
     from policies.delta_file import load_delta
@@ -58,13 +68,21 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from policies.policy_file import load_policy_checkpoint
     from suite.train.run import train
 
+    resolved = resolve(config)
     params, delta = None, None
     if config.from_ is not None:
         params = jax.tree.map(jax.numpy.asarray, load_policy_checkpoint(config.from_).params)
         params = fitted(params, resolve(config).spec)
     if config.delta is not None:
-        delta = jax.tree.map(jax.numpy.asarray, load_delta(config.delta).params)
-    outcome = train(resolve(config), config.out, console, params, delta)
+        stored = load_delta(config.delta)
+        corrects = stored.config.get("fit", {}).get("model", "point")
+        if corrects != config.model:
+            raise ValueError(
+                f"--delta {config.delta} corrects --model {corrects}, and this run has --model "
+                f"{config.model}; train with the model that it was fitted to"
+            )
+        delta = jax.tree.map(jax.numpy.asarray, stored.params)
+    outcome = train(resolved, config.out, console, params, delta)
     last = outcome.last
     console.say(
         f"{outcome.iterations} iterations; at the end {last['gates']:.2f} gates a rollout, "

@@ -8,7 +8,9 @@ plain system identification to be worth its network.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from dataclasses import replace as changed
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +25,8 @@ from suite.train.config import PointMassConfig
 
 IDENTIFY_RATE = 3e-2
 """Least learning rate of lag, drag and delay: they have further to go than a network's weights."""
+WATCHED = 512
+"""About as many fitted windows, evenly chosen, make the curve's fit error."""
 
 
 @dataclass(frozen=True)
@@ -76,17 +80,21 @@ class Fit:
     """Rows of iteration, fit error and held-out error [m]."""
 
 
-def window_errors(plant: Plant, windows: Windows, delta: Any) -> tuple[jax.Array, jax.Array]:
+Replay = Callable[[Any, Any], tuple[jax.Array, jax.Array, jax.Array]]
+"""(windows, network or None) -> pos_w, vel_w (N, T, 3) after each step, corrections (N, T, 3)."""
+
+
+def window_errors(replay: Replay, windows: Any, delta: Any) -> tuple[jax.Array, jax.Array]:
     """Return position [m] and velocity [m/s] errors at the end of every window, (N,) each."""
-    pos, vel, _ = replay(plant, windows, delta)
+    pos, vel, _ = replay(windows, delta)
     return (
         jnp.linalg.norm(pos[:, -1] - windows.pos_w[:, -1], axis=-1),
         jnp.linalg.norm(vel[:, -1] - windows.vel_w[:, -1], axis=-1),
     )
 
 
-def _loss(config: FitConfig, plant: Plant, windows: Windows, delta: Any) -> jax.Array:
-    pos, vel, correction = replay(plant, windows, delta)
+def _loss(config: FitConfig, replay: Replay, windows: Any, delta: Any) -> jax.Array:
+    pos, vel, correction = replay(windows, delta)
 
     def mean_norm(vector: jax.Array) -> jax.Array:
         return jnp.sqrt((vector * vector).sum(-1) + 1e-8).mean()
@@ -98,26 +106,26 @@ def _loss(config: FitConfig, plant: Plant, windows: Windows, delta: Any) -> jax.
 
 def _descend(
     config: FitConfig,
-    loss: Callable[[Any, Windows], jax.Array],
+    loss: Callable[[Any, Any], jax.Array],
     start: Any,
-    windows: Windows,
+    windows: Any,
     iterations: int,
     watch: Callable[[int, Any], None],
 ) -> Any:
     optimizer = optax.adam(optax.cosine_decay_schedule(config.rate, iterations))
 
     @jax.jit
-    def update(variables: Any, state: Any, batch: Windows) -> tuple[Any, Any]:
+    def update(variables: Any, state: Any, batch: Any) -> tuple[Any, Any]:
         gradient = jax.grad(loss)(variables, batch)
         change, state = optimizer.update(gradient, state)
         return optax.apply_updates(variables, change), state
 
     rng = np.random.default_rng(config.seed)
-    count = len(windows.time_step)
+    count = len(windows.pos_w)
     variables, state = start, optimizer.init(start)
     for iteration in range(iterations):
         chosen = rng.choice(count, min(config.batch, count), replace=False)
-        batch = Windows(*(array[chosen] for array in windows))
+        batch = type(windows)(*(array[chosen] for array in windows))
         variables, state = update(variables, state, batch)
         watch(iteration, variables)
     return variables
@@ -133,12 +141,79 @@ def identify(config: FitConfig, physics: PointMassConfig, windows: Windows) -> P
         return Plant(jnp.exp(lag), drag, jnp.clip(delay, 0.0, 2.0))
 
     def loss(variables: Any, batch: Windows) -> jax.Array:
-        return _loss(config, as_plant(variables), batch, None)
+        return _loss(config, partial(replay, as_plant(variables)), batch, None)
 
     iterations = max(1, config.iterations // 3)
-    faster = replace(config, rate=max(config.rate, IDENTIFY_RATE))
+    faster = changed(config, rate=max(config.rate, IDENTIFY_RATE))
     best = _descend(faster, loss, start, windows, iterations, lambda *_: None)
     return as_plant(best)
+
+
+@dataclass(frozen=True)
+class Network:
+    """A fitted network and what it brings on held-out flights."""
+
+    params: dict[str, np.ndarray]
+    """Of the Delta Action network."""
+    without: Errors
+    """Held-out errors of the dynamics alone."""
+    with_delta: Errors
+    """Held-out errors with the network."""
+    curve: list[dict[str, float]]
+    """Rows of iteration, fit error and held-out error [m]."""
+
+
+def fit_network(
+    config: FitConfig,
+    replay: Replay,
+    known: Any,
+    held_out: Any,
+    show: Callable[[int, str], None] = lambda *_: None,
+) -> Network:
+    """Fit a network by gradients through `replay` on `known` and judge it on `held_out`.
+
+    Args:
+        config: the fit.
+        replay: flies windows again; differentiable.
+        known: windows of the flights that are fitted.
+        held_out: windows of flights that take no part.
+        show: called with (iteration, words) as it goes.
+    """
+    errors = jax.jit(partial(window_errors, replay))
+    watched = type(known)(*(array[:: -(-len(array) // WATCHED)] for array in known))
+    curve: list[dict[str, float]] = []
+    every = max(1, config.iterations // 50)
+
+    def watch(iteration: int, params: delta_network.Params) -> None:
+        if iteration % every and iteration + 1 < config.iterations:
+            return
+        row = {
+            "iteration": iteration,
+            "fit_m": float(errors(watched, params)[0].mean()),
+            "held_out_m": float(errors(held_out, params)[0].mean()),
+        }
+        curve.append(row)
+        show(iteration + 1, f"1 s error {row['fit_m']:.3f} m, held out {row['held_out_m']:.3f} m")
+
+    start = delta_network.init(jax.random.key(config.seed))
+    loss = partial(_network_loss, config, replay)
+    params = _descend(config, loss, start, known, config.iterations, watch)
+    return Network(
+        params={name: np.asarray(value) for name, value in params.items()},
+        without=_means(errors(held_out, None)),
+        with_delta=_means(errors(held_out, params)),
+        curve=curve,
+    )
+
+
+def _network_loss(
+    config: FitConfig, replay: Replay, params: delta_network.Params, batch: Any
+) -> jax.Array:
+    return _loss(config, replay, batch, params)
+
+
+def _means(errors: tuple[jax.Array, jax.Array]) -> Errors:
+    return Errors(*(float(error.mean()) for error in errors))
 
 
 def fit(
@@ -148,7 +223,7 @@ def fit(
     held_out: Windows,
     show: Callable[[int, str], None] = lambda *_: None,
 ) -> Fit:
-    """Fit the Delta Action Model to `known` and judge it on `held_out`.
+    """Fit the Delta Action Model of the point mass to `known` and judge it on `held_out`.
 
     Args:
         config: the fit.
@@ -157,37 +232,15 @@ def fit(
         held_out: windows of flights that take no part.
         show: called with (iteration, words) as it goes.
     """
-    plant = nominal_plant(physics)
-    errors = jax.jit(window_errors)
-    curve: list[dict[str, float]] = []
-    every = max(1, config.iterations // 50)
-
-    def loss(params: delta_network.Params, batch: Windows) -> jax.Array:
-        return _loss(config, plant, batch, params)
-
-    def watch(iteration: int, params: delta_network.Params) -> None:
-        if iteration % every and iteration + 1 < config.iterations:
-            return
-        row = {
-            "iteration": iteration,
-            "fit_m": float(errors(plant, known, params)[0].mean()),
-            "held_out_m": float(errors(plant, held_out, params)[0].mean()),
-        }
-        curve.append(row)
-        show(iteration + 1, f"1 s error {row['fit_m']:.3f} m, held out {row['held_out_m']:.3f} m")
-
-    def judged(plant: Plant, params: Any) -> Errors:
-        pos, vel = errors(plant, held_out, params)
-        return Errors(float(pos.mean()), float(vel.mean()))
-
-    start = delta_network.init(jax.random.key(config.seed))
-    params = _descend(config, loss, start, known, config.iterations, watch)
+    nominal = partial(replay, nominal_plant(physics))
+    network = fit_network(config, nominal, known, held_out, show)
     identified = identify(config, physics, known)
+    rival = jax.jit(partial(window_errors, partial(replay, identified)))
     return Fit(
-        params={name: np.asarray(value) for name, value in params.items()},
+        params=network.params,
         identified=identified,
-        point_mass=judged(plant, None),
-        fitted_point_mass=judged(identified, None),
-        delta_action=judged(plant, params),
-        curve=curve,
+        point_mass=network.without,
+        fitted_point_mass=_means(rival(held_out, None)),
+        delta_action=network.with_delta,
+        curve=network.curve,
     )

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from policies import delta_network
+from suite.delta.warm import remembered
 from suite.delta.windows import Windows
 from suite.train import point_mass
 from suite.train.config import PointMassConfig
@@ -91,7 +92,8 @@ def replay(
         jnp.swapaxes(windows.heading_w, 0, 1)[1:],
         jnp.swapaxes(windows.time_step, 0, 1),
     )
-    start = (body, delta_network.start(count))
+    hidden = delta_network.start(count) if delta is None else remembered(delta, windows.warm)
+    start = (body, hidden)
     _, (pos_w, vel_w, correction_b) = jax.lax.scan(step, start, by_step)
     pos_w, vel_w = jnp.swapaxes(pos_w, 0, 1), jnp.swapaxes(vel_w, 0, 1)
     return pos_w, vel_w, jnp.swapaxes(correction_b, 0, 1)

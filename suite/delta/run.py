@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from eval.flight_log import FlightLog, read_flights
 from policies.delta_file import save_delta
 from suite.console import Console
-from suite.delta.fit import Errors, Fit, FitConfig, fit
+from suite.delta.fit import Errors, Fit, FitConfig, Network, fit, fit_network
 from suite.delta.windows import cut_windows
 from suite.estimate import Estimate, announce
 from suite.provenance import write_run_record
-from suite.train.config import PointMassConfig
+from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.files import plain, write_json, write_text
+
+POINT, QUAD = "point", "quad"
+"""What a Delta Action Model corrects, as `suite train --model` calls it."""
+PLANT_STEPS_S = 4e5
+"""Steps of the quadrotor a second that a fit makes, for the estimate."""
 
 
 def flight_files(paths: Sequence[Path]) -> list[Path]:
@@ -63,21 +70,15 @@ def fit_delta(
     Raises:
         ValueError: where the logs cannot be used.
     """
-    logs, warnings = read_flights(flight_files(paths))
-    for warning in warnings:
-        console.note(f"warning: {warning}")
-    known, held = split(logs, config.held_out, config.seed)
+    known, held = _read(config, paths, console)
     windows = cut_windows(known, config.horizon_s, config.stride_s)
     held_windows = cut_windows(held, config.horizon_s, config.stride_s)
     work = config.iterations * config.batch * windows.action_b.shape[1]
     announce(console, "fitting the Delta Action Model", Estimate(20 + work / 1.5e5, 8e8))
     with console.progress("fitting", config.iterations) as show:
         result = fit(config, physics, windows, held_windows, show)
-    held_out = [log.name for log in held]
-    write_run_record(out, config, config.seed)
     summary = {
-        "horizon_s": config.horizon_s,
-        "held_out": held_out,
+        "model": POINT,
         "windows": {"fit": len(windows.acc_w), "held_out": len(held_windows.acc_w)},
         "point_mass": result.point_mass,
         "fitted_point_mass": result.fitted_point_mass,
@@ -85,28 +86,96 @@ def fit_delta(
         "identified": result.identified,
         "curve": result.curve,
     }
-    save_delta(out / "delta", result.params, seed=config.seed, fit=plain(config))
-    write_json(out / "delta.json", plain(summary))
-    write_text(out / "table.md", table(result, config.horizon_s))
+    _write(config, held, result.params, summary, table(result, config.horizon_s), out)
     return result
+
+
+def fit_quadrotor_delta(
+    config: FitConfig, quad: QuadrotorConfig, paths: Sequence[Path], out: Path, console: Console
+) -> Network:
+    """Fit a Delta Action Model of the trainer's quadrotor; write the same files.
+
+    Raises:
+        ValueError: where the logs cannot be used.
+    """
+    from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor
+
+    known, held = _read(config, paths, console)
+    windows, cut = cut_quadrotor_windows(known, quad, config.horizon_s, config.stride_s)
+    held_windows, _ = cut_quadrotor_windows(held, quad, config.horizon_s, config.stride_s)
+    work = config.iterations * config.batch * windows.action_b.shape[1] * cut.physics
+    words = "fitting the Delta Action Model through the quadrotor"
+    announce(console, words, Estimate(40 + work / PLANT_STEPS_S, 1.5e9))
+    with console.progress("fitting", config.iterations) as show:
+        replay = partial(replay_quadrotor, quad, cut)
+        result = fit_network(config, replay, windows, held_windows, show)
+    summary = {
+        "model": QUAD,
+        "vehicle": quad.vehicle,
+        "windows": {"fit": len(windows.start_s), "held_out": len(held_windows.start_s)},
+        "without": result.without,
+        "delta_action": result.with_delta,
+        "curve": result.curve,
+    }
+    words = quadrotor_table(result, config.horizon_s)
+    _write(config, held, result.params, summary, words, out)
+    return result
+
+
+def _read(
+    config: FitConfig, paths: Sequence[Path], console: Console
+) -> tuple[list[FlightLog], list[FlightLog]]:
+    logs, warnings = read_flights(flight_files(paths))
+    for warning in warnings:
+        console.note(f"warning: {warning}")
+    return split(logs, config.held_out, config.seed)
+
+
+def _write(
+    config: FitConfig,
+    held: Sequence[FlightLog],
+    params: Mapping[str, Any],
+    summary: Mapping[str, Any],
+    words: str,
+    out: Path,
+) -> None:
+    write_run_record(out, config, config.seed)
+    about = {"horizon_s": config.horizon_s, "held_out": [log.name for log in held], **summary}
+    fitted = {**plain(config), "model": summary["model"]}
+    save_delta(out / "delta", params, seed=config.seed, fit=fitted)
+    write_json(out / "delta.json", plain(about))
+    write_text(out / "table.md", words)
+
+
+def quadrotor_table(result: Network, horizon_s: float) -> str:
+    """Return the held-out errors through the quadrotor as a Markdown table."""
+    rows = (
+        ("quadrotor of the vehicle file", result.without),
+        ("quadrotor with Delta Action Model", result.with_delta),
+    )
+    return _markdown(rows, horizon_s, "the quadrotor's")
 
 
 def table(result: Fit, horizon_s: float) -> str:
     """Return the held-out errors as a Markdown table."""
-    base = result.point_mass.position_m
-
-    def row(name: str, errors: Errors) -> str:
-        share = errors.position_m / base
-        return f"| {name} | {errors.position_m:.3f} | {errors.velocity_m_s:.3f} | {share:.2f} |"
-
-    return "\n".join(
-        [
-            f"| held-out flights, after {horizon_s:g} s | position error [m] "
-            "| velocity error [m/s] | of the point mass's |",
-            "|---|---|---|---|",
-            row("point mass as trained in", result.point_mass),
-            row("point mass, lag, drag and delay fitted", result.fitted_point_mass),
-            row("point mass with Delta Action Model", result.delta_action),
-            "",
-        ]
+    rows = (
+        ("point mass as trained in", result.point_mass),
+        ("point mass, lag, drag and delay fitted", result.fitted_point_mass),
+        ("point mass with Delta Action Model", result.delta_action),
     )
+    return _markdown(rows, horizon_s, "the point mass's")
+
+
+def _markdown(rows: Sequence[tuple[str, Errors]], horizon_s: float, whose: str) -> str:
+    base = rows[0][1].position_m
+    lines = [
+        f"| held-out flights, after {horizon_s:g} s | position error [m] "
+        f"| velocity error [m/s] | of {whose} |",
+        "|---|---|---|---|",
+    ]
+    for name, errors in rows:
+        share = errors.position_m / base
+        lines.append(
+            f"| {name} | {errors.position_m:.3f} | {errors.velocity_m_s:.3f} | {share:.2f} |"
+        )
+    return "\n".join([*lines, ""])

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.flight_log import FlightLog
+from suite.delta.warm import WARM_S, Warm, gather
 from tracks.rotation import quat_to_rot
 
 HISTORY = 2
@@ -33,6 +34,15 @@ class Windows(NamedTuple):
     """(N, HISTORY, 3) commands before the window in world axes, latest first [m/s^2]."""
     time_step: np.ndarray
     """(N, T) time between decisions [s]."""
+    warm_inputs: np.ndarray
+    """(N, W, 9) as in `suite.delta.warm.Warm`."""
+    warm_seen: np.ndarray
+    """(N, W)."""
+
+    @property
+    def warm(self) -> Warm:
+        """What the network saw before each window."""
+        return Warm(self.warm_inputs, self.warm_seen)
 
 
 def _heading(rot_w: np.ndarray) -> np.ndarray:
@@ -66,9 +76,12 @@ def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -
     shortest = min(part.action_b.shape[0] for part in parts)
     rows = {"pos_w": shortest + 1, "vel_w": shortest + 1, "heading_w": shortest + 1}
     rows |= {"action_b": shortest, "time_step": shortest}
+    looks_back = min(part.warm_seen.shape[0] for part in parts)
 
     def stacked(name: str) -> np.ndarray:
         arrays = [getattr(part, name) for part in parts]
+        if name.startswith("warm"):
+            return np.stack([a[len(a) - looks_back :] for a in arrays])
         return np.stack([a[: rows[name]] if name in rows else a for a in arrays])
 
     return Windows(*(stacked(name).astype(np.float32) for name in Windows._fields))
@@ -108,6 +121,7 @@ def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[
                 action[at[span]][:-1],
                 command[first - HISTORY : first][::-1],
                 np.diff(time[span]),
+                *gather(rot, log.vel_w[at], action[at], first, round(WARM_S / period)),
             )
         )
     return found

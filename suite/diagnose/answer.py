@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -139,3 +140,14 @@ def _parameters(diagnosis: Diagnosis, name: str, ones: list[Named]) -> dict[str,
             value, ci = one(at[None])
         found[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci}
     return found
+
+
+def components(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield label, value and interval of every component, None where there is none."""
+    for name, entry in parameters.items():
+        value, span, unit = entry["value"], entry["ci95"], entry["unit"]
+        if not isinstance(value, list):
+            yield f"{name} [{unit}]", value, span
+            continue
+        for k, one in enumerate(value):
+            yield f"{name} {k + 1} [{unit}]", one, span[k] if span else None

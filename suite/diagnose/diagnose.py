@@ -27,6 +27,8 @@ from suite.diagnose.turbulence import Turbulence, find_turbulence
 from suite.diagnose.verdict import COLOURED, SHAPED, Judgement, judge
 from suite.diagnose.windows import Windows, cut, take
 
+HALF_STEP = 0.6
+"""Share of a physics step up to which pose and rates may be apart by integration alone."""
 LOST_M = 50.0
 """A simulated stretch that ends this far from the flight says nothing [m]."""
 LEAST = 2
@@ -140,6 +142,7 @@ def diagnose(
         labels = ", ".join(n.candidate.label for n in finding.named)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
         finding, after = _without_names(model, finding), before
+    warnings += _of_another_integrator(model, finding)
     without: dict[str, Gap] = {}
     for one in finding.named:
         others = [n.candidate for n in finding.named if n is not one]
@@ -193,6 +196,19 @@ def _without_names(model: Model, finding: Finding) -> Finding:
     return replace(
         finding, named=[], indices=[], state=start_state(model, finding.windows), explained=0.0
     )
+
+
+def _of_another_integrator(model: Model, finding: Finding) -> list[str]:
+    """Return a warning where a clock's offset may be a simulator's way to integrate."""
+    if all(one.candidate.name != "clock_offset" for one in finding.named):
+        return []
+    offset = float(model.space.effects(finding.state.theta)["clock_offset"].offset)
+    if abs(offset) > HALF_STEP * model.dt:
+        return []
+    return [
+        f"clock_offset: {1e3 * offset:.2g} ms is about half a physics step; flights of a simulator "
+        "that integrates in another way look like this"
+    ]
 
 
 def _sound(linear: Linear) -> np.ndarray:

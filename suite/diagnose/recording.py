@@ -59,7 +59,7 @@ def write_rollouts(
             simulations.append(Simulation(label, tracks, errors))
         log = logs[int(number)]
         flights.append(Compared(log.name, _measured(log, first_s), simulations))
-    return write_comparison(path, flights, vehicle.half_size)
+    return write_comparison(path, flights, vehicle.body.half_size)
 
 
 def _measured(log: FlightLog, first_s: float) -> Track:

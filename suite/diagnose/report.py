@@ -6,11 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from eval.effects import EFFECTS
+from suite.diagnose.answer import components
 from suite.diagnose.charts import drift_chart, gains_chart, where_chart
 from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.proof import Proof
 from suite.diagnose.report_logs import actuators_section, logs_section, noise_section
 from suite.diagnose.report_proof import evidence_section, rest_section
+from suite.diagnose.search import P_VALUE
+from suite.diagnose.select import FLIPS
 from suite.diagnose.windows import UNITS
 from suite.report import Cell, Details, Grid, Links, Part, Picture, Report, Section
 
@@ -100,21 +103,21 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
     rows = []
     for effect in found["effects"]:
         removed, chance = effect["gap_removed"], effect["p_value"]
-        for name, entry in effect["parameters"].items():
+        for label, value, span in components(effect["parameters"]):
             rows.append(
                 [
                     Cell(effect["name"]),
                     Cell(", ".join(effect["alternatives"]) or "none"),
-                    Cell(f"{name} [{entry['unit']}]"),
-                    Cell(_number(entry["value"])),
-                    Cell(_number(entry["ci95"]) if entry["ci95"] is not None else "given"),
+                    Cell(label),
+                    Cell("not seen" if value is None else _number(value)),
+                    Cell("" if span is None else f"{_number(span[0])} to {_number(span[1])}"),
                     Cell("exempt" if removed is None else f"{100 * removed:.0f} %"),
                     Cell(f"{chance:.2g}"),
                 ]
             )
     headers = ["effect", "cannot be told from", "parameter", "total", "95 %", "of the gap", "p"]
     words = [
-        f"{effect['name']}: {EFFECTS[effect['name']].summary} {EFFECTS[effect['name']].equation}"
+        f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
         for effect in found["effects"]
     ]
     note = (
@@ -184,9 +187,9 @@ def _candidates(diagnosis: Diagnosis) -> Section:
     words = (
         f"All {len(scores)} candidates, each fitted alone before anything was named. The gain is "
         "the fall of the whitened squared error on stretches that its fit did not see. The null: "
-        "the signs of whole stretches are shuffled 999 times, and the best gain of all candidates "
-        "is taken each time; p is how often that is as large. One name follows another while "
-        "p is at most 0.01; then all are refitted jointly."
+        f"the signs of whole stretches are shuffled {FLIPS} times, and the best gain of all "
+        "candidates is taken each time; p is how often that is as large. One name follows another "
+        f"while p is at most {P_VALUE:g}; then all are refitted jointly."
     )
     table = "\n".join(f"{c[0].text:24}{c[1].text:>12}{c[2].text:>8}  {c[3].text}" for c in rows)
     return Section(
@@ -252,9 +255,5 @@ def _written(found: Mapping[str, Any], toml: str, files: set[str]) -> Section:
     return Section("8. What was written", parts)
 
 
-def _number(value: Any) -> str:
-    if value is None:
-        return "not seen"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_number(v) for v in value) + "]"
+def _number(value: float) -> str:
     return f"{value:.4g}"

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from eval.stats import Interval
+from suite.charts import plain_axes, png, titled
 from suite.loop.compare import BEFORE, WITH, WITHOUT, Line
+from suite.loop.variants import Standing
 
 COLOURS = {BEFORE: "#8b93a1", WITHOUT: "#e0892b", WITH: "#2463c9"}
 LABELS = {BEFORE: "before", WITHOUT: "tuned without delta", WITH: "tuned with delta"}
-GRID = "#e6e9ee"
-DPI = 130
+PANELS = (
+    ("gates", "Gates a rollout", 1),
+    ("collided", "Worlds that collided [%]", 100),
+    ("speed", "Mean speed [m/s]", 1),
+)
+"""Numbers of a training's curve, their titles and scales."""
 
 
 def comparison_chart(lines: Sequence[Line]) -> bytes:
@@ -31,7 +35,7 @@ def comparison_chart(lines: Sequence[Line]) -> bytes:
         (right, "Mean speed, median over trials [m/s]", 1, lambda line: line.v_mean),
     ):
         _dots(axes, lines, scale, pick)
-        axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
+        titled(axes, title)
         axes.set_xticks(range(len(lines)), names, fontsize=8)
         if lines[-1].difficulty is None and len(lines) > 1:
             axes.axvline(len(lines) - 1.5, color="#b8bec8", lw=0.8)
@@ -39,7 +43,7 @@ def comparison_chart(lines: Sequence[Line]) -> bytes:
     right.set_ylim(bottom=0)
     handles, labels = left.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    return _png(figure)
+    return png(figure)
 
 
 def _dots(
@@ -51,7 +55,6 @@ def _dots(
         reach = np.maximum([value - low, high - value], 0)
         style = {"fmt": "o", "ms": 5.5, "lw": 1.8, "capsize": 0}
         axes.errorbar(at, value, reach, color=COLOURS[variant], label=LABELS[variant], **style)
-    _plain(axes)
 
 
 def training_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
@@ -62,9 +65,7 @@ def training_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
     """
     figure = Figure(figsize=(10.4, 3.1), layout="constrained")
     before = len(curves.get(BEFORE, ()))
-    panels = (("gates", "Gates a rollout", 1), ("collided", "Worlds that collided [%]", 100),
-              ("speed", "Mean speed [m/s]", 1))  # fmt: skip
-    for axes, (key, title, scale) in zip(figure.subplots(1, 3), panels, strict=True):
+    for axes, (key, title, scale) in zip(figure.subplots(1, 3), PANELS, strict=True):
         for variant, rows in curves.items():
             if not rows:
                 continue
@@ -74,13 +75,59 @@ def training_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
             axes.plot(at, values, color=COLOURS[variant], lw=0.7, alpha=0.25)
             label = "training" if variant == BEFORE else LABELS[variant]
             axes.plot(at, _smooth(values), color=COLOURS[variant], lw=1.8, label=label)
+        titled(axes, title)
+        axes.set_xlabel("iteration", fontsize=9)
+        axes.set_ylim(bottom=0)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    return png(figure)
+
+
+SEVERAL = ("#8b93a1", "#c0504d", "#e0892b", "#7a5fb5", "#2463c9", "#2e9e6b")
+"""Colours of up to six policies."""
+
+
+def success_chart(stand: Sequence[Standing], labels: Mapping[str, str]) -> bytes:
+    """Return the success rates of any policies by track and level, and over all."""
+    figure = Figure(figsize=(10.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    cells = [*stand[0].by_cell, "all"]
+    for number, (one, colour) in enumerate(zip(stand, SEVERAL, strict=False)):
+        rates = [*one.by_cell.values(), one.success]
+        value, low, high = 100 * np.array(rates).T
+        at = np.arange(len(cells)) + 0.13 * (number - 0.5 * (len(stand) - 1))
+        reach = np.maximum([value - low, high - value], 0)
+        style = {"fmt": "o", "ms": 5, "lw": 1.6, "capsize": 0}
+        axes.errorbar(at, value, reach, color=colour, label=labels[one.name], **style)
+    axes.axvline(len(cells) - 1.5, color="#b8bec8", lw=0.8)
+    axes.set_xticks(range(len(cells)), [cell.replace(" ", "\nlevel ") for cell in cells])
+    axes.set_ylim(-3, 103)
+    axes.set_title("Success [%]", loc="left", fontsize=11, fontweight="bold")
+    plain_axes(axes)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    return png(figure)
+
+
+def tuning_chart(
+    curves: Mapping[str, Sequence[Mapping[str, Any]]], labels: Mapping[str, str]
+) -> bytes:
+    """Return gates, collisions and speed over several fine-tunings (rows of metrics.jsonl)."""
+    figure = Figure(figsize=(10.4, 3.1), layout="constrained")
+    colours = dict(zip(curves, SEVERAL[2:], strict=False))
+    for axes, (key, title, scale) in zip(figure.subplots(1, 3), PANELS, strict=True):
+        for variant, rows in curves.items():
+            if not rows:
+                continue
+            values = scale * np.array([row[key] for row in rows], float)
+            at = np.array([row["iteration"] for row in rows])
+            axes.plot(at, _smooth(values), color=colours[variant], lw=1.8, label=labels[variant])
         axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
         axes.set_xlabel("iteration", fontsize=9)
         axes.set_ylim(bottom=0)
-        _plain(axes)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    return _png(figure)
+        plain_axes(axes)
+    handles, names = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return png(figure)
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
@@ -112,21 +159,6 @@ def delta_chart(fitted: Mapping[str, Any]) -> bytes:
     axes.set_ylim(bottom=0)
     axes.set_xlabel("iteration of the fit", fontsize=9)
     title = f"Position error after {fitted['horizon_s']:g} s [m]"
-    axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
-    _plain(axes)
+    titled(axes, title)
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    return _png(figure)
-
-
-def _plain(axes: Axes) -> None:
-    axes.grid(color=GRID, lw=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=8)
-
-
-def _png(figure: Figure) -> bytes:
-    FigureCanvasAgg(figure)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=DPI)
-    return file.getvalue()
+    return png(figure)

@@ -156,11 +156,11 @@ def _grid(title: str, lines: Sequence[Line], field: str, scale: float, digits: i
     for line in lines:
         measure: Measure = getattr(line, field)
         level = "all" if line.difficulty is None else str(line.difficulty)
-        merit, gain = (_difference(d, scale, digits) for d in measure[3:])
+        merit, gain = (difference_cell(d, scale, digits) for d in measure[3:])
         rows.append(
             [
                 *(Cell(text) for text in (line.track, level, str(line.trials))),
-                *(Cell(_value(interval, scale, digits)) for interval in measure[:3]),
+                *(Cell(value_text(interval, scale, digits)) for interval in measure[:3]),
                 merit,
                 *([Cell(f"{line.p_value:.2g}")] if test else []),
                 gain,
@@ -169,12 +169,14 @@ def _grid(title: str, lines: Sequence[Line], field: str, scale: float, digits: i
     return Grid(title, headers, rows, strong_last=True)
 
 
-def _value(interval: Interval, scale: float, digits: int) -> str:
+def value_text(interval: Interval, scale: float, digits: int) -> str:
+    """Return a number with its interval for a table."""
     value, low, high = (f"{scale * x:.{digits}f}" for x in interval)
     return f"{value} [{low}, {high}]"
 
 
-def _difference(interval: Interval, scale: float, digits: int) -> Cell:
+def difference_cell(interval: Interval, scale: float, digits: int) -> Cell:
+    """Return a difference with its interval and sign, toned where it does not hold zero."""
     # Adding zero to what is rounded turns -0, which reads as if something had been lost, into +0.
     value, low, high = (f"{round(scale * x, digits) + 0.0:+.{digits}f}" for x in interval)
     tone = "good" if interval.low > 0 else "bad" if interval.high < 0 else ""

@@ -127,7 +127,7 @@ def resolve(
         seed=seed,
         digests=digests,
     )
-    _check(config)
+    check_seeds(config.track, config.difficulty, config.seed, config.trials, config.flights)
     return config
 
 
@@ -153,24 +153,37 @@ def _with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
     return replace(config, optimizer=replace(config.optimizer, iterations=iterations))
 
 
-def _check(config: LoopConfig) -> None:
-    files = [name for name in parse_tracks(config.track) if is_track_file(name)]
+def check_seeds(track: str, difficulty: str, seed: int, trials: int, flights: int) -> None:
+    """Check that recorded flights and judged trials can be kept apart.
+
+    Args:
+        track: as people write it, and so on.
+        difficulty: levels.
+        seed: of the first judged trial.
+        trials: judged, on every track at every level.
+        flights: recorded, on every track at every level.
+
+    Raises:
+        ValueError: naming the option and what is allowed.
+    """
+    names, levels = parse_tracks(track), parse_levels(difficulty)
+    files = [name for name in names if is_track_file(name)]
     if files:
         raise ValueError(
             f"--track {files[0]}: a track from a file is the same at every seed, so flights on it "
             "cannot be held apart from trials; give families (zigzag, circular, ellipse)"
         )
-    parse_levels(config.difficulty)
-    at_least("--seed", config.seed, 0)
-    at_least("--trials", config.trials, 1)
-    at_least("--flights", config.flights, 1)
-    if config.trials > RECORDED_FROM:
+    at_least("--seed", seed, 0)
+    at_least("--trials", trials, 1)
+    at_least("--flights", flights, 1)
+    if trials > RECORDED_FROM:
         raise ValueError(
-            f"--trials is {config.trials}; it must be {RECORDED_FROM} or less, since recorded "
+            f"--trials is {trials}; it must be {RECORDED_FROM} or less, since recorded "
             "flights have the seeds above"
         )
-    if config.flights * config.cells < 2:
+    cells = len(names) * len(levels)
+    if flights * cells < 2:
         raise ValueError(
-            f"--flights is {config.flights} on {config.cells} track and level; at least 2 flights "
+            f"--flights is {flights} on {cells} track and level; at least 2 flights "
             "are needed, one of which is held out"
         )

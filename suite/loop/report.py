@@ -10,7 +10,6 @@ from suite.console import duration
 from suite.loop.charts import comparison_chart, delta_chart, training_chart
 from suite.loop.compare import BEFORE, CAVEAT, WITH, WITHOUT, Line, grids, verdict
 from suite.loop.config import LoopConfig
-from suite.loop.replays import SHOWN
 from suite.report import (
     Cell,
     Details,
@@ -141,7 +140,7 @@ def _flights(out: Path) -> list[Section]:
     }
     titles = {BEFORE: "Flights before fine-tuning", WITH: "Flights, fine-tuned with delta"}
     sections = []
-    for variant in SHOWN:
+    for variant in (BEFORE, WITH):
         png = (out / "replays" / f"{variant}.png").read_bytes()
         sections.append(Section(titles[variant], [words[variant], Picture(png, "")]))
     return sections

@@ -8,25 +8,22 @@ recording.rrd. Every stage goes on where it was cut off; a finished one is not d
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from rich.console import RenderableType
 
 from eval.results import read_trials
 from policies.delta_file import load_delta
 from policies.network import fitted
 from policies.policy_file import load_policy_checkpoint
-from suite.collect import Collection, collect
+from suite.collect import Collection
 from suite.console import Console
 from suite.delta.run import fit_delta
 from suite.errors import WorkFailed
 from suite.estimate import Estimate, announce
-from suite.evaluate import Judgement, evaluate
-from suite.flying import PROCESS_BYTES, SECONDS_A_TRIAL, START_SECONDS, options_for
+from suite.evaluate import Judgement
 from suite.loop.compare import (
     BEFORE,
     CAVEAT,
@@ -38,28 +35,19 @@ from suite.loop.compare import (
     grids,
     verdict,
 )
-from suite.loop.config import LoopConfig, checkpoint_folder
+from suite.loop.config import LoopConfig
 from suite.loop.replays import write_replays
 from suite.loop.report import write_loop_report
 from suite.loop.stages import Stages, claim
+from suite.loop.work import flying, judge, record, take_policy, what_is_left
 from suite.report import markdown, rich_table
 from suite.train import run as training
-from tracks.files import plain, replacing_folder, write_json, write_text
+from tracks.files import plain, write_json, write_text
 from tracks.provenance import stamp
 
 STAGES = 9
 """How many stages a loop has."""
 RECORDING = "recording.rrd"
-
-
-class Quiet(Console):
-    """Keeps progress and leaves the lines of a stage's own result out: the loop has its own."""
-
-    def say(self, text: str = "") -> None:
-        """Print nothing."""
-
-    def show(self, table: RenderableType) -> None:
-        """Print nothing."""
 
 
 def run_loop(config: LoopConfig, out: Path, console: Console) -> dict[str, Any]:
@@ -92,7 +80,9 @@ def run_loop(config: LoopConfig, out: Path, console: Console) -> dict[str, Any]:
     for variant in (WITHOUT, WITH):
         judged[variant] = _judge(config, stages, variant, policies[variant])
     words = "flying a few trials again for the recording and the pictures"
-    stages.do("replays", words, lambda folder: write_replays(config, policies, folder))
+    shown = {BEFORE: ("before", policies[BEFORE]), WITH: ("tuned with delta", policies[WITH])}
+    judgement = _judgement(config, policies[BEFORE])
+    stages.do("replays", words, lambda folder: write_replays(judgement, shown, folder))
     lines = compare({name: read_trials(judged[name] / "trials.parquet") for name in VARIANTS})
     return _conclude(config, stages, lines)
 
@@ -100,11 +90,6 @@ def run_loop(config: LoopConfig, out: Path, console: Console) -> dict[str, Any]:
 def estimate(config: LoopConfig, stages: Stages) -> Estimate:
     """Return about how long the stages that are left take, and the largest memory of one."""
     train, tune = training.estimate(config.training), training.estimate(config.tuning)
-
-    def flying(trials: int) -> Estimate:
-        processes = options_for(trials, None, "mujoco").processes or 1
-        seconds = START_SECONDS + trials * SECONDS_A_TRIAL / processes
-        return Estimate(seconds, processes * PROCESS_BYTES)
 
     judging, recording = (flying(n * config.cells) for n in (config.trials, config.flights))
     steps = config.fit.horizon_s * config.training.spec.rate_hz
@@ -117,9 +102,7 @@ def estimate(config: LoopConfig, stages: Stages) -> Estimate:
         **{f"tuned-{name}": tune for name in (WITHOUT, WITH)},
         "replays": flying(12),
     }
-    left = [need for name, need in needs.items() if not stages.is_done(name)]
-    most = max((need.memory_bytes for need in left), default=0.0)
-    return Estimate(sum(need.seconds for need in left), most)
+    return what_is_left(stages, needs)
 
 
 def _first_policy(config: LoopConfig, stages: Stages) -> Path:
@@ -131,15 +114,18 @@ def _first_policy(config: LoopConfig, stages: Stages) -> Path:
 
         return stages.do("train", "training in the point mass", train) / "policy"
 
-    def copy(folder: Path) -> None:
-        with replacing_folder(folder / "policy") as beside:
-            shutil.copytree(checkpoint_folder(given), beside, dirs_exist_ok=True)
-
-    return stages.do("given", f"taking {given} instead of training", copy) / "policy"
+    return take_policy(stages, given)
 
 
 def _judge(config: LoopConfig, stages: Stages, variant: str, policy: Path) -> Path:
-    judgement = Judgement(
+    words = "judging the policy in MuJoCo"
+    if variant != BEFORE:
+        words = f"judging the one fine-tuned {variant} the Delta Action Model, on the same seeds"
+    return judge(stages, f"eval-{variant}", words, _judgement(config, policy))
+
+
+def _judgement(config: LoopConfig, policy: Path) -> Judgement:
+    return Judgement(
         policies=(str(policy),),
         track=config.track,
         difficulty=config.difficulty,
@@ -147,17 +133,6 @@ def _judge(config: LoopConfig, stages: Stages, variant: str, policy: Path) -> Pa
         seed=config.seed,
         vehicle=config.vehicle,
     )
-    words = "judging the policy in MuJoCo"
-    if variant != BEFORE:
-        words = f"judging the one fine-tuned {variant} the Delta Action Model, on the same seeds"
-    folder = stages.do(f"eval-{variant}", words, lambda out: evaluate(judgement, out, Quiet()))
-    rows = read_trials(folder / "trials.parquet")
-    won = sum(row.success for row in rows) / len(rows)
-    gates = sum(row.gates_passed for row in rows) / len(rows)
-    stages.console.note(
-        f"    {won:.0%} of {len(rows)} trials succeed, {gates:.1f} gates on average"
-    )
-    return folder
 
 
 def _record(config: LoopConfig, stages: Stages, policy: Path) -> None:
@@ -169,8 +144,7 @@ def _record(config: LoopConfig, stages: Stages, policy: Path) -> None:
         vehicle=config.vehicle,
         seed=config.recorded_from,
     )
-    words = "recording flights on other seeds"
-    stages.do("flights", words, lambda out: collect(collection, out, Quiet()))
+    record(stages, collection)
 
 
 def _fit(config: LoopConfig, stages: Stages) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from eval.vehicle import Vehicle
 from policies.spec import PolicySpec
 
 
@@ -40,6 +41,34 @@ class PointMassConfig:
 
 
 @dataclass(frozen=True)
+class QuadrotorConfig:
+    """The differentiable quadrotor around a vehicle file; what varies is drawn per world.
+
+    Images and their delay, noise and field of view are those of `PointMassConfig`.
+    """
+
+    vehicle: Vehicle
+    """The simulation's vehicle with its effects."""
+    attitude_hz: float = 100.0
+    """About how often the attitude loop runs: a whole number of times a policy period [Hz]."""
+    physics_hz: float = 250.0
+    """About how often rate loop and rigid body are stepped; the judge steps at the vehicle's
+    controller.frequency [Hz]."""
+    mass_std: float = 0.03
+    """Standard deviation of the true mass over worlds, as a share of the vehicle's [1]."""
+    lag_spread: float = 0.3
+    """The rotors' time constant varies by up to this share of the vehicle's either way [1]."""
+    drag_spread: float = 0.1
+    """Linear drag varies by up to this on each axis either way, and is never negative [1/s]."""
+    delay_spread_s: float = 0.01
+    """The delay of commands varies by up to this either way, and is never negative [s]."""
+    gain_spread: float = 0.1
+    """The rate loop's gain varies by up to this share either way [1]."""
+    wind_std: tuple[float, float, float] = (1.0, 1.0, 0.2)
+    """Standard deviation of the constant wind over worlds, around the vehicle's [m/s]."""
+
+
+@dataclass(frozen=True)
 class LossConfig:
     """Weights of the losses of Su et al. 2026, Sec. III-C3, and the strength of the field.
 
@@ -64,6 +93,9 @@ class LossConfig:
     """Where the drone is off a gate's axis or beyond its plane, progress is measured towards a
     point on the axis before the gate, by as much as it is off, at most this far: straight to the
     centre the frame is in the way, and the drone hovers above it; 0: always the centre [m]."""
+    pass_first: bool = False
+    """Whether the step that passes a gate measures progress towards the next one already, and not
+    backwards to the one that was passed: faster, and less careful at these weights."""
     projection_decay: float = 0.5
     """beta_3 of L_proj [1/m]."""
     barrier_height: float = 2.0
@@ -150,6 +182,8 @@ class TrainConfig:
     """Rate, camera and encodings of the policy."""
     physics: PointMassConfig = field(default_factory=PointMassConfig)
     """Dynamics and their randomisation."""
+    quadrotor: QuadrotorConfig | None = None
+    """Train through this quadrotor; None: through the point mass of `physics`."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Weights of the loss and of the field."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)

@@ -75,7 +75,7 @@ def start(pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> Body:
     return Body(pos_w, vel_w, zero, zero, rot_w, heading_w, commands)
 
 
-def _fade(x: jax.Array, factor: jax.Array) -> jax.Array:
+def faded(x: jax.Array, factor: jax.Array | float) -> jax.Array:
     """Return x, with its gradient multiplied by factor (gradient decay of Zhang et al. 2025)."""
     return x * factor + jax.lax.stop_gradient(x * (1 - factor))
 
@@ -113,7 +113,7 @@ def step(
     air_b = to_local(rot, body.vel_w - constants.wind_w)
     acc = thrust - to_world(rot, constants.drag * air_b)
     fade = jnp.exp(-gradient_decay * dt)
-    pos, vel = _fade(body.pos_w, fade), _fade(body.vel_w, fade)
+    pos, vel = faded(body.pos_w, fade), faded(body.vel_w, fade)
     pos = pos + vel * dt + 0.5 * body.acc_w * dt * dt
     vel = vel + 0.5 * (body.acc_w + acc) * dt
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from eval.vehicle import Vehicle
 from policies.spec import PolicySpec
 from suite.train.config import (
     EpisodeConfig,
     LossConfig,
     OptimizerConfig,
     PointMassConfig,
+    QuadrotorConfig,
     TrainConfig,
 )
 from tracks.names import unknown_name
@@ -87,6 +89,48 @@ def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
         ),
         seed=config.seed + 1,
     )
+
+
+def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:
+    """Return `config` through the quadrotor of `vehicle` instead of the point mass.
+
+    Raises:
+        ValueError: where the policy decides faster than the vehicle's controller runs.
+    """
+    rate, frequency = config.spec.rate_hz, vehicle.controller.frequency
+    if rate > frequency:
+        raise ValueError(
+            f"the policy decides at {rate:g} Hz, allowed is up to the {frequency:g} Hz of vehicle "
+            f"{vehicle.name!r}'s controller.frequency"
+        )
+    return replace(config, quadrotor=QuadrotorConfig(vehicle))
+
+
+def chosen_model(config: TrainConfig, model: str, vehicle: str | None) -> TrainConfig:
+    """Return `config` with what --model and --vehicle ask for.
+
+    Args:
+        config: a recipe.
+        model: "point" or "quad".
+        vehicle: a vehicle file or a shipped name; with "quad" only.
+
+    Raises:
+        ValueError: where one is given without the other, or the vehicle cannot be used.
+    """
+    from eval.vehicle_file import load_vehicle, shipped_vehicles
+
+    if model == "point":
+        if vehicle is not None:
+            raise ValueError(
+                f"--vehicle is {vehicle}, but the point mass has none: add --model quad"
+            )
+        return config
+    if vehicle is None:
+        raise ValueError(
+            "--model quad needs --vehicle: a vehicle file, or a shipped one by its name "
+            f"({', '.join(shipped_vehicles())})"
+        )
+    return with_quadrotor(config, load_vehicle(vehicle))
 
 
 PRESETS = {"racer": racer, "paper": paper, "small": small, "gpu": gpu}

@@ -1,4 +1,4 @@
-"""One rollout of the policy in the point mass, with the loss of every step.
+"""One rollout of the policy in its dynamics, with the loss of every step.
 
 The image carries no gradient to the state (Zhang et al. 2025), so the encoder can leave the
 differentiated loop: the embeddings enter as constants plus `nudge`, a zero whose gradient is the
@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from policies import delta_network, network
 from policies.observation import encode_depth, state_vector
-from suite.train import losses, point_mass
+from suite.train import losses
 from suite.train.config import LossConfig, TrainConfig
+from suite.train.dynamics import Body, make_dynamics
 from suite.train.worlds import Worlds
 from tracks.camera import pixel_rays_b
 from tracks.clearance import nearest_obstacle
@@ -40,7 +41,8 @@ BODY_RADIUS_M = 0.08
 class Memory(NamedTuple):
     """What a world carries from step to step."""
 
-    body: point_mass.Body
+    body: Any
+    """Of the dynamics."""
     target: jax.Array
     """(B,) gates passed, counted from the track's first."""
     hidden: jax.Array
@@ -99,12 +101,12 @@ def _queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def make_look(
     config: TrainConfig,
-) -> Callable[[Worlds, point_mass.Body, jax.Array], jax.Array]:
+) -> Callable[[Worlds, Body, jax.Array], jax.Array]:
     """Return look(worlds, body, key) -> (B, height, width), the encoded image with its noise."""
     spec, physics = config.spec, config.physics
     rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
 
-    def look(worlds: Worlds, body: point_mass.Body, key: jax.Array) -> jax.Array:
+    def look(worlds: Worlds, body: Body, key: jax.Array) -> jax.Array:
         # Scaling the rays across the optical axis changes the field of view; every world of an
         # iteration shares it, so that the rays stay one array.
         axis = rays.mean(0)
@@ -127,18 +129,17 @@ def make_judge(
     """
 
     def judge(
-        worlds: Worlds, before: point_mass.Body, body: point_mass.Body, target: jax.Array
+        worlds: Worlds, before: Body, body: Body, target: jax.Array
     ) -> tuple[losses.Terms, jax.Array, jax.Array]:
         gate, _ = target_gate(worlds.scene.gates, target)
         count = worlds.scene.gates.center_w.shape[1]
         held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
         passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
         passed = passed & (target < count)
-        # A gate that was passed in this step is no goal any more: measured to it, progress would
-        # be backwards, and the drone learns to slow down in front of gates.
-        aim, aim_w = target_gate(worlds.scene.gates, target + passed)
+        goal = target + (passed & weights.pass_first)
+        aim, aim_w = target_gate(worlds.scene.gates, goal)
         local = to_local(aim.rot_w, body.pos_w - aim.center_w)
-        shift = (target + passed < count) * losses.approach_shift(weights, local)
+        shift = (goal < count) * losses.approach_shift(weights, local)
         goal_w = aim_w - shift[:, None] * aim.rot_w[:, :, 0]
         share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
@@ -174,7 +175,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
     are (T, B, ...).
     """
     spec, physics, weights = config.spec, config.physics, config.loss
-    look, judge = make_look(config), make_judge(weights)
+    look, judge, dynamics = make_look(config), make_judge(weights), make_dynamics(config)
 
     def act(
         params: network.Params,
@@ -204,7 +205,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
         delta: delta_network.Params | None = None,
     ) -> tuple[jax.Array, StepRecord]:
         steps, batch, width = nudge.shape
-        body = point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w)
+        body = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
         memory = Memory(
             body=body,
             target=worlds.target,
@@ -235,14 +236,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
                 )
                 action = action + correction
                 memory = memory._replace(delta_hidden=delta_hidden)
-            body = point_mass.step(
-                before,
-                worlds.constants,
-                action,
-                target_w,
-                physics.heading_rate,
-                weights.gradient_decay,
-            )
+            body = dynamics.step(before, worlds.constants, action, target_w, key_now)
             terms, clearance, passed = judge(worlds, before, body, memory.target)
             terms = losses.Terms(*(term * memory.alive for term in terms))
             alive = memory.alive * (clearance > -weights.crash_depth_m)

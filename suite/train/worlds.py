@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from suite.train import dynamics, point_mass
 from suite.train.config import TrainConfig
-from suite.train.point_mass import Constants
 from tracks.cull import Bounds, bounds
 from tracks.families import MAX_COUNTS, random_track
 from tracks.families.random import Mix
@@ -30,7 +30,8 @@ class Worlds(NamedTuple):
     """(B, 3) unit, horizontal."""
     target: Array
     """(B,) index of the first gate to pass."""
-    constants: Constants
+    constants: dynamics.Constants
+    """Of the dynamics."""
     hidden: Array
     """(B, hidden) the policy's recurrent state at the start, zero for worlds that start at rest."""
     remembers: Array
@@ -106,6 +107,16 @@ def _beside_a_gate(
     return point, speed_limit * onward, target
 
 
+def _quadrotor_constants(config: TrainConfig, iteration: int) -> dynamics.Constants:
+    """Return the quadrotors of an iteration, from draws of their own: the tracks stay the same."""
+    from suite.train.quadrotor import Constants, draw_effects
+
+    assert config.quadrotor is not None
+    batch, rng = config.episode.batch, np.random.default_rng([config.seed, iteration, 1])
+    period = np.full(batch, 1.0 / config.spec.rate_hz, np.float32)
+    return Constants(period, draw_effects(config.quadrotor, batch, rng))
+
+
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     """Return the worlds of an iteration."""
     rng = np.random.default_rng([config.seed, iteration])
@@ -131,14 +142,16 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     earliest = max(1, round(episode.stop_from * episode.steps))
     stretch = np.clip(1 + physics.time_step_std * rng.standard_normal(batch), 0.5, 1.5)
     lag = physics.lag_mean + physics.lag_std * rng.standard_normal(batch)
-    constants = Constants(
+    point = point_mass.Constants(
         lag=np.clip(lag, 0.2 * physics.lag_mean, None),
         drag=rng.uniform(*physics.drag, (batch, 3)),
         wind_w=rng.standard_normal((batch, 3)) * np.asarray(physics.wind_std),
         time_step=period * stretch,
         delay=rng.uniform(*physics.action_delay, batch),
     )
-    constants = Constants(*(np.asarray(x, np.float32) for x in constants))
+    constants = point_mass.Constants(*(np.asarray(x, np.float32) for x in point))
+    if config.quadrotor is not None:
+        constants = _quadrotor_constants(config, iteration)
     return Worlds(
         scene=stack([track.scene for track in tracks], MAX_COUNTS),
         pos_w=pos.astype(np.float32),

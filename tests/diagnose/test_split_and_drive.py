@@ -33,6 +33,7 @@ def test_a_flight_that_alone_tells_of_something_is_fitted(three):
 def test_of_a_lone_flight_the_end_is_held_out(three):
     logs, _ = three
     windows, _ = cut(logs[:1], LAGGED, False)
+    assert windows is not None
     inside, names = split(logs[:1], windows, np.ones((len(windows.flight), 1)))
     assert names == ["flight_0 from 2.8 s"]
     assert inside.any() and not inside[-1]
@@ -45,6 +46,7 @@ def test_a_moved_centre_of_mass_is_no_other_controller():
 
 def test_speeds_that_the_loop_does_not_ask_for_are_another_controllers(three):
     log = fly(LAGGED, 0, duration_s=4.0, motors=True)
+    assert log.rotor_speed is not None
     other = replace(log, rotor_speed=np.roll(log.rotor_speed, 1, axis=1))
     assert another_controller([other], LAGGED)
     assert not another_controller(three[0], LAGGED)

@@ -47,10 +47,10 @@ def test_px4_equals_the_flight(tmp_path):
     _near(log.acc_b, truth.acc, 1e-5)
     _near(log.voltage, truth.voltage, 1e-5)
     _near(log.rotor_speed, truth.motor, 0.1)
-    # Commands come at 100 Hz and are held: exact on the rows they come with.
-    _near(np.asarray(log.thrust_cmd)[::2], truth.thrust[::2], 1e-5)
-    _near(np.asarray(log.rate_cmd_b)[::2], truth.cmd_rate[::2], 1e-6)
-    _near(np.asarray(log.rate_cmd_b)[1::2], np.asarray(log.rate_cmd_b)[:-1:2], 1e-12)
+    # Rows stand at the positions, at 100 Hz, as the commands do.
+    assert len(log.time_s) == 800
+    _near(log.thrust_cmd, truth.thrust, 1e-5)
+    _near(log.rate_cmd_b, truth.cmd_rate, 1e-6)
     assert {"corrected", "doubt"}.isdisjoint(_levels(findings).values())
     assert log.about["source"] == "px4" and not log.velocity_derived
 
@@ -60,11 +60,11 @@ def test_px4_without_escs_or_a_thrust_scale_takes_the_accelerometer(tmp_path):
     log, findings = import_log(path)
     truth = made.fly(log.time_s)
     assert log.rotor_speed is None
-    _near(np.asarray(log.thrust_cmd)[::2], truth.thrust[::2], 0.05)
+    _near(log.thrust_cmd, truth.thrust, 0.05)
     assert "accelerometer" in _text(findings, "thrust")
     of_vehicle = import_log(path, "px4", ImportOptions(vehicle=PLAIN))
     full = 4 * PLAIN.rotors.thrust_coefficient * PLAIN.rotors.speed_max**2 / PLAIN.mass
-    _near(np.asarray(of_vehicle.log.thrust_cmd)[::2], truth.thrust[::2] / 30.0 * full, 1e-5)
+    _near(of_vehicle.log.thrust_cmd, truth.thrust / 30.0 * full, 1e-5)
 
 
 def test_px4_motors_follow_the_vehicles_hubs(tmp_path):
@@ -76,6 +76,36 @@ def test_px4_motors_follow_the_vehicles_hubs(tmp_path):
     vehicle = PLAIN.__class__(**{**PLAIN.__dict__, "rotors": turned})
     log, _ = import_log(path, None, ImportOptions(vehicle=vehicle))
     _near(log.rotor_speed, made.fly(log.time_s).motor[:, [3, 0, 2, 1]], 0.1)
+
+
+def test_px4_at_the_loggers_default_rates(tmp_path):
+    """Position at 10 Hz, attitude at 20, gyro and commands at 50: rows at 20, nothing made up."""
+    path = tmp_path / "log.ulg"
+    made.write_ulog(path, (0, 12), 20.0, esc=False, pos_hz=10.0, gyro_hz=50.0, command_hz=50.0)
+    log, findings = import_log(path, None, FULL)
+    assert len(log.time_s) == pytest.approx(240, abs=3)
+    assert {"position", "attitude"} <= {f.subject for f in findings if "Hz only" in f.text}
+    assert np.isnan(log.pos_w[1::2]).all() and np.isnan(log.vel_w[1::2]).all()
+    _near(log.pos_w[::2], made.fly(log.time_s[::2]).pos, 1e-5)
+    assert log.whole.mean() > 0.48
+    assert "doubt" not in _levels(findings).values()
+
+
+@pytest.mark.parametrize("frame", [(True, 1), (True, 3), (False, 0), (False, 3)])
+def test_px4_odometry_in_each_frame_of_its_velocity(tmp_path, frame):
+    log, findings = import_log(made.write_ulog(tmp_path / "log.ulg", odometry=frame), None, FULL)
+    truth = made.fly(log.time_s)
+    assert not log.velocity_derived
+    _near(log.pos_w, truth.pos, 2e-6)
+    _near(log.vel_w, truth.vel, 2e-6)
+    assert {"corrected", "doubt"}.isdisjoint(_levels(findings).values())
+
+
+@pytest.mark.parametrize("frame", [(True, 2), (True, 0), (False, 2)])
+def test_px4_odometry_in_another_frame_leaves_the_velocity_out(tmp_path, frame):
+    log, _ = import_log(made.write_ulog(tmp_path / "log.ulg", odometry=frame), None, FULL)
+    assert log.velocity_derived
+    _near(log.vel_w, made.fly(log.time_s).vel, 0.1)
 
 
 @pytest.mark.parametrize("cut", [20, 400, 3000])
@@ -90,12 +120,12 @@ def test_betaflight_with_motion_capture_equals_the_flight(tmp_path):
     path = made.write_blackbox(tmp_path / "log.csv")
     pose = made.write_mocap(tmp_path / "pose.csv", span=(1.0005, 19.0), offset=-3.21, drift=60e-6)
     log, findings = import_log(path, None, ImportOptions(pose=pose, full_thrust=30.0))
-    truth = made.fly(log.time_s + 1.001)
+    truth = made.fly(log.time_s + 1.0005)
     late = float(np.sum((log.pos_w - truth.pos) * truth.vel) / np.sum(truth.vel**2))
     assert abs(late) < 2e-4
     _near(log.pos_w, truth.pos, 2e-3)
     assert _quat_off(log, truth) < 1e-3
-    # Whole degrees per second, at 1 kHz averaged to 250 Hz.
+    # Whole degrees per second, at 1 kHz smoothed to the poses' 120 Hz.
     _near(log.rate_b, truth.rate, 0.02)
     _near(log.acc_b, truth.acc, 0.02)
     _near(log.thrust_cmd, truth.thrust, 0.1)
@@ -103,6 +133,24 @@ def test_betaflight_with_motion_capture_equals_the_flight(tmp_path):
     _near(log.rotor_speed, truth.motor, 2.0)
     assert log.velocity_derived
     assert any(f"+{ppm} ppm" in _text(findings, "pose clock") for ppm in range(57, 64))
+
+
+@pytest.mark.parametrize("fix", [True, False])
+def test_betaflights_tenfold_values_are_found(tmp_path, fix):
+    """blackbox_high_resolution multiplies rates by ten, blackbox_decode the voltage."""
+    path = made.write_blackbox(tmp_path / "log.csv", span=(0, 10), gain=10, tenfold=10)
+    pose = made.write_mocap(tmp_path / "pose.csv", span=(0, 10), offset=0.4)
+    options = ImportOptions(pose=pose, full_thrust=30.0, fix=fix)
+    log, findings = import_log(path, None, options)
+    level = {f.subject for f in findings if f.level == ("corrected" if fix else "doubt")}
+    assert {"units", "voltage"} <= level
+    assert "blackbox_high_resolution" in _text(findings, "units")
+    truth, tenfold = made.fly(log.time_s), 1 if fix else 10
+    _near(log.rate_b, tenfold * truth.rate, 0.02 * tenfold)
+    _near(log.rate_cmd_b, tenfold * truth.cmd_rate, 0.04 * tenfold)
+    _near(log.voltage, tenfold * truth.voltage, 0.1 * tenfold)
+    if fix:
+        assert level == {"units", "voltage"}
 
 
 def test_betaflight_counts_the_motors_poles(tmp_path):
@@ -200,8 +248,8 @@ def test_mcap_equals_the_flight(tmp_path):
     assert _quat_off(log, truth) < 1e-6
     _near(log.rate_b, truth.rate, 1e-9)
     _near(log.acc_b, truth.acc, 1e-9)
-    _near(np.asarray(log.rate_cmd_b)[::4], truth.cmd_rate[::4], 1e-9)
-    _near(np.asarray(log.thrust_cmd)[::4], truth.thrust[::4], 1e-5)
+    _near(np.asarray(log.rate_cmd_b)[::2], truth.cmd_rate[::2], 1e-9)
+    _near(np.asarray(log.thrust_cmd)[::2], truth.thrust[::2], 1e-5)
     assert "/odom_slow" in _text(findings, "topics")
     assert {"corrected", "doubt"}.isdisjoint(_levels(findings).values())
 
@@ -212,8 +260,9 @@ def test_mcap_topics_are_chosen_by_a_map(tmp_path):
     chosen.write_text('[topics]\nodometry = "/odom_slow"\n')
     log, findings = import_log(path, None, ImportOptions(map=chosen, full_thrust=30.0))
     assert "10 Hz" in _text(findings, "position")
-    truth = made.fly(log.time_s)
-    _near(log.pos_w, truth.pos, 0.02)
+    # Rows at twice the rate of the slow poses: every other one has a pose, and that is exact.
+    assert np.isnan(log.pos_w[1::2]).all() and np.isfinite(log.rate_b).all()
+    _near(log.pos_w[::2], made.fly(log.time_s[::2]).pos, 1e-6)
     chosen.write_text('[topics]\nodometry = "/imu"\n')
     with pytest.raises(FlightLogError, match="'/imu' has no nav_msgs/Odometry"):
         import_log(path, None, ImportOptions(map=chosen))

@@ -79,7 +79,7 @@ def test_the_poses_own_faults_are_put_right(tmp_path):
         rows.append(",".join([f"{float(t) * 1e6:.1f}", x, y, z, qx, qy, qz, qw]))
     log, findings = _import(tmp_path, "\n".join(rows))
     assert {"pose time", "pose attitude"} == {f.subject for f in findings if f.level == "corrected"}
-    truth = made.fly(log.time_s + 1.002)
+    truth = made.fly(log.time_s + 1.0003)
     np.testing.assert_allclose(log.pos_w, truth.pos, atol=2e-3)
     np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-5)
 

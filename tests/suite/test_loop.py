@@ -5,18 +5,14 @@ tested with the trainer; trials are cut short. All else is what a person runs.
 """
 
 import json
-from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
-import eval.judge
-import suite.train.run
 from eval.flight_log import read_flights
 from eval.results import read_trials
 from eval.stats import bootstrap_mean
-from eval.trial import Rules, TrialResult
+from eval.trial import TrialResult
 from policies.checkpoint import WEIGHTS
 from suite import cli
 from suite.errors import WorkFailed
@@ -25,55 +21,13 @@ from suite.loop.compare import CAVEAT, Line, compare, grids, verdict
 from suite.loop.config import resolve
 from suite.report import markdown, rich_table
 from suite.train.presets import finetune, preset
+from tests.support.loops import Small
 
 ARGS = ["--preset", "small", "--track", "zigzag", "--difficulty", "0", "--trials", "3"]
 ARGS += ["--flights", "3", "--iterations", "3", "--finetune-iterations", "2"]
 ARGS += ["--fit-iterations", "3", "--seed", "4", "--set", "episode.batch=2"]
 STAGES = ["train", "eval-before", "flights", "delta", "tuned-without", "tuned-with"]
 STAGES += ["eval-without", "eval-with", "replays"]
-
-
-class Small:
-    """Makes a loop cheap, counts what it does, and stops it where it is told to."""
-
-    def __init__(self, monkeypatch):
-        self.flown, self.trained = [], []
-        self.stop_after: tuple[str, int] | None = None
-        self._fly = eval.judge.fly
-        monkeypatch.setattr(eval.judge, "fly", self.fly)
-        monkeypatch.setattr(suite.train.run, "make_update", self.make_update)
-
-    def count(self, kind):
-        """Raise as Ctrl-C does at the given (kind, number), once."""
-        done = len(self.flown) if kind == "fly" else len(self.trained)
-        if self.stop_after == (kind, done):
-            self.stop_after = None
-            raise KeyboardInterrupt
-
-    def fly(self, policy, trials, vehicle, world, options, on_result, *rest, **more):
-        options = replace(options, slots=4, rules=Rules(time_limit_s=2.0))
-
-        def keep(result, flight):
-            on_result(result, flight)
-            self.flown.append(result.trial)
-            self.count("fly")
-
-        return self._fly(policy, trials, vehicle, world, options, keep, *rest, **more)
-
-    def make_update(self, config, mesh, delta=None):
-        numbers = {"loss": 1.0, "gates": 2.0, "collided": 0.5, "speed": 3.0}
-
-        def update(state, worlds):
-            # A lean that depends on the tracks and, with a correction, on that.
-            push = 1e-3 * float(np.asarray(worlds.pos_w)[0, 0])
-            if delta is not None:
-                push += 1e-2 + float(np.ravel(delta[min(delta)])[0])
-            params = jax.tree.map(lambda leaf: leaf + 1e-2 * push, state.params)
-            self.trained.append((config, delta is not None, np.asarray(worlds.pos_w)))
-            self.count("train")
-            return state._replace(params=params, iteration=state.iteration + 1), numbers
-
-        return update
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """A smooth flight that is known exactly, written as other programs write their logs.
 
 Every writer follows the public description of its format and shares no code with the importers.
+Another flight than this one is written by giving its function of time in place of `fly`.
 """
 
 import csv
@@ -122,11 +123,26 @@ class UlogWriter:
         path.write_bytes(self.bytes)
 
 
-def write_ulog(path, span=(0.0, 8.0), rate=200.0, esc=True, full_thrust=30.0, start_us=5_000_000):
-    """PX4 with attitude at `rate`, positions at half of it, commands at 100 Hz, ESCs at 50 Hz."""
+def write_ulog(
+    path,
+    span=(0.0, 8.0),
+    rate=200.0,
+    esc=True,
+    full_thrust=30.0,
+    start_us=5_000_000,
+    pos_hz=None,
+    gyro_hz=None,
+    command_hz=100.0,
+    odometry=None,
+    source=fly,
+):
+    """PX4 with attitude at `rate`, positions at half of it, commands at 100 Hz, ESCs at 50 Hz.
+
+    `odometry` (new format, frame of the velocity) takes the place of vehicle_local_position.
+    """
 
     def at(hz):
-        truth = fly(np.arange(span[0], span[1], 1 / hz))
+        truth = source(np.arange(span[0], span[1], 1 / hz))
         return truth, np.round(truth.time * 1e6).astype(int) + start_us
 
     log = UlogWriter()
@@ -141,17 +157,22 @@ def write_ulog(path, span=(0.0, 8.0), rate=200.0, esc=True, full_thrust=30.0, st
     # Published 300 us after it was measured.
     rows = [(k + 300, k, *q) for k, q in zip(t, ned_quat(fast), strict=True)]
     log.topic("vehicle_attitude", [stamped, ("float[4]", "q")], rows, "Qffff")
+    fast, t = at(gyro_hz or rate)
     rows = [(k + 250, k, *v) for k, v in zip(t, ned(fast.rate), strict=True)]
     log.topic("vehicle_angular_velocity", [stamped, ("float[3]", "xyz")], rows, "Qfff")
     rows = [(k, *v) for k, v in zip(t, ned(fast.acc), strict=True)]
     log.topic("sensor_combined", [("float[3]", "accelerometer_m_s2")], rows, "fff")
-    slow, t = at(rate / 2)
-    names = ["x", "y", "z", "vx", "vy", "vz"]
-    both = np.concatenate([ned(slow.pos), ned(slow.vel)], axis=1)
-    fields = [stamped, *(("float", n) for n in names), ("bool", "xy_valid"), ("bool", "z_valid")]
-    rows = [(k, k, *v, True, True) for k, v in zip(t, both, strict=True)]
-    log.topic("vehicle_local_position", fields, rows, "Q6f??")
-    slow, t = at(100.0)
+    slow, t = at(pos_hz or rate / 2)
+    if odometry is not None:
+        _odometry(log, slow, t, *odometry)
+    else:
+        names = ["x", "y", "z", "vx", "vy", "vz"]
+        both = np.concatenate([ned(slow.pos), ned(slow.vel)], axis=1)
+        valid = [("bool", "xy_valid"), ("bool", "z_valid")]
+        rows = [(k, k, *v, True, True) for k, v in zip(t, both, strict=True)]
+        fields = [stamped, *(("float", n) for n in names), *valid]
+        log.topic("vehicle_local_position", fields, rows, "Q6f??")
+    slow, t = at(command_hz)
     wanted = ned(slow.cmd_rate)
     rows = [
         (k, *w, 0.0, 0.0, -c / full_thrust) for k, w, c in zip(t, wanted, slow.thrust, strict=True)
@@ -175,21 +196,46 @@ def write_ulog(path, span=(0.0, 8.0), rate=200.0, esc=True, full_thrust=30.0, st
     return path
 
 
+def _odometry(log, truth, t, new, frame):
+    """Write vehicle_odometry as v1.14 has it, or as v1.11 had it, with the velocity in `frame`."""
+    vel = ned(truth.vel)
+    if frame == 3:
+        vel = ned(np.einsum("tji,tj->ti", truth.rot, truth.vel))
+    both = np.concatenate([ned(truth.pos), ned_quat(truth), vel], axis=1)
+    if new:
+        names = [("float[3]", "position"), ("float[4]", "q"), ("float[3]", "velocity")]
+        frames, place = [("uint8_t", "pose_frame"), ("uint8_t", "velocity_frame")], 1
+    else:
+        names = [*(("float", n) for n in "xyz"), ("float[4]", "q")]
+        names += [("float", n) for n in ("vx", "vy", "vz")]
+        frames, place = [("uint8_t", "local_frame"), ("uint8_t", "velocity_frame")], 0
+    rows = [(k, k, *v, place, frame) for k, v in zip(t, both, strict=True)]
+    fields = [("uint64_t", "timestamp_sample"), *names, *frames]
+    log.topic("vehicle_odometry", fields, rows, "Q10fBB")
+
+
 BLACKBOX_HEADER = (
     "loopIteration, time (us), axisP[0], axisP[1], axisP[2], rcCommand[0], rcCommand[1], "
     "rcCommand[2], rcCommand[3], setpoint[0], setpoint[1], setpoint[2], setpoint[3], "
-    "vbatLatest (V), amperageLatest (A), gyroADC[0], gyroADC[1], gyroADC[2], accSmooth[0], "
-    "accSmooth[1], accSmooth[2], motor[0], motor[1], motor[2], motor[3], eRPM[0], eRPM[1], "
-    "eRPM[2], eRPM[3], energyCumulative (mAh), flightModeFlags (flags), stateFlags (flags)"
+    "vbatLatest (V), amperageLatest (A), rssi, gyroADC[0], gyroADC[1], gyroADC[2], "
+    "accSmooth[0], accSmooth[1], accSmooth[2], debug[0], motor[0], motor[1], motor[2], "
+    "motor[3], eRPM[0], eRPM[1], eRPM[2], eRPM[3], energyCumulative (mAh), "
+    "flightModeFlags (flags), stateFlags (flags), failsafePhase (flags), rxSignalReceived"
 )
 
 
-def write_blackbox(path, span=(0.0, 20.0), rate=1000.0, full_thrust=30.0, poles=14, gain=1):
-    """A CSV as `blackbox_decode` prints it: whole deg/s, hundreds of electrical turns a minute."""
-    truth = fly(np.arange(span[0], span[1], 1 / rate))
+def write_blackbox(
+    path, span=(0.0, 20.0), rate=1000.0, full_thrust=30.0, poles=14, gain=1, tenfold=1, source=fly
+):
+    """A CSV as `blackbox_decode` prints it: whole deg/s, hundreds of electrical turns a minute.
+
+    `gain` is 10 under blackbox_high_resolution, and `tenfold` 10 where the tool turns the
+    firmware's 10 mV into "volts" by a tenth.
+    """
+    truth = source(np.arange(span[0], span[1], 1 / rate))
     degrees = np.rad2deg(1.0)
     gyro = np.round(truth.rate * degrees * gain).astype(int)
-    wanted = np.round(truth.cmd_rate * degrees).astype(int)
+    wanted = np.round(truth.cmd_rate * degrees * gain).astype(int)
     throttle = np.round(truth.thrust / full_thrust * 1000).astype(int)
     acc = np.round(truth.acc / 9.81 * 2048).astype(int)
     # Betaflight: rear right, front right, rear left, front left.
@@ -199,17 +245,19 @@ def write_blackbox(path, span=(0.0, 20.0), rate=1000.0, full_thrust=30.0, poles=
     for k in range(len(truth.time)):
         time_us = 52_000_000 + round(truth.time[k] * 1e6)
         cells = [k, time_us, 1, -2, 3, 0, 0, 0, 1500, *wanted[k], throttle[k]]
-        cells += [f"{truth.voltage[k]:.1f}", "12.34", *gyro[k], *acc[k], 900, 900, 900, 900]
-        cells += [*erpm[k], 12, "ANGLE_MODE|AIR_MODE", "SMALL_ANGLE"]
+        cells += [f"{tenfold * truth.voltage[k]:.1f}", "12.34", 785, *gyro[k], *acc[k], -5]
+        cells += [900, 900, 900, 900, *erpm[k], 12, "ANGLE_MODE|AIR_MODE", "SMALL_ANGLE", "IDLE", 1]
         lines.append(", ".join(f"{cell:>3}" for cell in cells))
     path.write_text("\n".join(lines) + "\n")
     return path
 
 
-def write_mocap(path, span=(0.0, 20.0), rate=120.0, offset=0.0, drift=0.0, noise=0.0, turn=None):
+def write_mocap(
+    path, span=(0.0, 20.0), rate=120.0, offset=0.0, drift=0.0, noise=0.0, turn=None, source=fly
+):
     """Poses at flight times `span` on another clock: flight = offset + (1 + drift) * its time."""
     time = np.arange(span[0], span[1], 1 / rate)
-    truth = fly(time)
+    truth = source(time)
     rng = np.random.default_rng(7)
     rot = Rotation.from_matrix(truth.rot)
     if turn is not None:
@@ -225,9 +273,18 @@ def write_mocap(path, span=(0.0, 20.0), rate=120.0, offset=0.0, drift=0.0, noise
     return path
 
 
-def write_usd(path, span=(0.0, 8.0), rate=100.0, version=2, compressed=False, crc=True):
+def write_usd(
+    path,
+    span=(0.0, 8.0),
+    rate=100.0,
+    version=2,
+    compressed=False,
+    crc=True,
+    full_thrust=30.0,
+    source=fly,
+):
     """A log of the uSD deck: one event at a fixed rate, one rare one, CRC at the end."""
-    truth = fly(np.arange(span[0], span[1], 1 / rate))
+    truth = source(np.arange(span[0], span[1], 1 / rate))
     degrees = np.rad2deg(1.0)
     columns = {}
     if compressed:
@@ -249,7 +306,7 @@ def write_usd(path, span=(0.0, 8.0), rate=100.0, version=2, compressed=False, cr
     wanted = truth.cmd_rate * degrees * [1, -1, 1]
     for k, name in enumerate(("rollRate", "pitchRate", "yawRate")):
         columns[f"controller.{name}(f)"] = wanted[:, k]
-    columns["controller.cmd_thrust(f)"] = truth.thrust / 30.0 * 65535
+    columns["controller.cmd_thrust(f)"] = truth.thrust / full_thrust * 65535
     for k in range(4):
         rpm = np.round(truth.motor[:, k] * 60 / (2 * np.pi)).astype(int)
         columns[f"rpm.m{k + 1}(H)"] = rpm
@@ -282,7 +339,16 @@ def pack_quaternion(wxyz):
     return word
 
 
-def write_mcap(path, span=(0.0, 6.0), imu=200.0, odometry=100.0, full_thrust=30.0, motion=True):
+def write_mcap(
+    path,
+    span=(0.0, 6.0),
+    imu=200.0,
+    odometry=100.0,
+    command=50.0,
+    full_thrust=30.0,
+    motion=True,
+    source=fly,
+):
     """ROS 2: odometry (twist in the body), imu and mavros' attitude target, CDR in MCAP."""
     from mcap_ros2.writer import Writer
 
@@ -301,7 +367,7 @@ def write_mcap(path, span=(0.0, 6.0), imu=200.0, odometry=100.0, full_thrust=30.
     with path.open("wb") as file:
         writer = Writer(file)
         schema = writer.register_msgdef("nav_msgs/msg/Odometry", ODOMETRY + DEFINITIONS)
-        truth = fly(np.arange(span[0], span[1], 1 / odometry))
+        truth = source(np.arange(span[0], span[1], 1 / odometry))
         for k, t in enumerate(truth.time if motion else ()):
             body = truth.rot[k].T @ truth.vel[k]
             pose = {"position": xyz(truth.pos[k]), "orientation": quaternion(truth.quat[k])}
@@ -316,7 +382,7 @@ def write_mcap(path, span=(0.0, 6.0), imu=200.0, odometry=100.0, full_thrust=30.
             if k % 10 == 0:
                 writer.write_message("/odom_slow", schema, message, origin + round(t * 1e9))
         schema = writer.register_msgdef("sensor_msgs/msg/Imu", IMU + DEFINITIONS)
-        truth = fly(np.arange(span[0], span[1], 1 / imu))
+        truth = source(np.arange(span[0], span[1], 1 / imu))
         for k, t in enumerate(truth.time):
             message = {
                 "header": header(t),
@@ -329,7 +395,7 @@ def write_mcap(path, span=(0.0, 6.0), imu=200.0, odometry=100.0, full_thrust=30.
             }
             writer.write_message("/imu", schema, message, origin + round(t * 1e9))
         schema = writer.register_msgdef("mavros_msgs/msg/AttitudeTarget", TARGET + DEFINITIONS)
-        truth = fly(np.arange(span[0], span[1], 1 / 50.0))
+        truth = source(np.arange(span[0], span[1], 1 / command))
         for k, t in enumerate(truth.time):
             message = {
                 "header": header(t),

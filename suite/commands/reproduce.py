@@ -1,0 +1,56 @@
+"""`suite reproduce NAME`: the paper's tables and more, made by one command each."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Union
+
+import tyro
+
+from suite.console import Console
+from suite.reproduce import EXPERIMENTS
+
+if TYPE_CHECKING:
+    Experiment = Any
+else:
+    Experiment = Union[  # noqa: UP007  (made from the table)
+        tuple(
+            Annotated[
+                importlib.import_module(f"suite.reproduce.{name}").Config,
+                tyro.conf.subcommand(name),
+            ]
+            for name in EXPERIMENTS
+        )
+    ]
+
+
+@tyro.conf.configure(tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
+@dataclass(frozen=True)
+class Config:
+    """Make one of the documents of docs/results; the same command again goes on where it stopped.
+
+    NAME.md, its figures and NAME.json with the numbers go to --out.
+    """
+
+    experiment: Experiment
+    """Which document."""
+    out: Path = Path("runs/reproduce")
+    """Folder of the document; docs/results in a checkout is where the published ones are."""
+    cache: Path = Path("runs/reproduce/cache")
+    """Folder of finished trials and trainings, shared by all documents."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Run the experiment, or what is left of it, and write its document.
+
+    Raises:
+        ValueError: for anything that cannot be used, before the first flight.
+    """
+    from suite.reproduce.document import Place
+
+    experiment = importlib.import_module(type(config.experiment).__module__)
+    return experiment.run(config.experiment, Place(config.out, config.cache), console)

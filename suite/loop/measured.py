@@ -1,0 +1,119 @@
+"""Recorded flights as a state estimator would have logged them, cut before they touch anything.
+
+The simulation's own record is exact. Noise of the size of an estimator's is added, so that what
+the diagnosis finds does not rest on digits that no one measures.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from eval.flight_log import FlightLog, read_flights, write_flight
+from suite.collect import LIST
+from tracks.files import write_json
+from tracks.rotation import exp_rot, rot_to_quat
+
+CONTACT_MARGIN_S = 0.1
+"""This much is cut off the end of a flight that did not finish [s]."""
+SHORTEST_S = 1.5
+"""Shorter flights are left out [s]."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of white noise."""
+
+    pos: float = 0.005
+    """Each axis [m]."""
+    attitude: float = 0.004
+    """About each body axis [rad]."""
+    vel: float = 0.03
+    """Each axis [m/s]."""
+    gyro: float = 0.02
+    """Each axis [rad/s]."""
+    rotor: float = 5.0
+    """Each rotor [rad/s]."""
+
+
+def measure(flights: Path, out: Path, seed: int) -> list[Path]:
+    """Write the flights of `suite collect` in `flights` as they would be measured into `out`.
+
+    Returns:
+        The files, one cell of track and level after the other in turn, so that the first of them
+        are of all kinds.
+
+    Raises:
+        ValueError: where no flight is long enough.
+    """
+    rows = json.loads((flights / LIST).read_text(encoding="utf-8"))["flights"]
+    rng = np.random.default_rng([seed, 7])
+    cells: dict[tuple[str, int], list[Path]] = {}
+    out.mkdir(parents=True, exist_ok=True)
+    for row in rows:
+        if row["file"] is None:
+            continue
+        log = read_flights([flights / row["file"]])[0][0]
+        finished = row["ended_by"] in ("finished", "timeout")
+        log = noisy(cut_end(log, 0.0 if finished else CONTACT_MARGIN_S), Noise(), rng)
+        if log.duration_s < SHORTEST_S:
+            continue
+        write_flight(out / row["file"], log)
+        cells.setdefault((row["track"], row["difficulty"]), []).append(out / row["file"])
+    most = max((len(files) for files in cells.values()), default=0)
+    files = [cell[k] for k in range(most) for cell in cells.values() if k < len(cell)]
+    if not files:
+        raise ValueError(f"no flight in {flights} is {SHORTEST_S:g} s long")
+    write_json(out / "measured.json", {"noise": Noise(), "files": [file.name for file in files]})
+    return files
+
+
+def cut_end(log: FlightLog, margin_s: float) -> FlightLog:
+    """Return a log without its last `margin_s` [s]."""
+    return _rows(log, log.time_s <= log.time_s[-1] - margin_s)
+
+
+def _rows(log: FlightLog, kept: np.ndarray) -> FlightLog:
+    count = len(log.time_s)
+    arrays = {
+        name: value[kept]
+        for name, value in vars(log).items()
+        if isinstance(value, np.ndarray) and len(value) == count
+    }
+    extra = {name: value[kept] for name, value in log.extra.items()}
+    return replace(log, **arrays, extra=extra)
+
+
+def noisy(log: FlightLog, noise: Noise, rng: np.random.Generator) -> FlightLog:
+    """Return a log with white noise on what is measured; commands and actions are known."""
+
+    def with_noise(values: np.ndarray, sigma: float) -> np.ndarray:
+        return values + sigma * rng.standard_normal(values.shape)
+
+    turn_b = noise.attitude * rng.standard_normal((len(log.time_s), 3))
+    rotors = log.rotor_speed
+    return replace(
+        log,
+        pos_w=with_noise(log.pos_w, noise.pos),
+        quat_wxyz=rot_to_quat(log.rot_w @ exp_rot(turn_b)),
+        vel_w=with_noise(log.vel_w, noise.vel),
+        rate_b=with_noise(log.rate_b, noise.gyro),
+        rotor_speed=None if rotors is None else np.maximum(with_noise(rotors, noise.rotor), 0.0),
+    )
+
+
+def enough(files: Sequence[Path], duration_s: float) -> list[Path]:
+    """Return the first of `files` that hold `duration_s` of flight together, at least five."""
+    logs, _ = read_flights(list(files))
+    length = {Path(log.name).name: log.duration_s for log in logs}
+    chosen, total = [], 0.0
+    for file in files:
+        if total >= duration_s and len(chosen) >= 5:
+            break
+        chosen.append(file)
+        total += length.get(file.name, 0.0)
+    return chosen

@@ -1,0 +1,53 @@
+"""What the paper prints, read from paper.toml."""
+
+from __future__ import annotations
+
+import functools
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Printed(NamedTuple):
+    """One method on one track at one level, as printed."""
+
+    method: str
+    """Its key in paper.toml."""
+    name: str
+    """What tables call it."""
+    track: str
+    level: int
+    won: int
+    trials: int
+    v_max: float
+    """[m/s]; the paper does not say over what it is the maximum."""
+
+
+class SimToSim(NamedTuple):
+    """The paper's table of judged policies."""
+
+    source: str
+    levels: tuple[int, ...]
+    methods: dict[str, str]
+    """Names by key, in the order of the table."""
+    cells: tuple[Printed, ...]
+
+    def at(self, track: str, level: int) -> list[Printed]:
+        """Return every method's cell on one track at one level."""
+        return [cell for cell in self.cells if (cell.track, cell.level) == (track, level)]
+
+
+@functools.cache
+def sim_to_sim() -> SimToSim:
+    """Return the table "Sim-to-sim Performance"."""
+    path = Path(__file__).with_name("paper.toml")
+    table = tomllib.loads(path.read_text(encoding="utf-8"))["sim_to_sim"]
+    names = {key: method["name"] for key, method in table["methods"].items()}
+    cells = [
+        Printed(key, names[key], track, level, won, table["trials"], v_max)
+        for key, method in table["methods"].items()
+        for track, rows in method.items()
+        if track != "name"
+        for level, won, v_max in zip(table["levels"], rows["won"], rows["v_max"], strict=True)
+    ]
+    return SimToSim(table["source"], tuple(table["levels"]), names, tuple(cells))

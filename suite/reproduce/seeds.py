@@ -1,0 +1,118 @@
+"""The same recipe from several training seeds: each one's table, the spread, the median."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from suite.choices import at_least
+from suite.console import Console
+
+if TYPE_CHECKING:
+    from suite.reproduce.document import Place
+
+LEVELS = (0, 3, 6, 9)
+"""The levels of the paper's table."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Judge the policies of several training seeds on the same trials, and say which is the median.
+
+    Without --policies they are trained, and found again by the hash of their configuration.
+    """
+
+    policies: tuple[str, ...] = ()
+    """Policies of one recipe, one a training seed: run folders of `suite train`, checkpoints'
+    folders, or names."""
+    preset: str = "racer"
+    """Without --policies: the recipe."""
+    set: tuple[str, ...] = ()
+    """Without --policies: change settings of the recipe by name."""
+    iterations: int | None = None
+    """Without --policies: gradient steps, instead of the preset's."""
+    training_seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Without --policies: the seeds that are trained."""
+    trials: int = 100
+    """Trials of every policy on every track at levels 0, 3, 6 and 9."""
+    seed: int = 0
+    """Seed of the first trial; the others follow by one."""
+    vehicle: str = "reference"
+    """A shipped vehicle's name or a vehicle file (.toml)."""
+
+
+def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
+    """Train and fly what is missing and write seeds.md.
+
+    Raises:
+        ValueError: for anything that cannot be used, before the first flight.
+    """
+    from eval.table import summarise
+    from eval.vehicle_file import load_vehicle
+    from suite.flying import trial_list
+    from suite.reproduce.document import write_document
+    from suite.reproduce.flights import Flier, Order, flown
+    from suite.reproduce.seed_tables import seed_report, spread
+    from tracks.families import JUDGED
+
+    at_least("--trials", config.trials, 1)
+    at_least("--seed", config.seed, 0)
+    vehicle = load_vehicle(config.vehicle)
+    policies = _policies(config, place, console)
+    trials = trial_list(JUDGED, LEVELS, config.trials, config.seed)
+    orders = [Order(Flier(policy, vehicle), trials) for policy in policies.values()]
+    results = flown(orders, place.cache, console, f"judging {len(policies)} training seeds")
+    cells = {
+        name: summarise([row._replace(policy=name) for row in rows])["cells"]
+        for name, rows in zip(policies, results, strict=True)
+    }
+    found = spread(cells)
+    report = seed_report(config, policies, cells, found)
+    numbers = {"config": config, "spread": found, "cells": [c for s in cells.values() for c in s]}
+    return write_document(place, "seeds", report, numbers, config.seed, console)
+
+
+def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:
+    """Return the policies by what the tables call them; missing ones are trained."""
+    from pathlib import Path
+
+    from policies.policy import load_policy
+    from suite.flying import labels
+
+    if config.policies:
+        inside = [Path(path, "policy") for path in config.policies]
+        chosen = [
+            str(within) if within.is_dir() else path
+            for path, within in zip(config.policies, inside, strict=True)
+        ]
+        for path in chosen:
+            load_policy(path)
+        names = labels(config.policies, [Path(path).name for path in config.policies])
+        return dict(zip(names, chosen, strict=True))
+    return _trained(config, place, console)
+
+
+def _trained(config: Config, place: Place, console: Console) -> dict[str, str]:
+    from dataclasses import replace
+
+    from suite.reproduce.trainings import trained
+    from suite.train.overrides import override
+    from suite.train.presets import preset
+
+    if len(set(config.training_seeds)) < len(config.training_seeds) or not config.training_seeds:
+        raise ValueError(f"--training-seeds is {_words(config.training_seeds)}; give each once")
+    recipe = override(preset(config.preset), config.set)
+    if config.iterations is not None:
+        at_least("--iterations", config.iterations, 1)
+        recipe = replace(recipe, optimizer=replace(recipe.optimizer, iterations=config.iterations))
+    for seed in config.training_seeds:
+        at_least("--training-seeds", seed, 0)
+    return {
+        f"seed {seed}": str(trained(replace(recipe, seed=seed), place.cache, console).policy)
+        for seed in config.training_seeds
+    }
+
+
+def _words(values: Sequence[object]) -> str:
+    return " ".join(map(str, values)) or "empty"

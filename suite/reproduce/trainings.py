@@ -1,0 +1,43 @@
+"""Trainings that are kept for good: whoever asks for the same configuration gets its policy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from suite.console import Console
+from suite.reproduce.cache import digest
+from suite.train.config import TrainConfig
+from suite.train.repeat import Outcome
+from suite.train.run import train
+
+
+def trained(config: TrainConfig, cache: Path, console: Console) -> Outcome:
+    """Return what the training of `config` came to; it is done, or gone on with, where missing.
+
+    The run's folder is named by the configuration alone: code that has changed since does not
+    start it anew, so a document should say `commit_of` the run.
+
+    Args:
+        config: the whole run, its seed included.
+        cache: folder of all runs.
+        console: where progress goes.
+
+    Raises:
+        WorkFailed: where the training diverges.
+    """
+    return train(config, folder_of(config, cache), console)
+
+
+def folder_of(config: TrainConfig, cache: Path) -> Path:
+    """Return the folder of the run of `config`."""
+    return cache / "trainings" / digest(config)
+
+
+def commit_of(policy: Path) -> str:
+    """Return the commit that trained `policy` (RUN/policy), "unknown" where nothing says so."""
+    record = policy.parent / "run.json"
+    try:
+        return str(json.loads(record.read_text(encoding="utf-8"))["git_commit"])
+    except (OSError, ValueError, KeyError):
+        return "unknown"

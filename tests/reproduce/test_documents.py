@@ -1,0 +1,178 @@
+"""suite reproduce at a small size: every document from one command, resumed, from the cache."""
+
+import json
+import re
+
+import pytest
+
+from policies import shipped
+from suite import cli
+from suite.reproduce import EXPERIMENTS
+
+
+def reproduce(tmp_path, name, *args):
+    place = ["--out", str(tmp_path / "docs"), "--cache", str(tmp_path / "cache")]
+    return cli.main(["reproduce", name, *args, *place])
+
+
+def page(tmp_path, name):
+    """Return a document's text and numbers, having checked what holds for all."""
+    folder = tmp_path / "docs"
+    text = (folder / f"{name}.md").read_text()
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        assert (folder / target).read_bytes().startswith(b"\x89PNG"), target
+    numbers = json.loads((folder / f"{name}.json").read_text())
+    assert set(numbers) >= {"schema", "suite_version", "git_commit", "seed", "config", "made_by"}
+    assert numbers["git_commit"] in text and "- machine: " in text and "- command: `" in text
+    tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    assert tables
+    for table in tables:
+        assert len({line.replace("\\|", "").count("|") for line in table.splitlines()}) == 1
+    return text, numbers
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_has_help_for_every_option(name, capsys):
+    assert cli.main(["reproduce", name, "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "--out" in said and "--cache" in said and "--json" in said
+
+
+def test_an_experiment_that_does_not_exist_is_code_2(capsys):
+    assert cli.main(["reproduce", "table3"]) == 2
+    assert "table2" in capsys.readouterr().err
+
+
+def test_table2_and_all_levels(sky, tmp_path, capfd):
+    sky.stop_after = 11
+    assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7") == 130
+    assert not (tmp_path / "docs").exists() and len(sky.flown) == 11
+    assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7") == 0
+    assert "11 of 30 trials were flown before" in capfd.readouterr().err
+    assert len(sky.flown) == len(set(trial for *_, trial in sky.flown)) == 30
+    text, numbers = page(tmp_path, "table2")
+    assert {(cell["track"], cell["difficulty"]) for cell in numbers["cells"]} == {
+        (track, level) for track in ("zigzag", "circular", "ellipse") for level in range(10)
+    }
+    # In a second nobody finishes: every cell misses what is asked of it, and says by how much.
+    assert "0 of 12 cells meet the whole goal" in text
+    assert all(goal["success_miss"] > 0 for goal in numbers["goals"]["ours"])
+    assert "| 90.0 points | 97 % | 97.0 points |" in text
+    assert "no row of ours with the Delta Action Model" in text
+    assert "| paper, with Delta Action Model | 9 | 7/10 | 6.1 |" in text
+    assert "seeds: 7 to 7, 1 trials a cell" in text
+    # Other documents find the flights of this one.
+    assert reproduce(tmp_path, "seeds", "--policies", "racer", "--trials", "1", "--seed", "7") == 0
+    assert len(sky.flown) == 30
+    text, numbers = page(tmp_path, "seeds")
+    assert numbers["spread"]["median"] == "racer"
+    # A second time nothing is flown and the same is written.
+    capfd.readouterr()
+    assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7", "--json") == 0
+    said = json.loads(capfd.readouterr().out)
+    assert said["out"].endswith("table2.md") and len(said["cells"]) == 30
+    assert len(sky.flown) == 30
+
+
+def test_table2_with_policies_tuned_under_the_delta_model(sky, tmp_path):
+    tuned = tmp_path / "tuned"
+    tuned.mkdir()
+    for file in shipped.folder("racer").iterdir():
+        (tuned / file.name).write_bytes(file.read_bytes())
+    (tuned / "card.md").write_text("another")
+    args = ["--trials", "1", "--delta-policy", str(tuned)]
+    assert reproduce(tmp_path, "table2", *args) == 0
+    assert len(sky.flown) == 60
+    text, numbers = page(tmp_path, "table2")
+    assert {cell["policy"] for cell in numbers["cells"]} == {
+        "ours",
+        "ours, with Delta Action Model",
+    }
+    assert "no row of ours" not in text and "The goal, cell by cell: ours, with" in text
+
+
+def test_robustness(sky, tmp_path, capfd):
+    only = ["--only", "wind", "mass_offset", "gate-pose error"]
+    args = [*only, "--trials", "1", "--difficulty", "0", "--policy", "racer"]
+    sky.stop_after = 5
+    assert reproduce(tmp_path, "robustness", *args) == 130
+    assert reproduce(tmp_path, "robustness", *args) == 0
+    # Undisturbed once for all, two signs of mass, four winds, four gate errors; three tracks.
+    assert len(sky.flown) == 3 * (1 + 2 + 4 + 4)
+    winds = {flight[1].effects["constant_wind"].velocity for flight in sky.flown
+             if "constant_wind" in flight[1].effects}  # fmt: skip
+    assert sorted(round(y / 0.8) for _, y, _ in winds) == [2, 4, 6, 8]
+    assert {flight[2].gate_m for flight in sky.flown} == {0, 0.05, 0.1, 0.2, 0.3}
+    text, numbers = page(tmp_path, "robustness")
+    assert len(numbers["conditions"]) == 1 + 2 + 5 + 5
+    assert text.count("| 0 % [0, 56] |") == 13
+    assert "gyro_bias, accelerometer_bias, frame_tilt and clock_offset are faults" in text
+    assert (tmp_path / "docs" / "robustness-2.png").is_file()
+
+
+def test_what_randomisation_buys_is_two_policies_side_by_side(sky, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    for file in shipped.folder("racer").iterdir():
+        (other / file.name).write_bytes(file.read_bytes())
+    (other / "card.md").write_text("another")
+    both = ["--policy", "racer", "--policy", str(other)]
+    args = [*both, "--only", "depth noise", "--trials", "1", "--difficulty", "0"]
+    assert reproduce(tmp_path, "robustness", *args) == 0
+    text, numbers = page(tmp_path, "robustness")
+    assert "| other - racer |" in text and "| racer: success |" in text
+    # The same network on the same trials under the same noise: no difference in any number.
+    for condition in numbers["conditions"]:
+        one, two = condition["policies"].values()
+        assert one == two
+
+
+def test_seeds_are_trained_once_and_compared(sky, tmp_path, monkeypatch):
+    made = []
+
+    def stand_in(config, folder, console):
+        from suite.train.repeat import Outcome
+
+        if not (folder / "policy").is_dir():
+            made.append(config)
+            (folder / "policy").mkdir(parents=True)
+            for file in shipped.folder("racer").iterdir():
+                (folder / "policy" / file.name).write_bytes(file.read_bytes())
+            (folder / "policy" / "card.md").write_text(str(config.seed))
+        return Outcome(folder / "policy", 1, {})
+
+    monkeypatch.setattr("suite.reproduce.trainings.train", stand_in)
+    recipe = ["--preset", "small", "--iterations", "3", "--set", "episode.batch=2"]
+    args = [*recipe, "--training-seeds", "0", "4", "--trials", "1"]
+    assert reproduce(tmp_path, "seeds", *args) == 0
+    assert [(c.seed, c.optimizer.iterations, c.episode.batch) for c in made] == [
+        (0, 3, 2),
+        (4, 3, 2),
+    ]
+    assert reproduce(tmp_path, "seeds", *args) == 0
+    assert len(made) == 2 and len(sky.flown) == 24
+    text, numbers = page(tmp_path, "seeds")
+    assert set(numbers["spread"]["mean_success"]) == {"seed 0", "seed 4"}
+    assert "small episode.batch=2" in text
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["table2", "--trials", "0"], "--trials is 0"),
+        (["table2", "--policy", "racr"], "Did you mean 'racer'?"),
+        (["table2", "--delta-policy", "nowhere/policy"], "nowhere/policy: no such file"),
+        (["table2", "--delta-policy", "x", "--delta-iterations", "3"], "give the one or the other"),
+        (["table2", "--vehicle", "referense"], "Did you mean 'reference'?"),
+        (["robustness", "--only", "linear_darg"], "Did you mean 'linear_drag'?"),
+        (["robustness", "--policy", "racer", "--policy", "racer"], "given twice"),
+        (["seeds", "--preset", "smal"], "Did you mean 'small'?"),
+        (["seeds", "--training-seeds", "1", "1"], "--training-seeds is 1 1"),
+        (["seeds", "--policies", "racer", "--trials", "0"], "--trials is 0"),
+    ],
+)
+def test_what_cannot_be_used_is_said_before_anything_is_flown(args, words, sky, tmp_path, capsys):
+    assert reproduce(tmp_path, *args) == 2
+    said = capsys.readouterr().err
+    assert words in said and len(said.strip().splitlines()) == 1
+    assert not sky.flown and not list(tmp_path.iterdir())
