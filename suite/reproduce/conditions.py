@@ -32,6 +32,7 @@ DIRECTIONS: Mapping[str, tuple[float, ...]] = MappingProxyType(
         "com_offset": (0.6, 0.8, 0.0),
         "torque_trim": (0.6, 0.8, 0.0),
         "thrust_tilt": (0.6, 0.8),
+        "frame_tilt": (0.6, 0.8),
         "weak_motor": (1.0, 0.0, 0.0, 0.0),
     }
 )

@@ -71,7 +71,7 @@ def robust_report(
             _grid("", effects, base, names, ("effect", "total")),
             MEANINGS,
             f"{_listed(log_faults())} are faults of a log, not of the flight, and change nothing "
-            "here; wrong senses are in the sweeps.",
+            "here; errors of what the policy senses are below.",
         ]
         sections.append(Section("Every effect at its usual size", parts))
     if grown:

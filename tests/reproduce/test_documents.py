@@ -106,7 +106,7 @@ def test_robustness(sky, tmp_path, capfd):
     text, numbers = page(tmp_path, "robustness")
     assert len(numbers["conditions"]) == 1 + 2 + 5 + 5
     assert text.count("| 0 % [0, 56] |") == 13
-    assert "gyro_bias, accelerometer_bias, frame_tilt and clock_offset are faults" in text
+    assert "gyro_bias, accelerometer_bias and clock_offset are faults" in text
     assert (tmp_path / "docs" / "robustness-2.png").is_file()
 
 
