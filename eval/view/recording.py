@@ -1,7 +1,8 @@
 """Recordings of trials that the rerun viewer opens, laid out; Parquet is the record, this a view.
 
-With `blueprint.py` the only file that touches rerun, whose interface moves every few releases
-(0.41 here). Columns of a whole flight are sent at once, which is far faster than step by step.
+With `blueprint.py` and `comparison.py` the only file that touches rerun, whose interface moves
+every few releases (0.41 here). Columns of a whole flight are sent at once, which is far faster than
+step by step.
 
 Entities of trial k stand below `/trial_k`: `world/ground`, `world/obstacles/NAME`, `world/gates/N`,
 `world/path`, `world/start`, `world/end`, `world/drone` (moving, with `body`, `rotors` and
@@ -114,7 +115,8 @@ def _finite(points: np.ndarray) -> np.ndarray:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def _times(time_s: np.ndarray) -> list[rr.TimeColumn]:
+def time_columns(time_s: np.ndarray) -> list[rr.TimeColumn]:
+    """Return `time_s` (T,) [s] as rerun's column of the recording's timeline."""
     # Whole nanoseconds, as the file holds them: rounding there would be down.
     return [rr.TimeColumn(TIMELINE, duration=np.round(time_s * 1e9).astype("timedelta64[ns]"))]
 
@@ -147,7 +149,7 @@ def _log_track(
         passed = np.flatnonzero(flight.gate > number)
         time = np.array([0.0, *flight.time_s[passed[:1]]])
         colour = [colours.AHEAD, colours.PASSED][: len(time)]
-        recording.send_columns(entity, _times(time), rr.Mesh3D.columns(albedo_factor=colour))
+        recording.send_columns(entity, time_columns(time), rr.Mesh3D.columns(albedo_factor=colour))
     for solid in solids:
         if solid.gate is None:
             entity = f"{world}/obstacles/{rr.escape_entity_path_part(solid.name)}"
@@ -179,7 +181,7 @@ def _log_drone(recording: rr.RecordingStream, entity: str, flight: Flight, drone
     columns = rr.Transform3D.columns(
         translation=flight.pos_w, quaternion=np.roll(flight.quat_wxyz, -1, axis=1)
     )
-    recording.send_columns(entity, _times(flight.time_s), columns)
+    recording.send_columns(entity, time_columns(flight.time_s), columns)
     body = rr.Boxes3D(half_sizes=[drone.half_size], colors=[colours.DRONE], fill_mode="solid")
     recording.log(f"{entity}/body", body, static=True)
     rotors = np.array(drone.rotors_b)
@@ -228,7 +230,7 @@ def _log_depth(recording: rr.RecordingStream, entity: str, flight: Flight, camer
         point_fill_ratio=0.2,
     )
     recording.log(entity, constant, static=True)
-    times = _times(flight.time_s[np.asarray(flight.policy_step, dtype=bool)])
+    times = time_columns(flight.time_s[np.asarray(flight.policy_step, dtype=bool)])
     buffers = frames.view(np.uint8).reshape(len(frames), -1)
     recording.send_columns(entity, times, rr.DepthImage.columns(buffer=buffers))
 
@@ -252,7 +254,7 @@ def _log_series(recording: rr.RecordingStream, root: str, flight: Flight) -> Non
         entity = f"{root}/{name}"
         recording.log(entity, rr.SeriesLines(names=names, colors=colour), static=True)
         columns = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)[rows])
-        recording.send_columns(entity, _times(flight.time_s[rows]), columns)
+        recording.send_columns(entity, time_columns(flight.time_s[rows]), columns)
 
 
 def _log_events(
@@ -262,4 +264,4 @@ def _log_events(
     texts = [f"gate {flight.gate[row] - 1} passed" for row in rows]
     texts.append(result.ending)
     time = np.append(flight.time_s[rows], result.time_s)
-    recording.send_columns(entity, _times(time), rr.TextLog.columns(text=texts))
+    recording.send_columns(entity, time_columns(time), rr.TextLog.columns(text=texts))

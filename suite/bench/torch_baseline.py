@@ -137,7 +137,7 @@ class Baseline:
             before, body = body, step(body, worlds.constants, action, target_w, config)
             passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
             passed = passed & (target < worlds.scene.gates.center_w.shape[1])
-            aim = self.target_gate(worlds.scene.gates, target + passed)
+            aim = self.target_gate(worlds.scene.gates, target + passed * config.loss.pass_first)
             loss, clearance = self.judge(worlds, before, body, gate, *aim)
             total = total + (loss * alive).mean()
             alive = alive * (clearance > -config.loss.crash_depth_m) * (number + 1 < worlds.stop)

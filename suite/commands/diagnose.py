@@ -20,9 +20,19 @@ class Config:
     vehicle: str
     """The vehicle file that the simulation used, or a shipped vehicle's name."""
     out: Path = Path("runs/diagnosis")
-    """Folder for diagnosis.json, vehicle.toml and report.html."""
+    """Folder for diagnosis.json, vehicle.toml, report.html and recording.rrd."""
     drive: Literal["auto", "commands", "motors"] = "auto"
     """What drives the model: logged commands, measured rotor speeds, or what the logs allow."""
+    compare_delta: bool = False
+    """Fit a Delta Action Model to the same flights and show what it removes; takes minutes."""
+    plan: bool = False
+    """Write flights that would tell apart what these could not, in OUT/plan."""
+    fly: str | None = None
+    """Fly the plan in simulation with this vehicle (a file or a shipped name); write its logs."""
+    recording: bool = True
+    """Write the held-out flights, measured and simulated, as a recording for rerun."""
+    seed: int = 0
+    """Seed of the null's draws, of the intervals' and of simulated noise."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -33,20 +43,51 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
-    from suite.diagnose.run import diagnose_files
+    from suite.diagnose.answer import components
+    from suite.diagnose.run import Wishes, diagnose_files
 
-    result = diagnose_files(config.flights, config.vehicle, config.drive, config.out, console)
+    wishes = Wishes(
+        drive=config.drive,
+        compare_delta=config.compare_delta,
+        plan=config.plan,
+        fly=config.fly,
+        recording=config.recording,
+        seed=config.seed,
+    )
+    result = diagnose_files(config.flights, config.vehicle, wishes, config.out, console)
     console.say(f"verdict: {result['verdict']}")
     for effect in result["effects"]:
         rivals = ", ".join(effect["alternatives"])
         same = f" (these flights cannot tell it from {rivals})" if rivals else ""
         console.say(f"  {effect['name']}{same}")
-        for name, entry in effect["parameters"].items():
-            console.say(f"    {name} = {entry['value']} {entry['unit']}, 95 %: {entry['ci95']}")
+        for label, value, span in components(effect["parameters"]):
+            if value is None:
+                console.say(f"    {label}: no flight can tell")
+            else:
+                between = f", 95 %: {span[0]:.4g} to {span[1]:.4g}" if span else ""
+                console.say(f"    {label}: {value:.4g}{between}")
     gap = result["gap"]
-    console.say(f"gap on held-out flight: {gap['before']:.2f} before, {gap['after']:.2f} after; "
+    console.say(f"gap on held-out flights: {gap['before']:.2f} before, {gap['after']:.2f} after; "
                 "1 is the noise floor")  # fmt: skip
+    if result["unexplained"]["where"]:
+        console.say(f"unexplained: {result['unexplained']['where']}")
     for line in result["separate_with"]:
         console.say(f"would tell {line}")
+    for side in ("held_out", "outside"):
+        contest = (result["black_box"] or {}).get(side)
+        if contest:
+            named = contest["named"]
+            beside = f"{named['gap']:.2f} with the names, " if named else ""
+            console.say(
+                f"on {contest['judged_on']}: {contest['before']['gap']:.2f} before, {beside}"
+                f"{contest['black_box']['gap']:.2f} with a Delta Action Model"
+            )
+    plan = result.get("plan")
+    if plan:
+        count = len(plan["flights"])
+        where = f": {config.out / 'plan'}" if count else ""
+        console.say(f"plan: {count} flights{where}")
+        if any(flight["flown"] for flight in plan["flights"]):
+            console.say(f"flown in simulation: {config.out / 'plan' / 'flights'}")
     console.say(f"report: {config.out / 'report.html'}")
     return result

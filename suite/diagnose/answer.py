@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,8 @@ SHOWN = 5
 """Shapes of the rest that are listed."""
 
 
-def answer(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the contents of diagnosis.json."""
+def answer(diagnosis: Diagnosis, seed: int = 0) -> dict[str, Any]:
+    """Return the contents of diagnosis.json; `seed` is that of the intervals' draws."""
     named = diagnosis.finding.named
     before, after = diagnosis.before, diagnosis.after
     return {
@@ -32,8 +33,8 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
             "before": before.rms,
             "after": after.rms,
             "noise_floor": 1.0,
-            "before_ci95": interval(before.score),
-            "after_ci95": interval(after.score),
+            "before_ci95": interval(before.score, seed),
+            "after_ci95": interval(after.score, seed),
             "horizon_s": HEADLINE_S,
             "held_out": diagnosis.held_out,
             "channels": {
@@ -53,6 +54,7 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
         else {
             "effect": diagnosis.control[0],
             "after": diagnosis.control[1].rms,
+            "after_ci95": interval(diagnosis.control[1].score, seed),
         },  # fmt: skip
         "unexplained": {
             "share": diagnosis.share_left,
@@ -138,3 +140,14 @@ def _parameters(diagnosis: Diagnosis, name: str, ones: list[Named]) -> dict[str,
             value, ci = one(at[None])
         found[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci}
     return found
+
+
+def components(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield label, value and interval of every component, None where there is none."""
+    for name, entry in parameters.items():
+        value, span, unit = entry["value"], entry["ci95"], entry["unit"]
+        if not isinstance(value, list):
+            yield f"{name} [{unit}]", value, span
+            continue
+        for k, one in enumerate(value):
+            yield f"{name} {k + 1} [{unit}]", one, span[k] if span else None

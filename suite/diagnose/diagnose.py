@@ -14,24 +14,23 @@ from eval.effects import EFFECTS
 from eval.flight_log import FlightLog
 from eval.vehicle import Vehicle
 from suite.diagnose.drive import another_controller, choose_drive
-from suite.diagnose.evidence import Frame, State, fit
-from suite.diagnose.gap import Gap, measure, worse
+from suite.diagnose.evidence import Frame, State, fit, information
+from suite.diagnose.gap import OVERLAP_S, Gap, measure, worse
 from suite.diagnose.intervals import errors_of
-from suite.diagnose.model import Model
+from suite.diagnose.model import Linear, Model
 from suite.diagnose.parameters import candidates, indices_of, make_space
 from suite.diagnose.rest import Rest, push_of, rest_of
 from suite.diagnose.search import Finding, search, start_state
 from suite.diagnose.select import FEW, folds_of
+from suite.diagnose.split import split
 from suite.diagnose.turbulence import Turbulence, find_turbulence
 from suite.diagnose.verdict import COLOURED, SHAPED, Judgement, judge
 from suite.diagnose.windows import Windows, cut, take
 
-OVERLAP_S = 0.25
-"""From one start to the next of the rollouts that measure the gap [s]."""
+LOST_M = 50.0
+"""A simulated stretch that ends this far from the flight says nothing [m]."""
 LEAST = 2
 """Stretches to fit without which nothing can be left out."""
-ONE_FLIGHT = 0.7
-"""Share of a lone flight that is fitted; the rest is held out."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +73,8 @@ def diagnose(
     """Find what explains how `logs` differ from `vehicle`.
 
     Args:
-        logs: flights; the last fifth of them, at least one, is held out (of a lone flight, the
-            last 30 %).
+        logs: flights; a fifth of them, at least one, is held out (of a lone flight, the last
+            30 %).
         vehicle: the one that the simulation used.
         drive: what drives the model: "commands", "motors", or "auto".
         say: told of the search's steps.
@@ -86,23 +85,24 @@ def diagnose(
     """
     began = time.monotonic()
     by_rotors, warnings = choose_drive(logs, drive), list[str]()
+    if drive == "auto" and not by_rotors and another_controller(logs, vehicle):
+        warnings.append("the nominal rate loop does not give the measured rotor speeds; they drive")
+        by_rotors = True
     space = make_space(vehicle)
     voltage = all(log.voltage is not None for log in logs)
     model = Model(vehicle, space, by_rotors, voltage)
     cut_, notes = cut(logs, vehicle, by_rotors)
     if cut_ is None:
         raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
-    if drive == "auto" and not by_rotors and another_controller(model, cut_):
-        warnings.append("the nominal rate loop does not give the measured rotor speeds; they drive")
-        by_rotors = True
-        model = Model(vehicle, space, by_rotors, voltage)
-        cut_, notes = cut(logs, vehicle, by_rotors)
-        assert cut_ is not None
     warnings += notes
-    cut_, broken = _finite(model, cut_)
-    if broken:
+    begin = start_state(model, cut_)
+    linear = model.linearise(begin.theta, begin.offset, cut_, None)
+    good = _sound(linear)
+    if not good.all():
+        broken = int((~good).sum())
         warnings.append(f"{broken} stretches left out: the model's flight from there diverges")
-    inside, names = _split(logs, cut_)
+    cut_, linear = take(cut_, good), Linear(*(part[good] for part in linear))
+    inside, names = split(logs, cut_, information(linear, cut_, model.size))
     if inside.sum() < LEAST:
         raise ValueError(
             f"{int(inside.sum())} stretches of 1 s to fit, at least {LEAST} are needed: fly longer"
@@ -112,35 +112,34 @@ def diagnose(
             f"{int(inside.sum())} stretches of 1 s to fit: too few for a null of their own, so "
             "the null is drawn from the measured noise"
         )
-    windows, rest = take(cut_, inside), take(cut_, ~inside)
+    windows, apart = take(cut_, inside), take(cut_, ~inside)
     among = candidates(space, voltage, any(log.acc_b is not None for log in logs))
     if by_rotors:
         among = [c for c in among if c.name not in ("motor_lag", "command_delay", "rate_gain")]
-    say(f"{len(windows.flight)} stretches of 1 s to fit, {len(rest.flight)} held out")
-    finding = search(model, windows, among, say)
+    say(f"{len(windows.flight)} stretches of 1 s to fit, {len(apart.flight)} held out")
+    known = Linear(*(part[inside] for part in linear))
+    finding = search(model, windows, among, say, known, seed)
 
-    held = _held_out(logs, vehicle, by_rotors, rest)
+    windows = finding.windows
+    held = _held_out(logs, vehicle, by_rotors, apart)
     start = start_state(model, windows).theta
     before = measure(model, start, held, finding.sigma)
     after = measure(model, finding.state.theta, held, finding.sigma) if finding.named else before
     if finding.named and worse(before, after):
         warnings.append("what was found on the fitted flights does not hold on held-out ones")
-        finding.named.clear()
-    push = push_of(model, windows, finding.frame, finding.state)
-    rest = rest_of(push, folds_of(windows.flight, windows.start_s), seed)
+        finding, after = _without_names(model, finding), before
+    rest, turbulence = _left_over(model, finding, seed)
+    if turbulence and finding.named and not worse(after, before):
+        # Wind that lasts from one stretch to the next looks like many a steady number.
+        finding, after = _without_names(model, finding), before
+        rest, turbulence = _left_over(model, finding, seed)
     judgement = judge(finding, rest, by_rotors)
-    turbulence = None
-    repeats = any(shape.p_value <= SHAPED for shape in rest.shapes[:1])
-    blows = any(p <= COLOURED for axis, p in rest.coloured.items() if axis.startswith("force"))
-    if blows and not repeats:
-        turbulence = find_turbulence(model, finding.state.theta, push)
     if turbulence:
         judgement = Judgement("named", 0.0, None)
     if judgement.verdict == "unknown" and finding.named:
         labels = ", ".join(n.candidate.label for n in finding.named)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
-        finding.named.clear()
-        after = before
+        finding, after = _without_names(model, finding), before
     without: dict[str, Gap] = {}
     for one in finding.named:
         others = [n.candidate for n in finding.named if n is not one]
@@ -174,27 +173,43 @@ def diagnose(
     )
 
 
-def _finite(model: Model, windows: Windows) -> tuple[Windows, int]:
-    theta = model.space.array("start")
-    residual = model.residual(theta, np.zeros((len(windows.flight), model.free)), windows)
-    good = np.isfinite(residual).all(axis=(1, 2)) & (np.abs(residual[..., :3]) < 50).all((1, 2))
+def _left_over(model: Model, finding: Finding, seed: int) -> tuple[Rest, Turbulence | None]:
+    """Return the structure in what `finding` leaves over, and the wind that may have made it."""
+    windows = finding.windows
+    push = push_of(model, windows, finding.frame, finding.state)
+    rest = rest_of(push, folds_of(windows.flight, windows.start_s), seed)
+    if not any(p <= COLOURED for axis, p in rest.coloured.items() if axis.startswith("force")):
+        return rest, None
+    turbulence = find_turbulence(model, finding.state.theta, push)
+    # Wind is one explanation and a shape over the state another: the better one counts.
+    shape = rest.shapes[0]
+    if turbulence and shape.p_value <= SHAPED and shape.gain > turbulence.ratio:
+        return rest, None
+    return rest, turbulence
+
+
+def _without_names(model: Model, finding: Finding) -> Finding:
+    """Return `finding` with nothing named, at the numbers of the vehicle file."""
+    return replace(
+        finding, named=[], indices=[], state=start_state(model, finding.windows), explained=0.0
+    )
+
+
+def _sound(linear: Linear) -> np.ndarray:
+    """Return which windows (W,) the model flies to their end.
+
+    Raises:
+        ValueError: where it is none.
+    """
+    residual = linear.residual
+    good = np.asarray(np.isfinite(residual).all(axis=(1, 2)))
+    good &= np.isfinite(linear.slope).all(axis=(1, 2, 3))
+    good &= (np.abs(residual[..., :3]) < LOST_M).all(axis=(1, 2))
     if not good.any():
         raise ValueError(
             "the model diverges on every flight: check the vehicle file and the frames"
         )
-    return take(windows, good), int((~good).sum())
-
-
-def _split(logs: Sequence[FlightLog], windows: Windows) -> tuple[np.ndarray, list[str]]:
-    """Return which windows are fitted, and the names of what is held out."""
-    flight, start = np.asarray(windows.flight), np.asarray(windows.start_s)
-    there = np.unique(flight)
-    if len(there) == 1:
-        cut_s = ONE_FLIGHT * logs[int(there[0])].duration_s
-        name = logs[int(there[0])].name
-        return start + 1.0 <= cut_s, [f"{name} from {cut_s:.1f} s"]
-    held = there[-max(1, round(0.2 * len(there))) :]
-    return ~np.isin(flight, held), [logs[int(k)].name for k in held]
+    return good
 
 
 def _held_out(

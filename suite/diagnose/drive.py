@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.signal import lfilter
 
 from eval.flight_log import FlightLog
-from suite.diagnose.evidence import make_frame
-from suite.diagnose.model import Model
-from suite.diagnose.noise import noise_of
-from suite.diagnose.windows import SLICES, Windows
+from eval.plant import Command, make_plant, wanted_speed
+from eval.vehicle import Vehicle
+from suite.diagnose.windows import step_s
 
 FOLLOWS = 0.5
 """Rotor speeds that the nominal rate loop predicts worse than this share of how they change are
 another controller's: they are the input then."""
-SEEN = 2.0
-"""Below this multiple of its noise the difference says nothing."""
-DEGREE = 5
-"""Of the polynomials in which rotor speeds are compared."""
+SMOOTH_S = 0.1
+"""Speeds are compared as means over this time, in which noise does not count [s]."""
+STILL_RAD_S = 10.0
+"""Speeds that change by less than this, or are off by less, say nothing [rad/s]."""
+SETTLED_S = 0.3
+"""After the first row, until the rotors' lag has forgotten how they began [s]."""
 
 
 def choose_drive(logs: Sequence[FlightLog], drive: str) -> bool:
@@ -38,34 +40,55 @@ def choose_drive(logs: Sequence[FlightLog], drive: str) -> bool:
     return drive == "motors" or not commands
 
 
-def another_controller(model: Model, windows: Windows) -> bool:
+def another_controller(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
     """Return whether the measured rotor speeds are not those that the nominal rate loop asks for.
 
-    Slow changes are compared, where neither the gyro's noise in the loop nor that of the speeds
-    counts for much.
+    The loop is given the measured rates, so that nothing but the controller and the rotors is
+    compared: what the air or a moved centre of mass does shows in the rates.
     """
-    rotors = SLICES["rotor speed"]
-    seen = np.asarray(windows.seen)[..., rotors]
-    if not seen.any():
-        return False
-    theta = model.space.array("start")
-    offset = np.zeros((len(windows.flight), model.free))
-    linear = model.linearise(theta, offset, windows, model.starts)
-    sigma = noise_of(linear.residual, windows)
-    frame = make_frame(linear, sigma, windows)
-    white = np.where(windows.seen, linear.residual / np.where(np.isfinite(sigma), sigma, 1.0), 0.0)
-    flat = white.reshape(len(white), -1, 1)
-    freed = flat - frame.start @ (np.swapaxes(frame.start, 1, 2) @ flat)
-    apart = freed.reshape(white.shape)[..., rotors]
-    turned = np.where(seen, np.asarray(windows.row_rotor_speed) / sigma[rotors], 0.0)
-    error, change, freedom = 0.0, 0.0, 0
-    for w in range(len(white)):
-        rows = seen[w].all(axis=-1)
-        time = np.asarray(windows.row_s)[w, rows]
-        if len(time) <= DEGREE + 1:
+    apart, change, count = 0.0, 0.0, 0
+    for log in logs:
+        if log.rotor_speed is None or log.thrust_cmd is None:
             continue
-        basis = np.linalg.qr(np.vander(2.0 * time - 1.0, DEGREE + 1)[:, ::-1])[0]
-        error += float(((basis.T @ apart[w, rows]) ** 2).sum())
-        change += float(((basis[:, 1:].T @ turned[w, rows]) ** 2).sum())
-        freedom += 4 * (DEGREE + 1)
-    return error > SEEN**2 * freedom and error > FOLLOWS**2 * change
+        error, own = _compare(log, vehicle)
+        apart, change, count = apart + (error**2).sum(), change + (own**2).sum(), count + own.size
+    if not count:
+        return False
+    still = count * STILL_RAD_S**2
+    return bool(apart > still and apart > FOLLOWS**2 * max(change, still))
+
+
+def _compare(log: FlightLog, vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far means of the speeds (B, 4) are from the loop's, and from their own mean."""
+    assert log.rotor_speed is not None and log.thrust_cmd is not None
+    assert log.rate_cmd_b is not None
+    dt = step_s(vehicle)
+    plant = make_plant(vehicle, dt)
+    time = np.arange(log.time_s[0], log.time_s[-1], dt)
+    rates = [np.interp(time, log.time_s, _filled(column)) for column in log.rate_b.T]
+    row = np.searchsorted(log.time_s, time - float(plant.constants.delay) + 1e-7, side="right") - 1
+    row = np.maximum(row, 0)
+    rate_cmd = np.stack([_filled(column) for column in log.rate_cmd_b.T], axis=-1)
+    order = Command(_filled(log.thrust_cmd)[row], rate_cmd[row])
+    wanted = wanted_speed(plant, order, np.stack(rates, axis=-1))
+    left = float(np.exp(-dt / max(float(plant.constants.time_constant), 1e-9)))
+    loop = lfilter([1.0 - left], [1.0, -left], wanted, axis=0, zi=left * wanted[:1])[0]
+    place = ((log.time_s - log.time_s[0]) / SMOOTH_S).astype(int)
+    asked = np.stack([np.interp(log.time_s, time, column) for column in loop.T], axis=-1)
+    good = np.isfinite(log.rotor_speed).all(axis=1) & (log.time_s > log.time_s[0] + SETTLED_S)
+    if not good.any():
+        return np.zeros((0, 4)), np.zeros((0, 4))
+    bins, inverse = np.unique(place[good], return_inverse=True)
+    size = np.bincount(inverse, minlength=len(bins))[:, None]
+    means = [np.zeros((len(bins), 4)), np.zeros((len(bins), 4))]
+    for mean, values in zip(means, (log.rotor_speed[good], asked[good]), strict=True):
+        np.add.at(mean, inverse, values)
+        mean /= size
+    return means[0] - means[1], means[0] - means[0].mean(axis=0)
+
+
+def _filled(series: np.ndarray) -> np.ndarray:
+    good = np.isfinite(series)
+    if not good.any():
+        return np.zeros_like(series)
+    return np.interp(np.arange(len(series)), np.flatnonzero(good), series[good])

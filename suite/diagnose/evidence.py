@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from suite.diagnose.model import Linear, Model
-from suite.diagnose.noise import rotor_noise
+from suite.diagnose.noise import noise_of, rotor_noise
 from suite.diagnose.rollout import KNOTS, STATE
 from suite.diagnose.windows import Windows
 
@@ -142,6 +142,13 @@ def sums_of(frame: Frame, linear: Linear, directions: int) -> Sums:
         (residual**2).sum(axis=1),
         slow.reshape(len(slow), 12, SLOW + 1).sum(axis=2),
     )
+
+
+def information(linear: Linear, windows: Windows, directions: int) -> np.ndarray:
+    """Return what each window tells of each of the first `directions`, (W, K)."""
+    frame = make_frame(linear, noise_of(linear.residual, windows), windows)
+    sums = sums_of(frame, linear, directions)
+    return np.einsum("wkk->wk", sums.square)
 
 
 def solve(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +14,7 @@ from eval.effects.interface import Constants
 from eval.plant import Nominal, assemble, nominal_quadrotor
 from eval.vehicle import Vehicle
 from suite.diagnose.parameters import Layout, Space, effects_at
-from suite.diagnose.rollout import KNOTS, STATE, Flown, difference, fly_windows
+from suite.diagnose.rollout import KNOTS, STATE, Feedback, Flown, difference, fly_windows
 from suite.diagnose.windows import Windows, step_s
 
 BATCH = 12
@@ -78,6 +78,9 @@ class Model:
         """Length of a step [s]."""
         self._kind = (space.layout, self.dt, driven_by_rotors, voltage)
         self._linear = _slopes(*self._kind)
+        self.fly: Callable[..., Any] = partial(_flight(*self._kind), self.given)
+        """(theta, offset, windows, push, feedback) -> (simulated - measured, the flight), to be
+        compiled by who needs it."""
 
     def residual(self, theta: np.ndarray, offset: np.ndarray, windows: Windows) -> np.ndarray:
         """Return measured - simulated (W, N, 19) from starts moved by `offset` (W, F)."""
@@ -179,11 +182,18 @@ def _flight(
     """Return the function that flies windows: simulated - measured, and the flight itself."""
 
     def fly(
-        given: Given, theta: Any, offset: Any, windows: Windows, push: Any = None
+        given: Given,
+        theta: Any,
+        offset: Any,
+        windows: Windows,
+        push: Any = None,
+        feedback: Feedback | None = None,
     ) -> tuple[Any, Flown]:
         values = effects_at(layout, given.base, theta)
         plant = assemble(given.nominal, given.constants, values, dt, 0.0)
-        flown = fly_windows(plant, values, driven_by_rotors, voltage, offset, windows, push)
+        flown = fly_windows(
+            plant, values, driven_by_rotors, voltage, offset, windows, push, feedback
+        )
         return difference(plant, values, flown, windows), flown
 
     return fly

@@ -1,18 +1,21 @@
-"""What the report of a diagnosis shows, step by step."""
+"""What the report of a diagnosis shows: the answer first, then the eight steps that led to it."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
+from eval.effects import EFFECTS
+from suite.diagnose.answer import components
+from suite.diagnose.charts import drift_chart, gains_chart, where_chart
 from suite.diagnose.diagnose import Diagnosis
-from suite.diagnose.windows import SLICES, UNITS
-from suite.report import Cell, Details, Grid, Links, Picture, Report, Section
+from suite.diagnose.proof import Proof
+from suite.diagnose.report_logs import actuators_section, logs_section, noise_section
+from suite.diagnose.report_proof import evidence_section, rest_section
+from suite.diagnose.search import P_VALUE
+from suite.diagnose.select import FLIPS
+from suite.diagnose.windows import UNITS
+from suite.report import Cell, Details, Grid, Links, Part, Picture, Report, Section
 
 VERDICTS = {
     "no_gap": "Simulation and flights agree within the measurement noise.",
@@ -20,149 +23,237 @@ VERDICTS = {
     "partly": "The gap is explained in part; a structured rest remains.",
     "unknown": "There is a gap that nothing in the catalogue explains.",
 }
+FILES = (
+    ("vehicle.toml", "the vehicle with what was named; every command takes it"),
+    ("diagnosis.json", "all numbers of this page"),
+    ("recording.rrd", "held-out flights measured and simulated, before and after, for rerun"),
+    ("plan/plan.json", "flights that would tell apart what these could not"),
+)
+"""Beside the report, where they were written."""
+RIVALS = 6
+"""Other names in the table of what fits as well."""
 
 
-def page(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Report:
-    """Return the report of `diagnosis`, whose JSON is `found`."""
-    names = ", ".join(
-        " or ".join([effect["name"], *effect["alternatives"]]) for effect in found["effects"]
-    )
+def page(
+    diagnosis: Diagnosis, found: Mapping[str, Any], proof: Proof, toml: str, files: set[str],
+    seed: int,
+) -> Report:  # fmt: skip
+    """Return the report of a diagnosis.
+
+    Args:
+        diagnosis: the diagnosis.
+        found: its JSON.
+        proof: what stands beside the names.
+        toml: the vehicle file that was written.
+        files: which of `FILES` there are.
+        seed: of the intervals' draws.
+    """
     gap = found["gap"]
-    lead = VERDICTS[found["verdict"]] + (f" Named: {names}." if names else "")
     sections = [
-        Section("The effects", [_effects(found)]),
-        Section("Where they disagree", [_gap_table(found), Picture(_chart(diagnosis), CHART)]),
-        Section("The candidates", [_scores(diagnosis)]),
-        Section("The measurement noise", [_noise(diagnosis)]),
-        Section("What is left", [_rest(found)]),
-        Section("Files", [Links([("diagnosis.json", "all numbers"),
-                                 ("vehicle.toml", "the vehicle with the named effects")])]),
-    ]  # fmt: skip
+        Section("The answer", _answer(found)),
+        logs_section(diagnosis, proof),
+        noise_section(diagnosis),
+        _where(found, proof),
+        *actuators_section(proof, diagnosis.driven_by),
+        _candidates(diagnosis),
+        _identity(diagnosis, found),
+        rest_section(diagnosis, found),
+        evidence_section(diagnosis, found, proof, seed),
+        _written(found, toml, files),
+    ]
     if found["warnings"]:
         sections.append(
             Section("Warnings", [Details("what was odd", "\n".join(found["warnings"]))])
         )
     return Report(
         title=f"Diagnosis: {found['verdict']}",
-        lead=lead,
+        lead=_lead(found),
         facts={
             "gap before": f"{gap['before']:.2f}",
             "gap after": f"{gap['after']:.2f}",
             "noise floor": "1",
-            "held out": ", ".join(gap["held_out"]),
+            "held out": _few(gap["held_out"]),
             "driven by": found["driven_by"],
+            "took": f"{found['seconds']:.0f} s",
         },
         sections=sections,
     )
 
 
-CHART = (
-    "Slow error of 1 s rollouts on held-out data over its noise floor, by speed at the start: "
-    "with the vehicle file as given, and with what was named."
-)
+def _lead(found: Mapping[str, Any]) -> str:
+    names = " and ".join(
+        " or ".join([effect["name"], *effect["alternatives"]]) for effect in found["effects"]
+    )
+    lead = VERDICTS[found["verdict"]]
+    if names:
+        lead += f" Named: {names}."
+    if found["unexplained"]["where"]:
+        lead += f" Unexplained: {found['unexplained']['where']}."
+    return lead
 
 
-def _effects(found: Mapping[str, Any]) -> Grid:
+def _few(names: list[str]) -> str:
+    short = [name.replace("\\", "/").rsplit("/", 1)[-1] for name in names]
+    return ", ".join(short[:3]) + (f" and {len(short) - 3} more" if len(short) > 3 else "")
+
+
+def _answer(found: Mapping[str, Any]) -> list[Part]:
+    if not found["effects"]:
+        return [VERDICTS[found["verdict"]]]
     rows = []
     for effect in found["effects"]:
-        for name, entry in effect["parameters"].items():
+        removed, chance = effect["gap_removed"], effect["p_value"]
+        for label, value, span in components(effect["parameters"]):
             rows.append(
                 [
                     Cell(effect["name"]),
                     Cell(", ".join(effect["alternatives"]) or "none"),
-                    Cell(f"{name} [{entry['unit']}]"),
-                    Cell(_number(entry["value"])),
-                    Cell(_number(entry["ci95"])),
-                    _share(effect["gap_removed"]),
-                    Cell(f"{effect['p_value']:.3g}"),
+                    Cell(label),
+                    Cell("not seen" if value is None else _number(value)),
+                    Cell("" if span is None else f"{_number(span[0])} to {_number(span[1])}"),
+                    Cell("exempt" if removed is None else f"{100 * removed:.0f} %"),
+                    Cell(f"{chance:.2g}"),
                 ]
             )
-    note = " ".join(f"To tell {line}." for line in found["separate_with"])
-    headers = ["effect", "cannot be told from", "parameter", "value", "95 %", "of the gap", "p"]
-    return Grid("", headers, rows, note=note or "Nothing to tell apart.")
+    headers = ["effect", "cannot be told from", "parameter", "total", "95 %", "of the gap", "p"]
+    words = [
+        f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
+        for effect in found["effects"]
+    ]
+    note = (
+        "Values are totals: what the vehicle file had of an effect is replaced. Of the gap: the "
+        "share that this effect takes away when it is added last."
+    )
+    return [*words, Grid("", headers, rows, note=note)]
 
 
-def _gap_table(found: Mapping[str, Any]) -> Grid:
+def _where(found: Mapping[str, Any], proof: Proof) -> Section:
     rows = []
     for horizon, groups in found["gap"]["channels"].items():
         for group, values in groups.items():
-            near = values["after"] < 1.2 * values["noise_floor"]
-            rows.append(
-                [
-                    Cell(horizon),
-                    Cell(f"{group} [{UNITS[group]}]"),
-                    Cell(f"{values['before']:.4g}"),
-                    Cell(f"{values['after']:.4g}", "good" if near else ""),
-                    Cell(f"{values['noise_floor']:.4g}"),
-                ]
-            )
-    control = found["control"]
-    note = "" if control is None else (
-        f"A wrong effect fitted in the same way ({control['effect']}) leaves a gap of "
-        f"{control['after']:.2f}; what was named leaves {found['gap']['after']:.2f}."
-    )  # fmt: skip
-    headers = ["rollout of", "RMS error", "before", "after", "noise floor"]
-    return Grid("Rollouts from measured states on held-out data", headers, rows, note=note)
-
-
-def _scores(diagnosis: Diagnosis) -> Grid:
-    rows = [
-        [Cell(s.candidate.label), Cell(f"{s.gain:.1f}"), Cell(f"{s.p_value:.3f}")]
-        for s in diagnosis.finding.first[:12]
+            floor = values["noise_floor"]
+            cells = [Cell(horizon), Cell(f"{group} [{UNITS[group]}]")]
+            for key in ("before", "after"):
+                tone = "good" if key == "after" and values[key] < 1.2 * floor else ""
+                cells.append(Cell(f"{values[key]:.4g}", tone))
+            rows.append([*cells, Cell(f"{floor:.4g}")])
+    headers = ["rollout of", "RMS error", "as given", "with what was named", "noise floor"]
+    told = found["disagreement"]
+    words = [
+        "Rollouts start from measured states; the noise floor is what the noise of the start and "
+        "of the row compared would make of a perfect model."
     ]
-    note = (
-        "Gain: fall of the whitened squared error on stretches that were left out. p: how often "
-        "the best of all candidates gains as much when the signs of the stretches are shuffled."
+    if told["before"]:
+        words.append(f"As given, errors stand out most in {told['before']}.")
+    else:
+        words.append("As given, no error stands out from the noise.")
+    if told["after"]:
+        words.append(f"With what was named, most in {told['after']}.")
+    return Section(
+        "3. Where they disagree",
+        [
+            *words,
+            Picture(where_chart(proof.where), WHERE),
+            Picture(drift_chart(proof.where), DRIFT),
+            Grid("On held-out flights", headers, rows),
+        ],
     )
-    return Grid("Alone, before anything was named", ["effect", "gain", "p"], rows, note=note)
 
 
-def _noise(diagnosis: Diagnosis) -> Grid:
+WHERE = (
+    "Errors of rollouts of 0.5 s over their noise floor, all flights, against what was flown at "
+    "their starts. A line that stays at the dotted one is noise; one that rises says with what the "
+    "disagreement grows."
+)
+DRIFT = (
+    "Measured minus simulated in the body axes of the start: the mean acceleration over 0.5 s that "
+    "the model lacks, and the turn that it lacks. Dots are rollouts; lines are means with 95 %."
+)
+
+
+def _candidates(diagnosis: Diagnosis) -> Section:
+    scores = diagnosis.finding.first
+    named = {n.candidate.label for n in diagnosis.finding.named}
+    chance = scores[0].chance if scores else None
     rows = [
-        [Cell(f"{name} [{UNITS[name]}]"), Cell(", ".join(f"{v:.3g}" for v in values))]
-        for name, place in SLICES.items()
-        if np.isfinite(values := diagnosis.finding.sigma[place]).any()
+        [
+            Cell(s.candidate.label),
+            Cell(f"{s.gain:.1f}"),
+            Cell(f"{s.p_value:.3f}"),
+            Cell("named" if s.candidate.label in named else ""),
+        ]
+        for s in scores
     ]
-    return Grid("Standard deviation by axis, from the data", ["measurement", "noise"], rows)
+    words = (
+        f"All {len(scores)} candidates, each fitted alone before anything was named. The gain is "
+        "the fall of the whitened squared error on stretches that its fit did not see. The null: "
+        f"the signs of whole stretches are shuffled {FLIPS} times, and the best gain of all "
+        "candidates is taken each time; p is how often that is as large. One name follows another "
+        f"while p is at most {P_VALUE:g}; then all are refitted jointly."
+    )
+    table = "\n".join(f"{c[0].text:24}{c[1].text:>12}{c[2].text:>8}  {c[3].text}" for c in rows)
+    return Section(
+        "4. The candidates",
+        [
+            words,
+            Picture(gains_chart(scores, chance, named), "The best fourteen; blue were named."),
+            Details("all candidates", f"{'effect':24}{'gain':>12}{'p':>8}\n{table}"),
+        ],
+    )
 
 
-def _rest(found: Mapping[str, Any]) -> str:
-    rest = found["unexplained"]
-    if rest["where"]:
-        return (
-            f"{100 * rest['share']:.0f} % of the structured gap is left, most in {rest['where']}."
-        )
-    return "No structure beyond the measurement noise is left."
+def _identity(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
+    rows = []
+    for one in diagnosis.finding.named:
+        ordered = sorted(one.apart.items(), key=lambda item: item[1])
+        for label, apart in ordered[:RIVALS]:
+            same = label.split()[0] in one.rivals
+            verdict = Cell("cannot be told apart", "bad") if same else Cell("ruled out")
+            rows.append([Cell(one.candidate.label), Cell(label), Cell(f"{apart:.1f}"), verdict])
+    headers = ["named", "in its place", "worse by", ""]
+    note = (
+        "Worse by: squared error in units of the noise, with one for each number that is fitted; "
+        "9 is three standard errors. What was not fitted in a name's place was too far off."
+    )
+    parts: list[Part] = [Grid("", headers, rows, note=note)] if rows else []
+    if not diagnosis.finding.named:
+        parts.append("Nothing was named, so that there is nothing to tell apart.")
+    elif not found["separate_with"]:
+        parts.append("No other name explains the same flights as well.")
+    parts += [f"What would tell {line}." for line in found["separate_with"]]
+    if found["separate_with"]:
+        parts.append("suite diagnose --plan writes such flights as commanded trajectories.")
+    return Section("5. What could stand in its place", parts)
 
 
-def _chart(diagnosis: Diagnosis) -> bytes:
-    speed = np.linalg.norm(np.asarray(diagnosis.held.vel_w), axis=1)
-    figure = Figure(figsize=(7.2, 3.2), layout="constrained")
-    axes = figure.subplots()
-    for gap, colour, label in (
-        (diagnosis.before, "#8b93a1", "before"),
-        (diagnosis.after, "#2463c9", "after"),
-    ):
-        axes.plot(speed, np.sqrt(gap.score), "o", ms=4, color=colour, label=label)
-    axes.axhline(1.0, color="#b8bec8", lw=1.0)
-    axes.set_xlabel("speed [m/s]")
-    axes.set_ylabel("error over noise floor")
-    axes.set_ylim(bottom=0)
-    axes.legend(frameon=False)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
-    return buffer.getvalue()
+def _written(found: Mapping[str, Any], toml: str, files: set[str]) -> Section:
+    links = [(path, words) for path, words in FILES if path in files]
+    named = bool(found["effects"])
+    words = (
+        "The vehicle file with the named effects, for every other command (--vehicle)."
+        if named
+        else "Nothing was named: the vehicle file is as it was."
+    )
+    parts: list[Part] = [words, Details("vehicle.toml", toml), Links(links)]
+    plan = found.get("plan")
+    if plan:
+        rows = [
+            [
+                Cell(way["file"]),
+                Cell(way["trajectory"]["kind"]),
+                Cell(f"{way['trajectory']['duration_s']:g} s"),
+                Cell(f"{way['top_speed']:.1f} m/s"),
+                Cell(f"{way['top_acceleration']:.1f} m/s²"),
+                Cell(" x ".join(f"{size:.1f}" for size in way["room"]) + " m"),
+                Cell(way["flown"] or ""),
+            ]
+            for way in plan["flights"]
+        ]
+        headers = ["flight", "kind", "lasts", "speed", "acceleration", "needs", "flown as"]
+        note = " ".join(plan["words"])
+        parts.append(Grid("Flights to fly next", headers, rows, note=note))
+    return Section("8. What was written", parts)
 
 
-def _number(value: Any) -> str:
-    if value is None:
-        return "not seen"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_number(v) for v in value) + "]"
+def _number(value: float) -> str:
     return f"{value:.4g}"
-
-
-def _share(value: float | None) -> Cell:
-    return Cell("–" if value is None else f"{100 * value:.0f} %")

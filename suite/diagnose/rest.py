@@ -90,7 +90,7 @@ def rest_of(push: Push, fold: np.ndarray, seed: int = 0) -> Rest:
     cross = (turned @ push.cross[..., None])[..., 0]
     size = np.sqrt(np.maximum(np.einsum("wjj->j", square), 1e-12))
     groups = push.shapes.groups
-    gains, p_values = compare(
+    gains, p_values, _ = compare(
         square / np.outer(size, size), cross / size, [g.columns for g in groups], (), fold, seed
     )
     found = [Shape(g.label, *x) for g, *x in zip(groups, gains, p_values, strict=True)]

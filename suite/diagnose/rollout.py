@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -32,6 +32,15 @@ class Flown(NamedTuple):
     """(B, S + 1, 3) specific force in the step before [m/s^2]."""
 
 
+class Feedback(NamedTuple):
+    """A push that follows from the simulated state, such as a network's."""
+
+    start: Any
+    """What it remembers, at the start of B windows."""
+    act: Callable[[Any, Motion, Any, Any], tuple[Any, Any]]
+    """(memory, motion, commands (B, 4), number of the step) -> (memory, push (B, 6) as below)."""
+
+
 def fly_windows(
     plant: Plant,
     values: Mapping[str, Any],
@@ -40,6 +49,7 @@ def fly_windows(
     offset: Any,
     windows: Windows,
     push: Any = None,
+    feedback: Feedback | None = None,
 ) -> Flown:
     """Fly B windows from their measured starts.
 
@@ -52,6 +62,7 @@ def fly_windows(
         windows: B of them.
         push: (B, KNOTS, 6) further acceleration [m/s^2] and angular acceleration [rad/s^2] in
             body axes; none if not given.
+        feedback: the same from the simulated state, in place of `push`.
     """
     dt = float(plant.dt)
     gyro = values["gyro_bias"].bias
@@ -80,8 +91,10 @@ def fly_windows(
     )
 
     def step(carry: Any, inputs: Any) -> Any:
-        speed, motion = carry
+        speed, motion, remembered = carry
         order, measured, drop, index, pushed = inputs
+        if feedback is not None:
+            remembered, pushed = feedback.act(remembered, motion, order, index)
         if driven_by_rotors:
             spin = steady(measured)
         else:
@@ -96,7 +109,8 @@ def fly_windows(
                 wrench.torque_b + plant.constants.inertia * pushed[:, 3:],
             )
         after = euler_step(plant, motion, wrench)
-        return (spin.end, after), (after, spin.end, wrench.force_b / plant.constants.mass)
+        force_b = wrench.force_b / plant.constants.mass
+        return (spin.end, after, remembered), (after, spin.end, force_b)
 
     measured_speed = jnp.asarray(windows.rotor_speed)
     if driven_by_rotors:
@@ -109,7 +123,8 @@ def fly_windows(
         jnp.arange(steps),
         None if push is None else jnp.swapaxes(jnp.matmul(_hats(steps), push), 0, 1),
     )
-    _, (flown, speeds, forces) = jax.lax.scan(step, (speed, motion), inputs)
+    begin = (speed, motion, None if feedback is None else feedback.start)
+    _, (flown, speeds, forces) = jax.lax.scan(step, begin, inputs)
     track = Motion(
         *(
             jnp.moveaxis(jnp.concatenate([a[None], b]), 0, 1)

@@ -16,9 +16,9 @@ from suite.diagnose.model import Linear, Model
 from suite.diagnose.noise import noise_of
 from suite.diagnose.parameters import Candidate, Space, indices_of
 from suite.diagnose.select import Score, folds_of, score
-from suite.diagnose.windows import Windows
+from suite.diagnose.windows import SLICES, Windows
 
-P_VALUE = 0.01
+P_VALUE = 0.001
 """Chance of a false name at each step of the search."""
 MOST = 4
 """Effects that are named at most."""
@@ -36,6 +36,16 @@ MOSTLY = 0.25
 """Nor can one that leaves less than this share of what the name explains, where that is little."""
 ROUNDS = 3
 """Times that names and rivals are weighed anew."""
+HORIZONS_S = (1.0, 0.5, 0.25)
+"""Lengths of a window, of which the longest is taken that it can be trusted for [s]."""
+LOST_M = 0.15
+"""Error of position from which slopes are not trusted [m]."""
+LOST_HEIGHT = 0.25
+"""The same for height, as a share of it: near the ground the air changes with it [1]."""
+LOST_RAD = 0.25
+"""The same for attitude [rad]."""
+LAST_ROUNDS = 10
+"""Steps of the last fit of all names: some effects saturate."""
 LOOK = 25.0
 """A candidate that is worse than the best by more than this to first order is not fitted."""
 BENT = 0.1
@@ -52,6 +62,9 @@ class Named:
     """Fall of the error when it is added last."""
     rivals: list[str] = field(default_factory=list)
     """Names that explain the same."""
+    apart: dict[str, float] = field(default_factory=dict)
+    """By label of what was fitted in its place: by how much it is worse, in units of the noise and
+    with a unit for each number."""
 
 
 @dataclass
@@ -59,6 +72,8 @@ class Finding:
     """What a search found."""
 
     named: list[Named]
+    windows: Windows
+    """What was fitted, as long as the model could be trusted."""
     state: State
     sums: Sums
     """Along the named numbers, at the end."""
@@ -79,18 +94,32 @@ def start_state(model: Model, windows: Windows) -> State:
 
 
 def search(
-    model: Model, windows: Windows, among: Sequence[Candidate], say: Callable[[str], None]
+    model: Model,
+    windows: Windows,
+    among: Sequence[Candidate],
+    say: Callable[[str], None],
+    known: Linear | None = None,
+    seed: int = 0,
 ) -> Finding:
-    """Return what explains the gap between `model` and `windows`."""
-    fold = folds_of(np.asarray(windows.flight), np.asarray(windows.start_s))
+    """Return what explains the gap between `model` and `windows`.
+
+    Args:
+        model: of the windows.
+        windows: what is fitted.
+        among: the candidates.
+        say: told of the steps.
+        known: slopes along everything at the vehicle file's numbers, where they are known.
+        seed: of the null's draws.
+    """
+    whole, fold = windows, folds_of(np.asarray(windows.flight), np.asarray(windows.start_s))
     state = start_state(model, windows)
     named: list[Named] = []
     first: list[Score] = []
     while True:
-        linear, frame, sums, sigma = _look(model, windows, state)
+        linear, windows, frame, sums, sigma = _look(model, whole, state, None if named else known)
         indices = indices_of([n.candidate for n in named])
         left = [c for c in among if not set(c.indices) & set(indices)]
-        scores = score(sums, state.theta, model.space, indices, left, fold)
+        scores = score(sums, state.theta, model.space, indices, left, fold, seed)
         if not first:
             first = scores
         best = scores[0] if scores else None
@@ -99,7 +128,7 @@ def search(
             break
         tried = []
         fallen = {
-            s.candidate: _fallen(sums, state.theta, model.space, indices, s.candidate)
+            s.candidate: _fallen(sums, state.theta, model.space, [*indices, *s.candidate.indices])
             for s in scores
             if s.gain >= NEAR * best.gain
         }
@@ -111,16 +140,17 @@ def search(
             say(f"{item.candidate.label}: {float(sums.error.sum() - fitted.error.sum()):.0f}")
         _, item, state = min(tried, key=lambda t: t[0])
         named.append(Named(item.candidate, item.p_value, item.gain))
-    named, state = _settle(model, windows, frame, named, state, among, fold, say)
+    named, state = _settle(model, whole, windows, frame, named, state, among, fold, say, seed)
     indices = indices_of([n.candidate for n in named])
-    state, last = fit(model, windows, frame, state, indices, rounds=3 if indices else 0)
+    state, last = fit(model, windows, frame, state, indices, LAST_ROUNDS if indices else 0)
     begin = fit(model, windows, frame, start_state(model, windows), [])[1] if indices else last
     explained = float(begin.error.sum() - last.error.sum())
-    return Finding(named, state, last, indices, sigma, frame, first, last.slow, explained)
+    return Finding(named, windows, state, last, indices, sigma, frame, first, last.slow, explained)
 
 
 def _settle(
     model: Model,
+    whole: Windows,
     windows: Windows,
     frame: Frame,
     named: list[Named],
@@ -128,15 +158,29 @@ def _settle(
     among: Sequence[Candidate],
     fold: np.ndarray,
     say: Callable[[str], None],
+    seed: int,
 ) -> tuple[list[Named], State]:
-    """Refit all names jointly and judge each against its rivals, until no name changes."""
+    """Refit all names jointly and judge each against its rivals, until no name changes.
+
+    Args:
+        model: of the windows.
+        whole: windows at full length.
+        windows: as long as the model with all names can be trusted.
+        frame: of these.
+        named: what was named.
+        state: with it.
+        among: the candidates.
+        fold: (W,) windows of one number are left out together.
+        say: told of the steps.
+        seed: of the null's draws.
+    """
     for _ in range(ROUNDS):
         indices = indices_of([n.candidate for n in named])
         if not indices:
             break
-        state, last = fit(model, windows, frame, state, indices)
+        state, _ = fit(model, windows, frame, state, indices)
         before = [n.candidate for n in named]
-        state = _judge_rivals(model, windows, frame, named, state, last, among, fold, say)
+        state = _judge_rivals(model, whole, named, state, among, fold, say, seed)
         needed = [n for n in named if n.p_value <= P_VALUE]
         if [n.candidate for n in needed] == before:
             break
@@ -149,12 +193,43 @@ def _settle(
     return named, state
 
 
-def _look(model: Model, windows: Windows, state: State) -> tuple[Linear, Frame, Sums, np.ndarray]:
-    """Return the slopes along everything at `state`, their frame and sums, and the noise."""
-    linear = model.linearise(state.theta, state.offset, windows, None)
+def _look(
+    model: Model, windows: Windows, state: State, known: Linear | None
+) -> tuple[Linear, Windows, Frame, Sums, np.ndarray]:
+    """Return the slopes along everything at `state`, and how to weigh them.
+
+    With them come the windows, as long as slopes can be trusted, their frame and sums, and the
+    noise.
+    """
+    linear = known
+    if linear is None:
+        linear = model.linearise(state.theta, state.offset, windows, None)
     sigma = noise_of(linear.residual, windows)
-    frame = make_frame(linear, sigma, windows)
-    return linear, frame, sums_of(frame, linear, model.size), sigma
+    view = _trusted(windows, linear.residual)
+    frame = make_frame(linear, sigma, view)
+    return linear, view, frame, sums_of(frame, linear, model.size), sigma
+
+
+def _trusted(windows: Windows, residual: np.ndarray) -> Windows:
+    """Return `windows`, each up to where the model has not left the flight by too much.
+
+    Beyond, slopes taken where the model is say nothing of where the flight was: it may have turned
+    over, or sunk below the ground. What is named brings the model back, and the next look is
+    longer.
+    """
+    apart = np.abs(residual)
+    height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
+    lost = (apart[..., SLICES["position"]].max(axis=-1) > LOST_M) | (
+        apart[..., SLICES["attitude"]].max(axis=-1) > LOST_RAD
+    )
+    lost |= (apart[..., 2] > LOST_HEIGHT * height) & (height > 0.0)
+    row_s = np.asarray(windows.row_s)
+    trusted = np.full(len(row_s), HORIZONS_S[-1])
+    for horizon in reversed(HORIZONS_S):
+        there = ~(lost & (row_s <= horizon)).any(axis=1)
+        trusted = np.where(there, horizon, trusted)
+    seen = np.asarray(windows.seen) & (row_s <= trusted[:, None] + 1e-9)[..., None]
+    return windows._replace(seen=seen)
 
 
 def _near(fallen: Mapping[Candidate, float], candidate: Candidate) -> bool:
@@ -171,60 +246,54 @@ def _near(fallen: Mapping[Candidate, float], candidate: Candidate) -> bool:
 def _judge_rivals(
     model: Model,
     windows: Windows,
-    frame: Frame,
     named: list[Named],
     state: State,
-    last: Sums,
     among: Sequence[Candidate],
     fold: np.ndarray,
     say: Callable[[str], None],
+    seed: int,
 ) -> State:
     """Set each name's evidence when added last, and its rivals; a better rival takes its place."""
     begin = model.space.array("start")
     for one in list(named):
         others = [n.candidate for n in named if n is not one]
-        without_theta = state.theta.copy()
-        without_theta[list(one.candidate.indices)] = begin[list(one.candidate.indices)]
+        theta = state.theta.copy()
+        theta[list(one.candidate.indices)] = begin[list(one.candidate.indices)]
+        without = State(theta, state.offset)
+        linear, view, frame, sums, _ = _look(model, windows, without, None)
         at = indices_of(others)
-        without, bare = fit(model, windows, frame, State(without_theta, state.offset), at)
-        linear = model.linearise(without.theta, without.offset, windows, None)
-        sums = sums_of(frame, linear, model.size)
         left = [c for c in among if not set(c.indices) & set(at)]
-        scores = score(sums, without.theta, model.space, at, left, fold)
+        scores = score(sums, theta, model.space, at, left, fold, seed)
         own = next((s for s in scores if s.candidate == one.candidate), None)
         if own is not None:
             one.p_value, one.gain = own.p_value, own.gain
-        # (candidate, error with it in place of the name, what it costs in numbers)
-        tried = [(one.candidate, float(last.error.sum()), state, last)]
-        fallen = {c: _fallen(sums, without.theta, model.space, at, c) for c in left}
+        fallen = {c: _fallen(sums, theta, model.space, [*at, *c.indices]) for c in left}
+        tried = []
         for candidate in left:
-            if candidate == one.candidate or not _near(fallen, candidate):
-                continue
-            chosen = indices_of([*others, candidate])
-            after, sums_after = fit(model, windows, frame, without, chosen, known=linear)
-            tried.append((candidate, float(sums_after.error.sum()), after, sums_after))
-            say(f"{one.candidate.label} or {candidate.label}: {tried[-1][1] - tried[0][1]:.1f}")
-        cost = {c.label: error + len(c.indices) for c, error, _, _ in tried}
-        best, error, state, last = min(tried, key=lambda t: cost[t[0].label])
+            if candidate == one.candidate or _near(fallen, candidate):
+                chosen = indices_of([*others, candidate])
+                after, fitted = fit(model, view, frame, without, chosen, known=linear)
+                tried.append((float(fitted.error.sum()) + len(candidate.indices), candidate, after))
+                say(f"{one.candidate.label} or {candidate.label}: {tried[-1][0]:.1f}")
+        least, best, state = min(tried, key=lambda t: t[0])
         if best != one.candidate:
             one.p_value = next(s.p_value for s in scores if s.candidate == best)
-        explained = float(bare.error.sum()) - error
+        explained = float(sums.error.sum()) - _fallen(sums, theta, model.space, at) - least
         limit = min(APART, MOSTLY * explained)
         one.candidate = best
-        names = [c.name for c, *_ in tried if cost[c.label] - cost[best.label] <= limit]
+        one.apart = {c.label: cost - least for cost, c, _ in tried if c != best}
+        names = [c.name for cost, c, _ in tried if cost - least <= limit]
         one.rivals = [name for name in dict.fromkeys(names) if name != best.name]
     return state
 
 
-def _fallen(
-    sums: Sums, theta: np.ndarray, space: Space, at: Sequence[int], candidate: Candidate
-) -> float:
-    """Return the fall of the error, to first order, where `candidate` joins the numbers `at`."""
-    columns = indices_of([candidate]) if not at else sorted({*at, *candidate.indices})
+def _fallen(sums: Sums, theta: np.ndarray, space: Space, columns: Sequence[int]) -> float:
+    """Return the fall of the error, to first order, where the numbers at `columns` are fitted."""
+    columns = sorted(set(columns))
     square = sums.square[:, columns][:, :, columns].sum(0)
     cross = sums.cross[:, columns].sum(0)
     low, high, scale = (space.array(name)[columns] for name in ("low", "high", "step"))
-    if np.trace(square) < 1e-12:
+    if not columns or np.trace(square) < 1e-12:
         return 0.0
     change = solve(square, cross, low - theta[columns], high - theta[columns], scale)
     return float(2 * cross @ change - change @ square @ change)

@@ -10,9 +10,13 @@ import numpy as np
 from suite.diagnose.evidence import Sums, solve
 from suite.diagnose.parameters import Candidate, Space
 
-FLIPS = 999
+FLIPS = 1999
 """Draws of the null."""
 FOLDS = 5
+LOUD = 50.0
+"""A gain that noise never has: what else explains as much as the best is no chance either."""
+ALIKE = 0.5
+"""Share of the best gain from which a group explains about as much."""
 FEW = 10
 """Signs of fewer windows can be shuffled in too few ways for a p-value of 1 %."""
 
@@ -25,6 +29,8 @@ class Score(NamedTuple):
     """Fall of the error on windows that were left out of its fit, summed over the folds."""
     p_value: float
     """How often the best of all candidates gains as much on data of the null."""
+    chance: float
+    """Gain that the best of all candidates reaches on data of the null once in a hundred."""
 
 
 def folds_of(flight: np.ndarray, start_s: np.ndarray) -> np.ndarray:
@@ -64,8 +70,9 @@ def score(
     square, cross = sums.square * np.outer(scale, scale), sums.cross * scale
     seen = [c for c in among if np.einsum("wjj->j", square)[list(c.indices)].sum() > 1e-9]
     groups = [tuple(sorted({*named, *c.indices})) for c in seen]
-    gains, p_values = compare(square, cross, groups, tuple(named), fold, seed, (low, high))
-    scores = [Score(*item) for item in zip(seen, gains, p_values, strict=True)]
+    found = compare(square, cross, groups, tuple(named), fold, seed, (low, high))
+    gains, p_values, chance = found
+    scores = [Score(*item, chance) for item in zip(seen, gains, p_values, strict=True)]
     return sorted(scores, key=lambda s: -s.gain)
 
 
@@ -77,12 +84,15 @@ def compare(
     fold: np.ndarray,
     seed: int,
     room: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[list[float], list[float]]:
-    """Return the gain of each group of columns over those `beside`, and its p-value.
+) -> tuple[list[float], list[float], float]:
+    """Return the gain of each group of columns over those `beside`, its p-value, and chance's gain.
 
     The null is the largest gain of all groups where the signs of whole windows are shuffled, which
-    keeps all that is coloured within a window. Where there are fewer than `FEW` windows it is
-    drawn from the measured noise instead.
+    keeps all that is coloured within a window. What the best group explains, with those that are
+    nearly as good where it is much, is taken off before (Freedman and Lane 1983): a real effect
+    that a few windows show would otherwise stand in the null as well. Where there are fewer than
+    `FEW` windows the null is drawn from the measured noise instead. Chance's gain is what one draw
+    in a hundred exceeds.
 
     Args:
         square: (W, K, K) normal equations, columns of like size.
@@ -93,36 +103,53 @@ def compare(
         seed: of the null's draws.
         room: (K,) lowest and highest change of each column; no bounds if not given.
     """
-    rng = np.random.default_rng(seed)
-    if len(fold) >= FEW:
-        drawn = rng.choice([-1.0, 1.0], (FLIPS, len(fold), 1)) * cross
-    else:
-        drawn = _noise_like(square, rng)
     folds = [(fold != f, fold == f) for f in np.unique(fold)]
     sums = [(square[i].sum(0), square[o].sum(0)) for i, o in folds]
-    crosses = [(cross[i].sum(0), cross[o].sum(0)) for i, o in folds]
-    nulls = [(drawn[:, i].sum(1), drawn[:, o].sum(1)) for i, o in folds]
     free = (np.full(len(cross.T), -np.inf), np.full(len(cross.T), np.inf))
     low, high = free if room is None else room
 
-    def gains(columns: tuple[int, ...]) -> tuple[float, np.ndarray]:
-        total, null, at = 0.0, np.zeros(FLIPS), list(columns)
-        if not at:
-            return total, null
-        for (known, test), pull, chance in zip(sums, crosses, nulls, strict=True):
-            known, test = known[np.ix_(at, at)], test[np.ix_(at, at)]
-            change = solve(known, pull[0][at], low[at], high[at], np.ones(len(at)))
-            total += float(2 * pull[1][at] @ change - change @ test @ change)
-            damp = 1e-9 * np.diag(np.diag(known)) + 1e-30 * np.eye(len(at))
-            changes = np.linalg.solve(known + damp, chance[0][:, at].T).T
-            null += 2 * (chance[1][:, at] * changes).sum(1) - ((changes @ test) * changes).sum(1)
-        return total, null
+    def change(known: np.ndarray, pull: np.ndarray, at: list[int]) -> np.ndarray:
+        return solve(known[np.ix_(at, at)], pull[at], low[at], high[at], np.ones(len(at)))
 
-    without, null_without = gains(beside)
-    found = [gains(group) for group in groups]
-    best = np.max([null - null_without for _, null in found], axis=0, initial=-np.inf)
-    falls = [gain - without for gain, _ in found]
-    return falls, [float((1 + (best >= fall).sum()) / (1 + FLIPS)) for fall in falls]
+    def gain(columns: tuple[int, ...]) -> float:
+        total, at = 0.0, list(columns)
+        for (known, test), (inside, outside) in zip(sums, folds, strict=True):
+            moved = change(known, cross[inside].sum(0), at)
+            pull = cross[outside].sum(0)[at]
+            total += float(2 * pull @ moved - moved @ test[np.ix_(at, at)] @ moved)
+        return total
+
+    def chance(columns: tuple[int, ...]) -> np.ndarray:
+        total, at = np.zeros(FLIPS), list(columns)
+        if not at:
+            return total
+        for (known, test), (inside, outside) in zip(sums, drawn, strict=True):
+            known, test = known[np.ix_(at, at)], test[np.ix_(at, at)]
+            damp = 1e-9 * np.diag(np.diag(known)) + 1e-30 * np.eye(len(at))
+            moved = np.linalg.solve(known + damp, inside[:, at].T).T
+            pull = outside[:, at]
+            total += 2 * (pull * moved).sum(1) - ((moved @ test) * moved).sum(1)
+        return total
+
+    if not groups:
+        return [], [], 0.0
+    without = gain(beside)
+    falls = [gain(group) - without for group in groups]
+    rng = np.random.default_rng(seed)
+    if len(fold) >= FEW:
+        best = max(falls)
+        share = ALIKE if best > LOUD else 1.0
+        alike = [g for g, fall in zip(groups, falls, strict=True) if fall >= share * best]
+        at = sorted({column for group in alike for column in group})
+        left = cross - square[:, :, at] @ change(square.sum(0), cross.sum(0), at)
+        signs = rng.choice([-1.0, 1.0], (FLIPS, len(fold)))
+        drawn = [(signs[:, i] @ left[i], signs[:, o] @ left[o]) for i, o in folds]
+    else:
+        noise = _noise_like(square, rng)
+        drawn = [(noise[:, i].sum(axis=1), noise[:, o].sum(axis=1)) for i, o in folds]
+    null = np.max([chance(group) for group in groups], axis=0) - chance(beside)
+    p_values = [float((1 + (null >= fall).sum()) / (1 + FLIPS)) for fall in falls]
+    return falls, p_values, float(np.quantile(null, 0.99))
 
 
 def _noise_like(square: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -13,7 +13,7 @@ STRUCTURE = 1.15
 """Slow errors above their expectation by this factor are no noise."""
 STRUCTURE_BY_ROTORS = 1.3
 """The same where measured rotor speeds drive the model: their noise is known less well."""
-SHAPED = 0.01
+SHAPED = 0.001
 """A shape over the state that chance equals more rarely than this is structure."""
 COLOURED = 1e-4
 """So is energy of a smooth push along an axis that noise gives more rarely than this."""

@@ -64,6 +64,9 @@ class LossConfig:
     """Where the drone is off a gate's axis or beyond its plane, progress is measured towards a
     point on the axis before the gate, by as much as it is off, at most this far: straight to the
     centre the frame is in the way, and the drone hovers above it; 0: always the centre [m]."""
+    pass_first: bool = False
+    """Whether the step that passes a gate measures progress towards the next one already, and not
+    backwards to the one that was passed: faster, and less careful at these weights."""
     projection_decay: float = 0.5
     """beta_3 of L_proj [1/m]."""
     barrier_height: float = 2.0

@@ -134,11 +134,10 @@ def make_judge(
         held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
         passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
         passed = passed & (target < count)
-        # A gate that was passed in this step is no goal any more: measured to it, progress would
-        # be backwards, and the drone learns to slow down in front of gates.
-        aim, aim_w = target_gate(worlds.scene.gates, target + passed)
+        goal = target + (passed & weights.pass_first)
+        aim, aim_w = target_gate(worlds.scene.gates, goal)
         local = to_local(aim.rot_w, body.pos_w - aim.center_w)
-        shift = (target + passed < count) * losses.approach_shift(weights, local)
+        shift = (goal < count) * losses.approach_shift(weights, local)
         goal_w = aim_w - shift[:, None] * aim.rot_w[:, :, 0]
         share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]

@@ -21,6 +21,7 @@ from eval.view.scene3d import Faces, Lines, look_at, paint, to_camera, to_pixels
 from eval.view.solids import flat_normals, joined, outline, track_solids
 from eval.view.video import VideoOptions, frame_times, video_frames, write_video
 from tests.support.flights import result_of, small_track, smooth_flight
+from tests.support.recordings import columns
 from tracks.camera import Camera, pixel_rays_b
 from tracks.rotation import quat_to_rot
 
@@ -33,22 +34,6 @@ def rollout(ended_by="finished", duration_s=None, depth=True):
     track = small_track()
     flight = smooth_flight(track, duration_s=duration_s, depth=depth)
     return track, flight, result_of(track, flight, ended_by)
-
-
-def columns(path, store=None):
-    """Every component of a recording: {(entity, component): (times or None, values)}."""
-    reader = rerun.chunk.RrdReader(path)
-    found = {}
-    for chunk in reader.stream(store=store).to_chunks():
-        batch = chunk.to_record_batch()
-        times = None
-        if "time" in chunk.timeline_names:
-            times = batch.column("time").to_numpy().astype(np.int64)
-        for name in batch.schema.names:
-            if name not in (*chunk.timeline_names, "rerun.controls.RowId"):
-                assert (chunk.entity_path, name) not in found
-                found[chunk.entity_path, name] = (times, batch.column(name).to_pylist())
-    return found
 
 
 @pytest.fixture(scope="module")

@@ -49,11 +49,13 @@ def at_first_gate(config, ahead_m):
     )  # fmt: skip
 
 
-def test_the_step_that_passes_a_gate_is_progress_to_the_next():
-    config = small_config(1, 1, physics=STILL, loss={"progress": 1.0})
+@pytest.mark.parametrize(("pass_first", "progress"), [(True, -3.0), (False, 3.0)])
+def test_the_step_that_passes_a_gate_is_progress_to_the_next_where_asked(pass_first, progress):
+    loss = {"progress": 1.0, "pass_first": pass_first}
+    config = small_config(1, 1, physics=STILL, loss=loss)
     records = flown(config, at_first_gate(config, 0.02))
     assert bool(records.passed[0, 0])
-    assert float(records.terms.progress[0, 0]) == pytest.approx(-3.0, abs=0.2)
+    assert float(records.terms.progress[0, 0]) == pytest.approx(progress, abs=0.2)
 
 
 def test_the_step_before_is_progress_to_the_gate():
