@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import tomllib
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class Printed(NamedTuple):
@@ -37,11 +37,33 @@ class SimToSim(NamedTuple):
         return [cell for cell in self.cells if (cell.track, cell.level) == (track, level)]
 
 
+class Ablated(NamedTuple):
+    """One setting of the ablation, as printed."""
+
+    success_cross: float
+    """Share of trials with all four gates and no collision."""
+    success_rate: float
+    """Share of trials without a collision."""
+    v_max: float
+    """[m/s]; the paper does not say over what it is the maximum."""
+
+
+def _table(name: str) -> dict[str, Any]:
+    path = Path(__file__).with_name("paper.toml")
+    return tomllib.loads(path.read_text(encoding="utf-8"))[name]
+
+
+@functools.cache
+def ablation() -> tuple[str, dict[str, Ablated]]:
+    """Return the source and the rows of the table "Performance Comparison with and without AVF"."""
+    table = _table("ablation")
+    return table["source"], {key: Ablated(**row) for key, row in table["rows"].items()}
+
+
 @functools.cache
 def sim_to_sim() -> SimToSim:
     """Return the table "Sim-to-sim Performance"."""
-    path = Path(__file__).with_name("paper.toml")
-    table = tomllib.loads(path.read_text(encoding="utf-8"))["sim_to_sim"]
+    table = _table("sim_to_sim")
     names = {key: method["name"] for key, method in table["methods"].items()}
     cells = [
         Printed(key, names[key], track, level, won, table["trials"], v_max)

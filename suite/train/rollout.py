@@ -78,6 +78,13 @@ class StepRecord(NamedTuple):
     """(B, hidden) recurrent state after the step."""
     alive: jax.Array
     """1 where the step counted in the loss, else 0."""
+    noted: Any = None
+    """What `note` returned, where there was one."""
+
+
+Note = Callable[[Worlds, Body, Body, jax.Array], Any]
+"""note(worlds, before, body, target) -> arrays (B, ...) to be kept of a step; `target` is that of
+its beginning."""
 
 
 def target_gate(gates: Gates, target: jax.Array, ahead: int = 0) -> tuple[Gates, jax.Array]:
@@ -167,7 +174,9 @@ def states_at_start(batch: int, config: TrainConfig) -> jax.Array:
     return jnp.zeros((batch, config.physics.state_delay, size)).at[:, :, 5].set(1.0)
 
 
-def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepRecord]]:
+def make_rollout(
+    config: TrainConfig, note: Note | None = None
+) -> Callable[..., tuple[jax.Array, StepRecord]]:
     """Return rollout(params, nudge, worlds, key, encode, delta) -> (loss, records).
 
     `encode(params, image)` gives the embeddings; `nudge` is (T, B, hidden); `delta` is the frozen
@@ -250,6 +259,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[jax.Array, StepReco
                 pos_w=body.pos_w,
                 hidden=memory.hidden,
                 alive=memory.alive,
+                noted=None if note is None else note(worlds, before, body, memory.target),
             )
             target = memory.target + passed
             return memory._replace(body=body, target=target, alive=alive), record

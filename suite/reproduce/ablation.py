@@ -1,0 +1,218 @@
+"""The paper's ablation: with the Attractive Vector Field and without it, at several weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from suite.choices import at_least
+from suite.console import Console
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from suite.reproduce.document import Place
+    from suite.train.config import TrainConfig
+
+GATES = 4
+"""Of the paper's tracks in this experiment."""
+PROGRESS = (0.4, 0.8, 1.6, 3.2)
+"""lambda_p without the field; the first is also that with it."""
+NORMALISED = (1.6, 3.2, 6.4)
+"""lambda_p of L_p^norm without the field."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Train with the vector field and without it, from several seeds, and fly unseen worlds.
+
+    Trainings are found again by the hash of their configuration.
+    """
+
+    preset: str = "small"
+    """The recipe that all settings share but for gates, field and progress loss."""
+    set: tuple[str, ...] = ()
+    """Change settings of the recipe by name."""
+    iterations: int | None = None
+    """Gradient steps, instead of the preset's."""
+    worlds: int | None = None
+    """Worlds in one gradient step, instead of the preset's."""
+    training_seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds that every setting is trained from."""
+    trials: int = 300
+    """Unseen worlds that every policy flies."""
+    seconds: float = 10.0
+    """Of a trial, from standing start."""
+    seed: int = 1000
+    """Of the unseen worlds; none of the training seeds."""
+    only: tuple[str, ...] = ()
+    """Settings, such as "field 0.4"; all if none is named."""
+    jobs: int = 1
+    """Trainings at once, each in a process with its own share of the cores."""
+
+
+class Setting(NamedTuple):
+    """One row: what is trained."""
+
+    key: str
+    """Its name, that of the paper's row where there is one."""
+    words: str
+    """What tables call it."""
+    weight: float
+    """lambda_p."""
+    recipe: TrainConfig
+    """With the seed left as it is."""
+
+
+class Trained(NamedTuple):
+    """One training run of a setting, measured."""
+
+    setting: str
+    seed: int
+    seconds: float
+    """Spent on gradient steps after the first, which compiles [s]."""
+    commit: str
+    """That trained it."""
+    measured: dict[str, float] | None
+    """Numbers of `validation.py`; None where the training diverged."""
+    diverged: str = ""
+    """What was said then."""
+
+
+def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
+    """Train and fly what is missing and write ablation.md.
+
+    Raises:
+        ValueError: for anything that cannot be used, before the first training.
+    """
+    import functools
+
+    from suite.estimate import Estimate, announce
+    from suite.reproduce.ablation_tables import ablation_report, summaries
+    from suite.reproduce.document import write_document
+    from suite.reproduce.side_by_side import all_done, check_jobs
+    from suite.train.run import estimate
+
+    _check(config)
+    check_jobs(config.jobs)
+    chosen = settings(config)
+    runs = [
+        (setting.key, replace(setting.recipe, seed=seed))
+        for setting in chosen
+        for seed in config.training_seeds
+    ]
+    needs = [estimate(recipe) for _, recipe in runs]
+    memory = config.jobs * max(need.memory_bytes for need in needs)
+    whole = Estimate(sum(need.seconds for need in needs), memory)
+    announce(console, f"{len(runs)} trainings, less those that are there", whole)
+    trials = (config.trials, config.seed, config.seconds)
+    do = functools.partial(train_and_measure, cache=place.cache, trials=trials)
+    results = all_done(do, runs, config.jobs, console, "training")
+    rows = summaries(chosen, results, config.trials)
+    report = ablation_report(config, chosen, rows, results)
+    numbers = {"config": config, "rows": rows, "runs": results}
+    return write_document(place, "ablation", report, numbers, config.seed, console)
+
+
+def settings(config: Config) -> list[Setting]:
+    """Return the rows that are asked for, in the paper's order.
+
+    Raises:
+        ValueError: for a preset, a change or a row that does not exist.
+    """
+    from suite.train.overrides import override
+    from suite.train.presets import preset
+    from tracks.names import unknown_name
+
+    base = override(preset(config.preset), config.set)
+    optimizer = replace(base.optimizer, iterations=config.iterations or base.optimizer.iterations)
+    episode = replace(base.episode, gates=GATES, batch=config.worlds or base.episode.batch)
+    base = replace(base, episode=episode, optimizer=optimizer)
+
+    def row(key: str, words: str, weight: float, **changes: float) -> Setting:
+        recipe = replace(base, loss=replace(base.loss, **changes))
+        return Setting(f"{key} {weight:g}", words, weight, recipe)
+
+    def field(weight: float, words: str) -> Setting:
+        return row("field", words, weight, progress=weight, progress_norm=0.0)
+
+    bare = {"field_gain": 0.0, "projection": 0.0}
+    rows = [field(PROGRESS[0], "with the field, L_p")]
+    if base.loss.progress != PROGRESS[0]:
+        rows.append(field(base.loss.progress, "with the field, L_p at the recipe's own weight"))
+    rows += [
+        row("progress", "without, L_p", w, progress=w, progress_norm=0.0, **bare) for w in PROGRESS
+    ]
+    rows += [
+        row("normalised", "without, L_p^norm", w, progress=0.0, progress_norm=w, **bare)
+        for w in NORMALISED
+    ]
+    names = [row.key for row in rows]
+    for name in config.only:
+        if name not in names:
+            raise unknown_name("setting", name, names)
+    return [row for row in rows if not config.only or row.key in config.only]
+
+
+def train_and_measure(
+    run: tuple[str, TrainConfig],
+    console: Console,
+    cache: Path,
+    trials: tuple[int, int, float],
+) -> Trained:
+    """Train one run, or find it, and fly its policy.
+
+    Args:
+        run: the setting's key and the whole configuration.
+        console: where progress goes.
+        cache: folder of all runs.
+        trials: how many, the seed of their worlds, and the seconds of each.
+    """
+    import jax.numpy as jnp
+
+    from policies.policy_file import load_policy_checkpoint
+    from suite.errors import WorkFailed
+    from suite.reproduce.trainings import commit_of, folder_of, trained
+    from suite.reproduce.validation import make_validation
+    from suite.train import curve
+
+    key, config = run
+    diverged = ""
+    try:
+        trained(config, cache, console)
+    except WorkFailed as failure:
+        diverged = str(failure)
+    folder = folder_of(config, cache)
+    seconds = sum(row["seconds"] for row in curve.read(folder) if not row["cold"])
+    about = Trained(key, config.seed, seconds, commit_of(folder / "policy"), None, diverged)
+    if diverged:
+        console.note(f"{key}, seed {config.seed}: {diverged}")
+        return about
+    stored = load_policy_checkpoint(folder / "policy").params
+    params = {name: jnp.asarray(array) for name, array in stored.items()}
+    measured = make_validation(config, *trials)(params)
+    console.note(
+        f"{key}, seed {config.seed}: success cross {measured['success_cross']:.0%}, "
+        f"success rate {measured['success_rate']:.0%}, v_max {measured['v_max']:.1f} m/s"
+    )
+    return about._replace(measured=measured)
+
+
+def _check(config: Config) -> None:
+    seeds = config.training_seeds
+    if len(set(seeds)) < len(seeds) or not seeds:
+        said = " ".join(map(str, seeds)) or "empty"
+        raise ValueError(f"--training-seeds is {said}; give each once")
+    for seed in seeds:
+        at_least("--training-seeds", seed, 0)
+    at_least("--seed", config.seed, 0)
+    at_least("--trials", config.trials, 1)
+    at_least("--seconds", config.seconds, 0.5)
+    for option, value in (("--iterations", config.iterations), ("--worlds", config.worlds)):
+        if value is not None:
+            at_least(option, value, 1)
+    if config.seed in seeds:
+        raise ValueError(
+            f"--seed {config.seed} is one of --training-seeds, whose policies would have seen the "
+            "worlds they are measured on; give another"
+        )
