@@ -23,7 +23,7 @@ def _chunk(count: int) -> int:
     return max(size for size in range(1, min(count, CHUNK) + 1) if count % size == 0)
 
 
-def _every(stride: int, first: jax.Array, array: jax.Array) -> jax.Array:
+def every(stride: int, first: jax.Array, array: jax.Array) -> jax.Array:
     """Return one in `stride` of the rows of an array (T, ...), from row `first` on."""
     split = array.reshape(-1, stride, *array.shape[1:])
     return jax.lax.dynamic_index_in_dim(split, first, axis=1, keepdims=False)
@@ -87,7 +87,7 @@ def make_gradient(
         )(params, nudge, worlds, key, frozen_encode, delta)
         first = jax.random.randint(jax.random.fold_in(key, stride), (), 0, stride)
         images, cotangents = (
-            _every(stride, first, array).reshape(-1, *array.shape[2:])
+            every(stride, first, array).reshape(-1, *array.shape[2:])
             for array in (records.image, stride * cotangents)
         )
         through_images = encoder_gradient(params, images, cotangents)

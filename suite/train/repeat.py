@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import NamedSharding
+from jax.sharding import Sharding
 
 from policies import network
 from policies.checkpoint import load_arrays, read_config, save_arrays
@@ -88,7 +88,7 @@ class Run(NamedTuple):
     """What a folder's run must have been made from for it to be resumed, "config" among it."""
     folder: Path
     """Where it lives."""
-    place: NamedSharding
+    place: Sharding
     """Where the update leaves its state."""
 
 

@@ -100,7 +100,7 @@ def target_gate(gates: Gates, target: jax.Array, ahead: int = 0) -> tuple[Gates,
     return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
 
 
-def _queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
+def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return (the oldest entry, the queue after it left and `new` joined)."""
     line = jnp.concatenate([waiting, new[:, None]], axis=1)
     return line[:, 0], line[:, 1:]
@@ -197,8 +197,8 @@ def make_rollout(
         state = state_vector(
             body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b, second_w
         )
-        state, states = _queue(memory.states, state)
-        embedding, embeddings = _queue(memory.embeddings, embedding)
+        state, states = queue(memory.states, state)
+        embedding, embeddings = queue(memory.embeddings, embedding)
         action, hidden = network.recur(params, memory.hidden, embedding, state)
         memory = memory._replace(
             hidden=hidden, action_b=action, embeddings=embeddings, states=states

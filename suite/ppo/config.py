@@ -1,0 +1,87 @@
+"""Every setting of a PPO run: what it shares with the differentiable trainer, and its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from policies.spec import PolicySpec
+from suite.train.config import (
+    EpisodeConfig,
+    LossConfig,
+    OptimizerConfig,
+    PointMassConfig,
+    QuadrotorConfig,
+    TrainConfig,
+)
+
+
+@dataclass(frozen=True)
+class PpoConfig:
+    """A PPO run (Schulman et al. 2017): policy, dynamics and worlds are the trainer's."""
+
+    spec: PolicySpec = field(default_factory=lambda: PolicySpec(rate_hz=15.0))
+    """Rate, camera and encodings of the policy."""
+    physics: PointMassConfig = field(default_factory=PointMassConfig)
+    """Dynamics and their randomisation."""
+    quadrotor: QuadrotorConfig | None = None
+    """Train through this quadrotor; None: through the point mass of `physics`."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """beta_2, r_q and the points of a step's path, for the reward; nothing else of it is read."""
+    episode: EpisodeConfig = field(default_factory=EpisodeConfig)
+    """Worlds and horizon; `stop_from` is not read, since the value of what follows is learned."""
+    seed: int = 0
+    """Seed of the parameters, the tracks, the randomisation and the exploration."""
+    iterations: int = 200
+    """Rollouts, each followed by `epochs` times `minibatches` gradient steps."""
+    discount: float = 0.97
+    """gamma of the return, per policy period [1]."""
+    trace: float = 0.95
+    """lambda of generalised advantage estimation (Schulman et al. 2016) [1]."""
+    clip: float = 0.2
+    """Largest change of an action's probability that is rewarded, as a ratio's distance from 1."""
+    epochs: int = 3
+    """Passes of the policy over a rollout."""
+    minibatches: int = 4
+    """Gradient steps of a pass, each over a share of the worlds; must divide `episode.batch`."""
+    rate: float = 1e-3
+    """Adam's learning rate of the policy at the start; it falls linearly to zero."""
+    gradient_clip: float = 1.0
+    """Largest global norm of the policy's gradient."""
+    entropy: float = 0.0
+    """Weight of the exploration's entropy in the objective [1]."""
+    deviation: float = 1.5
+    """Standard deviation of the exploration at the start, on each axis of the action [m/s^2]."""
+    reward_scale: float = 0.01
+    """The critic learns returns of rewards times this: numbers around one [1]."""
+    critic_size: int = 128
+    """Width of the critic's two hidden layers."""
+    critic_rate: float = 1e-3
+    """Adam's learning rate of the critic."""
+    critic_epochs: int = 8
+    """Passes of the critic over a rollout; it sees no images, so they cost little."""
+
+    @property
+    def shared(self) -> TrainConfig:
+        """The differentiable training in the same worlds and dynamics."""
+        return TrainConfig(
+            spec=self.spec,
+            physics=self.physics,
+            quadrotor=self.quadrotor,
+            loss=self.loss,
+            episode=self.episode,
+            optimizer=OptimizerConfig(iterations=self.iterations),
+            seed=self.seed,
+        )
+
+
+def ppo_like(config: TrainConfig, iterations: int) -> PpoConfig:
+    """Return PPO with its default settings in the worlds and dynamics of `config`."""
+    return PpoConfig(
+        spec=config.spec,
+        physics=config.physics,
+        quadrotor=config.quadrotor,
+        loss=config.loss,
+        episode=config.episode,
+        seed=config.seed,
+        iterations=iterations,
+    )
