@@ -84,7 +84,7 @@ def test_spread_pooled_interval_and_sentences_by_hand():
         *runs_of("normalised 6.4", None),
     ]
     field, bare, gone = summaries(chosen, runs, 10)
-    assert field.over["success_cross"] == Over(pytest.approx(0.9), 0.8, 1.0)
+    assert field.over["success_cross"] == pytest.approx(Over(0.9, 0.8, 1.0))
     assert field.over["v_max"] == Over(6.0, 5.0, 7.0)
     assert field.pooled["success_cross"] == wilson(27, 30)
     assert (bare.seeds, bare.diverged) == (3, 1)

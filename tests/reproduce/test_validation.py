@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -66,20 +67,14 @@ def straight(wall_x):
         walls, np.broadcast_to(np.eye(3), (2, 8, 3, 3)), np.full((2, 8, 3), [0.1, 3.0, 3.0])
     )
     scene = scene._replace(gates=gates, boxes=boxes)
-    scene = type(scene)(*(_float32(part) for part in scene))
+    scene = jax.tree.map(lambda array: np.asarray(array, np.float32), scene)
     row = np.ones((2, 1), np.float32)
     return worlds._replace(
         scene=scene,
-        pos_w=row * np.float32([0, 0, 1.5]),
-        vel_w=row * np.float32([SPEED, 0, 0]),
-        heading_w=row * np.float32([1, 0, 0]),
+        pos_w=row * np.array([0, 0, 1.5], np.float32),
+        vel_w=row * np.array([SPEED, 0, 0], np.float32),
+        heading_w=row * np.array([1, 0, 0], np.float32),
     )
-
-
-def _float32(part):
-    if isinstance(part, tuple):
-        return type(part)(*(_float32(array) for array in part))
-    return np.asarray(part, np.float32)
 
 
 def test_a_straight_flight_through_two_gates_is_a_success():
@@ -114,7 +109,8 @@ def test_scores_by_hand():
         [[clear] * 4, [clear, near, clear, near], [near, clear, clear, clear], [clear] * 4]
     )
     speed = np.array([[1.0, 4, 2, 1], [2, 5, 3, 2], [9, 9, 4, 9], [9, 9, 1, 9]])
-    found = scored(*map(jnp.asarray, (passed, clearance, speed)), 2, jnp.ones((4, 4)))
+    arrays = jnp.asarray(passed), jnp.asarray(clearance), jnp.asarray(speed)
+    found = scored(*arrays, 2, jnp.ones((4, 4)))
     # Both gates in two steps, a hit after it; a hit in step two; nothing; both in one step.
     assert found.gates.tolist() == [2, 1, 0, 1]
     assert found.crossed.tolist() == [True, False, False, False]
