@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from suite.reproduce.document import Place
+    from suite.reproduce.schemes import Config as SchemesConfig
     from suite.train.config import TrainConfig
 
 GATES = 4
@@ -93,7 +94,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     from suite.reproduce.side_by_side import all_done, check_jobs
     from suite.train.run import estimate
 
-    _check(config)
+    check_sizes(config)
     check_jobs(config.jobs)
     chosen = settings(config)
     runs = [
@@ -120,14 +121,9 @@ def settings(config: Config) -> list[Setting]:
     Raises:
         ValueError: for a preset, a change or a row that does not exist.
     """
-    from suite.train.overrides import override
-    from suite.train.presets import preset
     from tracks.names import unknown_name
 
-    base = override(preset(config.preset), config.set)
-    optimizer = replace(base.optimizer, iterations=config.iterations or base.optimizer.iterations)
-    episode = replace(base.episode, gates=GATES, batch=config.worlds or base.episode.batch)
-    base = replace(base, episode=episode, optimizer=optimizer)
+    base = recipe_of(config.preset, config.set, config.iterations, config.worlds)
 
     def row(key: str, words: str, weight: float, **changes: float) -> Setting:
         recipe = replace(base, loss=replace(base.loss, **changes))
@@ -152,6 +148,23 @@ def settings(config: Config) -> list[Setting]:
         if name not in names:
             raise unknown_name("setting", name, names)
     return [row for row in rows if not config.only or row.key in config.only]
+
+
+def recipe_of(
+    name: str, changes: tuple[str, ...], iterations: int | None, worlds: int | None
+) -> TrainConfig:
+    """Return the preset `name` on tracks of four gates, with `changes` and a size of its own.
+
+    Raises:
+        ValueError: for a preset or a change that does not exist.
+    """
+    from suite.train.overrides import override
+    from suite.train.presets import preset
+
+    base = override(preset(name), changes)
+    optimizer = replace(base.optimizer, iterations=iterations or base.optimizer.iterations)
+    episode = replace(base.episode, gates=GATES, batch=worlds or base.episode.batch)
+    return replace(base, episode=episode, optimizer=optimizer)
 
 
 def train_and_measure(
@@ -198,7 +211,12 @@ def train_and_measure(
     return about._replace(measured=measured)
 
 
-def _check(config: Config) -> None:
+def check_sizes(config: Config | SchemesConfig) -> None:
+    """Refuse numbers of either document of trainings that cannot be used.
+
+    Raises:
+        ValueError: naming the option and what is allowed.
+    """
     seeds = config.training_seeds
     if len(set(seeds)) < len(seeds) or not seeds:
         said = " ".join(map(str, seeds)) or "empty"

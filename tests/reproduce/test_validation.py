@@ -97,7 +97,7 @@ def test_a_wall_behind_the_last_gate_is_no_collision():
 
 def test_whoever_falls_faster_than_the_policy_can_brake_collides():
     worlds = straight(wall_x=FAR)
-    falling = worlds._replace(vel_w=np.float32([[0, 0, -20]] * 2))
+    falling = worlds._replace(vel_w=np.array([[0, 0, -20]] * 2, np.float32))
     numbers = measure(falling)
     assert numbers["success_rate"] == numbers["success_cross"] == numbers["gates"] == 0.0
 
