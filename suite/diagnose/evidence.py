@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
+from scipy.special import eval_legendre
 
 from suite.diagnose.model import Linear, Model
 from suite.diagnose.noise import noise_of, rotor_noise
@@ -24,6 +25,8 @@ SLOW = 5
 """Degree of the polynomials in which a model's error of a window would show."""
 DONE = 0.05
 """A fit has converged where another round would lower its squared error by less than this."""
+SINGULAR = 1e-5
+"""A column with less than this of its own beside the others needs Householder's way [1]."""
 ROOM = 1.5
 """Errors of rotor speeds may be this much larger, for what happens between the knots."""
 
@@ -40,7 +43,7 @@ class Frame(NamedTuple):
     upper: np.ndarray
     """(W, F, F) from the start to `start`'s coordinates."""
     slow: np.ndarray
-    """(W, M, 12 L) slow errors of pose, velocity and rates, less what the start explains."""
+    """(W, 12, N, L) unit slow errors of pose, velocity and rates, channel by channel."""
     slow_freedom: np.ndarray
     """(W, 12) expected energy along them where there is noise only, by channel."""
     freedom: np.ndarray
@@ -79,21 +82,38 @@ def make_frame(linear: Linear, sigma: np.ndarray, windows: Windows) -> Frame:
     slope = (linear.slope[..., -size:] * weight[..., None]).reshape(count, -1, size)
     held = np.zeros((count, size - STATE, size))
     held[:, :, STATE:] = np.diag(prior)
-    start, upper = np.linalg.qr(np.concatenate([slope, held], axis=1))
+    start, upper = orthonormal(np.concatenate([slope, held], axis=1))
     upper = upper + 1e-9 * np.eye(size)
-    time = np.asarray(windows.row_s)
-    basis = np.zeros((count, rows, channels, 12, SLOW + 1))
-    for degree in range(SLOW + 1):
-        power = np.polynomial.legendre.Legendre.basis(degree)(2.0 * time - 1.0)
-        for channel in range(12):
-            basis[:, :, channel, channel, degree] = power * (weight[:, :, channel] > 0)
-    flat = basis.reshape(count, rows * channels, -1)
-    flat = np.concatenate([flat, np.zeros((count, size - STATE, flat.shape[2]))], axis=1)
-    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
-    slow = flat - start @ (np.swapaxes(start, 1, 2) @ flat)
-    slow_freedom = (slow**2).sum(axis=1).reshape(count, 12, SLOW + 1).sum(axis=2)
+    time = 2.0 * np.asarray(windows.row_s)[..., None] - 1.0
+    power = np.concatenate([eval_legendre(degree, time) for degree in range(SLOW + 1)], axis=-1)
+    slow = np.moveaxis((weight[..., :12] > 0)[..., None] * power[:, :, None], 1, 2)
+    slow = slow / np.maximum(np.linalg.norm(slow, axis=2, keepdims=True), 1e-9)
+    inside = start[:, : rows * channels].reshape(count, rows, channels, size)[:, :, :12]
+    taken = np.moveaxis(inside, 1, 3) @ slow
+    slow_freedom = (slow**2).sum(axis=(2, 3)) - (taken**2).sum(axis=(2, 3))
     freedom = (weight > 0).sum(axis=(1, 2)) - STATE
     return Frame(weight, prior, start, upper, slow, slow_freedom, freedom)
+
+
+def orthonormal(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return Q and upper triangular R of `matrix` (..., M, F), M much larger than F.
+
+    Cholesky's factor of the Gram matrix, twice (CholeskyQR2; Yamamoto et al. 2015): products of
+    whole matrices, where Householder's way through so tall a matrix is many small steps. Columns
+    that depend on each other to single precision are left to Householder.
+    """
+    size = np.maximum(np.linalg.norm(matrix, axis=-2, keepdims=True), 1e-300)
+    base, upper = matrix / size, np.swapaxes(size, -1, -2) * np.eye(matrix.shape[-1])
+    for _ in range(2):
+        try:
+            lower = np.linalg.cholesky(np.swapaxes(base, -1, -2) @ base)
+        except np.linalg.LinAlgError:
+            return np.linalg.qr(matrix)
+        factor = np.swapaxes(lower, -1, -2)
+        if np.einsum("...kk->...k", factor).min() < SINGULAR:
+            return np.linalg.qr(matrix)
+        base, upper = base @ np.linalg.inv(factor), factor @ upper
+    return base, upper
 
 
 def rotor_spread(windows: Windows) -> float:
@@ -135,12 +155,14 @@ def sums_of(frame: Frame, linear: Linear, directions: int) -> Sums:
     residual = free(frame, white_residual(frame, linear))[..., 0]
     slope = free(frame, whiten(frame, linear.slope[..., :directions]))
     turned = np.swapaxes(slope, 1, 2)
-    slow = np.einsum("wml,wm->wl", frame.slow, residual, optimize=True) ** 2
+    # What the start explains is out of the residual, so the slow errors need not be freed of it.
+    rows = residual[:, : frame.weight[0].size].reshape(frame.weight.shape)[..., :12]
+    slow = ((np.swapaxes(rows, 1, 2)[:, :, None] @ frame.slow)[:, :, 0] ** 2).sum(axis=2)
     return Sums(
         turned @ slope,
         (turned @ residual[..., None])[..., 0],
         (residual**2).sum(axis=1),
-        slow.reshape(len(slow), 12, SLOW + 1).sum(axis=2),
+        slow,
     )
 
 

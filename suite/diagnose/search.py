@@ -205,12 +205,12 @@ def _look(
     if linear is None:
         linear = model.linearise(state.theta, state.offset, windows, None)
     sigma = noise_of(linear.residual, windows)
-    view = _trusted(windows, linear.residual)
+    view = trusted(windows, linear.residual)
     frame = make_frame(linear, sigma, view)
     return linear, view, frame, sums_of(frame, linear, model.size), sigma
 
 
-def _trusted(windows: Windows, residual: np.ndarray) -> Windows:
+def trusted(windows: Windows, residual: np.ndarray) -> Windows:
     """Return `windows`, each up to where the model has not left the flight by too much.
 
     Beyond, slopes taken where the model is say nothing of where the flight was: it may have turned
