@@ -133,7 +133,7 @@ def beside_paper(rows: Sequence[Row]) -> str:
         )
     ours = {row.setting: row.over["success_cross"].mean for row, _ in pairs}
     parts.append(
-        f"The most success cross has {_most(ours)} here and "
+        f"Most success cross: {_most(ours)} here, "
         f"{_most({key: row.success_cross for key, row in theirs.items()})} in the paper."
     )
     return " ".join(parts)

@@ -25,7 +25,7 @@ def scheme_chart(rows: Sequence[Row]) -> bytes:
                 axes.fill_between(x, least, most, color=colour, alpha=0.15, lw=0)
                 axes.plot(x, mean, color=colour, label=row.words)
             axes.set_xlabel(words, fontsize=9)
-            titled(axes, title[0].upper() + title[1:])
+            titled(axes, title if name == "v_max" else title[0].upper() + title[1:])
         if scale == 100:
             upper[column].set_ylim(-3, 103)
     handles, labels = upper[0].get_legend_handles_labels()

@@ -203,7 +203,8 @@ MEANING = (
     "lambda_proj and beta_3.",
     "Seconds are those of iterations alone: measurements are left out, and iterations that compile "
     "count as long as the median of the others; what they took longer stands in the table. Each "
-    "training had its share of the cores for itself, as the facts above say.",
+    "training is held to its share of the cores, the same for all; what else the machine did "
+    "meanwhile is in the seconds.",
     "A time of reaching so many gates is that of the first measurement which has them: the median "
     "over the seeds that do, and of how many.",
 )

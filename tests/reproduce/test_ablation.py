@@ -98,7 +98,7 @@ def test_spread_pooled_interval_and_sentences_by_hand():
         "success cross lies within the range of our seeds or their pooled interval in 2 of 2"
         in (compared)
     )
-    assert "has field 0.4 here and field 0.4 in the paper" in compared
+    assert "Most success cross: field 0.4 here, field 0.4 in the paper" in compared
 
 
 def test_sentences_follow_the_numbers_where_the_field_loses():
@@ -111,14 +111,14 @@ def test_sentences_follow_the_numbers_where_the_field_loses():
     assert (
         "in 0 of 2 rows: elsewhere field 0.4: 15 % here, 95 % there; progress 3.2: 85" in compared
     )
-    assert "has progress 3.2 here and field 0.4 in the paper" in compared
+    assert "Most success cross: progress 3.2 here, field 0.4 in the paper" in compared
     mixed = summaries(
         chosen, [*runs_of("field 0.4", 0.1, 0.9), *runs_of("progress 3.2", 0.3, 0.5)], 10
     )
     assert "is 10 points above that, and their seeds overlap" in verdict(mixed)
     none = summaries(chosen, [*runs_of("field 0.4", 0.0), *runs_of("progress 3.2", 0.0)], 10)
     assert "has as much as that" in verdict(none)
-    assert "has no row here" in beside_paper(none)
+    assert "Most success cross: no row here" in beside_paper(none)
 
 
 @pytest.mark.parametrize(
