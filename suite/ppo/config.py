@@ -39,17 +39,17 @@ class PpoConfig:
     """lambda of generalised advantage estimation (Schulman et al. 2016) [1]."""
     clip: float = 0.2
     """Largest change of an action's probability that is rewarded, as a ratio's distance from 1."""
-    epochs: int = 3
+    epochs: int = 4
     """Passes of the policy over a rollout."""
-    minibatches: int = 4
+    minibatches: int = 8
     """Gradient steps of a pass, each over a share of the worlds; must divide `episode.batch`."""
-    rate: float = 1e-3
+    rate: float = 3e-3
     """Adam's learning rate of the policy at the start; it falls linearly to zero."""
     gradient_clip: float = 1.0
     """Largest global norm of the policy's gradient."""
-    entropy: float = 0.0
+    entropy: float = 0.01
     """Weight of the exploration's entropy in the objective [1]."""
-    deviation: float = 1.5
+    deviation: float = 2.0
     """Standard deviation of the exploration at the start, on each axis of the action [m/s^2]."""
     reward_scale: float = 0.01
     """The critic learns returns of rewards times this: numbers around one [1]."""
@@ -59,6 +59,8 @@ class PpoConfig:
     """Adam's learning rate of the critic."""
     critic_epochs: int = 8
     """Passes of the critic over a rollout; it sees no images, so they cost little."""
+    critic_minibatches: int = 16
+    """Gradient steps of such a pass; must divide `episode.batch`."""
 
     @property
     def shared(self) -> TrainConfig:

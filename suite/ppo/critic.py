@@ -17,10 +17,14 @@ from tracks.rotation import to_local
 
 Params = dict[str, jax.Array]
 
-FEATURES = 27
+AHEAD_S = (0.0, 0.1, 0.2, 0.4, 0.8)
+"""Times at which the critic sees how close a solid is, along the present velocity [s]."""
+FEATURES = 29 + 2 * len(AHEAD_S)
 """Numbers that the critic sees."""
 REACH_M = 2.0
 """Obstacles further away than this look the same [m]."""
+TOUCH_M = 0.2
+"""Distance over which an obstacle becomes urgent [m]."""
 
 
 def features(worlds: Worlds, body: Body, target: jax.Array) -> jax.Array:
@@ -28,26 +32,36 @@ def features(worlds: Worlds, body: Body, target: jax.Array) -> jax.Array:
 
     Position, velocity, acceleration, the next gate, the drone's forward and up axes and the
     direction away from the nearest obstacle, in the frame of the current gate and scaled to numbers
-    around one; the same position where it is near, how far the obstacle is, the opening's half
-    width and how many gates are left.
+    around one; the position again where it is near; how close solids are now and further on; when
+    and where the gate's plane is reached, were the velocity kept; the opening's half width and how
+    many gates are left.
     """
     gates = worlds.scene.gates
     gate, _ = target_gate(gates, target)
     following, _ = target_gate(gates, target, ahead=1)
-    distance, away_w = nearest_obstacle(worlds.scene, body.pos_w[:, None], NEAR)
+    times = jnp.asarray(AHEAD_S)[:, None]
+    path_w = body.pos_w[:, None] + times * body.vel_w[:, None]
+    distance, away_w = nearest_obstacle(worlds.scene, path_w, NEAR)
     pos_g = to_local(gate.rot_w, body.pos_w - gate.center_w)
+    vel_g = to_local(gate.rot_w, body.vel_w)
+    half_width = gate.opening_g.max((1, 2))[:, None]
+    until = jnp.clip(-pos_g[:, :1] / jnp.maximum(vel_g[:, :1], 0.1), 0.0, 2.0)
+    crossed = pos_g[:, 1:] + until * vel_g[:, 1:]
     left = gates.center_w.shape[1] - target
     columns = [
         pos_g / 5.0,
-        to_local(gate.rot_w, body.vel_w) / 5.0,
+        vel_g / 5.0,
         to_local(gate.rot_w, body.acc_w) / 10.0,
         to_local(gate.rot_w, following.center_w - gate.center_w) / 5.0,
         to_local(gate.rot_w, body.rot_w[:, :, 0]),
         to_local(gate.rot_w, body.rot_w[:, :, 2]),
         to_local(gate.rot_w, away_w[:, 0]),
         jnp.tanh(2.0 * pos_g),
-        jnp.minimum(distance, REACH_M),
-        2.0 * gate.opening_g.max((1, 2))[:, None],
+        jnp.clip(distance, -REACH_M, REACH_M),
+        jnp.exp(-jnp.maximum(distance, -TOUCH_M) / TOUCH_M),
+        until,
+        jnp.clip(crossed / half_width, -3.0, 3.0),
+        2.0 * half_width,
         jnp.minimum(left, 2)[:, None] - 1.0,
     ]
     return jnp.concatenate(columns, axis=-1)

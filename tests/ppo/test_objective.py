@@ -14,7 +14,7 @@ from suite.ppo.rollout import log_probability
 from tests.support.training import SPEC, doubled, fresh_params
 
 STEPS, BATCH = 5, 3
-CONFIG = PpoConfig(spec=SPEC)
+CONFIG = PpoConfig(spec=SPEC, entropy=0.0)
 
 
 @pytest.fixture(autouse=True)
