@@ -41,8 +41,9 @@ class PpoConfig:
     """Largest change of an action's probability that is rewarded, as a ratio's distance from 1."""
     epochs: int = 4
     """Passes of the policy over a rollout."""
-    minibatches: int = 8
-    """Gradient steps of a pass, each over a share of the worlds; must divide `episode.batch`."""
+    minibatches: int = 4
+    """Gradient steps of a pass of policy or critic, each over a share of the worlds; must divide
+    `episode.batch`."""
     rate: float = 3e-3
     """Adam's learning rate of the policy at the start; it falls linearly to zero."""
     gradient_clip: float = 1.0
@@ -57,10 +58,8 @@ class PpoConfig:
     """Width of the critic's two hidden layers."""
     critic_rate: float = 1e-3
     """Adam's learning rate of the critic."""
-    critic_epochs: int = 8
+    critic_epochs: int = 16
     """Passes of the critic over a rollout; it sees no images, so they cost little."""
-    critic_minibatches: int = 16
-    """Gradient steps of such a pass; must divide `episode.batch`."""
 
     @property
     def shared(self) -> TrainConfig:

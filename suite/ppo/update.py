@@ -129,14 +129,14 @@ def make_update(
     """Return update(state, worlds) -> (state', numbers of the curve), compiled on first call.
 
     Raises:
-        ValueError: where a number of minibatches does not divide `episode.batch`, or
-            `episode.image_stride` `episode.steps`.
+        ValueError: where `minibatches` does not divide `episode.batch`, or `episode.image_stride`
+            `episode.steps`.
     """
     batch, steps = config.episode.batch, config.episode.steps
-    for name in ("minibatches", "critic_minibatches"):
-        parts = getattr(config, name)
-        if parts < 1 or batch % parts:
-            raise ValueError(f"{name} is {parts}, allowed are divisors of episode.batch ({batch})")
+    if config.minibatches < 1 or batch % config.minibatches:
+        raise ValueError(
+            f"minibatches is {config.minibatches}, allowed are divisors of episode.batch ({batch})"
+        )
     if config.episode.image_stride < 1 or steps % config.episode.image_stride:
         raise ValueError(
             f"episode.image_stride is {config.episode.image_stride}, allowed are divisors of "
@@ -178,7 +178,7 @@ def make_update(
             change, optimizer = critic_optimizer.update(gradient, optimizer, params)
             return (cast(critic.Params, optax.apply_updates(params, change)), optimizer), None
 
-        rows = shuffled(key, batch, config.critic_epochs, config.critic_minibatches)
+        rows = shuffled(key, batch, config.critic_epochs, config.minibatches)
         held = state.critic, state.critic_optimizer
         (params, optimizer), _ = jax.lax.scan(learn, held, rows)
         return state._replace(critic=params, critic_optimizer=optimizer)

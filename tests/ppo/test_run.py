@@ -22,7 +22,7 @@ from tests.support.training import SPEC, boxes_worlds, fresh_params, small_confi
 DELAYS = {"image_delay": 2, "state_delay": 1, "depth_noise": 0.02}
 CONFIG = replace(
     ppo_like(small_config(4, 6, physics=DELAYS, image_stride=2), iterations=3),
-    epochs=2, minibatches=2, critic_epochs=2, critic_minibatches=4, critic_size=8,
+    epochs=2, minibatches=2, critic_epochs=2, critic_size=8,
 )  # fmt: skip
 
 make_update = cache(run.make_update)
@@ -70,9 +70,7 @@ def test_a_stopped_run_resumes_exactly_and_leaves_a_policy(tmp_path, monkeypatch
         run.train_ppo(replace(CONFIG, discount=0.5), whole, Console())
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"minibatches": 3}, {"minibatches": 0}, {"critic_minibatches": 3}]
-)
+@pytest.mark.parametrize("wrong", [{"minibatches": 3}, {"minibatches": 0}])
 def test_minibatches_that_do_not_divide_the_batch_are_refused(wrong):
     with pytest.raises(ValueError, match=r"minibatches is \d, allowed are divisors .*\(4\)"):
         run.make_update(replace(CONFIG, **wrong))
