@@ -19,7 +19,7 @@ class Config:
     """Flight logs, or folders of them, as `suite collect` writes them."""
     out: Path = Path("runs/delta")
     """Folder for the checkpoint delta/, delta.json and table.md."""
-    preset: str = "racer"
+    preset: str = "swift"
     """The training recipe whose point mass is corrected."""
     model: Literal["point", "quad"] = "point"
     """What is corrected: the point mass, or the quadrotor of --vehicle with its effects."""

@@ -16,8 +16,8 @@ class Config:
     The same command again goes on where it was stopped.
     """
 
-    preset: str = "racer"
-    """The recipe: racer (the shipped policy's), small, gpu or paper."""
+    preset: str = "swift"
+    """The recipe: swift (the shipped policy's), racer, small, gpu or paper."""
     policy: str | None = None
     """Start from this policy instead of training one: a shipped name or a checkpoint's folder."""
     track: str = "all"

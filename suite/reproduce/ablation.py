@@ -30,13 +30,13 @@ class Config:
     Trainings are found again by the hash of their configuration.
     """
 
-    preset: str = "small"
-    """The recipe that all settings share but for gates, field and progress loss."""
-    set: tuple[str, ...] = ()
+    preset: str = "racer"
+    """The recipe that all settings share but for its size, gates, field and progress loss."""
+    set: tuple[str, ...] = ("episode.image_stride=3",)
     """Change settings of the recipe by name."""
-    iterations: int | None = None
+    iterations: int = 200
     """Gradient steps, instead of the preset's."""
-    worlds: int | None = None
+    worlds: int = 48
     """Worlds in one gradient step, instead of the preset's."""
     training_seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds that every setting is trained from."""
@@ -150,9 +150,7 @@ def settings(config: Config) -> list[Setting]:
     return [row for row in rows if not config.only or row.key in config.only]
 
 
-def recipe_of(
-    name: str, changes: tuple[str, ...], iterations: int | None, worlds: int | None
-) -> TrainConfig:
+def recipe_of(name: str, changes: tuple[str, ...], iterations: int, worlds: int) -> TrainConfig:
     """Return the preset `name` on tracks of four gates, with `changes` and a size of its own.
 
     Raises:
@@ -162,8 +160,8 @@ def recipe_of(
     from suite.train.presets import preset
 
     base = override(preset(name), changes)
-    optimizer = replace(base.optimizer, iterations=iterations or base.optimizer.iterations)
-    episode = replace(base.episode, gates=GATES, batch=worlds or base.episode.batch)
+    optimizer = replace(base.optimizer, iterations=iterations)
+    episode = replace(base.episode, gates=GATES, batch=worlds)
     return replace(base, episode=episode, optimizer=optimizer)
 
 
@@ -226,9 +224,8 @@ def check_sizes(config: Config | SchemesConfig) -> None:
     at_least("--seed", config.seed, 0)
     at_least("--trials", config.trials, 1)
     at_least("--seconds", config.seconds, 0.5)
-    for option, value in (("--iterations", config.iterations), ("--worlds", config.worlds)):
-        if value is not None:
-            at_least(option, value, 1)
+    at_least("--iterations", config.iterations, 1)
+    at_least("--worlds", config.worlds, 1)
     if config.seed in seeds:
         raise ValueError(
             f"--seed {config.seed} is one of --training-seeds, whose policies would have seen the "

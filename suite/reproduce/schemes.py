@@ -27,17 +27,17 @@ class Config:
     found again by the hash of their configuration and of what is measured on the way.
     """
 
-    preset: str = "small"
-    """The recipe of the differentiable schemes."""
-    set: tuple[str, ...] = ()
+    preset: str = "racer"
+    """The recipe of the differentiable schemes, but for its size and gates."""
+    set: tuple[str, ...] = ("episode.image_stride=3",)
     """Change settings of the recipe by name."""
     progress: float = 0.4
     """lambda_p of both differentiable schemes; the paper's."""
-    iterations: int | None = None
+    iterations: int = 200
     """Gradient steps of the differentiable schemes, instead of the preset's."""
     ppo_iterations: int | None = None
     """Rollouts of PPO; as many as the others' gradient steps if not given."""
-    worlds: int | None = None
+    worlds: int = 48
     """Worlds in one gradient step or rollout, instead of the preset's."""
     training_seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds that every scheme is trained from."""

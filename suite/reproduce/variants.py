@@ -68,7 +68,7 @@ def variants_of(config: Config, place: Place, console: Console) -> list[Variant]
 def loop_config(config: Config, policy: str) -> LoopConfig:
     """Return the loop that fine-tunes `policy`, on flights of seeds that no table judges."""
     loop = resolve(
-        recipe="racer",
+        recipe="swift",
         policy=policy,
         difficulty="0,3,6,9",
         trials=LOOP_TRIALS,
