@@ -29,10 +29,10 @@ class Plant(NamedTuple):
 
 def nominal_plant(config: PointMassConfig) -> Plant:
     """Return the middle of the trainer's ranges."""
-    low, high = config.drag
+    along = (config.drag, config.drag, config.drag_up)
     return Plant(
         jnp.asarray(config.lag_mean),
-        jnp.full(3, (low + high) / 2),
+        jnp.asarray([(low + high) / 2 for low, high in along]),
         jnp.asarray(sum(config.action_delay) / 2),
     )
 

@@ -12,6 +12,7 @@ from suite.console import Console
 if TYPE_CHECKING:
     from eval.table import Cell
     from eval.trial import TrialResult
+    from suite.loop.compare import Line
     from suite.report import Report
     from suite.reproduce.document import Place
     from suite.reproduce.variants import Variant
@@ -65,11 +66,13 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
         zip(variants, flown(orders, place.cache, console, "judging all levels"), strict=True)
     )
     cells = {variant: _cells(variant, rows) for variant, rows in results.items()}
-    report = _report(config, cells)
+    lines = _merit(results)
+    report = _report(config, cells, lines)
     numbers = {
         "config": config,
         "cells": [cell for some in cells.values() for cell in some],
         "goals": _goals(cells),
+        "with_against_without": lines,
         "policies": variants,
     }
     return write_document(place, "table2", report, numbers, config.seed, console)
@@ -81,29 +84,46 @@ def _cells(variant: Variant, rows: Sequence[TrialResult]) -> list[Cell]:
     return summarise([row._replace(policy=variant.name) for row in rows])["cells"]
 
 
+def _merit(results: Mapping[Variant, Sequence[TrialResult]]) -> list[Line]:
+    """Return what the Delta Action Model changes, trial by trial; nothing without its control."""
+    from suite.loop.compare import BEFORE, WITH, WITHOUT, compare
+    from suite.reproduce import variants
+
+    names = {BEFORE: variants.OURS, WITHOUT: variants.CONTROL, WITH: variants.WITH}
+    flown = {variant.name: rows for variant, rows in results.items()}
+    if set(flown) != set(names.values()):
+        return []
+    return compare({role: flown[name] for role, name in names.items()})
+
+
 def _goals(cells: Mapping[Variant, Sequence[Cell]]) -> dict[str, Any]:
     from suite.reproduce.goals import goals
 
     return {variant.name: goals(some) for variant, some in cells.items()}
 
 
-def _report(config: Config, cells: Mapping[Variant, Sequence[Cell]]) -> Report:
+def _report(
+    config: Config, cells: Mapping[Variant, Sequence[Cell]], lines: Sequence[Line]
+) -> Report:
     from eval.table import markdown_table
+    from suite.loop.compare import CAVEAT, grids
+    from suite.loop.compare import verdict as merit
     from suite.report import Picture, Report, Section
     from suite.reproduce import sim_tables
     from suite.reproduce.goals import goals, verdict
     from suite.reproduce.level_chart import level_chart
     from suite.reproduce.paper import sim_to_sim
+    from suite.reproduce.variants import OURS, WITH
 
     printed = sim_to_sim()
     everything = [cell for some in cells.values() for cell in some]
     chosen = [cell for cell in everything if cell.difficulty in printed.levels]
     last = config.seed + config.trials - 1
-    first = next(iter(cells))
+    led = [variant for variant in cells if variant.name in (OURS, WITH)]
     asides = [] if len(cells) > 1 else [sim_tables.NO_DELTA]
     return Report(
         title="Sim-to-sim: the paper's table and all ten levels",
-        lead=verdict(goals(cells[first])),
+        lead=" ".join(f"{variant.name}: {verdict(goals(cells[variant]))}" for variant in led),
         facts={
             **{variant.name: variant.about for variant in cells},
             "vehicle": config.vehicle,
@@ -113,6 +133,16 @@ def _report(config: Config, cells: Mapping[Variant, Sequence[Cell]]) -> Report:
             Section(
                 "Beside the paper",
                 [*asides, sim_tables.beside_the_paper(chosen), sim_tables.MEANINGS],
+            ),
+            *(
+                [
+                    Section(
+                        "What the Delta Action Model changes",
+                        [merit(lines[-1]), *grids(lines)[:1], CAVEAT],
+                    )
+                ]
+                if lines
+                else []
             ),
             *(
                 Section(f"The goal, cell by cell: {variant.name}", [sim_tables.goal_grid(some)])

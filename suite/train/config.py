@@ -21,7 +21,10 @@ class PointMassConfig:
     lag_std: float = 2.0
     """Its standard deviation over worlds [1/s]."""
     drag: tuple[float, float] = (0.1, 0.8)
-    """Range of the linear drag in body axes [1/s]."""
+    """Range of the linear drag along the body's x and y [1/s]."""
+    drag_up: tuple[float, float] = (0.1, 0.8)
+    """Range of the linear drag along the body's z, which pushes a drone that leans forward down;
+    real rotors have more of it than of the other two [1/s]."""
     wind_std: tuple[float, float, float] = (1.0, 1.0, 0.2)
     """Standard deviation of the constant wind over worlds [m/s]."""
     time_step_std: float = 0.1

@@ -53,6 +53,7 @@ def paper() -> TrainConfig:
             lag_mean=12.0,
             lag_std=1.2,
             drag=(0.30, 0.45),
+            drag_up=(0.30, 0.45),
             action_delay=(0.0, 0.0),
             state_delay=1,
             image_delay=2,

@@ -141,10 +141,11 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     period = 1.0 / config.spec.rate_hz
     earliest = max(1, round(episode.stop_from * episode.steps))
     stretch = np.clip(1 + physics.time_step_std * rng.standard_normal(batch), 0.5, 1.5)
+    low_drag, high_drag = np.transpose([physics.drag, physics.drag, physics.drag_up])
     lag = physics.lag_mean + physics.lag_std * rng.standard_normal(batch)
     point = point_mass.Constants(
         lag=np.clip(lag, 0.2 * physics.lag_mean, None),
-        drag=rng.uniform(*physics.drag, (batch, 3)),
+        drag=rng.uniform(low_drag, high_drag, (batch, 3)),
         wind_w=rng.standard_normal((batch, 3)) * np.asarray(physics.wind_std),
         time_step=period * stretch,
         delay=rng.uniform(*physics.action_delay, batch),

@@ -41,10 +41,10 @@ def test_table2_and_all_levels(sky, tmp_path, capfd):
     assert "| paper, with Delta Action Model | 9 | 7/10 | 6.1 |" in text
     assert "seeds: 7 to 7, 1 trials a cell" in text
     # Other documents find the flights of this one.
-    assert reproduce(tmp_path, "seeds", "--policies", "racer", "--trials", "1", "--seed", "7") == 0
+    assert reproduce(tmp_path, "seeds", "--policies", "swift", "--trials", "1", "--seed", "7") == 0
     assert len(sky.flown) == 30
     text, numbers = page(tmp_path, "seeds")
-    assert numbers["spread"]["median"] == "racer"
+    assert numbers["spread"]["median"] == "swift"
     # A second time nothing is flown and the same is written.
     capfd.readouterr()
     assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7", "--json") == 0
@@ -68,6 +68,14 @@ def test_table2_with_policies_tuned_under_the_delta_model(sky, tmp_path):
         "ours, with Delta Action Model",
     }
     assert "no row of ours" not in text and "The goal, cell by cell: ours, with" in text
+    assert not numbers["with_against_without"], "without its control nobody knows its merit"
+    (tuned / "card.md").write_text("a third")
+    args = [*args, "--control-policy", "racer"]
+    assert reproduce(tmp_path, "table2", *args) == 0
+    text, numbers = page(tmp_path, "table2")
+    overall = numbers["with_against_without"][-1]
+    assert overall["track"] == "all" and overall["trials"] == 30
+    assert "What the Delta Action Model changes" in text and "with - without" in text
 
 
 def test_robustness(sky, tmp_path, capfd):
