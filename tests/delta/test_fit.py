@@ -15,7 +15,7 @@ from suite.delta.windows import cut_windows
 from suite.train.config import PointMassConfig
 from tests.support.point_mass_flights import fly
 
-PHYSICS = PointMassConfig(drag=(0.3, 0.3), action_delay=(0.5, 0.5))
+PHYSICS = PointMassConfig(drag=(0.3, 0.3), drag_up=(0.3, 0.3), action_delay=(0.5, 0.5))
 CONFIG = FitConfig(horizon_s=0.6, iterations=240, batch=64, rate=1e-2)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from policies.observation import state_vector
+from suite.delta.replay import nominal_plant
 from suite.train import losses, rollout
 from suite.train.config import LossConfig, PointMassConfig
 from suite.train.gradient import make_gradient
@@ -22,7 +23,12 @@ from tests.support.training import (
 )
 
 KEY = jax.random.key(3)
-STILL = {"drag": (0.0, 0.0), "wind_std": (0.0, 0.0, 0.0), "action_delay": (0.0, 0.0)}
+STILL = {
+    "drag": (0.0, 0.0),
+    "drag_up": (0.0, 0.0),
+    "wind_std": (0.0, 0.0, 0.0),
+    "action_delay": (0.0, 0.0),
+}
 
 
 def blind(params, image):
@@ -185,3 +191,15 @@ def test_none_has_missed_a_gate_unless_asked():
     assert np.abs(one - other).max() > 0.1
     gates = sample_worlds(config, 3).scene.gates
     assert np.all(np.isfinite(gates.center_w))
+
+
+def test_drag_along_the_bodys_z_has_a_range_of_its_own():
+    config = small_config()
+    plain = sample_worlds(config, 2)
+    physics = replace(config.physics, drag_up=(3.0, 4.0))
+    changed = sample_worlds(replace(config, physics=physics), 2)
+    across, up = changed.constants.drag[:, :2], changed.constants.drag[:, 2]
+    np.testing.assert_array_equal(across, plain.constants.drag[:, :2])
+    assert np.all((up >= 3.0) & (up <= 4.0))
+    np.testing.assert_array_equal(changed.pos_w, plain.pos_w)
+    np.testing.assert_allclose(nominal_plant(physics).drag, [0.45, 0.45, 3.5])

@@ -175,7 +175,7 @@ def test_more_of_the_same_worlds_give_the_same_gradient(float64):
 @pytest.mark.parametrize(("steps", "batch"), [(4, 2), (8, 6)])
 def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64, steps, batch):
     """A world that hangs still: every step pulls alike, so the mean is one step's pull."""
-    still = {"drag": (0.0, 0.0), "wind_std": (0.0, 0.0, 0.0)}
+    still = {"drag": (0.0, 0.0), "drag_up": (0.0, 0.0), "wind_std": (0.0, 0.0, 0.0)}
     config = small_config(batch, steps, physics=still, rest_share=1.0)
     worlds, params = doubled(boxes_worlds(config)), doubled(fresh_params(lively=0.0))
     loss = loss_of(config)
