@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 class Config:
     """Judge a policy on three tracks at all ten levels, beside the paper's and the baseline's rows.
 
-    The rows with the Delta Action Model are there where --delta-policy or --delta-iterations is.
+    The rows with the Delta Action Model, at the paper's four levels, are there where --delta-policy
+    or --delta-iterations is.
     """
 
     policy: str | None = None
@@ -36,7 +37,7 @@ class Config:
     delta_set: tuple[str, ...] = ()
     """Settings of that fine-tuning, such as loss.safety_radius_m=0.3."""
     trials: int = 100
-    """Trials of every policy on every track at every level."""
+    """Trials of every policy on every track at every level that it flies."""
     seed: int = 0
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
@@ -53,15 +54,22 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     from suite.flying import trial_list
     from suite.reproduce.document import write_document
     from suite.reproduce.flights import Flier, Order, flown
-    from suite.reproduce.variants import variants_of
+    from suite.reproduce.paper import sim_to_sim
+    from suite.reproduce.variants import OURS, variants_of
     from tracks.families import JUDGED
 
     at_least("--trials", config.trials, 1)
     at_least("--seed", config.seed, 0)
     vehicle = load_vehicle(config.vehicle)
     variants = variants_of(config, place, console)
-    trials = trial_list(JUDGED, LEVELS, config.trials, config.seed)
-    orders = [Order(Flier(variant.policy, vehicle), trials) for variant in variants]
+    flying = {True: LEVELS, False: sim_to_sim().levels}
+    orders = [
+        Order(
+            Flier(variant.policy, vehicle),
+            trial_list(JUDGED, flying[variant.name == OURS], config.trials, config.seed),
+        )
+        for variant in variants
+    ]
     results = dict(
         zip(variants, flown(orders, place.cache, console, "judging all levels"), strict=True)
     )
@@ -88,12 +96,19 @@ def _merit(results: Mapping[Variant, Sequence[TrialResult]]) -> list[Line]:
     """Return what the Delta Action Model changes, trial by trial; nothing without its control."""
     from suite.loop.compare import BEFORE, WITH, WITHOUT, compare
     from suite.reproduce import variants
+    from suite.reproduce.paper import sim_to_sim
 
     names = {BEFORE: variants.OURS, WITHOUT: variants.CONTROL, WITH: variants.WITH}
     flown = {variant.name: rows for variant, rows in results.items()}
     if set(flown) != set(names.values()):
         return []
-    return compare({role: flown[name] for role, name in names.items()})
+    levels = sim_to_sim().levels
+    return compare(
+        {
+            role: [row for row in flown[name] if row.difficulty in levels]
+            for role, name in names.items()
+        }
+    )
 
 
 def _goals(cells: Mapping[Variant, Sequence[Cell]]) -> dict[str, Any]:
@@ -119,6 +134,7 @@ def _report(
     everything = [cell for some in cells.values() for cell in some]
     chosen = [cell for cell in everything if cell.difficulty in printed.levels]
     last = config.seed + config.trials - 1
+    whole = {variant: some for variant, some in cells.items() if variant.name == OURS}
     led = [variant for variant in cells if variant.name in (OURS, WITH)]
     asides = [] if len(cells) > 1 else [sim_tables.NO_DELTA]
     return Report(
@@ -151,9 +167,9 @@ def _report(
             Section(
                 "All ten levels",
                 [
-                    *(sim_tables.where_it_breaks(v.name, some) for v, some in cells.items()),
+                    *(sim_tables.where_it_breaks(v.name, some) for v, some in whole.items()),
                     Picture(level_chart(everything), sim_tables.CHART),
-                    *(sim_tables.all_levels(v.name, some) for v, some in cells.items()),
+                    *(sim_tables.all_levels(v.name, some) for v, some in whole.items()),
                 ],
             ),
             Section(
