@@ -12,6 +12,7 @@ from suite.delta.replay import nominal_plant
 from suite.train import losses, rollout
 from suite.train.config import LossConfig, PointMassConfig
 from suite.train.gradient import make_gradient
+from suite.train.point_mass import Constants
 from suite.train.rollout import make_rollout
 from suite.train.worlds import sample_worlds
 from tests.support.training import (
@@ -198,8 +199,10 @@ def test_drag_along_the_bodys_z_has_a_range_of_its_own():
     plain = sample_worlds(config, 2)
     physics = replace(config.physics, drag_up=(3.0, 4.0))
     changed = sample_worlds(replace(config, physics=physics), 2)
-    across, up = changed.constants.drag[:, :2], changed.constants.drag[:, 2]
-    np.testing.assert_array_equal(across, plain.constants.drag[:, :2])
+    before, after = (worlds.constants for worlds in (plain, changed))
+    assert isinstance(before, Constants) and isinstance(after, Constants)
+    across, up = after.drag[:, :2], after.drag[:, 2]
+    np.testing.assert_array_equal(across, before.drag[:, :2])
     assert np.all((up >= 3.0) & (up <= 4.0))
     np.testing.assert_array_equal(changed.pos_w, plain.pos_w)
     np.testing.assert_allclose(nominal_plant(physics).drag, [0.45, 0.45, 3.5])
