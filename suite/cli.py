@@ -31,7 +31,7 @@ COMMANDS: dict[str, str] = {
     "import": "a flight of PX4, Betaflight, a Crazyflie, ROS 2 or a table as a flight log",
     "info": "versions, devices, memory and commit, for bug reports",
     "loop": "train, fly, record, fit the Delta Action Model, fine-tune, fly again",
-    "reproduce": "the paper's tables and more, one document each: table2, robustness, seeds",
+    "reproduce": "the paper's tables and more, one document each: table2, ablation, robustness",
     "tracks": "list the track families, or draw a track as a picture",
     "delta": "fit the Delta Action Model to recorded flights",
     "train": "train a policy by backpropagation through a point mass or a quadrotor",

@@ -4,5 +4,12 @@ An experiment is a file here with `Config`, a frozen dataclass that becomes its 
 `run(config, place, console)`, which returns what --json prints; and one line in the table below.
 """
 
-EXPERIMENTS: tuple[str, ...] = ("table2", "robustness", "seeds", "ablation", "schemes")
+EXPERIMENTS: tuple[str, ...] = (
+    "table2",
+    "robustness",
+    "randomisation",
+    "seeds",
+    "ablation",
+    "schemes",
+)
 """Names; NAME lives in suite/reproduce/NAME.py."""

@@ -156,13 +156,10 @@ def recipe_of(name: str, changes: tuple[str, ...], iterations: int, worlds: int)
     Raises:
         ValueError: for a preset or a change that does not exist.
     """
-    from suite.train.overrides import override
-    from suite.train.presets import preset
+    from suite.reproduce.recipes import asked_recipe
 
-    base = override(preset(name), changes)
-    optimizer = replace(base.optimizer, iterations=iterations)
-    episode = replace(base.episode, gates=GATES, batch=worlds)
-    return replace(base, episode=episode, optimizer=optimizer)
+    base = asked_recipe(name, changes, iterations)
+    return replace(base, episode=replace(base.episode, gates=GATES, batch=worlds))
 
 
 def train_and_measure(
@@ -215,18 +212,15 @@ def check_sizes(config: Config | SchemesConfig) -> None:
     Raises:
         ValueError: naming the option and what is allowed.
     """
-    seeds = config.training_seeds
-    if len(set(seeds)) < len(seeds) or not seeds:
-        said = " ".join(map(str, seeds)) or "empty"
-        raise ValueError(f"--training-seeds is {said}; give each once")
-    for seed in seeds:
-        at_least("--training-seeds", seed, 0)
+    from suite.reproduce.recipes import check_seeds
+
+    check_seeds(config.training_seeds)
     at_least("--seed", config.seed, 0)
     at_least("--trials", config.trials, 1)
     at_least("--seconds", config.seconds, 0.5)
     at_least("--iterations", config.iterations, 1)
     at_least("--worlds", config.worlds, 1)
-    if config.seed in seeds:
+    if config.seed in config.training_seeds:
         raise ValueError(
             f"--seed {config.seed} is one of --training-seeds, whose policies would have seen the "
             "worlds they are measured on; give another"

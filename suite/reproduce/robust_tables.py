@@ -68,7 +68,7 @@ def robust_report(
                 effects_chart(effects, names),
                 "Success under each effect, 95 % Wilson intervals; dashed: undisturbed.",
             ),
-            _grid("", effects, base, names, ("effect", "total")),
+            condition_grid("", effects, base, names, ("effect", "total")),
             MEANINGS,
             f"{_listed(log_faults())} are faults of a log, not of the flight, and change nothing "
             "here; errors of what the policy senses are below.",
@@ -83,7 +83,7 @@ def robust_report(
                 "is the vehicle as it is.",
             ),
             *(
-                _grid(sweep.name, points, base, names, (sweep.axis,))
+                condition_grid(sweep.name, points, base, names, (sweep.axis,))
                 for sweep, points in grown.items()
             ),
             "The sensors' noise is in the policy's observation only; the autopilot below it sees "
@@ -112,7 +112,7 @@ def robust_report(
     numbers = {
         "config": config,
         "conditions": [
-            _numbers(entry, base, names)
+            tested_numbers(entry, base, names)
             for entry in (*effects, *(point for points in grown.values() for point in points))
         ],
     }
@@ -139,13 +139,22 @@ def _lead(policy: str, effects: Sequence[Tested], grown: Mapping[Sweep, Sequence
     return text
 
 
-def _grid(
+def condition_grid(
     title: str,
     entries: Sequence[Tested],
     base: Tested,
     names: Sequence[str],
     first: Sequence[str],
 ) -> Grid:
+    """Return success and change under each of `entries`, a row each.
+
+    Args:
+        title: of the table.
+        entries: conditions.
+        base: the undisturbed one.
+        names: of the policies; the others are compared with the first.
+        first: headers of what names a row: the size, or the name and the size.
+    """
     headers = list(first)
     for name in names:
         mine = f"{name}: " if len(names) > 1 else ""
@@ -179,7 +188,7 @@ def _points(difference: PairedDifference) -> Cell:
     return Cell(f"{value} [{low}, {high}]", tone)
 
 
-def _numbers(entry: Tested, base: Tested, names: Sequence[str]) -> dict[str, Any]:
+def tested_numbers(entry: Tested, base: Tested, names: Sequence[str]) -> dict[str, Any]:
     """Return one condition as JSON holds it, track by track too."""
     found: dict[str, Any] = {
         "name": entry.condition.name,

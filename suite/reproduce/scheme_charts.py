@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from suite.charts import LINES, png, titled
-from suite.reproduce.scheme_tables import FIGURE, METRICS, Row
+from suite.reproduce.scheme_curves import FIGURE, METRICS, Row
 
 
 def scheme_chart(rows: Sequence[Row]) -> bytes:

@@ -102,7 +102,8 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
 
     from suite.reproduce.ablation import check_sizes
     from suite.reproduce.document import write_document
-    from suite.reproduce.scheme_tables import scheme_report, summaries
+    from suite.reproduce.scheme_curves import summaries
+    from suite.reproduce.scheme_tables import scheme_report
     from suite.reproduce.side_by_side import all_done, check_jobs
 
     check_sizes(config)

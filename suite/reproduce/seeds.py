@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -96,23 +95,12 @@ def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:
 def _trained(config: Config, place: Place, console: Console) -> dict[str, str]:
     from dataclasses import replace
 
+    from suite.reproduce.recipes import asked_recipe, check_seeds
     from suite.reproduce.trainings import trained
-    from suite.train.overrides import override
-    from suite.train.presets import preset
 
-    if len(set(config.training_seeds)) < len(config.training_seeds) or not config.training_seeds:
-        raise ValueError(f"--training-seeds is {_words(config.training_seeds)}; give each once")
-    recipe = override(preset(config.preset), config.set)
-    if config.iterations is not None:
-        at_least("--iterations", config.iterations, 1)
-        recipe = replace(recipe, optimizer=replace(recipe.optimizer, iterations=config.iterations))
-    for seed in config.training_seeds:
-        at_least("--training-seeds", seed, 0)
+    check_seeds(config.training_seeds)
+    recipe = asked_recipe(config.preset, config.set, config.iterations)
     return {
         f"seed {seed}": str(trained(replace(recipe, seed=seed), place.cache, console).policy)
         for seed in config.training_seeds
     }
-
-
-def _words(values: Sequence[object]) -> str:
-    return " ".join(map(str, values)) or "empty"

@@ -5,7 +5,9 @@ from dataclasses import replace
 import pytest
 
 from eval.trial import Rules
+from policies import shipped
 from suite.reproduce import flights
+from suite.train.repeat import Outcome
 
 
 class Sky:
@@ -33,3 +35,21 @@ class Sky:
 @pytest.fixture
 def sky(monkeypatch):
     return Sky(monkeypatch)
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Return the configurations that were trained; each gives racer, with another digest."""
+    configs = []
+
+    def stand_in(config, folder, console):
+        if not (folder / "policy").is_dir():
+            configs.append(config)
+            (folder / "policy").mkdir(parents=True)
+            for file in shipped.folder("racer").iterdir():
+                (folder / "policy" / file.name).write_bytes(file.read_bytes())
+            (folder / "policy" / "card.md").write_text(str(config))
+        return Outcome(folder / "policy", 1, {})
+
+    monkeypatch.setattr("suite.reproduce.trainings.train", stand_in)
+    return configs

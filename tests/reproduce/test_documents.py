@@ -114,21 +114,7 @@ def test_what_randomisation_buys_is_two_policies_side_by_side(sky, tmp_path):
         assert one == two
 
 
-def test_seeds_are_trained_once_and_compared(sky, tmp_path, monkeypatch):
-    made = []
-
-    def stand_in(config, folder, console):
-        from suite.train.repeat import Outcome
-
-        if not (folder / "policy").is_dir():
-            made.append(config)
-            (folder / "policy").mkdir(parents=True)
-            for file in shipped.folder("racer").iterdir():
-                (folder / "policy" / file.name).write_bytes(file.read_bytes())
-            (folder / "policy" / "card.md").write_text(str(config.seed))
-        return Outcome(folder / "policy", 1, {})
-
-    monkeypatch.setattr("suite.reproduce.trainings.train", stand_in)
+def test_seeds_are_trained_once_and_compared(sky, made, tmp_path):
     recipe = ["--preset", "small", "--iterations", "3", "--set", "episode.batch=2"]
     args = [*recipe, "--training-seeds", "0", "4", "--trials", "1"]
     assert reproduce(tmp_path, "seeds", *args) == 0

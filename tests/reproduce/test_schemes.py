@@ -7,7 +7,8 @@ import pytest
 from suite.ppo.config import PpoConfig
 from suite.reproduce.ablation import Config as AblationConfig
 from suite.reproduce.ablation import settings
-from suite.reproduce.scheme_tables import Spread, first_times, summaries, value_at, verdict
+from suite.reproduce.scheme_curves import Spread, first_times, summaries, value_at
+from suite.reproduce.scheme_tables import verdict
 from suite.reproduce.schemes import Config, Learnt, curve_of, schemes
 from suite.train.config import TrainConfig
 from tests.reproduce.test_ablation import SMALL

@@ -1,0 +1,181 @@
+"""The document of `suite reproduce randomisation`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eval.stats import Interval, bootstrap_mean, wilson
+from eval.trial import TrialSpec
+from suite.report import Cell, Grid, Picture, Report, Section
+from suite.reproduce.conditions import Sweep
+from suite.reproduce.robust_charts import sweeps_chart
+from suite.reproduce.robust_tables import Tested, condition_grid, tested_numbers
+from suite.reproduce.trainings import commit_of
+from suite.train.config import TrainConfig
+
+if TYPE_CHECKING:
+    from suite.reproduce.randomisation import Config
+
+ALL = "all disturbances"
+MEANING = (
+    "Success: over all trials under all sizes of the disturbance but the undisturbed one. "
+    "Difference: randomised - fixed, in points, with the 95 % bootstrap interval over trials, each "
+    "drawn with all its conditions. Training seeds are few: the last table shows how they differ."
+)
+
+
+def randomisation_report(
+    config: Config,
+    recipe: TrainConfig,
+    policies: Mapping[str, Sequence[str]],
+    shares: Sequence[Sequence[TrialSpec]],
+    grown: Mapping[Sweep, Sequence[Tested]],
+) -> tuple[Report, dict[str, Any]]:
+    """Return the document and the numbers that go beside it.
+
+    Args:
+        config: what was asked.
+        recipe: of the randomised setting.
+        policies: of each setting, the fixed one first, one a training seed.
+        shares: the trials of each training seed, in the order of every `Tested`.
+        grown: the points of each sweep, the undisturbed first.
+    """
+    names = list(policies)
+    base = next(iter(grown.values()))[0]
+    disturbed = {sweep.name: points[1:] for sweep, points in grown.items()}
+    disturbed[ALL] = [point for points in disturbed.values() for point in points]
+    together = {"undisturbed": [base], **disturbed}
+    compared = {
+        what: compare({name: np.array([p.won(name) for p in points]) for name in names})
+        for what, points in together.items()
+    }
+    trained = _by_seed(config, shares, base, disturbed[ALL], names)
+    last = config.seed + config.trials - 1
+    report = Report(
+        title="What randomised dynamics in training buy",
+        lead=_lead(compared),
+        facts={
+            "recipe": f"{config.preset} {' '.join(config.set)}".strip()
+            + f", {recipe.optimizer.iterations} gradient steps",
+            "randomised": _ranges(recipe),
+            "fixed": "the middle of those ranges; no wind, no noise",
+            "training seeds": " ".join(map(str, config.training_seeds)),
+            "trained at commit": ", ".join(
+                sorted({commit_of(Path(path)) for paths in policies.values() for path in paths})
+            ),
+            "trials": f"three tracks, level {config.difficulty}, seeds {config.seed} to {last}: "
+            f"{sum(map(len, shares))} trials a condition, shared out to the training seeds",
+            "vehicle": config.vehicle,
+        },
+        sections=[
+            Section(
+                "By disturbance",
+                [
+                    _summary(compared),
+                    MEANING,
+                    Picture(sweeps_chart(grown, names), "Success with 95 % Wilson intervals."),
+                ],
+            ),
+            Section("Every training", [trained]),
+            Section(
+                "Every condition",
+                [
+                    condition_grid(sweep.name, points, base, names, (sweep.axis,))
+                    for sweep, points in grown.items()
+                ],
+            ),
+        ],
+    )
+    numbers = {
+        "config": config,
+        "compared": compared,
+        "conditions": [
+            tested_numbers(point, base, names) for points in grown.values() for point in points
+        ],
+    }
+    return report, numbers
+
+
+def compare(won: Mapping[str, np.ndarray]) -> dict[str, Interval]:
+    """Return two settings' success over all conditions together, and second - first.
+
+    The interval of the difference is a bootstrap over trials, since a trial's conditions are no
+    independent draws.
+
+    Args:
+        won: which trials succeeded, (conditions, trials) bool of each setting.
+    """
+    rates = {name: wilson(int(each.sum()), each.size) for name, each in won.items()}
+    first, second = (each.mean(axis=0) for each in won.values())
+    return {**rates, "difference": bootstrap_mean(second - first)}
+
+
+def _lead(compared: Mapping[str, Mapping[str, Interval]]) -> str:
+    def said(name: str) -> str:
+        fixed, randomised, _ = (100 * entry.value for entry in compared[name].values())
+        return (
+            f"{randomised:.0f} % succeed where dynamics were randomised in training and "
+            f"{fixed:.0f} % where they were not ({_points(compared[name])} points)"
+        )
+
+    low, high = compared[ALL]["difference"][1:]
+    worth = "buys robustness" if low > 0 else "costs it" if high < 0 else "shows no difference"
+    return (
+        f"Over all disturbances {said(ALL)}; undisturbed {said('undisturbed')}. "
+        f"So randomisation {worth} here."
+    )
+
+
+def _points(entry: Mapping[str, Interval]) -> str:
+    # round() + 0.0, so that nothing reads -0.
+    value, low, high = (f"{round(100 * x) + 0.0:+.0f}" for x in entry["difference"])
+    return f"{value} [{low}, {high}]"
+
+
+def _summary(compared: Mapping[str, Mapping[str, Interval]]) -> Grid:
+    names = [name for name in next(iter(compared.values())) if name != "difference"]
+    rows = []
+    for what, entry in compared.items():
+        _, low, high = entry["difference"]
+        tone = "good" if low > 0 else "bad" if high < 0 else ""
+        rates = [Cell(f"{100 * entry[name].value:.0f}") for name in names]
+        rows.append([Cell(what), *rates, Cell(_points(entry), tone)])
+    headers = ["disturbance", *(f"{name} [%]" for name in names), "difference [points]"]
+    return Grid("", headers, rows)
+
+
+def _by_seed(
+    config: Config,
+    shares: Sequence[Sequence[TrialSpec]],
+    base: Tested,
+    disturbed: Sequence[Tested],
+    names: Sequence[str],
+) -> Grid:
+    rows, start = [], 0
+    for seed, share in zip(config.training_seeds, shares, strict=True):
+        mine = slice(start, start + len(share))
+        start += len(share)
+        cells = [
+            Cell(f"{100 * np.mean([point.won(name)[mine] for point in points]):.0f}")
+            for points in ([base], disturbed)
+            for name in names
+        ]
+        rows.append([Cell(str(seed)), Cell(str(len(share))), *cells])
+    headers = ["training seed", "trials"]
+    headers += [f"{name}, {how} [%]" for how in ("undisturbed", "disturbed") for name in names]
+    return Grid("", headers, rows)
+
+
+def _ranges(recipe: TrainConfig) -> str:
+    physics = recipe.physics
+    low, high = physics.drag
+    first, last = physics.action_delay
+    return (
+        f"lag {physics.lag_mean:g} +- {physics.lag_std:g} 1/s, drag {low:g} to {high:g} 1/s, delay "
+        f"{first:g} to {last:g} decisions, wind {physics.wind_std[0]:g} m/s, time step "
+        f"{100 * physics.time_step_std:g} %, field of view, noise of the image"
+    )
