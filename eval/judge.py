@@ -237,8 +237,9 @@ class _Slots:
         if self._sensors:
             seen = self._sensors.see(seen, self._world.progress.gates, flying)
         second_w = seen.second_w if spec.second_gate else None
+        axis_w = seen.axis_w if spec.gate_axis else None
         state = state_vector(
-            seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, self._action_b, second_w
+            seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, self._action_b, second_w, axis_w
         )
         state = np.where(flying[:, None], state, 0).astype(np.float32)
         image = encode_depth(spec.depth, seen.depth_m, spec.camera.range_m).astype(np.float32)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from policies.conv import conv_valid
 from policies.gru import gru_update
-from policies.spec import ACTION_SIZE, PolicySpec
+from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
 
 Params = dict[str, jax.Array]
 
@@ -59,22 +59,25 @@ def init(key: jax.Array, spec: PolicySpec) -> Params:
     return params
 
 
-def fitted(params: Params, spec: PolicySpec) -> Params:
-    """Return parameters made for the paper's state as parameters for `spec`.
+def fitted(params: Params, seen: PolicySpec, spec: PolicySpec) -> Params:
+    """Return parameters of a policy that sees `seen` as parameters for `spec`.
 
     Numbers that `spec` adds to the state get weights of zero, so the policy acts as it did.
 
     Raises:
-        ValueError: where the state's weights have more rows than `spec` has numbers.
+        ValueError: where the policy sees what `spec` does not have.
     """
-    weight = params["state.weight"]
-    missing = spec.state_size - weight.shape[0]
-    if missing < 0:
-        raise ValueError(
-            f"the policy to start from sees {weight.shape[0]} numbers, spec.second_gate = "
-            f"{spec.second_gate} has {spec.state_size}; set spec.second_gate=True"
-        )
-    return {**params, "state.weight": jnp.pad(weight, ((0, missing), (0, 0)))}
+    rows, first = [params["state.weight"][:STATE_SIZE]], STATE_SIZE
+    for key in ("second_gate", "gate_axis"):
+        has, wanted = getattr(seen, key), getattr(spec, key)
+        if has and not wanted:
+            raise ValueError(f"the policy to start from has spec.{key}; set spec.{key}=True")
+        if has:
+            rows.append(params["state.weight"][first : first + 3])
+            first += 3
+        elif wanted:
+            rows.append(jnp.zeros((3, rows[0].shape[1])))
+    return {**params, "state.weight": jnp.concatenate(rows)}
 
 
 def encode(params: Params, image: jax.Array) -> jax.Array:

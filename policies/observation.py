@@ -1,4 +1,4 @@
-"""The observation: 12 numbers and an encoded depth image (Su et al. 2026, Eq. 1), or 15 numbers."""
+"""The observation: the paper's 12 numbers (Su et al. 2026, Eq. 1) or more, and a depth image."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ def state_vector(
     gate_w: Array,
     last_action_b: Array,
     second_w: Array | None = None,
+    axis_w: Array | None = None,
 ) -> Array:
-    """Return the numbers that a policy sees besides the image, (..., 12) or (..., 15).
+    """Return the numbers that a policy sees besides the image, (..., 12), (..., 15) or (..., 18).
 
     Args:
         pos_w: (..., 3) position [m].
@@ -25,17 +26,21 @@ def state_vector(
         last_action_b: (..., 3) the previous action, in the body axes of its own time [m/s^2].
         second_w: (..., 3) centre of the gate after the next, or of the last gate where there is
             none after it [m]; for policies with `PolicySpec.second_gate`.
+        axis_w: (..., 3) unit vector along which the next gate is flown through; for policies with
+            `PolicySpec.gate_axis`.
 
     Returns:
         Velocity in body axes [m/s], the third row of R (world z in body axes, free of yaw), the
-        next gate's centre in body axes [m], the last action [m/s^2] and, where `second_w` is given,
-        that gate's centre in body axes [m].
+        next gate's centre in body axes [m], the last action [m/s^2] and, where they are given, the
+        second gate's centre [m] and the next gate's direction, both in body axes.
     """
     xp = rot_w.__array_namespace__()
     vel_b, gate_b = to_local(rot_w, vel_w), to_local(rot_w, gate_w - pos_w)
     numbers = [vel_b, rot_w[..., 2, :], gate_b, last_action_b]
     if second_w is not None:
         numbers.append(to_local(rot_w, second_w - pos_w))
+    if axis_w is not None:
+        numbers.append(to_local(rot_w, axis_w))
     return xp.concatenate(numbers, axis=-1)
 
 

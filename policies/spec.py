@@ -1,7 +1,7 @@
 """What a policy expects of the world: its rate, its camera and how its inputs are scaled.
 
 The observation is the paper's (Su et al. 2026, Eq. 1), 12 numbers and a depth image, unless a
-policy asks for the gate after the next one as well.
+policy asks for the gate after the next one or for the next gate's flight direction as well.
 """
 
 from __future__ import annotations
@@ -41,9 +41,11 @@ class PolicySpec:
     hidden_size: int = 192
     """Width of the embeddings and of the recurrent state."""
     second_gate: bool = False
-    """Whether the state ends with the centre of the gate after the next one, in body axes."""
+    """Whether the state goes on with the centre of the gate after the next one, in body axes."""
+    gate_axis: bool = False
+    """Whether the state ends with the next gate's flight direction, in body axes."""
 
     @property
     def state_size(self) -> int:
         """Numbers in the state observation."""
-        return STATE_SIZE + 3 * self.second_gate
+        return STATE_SIZE + 3 * self.second_gate + 3 * self.gate_axis

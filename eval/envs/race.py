@@ -136,13 +136,14 @@ class Race:
     def observation(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
         """Return what a policy sees: `state` (spec.state_size,) and `image` (H, W), float32."""
         pos_w, rot_w, vel_w, _ = motion_of(data)
-        gate_w = next_gate(self._course, self.progress.gates).center_w
+        gate = next_gate(self._course, self.progress.gates)
         if self.ended_by == "diverged":
             pos_w, rot_w, vel_w = self.progress.pos_w, np.eye(3)[None], np.zeros((1, 3))
         second_w = None
         if self.spec.second_gate:
             second_w = next_gate(self._course, self.progress.gates + 1).center_w
-        state = state_vector(pos_w, vel_w, rot_w, gate_w, self.action_b, second_w)[0]
+        axis_w = gate.rot_w[..., 0] if self.spec.gate_axis else None
+        state = state_vector(pos_w, vel_w, rot_w, gate.center_w, self.action_b, second_w, axis_w)[0]
         depth = self._eye.image(self.model, data, pos_w[0], rot_w[0])
         image = encode_depth(self.spec.depth, depth, self.spec.camera.range_m)
         return {

@@ -38,6 +38,8 @@ class View(NamedTuple):
     """(N, 3) centre of the next gate [m]."""
     second_w: np.ndarray
     """(N, 3) centre of the gate after it, or of the last gate where there is none [m]."""
+    axis_w: np.ndarray
+    """(N, 3) unit vector along which the next gate is flown through."""
     depth_m: np.ndarray
     """(N, H, W) planar depth, clipped to the camera's range [m]."""
 

@@ -200,10 +200,9 @@ class MjxWorld:
         pos_w, rot_w, vel_w, _ = _motion(state.qpos, state.qvel)
         depth = depth_image(scene, pos_w, rot_w, self._rays_b, self._camera.range_m)
         depth = depth.reshape(self.slots, self._camera.height, self._camera.width)
-        gate_w, second_w = (
-            next_gate(course, state.progress.gates + ahead).center_w for ahead in (0, 1)
-        )
-        return View(pos_w, rot_w, vel_w, gate_w, second_w, depth)
+        gate, second = (next_gate(course, state.progress.gates + ahead) for ahead in (0, 1))
+        axis_w = gate.rot_w[..., 0]
+        return View(pos_w, rot_w, vel_w, gate.center_w, second.center_w, axis_w, depth)
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
         """Fly each slot's action (N, 3) for its number of physics steps (N,)."""

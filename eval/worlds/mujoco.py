@@ -175,9 +175,17 @@ class MujocoWorld:
                 look(slot)
         else:
             list(self._pool.map(look, slots, chunksize=8))
-        gate_w = next_gate(self._course, self._progress.gates).center_w
+        gate = next_gate(self._course, self._progress.gates)
         second_w = next_gate(self._course, self._progress.gates + 1).center_w
-        return View(motion.pos_w, motion.rot_w, motion.vel_w, gate_w, second_w, depth)
+        return View(
+            motion.pos_w,
+            motion.rot_w,
+            motion.vel_w,
+            gate.center_w,
+            second_w,
+            gate.rot_w[..., 0],
+            depth,
+        )
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
         """Fly each slot's action (N, 3) for its number of physics steps (N,)."""

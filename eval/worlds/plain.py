@@ -104,12 +104,16 @@ def fly_trial(
         if step == np.rint(decisions * (1 / (spec.rate_hz * dt))):
             second_w = gates.center_w[None, min(passed + 1, count - 1)]
             depth = eye.image(model, data, pos_w, motion.rot_w[0])
-            seen = View(motion.pos_w, motion.rot_w, motion.vel_w, gate_w, second_w, depth[None])
+            axis_w = gates.rot_w[None, passed, :, 0]
+            seen = View(
+                motion.pos_w, motion.rot_w, motion.vel_w, gate_w, second_w, axis_w, depth[None]
+            )
             if sensors:
                 seen = sensors.see(seen, np.array([passed]), np.array([True]))
             state = state_vector(
                 seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, action_b,
                 seen.second_w if spec.second_gate else None,
+                seen.axis_w if spec.gate_axis else None,
             )  # fmt: skip
             image = encode_depth(spec.depth, seen.depth_m, spec.camera.range_m)
             fresh = np.full(rows, decisions == 0)

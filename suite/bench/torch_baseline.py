@@ -132,6 +132,8 @@ class Baseline:
             if config.spec.second_gate:
                 _, second_w = self.target_gate(worlds.scene.gates, target, ahead=1)
                 numbers.append(to_local(body.rot_w, second_w - body.pos_w))
+            if config.spec.gate_axis:
+                numbers.append(to_local(body.rot_w, gate.rot_w[:, :, 0]))
             states.append(torch.cat(numbers, -1))
             action, hidden = self.network(states.pop(0), images.pop(0), hidden)
             constants = worlds.constants

@@ -72,8 +72,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     resolved = resolve(config)
     params, delta = None, None
     if config.from_ is not None:
-        params = jax.tree.map(jax.numpy.asarray, load_policy_checkpoint(config.from_).params)
-        params = fitted(params, resolve(config).spec)
+        start = load_policy_checkpoint(config.from_)
+        params = jax.tree.map(jax.numpy.asarray, start.params)
+        params = fitted(params, start.spec, resolved.spec)
     if config.delta is not None:
         stored = load_delta(config.delta)
         corrects = stored.config.get("fit", {}).get("model", "point")

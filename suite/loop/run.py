@@ -167,8 +167,9 @@ def _fit(config: LoopConfig, stages: Stages) -> None:
 
 def _tune(config: LoopConfig, stages: Stages, variant: str, policy: Path) -> Path:
     def work(folder: Path) -> None:
-        start = jax.tree.map(jnp.asarray, load_policy_checkpoint(policy).params)
-        start = fitted(start, config.tuning.spec)
+        stored = load_policy_checkpoint(policy)
+        start = jax.tree.map(jnp.asarray, stored.params)
+        start = fitted(start, stored.spec, config.tuning.spec)
         delta = None
         if variant == WITH:
             model = load_delta(stages.out / "delta" / "delta").params

@@ -107,12 +107,19 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
         def step(memory: Memory, key: jax.Array) -> tuple[Memory, Record]:
             before = memory.body
             seen = critic.features(worlds, before, memory.target)
-            _, target_w = target_gate(worlds.scene.gates, memory.target)
+            gate, target_w = target_gate(worlds.scene.gates, memory.target)
             second_w = None
             if spec.second_gate:
                 _, second_w = target_gate(worlds.scene.gates, memory.target, ahead=1)
+            axis_w = gate.rot_w[:, :, 0] if spec.gate_axis else None
             state = state_vector(
-                before.pos_w, before.vel_w, before.rot_w, target_w, memory.action_b, second_w
+                before.pos_w,
+                before.vel_w,
+                before.rot_w,
+                target_w,
+                memory.action_b,
+                second_w,
+                axis_w,
             )
             state, states = queue(memory.states, state)
             image, images = queue(memory.images, look(worlds, before, key))

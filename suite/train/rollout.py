@@ -192,10 +192,11 @@ def make_rollout(
         embedding: jax.Array,
         target_w: jax.Array,
         second_w: jax.Array | None,
+        axis_w: jax.Array | None,
     ) -> tuple[jax.Array, Memory]:
         body = memory.body
         state = state_vector(
-            body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b, second_w
+            body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b, second_w, axis_w
         )
         state, states = queue(memory.states, state)
         embedding, embeddings = queue(memory.embeddings, embedding)
@@ -232,12 +233,13 @@ def make_rollout(
             nudge_now, key_now, number = inputs
             before = memory.body
             image = look(worlds, jax.lax.stop_gradient(before), key_now)
-            _, target_w = target_gate(worlds.scene.gates, memory.target)
+            gate, target_w = target_gate(worlds.scene.gates, memory.target)
             embedding = encode(params, image) + nudge_now
             second_w = None
             if spec.second_gate:
                 _, second_w = target_gate(worlds.scene.gates, memory.target, ahead=1)
-            action, memory = act(params, memory, embedding, target_w, second_w)
+            axis_w = gate.rot_w[:, :, 0] if spec.gate_axis else None
+            action, memory = act(params, memory, embedding, target_w, second_w, axis_w)
             if delta is not None:
                 vel_b = to_local(jax.lax.stop_gradient(before.rot_w), before.vel_w)
                 correction, delta_hidden = delta_network.step(

@@ -69,6 +69,9 @@ FUNCTIONS = {
     lambda pos_w, vel_w, rot_w, gate_w, last_b, second_w: state_vector(
         pos_w, vel_w, rot_w, gate_w, last_b, second_w
     ): ("*batch 3, *batch 3, *batch 3 3, *batch 3, *batch 3, *batch 3", "*batch 15"),
+    lambda pos_w, vel_w, rot_w, gate_w, last_b, second_w, axis_w: state_vector(
+        pos_w, vel_w, rot_w, gate_w, last_b, second_w, axis_w
+    ): ("*batch 3, *batch 3, *batch 3 3, *batch 3, *batch 3, *batch 3, *batch 3", "*batch 18"),
     lambda depth_m: encode_depth(DepthEncoding(), depth_m, 10.0): (
         "*batch height width",
         "*batch height width",

@@ -73,22 +73,25 @@ def test_the_step_before_is_progress_to_the_gate():
 
 
 def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
-    """What reaches the state: the second gate's centre, the last one's where none comes after."""
+    """The second gate's centre, the last one's where none comes after, and the next's direction."""
     seen = []
 
-    def spy(pos_w, vel_w, rot_w, gate_w, action_b, second_w=None):
-        seen.append(second_w)
-        return state_vector(pos_w, vel_w, rot_w, gate_w, action_b, second_w)
+    def spy(pos_w, vel_w, rot_w, gate_w, action_b, second_w=None, axis_w=None):
+        seen.append((second_w, axis_w))
+        return state_vector(pos_w, vel_w, rot_w, gate_w, action_b, second_w, axis_w)
 
     monkeypatch.setattr(rollout, "state_vector", spy)
-    config = replace(small_config(3, 1), spec=replace(SPEC, second_gate=True))
+    config = replace(small_config(3, 1), spec=replace(SPEC, second_gate=True, gate_axis=True))
     worlds = boxes_worlds(config)._replace(target=np.array([0, 3, 7], np.int32))
     nudge = jnp.zeros((1, 3, SPEC.hidden_size))
     with jax.disable_jit():
         make_rollout(config)(fresh_params(config.spec), nudge, worlds, KEY, blind)
     center = worlds.scene.gates.center_w
     expected = [center[0, 1], center[1, 4], center[2, 7]]
-    np.testing.assert_allclose(seen[0], expected, atol=1e-6)
+    np.testing.assert_allclose(seen[0][0], expected, atol=1e-6)
+    rot = worlds.scene.gates.rot_w
+    expected = [rot[0, 0, :, 0], rot[1, 3, :, 0], rot[2, 7, :, 0]]
+    np.testing.assert_allclose(seen[0][1], expected, atol=1e-6)
 
 
 def test_the_encoders_gradient_from_every_third_image_is_right_on_average():

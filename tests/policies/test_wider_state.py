@@ -1,4 +1,4 @@
-"""A policy that sees the gate after the next as well: 15 numbers in every form it takes."""
+"""Policies that see more than the paper's twelve numbers, in every form they take."""
 
 import json
 from dataclasses import replace
@@ -20,6 +20,8 @@ from policies.spec_json import spec_from_json, spec_to_json
 from tests.policies.conftest import SPEC
 
 SECOND = replace(SPEC, second_gate=True)
+AXIS = replace(SPEC, gate_axis=True)
+BOTH = replace(SECOND, gate_axis=True)
 SCALE = {"action.weight": 2000.0, "state.bias": 5.0}
 
 
@@ -32,6 +34,13 @@ def lively():
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, lively):
     return save_policy(tmp_path_factory.mktemp("second") / "second", lively, SECOND, seed=1)
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    made = network.init(jax.random.key(4), BOTH)
+    arrays = {k: np.asarray(v) * SCALE.get(k, 1.0) for k, v in made.items()}
+    return save_policy(tmp_path_factory.mktemp("both") / "both", arrays, BOTH, seed=1)
 
 
 def actions(policy, width, n=70, steps=5):
@@ -47,7 +56,8 @@ def actions(policy, width, n=70, steps=5):
 
 def test_the_paper_sees_one_gate_unless_asked():
     assert not PolicySpec().second_gate and PolicySpec().state_size == 12
-    assert SECOND.state_size == 15
+    assert not PolicySpec().gate_axis
+    assert SECOND.state_size == AXIS.state_size == 15 and BOTH.state_size == 18
 
 
 def test_the_last_three_numbers_are_the_second_gate_in_body_axes():
@@ -62,15 +72,31 @@ def test_the_last_three_numbers_are_the_second_gate_in_body_axes():
     np.testing.assert_allclose(seen[12:], turn.inv().apply(second - pos), atol=1e-12)
 
 
-def test_checkpoint_torch_and_onnx_are_one_policy(tmp_path, folder):
+def test_the_gates_direction_comes_last_and_turns_with_the_body():
+    """Worked with scipy: R^T e, whatever the position; alone it stands after the twelve."""
+    turn = Rotation.from_euler("ZYX", [0.7, -0.3, 0.2])
+    rng = np.random.default_rng(0)
+    pos, vel, gate, last, second = rng.normal(size=(5, 3))
+    axis = np.array([0.6, -0.8, 0.0])
+    body = turn.as_matrix()
+    with_both = state_vector(pos, vel, body, gate, last, second, axis)
+    np.testing.assert_array_equal(with_both[:15], state_vector(pos, vel, body, gate, last, second))
+    np.testing.assert_allclose(with_both[15:], turn.inv().apply(axis), atol=1e-12)
+    alone = state_vector(pos + 5, vel, body, gate, last, axis_w=axis)
+    np.testing.assert_array_equal(alone[12:], with_both[15:])
+
+
+@pytest.mark.parametrize(("kind", "spec"), [("folder", SECOND), ("both", BOTH)])
+def test_checkpoint_torch_and_onnx_are_one_policy(tmp_path, kind, spec, request):
+    folder = request.getfixturevalue(kind)
     ours = load_policy(folder)
-    assert ours.spec == SECOND
-    expected = actions(ours, 15)
+    assert ours.spec == spec
+    expected = actions(ours, spec.state_size)
     assert np.abs(expected).std() > 1.0
     for path in export_policy(folder, tmp_path):
         theirs = load_policy(path)
-        assert theirs.spec == SECOND
-        np.testing.assert_allclose(actions(theirs, 15), expected, atol=5e-5, rtol=1e-5)
+        assert theirs.spec == spec
+        np.testing.assert_allclose(actions(theirs, spec.state_size), expected, atol=5e-5, rtol=1e-5)
 
 
 def test_the_second_gate_matters_to_it(folder):
@@ -85,7 +111,7 @@ def test_the_second_gate_matters_to_it(folder):
 
 def test_a_checkpoint_without_the_key_sees_one_gate():
     stored = spec_to_json(SPEC)
-    del stored["second_gate"]
+    del stored["second_gate"], stored["gate_axis"]
     assert spec_from_json(stored, "here") == SPEC
 
 
@@ -102,15 +128,34 @@ def test_weights_of_another_state_are_refused(tmp_path, lively):
         load_policy(tmp_path / "torn")
 
 
-def test_a_policy_of_one_gate_goes_on_as_one_of_two(params):
-    """It acts as before, whatever the second gate is; the other way round is refused."""
+@pytest.mark.parametrize(
+    ("seen", "spec", "columns"),
+    [
+        (SPEC, SECOND, slice(0, 12)),
+        (SPEC, BOTH, slice(0, 12)),
+        (SECOND, BOTH, slice(0, 15)),
+        (AXIS, BOTH, np.r_[0:12, 15:18]),
+    ],
+)
+def test_a_policy_goes_on_as_one_that_sees_more(seen, spec, columns):
+    """It acts as before, whatever the new numbers are."""
     rng = np.random.default_rng(0)
-    wide = network.fitted(params, SECOND)
+    params = network.init(jax.random.key(5), seen)
+    wide = network.fitted(params, seen, spec)
     state, image, hidden = (
-        jnp.asarray(rng.normal(size=(4, *s)), jnp.float32) for s in ((15,), (24, 32), (64,))
+        jnp.asarray(rng.normal(size=(4, *s)), jnp.float32)
+        for s in ((spec.state_size,), (24, 32), (64,))
     )
-    before = network.step(params, hidden, state[:, :12], image)
+    before = network.step(params, hidden, state[:, columns], image)
     for a, b in zip(before, network.step(wide, hidden, state, image), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4, rtol=1e-5)
-    with pytest.raises(ValueError, match=r"sees 15 numbers.*spec\.second_gate=True"):
-        network.fitted(wide, SPEC)
+
+
+@pytest.mark.parametrize(
+    ("seen", "spec", "key"),
+    [(SECOND, SPEC, "second_gate"), (AXIS, SECOND, "gate_axis"), (BOTH, AXIS, "second_gate")],
+)
+def test_a_policy_that_sees_more_is_refused(seen, spec, key):
+    params = network.init(jax.random.key(5), seen)
+    with pytest.raises(ValueError, match=rf"has spec\.{key}; set spec\.{key}=True"):
+        network.fitted(params, seen, spec)

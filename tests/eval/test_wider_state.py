@@ -1,4 +1,4 @@
-"""Every world shows the gate after the next one to policies that ask for it, and to no others."""
+"""Every world shows what a policy asks for beyond the twelve numbers, and nothing else."""
 
 from dataclasses import dataclass, field, replace
 
@@ -29,9 +29,9 @@ class Witness(Pursuit):
         return super().act(hidden, state, image, fresh)
 
 
-def shown(world, second_gate):
+def shown(world, **more):
     camera = Camera(width=20, height=20)
-    policy = Witness(spec=replace(PolicySpec(camera=camera), second_gate=second_gate))
+    policy = Witness(spec=replace(PolicySpec(camera=camera), **more))
     options = JudgeOptions(slots=1, rules=Rules(time_limit_s=3.0))
     tracks = {"straight": straight(DISTANCES)}
     result = fly(policy, [TrialSpec("straight", 0, 0)], VEHICLE, world, options, tracks=tracks)[0]
@@ -42,7 +42,7 @@ def shown(world, second_gate):
 @pytest.mark.parametrize("world", ["mujoco", "plain", "mjx"])
 def test_the_second_gate_lies_a_stretch_behind_the_next(world):
     """Level gates on a line: their centres differ by the stretch, in whatever axes."""
-    states = shown(world, True)
+    states = shown(world, second_gate=True)
     assert states.shape[1] == 15
     stretch = np.linalg.norm(states[:, 12:] - states[:, 6:9], axis=-1)
     number = np.cumsum(np.diff(np.linalg.norm(states[:, 6:9], axis=-1), prepend=9.0) > 0.5)
@@ -53,13 +53,27 @@ def test_the_second_gate_lies_a_stretch_behind_the_next(world):
     assert np.all(ahead[:, 12] > ahead[:, 6] + 0.5)
 
 
+@pytest.mark.parametrize("world", ["mujoco", "plain", "mjx"])
+def test_the_gates_direction_is_along_the_line_of_gates(world):
+    """Flown straight through, direction and way to the gate's centre are the same line."""
+    states = shown(world, gate_axis=True)
+    assert states.shape[1] == 15
+    np.testing.assert_allclose(np.linalg.norm(states[:, 12:], axis=-1), 1.0, atol=1e-5)
+    distance = np.linalg.norm(states[:, 6:9], axis=-1)
+    far = distance > 0.8
+    cosine = (states[:, 12:] * states[:, 6:9]).sum(-1) / distance
+    assert far.sum() > 5 and np.all(cosine[far] > 0.9)
+
+
 @pytest.mark.parametrize("world", ["mujoco", "plain"])
 def test_others_are_shown_the_papers_twelve_numbers(world):
-    assert shown(world, False).shape[1] == 12
+    assert shown(world).shape[1] == 12
 
 
 def test_the_environment_shows_it_too():
-    env = RaceEnv("zigzag", 0, 1, spec=PolicySpec(second_gate=True))
+    env = RaceEnv("zigzag", 0, 1, spec=PolicySpec(second_gate=True, gate_axis=True))
     seen, _ = env.reset(seed=0)
-    assert env.observation_space.contains(seen) and seen["state"].shape == (15,)
-    assert np.linalg.norm(seen["state"][12:] - seen["state"][6:9]) > 3.0
+    state = seen["state"]
+    assert env.observation_space.contains(seen) and state.shape == (18,)
+    assert np.linalg.norm(state[12:15] - state[6:9]) > 3.0
+    np.testing.assert_allclose(state[15:], [1, 0, 0], atol=0.3)  # at rest before the first gate
