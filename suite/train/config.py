@@ -155,6 +155,9 @@ class EpisodeConfig:
     """Range of the obstacles' density as a share of the judged families'."""
     bare_share: float = 0.2
     """Share of tracks without obstacles."""
+    hairpin_share: float = 0.0
+    """Share of tracks with one or two gates that are met nearly from the side and left backwards,
+    as at the apexes of the hardest ellipses."""
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     low, high = difficulty_range(config, iteration)
     tracks, starts = [], []
     rests = rng.uniform(size=batch) < episode.rest_share
-    mix = Mix(episode.sharp_share, episode.density, episode.bare_share)
+    mix = Mix(episode.sharp_share, episode.density, episode.bare_share, episode.hairpin_share)
     for rest in rests:
         track = first_gates(random_track(rng.uniform(low, high), rng, mix), episode.gates)
         tracks.append(track)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tracks.families import make_track, random_track
-from tracks.families.random import is_free
+from tracks.families.random import Mix, is_free
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +81,26 @@ def test_density_runs_from_none_to_beyond_level_9(tracks):
     assert max(in_air) > 49 > hardest - 30
     easy, hard = numbers[:150], numbers[-150:]
     assert hard.mean() > 1.4 * easy.mean()
+
+
+def steepest(track):
+    """Return the largest angle between a stretch and the gate that it leads to [deg]."""
+    return np.rad2deg(np.arccos(shape_numbers(track)[2])).max()
+
+
+def test_hairpins_are_met_as_steeply_as_the_hardest_ellipses_apexes():
+    """Half of the hardest ellipses have a gate that is met from beyond its side."""
+    ellipses = [steepest(make_track("ellipse", 9, seed)) for seed in range(150)]
+    rng, mix = np.random.default_rng(2), Mix(hairpin_share=1.0)
+    hairpins = [steepest(random_track(d, rng, mix)) for d in np.linspace(0.3, 1, 150)]
+    plain = [steepest(random_track(d, rng)) for d in np.linspace(0.3, 1, 150)]
+    beyond = [np.mean(np.array(angles) > 85) for angles in (ellipses, hairpins, plain)]
+    assert beyond[0] > 0.45 and beyond[1] > 0.25 and beyond[2] < 0.1
+    assert 100 < max(hairpins) <= 110.001 and max(plain) <= 95.001
+
+
+def test_without_hairpins_a_seed_keeps_its_tracks():
+    one, other = (random_track(0.6, np.random.default_rng(3), mix) for mix in (Mix(), Mix(0.55)))
+    np.testing.assert_array_equal(one.scene.gates.center_w, other.scene.gates.center_w)
+    drawn = random_track(0.6, np.random.default_rng(3), Mix(hairpin_share=1e-9))
+    assert not np.array_equal(one.scene.gates.center_w, drawn.scene.gates.center_w)

@@ -21,6 +21,8 @@ PASSING_M = 1.6
 """Least level distance of a straight stretch from the centre of a gate that it does not join."""
 MAX_APPROACH = np.deg2rad(95.0)
 """Largest angle between a stretch and the direction of a gate that it joins [rad]."""
+MAX_HAIRPIN_APPROACH = np.deg2rad(110.0)
+"""The same on tracks with hairpins, as at the apexes of the hardest ellipses [rad]."""
 MAX_TOTALS = PerStretch(*(np.array(n) for n in (23, 23, 10, 14)))
 """Most plates, small solids, pillars and ground objects of a track."""
 _WALKS = 8
@@ -47,6 +49,8 @@ class Mix(NamedTuple):
     """Range of the obstacles' density, as a share of the judged families'."""
     bare_share: float = 0.2
     """Probability that a track has no obstacles."""
+    hairpin_share: float = 0.0
+    """Probability that a track is drawn with one or two hairpins; the crowded ones are redrawn."""
 
 
 MIX = Mix()
@@ -54,7 +58,7 @@ MIX = Mix()
 
 def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:
     """Return a random track of difficulty `d` in [0, 1]."""
-    xy, yaw, start = _walk(d, rng, mix.sharp_share)
+    xy, yaw, start = _walk(d, rng, mix)
     shape = GATE_COUNT
     side = np.clip(ramp(1.2, 0.85, d) + rng.uniform(-0.1, 0.1, shape), 0.75, 1.3)
     width = rng.uniform(0.13, 0.27, shape)
@@ -83,12 +87,15 @@ def _density(d: float, rng: np.random.Generator, stretches: int, mix: Mix) -> Pe
 
 
 def _walk(
-    d: float, rng: np.random.Generator, sharp_share: float
+    d: float, rng: np.random.Generator, mix: Mix
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return gate centres (G, 2), yaws (G,) and the start (2,) of the first walk that is free."""
+    # No draw where there is nothing to decide, so that seeds without hairpins keep their tracks.
+    hairpins = mix.hairpin_share > 0 and rng.random() < mix.hairpin_share
     for _ in range(_DRAWS):
-        walks = _candidates(d, rng, _drift_turns(d, rng, sharp_share))
-        free = np.flatnonzero(_is_free(walks))
+        turn = _drift_turns(d, rng, mix.sharp_share)
+        walks = _candidates(d, rng, _with_hairpins(turn, rng) if hairpins else turn)
+        free = np.flatnonzero(_is_free(walks, MAX_HAIRPIN_APPROACH if hairpins else MAX_APPROACH))
         if len(free):
             return walks.center[free[0]], walks.yaw[free[0]], walks.start[free[0]]
     straight = _candidates(0.0, rng, np.zeros(GATE_COUNT))
@@ -107,6 +114,16 @@ def _drift_turns(d: float, rng: np.random.Generator, sharp_share: float) -> np.n
     return turn
 
 
+def _with_hairpins(turn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return the turns (G,) with one or two of them so sharp that the track comes back [rad]."""
+    turn = 0.3 * turn
+    first = rng.integers(0, GATE_COUNT - 1)
+    second = first + rng.integers(3, 5)
+    corners = [first, second] if second < GATE_COUNT - 1 else [first]
+    turn[corners] = rng.choice([-1.0, 1.0]) * np.deg2rad(rng.uniform(140, 180, len(corners)))
+    return turn
+
+
 def _candidates(d: float, rng: np.random.Generator, turn: np.ndarray) -> Walks:
     shape = (_WALKS, GATE_COUNT)
     drift = rng.uniform(-np.pi, np.pi) + np.cumsum(turn) - turn
@@ -121,13 +138,13 @@ def _candidates(d: float, rng: np.random.Generator, turn: np.ndarray) -> Walks:
     return Walks(point - point[:, :1], yaw, -point[:, 0])
 
 
-def _is_free(walks: Walks) -> np.ndarray:
+def _is_free(walks: Walks, max_approach: float = MAX_APPROACH) -> np.ndarray:
     """Return which walks keep clear of their own gates and meet each gate from its side, (W,)."""
     point = np.concatenate([walks.start[:, None], walks.center], axis=1)
     way = np.diff(point, axis=1)
     normal = np.stack([np.cos(walks.yaw), np.sin(walks.yaw)], axis=-1)
     length = np.linalg.norm(way, axis=-1)
-    least = np.cos(MAX_APPROACH) * length
+    least = np.cos(max_approach) * length
     meets = np.all(np.sum(way * normal, -1) > least, axis=1)
     leaves = np.all(np.sum(way[:, 1:] * normal[:, :-1], -1) > least[:, 1:], axis=1)
 
