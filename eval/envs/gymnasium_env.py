@@ -24,7 +24,7 @@ class RaceEnv(gymnasium.Env):
 
     An action is the wanted net acceleration in body axes over `eval.envs.race.ACTION_LIMIT`, each
     component from -1 to 1, as learning libraries want it; an observation is what policies see:
-    `state`, the paper's 12 numbers (15 where `spec` has `second_gate`), and `image`, the encoded
+    `state`, the paper's 12 numbers (more where `spec` has them), and `image`, the encoded
     inverse depth. The reward is the progress towards the next gate [m], 1 a gate, and -5 for a
     crash. `terminated` is every end by the judge's rules but the time limit, which is `truncated`.
     A `reset` without a fixed track draws a new one.

@@ -24,18 +24,20 @@ def racer() -> TrainConfig:
 
 
 def swift() -> TrainConfig:
-    """Return the recipe of `swift`: as fast as the paper's, it sees the gate after the next one."""
+    """Return the recipe of `swift`: as fast as the paper's, with 18 numbers instead of 12."""
     base = racer()
     return replace(
         base,
-        spec=replace(base.spec, second_gate=True),
+        spec=replace(base.spec, second_gate=True, gate_axis=True),
+        physics=replace(base.physics, drag_up=(0.2, 2.0)),
         loss=replace(base.loss, pass_first=True, approach_m=1.5),
         episode=replace(
             base.episode,
-            missed_share=0.2,
+            missed_share=0.3,
             density=(0.3, 1.5),
             bare_share=0.1,
             sharp_share=0.7,
+            hairpin_share=0.35,
             image_stride=3,
         ),
     )

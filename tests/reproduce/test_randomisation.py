@@ -19,7 +19,7 @@ def test_fixed_dynamics_are_the_middle_and_all_else_is_the_recipe():
     assert replace(still, physics=recipe.physics) == recipe
     physics = still.physics
     assert physics.drag == pytest.approx((0.45, 0.45))
-    assert physics.drag_up == pytest.approx((0.45, 0.45))
+    assert physics.drag_up == pytest.approx((1.1, 1.1))
     assert physics.action_delay == (0.75, 0.75) and physics.lag_mean == recipe.physics.lag_mean
     assert not (physics.lag_std or any(physics.wind_std) or physics.time_step_std)
     assert physics.depth_noise == 0 and physics.fov_scale == (1, 1)
