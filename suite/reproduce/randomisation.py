@@ -9,6 +9,10 @@ from suite.choices import at_least, parse_levels
 from suite.console import Console
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from eval.trial import TrialSpec
+    from suite.reproduce.conditions import Condition
     from suite.reproduce.document import Place
     from suite.reproduce.robust_tables import Tested
     from suite.train.config import PointMassConfig, TrainConfig
@@ -114,7 +118,7 @@ def fixed(recipe: TrainConfig) -> TrainConfig:
     )
 
 
-def _train(config: TrainConfig, console: Console, cache: Any) -> str:
+def _train(config: TrainConfig, console: Console, cache: Path) -> str:
     from suite.reproduce.trainings import trained
 
     return str(trained(config, cache, console).policy)
@@ -122,8 +126,8 @@ def _train(config: TrainConfig, console: Console, cache: Any) -> str:
 
 def _flown(
     policies: dict[str, list[str]],
-    shares: list[list[Any]],
-    conditions: list[Any],
+    shares: list[list[TrialSpec]],
+    conditions: list[Condition],
     place: Place,
     console: Console,
 ) -> list[Tested]:
