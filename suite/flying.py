@@ -41,11 +41,15 @@ def default_policy() -> str:
 
 
 def policy_digest(name_or_path: str) -> str:
-    """Return the SHA-256 of a policy's file, or of all files of its folder by name, as hex."""
+    """Return the SHA-256 of a policy's file, or of what flies of its folder, as hex.
+
+    A card or a curve beside it may change and the policy be the same.
+    """
     from policies import shipped
+    from policies.checkpoint import CONFIG, WEIGHTS
 
     path = shipped.locate(name_or_path)
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    files = [path / CONFIG, path / WEIGHTS] if path.is_dir() else [path]
     digest = hashlib.sha256()
     for file in files:
         digest.update(file.name.encode() + b"\0" + file.read_bytes())

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 from eval.trial import Rules
-from policies import shipped
 from suite.reproduce import flights
 from suite.train.repeat import Outcome
+from tests.support.documents import another_racer
 
 
 class Sky:
@@ -45,10 +45,7 @@ def made(monkeypatch):
     def stand_in(config, folder, console):
         if not (folder / "policy").is_dir():
             configs.append(config)
-            (folder / "policy").mkdir(parents=True)
-            for file in shipped.folder("racer").iterdir():
-                (folder / "policy" / file.name).write_bytes(file.read_bytes())
-            (folder / "policy" / "card.md").write_text(str(config))
+            another_racer(folder / "policy", 1000 + len(configs))
         return Outcome(folder / "policy", 1, {})
 
     monkeypatch.setattr("suite.reproduce.trainings.train", stand_in)

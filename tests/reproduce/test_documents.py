@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from policies import shipped
 from suite import cli
+from suite.flying import policy_digest
 from suite.reproduce import EXPERIMENTS
-from tests.support.documents import page, reproduce
+from tests.support.documents import another_racer, page, reproduce
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -55,10 +55,7 @@ def test_table2_and_all_levels(sky, tmp_path, capfd):
 
 def test_table2_with_policies_tuned_under_the_delta_model(sky, tmp_path):
     tuned = tmp_path / "tuned"
-    tuned.mkdir()
-    for file in shipped.folder("racer").iterdir():
-        (tuned / file.name).write_bytes(file.read_bytes())
-    (tuned / "card.md").write_text("another")
+    another_racer(tuned, 1001)
     args = ["--trials", "1", "--delta-policy", str(tuned)]
     assert reproduce(tmp_path, "table2", *args) == 0
     assert len(sky.flown) == 30 + 12, "the paper's four levels"
@@ -69,7 +66,7 @@ def test_table2_with_policies_tuned_under_the_delta_model(sky, tmp_path):
     }
     assert "no row of ours" not in text and "The goal, cell by cell: ours, with" in text
     assert not numbers["with_against_without"], "without its control nobody knows its merit"
-    (tuned / "card.md").write_text("a third")
+    another_racer(tuned, 1002)
     args = [*args, "--control-policy", "racer"]
     assert reproduce(tmp_path, "table2", *args) == 0
     text, numbers = page(tmp_path, "table2")
@@ -99,10 +96,7 @@ def test_robustness(sky, tmp_path, capfd):
 
 def test_what_randomisation_buys_is_two_policies_side_by_side(sky, tmp_path):
     other = tmp_path / "other"
-    other.mkdir()
-    for file in shipped.folder("racer").iterdir():
-        (other / file.name).write_bytes(file.read_bytes())
-    (other / "card.md").write_text("another")
+    another_racer(other, 1001)
     both = ["--policy", "racer", "--policy", str(other)]
     args = [*both, "--only", "depth noise", "--trials", "1", "--difficulty", "0"]
     assert reproduce(tmp_path, "robustness", *args) == 0
@@ -149,3 +143,12 @@ def test_what_cannot_be_used_is_said_before_anything_is_flown(args, words, sky, 
     said = capsys.readouterr().err
     assert words in said and len(said.strip().splitlines()) == 1
     assert not sky.flown and not list(tmp_path.iterdir())
+
+
+def test_a_policys_digest_is_of_what_flies(tmp_path):
+    another_racer(tmp_path, 1)
+    before = policy_digest(str(tmp_path))
+    (tmp_path / "card.md").write_text("words")
+    assert policy_digest(str(tmp_path)) == before
+    another_racer(tmp_path, 2)
+    assert policy_digest(str(tmp_path)) != before != policy_digest("racer")

@@ -3,6 +3,8 @@
 import json
 import re
 
+from policies import shipped
+from policies.checkpoint import CONFIG, WEIGHTS
 from suite import cli
 
 
@@ -10,6 +12,14 @@ def reproduce(tmp_path, name, *args):
     """Run `suite reproduce` into folders of `tmp_path` and return its exit code."""
     place = ["--out", str(tmp_path / "docs"), "--cache", str(tmp_path / "cache")]
     return cli.main(["reproduce", name, *args, *place])
+
+
+def another_racer(folder, seed):
+    """Write a policy to `folder` that flies as racer does and is another to every digest."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / WEIGHTS).write_bytes((shipped.folder("racer") / WEIGHTS).read_bytes())
+    config = json.loads((shipped.folder("racer") / CONFIG).read_text())
+    (folder / CONFIG).write_text(json.dumps({**config, "seed": seed}))
 
 
 def page(tmp_path, name):
