@@ -142,9 +142,7 @@ class Baseline:
             passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
             passed = passed & (target < worlds.scene.gates.center_w.shape[1])
             aim = self.target_gate(worlds.scene.gates, target + passed * config.loss.pass_first)
-            last = target >= worlds.scene.gates.center_w.shape[1] - 1
-            care = torch.where(last, config.loss.last_gate_care, 1.0)
-            loss, clearance = self.judge(worlds, before, body, gate, care, *aim)
+            loss, clearance = self.judge(worlds, before, body, gate, *aim)
             total = total + (loss * alive).mean()
             alive = alive * (clearance > -config.loss.crash_depth_m) * (number + 1 < worlds.stop)
             target = target + passed
@@ -170,14 +168,7 @@ class Baseline:
         return image.reshape(-1, camera.height, camera.width)
 
     def judge(
-        self,
-        worlds: Worlds,
-        before: Body,
-        body: Body,
-        gate: Gates,
-        care: Tensor,
-        aim: Gates,
-        aim_w: Tensor,
+        self, worlds: Worlds, before: Body, body: Body, gate: Gates, aim: Gates, aim_w: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the loss of a step (B,) and the smallest distance on its path (B,)."""
         config = self.config.loss
@@ -188,8 +179,8 @@ class Baseline:
         barrier = torch.nn.functional.softplus(config.barrier_slope * gap, threshold=1e3)
         closing = (-(away * body.vel_w.detach()[:, None]).sum(-1)).clamp(min=0)
         collide = closing * (1.0 - gap).clamp(min=0) ** 2
-        loss = care * config.clearance * config.barrier_height * barrier.mean(-1)
-        loss = loss + care * config.collide * collide.mean(-1)
+        loss = config.clearance * config.barrier_height * barrier.mean(-1)
+        loss = loss + config.collide * collide.mean(-1)
 
         jerk = (body.acc_w - before.acc_w) / worlds.constants.time_step[:, None]
         loss = loss + config.acceleration * (body.acc_w**2).sum(-1)

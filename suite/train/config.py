@@ -99,9 +99,6 @@ class LossConfig:
     pass_first: bool = False
     """Whether the step that passes a gate measures progress towards the next one already, and not
     backwards to the one that was passed: faster, and less careful at these weights."""
-    last_gate_care: float = 1.0
-    """Factor on `clearance` and `collide` from the moment that the last gate is the next one: with
-    nothing to turn for behind it, it is flown at full tilt and its frame hit more than others'."""
     projection_decay: float = 0.5
     """beta_3 of L_proj [1/m]."""
     barrier_height: float = 2.0

@@ -152,13 +152,12 @@ def make_judge(
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
         distance, away = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path), NEAR)
         barrier, collide = losses.obstacle_terms(weights, distance, away, path, body.vel_w)
-        care = jnp.where(target >= count - 1, weights.last_gate_care, 1.0)
         size, change = losses.smoothness_terms(
             weights, body.acc_w, before.acc_w, worlds.constants.time_step
         )
         terms = losses.Terms(
-            clearance=weights.clearance * care * barrier,
-            collide=weights.collide * care * collide,
+            clearance=weights.clearance * barrier,
+            collide=weights.collide * collide,
             acceleration=size,
             jerk=change,
             progress=losses.progress_term(weights, body.pos_w, body.vel_w, goal_w, local[:, 1:]),

@@ -72,25 +72,6 @@ def test_the_step_before_is_progress_to_the_gate():
     assert float(records.terms.progress[0, 0]) == pytest.approx(-3.0, abs=0.2)
 
 
-def test_care_at_the_last_gate_weighs_obstacles_there_and_nowhere_else():
-    """Three worlds at the same place: long before, before and past the last gate."""
-    plain = small_config(3, 1, physics=STILL, loss={"collide": 0.2})
-    worlds = at_first_gate(plain, 0.3)
-    scene = jax.tree.map(lambda array: np.repeat(array[:1], 3, axis=0), worlds.scene)
-    first = {name: np.repeat(getattr(worlds, name)[:1], 3, 0) for name in ("pos_w", "vel_w")}
-    count = scene.gates.center_w.shape[1]
-    gates = scene.gates._replace(center_w=np.repeat(scene.gates.center_w[:, :1], count, axis=1))
-    target = np.array([0, count - 1, count], np.int32)
-    worlds = worlds._replace(scene=scene._replace(gates=gates), target=target, **first)
-    careful = replace(plain, loss=replace(plain.loss, last_gate_care=3.0))
-    one, other = (flown(config, worlds).terms for config in (plain, careful))
-    for name in ("clearance", "collide"):
-        before, after = (np.asarray(getattr(terms, name)[0]) for terms in (one, other))
-        assert before.min() > 0
-        np.testing.assert_allclose(after, before * [1, 3, 3], rtol=1e-5)
-    np.testing.assert_array_equal(one.acceleration, other.acceleration)
-
-
 def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
     """The second gate's centre, the last one's where none comes after, and the next's direction."""
     seen = []
