@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from eval.sharding import usable_cores
@@ -54,6 +55,26 @@ def policy_digest(name_or_path: str) -> str:
     for file in files:
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
+
+
+def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
+    """Return the folder of a policy that can be trained on.
+
+    Raises:
+        ValueError: where it is not one of our checkpoints; `option` is named.
+    """
+    from policies import shipped
+    from policies.checkpoint import CONFIG
+
+    folder = shipped.locate(policy)
+    if not (folder / CONFIG).is_file():
+        names = ", ".join(shipped.names()) or "none"
+        raise ValueError(
+            f"{option} {policy}: training goes on from what was trained here and needs a "
+            "checkpoint's folder, such as the policy/ in the --out of suite train, or a shipped "
+            f"policy's name ({names})"
+        )
+    return folder
 
 
 def labels(policies: Sequence[str], names: Sequence[str]) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from suite.choices import at_least, is_track_file, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
@@ -103,7 +102,7 @@ def resolve(
     digests = {"vehicle": hashlib.sha256(to_json(load_vehicle(vehicle)).encode()).hexdigest()}
     if policy is not None:
         from policies.policy_file import load_policy_checkpoint
-        from suite.flying import policy_digest
+        from suite.flying import checkpoint_folder, policy_digest
 
         given = load_policy_checkpoint(checkpoint_folder(policy))
         training = replace(training, spec=given.spec)
@@ -129,24 +128,6 @@ def resolve(
     )
     check_seeds(config.track, config.difficulty, config.seed, config.trials, config.flights)
     return config
-
-
-def checkpoint_folder(policy: str) -> Path:
-    """Return the folder of a policy that can be fine-tuned.
-
-    Raises:
-        ValueError: where it is not one of our checkpoints.
-    """
-    from policies import shipped
-
-    folder = shipped.locate(policy)
-    if not (folder / "config.json").is_file():
-        names = ", ".join(shipped.names()) or "none"
-        raise ValueError(
-            f"--policy {policy}: the loop fine-tunes and so needs a checkpoint's folder, such as "
-            f"the policy/ in the --out of suite train, or a shipped policy's name ({names})"
-        )
-    return folder
 
 
 def _with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:

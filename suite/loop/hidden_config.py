@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 from suite.choices import at_least, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
-from suite.loop.config import RECORDED_FROM, check_seeds, checkpoint_folder
+from suite.flying import checkpoint_folder
+from suite.loop.config import RECORDED_FROM, check_seeds
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
 from suite.train.presets import finetune, preset, with_quadrotor

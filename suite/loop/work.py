@@ -13,8 +13,13 @@ from suite.collect import Collection, collect
 from suite.console import Console
 from suite.estimate import Estimate
 from suite.evaluate import Judgement, evaluate
-from suite.flying import PROCESS_BYTES, SECONDS_A_TRIAL, START_SECONDS, options_for
-from suite.loop.config import checkpoint_folder
+from suite.flying import (
+    PROCESS_BYTES,
+    SECONDS_A_TRIAL,
+    START_SECONDS,
+    checkpoint_folder,
+    options_for,
+)
 from suite.loop.stages import Stages
 from tracks.files import replacing_folder
 

@@ -5,7 +5,10 @@ from dataclasses import replace
 import jax
 import pytest
 
+from policies import shipped
+from suite import cli
 from suite.commands.train import Config, resolve
+from suite.flying import checkpoint_folder
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
 from suite.train.presets import PRESETS, preset
@@ -84,3 +87,11 @@ def test_devices_that_are_not_there_or_do_not_divide_the_batch():
     with pytest.raises(ValueError, match="devices is -1"):
         device_mesh(replace(small_config(), devices=-1))
     assert device_mesh(small_config()).size >= 1
+
+
+def test_training_goes_on_from_a_shipped_policy_by_its_name(tmp_path, capsys):
+    assert checkpoint_folder("racer", "--from") == shipped.folder("racer")
+    assert cli.main(["train", "--from", "racr", "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert "--from racr: " in said and "a shipped policy's name (racer, swift" in said
+    assert not (tmp_path / "run").exists()
