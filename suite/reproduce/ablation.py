@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from suite.choices import at_least
 from suite.console import Console
+from suite.reproduce.recipes import FourGates, check_sizes, four_gate_recipe
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from suite.reproduce.document import Place
-    from suite.reproduce.schemes import Config as SchemesConfig
     from suite.train.config import TrainConfig
 
-GATES = 4
-"""Of the paper's tracks in this experiment."""
 PROGRESS = (0.4, 0.8, 1.6, 3.2)
 """lambda_p without the field; the first is also that with it."""
 NORMALISED = (1.6, 3.2, 6.4)
@@ -24,28 +21,12 @@ NORMALISED = (1.6, 3.2, 6.4)
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(FourGates):
     """Train with the vector field and without it, from several seeds, and fly unseen worlds.
 
     Trainings are found again by the hash of their configuration.
     """
 
-    preset: str = "racer"
-    """The recipe that all settings share but for its size, gates, field and progress loss."""
-    set: tuple[str, ...] = ("episode.image_stride=3",)
-    """Change settings of the recipe by name."""
-    iterations: int = 200
-    """Gradient steps, instead of the preset's."""
-    worlds: int = 48
-    """Worlds in one gradient step, instead of the preset's."""
-    training_seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds that every setting is trained from."""
-    trials: int = 300
-    """Unseen worlds that every policy flies."""
-    seconds: float = 10.0
-    """Of a trial, from standing start."""
-    seed: int = 1000
-    """Of the unseen worlds; none of the training seeds."""
     only: tuple[str, ...] = ()
     """Settings, such as "field 0.4"; all if none is named."""
     jobs: int = 1
@@ -123,7 +104,7 @@ def settings(config: Config) -> list[Setting]:
     """
     from tracks.names import unknown_name
 
-    base = recipe_of(config.preset, config.set, config.iterations, config.worlds)
+    base = four_gate_recipe(config)
 
     def row(key: str, words: str, weight: float, **changes: float) -> Setting:
         recipe = replace(base, loss=replace(base.loss, **changes))
@@ -148,18 +129,6 @@ def settings(config: Config) -> list[Setting]:
         if name not in names:
             raise unknown_name("setting", name, names)
     return [row for row in rows if not config.only or row.key in config.only]
-
-
-def recipe_of(name: str, changes: tuple[str, ...], iterations: int, worlds: int) -> TrainConfig:
-    """Return the preset `name` on tracks of four gates, with `changes` and a size of its own.
-
-    Raises:
-        ValueError: for a preset or a change that does not exist.
-    """
-    from suite.reproduce.recipes import asked_recipe
-
-    base = asked_recipe(name, changes, iterations)
-    return replace(base, episode=replace(base.episode, gates=GATES, batch=worlds))
 
 
 def train_and_measure(
@@ -204,24 +173,3 @@ def train_and_measure(
         f"success rate {measured['success_rate']:.0%}, v_max {measured['v_max']:.1f} m/s"
     )
     return about._replace(measured=measured)
-
-
-def check_sizes(config: Config | SchemesConfig) -> None:
-    """Refuse numbers of either document of trainings that cannot be used.
-
-    Raises:
-        ValueError: naming the option and what is allowed.
-    """
-    from suite.reproduce.recipes import check_seeds
-
-    check_seeds(config.training_seeds)
-    at_least("--seed", config.seed, 0)
-    at_least("--trials", config.trials, 1)
-    at_least("--seconds", config.seconds, 0.5)
-    at_least("--iterations", config.iterations, 1)
-    at_least("--worlds", config.worlds, 1)
-    if config.seed in config.training_seeds:
-        raise ValueError(
-            f"--seed {config.seed} is one of --training-seeds, whose policies would have seen the "
-            "worlds they are measured on; give another"
-        )

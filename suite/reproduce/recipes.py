@@ -3,13 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from suite.choices import at_least
 
 if TYPE_CHECKING:
     from suite.train.config import TrainConfig
+
+GATES = 4
+"""Of the paper's tracks in its ablation and its comparison of schemes."""
+
+
+@dataclass(frozen=True)
+class FourGates:
+    """What the experiments on tracks of four gates have in common; their options derive from it."""
+
+    preset: str = "racer"
+    """The recipe that all trainings share, but for its size, its gates and what is compared."""
+    set: tuple[str, ...] = ("episode.image_stride=3",)
+    """Change settings of the recipe by name."""
+    iterations: int = 200
+    """Gradient steps, instead of the preset's."""
+    worlds: int = 48
+    """Worlds in one gradient step, instead of the preset's."""
+    training_seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds that everything is trained from."""
+    trials: int = 300
+    """Unseen worlds that are flown at every measurement."""
+    seconds: float = 10.0
+    """Of a trial, from standing start."""
+    seed: int = 1000
+    """Of the unseen worlds; none of the training seeds."""
 
 
 def asked_recipe(name: str, changes: Sequence[str], iterations: int | None) -> TrainConfig:
@@ -39,3 +64,32 @@ def check_seeds(seeds: Sequence[int]) -> None:
         raise ValueError(f"--training-seeds is {said}; give each once")
     for seed in seeds:
         at_least("--training-seeds", seed, 0)
+
+
+def four_gate_recipe(config: FourGates) -> TrainConfig:
+    """Return the recipe that `config` asks for on tracks of four gates.
+
+    Raises:
+        ValueError: for a preset or a change that does not exist.
+    """
+    base = asked_recipe(config.preset, config.set, config.iterations)
+    return replace(base, episode=replace(base.episode, gates=GATES, batch=config.worlds))
+
+
+def check_sizes(config: FourGates) -> None:
+    """Refuse numbers that cannot be used.
+
+    Raises:
+        ValueError: naming the option and what is allowed.
+    """
+    check_seeds(config.training_seeds)
+    at_least("--seed", config.seed, 0)
+    at_least("--trials", config.trials, 1)
+    at_least("--seconds", config.seconds, 0.5)
+    at_least("--iterations", config.iterations, 1)
+    at_least("--worlds", config.worlds, 1)
+    if config.seed in config.training_seeds:
+        raise ValueError(
+            f"--seed {config.seed} is one of --training-seeds, whose policies would have seen the "
+            "worlds they are measured on; give another"
+        )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.choices import at_least
 from suite.console import Console
+from suite.reproduce.recipes import FourGates, check_sizes, four_gate_recipe
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,33 +21,19 @@ PROJECTION, PROJECTION_DECAY = 3.0, 0.5
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(FourGates):
     """Train by PPO, by our method, and by it without the field, and measure them as they learn.
 
     All three share policy, dynamics, worlds and the number of environment steps. Trainings are
     found again by the hash of their configuration and of what is measured on the way.
     """
 
-    preset: str = "racer"
-    """The recipe of the differentiable schemes, but for its size and gates."""
-    set: tuple[str, ...] = ("episode.image_stride=3",)
-    """Change settings of the recipe by name."""
     progress: float = 0.4
     """lambda_p of both differentiable schemes; the paper's."""
-    iterations: int = 200
-    """Gradient steps of the differentiable schemes, instead of the preset's."""
     ppo_iterations: int | None = None
     """Rollouts of PPO; as many as the others' gradient steps if not given."""
-    worlds: int = 48
-    """Worlds in one gradient step or rollout, instead of the preset's."""
-    training_seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds that every scheme is trained from."""
     trials: int = 100
     """Unseen worlds that are flown at every measurement."""
-    seconds: float = 10.0
-    """Of a trial, from standing start."""
-    seed: int = 1000
-    """Of the unseen worlds; none of the training seeds."""
     measurements: int = 20
     """About how many a training has; their time is no part of the curves."""
     only: tuple[str, ...] = ()
@@ -100,7 +87,6 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     """
     import functools
 
-    from suite.reproduce.ablation import check_sizes
     from suite.reproduce.document import write_document
     from suite.reproduce.scheme_curves import summaries
     from suite.reproduce.scheme_tables import scheme_report
@@ -134,10 +120,9 @@ def schemes(config: Config) -> list[Scheme]:
             cannot share among its minibatches.
     """
     from suite.ppo.config import ppo_like
-    from suite.reproduce.ablation import recipe_of
     from tracks.names import unknown_name
 
-    base = recipe_of(config.preset, config.set, config.iterations, config.worlds)
+    base = four_gate_recipe(config)
     loss = replace(base.loss, progress=config.progress, progress_norm=0.0, projection=0.0)
     ours = replace(base, loss=loss)
     scalar = replace(loss, field_gain=0.0, projection=PROJECTION, projection_decay=PROJECTION_DECAY)
