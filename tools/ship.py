@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from policies.checkpoint import CONFIG, WEIGHTS
+from policies.policy_file import load_policy_checkpoint
 from suite.console import duration
 from suite.loop.charts import training_chart
 from suite.loop.compare import BEFORE
@@ -39,12 +40,15 @@ def card(name: str, runs: Sequence[Path], judged: Path | None) -> str:
             f"| {len(rows)} | {duration(seconds)} |"
         )
     machine = made[-1]["machine"]
+    stored = load_policy_checkpoint(runs[-1] / "policy")
+    size = sum(array.size for array in stored.params.values())
     text = f"""# {name}
 
-CNN-GRU of Su et al. 2026 (514k parameters), trained in the point mass on the `random` tracks only;
-it has seen neither the judged families nor the vehicle of the tables. The recipe's numbers were
-chosen by looking at flights of earlier recipes on the judged tracks and vehicle, at other seeds
-(50,000 on); the recipe was then run once, at one training seed.
+CNN-GRU of Su et al. 2026 ({stored.spec.state_size} numbers and a depth image, {size / 1000:.0f}k
+parameters), trained in the point mass on the `random` tracks only; it has seen neither the judged
+families nor the vehicle of the tables. The recipe's numbers were chosen by looking at flights of
+earlier recipes on the judged tracks and vehicle, at other seeds (50,000 on); the recipe was then run
+once, at one training seed.
 
 | made by | seed | commit | iterations | time |
 |---|---|---|---|---|
