@@ -50,7 +50,8 @@ def policy_digest(name_or_path: str) -> str:
     from policies.checkpoint import CONFIG, WEIGHTS
 
     path = shipped.locate(name_or_path)
-    files = [path / CONFIG, path / WEIGHTS] if path.is_dir() else [path]
+    inside = [path / CONFIG, path / WEIGHTS]
+    files = [file for file in inside if file.is_file()] if path.is_dir() else [path]
     digest = hashlib.sha256()
     for file in files:
         digest.update(file.name.encode() + b"\0" + file.read_bytes())

@@ -5,7 +5,6 @@ import json
 import pytest
 
 from suite import cli
-from suite.flying import policy_digest
 from suite.reproduce import EXPERIMENTS
 from tests.support.documents import another_racer, page, reproduce
 
@@ -143,12 +142,3 @@ def test_what_cannot_be_used_is_said_before_anything_is_flown(args, words, sky, 
     said = capsys.readouterr().err
     assert words in said and len(said.strip().splitlines()) == 1
     assert not sky.flown and not list(tmp_path.iterdir())
-
-
-def test_a_policys_digest_is_of_what_flies(tmp_path):
-    another_racer(tmp_path, 1)
-    before = policy_digest(str(tmp_path))
-    (tmp_path / "card.md").write_text("words")
-    assert policy_digest(str(tmp_path)) == before
-    another_racer(tmp_path, 2)
-    assert policy_digest(str(tmp_path)) != before != policy_digest("racer")

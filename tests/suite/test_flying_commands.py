@@ -148,13 +148,15 @@ def test_more_trials_take_more_processes_up_to_what_there_is(monkeypatch):
     assert options_for(10, 3, "mujoco").processes == 3
 
 
-def test_a_digest_changes_with_any_byte_of_a_folder(tmp_path):
-    (tmp_path / "p").mkdir()
-    (tmp_path / "p" / "config.json").write_text("{}")
-    before = policy_digest(str(tmp_path / "p"))
-    assert before == policy_digest(str(tmp_path / "p"))
-    (tmp_path / "p" / "config.json").write_text("{ }")
-    assert policy_digest(str(tmp_path / "p")) != before
+def test_a_digest_changes_with_any_byte_of_what_flies_and_no_other(tmp_path):
+    folder, seen = tmp_path / "p", set()
+    folder.mkdir()
+    for name, text in (("config.json", "{}"), ("config.json", "{ }"), ("weights.safetensors", "a")):
+        (folder / name).write_text(text)
+        seen.add(policy_digest(str(folder)))
+    assert len(seen) == 3
+    (folder / "card.md").write_text("words")
+    assert policy_digest(str(folder)) in seen
 
 
 def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
