@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from policies.conv import conv_valid
 from policies.gru import gru_update
-from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
+from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
 
 Params = dict[str, jax.Array]
 
@@ -68,7 +68,7 @@ def fitted(params: Params, seen: PolicySpec, spec: PolicySpec) -> Params:
         ValueError: where the policy sees what `spec` does not have.
     """
     rows, first = [params["state.weight"][:STATE_SIZE]], STATE_SIZE
-    for key in ("second_gate", "gate_axis"):
+    for key in EXTRAS:
         has, wanted = getattr(seen, key), getattr(spec, key)
         if has and not wanted:
             raise ValueError(f"the policy to start from has spec.{key}; set spec.{key}=True")

@@ -12,6 +12,8 @@ from tracks.camera import Camera
 
 STATE_SIZE = 12
 """Numbers in the paper's state: v_b (3), third row of R (3), gate in body axes (3), u (3)."""
+EXTRAS = ("second_gate", "gate_axis")
+"""Keys of a spec that each add three numbers to the state, in this order."""
 ACTION_SIZE = 3
 """Numbers in an action: wanted net acceleration in current body axes [m/s^2]."""
 
@@ -48,4 +50,4 @@ class PolicySpec:
     @property
     def state_size(self) -> int:
         """Numbers in the state observation."""
-        return STATE_SIZE + 3 * self.second_gate + 3 * self.gate_axis
+        return STATE_SIZE + 3 * sum(getattr(self, key) for key in EXTRAS)

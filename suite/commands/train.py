@@ -11,7 +11,7 @@ import tyro
 from suite.console import Console
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
-from suite.train.presets import chosen_model, preset
+from suite.train.presets import chosen_model, preset, with_iterations
 from tracks.files import plain
 
 
@@ -53,7 +53,7 @@ def resolve(config: Config) -> TrainConfig:
     run = replace(preset(config.preset), seed=config.seed)
     run = chosen_model(run, config.model, config.vehicle)
     if config.iterations is not None:
-        run = replace(run, optimizer=replace(run.optimizer, iterations=config.iterations))
+        run = with_iterations(run, config.iterations)
     return override(run, config.set)
 
 

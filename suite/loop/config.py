@@ -10,7 +10,7 @@ from suite.choices import at_least, is_track_file, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
-from suite.train.presets import finetune, preset
+from suite.train.presets import finetune, preset, with_iterations
 from tracks.files import to_json
 
 RECORDED_FROM = 100_000
@@ -97,7 +97,7 @@ def resolve(
     training = replace(preset(recipe), seed=seed)
     if iterations is not None:
         at_least("--iterations", iterations, 1)
-        training = _with_iterations(training, iterations)
+        training = with_iterations(training, iterations)
     training = override(training, changes)
     digests = {"vehicle": hashlib.sha256(to_json(load_vehicle(vehicle)).encode()).hexdigest()}
     if policy is not None:
@@ -110,7 +110,7 @@ def resolve(
     tuning = finetune(training)
     if finetune_iterations is not None:
         at_least("--finetune-iterations", finetune_iterations, 1)
-        tuning = _with_iterations(tuning, finetune_iterations)
+        tuning = with_iterations(tuning, finetune_iterations)
     fitted = size.fit_iterations if fit_iterations is None else fit_iterations
     at_least("--fit-iterations", fitted, 1)
     config = LoopConfig(
@@ -128,10 +128,6 @@ def resolve(
     )
     check_seeds(config.track, config.difficulty, config.seed, config.trials, config.flights)
     return config
-
-
-def _with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
-    return replace(config, optimizer=replace(config.optimizer, iterations=iterations))
 
 
 def check_seeds(track: str, difficulty: str, seed: int, trials: int, flights: int) -> None:

@@ -12,7 +12,7 @@ from suite.flying import checkpoint_folder
 from suite.loop.config import RECORDED_FROM, check_seeds
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
-from suite.train.presets import finetune, preset, with_quadrotor
+from suite.train.presets import finetune, preset, with_iterations, with_quadrotor
 from tracks.files import to_json
 
 
@@ -113,8 +113,7 @@ def resolve_hidden(
     fitted = size.fit_iterations if fit_iterations is None else fit_iterations
     at_least("--fit-iterations", fitted, 1)
     tuning = finetune(replace(base, spec=given.spec))
-    optimizer = replace(tuning.optimizer, iterations=iterations)
-    tuning = with_quadrotor(replace(tuning, optimizer=optimizer), simulated)
+    tuning = with_quadrotor(with_iterations(tuning, iterations), simulated)
     config = HiddenConfig(
         tuning=override(tuning, changes),
         fit=FitConfig(iterations=fitted, seed=seed),

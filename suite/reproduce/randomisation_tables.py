@@ -13,7 +13,7 @@ from eval.trial import TrialSpec
 from suite.report import Cell, Grid, Picture, Report, Section
 from suite.reproduce.conditions import Sweep
 from suite.reproduce.robust_charts import sweeps_chart
-from suite.reproduce.robust_tables import Tested, condition_grid, tested_numbers
+from suite.reproduce.robust_tables import Tested, condition_grid, points_cell, tested_numbers
 from suite.reproduce.trainings import commit_of
 from suite.train.config import TrainConfig
 
@@ -117,9 +117,10 @@ def compare(won: Mapping[str, np.ndarray]) -> dict[str, Interval]:
 def _lead(compared: Mapping[str, Mapping[str, Interval]]) -> str:
     def said(name: str) -> str:
         fixed, randomised, _ = (100 * entry.value for entry in compared[name].values())
+        points = points_cell(compared[name]["difference"]).text
         return (
             f"{randomised:.0f} % succeed where dynamics were randomised in training and "
-            f"{fixed:.0f} % where they were not ({_points(compared[name])} points)"
+            f"{fixed:.0f} % where they were not ({points} points)"
         )
 
     low, high = compared[ALL]["difference"][1:]
@@ -130,20 +131,12 @@ def _lead(compared: Mapping[str, Mapping[str, Interval]]) -> str:
     )
 
 
-def _points(entry: Mapping[str, Interval]) -> str:
-    # round() + 0.0, so that nothing reads -0.
-    value, low, high = (f"{round(100 * x) + 0.0:+.0f}" for x in entry["difference"])
-    return f"{value} [{low}, {high}]"
-
-
 def _summary(compared: Mapping[str, Mapping[str, Interval]]) -> Grid:
     names = [name for name in next(iter(compared.values())) if name != "difference"]
     rows = []
     for what, entry in compared.items():
-        _, low, high = entry["difference"]
-        tone = "good" if low > 0 else "bad" if high < 0 else ""
         rates = [Cell(f"{100 * entry[name].value:.0f}") for name in names]
-        rows.append([Cell(what), *rates, Cell(_points(entry), tone)])
+        rows.append([Cell(what), *rates, points_cell(entry["difference"])])
     headers = ["disturbance", *(f"{name} [%]" for name in names), "difference [points]"]
     return Grid("", headers, rows)
 

@@ -44,13 +44,13 @@ def asked_recipe(name: str, changes: Sequence[str], iterations: int | None) -> T
         ValueError: for a preset, a change or a number that cannot be used.
     """
     from suite.train.overrides import override
-    from suite.train.presets import preset
+    from suite.train.presets import preset, with_iterations
 
     recipe = override(preset(name), changes)
     if iterations is None:
         return recipe
     at_least("--iterations", iterations, 1)
-    return replace(recipe, optimizer=replace(recipe.optimizer, iterations=iterations))
+    return with_iterations(recipe, iterations)
 
 
 def check_seeds(seeds: Sequence[int]) -> None:

@@ -168,11 +168,11 @@ def condition_grid(
             same = entry.condition.vehicle is base.condition.vehicle and (
                 entry.condition.noise == base.condition.noise
             )
-            change = Cell("") if same else _points(
+            change = Cell("") if same else points_cell(
                 paired_success(entry.won(name), base.won(name))
             )  # fmt: skip
             row += [Cell(_percent(entry.success(name))), change]
-        row += [_points(paired_success(entry.won(n), entry.won(names[0]))) for n in names[1:]]
+        row += [points_cell(paired_success(entry.won(n), entry.won(names[0]))) for n in names[1:]]
         rows.append(row)
     return Grid(title, headers, rows)
 
@@ -182,7 +182,8 @@ def _percent(interval: Interval) -> str:
     return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
 
 
-def _points(difference: PairedDifference) -> Cell:
+def points_cell(difference: PairedDifference | Interval) -> Cell:
+    """Return a difference of success rates in points with its interval, coloured by its sign."""
     value, low, high = (f"{round(100 * x) + 0.0:+.0f}" for x in difference[:3])
     tone = "good" if difference.low > 0 else "bad" if difference.high < 0 else ""
     return Cell(f"{value} [{low}, {high}]", tone)

@@ -90,6 +90,11 @@ def gpu() -> TrainConfig:
     return replace(base, episode=replace(base.episode, batch=2048))
 
 
+def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
+    """Return `config` with so many gradient steps."""
+    return replace(config, optimizer=replace(config.optimizer, iterations=iterations))
+
+
 def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
     """Return how a policy that `config` trained is fine-tuned, under a Delta Action Model or not.
 

@@ -13,11 +13,16 @@ from tracks.camera import Camera
 SPEC = PolicySpec(rate_hz=33.0, camera=Camera(pitch_deg=20.0), hidden_size=64)
 
 
+def lively(spec, seed):
+    """Return fresh parameters whose actions are of the size that racing has."""
+    scale = {"action.weight": 2000.0, "state.bias": 5.0}
+    made = network.init(jax.random.key(seed), spec)
+    return {name: np.asarray(value) * scale.get(name, 1.0) for name, value in made.items()}
+
+
 @pytest.fixture(scope="session")
 def params():
-    scale = {"action.weight": 2000.0, "state.bias": 5.0}
-    made = network.init(jax.random.key(2), SPEC)
-    return {name: np.asarray(value) * scale.get(name, 1.0) for name, value in made.items()}
+    return lively(SPEC, 2)
 
 
 @pytest.fixture(scope="session")

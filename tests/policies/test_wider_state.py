@@ -17,30 +17,26 @@ from policies.policy import load_policy
 from policies.policy_file import save_policy
 from policies.spec import PolicySpec
 from policies.spec_json import spec_from_json, spec_to_json
-from tests.policies.conftest import SPEC
+from tests.policies.conftest import SPEC, lively
 
 SECOND = replace(SPEC, second_gate=True)
 AXIS = replace(SPEC, gate_axis=True)
 BOTH = replace(SECOND, gate_axis=True)
-SCALE = {"action.weight": 2000.0, "state.bias": 5.0}
 
 
 @pytest.fixture(scope="module")
-def lively():
-    made = network.init(jax.random.key(3), SECOND)
-    return {k: np.asarray(v) * SCALE.get(k, 1.0) for k, v in made.items()}
+def second():
+    return lively(SECOND, 3)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, lively):
-    return save_policy(tmp_path_factory.mktemp("second") / "second", lively, SECOND, seed=1)
+def folder(tmp_path_factory, second):
+    return save_policy(tmp_path_factory.mktemp("second") / "second", second, SECOND, seed=1)
 
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory):
-    made = network.init(jax.random.key(4), BOTH)
-    arrays = {k: np.asarray(v) * SCALE.get(k, 1.0) for k, v in made.items()}
-    return save_policy(tmp_path_factory.mktemp("both") / "both", arrays, BOTH, seed=1)
+    return save_policy(tmp_path_factory.mktemp("both") / "both", lively(BOTH, 4), BOTH, seed=1)
 
 
 def actions(policy, width, n=70, steps=5):
@@ -122,8 +118,8 @@ def test_the_key_is_true_or_false(value):
         spec_from_json(stored, "here")
 
 
-def test_weights_of_another_state_are_refused(tmp_path, lively):
-    save_policy(tmp_path / "torn", lively, SPEC, seed=1)
+def test_weights_of_another_state_are_refused(tmp_path, second):
+    save_policy(tmp_path / "torn", second, SPEC, seed=1)
     with pytest.raises(PolicyError, match=r"state\.weight"):
         load_policy(tmp_path / "torn")
 

@@ -20,10 +20,8 @@ def pair():
     """Return (config, worlds, params, our gradient, our loss, the baseline after backward)."""
     base = train.bench_config(6, 12)
     physics = replace(base.physics, depth_noise=0.0, state_delay=1)
-    loss, spec = (
-        replace(base.loss, approach_m=1.5),
-        replace(base.spec, second_gate=True, gate_axis=True),
-    )
+    loss = replace(base.loss, approach_m=1.5)
+    spec = replace(base.spec, second_gate=True, gate_axis=True)
     config = replace(base, physics=physics, loss=loss, spec=spec)
     worlds, params = train.bench_worlds(config), fresh_params(config.spec)
     gradient, loss, _ = jax.jit(make_gradient(config))(params, worlds, jax.random.key(0), None)
