@@ -9,8 +9,6 @@ from suite.choices import at_least, parse_levels
 from suite.console import Console
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from eval.trial import TrialSpec
     from suite.reproduce.conditions import Condition
     from suite.reproduce.document import Place
@@ -65,6 +63,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     from suite.reproduce.randomisation_tables import randomisation_report
     from suite.reproduce.recipes import asked_recipe, check_seeds
     from suite.reproduce.side_by_side import all_done, check_jobs
+    from suite.reproduce.trainings import trained_policy
     from tracks.families import JUDGED
     from tracks.names import unknown_name
 
@@ -83,7 +82,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     trials = trial_list(JUDGED, parse_levels(config.difficulty), config.trials, config.seed)
     recipe = asked_recipe(config.preset, config.set, config.iterations)
     runs = [replace(r, seed=seed) for r in (fixed(recipe), recipe) for seed in seeds]
-    do = functools.partial(_train, cache=place.cache)
+    do = functools.partial(trained_policy, cache=place.cache)
     found = all_done(do, runs, config.jobs, console, "training")
     policies = {FIXED: found[: len(seeds)], RANDOMISED: found[len(seeds) :]}
     shares = [trials[number :: len(seeds)] for number in range(len(seeds))]
@@ -116,12 +115,6 @@ def fixed(recipe: TrainConfig) -> TrainConfig:
             fov_scale=(1.0, 1.0),
         ),
     )
-
-
-def _train(config: TrainConfig, console: Console, cache: Path) -> str:
-    from suite.reproduce.trainings import trained
-
-    return str(trained(config, cache, console).policy)
 
 
 def _flown(

@@ -39,6 +39,8 @@ class Config:
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
+    jobs: int = 1
+    """Trainings at once, each in a process with its own share of the cores."""
 
 
 def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
@@ -53,10 +55,12 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     from suite.reproduce.document import write_document
     from suite.reproduce.flights import Flier, Order, flown
     from suite.reproduce.seed_tables import seed_report, spread
+    from suite.reproduce.side_by_side import check_jobs
     from tracks.families import JUDGED
 
     at_least("--trials", config.trials, 1)
     at_least("--seed", config.seed, 0)
+    check_jobs(config.jobs)
     vehicle = load_vehicle(config.vehicle)
     policies = _policies(config, place, console)
     trials = trial_list(JUDGED, LEVELS, config.trials, config.seed)
@@ -93,14 +97,18 @@ def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:
 
 
 def _trained(config: Config, place: Place, console: Console) -> dict[str, str]:
+    import functools
     from dataclasses import replace
 
     from suite.reproduce.recipes import asked_recipe, check_seeds
-    from suite.reproduce.trainings import trained
+    from suite.reproduce.side_by_side import all_done
+    from suite.reproduce.trainings import trained_policy
 
     check_seeds(config.training_seeds)
     recipe = asked_recipe(config.preset, config.set, config.iterations)
+    runs = [replace(recipe, seed=seed) for seed in config.training_seeds]
+    do = functools.partial(trained_policy, cache=place.cache)
+    policies = all_done(do, runs, config.jobs, console, "training")
     return {
-        f"seed {seed}": str(trained(replace(recipe, seed=seed), place.cache, console).policy)
-        for seed in config.training_seeds
+        f"seed {seed}": policy for seed, policy in zip(config.training_seeds, policies, strict=True)
     }

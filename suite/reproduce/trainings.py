@@ -29,6 +29,11 @@ def trained(config: TrainConfig, cache: Path, console: Console) -> Outcome:
     return train(config, folder_of(config, cache), console)
 
 
+def trained_policy(config: TrainConfig, console: Console, cache: Path) -> str:
+    """Return the folder of the policy of `trained`, as work that can be done side by side."""
+    return str(trained(config, cache, console).policy)
+
+
 def folder_of(config: TrainConfig, cache: Path) -> Path:
     """Return the folder of the run of `config`."""
     return cache / "trainings" / digest(config)

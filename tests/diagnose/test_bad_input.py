@@ -44,6 +44,19 @@ def outcome(logs, drive="commands"):
     return found
 
 
+@pytest.mark.parametrize(
+    "breakages",
+    [BREAKAGES[first : first + 3] for first in range(0, len(BREAKAGES), 3)],
+    ids=lambda group: "-".join(breakage.__name__ for breakage in group),
+)
+def test_broken_flights_among_sound_ones(sound, breakages):
+    rng = np.random.default_rng(0)
+    broken = [breakage(log, rng) for breakage, log in zip(breakages, sound, strict=True)]
+    found = outcome([*broken, *sound[1:]])
+    assert isinstance(found, dict), found
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("breakage", BREAKAGES, ids=lambda f: f.__name__)
 def test_one_broken_flight_among_sound_ones(sound, breakage):
     rng = np.random.default_rng(0)

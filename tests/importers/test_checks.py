@@ -10,8 +10,8 @@ from eval.flight_check import FlightLogError
 from eval.importers import import_log
 from eval.importers.options import ImportOptions
 from eval.importers.rows import averaged, smoothed
-from tests.support import foreign_logs as made
-from tests.support.foreign_logs import FLIP
+from tests.support import known_flight
+from tests.support.known_flight import FLIP
 
 NAMES = {
     "pos": ["pos_x", "pos_y", "pos_z"],
@@ -26,7 +26,7 @@ NAMES = {
 
 def flight(hz=200.0, end=8.0, noise=0.0, seed=0):
     """The columns of a good table as arrays by signal."""
-    truth = made.fly(np.arange(0, end, 1 / hz))
+    truth = known_flight.fly(np.arange(0, end, 1 / hz))
     rng = np.random.default_rng(seed)
     parts = {
         "time": truth.time,
@@ -194,7 +194,7 @@ def test_a_rate_command_of_the_wrong_sign_is_doubted(tmp_path):
 def test_differing_rates_jitter_and_holes(tmp_path):
     rng = np.random.default_rng(1)
     time = np.cumsum(rng.uniform(0.003, 0.007, 1600))
-    truth = made.fly(time)
+    truth = known_flight.fly(time)
     parts = {"time": time, "pos": truth.pos, "quat": truth.quat, "rate": truth.rate}
     parts |= {"cmd_thrust": truth.thrust[:, None], "cmd_rate": truth.cmd_rate}
     every = np.arange(len(time))
@@ -209,7 +209,7 @@ def test_differing_rates_jitter_and_holes(tmp_path):
     assert {"position", "rows"} <= of(findings, "note")
     at = log.time_s + time[0]
     np.testing.assert_allclose(at, time[keep["pos"]], atol=1e-9)
-    found = made.fly(at)
+    found = known_flight.fly(at)
     np.testing.assert_allclose(log.pos_w, found.pos, atol=1e-9)
     np.testing.assert_allclose(log.rate_b, found.rate, atol=2e-3)
     # A derived velocity is not there beside the hole.
@@ -240,10 +240,10 @@ def test_faster_signals_are_smoothed_and_commands_hold_their_mean(tmp_path):
     parts["rate"] = parts["rate"] + shake
     path = write(tmp_path / "log.csv", parts)
     log, _ = import_log(path, None, ImportOptions(rate_hz=50.0))
-    truth = made.fly(log.time_s)
+    truth = known_flight.fly(log.time_s)
     assert len(log.time_s) == 300
     assert np.abs(log.rate_b - truth.rate)[2:-2].max() < 1.0
-    middle = made.fly(log.time_s + 0.0095).cmd_rate
+    middle = known_flight.fly(log.time_s + 0.0095).cmd_rate
     np.testing.assert_allclose(np.asarray(log.rate_cmd_b)[:-1], middle[:-1], atol=0.01)
 
 

@@ -9,6 +9,7 @@ from eval.importers import FORMATS, import_log
 from eval.importers.crazyflie_format import unpack_quaternion
 from eval.importers.options import ImportOptions
 from tests.support import foreign_logs as made
+from tests.support import known_flight
 from tests.support.vehicles import PLAIN
 
 FULL = ImportOptions(full_thrust=30.0)
@@ -38,7 +39,7 @@ def _near(value, wanted, tolerance):
 
 def test_px4_equals_the_flight(tmp_path):
     log, findings = import_log(made.write_ulog(tmp_path / "log.ulg"), None, FULL)
-    truth = made.fly(log.time_s)
+    truth = known_flight.fly(log.time_s)
     # The file holds float32 and whole rpm.
     _near(log.pos_w, truth.pos, 2e-6)
     _near(log.vel_w, truth.vel, 2e-6)
@@ -58,7 +59,7 @@ def test_px4_equals_the_flight(tmp_path):
 def test_px4_without_escs_or_a_thrust_scale_takes_the_accelerometer(tmp_path):
     path = made.write_ulog(tmp_path / "log.ulg", esc=False)
     log, findings = import_log(path)
-    truth = made.fly(log.time_s)
+    truth = known_flight.fly(log.time_s)
     assert log.rotor_speed is None
     _near(log.thrust_cmd, truth.thrust, 0.05)
     assert "accelerometer" in _text(findings, "thrust")
@@ -75,7 +76,7 @@ def test_px4_motors_follow_the_vehicles_hubs(tmp_path):
     )
     vehicle = PLAIN.__class__(**{**PLAIN.__dict__, "rotors": turned})
     log, _ = import_log(path, None, ImportOptions(vehicle=vehicle))
-    _near(log.rotor_speed, made.fly(log.time_s).motor[:, [3, 0, 2, 1]], 0.1)
+    _near(log.rotor_speed, known_flight.fly(log.time_s).motor[:, [3, 0, 2, 1]], 0.1)
 
 
 def test_px4_at_the_loggers_default_rates(tmp_path):
@@ -86,7 +87,7 @@ def test_px4_at_the_loggers_default_rates(tmp_path):
     assert len(log.time_s) == pytest.approx(240, abs=3)
     assert {"position", "attitude"} <= {f.subject for f in findings if "Hz only" in f.text}
     assert np.isnan(log.pos_w[1::2]).all() and np.isnan(log.vel_w[1::2]).all()
-    _near(log.pos_w[::2], made.fly(log.time_s[::2]).pos, 1e-5)
+    _near(log.pos_w[::2], known_flight.fly(log.time_s[::2]).pos, 1e-5)
     assert log.whole.mean() > 0.48
     assert "doubt" not in _levels(findings).values()
 
@@ -94,7 +95,7 @@ def test_px4_at_the_loggers_default_rates(tmp_path):
 @pytest.mark.parametrize("frame", [(True, 1), (True, 3), (False, 0), (False, 3)])
 def test_px4_odometry_in_each_frame_of_its_velocity(tmp_path, frame):
     log, findings = import_log(made.write_ulog(tmp_path / "log.ulg", odometry=frame), None, FULL)
-    truth = made.fly(log.time_s)
+    truth = known_flight.fly(log.time_s)
     assert not log.velocity_derived
     _near(log.pos_w, truth.pos, 2e-6)
     _near(log.vel_w, truth.vel, 2e-6)
@@ -105,7 +106,7 @@ def test_px4_odometry_in_each_frame_of_its_velocity(tmp_path, frame):
 def test_px4_odometry_in_another_frame_leaves_the_velocity_out(tmp_path, frame):
     log, _ = import_log(made.write_ulog(tmp_path / "log.ulg", odometry=frame), None, FULL)
     assert log.velocity_derived
-    _near(log.vel_w, made.fly(log.time_s).vel, 0.1)
+    _near(log.vel_w, known_flight.fly(log.time_s).vel, 0.1)
 
 
 @pytest.mark.parametrize("cut", [20, 400, 3000])
@@ -120,7 +121,7 @@ def test_betaflight_with_motion_capture_equals_the_flight(tmp_path):
     path = made.write_blackbox(tmp_path / "log.csv")
     pose = made.write_mocap(tmp_path / "pose.csv", span=(1.0005, 19.0), offset=-3.21, drift=60e-6)
     log, findings = import_log(path, None, ImportOptions(pose=pose, full_thrust=30.0))
-    truth = made.fly(log.time_s + 1.0005)
+    truth = known_flight.fly(log.time_s + 1.0005)
     late = float(np.sum((log.pos_w - truth.pos) * truth.vel) / np.sum(truth.vel**2))
     assert abs(late) < 2e-4
     _near(log.pos_w, truth.pos, 2e-3)
@@ -145,7 +146,7 @@ def test_betaflights_tenfold_values_are_found(tmp_path, fix):
     level = {f.subject for f in findings if f.level == ("corrected" if fix else "doubt")}
     assert {"units", "voltage"} <= level
     assert "blackbox_high_resolution" in _text(findings, "units")
-    truth, tenfold = made.fly(log.time_s), 1 if fix else 10
+    truth, tenfold = known_flight.fly(log.time_s), 1 if fix else 10
     _near(log.rate_b, tenfold * truth.rate, 0.02 * tenfold)
     _near(log.rate_cmd_b, tenfold * truth.cmd_rate, 0.04 * tenfold)
     _near(log.voltage, tenfold * truth.voltage, 0.1 * tenfold)
@@ -157,7 +158,7 @@ def test_betaflight_counts_the_motors_poles(tmp_path):
     path = made.write_blackbox(tmp_path / "log.csv", span=(0, 8), poles=12)
     pose = made.write_mocap(tmp_path / "pose.csv", span=(0, 8))
     log, _ = import_log(path, None, ImportOptions(pose=pose, motor_poles=12, full_thrust=30.0))
-    _near(log.rotor_speed, made.fly(log.time_s).motor, 2.0)
+    _near(log.rotor_speed, known_flight.fly(log.time_s).motor, 2.0)
     with pytest.raises(FlightLogError, match="motor_poles is 7"):
         import_log(path, None, ImportOptions(pose=pose, motor_poles=7))
 
@@ -176,7 +177,7 @@ def test_betaflight_alone_asks_for_a_pose(tmp_path):
 def test_crazyflie_equals_the_flight(tmp_path, version):
     path = made.write_usd(tmp_path / "log00", version=version)
     log, findings = import_log(path, None, FULL)
-    truth = made.fly(log.time_s)
+    truth = known_flight.fly(log.time_s)
     for value, wanted in (
         (log.pos_w, truth.pos),
         (log.vel_w, truth.vel),
@@ -195,7 +196,7 @@ def test_crazyflie_equals_the_flight(tmp_path, version):
 def test_crazyflie_compressed_and_without_checksum(tmp_path):
     path = made.write_usd(tmp_path / "log00", compressed=True, crc=False)
     log, findings = import_log(path, "crazyflie", FULL)
-    truth = made.fly(log.time_s)
+    truth = known_flight.fly(log.time_s)
     _near(log.pos_w, truth.pos, 6e-4)
     _near(log.rate_b, truth.rate, 6e-4)
     assert _quat_off(log, truth) < 1.5e-3
@@ -236,13 +237,13 @@ def test_a_crazyflie_log_is_read_up_to_where_it_breaks(tmp_path):
     path.write_bytes(data[: len(data) // 2] + b"\xff" * 500)
     log, findings = import_log(path, None, FULL)
     assert 3.0 < log.duration_s < 4.2
-    _near(log.pos_w[:-1], made.fly(log.time_s[:-1]).pos, 1e-5)
+    _near(log.pos_w[:-1], known_flight.fly(log.time_s[:-1]).pos, 1e-5)
     assert "no known event" in _text(findings, "file")
 
 
 def test_mcap_equals_the_flight(tmp_path):
     log, findings = import_log(made.write_mcap(tmp_path / "log.mcap"), None, FULL)
-    truth = made.fly(log.time_s)
+    truth = known_flight.fly(log.time_s)
     _near(log.pos_w, truth.pos, 1e-6)
     _near(log.vel_w, truth.vel, 1e-6)
     assert _quat_off(log, truth) < 1e-6
@@ -262,7 +263,7 @@ def test_mcap_topics_are_chosen_by_a_map(tmp_path):
     assert "10 Hz" in _text(findings, "position")
     # Rows at twice the rate of the slow poses: every other one has a pose, and that is exact.
     assert np.isnan(log.pos_w[1::2]).all() and np.isfinite(log.rate_b).all()
-    _near(log.pos_w[::2], made.fly(log.time_s[::2]).pos, 1e-6)
+    _near(log.pos_w[::2], known_flight.fly(log.time_s[::2]).pos, 1e-6)
     chosen.write_text('[topics]\nodometry = "/imu"\n')
     with pytest.raises(FlightLogError, match="'/imu' has no nav_msgs/Odometry"):
         import_log(path, None, ImportOptions(map=chosen))
@@ -290,7 +291,7 @@ def test_start_and_end_cut_the_flight(tmp_path):
     path = made.write_usd(tmp_path / "log00")
     log, _ = import_log(path, None, ImportOptions(full_thrust=30.0, start_s=2.0, end_s=5.0))
     assert log.duration_s == pytest.approx(3.0, abs=0.02)
-    _near(log.pos_w, made.fly(log.time_s + 2.0).pos, 1e-5)
+    _near(log.pos_w, known_flight.fly(log.time_s + 2.0).pos, 1e-5)
     with pytest.raises(FlightLogError, match="no time at which"):
         import_log(path, None, ImportOptions(start_s=50.0))
 

@@ -10,17 +10,18 @@ from eval.importers.options import ImportOptions
 from eval.importers.pose import align
 from eval.importers.signals import Signal
 from tests.support import foreign_logs as made
+from tests.support import known_flight
 
 
 def _gyro(span, rate=500.0, bias=0.0, noise=0.0):
-    truth = made.fly(np.arange(span[0], span[1], 1 / rate))
+    truth = known_flight.fly(np.arange(span[0], span[1], 1 / rate))
     rng = np.random.default_rng(2)
     return Signal(truth.time, truth.rate + bias + noise * rng.normal(size=truth.rate.shape))
 
 
 def _poses(span, rate, offset, drift, noise=0.0, turn=None):
     time = np.arange(span[0], span[1], 1 / rate)
-    rot = Rotation.from_matrix(made.fly(time).rot)
+    rot = Rotation.from_matrix(known_flight.fly(time).rot)
     rot = rot if turn is None else rot * turn
     rng = np.random.default_rng(3)
     rot = rot * Rotation.from_rotvec(noise * rng.normal(size=(len(time), 3)))
@@ -79,7 +80,7 @@ def test_the_poses_own_faults_are_put_right(tmp_path):
         rows.append(",".join([f"{float(t) * 1e6:.1f}", x, y, z, qx, qy, qz, qw]))
     log, findings = _import(tmp_path, "\n".join(rows))
     assert {"pose time", "pose attitude"} == {f.subject for f in findings if f.level == "corrected"}
-    truth = made.fly(log.time_s + 1.0003)
+    truth = known_flight.fly(log.time_s + 1.0003)
     np.testing.assert_allclose(log.pos_w, truth.pos, atol=2e-3)
     np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-5)
 
@@ -88,7 +89,7 @@ def test_a_turned_marker_body_is_corrected_only_where_allowed(tmp_path):
     turn = Rotation.from_euler("z", 90, degrees=True)
     made.write_mocap(tmp_path / "pose.csv", span=(1, 11), turn=turn)
     log, findings = _import(tmp_path)
-    truth = made.fly(log.time_s + 1.0)
+    truth = known_flight.fly(log.time_s + 1.0)
     assert "pose axes" in {f.subject for f in findings if f.level == "corrected"}
     np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-5)
     _, findings = _import(tmp_path, fix=False)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from eval.flight_check import FlightLogError
 from eval.importers import import_log
 from eval.importers.options import ImportOptions
-from tests.support import foreign_logs as made
+from tests.support import known_flight
 
 MAP = """
 [frames]
@@ -52,18 +52,18 @@ unit = "mV"
 
 
 def _table():
-    truth = made.fly(np.arange(0, 8, 0.005))
-    body = made.ned(np.einsum("tji,tj->ti", truth.rot, truth.vel))
-    inverse = made.ned_quat(truth) * [1, -1, -1, -1]
-    wanted = made.ned(truth.cmd_rate) * [1, -1, 1]
+    truth = known_flight.fly(np.arange(0, 8, 0.005))
+    body = known_flight.ned(np.einsum("tji,tj->ti", truth.rot, truth.vel))
+    inverse = known_flight.ned_quat(truth) * [1, -1, -1, -1]
+    wanted = known_flight.ned(truth.cmd_rate) * [1, -1, 1]
     stamps = 1_700_000_000_000_000_000 + np.round(truth.time * 1e9).astype(np.int64)
     columns = {"stamp": stamps, "thr": truth.thrust / 0.3, "vbat": truth.voltage * 1e3}
     for names, values in (
-        ("n e d", made.ned(truth.pos) * 1e3),
+        ("n e d", known_flight.ned(truth.pos) * 1e3),
         ("qw qx qy qz", inverse),
         ("u v w", body),
-        ("p q r", np.rad2deg(made.ned(truth.rate))),
-        ("ax ay az", made.ned(truth.acc) / 9.81),
+        ("p q r", np.rad2deg(known_flight.ned(truth.rate))),
+        ("ax ay az", known_flight.ned(truth.acc) / 9.81),
         ("pc qc rc", np.rad2deg(wanted)),
         ("m1 m2 m3 m4", truth.motor * 60 / (2 * np.pi)),
     ):

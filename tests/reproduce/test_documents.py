@@ -135,6 +135,7 @@ def test_seeds_are_trained_once_and_compared(sky, made, tmp_path):
         (["seeds", "--preset", "smal"], "Did you mean 'small'?"),
         (["seeds", "--training-seeds", "1", "1"], "--training-seeds is 1 1"),
         (["seeds", "--policies", "racer", "--trials", "0"], "--trials is 0"),
+        (["seeds", "--jobs", "0"], "--jobs is 0"),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_flown(args, words, sky, tmp_path, capsys):
