@@ -11,5 +11,6 @@ EXPERIMENTS: tuple[str, ...] = (
     "seeds",
     "ablation",
     "schemes",
+    "ideas",
 )
 """Names; NAME lives in suite/reproduce/NAME.py."""

@@ -110,6 +110,8 @@ class LossConfig:
     field_gain: float = 10.0
     """Gradient per step, of the loss before averaging over time and batch, that u_A adds at the
     centre of a 1 m gate to a velocity across it [1/m]; 0 turns the field off."""
+    field_square: bool = False
+    """Whether every gate pulls as the square around its opening would, whatever its shape."""
     field_decay: float = 0.3
     """lambda_A, how slowly u_A falls with distance [1]."""
     gradient_decay: float = 0.916
@@ -155,6 +157,8 @@ class EpisodeConfig:
     """Range of the obstacles' density as a share of the judged families'."""
     bare_share: float = 0.2
     """Share of tracks without obstacles."""
+    gate_corners: int = 4
+    """Corners of the gates' openings: 4 for squares, more for rounder gates of the same width."""
     hairpin_share: float = 0.0
     """Share of tracks with one or two gates that are met nearly from the side and left backwards,
     as at the apexes of the hardest ellipses."""

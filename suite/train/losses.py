@@ -112,12 +112,19 @@ def guidance_term(
         vel_w: (B, 3) [m/s].
     """
     held_pos, held_vel = jax.lax.stop_gradient(pos_w), jax.lax.stop_gradient(vel_w)
-    field = magnetic_field(gates.center_w, gates.rot_w, gates.opening_g, held_pos)
+    wires_g = _square_around(gates.opening_g) if config.field_square else gates.opening_g
+    field = magnetic_field(gates.center_w, gates.rot_w, wires_g, held_pos)
     pull = attractive_field(field, held_vel, config.field_decay)
     unit = (CURRENT * UNIT_FIELD) ** (1 - config.field_decay)
     pull = pull / unit
     pull = pull * jnp.minimum(1.0, MAX_PULL / _norm(pull))[:, None]
     return -config.field_gain * (jax.lax.stop_gradient(pull) * (pos_w - held_pos)).sum(-1)
+
+
+def _square_around(opening_g: jax.Array) -> jax.Array:
+    """Return the square (B, 4, 2) around a regular opening (B, V, 2) whose first side is level."""
+    half = -opening_g[..., :1, 1:]
+    return half * jnp.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 def smoothness_terms(

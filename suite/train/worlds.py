@@ -13,6 +13,7 @@ from suite.train import dynamics, point_mass
 from suite.train.config import TrainConfig
 from tracks.cull import Bounds, bounds
 from tracks.families import MAX_COUNTS, random_track
+from tracks.families.layout import GATE_COUNT
 from tracks.families.random import Mix
 from tracks.scene import Array, Scene, stack
 from tracks.track import Track, first_gates
@@ -125,7 +126,13 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     low, high = difficulty_range(config, iteration)
     tracks, starts = [], []
     rests = rng.uniform(size=batch) < episode.rest_share
-    mix = Mix(episode.sharp_share, episode.density, episode.bare_share, episode.hairpin_share)
+    mix = Mix(
+        episode.sharp_share,
+        episode.density,
+        episode.bare_share,
+        episode.hairpin_share,
+        episode.gate_corners,
+    )
     for rest in rests:
         track = first_gates(random_track(rng.uniform(low, high), rng, mix), episode.gates)
         tracks.append(track)
@@ -153,8 +160,10 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     constants = point_mass.Constants(*(np.asarray(x, np.float32) for x in point))
     if config.quadrotor is not None:
         constants = _quadrotor_constants(config, iteration)
+    more_bars = GATE_COUNT * max(0, episode.gate_corners - 4)
+    most = MAX_COUNTS._replace(boxes=MAX_COUNTS.boxes + more_bars)
     return Worlds(
-        scene=stack([track.scene for track in tracks], MAX_COUNTS),
+        scene=stack([track.scene for track in tracks], most),
         pos_w=pos.astype(np.float32),
         vel_w=vel.astype(np.float32),
         heading_w=np.stack([np.cos(yaw), np.sin(yaw), np.zeros(batch)], -1).astype(np.float32),

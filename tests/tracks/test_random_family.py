@@ -99,6 +99,19 @@ def test_hairpins_are_met_as_steeply_as_the_hardest_ellipses_apexes():
     assert 100 < max(hairpins) <= 110.001 and max(plain) <= 95.001
 
 
+def test_round_gates_are_as_wide_as_the_squares_in_their_place():
+    square, octagon = (
+        random_track(0.6, np.random.default_rng(3), Mix(gate_corners=n)).scene for n in (4, 8)
+    )
+    np.testing.assert_array_equal(square.gates.center_w, octagon.gates.center_w)
+    assert octagon.gates.opening_g.shape == (8, 8, 2)
+    np.testing.assert_allclose(octagon.gates.opening_g.max(1), square.gates.opening_g.max(1))
+    # Bars first; what stands about is the same.
+    np.testing.assert_array_equal(octagon.boxes.center_w[64:], square.boxes.center_w[32:])
+    with pytest.raises(ValueError, match="gates with 2 corners cannot be made, allowed are 3"):
+        random_track(0.6, np.random.default_rng(3), Mix(gate_corners=2))
+
+
 def test_without_hairpins_a_seed_keeps_its_tracks():
     one, other = (random_track(0.6, np.random.default_rng(3), mix) for mix in (Mix(), Mix(0.55)))
     np.testing.assert_array_equal(one.scene.gates.center_w, other.scene.gates.center_w)

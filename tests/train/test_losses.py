@@ -19,7 +19,7 @@ from suite.train.losses import (
 )
 from tracks.clearance import nearest_obstacle
 from tracks.field import attractive_field, magnetic_field
-from tracks.gates import square_gates
+from tracks.gates import round_gates, square_gates
 from tracks.scene import Boxes, Gates, Rods, Scene, Spheres
 
 
@@ -213,6 +213,20 @@ def test_the_field_enters_as_minus_its_vector_with_the_strength_it_says():
     middle = jnp.tile(jnp.asarray(center), (20, 1))
     at = pull_at(config, gates, middle, jnp.tile(jnp.asarray(sideways), (20, 1)))
     np.testing.assert_allclose(at[0], 0.42 * rot[0, :, 0], atol=1e-6)
+
+
+def test_a_round_gate_pulls_as_itself_or_as_the_square_around_it():
+    ones, rng = np.ones(20), np.random.default_rng(8)
+    octagon = round_gates(np.zeros((20, 3)), 0.4 * ones, ones, 0.2 * ones, 0.1 * ones, 8)
+    square = square_gates(np.zeros((20, 3)), 0.4 * ones, ones, 0.2 * ones, 0.1 * ones)
+    octagon, square = (Gates(*(jnp.asarray(x) for x in g)) for g in (octagon, square))
+    pos, vel = (jnp.asarray(rng.normal(0, size, (20, 3))) for size in (1.0, 3.0))
+    own = pull_at(LossConfig(), octagon, pos, vel)
+    borrowed = pull_at(LossConfig(field_square=True), octagon, pos, vel)
+    np.testing.assert_allclose(borrowed, pull_at(LossConfig(), square, pos, vel), rtol=1e-5)
+    assert np.abs(own - borrowed).max() > 0.1
+    unchanged = pull_at(LossConfig(field_square=True), square, pos, vel)
+    np.testing.assert_allclose(unchanged, borrowed, rtol=1e-5)
 
 
 def test_the_field_is_held_near_the_wires_and_carries_no_gradient_itself():

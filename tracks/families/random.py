@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tracks.families.layout import GATE_COUNT, MAX_YAW_NOISE, Layout, furnish, ramp
-from tracks.gates import square_gates
+from tracks.gates import round_gates, square_gates
 from tracks.obstacles import PerStretch, segment_distance, straight_sites
 from tracks.scene import Gates
 
@@ -51,6 +51,8 @@ class Mix(NamedTuple):
     """Probability that a track has no obstacles."""
     hairpin_share: float = 0.0
     """Probability that a track is drawn with one or two hairpins; the crowded ones are redrawn."""
+    gate_corners: int = 4
+    """Corners of the gates' openings: squares, or regular polygons around the same circle."""
 
 
 MIX = Mix()
@@ -65,7 +67,11 @@ def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:
     depth = rng.uniform(0.03, ramp(0.05, 0.08, d), shape)
     height = rng.uniform(1.0, 1.8) + ramp(0.1, 1, d) * rng.random() * rng.uniform(-1, 1, shape)
     height = np.clip(height, np.maximum(0.8, side / 2 + width), 2.2)
-    gates = square_gates(np.column_stack([xy, height]), yaw, side, width, depth)
+    center_w = np.column_stack([xy, height])
+    if mix.gate_corners == 4:
+        gates = square_gates(center_w, yaw, side, width, depth)
+    else:
+        gates = round_gates(center_w, yaw, side, width, depth, mix.gate_corners)
     start_height = max(0.5, height[0] + rng.uniform(-0.3, 0.3))
     start_pos_w = np.array([*start, start_height])
 
