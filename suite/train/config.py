@@ -157,6 +157,12 @@ class EpisodeConfig:
     """Range of the obstacles' density as a share of the judged families'."""
     bare_share: float = 0.2
     """Share of tracks without obstacles."""
+    finish: bool = False
+    """Whether a world leaves the loss as it passes its last gate. If not, it is to fly on beyond,
+    for which the policy learns to be as fast as it can at the last gate, and hits its lower bar."""
+    height_spread: float = 1.0
+    """How far gates' heights lie apart, as a share of the family's own 0 to 1 m; the judged
+    families have about twice that."""
     gate_corners: int = 4
     """Corners of the gates' openings: 4 for squares, more for rounder gates of the same width."""
     hairpin_share: float = 0.0

@@ -252,6 +252,9 @@ def make_rollout(
             terms = losses.Terms(*(term * memory.alive for term in terms))
             alive = memory.alive * (clearance > -weights.crash_depth_m)
             alive = alive * (number + 1 < worlds.stop)
+            target = memory.target + passed
+            if config.episode.finish:
+                alive = alive * (target < worlds.scene.gates.center_w.shape[1])
             record = StepRecord(
                 image=image,
                 terms=terms,
@@ -263,7 +266,6 @@ def make_rollout(
                 alive=memory.alive,
                 noted=None if note is None else note(worlds, before, body, memory.target),
             )
-            target = memory.target + passed
             return memory._replace(body=body, target=target, alive=alive), record
 
         keys = jax.random.split(key, steps)

@@ -132,6 +132,7 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         episode.bare_share,
         episode.hairpin_share,
         episode.gate_corners,
+        episode.height_spread,
     )
     for rest in rests:
         track = first_gates(random_track(rng.uniform(low, high), rng, mix), episode.gates)

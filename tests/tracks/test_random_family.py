@@ -99,6 +99,17 @@ def test_hairpins_are_met_as_steeply_as_the_hardest_ellipses_apexes():
     assert 100 < max(hairpins) <= 110.001 and max(plain) <= 95.001
 
 
+def test_heights_lie_further_apart_where_they_are_to():
+    usual, wide = (
+        random_track(0.6, np.random.default_rng(3), Mix(height_spread=share)).scene.gates.center_w
+        for share in (1.0, 2.0)
+    )
+    np.testing.assert_array_equal(usual[:, :2], wide[:, :2])
+    free = (usual[:, 2] > 0.9) & (wide[:, 2] > 0.9) & (wide[:, 2] < 2.2)
+    assert free.sum() > 3
+    np.testing.assert_allclose(np.diff(wide[free, 2]), 2 * np.diff(usual[free, 2]))
+
+
 def test_round_gates_are_as_wide_as_the_squares_in_their_place():
     square, octagon = (
         random_track(0.6, np.random.default_rng(3), Mix(gate_corners=n)).scene for n in (4, 8)

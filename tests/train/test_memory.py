@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from suite.train.gradient import make_gradient
 from suite.train.update import sample_hidden
@@ -34,6 +35,27 @@ def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
     remembered = worlds._replace(hidden=np.full_like(worlds.hidden, 0.5))
     first = run(params, remembered, KEY, None)[2].hidden[0]
     assert np.abs(np.asarray(first - records.hidden[0])).max() > 0.1
+
+
+@pytest.mark.parametrize("finish", [False, True])
+def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the_finish(finish):
+    config = small_config(steps=4, finish=finish)
+    worlds = boxes_worlds(config)
+    gates, last = worlds.scene.gates, worlds.scene.gates.center_w.shape[1] - 1
+    ahead = gates.rot_w[:, last, :, 0]
+    # 0.2 m before their last gates at 4 m/s, but for one that has the gate before them to pass.
+    worlds = worlds._replace(
+        pos_w=gates.center_w[:, last] - 0.2 * ahead,
+        vel_w=4 * ahead,
+        heading_w=ahead,
+        target=np.array([last, last, last, last - 1]),
+    )
+    records = jax.jit(make_gradient(config))(fresh_params(lively=0.0), worlds, KEY, None)[2]
+    passed = np.asarray(records.passed)
+    assert (passed.sum(0) == [1, 1, 1, 0]).all()
+    after = np.cumsum(passed, 0) - passed > 0
+    assert after.any()
+    assert np.array_equal(np.asarray(records.alive) == 0, after & finish)
 
 
 def test_remembered_states_are_of_steps_that_counted():

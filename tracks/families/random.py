@@ -53,6 +53,8 @@ class Mix(NamedTuple):
     """Probability that a track is drawn with one or two hairpins; the crowded ones are redrawn."""
     gate_corners: int = 4
     """Corners of the gates' openings: squares, or regular polygons around the same circle."""
+    height_spread: float = 1.0
+    """How far the gates' heights lie apart, as a share of what is usual."""
 
 
 MIX = Mix()
@@ -65,7 +67,8 @@ def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:
     side = np.clip(ramp(1.2, 0.85, d) + rng.uniform(-0.1, 0.1, shape), 0.75, 1.3)
     width = rng.uniform(0.13, 0.27, shape)
     depth = rng.uniform(0.03, ramp(0.05, 0.08, d), shape)
-    height = rng.uniform(1.0, 1.8) + ramp(0.1, 1, d) * rng.random() * rng.uniform(-1, 1, shape)
+    middle, reach = rng.uniform(1.0, 1.8), mix.height_spread * ramp(0.1, 1, d) * rng.random()
+    height = middle + reach * rng.uniform(-1, 1, shape)
     height = np.clip(height, np.maximum(0.8, side / 2 + width), 2.2)
     center_w = np.column_stack([xy, height])
     if mix.gate_corners == 4:
