@@ -30,7 +30,7 @@ def swift() -> TrainConfig:
         base,
         spec=replace(base.spec, second_gate=True, gate_axis=True),
         physics=replace(base.physics, drag_up=(0.2, 2.0)),
-        loss=replace(base.loss, pass_first=True, approach_m=1.5, safety_radius_m=0.3),
+        loss=replace(base.loss, progress=1.6, pass_first=True, approach_m=1.5, safety_radius_m=0.3),
         episode=replace(
             base.episode,
             missed_share=0.3,
@@ -38,6 +38,8 @@ def swift() -> TrainConfig:
             bare_share=0.1,
             sharp_share=0.7,
             hairpin_share=0.35,
+            height_spread=2.0,
+            finish=True,
             image_stride=3,
         ),
     )
