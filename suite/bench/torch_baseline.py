@@ -90,7 +90,13 @@ class Baseline:
     """A policy in torch, its optimiser and the loss of a batch of worlds."""
 
     def __init__(self, config: TrainConfig, params: Mapping[str, Any]) -> None:
-        """Take over the parameters of `policies.network`."""
+        """Take over the parameters of `policies.network`.
+
+        Raises:
+            ValueError: for `loss.field_square`, which it does not have.
+        """
+        if config.loss.field_square:
+            raise ValueError("loss.field_square is True, allowed for the torch baseline is False")
         self.config = config
         self.network = torch_twin(params, config.spec).requires_grad_(True)
         rate, decay = config.optimizer.rate, config.optimizer.weight_decay
@@ -146,6 +152,8 @@ class Baseline:
             total = total + (loss * alive).mean()
             alive = alive * (clearance > -config.loss.crash_depth_m) * (number + 1 < worlds.stop)
             target = target + passed
+            if config.episode.finish:
+                alive = alive * (target < worlds.scene.gates.center_w.shape[1])
         return total / config.episode.steps
 
     def target_gate(self, gates: Gates, target: Tensor, ahead: int = 0) -> tuple[Gates, Tensor]:

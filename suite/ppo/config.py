@@ -28,7 +28,8 @@ class PpoConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     """beta_2, r_q and the points of a step's path, for the reward; nothing else of it is read."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
-    """Worlds and horizon; `stop_from` is not read, since the value of what follows is learned."""
+    """Worlds and horizon; `stop_from` and `finish` are not read, since the value of what follows is
+    learned."""
     seed: int = 0
     """Seed of the parameters, the tracks, the randomisation and the exploration."""
     iterations: int = 200

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.console import Console
-from suite.reproduce.recipes import FourGates, check_sizes, four_gate_recipe
+from suite.reproduce.recipes import FourGates, asked_rows, check_sizes, four_gate_recipe
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -102,8 +102,6 @@ def settings(config: Config) -> list[Setting]:
     Raises:
         ValueError: for a preset, a change or a row that does not exist.
     """
-    from tracks.names import unknown_name
-
     base = four_gate_recipe(config)
 
     def row(key: str, words: str, weight: float, **changes: float) -> Setting:
@@ -124,11 +122,7 @@ def settings(config: Config) -> list[Setting]:
         row("normalised", "without, L_p^norm", w, progress=0.0, progress_norm=w, **bare)
         for w in NORMALISED
     ]
-    names = [row.key for row in rows]
-    for name in config.only:
-        if name not in names:
-            raise unknown_name("setting", name, names)
-    return [row for row in rows if not config.only or row.key in config.only]
+    return asked_rows(rows, config.only, "setting")
 
 
 def train_and_measure(
@@ -145,12 +139,9 @@ def train_and_measure(
         cache: folder of all runs.
         trials: how many, the seed of their worlds, and the seconds of each.
     """
-    import jax.numpy as jnp
-
-    from policies.policy_file import load_policy_checkpoint
     from suite.errors import WorkFailed
     from suite.reproduce.trainings import commit_of, folder_of, trained
-    from suite.reproduce.validation import make_validation
+    from suite.reproduce.validation import make_validation, stored_params
     from suite.train import curve
 
     key, config = run
@@ -165,9 +156,7 @@ def train_and_measure(
     if diverged:
         console.note(f"{key}, seed {config.seed}: {diverged}")
         return about
-    stored = load_policy_checkpoint(folder / "policy").params
-    params = {name: jnp.asarray(array) for name, array in stored.items()}
-    measured = make_validation(config, *trials)(params)
+    measured = make_validation(config, *trials)(stored_params(folder / "policy"))
     console.note(
         f"{key}, seed {config.seed}: success cross {measured['success_cross']:.0%}, "
         f"success rate {measured['success_rate']:.0%}, v_max {measured['v_max']:.1f} m/s"

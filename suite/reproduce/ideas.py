@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.choices import at_least, parse_levels
 from suite.console import Console
+from suite.reproduce.schemes import PROJECTION, PROJECTION_DECAY
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from suite.reproduce.document import Place
     from suite.train.config import TrainConfig
 
@@ -16,13 +19,11 @@ RECIPE = "recipe"
 """The key of the row that all others are compared with."""
 ROUND_CORNERS = 8
 """Of the gates in the comparison of fields."""
-PROJECTION = 3.0
-"""lambda_proj in the field's place."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Train a recipe and variants of it that differ in one thing each, and judge them in pairs.
+    """Train a recipe and variants of it with one change each, and judge them in pairs.
 
     Round gates, which no judged track has, are flown in the training's own dynamics.
     """
@@ -34,7 +35,7 @@ class Config:
     iterations: int | None = None
     """Gradient steps, instead of the preset's."""
     training_seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds that every row is trained from."""
+    """Seeds that every row is trained from; less than three tell nothing."""
     difficulty: str = "0,3,6"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: int = 10
@@ -44,7 +45,9 @@ class Config:
     round_trials: int = 300
     """Unseen worlds with round gates that each of their trainings flies."""
     round_seed: int = 1000
-    """Of those worlds."""
+    """Of those worlds; none of the training seeds."""
+    round_seconds: float = 20.0
+    """Of a trial there, from standing start."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     only: tuple[str, ...] = ()
@@ -65,13 +68,29 @@ class Idea(NamedTuple):
     recipe: TrainConfig
     """With the changes made, and the seed left as it is."""
 
+    @property
+    def round(self) -> bool:
+        """Whether it is about round gates, which the judge does not have."""
+        return self.recipe.episode.gate_corners != 4
+
+
+class Made(NamedTuple):
+    """A training of a row."""
+
+    policy: str
+    """Its checkpoint's folder."""
+    seconds: float
+    """Spent on gradient steps after those that compile [s]."""
+    commit: str
+    """That trained it."""
+
 
 def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     """Train and fly what is missing and write ideas.md.
 
     Raises:
         ValueError: for anything that cannot be used, before the first training.
-        WorkFailed: where a training diverges.
+        WorkFailed: where a training diverges; --only leaves its row out.
     """
     import functools
 
@@ -80,108 +99,97 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     from suite.reproduce.document import write_document
     from suite.reproduce.flights import Flier, Order, flown
     from suite.reproduce.ideas_tables import ideas_report
-    from suite.reproduce.recipes import check_seeds
+    from suite.reproduce.recipes import check_seeds, check_unseen
     from suite.reproduce.side_by_side import all_done, check_jobs
-    from suite.reproduce.trainings import trained_policy
     from tracks.families import JUDGED
 
     seeds = config.training_seeds
     check_seeds(seeds)
+    check_unseen("--round-seed", config.round_seed, seeds)
     check_jobs(config.jobs)
     at_least("--trials", config.trials, 1)
     at_least("--round-trials", config.round_trials, 1)
+    at_least("--round-seconds", config.round_seconds, 0.5)
     at_least("--seed", config.seed, 0)
-    vehicle = load_vehicle(config.vehicle)
-    chosen, rounds = judged_ideas(config), round_ideas(config)
+    vehicle, chosen = load_vehicle(config.vehicle), ideas(config)
     trials = trial_list(JUDGED, parse_levels(config.difficulty), config.trials, config.seed)
-    runs = [replace(idea.recipe, seed=seed) for idea in (*chosen, *rounds) for seed in seeds]
-    do = functools.partial(trained_policy, cache=place.cache)
-    policies = all_done(do, runs, config.jobs, console, "training")
-    orders = [Order(Flier(path, vehicle), trials) for path in policies[: len(chosen) * len(seeds)]]
-    rows = iter(flown(orders, place.cache, console, f"judging {len(orders)} trainings"))
-    judged = {idea.key: [next(rows) for _ in seeds] for idea in chosen}
-    flights = iter(
-        _flown_round(path, recipe, config)
-        for path, recipe in zip(policies[len(orders) :], runs[len(orders) :], strict=True)
-    )
-    measured = {idea.key: [next(flights) for _ in seeds] for idea in rounds}
-    report, numbers = ideas_report(config, chosen, judged, rounds, measured, policies)
+    runs = {(idea.key, s): replace(idea.recipe, seed=s) for s in seeds for idea in chosen}
+    console.note(f"{len(runs)} trainings, less those that are there")
+    do = functools.partial(_make, cache=place.cache)
+    found = all_done(do, list(runs.values()), config.jobs, console, "training")
+    made = dict(zip(runs, found, strict=True))
+    wanted = [(idea.key, seed) for idea in chosen if not idea.round for seed in seeds]
+    orders = [Order(Flier(made[which].policy, vehicle), trials) for which in wanted]
+    flights = flown(orders, place.cache, console, f"judging {len(orders)} trainings")
+    judged = dict(zip(wanted, flights, strict=True))
+    measured = {
+        idea.key: _flown_round(idea, [made[idea.key, seed].policy for seed in seeds], config)
+        for idea in chosen
+        if idea.round
+    }
+    report, numbers = ideas_report(config, chosen, made, judged, measured)
     return write_document(place, "ideas", report, numbers, config.seed, console)
 
 
-def judged_ideas(config: Config) -> list[Idea]:
-    """Return the recipe and the changes of it that are asked for.
+def ideas(config: Config) -> list[Idea]:
+    """Return the recipe and the changes of it that are asked for; what changes nothing is left out.
 
     Raises:
         ValueError: for a preset, a change or a row that does not exist.
     """
-    from tracks.names import unknown_name
+    from suite.reproduce.recipes import asked_recipe, asked_rows
+    from suite.train.overrides import override
 
-    base = _base(config)
+    base = asked_recipe(config.preset, config.set, config.iterations)
     longer = (
         f"episode.steps={2 * base.episode.steps}",
         f"episode.batch={max(1, base.episode.batch // 2)}",
     )
     fading = f"loss.gradient_decay={2 * base.loss.gradient_decay:g}"
+    scalar = f"loss.projection={PROJECTION:g}", f"loss.projection_decay={PROJECTION_DECAY:g}"
+    corners = f"episode.gate_corners={ROUND_CORNERS}"
     rows = {
         "second gate": ("the gate after the next is observed", ("spec.second_gate=True",)),
         "gate axis": ("the next gate's direction is observed", ("spec.gate_axis=True",)),
         "pass first": ("progress looks ahead at a gate", ("loss.pass_first=True",)),
+        "finish": ("a world is done at its last gate", ("episode.finish=True",)),
+        "heights": ("gates further up and down", ("episode.height_spread=2.0",)),
         "curriculum": ("difficulty grows over the first half", ("episode.easy_until=0.5",)),
         "one check": ("collision check at a step's end alone", ("loss.path_samples=1",)),
         "longer": ("twice the horizon, half the worlds", longer),
         "longer, truncated": ("and gradients that fade twice as fast", (*longer, fading)),
-        "L_proj": (
-            "the scalar substitute in the field's place",
-            ("loss.field_gain=0", f"loss.projection={PROJECTION:g}"),
-        ),
-        "field and L_proj": ("both", (f"loss.projection={PROJECTION:g}",)),
-    }
-    for name in config.only:
-        if name not in rows:
-            raise unknown_name("row", name, rows)
-    kept = [key for key in rows if not config.only or key in config.only]
-    first = Idea(RECIPE, "nothing changed", (), base)
-    return [first, *(_idea(base, key, *rows[key]) for key in kept)]
-
-
-def round_ideas(config: Config) -> list[Idea]:
-    """Return the two rows with round gates; none where only others are asked for."""
-    if config.only:
-        return []
-    base, corners = _base(config), f"episode.gate_corners={ROUND_CORNERS}"
-    return [
-        _idea(base, "round", "the field of the round gate", (corners,)),
-        _idea(
-            base,
-            "round, square field",
-            "the field of the square around it",
+        "L_proj": ("the scalar substitute in the field's place", ("loss.field_gain=0", *scalar)),
+        "field and L_proj": ("both", scalar),
+        "round": ("round gates with their own field", (corners,)),
+        "round, square field": (
+            "round gates with the field of the square around them",
             (corners, "loss.field_square=True"),
         ),
+    }
+    made = [
+        Idea(k, words, changes, override(base, changes)) for k, (words, changes) in rows.items()
+    ]
+    kept = asked_rows(made, config.only, "row")
+    return [
+        Idea(RECIPE, "nothing changed", (), base),
+        *(idea for idea in kept if idea.recipe != base),
     ]
 
 
-def _base(config: Config) -> TrainConfig:
-    from suite.reproduce.recipes import asked_recipe
+def _make(config: TrainConfig, console: Console, cache: Path) -> Made:
+    from suite.reproduce.trainings import commit_of, trained
+    from suite.train import curve
 
-    return asked_recipe(config.preset, config.set, config.iterations)
-
-
-def _idea(base: TrainConfig, key: str, words: str, changes: tuple[str, ...]) -> Idea:
-    from suite.train.overrides import override
-
-    return Idea(key, words, changes, override(base, changes))
+    policy = trained(config, cache, console).policy
+    seconds = sum(row["seconds"] for row in curve.read(policy.parent) if not row["cold"])
+    return Made(str(policy), seconds, commit_of(policy))
 
 
-def _flown_round(path: str, recipe: TrainConfig, config: Config) -> dict[str, float]:
-    """Return what the policy at `path` does in unseen worlds with round gates."""
-    from pathlib import Path
+def _flown_round(idea: Idea, policies: list[str], config: Config) -> list[dict[str, float]]:
+    """Return what each policy does in unseen worlds with round gates, the same for all."""
+    from suite.reproduce.validation import make_validation, stored_params
 
-    import jax.numpy as jnp
-
-    from policies.policy_file import load_policy_checkpoint
-    from suite.reproduce.validation import make_validation
-
-    stored = load_policy_checkpoint(Path(path)).params
-    params = {name: jnp.asarray(array) for name, array in stored.items()}
-    return make_validation(recipe, config.round_trials, config.round_seed)(params)
+    measure = make_validation(
+        idea.recipe, config.round_trials, config.round_seed, config.round_seconds
+    )
+    return [measure(stored_params(path)) for path in policies]

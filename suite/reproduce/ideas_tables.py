@@ -3,34 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from eval.stats import Interval, bootstrap_mean
+from eval.stats import Interval
 from eval.trial import TrialResult
 from suite.charts import LINES, png, titled
+from suite.console import duration
 from suite.report import Cell, Grid, Picture, Report, Section
 from suite.reproduce.robust_tables import points_cell
-from suite.reproduce.trainings import commit_of
 
 if TYPE_CHECKING:
-    from suite.reproduce.ideas import Config, Idea
+    from suite.reproduce.ideas import Config, Idea, Made
 
+DRAWS = 4000
+"""Of the bootstrap."""
+FEWEST_SEEDS = 3
+"""With less, no row is called a gain or a loss."""
 MEANING = (
     "Success: over the trials of all training seeds, with the least and the most of a seed. "
-    "Difference: to the recipe on the same trials and training seeds, in points, with the 95 % "
-    "bootstrap interval over trials, each drawn with all its trainings; it holds for these "
-    "trainings, and their differences, seed by seed, say how far others may be off. A change "
-    "counts as a gain or a loss where the interval leaves zero out and every seed agrees.",
-    "v_max: the median over trials of each one's largest speed before any contact.",
+    "Difference: to the recipe on the same trials and training seeds, in points, with a 95 % "
+    "bootstrap interval that draws training seeds and trials anew. A gain or a loss is where it "
+    "leaves zero out and every seed agrees. Seeds are few, and all rows are compared with the same "
+    "trainings of the recipe: where a change does nothing, three seeds agree in sign one time in "
+    "four, and of many rows one may stand out by chance.",
+    "v_max: the median over trials of each one's largest speed before any contact. Training: the "
+    "median time of a row's trainings, without compilation.",
 )
 ROUND = (
-    "Flown in the training's own dynamics from standing start, with the same unseen tracks of "
-    "eight round gates for both. Success cross: all gates without a collision; success rate: no "
-    "collision, whatever gates were passed. Mean over training seeds, least and most."
+    "In the training's own dynamics, from standing start. Success cross: all gates without a "
+    "collision; success rate: no collision, whatever gates were passed. Mean over training seeds, "
+    "least and most. Images show the nearest 24 bars and plates, and collisions are looked for "
+    "among the nearest 8: three gates and one, with eight bars each. It is the same for both."
 )
 
 
@@ -50,82 +56,116 @@ class Compared(NamedTuple):
     """Share of trials."""
     timeouts: float
     """Share of trials."""
+    seconds: float
+    """Median training time [s]."""
 
     @property
     def verdict(self) -> str:
         """`gain`, `loss` or `unclear`."""
-        low, high = self.difference.low, self.difference.high
-        if low > 0 and min(self.of_seeds) > 0:
+        if len(self.of_seeds) < FEWEST_SEEDS:
+            return "unclear"
+        if self.difference.low > 0 and min(self.of_seeds) > 0:
             return "gain"
-        return "loss" if high < 0 and max(self.of_seeds) < 0 else "unclear"
+        worse = self.difference.high < 0 and max(self.of_seeds) < 0
+        return "loss" if worse else "unclear"
 
 
-def compared(key: str, mine: Sequence[Sequence[TrialResult]], base: np.ndarray) -> Compared:
+def over_seeds(gap: np.ndarray) -> Interval:
+    """Return the mean of `gap` (seeds, trials) with its interval over both."""
+    rng = np.random.default_rng(0)
+    seeds, trials = gap.shape
+    drawn = [
+        gap[rng.integers(0, seeds, seeds)][:, rng.integers(0, trials, trials)].mean()
+        for _ in range(DRAWS)
+    ]
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return Interval(float(gap.mean()), float(low), float(high))
+
+
+def compared(
+    key: str, mine: Sequence[Sequence[TrialResult]], base: np.ndarray, seconds: float
+) -> Compared:
     """Return a row.
 
     Args:
         key: its name.
         mine: results of each training seed, the same trials in the same order.
         base: which of them the recipe's trainings won, (seeds, trials) bool.
+        seconds: median training time.
     """
-    won = np.array([[row.success for row in rows] for rows in mine])
+    won = _won(mine)
     gap = won.astype(float) - base
     every = [row for rows in mine for row in rows]
     return Compared(
         key=key,
         success=won.mean(axis=1).tolist(),
-        difference=bootstrap_mean(gap.mean(axis=0)),
+        difference=over_seeds(gap),
         of_seeds=gap.mean(axis=1).tolist(),
         v_max=float(np.median([row.v_max for row in every])),
         collisions=float(np.mean([row.ended_by == "collision" for row in every])),
         timeouts=float(np.mean([row.ended_by == "timeout" for row in every])),
+        seconds=seconds,
     )
+
+
+def _won(results: Sequence[Sequence[TrialResult]]) -> np.ndarray:
+    return np.array([[row.success for row in rows] for rows in results])
 
 
 def ideas_report(
     config: Config,
     chosen: Sequence[Idea],
-    judged: Mapping[str, Sequence[Sequence[TrialResult]]],
-    rounds: Sequence[Idea],
+    made: Mapping[tuple[str, int], Made],
+    judged: Mapping[tuple[str, int], Sequence[TrialResult]],
     measured: Mapping[str, Sequence[Mapping[str, float]]],
-    policies: Sequence[str],
 ) -> tuple[Report, dict[str, Any]]:
     """Return the document and the numbers that go beside it.
 
     Args:
         config: what was asked.
-        chosen: the rows that were judged, the recipe first.
-        judged: results of each row's training seeds.
-        rounds: the rows with round gates.
-        measured: their numbers, of each training seed.
-        policies: every training's policy.
+        chosen: all rows, the recipe first.
+        made: every training by its row and seed.
+        judged: results of those that the judge flew.
+        measured: numbers of the rows with round gates, of each training seed.
     """
-    first, recipe = next(iter(judged.values())), chosen[0].recipe
-    base = np.array([[row.success for row in rows] for rows in first])
-    rows = [compared(key, mine, base) for key, mine in judged.items()]
-    last = config.seed + config.trials - 1
+    seeds, first = config.training_seeds, chosen[0]
+    base = _won([judged[first.key, seed] for seed in seeds])
+    flown = [idea for idea in chosen if not idea.round]
+    rows = [
+        compared(
+            idea.key,
+            [judged[idea.key, seed] for seed in seeds],
+            base,
+            float(np.median([made[idea.key, seed].seconds for seed in seeds])),
+        )
+        for idea in flown
+    ]
+    caption = "Difference in success to the recipe; dots: training seeds."
     sections = [
         Section(
             "One change at a time",
-            [
-                _grid(chosen, rows),
-                *MEANING,
-                Picture(_chart(rows), "Difference in success to the recipe; dots: training seeds."),
-            ],
+            [_grid(flown, rows), *MEANING, Picture(_chart(rows), caption)],
         )
     ]
+    rounds = [idea for idea in chosen if idea.round]
     if rounds:
         sections.append(Section("Round gates", [_round_grid(rounds, measured), ROUND]))
+    optimizer, episode = first.recipe.optimizer, first.recipe.episode
+    last = config.seed + config.trials - 1
     report = Report(
         title="What could be better than the recipe",
-        lead=lead(rows),
+        lead=" ".join([lead(rows), *(_round_words(idea, measured) for idea in rounds)]),
         facts={
             "recipe": f"{config.preset} {' '.join(config.set)}".strip()
-            + f", {recipe.optimizer.iterations} gradient steps",
-            "training seeds": " ".join(map(str, config.training_seeds)),
-            "trained at commit": ", ".join(sorted({commit_of(Path(path)) for path in policies})),
+            + f", {optimizer.iterations} gradient steps of {episode.batch} worlds x "
+            f"{episode.steps} steps",
+            "training seeds": " ".join(map(str, seeds)),
+            "trained at commit": ", ".join(sorted({run.commit for run in made.values()})),
             "trials": f"three tracks, levels {config.difficulty}, seeds {config.seed} to {last}: "
             f"{base.shape[1]} a training",
+            "worlds with round gates": f"{config.round_trials}, seed {config.round_seed}, "
+            f"{config.round_seconds:g} s each",
+            "trainings at once": f"{config.jobs}, each on its own share of the cores",
             "vehicle": config.vehicle,
         },
         sections=sections,
@@ -135,7 +175,7 @@ def ideas_report(
 
 def lead(rows: Sequence[Compared]) -> str:
     """Return in sentences which changes are gains and which losses."""
-    said = []
+    said = [f"Of the recipe's trials {100 * float(np.mean(rows[0].success)):.0f} % succeed."]
     for verdict, words in (("gain", "More succeed with"), ("loss", "Fewer succeed with")):
         named = [
             f"{row.key} ({points_cell(row.difference).text})"
@@ -147,29 +187,32 @@ def lead(rows: Sequence[Compared]) -> str:
     unclear = [row.key for row in rows[1:] if row.verdict == "unclear"]
     if unclear:
         said.append(f"These trainings do not tell for {', '.join(unclear)}.")
-    rate = 100 * float(np.mean(rows[0].success))
-    return f"Of the recipe's trials {rate:.0f} % succeed. " + " ".join(said)
+    return " ".join(said)
+
+
+def _round_words(idea: Idea, measured: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
+    cross = _range([100 * numbers["success_cross"] for numbers in measured[idea.key]], 0)
+    return f"{idea.words[0].upper() + idea.words[1:]}: {cross} % of the tracks are crossed."
 
 
 def _grid(chosen: Sequence[Idea], rows: Sequence[Compared]) -> Grid:
     headers = ["row", "what", "changes", "success [%]", "difference [points]", "by seed",
-               "v_max [m/s]", "collisions [%]", "timeouts [%]", ""]  # fmt: skip
+               "v_max [m/s]", "collisions [%]", "timeouts [%]", "training", ""]  # fmt: skip
     cells = []
     for number, (idea, row) in enumerate(zip(chosen, rows, strict=True)):
-        low, high = 100 * min(row.success), 100 * max(row.success)
-        mean = 100 * float(np.mean(row.success))
-        seeds = " ".join(f"{100 * gap:+.0f}" for gap in row.of_seeds)
+        seeds = " ".join(f"{round(100 * gap) + 0:+d}" for gap in row.of_seeds)
         cells.append(
             [
                 Cell(idea.key),
                 Cell(idea.words),
                 Cell(" ".join(f"`{change}`" for change in idea.changes) or "-"),
-                Cell(f"{mean:.0f} [{low:.0f}, {high:.0f}]"),
+                Cell(_range([100 * rate for rate in row.success], 0)),
                 points_cell(row.difference) if number else Cell("-"),
                 Cell(seeds if number else "-"),
                 Cell(f"{row.v_max:.2f}"),
                 Cell(f"{100 * row.collisions:.0f}"),
                 Cell(f"{100 * row.timeouts:.0f}"),
+                Cell(duration(row.seconds)),
                 Cell(row.verdict if number else ""),
             ]
         )
@@ -183,15 +226,18 @@ def _round_grid(
     headers = ["row", "what", "success cross [%]", "success rate [%]", "v_max [m/s]", "gates"]
     cells = []
     for idea in rounds:
-        line = [idea.key, idea.words]
-        for name, scale in names.items():
-            values = [scale * numbers[name] for numbers in measured[idea.key]]
-            digits = 0 if scale > 1 else 2
-            line.append(
-                f"{np.mean(values):.{digits}f} [{min(values):.{digits}f}, {max(values):.{digits}f}]"
-            )
-        cells.append([Cell(text) for text in line])
+        columns = [
+            _range([scale * numbers[name] for numbers in measured[idea.key]], 0 if scale > 1 else 2)
+            for name, scale in names.items()
+        ]
+        cells.append([Cell(text) for text in (idea.key, idea.words, *columns)])
     return Grid("", headers, cells)
+
+
+def _range(values: Sequence[float], digits: int) -> str:
+    """Return the mean with the least and the most."""
+    mean, least, most = float(np.mean(values)), min(values), max(values)
+    return f"{mean:.{digits}f} [{least:.{digits}f}, {most:.{digits}f}]"
 
 
 def _chart(rows: Sequence[Compared]) -> bytes:
@@ -204,7 +250,7 @@ def _chart(rows: Sequence[Compared]) -> bytes:
         axes.plot([low, high], [at, at], "-", lw=4, color=LINES[0], alpha=0.35)
         axes.plot(value, at, "|", ms=12, mew=2, color=LINES[0])
         axes.plot(100 * np.array(row.of_seeds), [at] * len(row.of_seeds), "o", ms=4, color=LINES[0])
-    titled(axes, "Success, points more than the recipe (bar: 95 % interval over trials)")
+    titled(axes, "Success, points more than the recipe (bar: 95 % interval)")
     axes.set_yticks(range(len(shown)), [row.key for row in shown])
     axes.invert_yaxis()
     return png(figure)

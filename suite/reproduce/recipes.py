@@ -4,12 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from suite.choices import at_least
 
 if TYPE_CHECKING:
     from suite.train.config import TrainConfig
+
+
+class Keyed(Protocol):
+    """A row of an experiment."""
+
+    @property
+    def key(self) -> str:
+        """Its name."""
+        ...
+
+
+Row = TypeVar("Row", bound=Keyed)
 
 GATES = 4
 """Of the paper's tracks in its ablation and its comparison of schemes."""
@@ -66,6 +78,35 @@ def check_seeds(seeds: Sequence[int]) -> None:
         at_least("--training-seeds", seed, 0)
 
 
+def check_unseen(option: str, seed: int, training_seeds: Sequence[int]) -> None:
+    """Refuse a seed of worlds that a training has seen.
+
+    Raises:
+        ValueError: naming the option and what is allowed.
+    """
+    at_least(option, seed, 0)
+    if seed in training_seeds:
+        raise ValueError(
+            f"{option} {seed} is one of --training-seeds, whose policies would have seen the "
+            "worlds they are measured on; give another"
+        )
+
+
+def asked_rows(rows: Sequence[Row], only: Sequence[str], what: str) -> list[Row]:
+    """Return the rows whose keys are in `only`, all where it is empty.
+
+    Raises:
+        ValueError: for a key that no row has; `what` says what a row is.
+    """
+    from tracks.names import unknown_name
+
+    names = [row.key for row in rows]
+    for name in only:
+        if name not in names:
+            raise unknown_name(what, name, names)
+    return [row for row in rows if not only or row.key in only]
+
+
 def four_gate_recipe(config: FourGates) -> TrainConfig:
     """Return the recipe that `config` asks for on tracks of four gates.
 
@@ -83,13 +124,8 @@ def check_sizes(config: FourGates) -> None:
         ValueError: naming the option and what is allowed.
     """
     check_seeds(config.training_seeds)
-    at_least("--seed", config.seed, 0)
+    check_unseen("--seed", config.seed, config.training_seeds)
     at_least("--trials", config.trials, 1)
     at_least("--seconds", config.seconds, 0.5)
     at_least("--iterations", config.iterations, 1)
     at_least("--worlds", config.worlds, 1)
-    if config.seed in config.training_seeds:
-        raise ValueError(
-            f"--seed {config.seed} is one of --training-seeds, whose policies would have seen the "
-            "worlds they are measured on; give another"
-        )

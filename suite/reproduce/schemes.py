@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.choices import at_least
 from suite.console import Console
-from suite.reproduce.recipes import FourGates, check_sizes, four_gate_recipe
+from suite.reproduce.recipes import FourGates, asked_rows, check_sizes, four_gate_recipe
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -120,7 +120,6 @@ def schemes(config: Config) -> list[Scheme]:
             cannot share among its minibatches.
     """
     from suite.ppo.config import ppo_like
-    from tracks.names import unknown_name
 
     base = four_gate_recipe(config)
     loss = replace(base.loss, progress=config.progress, progress_norm=0.0, projection=0.0)
@@ -132,10 +131,7 @@ def schemes(config: Config) -> list[Scheme]:
         Scheme("ours", "ours", ours),
         Scheme("projection", "ours without the field, with L_proj", replace(base, loss=scalar)),
     ]
-    for name in config.only:
-        if name not in [row.key for row in rows]:
-            raise unknown_name("scheme", name, [row.key for row in rows])
-    rows = [row for row in rows if not config.only or row.key in config.only]
+    rows = asked_rows(rows, config.only, "scheme")
     if ppo.episode.batch % ppo.minibatches and "ppo" in [row.key for row in rows]:
         raise ValueError(
             f"--worlds is {ppo.episode.batch}, allowed with PPO are multiples of its "

@@ -40,7 +40,7 @@ class Config:
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     jobs: int = 1
-    """Trainings at once, each in a process with its own share of the cores."""
+    """Without --policies: trainings at once, each in a process with its own share of the cores."""
 
 
 def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
@@ -48,6 +48,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
 
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
+        WorkFailed: where a training diverges.
     """
     from eval.table import summarise
     from eval.vehicle_file import load_vehicle

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from policies import network
+from policies.policy_file import load_policy_checkpoint
 from suite.train.config import TrainConfig
 from suite.train.rollout import BODY_RADIUS_M, Note, make_rollout
 from suite.train.worlds import Worlds, sample_worlds
@@ -130,6 +132,12 @@ def measured(scores: Scores) -> dict[str, float]:
         "reward": scores.reward.mean(),
     }
     return {name: float(value) for name, value in numbers.items()}
+
+
+def stored_params(policy: Path | str) -> network.Params:
+    """Return the parameters of the checkpoint in the folder `policy`, ready for the device."""
+    stored = load_policy_checkpoint(Path(policy)).params
+    return {name: jnp.asarray(array) for name, array in stored.items()}
 
 
 def make_validation(

@@ -158,11 +158,11 @@ class EpisodeConfig:
     bare_share: float = 0.2
     """Share of tracks without obstacles."""
     finish: bool = False
-    """Whether a world leaves the loss as it passes its last gate. If not, it is to fly on beyond,
-    for which the policy learns to be as fast as it can at the last gate, and hits its lower bar."""
+    """Whether a world leaves the loss as it passes its last gate. If not, it is to fly on to a
+    point 10 m beyond, so that speed is worth more at the last gate than at the others."""
     height_spread: float = 1.0
-    """How far gates' heights lie apart, as a share of the family's own 0 to 1 m; the judged
-    families have about twice that."""
+    """How far gates' heights lie apart before they are held to 0.8 to 2.2 m, as a share of what is
+    usual for a difficulty: with 2 they lie about as far apart as those of circles and ellipses."""
     gate_corners: int = 4
     """Corners of the gates' openings: 4 for squares, more for rounder gates of the same width."""
     hairpin_share: float = 0.0

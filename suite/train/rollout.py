@@ -33,7 +33,8 @@ SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
 NEAR = Counts(boxes=8, cylinders=4, capsules=3, spheres=3)
 """Solids of each kind among which the nearest obstacle is looked for."""
 BEYOND_M = 10.0
-"""After the last gate the target is this far behind it, so that nothing is gained by braking."""
+"""After the last gate the target is this far behind it, so that nothing is gained by braking; with
+`episode.finish` that is for the one step that passes the gate."""
 BODY_RADIUS_M = 0.08
 """Closer than this to a surface counts as a collision in the curves [m]."""
 
@@ -56,7 +57,7 @@ class Memory(NamedTuple):
     delta_hidden: jax.Array
     """(B, 32) of the Delta Action network."""
     alive: jax.Array
-    """(B,) 1 while the world counts in the loss: until it crashes or stops, then 0."""
+    """(B,) 1 while the world counts in the loss: until it crashes, stops or finishes, then 0."""
 
 
 class StepRecord(NamedTuple):
@@ -65,7 +66,7 @@ class StepRecord(NamedTuple):
     image: jax.Array
     """(B, height, width) encoded, with its noise."""
     terms: losses.Terms
-    """Weighted, zero for worlds that have crashed."""
+    """Weighted, zero for worlds that have left the loss."""
     speed: jax.Array
     """[m/s]."""
     clearance: jax.Array

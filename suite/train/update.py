@@ -69,14 +69,20 @@ def device_mesh(config: TrainConfig) -> Mesh:
 def curve_numbers(
     loss: jax.Array, gradient: network.Params, records: StepRecord
 ) -> dict[str, jax.Array]:
-    """Return the numbers of the curve, scalars each: a row of metrics.jsonl."""
+    """Return the numbers of the curve, scalars each: a row of metrics.jsonl.
+
+    Collisions and speeds are those of steps that count in the loss.
+    """
+    counts = records.alive > 0
+    speed = jnp.where(counts, records.speed, 0.0)
+    hit = counts & (records.clearance < BODY_RADIUS_M)
     numbers = {
         "loss": loss,
         "gradient_norm": jnp.sqrt(sum((leaf * leaf).sum() for leaf in gradient.values())),
         "gates": records.passed.sum(0).mean(),
-        "collided": (records.clearance.min(0) < BODY_RADIUS_M).mean(),
-        "speed": records.speed.mean(),
-        "speed_max": records.speed.max(0).mean(),
+        "collided": hit.any(0).mean(),
+        "speed": speed.sum() / jnp.maximum(counts.sum(), 1),
+        "speed_max": speed.max(0).mean(),
     }
     return numbers | {f"loss_{k}": v.mean() for k, v in records.terms._asdict().items()}
 

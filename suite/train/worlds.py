@@ -12,8 +12,7 @@ import numpy as np
 from suite.train import dynamics, point_mass
 from suite.train.config import TrainConfig
 from tracks.cull import Bounds, bounds
-from tracks.families import MAX_COUNTS, random_track
-from tracks.families.layout import GATE_COUNT
+from tracks.families import max_counts, random_track
 from tracks.families.random import Mix
 from tracks.scene import Array, Scene, stack
 from tracks.track import Track, first_gates
@@ -41,6 +40,19 @@ class Worlds(NamedTuple):
     """(B,) step at which a world leaves the loss."""
     fov_scale: Array
     """(B,) this iteration's field of view as a share of the camera's."""
+
+
+def check_worlds(config: TrainConfig) -> None:
+    """Refuse settings that no world can be made with.
+
+    Raises:
+        ValueError: naming the setting, its value and what is allowed.
+    """
+    corners, spread = config.episode.gate_corners, config.episode.height_spread
+    if corners < 3:
+        raise ValueError(f"episode.gate_corners is {corners}, allowed are 3 and more")
+    if not 0 <= spread < np.inf:
+        raise ValueError(f"episode.height_spread is {spread}, allowed are 0 and more")
 
 
 def difficulty_range(config: TrainConfig, iteration: int) -> tuple[float, float]:
@@ -127,12 +139,12 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     tracks, starts = [], []
     rests = rng.uniform(size=batch) < episode.rest_share
     mix = Mix(
-        episode.sharp_share,
-        episode.density,
-        episode.bare_share,
-        episode.hairpin_share,
-        episode.gate_corners,
-        episode.height_spread,
+        sharp_share=episode.sharp_share,
+        density=episode.density,
+        bare_share=episode.bare_share,
+        hairpin_share=episode.hairpin_share,
+        gate_corners=episode.gate_corners,
+        height_spread=episode.height_spread,
     )
     for rest in rests:
         track = first_gates(random_track(rng.uniform(low, high), rng, mix), episode.gates)
@@ -161,10 +173,8 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     constants = point_mass.Constants(*(np.asarray(x, np.float32) for x in point))
     if config.quadrotor is not None:
         constants = _quadrotor_constants(config, iteration)
-    more_bars = GATE_COUNT * max(0, episode.gate_corners - 4)
-    most = MAX_COUNTS._replace(boxes=MAX_COUNTS.boxes + more_bars)
     return Worlds(
-        scene=stack([track.scene for track in tracks], most),
+        scene=stack([track.scene for track in tracks], max_counts(episode.gate_corners)),
         pos_w=pos.astype(np.float32),
         vel_w=vel.astype(np.float32),
         heading_w=np.stack([np.cos(yaw), np.sin(yaw), np.zeros(batch)], -1).astype(np.float32),

@@ -51,7 +51,7 @@ def outcome(logs, drive="commands"):
 )
 def test_broken_flights_among_sound_ones(sound, breakages):
     rng = np.random.default_rng(0)
-    broken = [breakage(log, rng) for breakage, log in zip(breakages, sound, strict=True)]
+    broken = [breakage(log, rng) for breakage, log in zip(breakages, sound, strict=False)]
     found = outcome([*broken, *sound[1:]])
     assert isinstance(found, dict), found
 

@@ -1,5 +1,6 @@
 """One change of a recipe at a time: the rows, their numbers by hand, and the whole command."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -7,17 +8,18 @@ import numpy as np
 import pytest
 
 from suite.console import Console
-from suite.reproduce import ideas
-from suite.reproduce.ideas import Config, judged_ideas, round_ideas
-from suite.reproduce.ideas_tables import compared, lead
+from suite.reproduce import ideas as module
+from suite.reproduce.ideas import Config, ideas
+from suite.reproduce.ideas_tables import compared, lead, over_seeds
 from suite.reproduce.trainings import trained_policy
 from suite.train.overrides import override
+from suite.train.worlds import sample_worlds
 from tests.reproduce.test_ablation import SMALL
 from tests.support.documents import page, reproduce
 
 
 def test_every_row_is_the_recipe_with_its_changes():
-    rows = judged_ideas(Config()) + round_ideas(Config())
+    rows = ideas(Config())
     base = rows[0].recipe
     assert base.episode.image_stride == 3 and not rows[0].changes
     for row in rows[1:]:
@@ -30,8 +32,14 @@ def test_every_row_is_the_recipe_with_its_changes():
     assert truncated.loss.gradient_decay == pytest.approx(2 * base.loss.gradient_decay)
     assert by_key["L_proj"].loss.field_gain == 0 < by_key["field and L_proj"].loss.field_gain
     assert by_key["round"].episode == by_key["round, square field"].episode
-    assert [row.key for row in judged_ideas(Config(only=("longer",)))] == ["recipe", "longer"]
-    assert not round_ideas(Config(only=("longer",)))
+    assert [row.key for row in rows if row.round] == ["round", "round, square field"]
+    assert [row.key for row in ideas(Config(only=("longer",)))] == ["recipe", "longer"]
+
+
+def test_a_change_that_the_recipe_has_already_is_no_row():
+    keys = {row.key for row in ideas(Config(preset="swift"))}
+    assert not keys & {"second gate", "gate axis", "pass first", "finish", "heights"}
+    assert {"recipe", "curriculum", "L_proj", "round"} < keys
 
 
 def flown(*won) -> list[Any]:
@@ -41,50 +49,83 @@ def flown(*won) -> list[Any]:
 
 
 def test_differences_and_verdicts_by_hand():
-    base = np.array([[1, 0, 0, 0] * 5, [0, 0, 0, 0] * 5], bool)
-    better = compared("a", [flown(*[1, 1, 0, 0] * 5), flown(*[1, 0, 0, 0] * 5)], base)
-    assert better.success == [0.5, 0.25] and better.of_seeds == [0.25, 0.25]
+    base = np.array([[1, 0, 0, 0] * 5, [0, 0, 0, 0] * 5, [0, 0, 0, 0] * 5], bool)
+    quarter, none = [1, 0, 0, 0] * 5, [0] * 20
+    better = compared("a", [flown(*[1, 1, 0, 0] * 5), flown(*quarter), flown(*quarter)], base, 9.0)
+    assert better.success == [0.5, 0.25, 0.25] and better.of_seeds == [0.25, 0.25, 0.25]
     assert better.difference.value == 0.25 and better.difference.low > 0
-    assert better.verdict == "gain" and better.v_max == 4.0
-    # As much over all trials, but one seed is worse.
-    torn = compared("b", [flown(*[1, 1, 1, 1] * 5), flown(*[0] * 20)], base)
-    assert torn.difference.low > 0 and torn.of_seeds == [0.75, 0.0] and torn.verdict == "unclear"
-    worse = compared("c", [flown(*[0] * 20), flown(*[0] * 20)], np.ones((2, 20), bool))
-    assert worse.verdict == "loss" and worse.of_seeds == [-1, -1]
-    same = compared("recipe", [flown(*row) for row in base], base)
+    assert better.verdict == "gain" and better.v_max == 4.0 and better.seconds == 9.0
+    # More over all trials, but not with every seed.
+    torn = compared("b", [flown(*[1] * 20), flown(*none), flown(*none)], base, 9.0)
+    assert torn.difference.value == 0.25 and torn.of_seeds == [0.75, 0.0, 0.0]
+    assert torn.verdict == "unclear"
+    worse = compared("c", [flown(*none)] * 3, np.ones((3, 20), bool), 9.0)
+    assert worse.verdict == "loss" and worse.of_seeds == [-1, -1, -1]
+    assert worse._replace(of_seeds=[-1, -1]).verdict == "unclear", "two seeds tell nothing"
+    same = compared("recipe", [flown(*row) for row in base], base, 9.0)
     said = lead([same, better, torn, worse])
-    assert said.startswith("Of the recipe's trials 12 % succeed. More succeed with a (+25 [")
+    assert said.startswith("Of the recipe's trials 8 % succeed. More succeed with a (+25 [")
     assert "Fewer succeed with c (-100 [-100, -100])." in said and "do not tell for b." in said
+
+
+def test_intervals_are_as_wide_as_seeds_differ():
+    steady, torn = np.full((4, 400), 0.0), np.zeros((4, 400))
+    steady[:, ::2] = torn[::2] = 1.0
+    one, other = over_seeds(steady), over_seeds(torn)
+    assert one.value == other.value == 0.5
+    # Half of 400 trials in every seed: +- 2 sqrt(0.25 / 400); all of every other seed: 0 to 1.
+    assert one.high - one.low == pytest.approx(4 * np.sqrt(0.25 / 400), rel=0.1)
+    assert other.low <= 0.01 and other.high >= 0.99
 
 
 def test_the_rows_are_trained_and_judged_once(sky, made, tmp_path, monkeypatch):
     numbers = {"success_cross": 0.5, "success_rate": 1.0, "v_max": 3.0, "gates": 6.0}
     seen = []
-    monkeypatch.setattr(
-        "suite.reproduce.validation.make_validation",
-        lambda recipe, trials, seed: lambda params: seen.append((recipe, trials, seed)) or numbers,
-    )
+
+    def validation(recipe, *worlds):
+        return lambda params: seen.append((recipe, worlds)) or numbers
+
+    monkeypatch.setattr("suite.reproduce.validation.make_validation", validation)
+    monkeypatch.setattr("suite.train.curve.read", lambda folder: [{"seconds": 7, "cold": False}])
     args = ["ideas", "--trials", "1", "--difficulty", "0", "--training-seeds", "3", "5"]
     assert reproduce(tmp_path, *args) == 0
-    rows = len(judged_ideas(Config()))
-    assert len(made) == (rows + 2) * 2 and {c.seed for c in made} == {3, 5}
-    assert len(sky.flown) == rows * 2 * 3
-    assert [recipe.loss.field_square for recipe, *_ in seen] == [False, False, True, True]
-    assert {(recipe.episode.gate_corners, t, s) for recipe, t, s in seen} == {(8, 300, 1000)}
+    rows = ideas(Config())
+    judged = [row for row in rows if not row.round]
+    assert len(made) == len(rows) * 2 and {c.seed for c in made} == {3, 5}
+    assert len(sky.flown) == len(judged) * 2 * 3
+    assert [recipe.loss.field_square for recipe, _ in seen] == [False, False, True, True]
+    assert {recipe.episode.gate_corners for recipe, _ in seen} == {8}
+    assert {worlds for _, worlds in seen} == {(300, 1000, 20.0)}
     text, found = page(tmp_path, "ideas")
-    assert [row["key"] for row in found["rows"]][:2] == ["recipe", "second gate"]
-    assert "| round | the field of the round gate | 50 [50, 50] | 100 [100, 100] |" in text
-    assert "`loss.path_samples=1`" in text
+    assert [row["key"] for row in found["rows"]] == [row.key for row in judged]
+    assert "| round | round gates with their own field | 50 [50, 50] | 100 [100, 100] |" in text
+    assert "Round gates with their own field: 50 [50, 50] % of the tracks are crossed." in text
+    assert "`loss.path_samples=1`" in text and "| 7.0 s |" in text
     assert reproduce(tmp_path, *args) == 0
-    assert len(made) == (rows + 2) * 2 and len(sky.flown) == rows * 6, "all is there"
+    assert len(made) == len(rows) * 2 and len(sky.flown) == len(judged) * 6, "all is there"
 
 
-def test_round_gates_are_flown_by_the_trainers_own_code(tmp_path):
-    small = Config(set=(*SMALL, "episode.batch=2"), iterations=1, round_trials=2)
-    recipe = round_ideas(small)[0].recipe
-    policy = trained_policy(recipe, Console(), tmp_path)
-    found = ideas._flown_round(policy, recipe, small)
-    assert found["gates"] == 0 and 0 <= found["success_rate"] <= 1 and found["v_max"] > 0
+def test_round_gates_are_flown_by_the_trainers_own_code(tmp_path, monkeypatch):
+    small = Config(
+        set=(*SMALL, "episode.batch=2"), iterations=1, round_trials=2, round_seconds=0.5,
+        only=("round",),
+    )  # fmt: skip
+    _, row = ideas(small)
+    sampled = []
+
+    def watched(config, iteration):
+        sampled.append(sample_worlds(config, iteration))
+        return sampled[-1]
+
+    monkeypatch.setattr("suite.reproduce.validation.sample_worlds", watched)
+    policy = trained_policy(row.recipe, Console(), tmp_path)
+    (found,) = module._flown_round(row, [policy], small)
+    assert set(found) > {"success_cross", "success_rate", "v_max", "gates"}
+    (worlds,) = sampled
+    assert worlds.scene.gates.opening_g.shape == (2, 8, 8, 2)
+    square = replace(row.recipe, episode=replace(row.recipe.episode, gate_corners=4))
+    fewer = sample_worlds(square, 0).scene.boxes.center_w.shape[1]
+    assert worlds.scene.boxes.center_w.shape[1] == fewer + 32
 
 
 @pytest.mark.parametrize(
@@ -93,6 +134,8 @@ def test_round_gates_are_flown_by_the_trainers_own_code(tmp_path):
         (["--only", "second gat"], "Did you mean 'second gate'?"),
         (["--training-seeds", "1", "1"], "--training-seeds is 1 1"),
         (["--round-trials", "0"], "--round-trials is 0"),
+        (["--round-seed", "2"], "--round-seed 2 is one of --training-seeds"),
+        (["--round-seed", "-1"], "--round-seed is -1"),
         (["--jobs", "0"], "--jobs is 0"),
     ],
 )

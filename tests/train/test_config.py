@@ -3,17 +3,20 @@
 from dataclasses import replace
 
 import jax
+import numpy as np
 import pytest
 
 from policies import shipped
 from suite import cli
 from suite.commands.train import Config, resolve
+from suite.console import Console
 from suite.flying import checkpoint_folder
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
 from suite.train.presets import PRESETS, preset
+from suite.train.run import train
 from suite.train.update import device_mesh
-from suite.train.worlds import difficulty_range
+from suite.train.worlds import difficulty_range, sample_worlds
 from tests.support.training import small_config
 
 
@@ -78,6 +81,30 @@ def test_difficulty_grows_from_its_lower_end():
     assert difficulty_range(config, 3) == (0.2, 0.8) == difficulty_range(config, 5)
     at_once = replace(config, episode=replace(config.episode, easy_until=0.0))
     assert difficulty_range(at_once, 0) == (0.2, 0.8)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"gate_corners": 2}, "episode.gate_corners is 2, allowed are 3 and more"),
+        ({"height_spread": -1.0}, "episode.height_spread is -1.0, allowed are 0 and more"),
+        ({"height_spread": float("nan")}, "episode.height_spread is nan"),
+    ],
+)
+def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
+    changes, words, tmp_path
+):
+    with pytest.raises(ValueError, match=words):
+        train(small_config(**changes), tmp_path / "run", Console())
+    assert not list(tmp_path.iterdir())
+
+
+def test_gates_heights_follow_the_setting():
+    usual, wide = (
+        sample_worlds(small_config(batch=16, height_spread=share), 0).scene.gates.center_w[..., 2]
+        for share in (1.0, 2.0)
+    )
+    assert np.ptp(wide, axis=1).mean() > 1.4 * np.ptp(usual, axis=1).mean()
 
 
 def test_devices_that_are_not_there_or_do_not_divide_the_batch():

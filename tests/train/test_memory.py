@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from suite.train.gradient import make_gradient
-from suite.train.update import sample_hidden
+from suite.train.update import curve_numbers, sample_hidden
 from suite.train.worlds import sample_worlds
 from tests.support.training import boxes_worlds, fresh_params, small_config
 
@@ -56,6 +56,23 @@ def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the
     after = np.cumsum(passed, 0) - passed > 0
     assert after.any()
     assert np.array_equal(np.asarray(records.alive) == 0, after & finish)
+
+
+def test_the_curve_is_of_steps_that_count():
+    config = small_config(steps=4)
+    worlds, params = boxes_worlds(config), fresh_params()
+    worlds = worlds._replace(stop=np.array([1, 1, 1, 1]))
+    gradient, loss, records = jax.jit(make_gradient(config))(params, worlds, KEY, None)
+    after = np.arange(4)[:, None] > 0
+    # What comes later would be a collision at 100 m/s.
+    records = records._replace(
+        speed=np.where(after, 100.0, records.speed),
+        clearance=np.where(after, -1.0, records.clearance),
+    )
+    numbers = curve_numbers(loss, gradient, records)
+    first = np.mean(records.speed[0])
+    assert numbers["speed"] == pytest.approx(first) == numbers["speed_max"]
+    assert numbers["collided"] == 0
 
 
 def test_remembered_states_are_of_steps_that_counted():

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tracks.families import circular, ellipse, random, zigzag
-from tracks.families.layout import Layout
+from tracks.families.layout import GATE_COUNT, Layout
 from tracks.names import unknown_name
 from tracks.scene import Counts
 from tracks.track import Track
@@ -24,6 +24,12 @@ LEVELS = range(10)
 MAX_COUNTS = Counts(boxes=70, cylinders=15, capsules=12, spheres=12)
 """Most solids of each kind over all families and levels: 32 frame bars, and 7 stretches with at
 most 3 plates, 3 small solids, 1 pillar and 4 ground objects, whose kinds are dealt out evenly."""
+
+
+def max_counts(gate_corners: int) -> Counts:
+    """Return `MAX_COUNTS` where every gate has so many corners, and so many bars."""
+    bars = GATE_COUNT * (gate_corners - 4)
+    return MAX_COUNTS._replace(boxes=MAX_COUNTS.boxes + bars)
 
 
 def make_track(family: str, level: int, seed: int) -> Track:
