@@ -27,6 +27,11 @@ class Cell(NamedTuple):
     """good, bad, or nothing: whether the number speaks for or against what is judged."""
 
 
+def ranged(mean: float, least: float, most: float, digits: int) -> str:
+    """Return a mean over training seeds as cells show it, with the least and the most of one."""
+    return f"{mean:.{digits}f} [{least:.{digits}f}, {most:.{digits}f}]"
+
+
 @dataclass(frozen=True)
 class Grid:
     """A table."""

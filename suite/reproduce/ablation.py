@@ -140,9 +140,8 @@ def train_and_measure(
         trials: how many, the seed of their worlds, and the seconds of each.
     """
     from suite.errors import WorkFailed
-    from suite.reproduce.trainings import commit_of, folder_of, trained
+    from suite.reproduce.trainings import commit_of, folder_of, trained, warm_seconds
     from suite.reproduce.validation import make_validation, stored_params
-    from suite.train import curve
 
     key, config = run
     diverged = ""
@@ -151,8 +150,8 @@ def train_and_measure(
     except WorkFailed as failure:
         diverged = str(failure)
     folder = folder_of(config, cache)
-    seconds = sum(row["seconds"] for row in curve.read(folder) if not row["cold"])
-    about = Trained(key, config.seed, seconds, commit_of(folder / "policy"), None, diverged)
+    seconds, commit = warm_seconds(folder), commit_of(folder / "policy")
+    about = Trained(key, config.seed, seconds, commit, None, diverged)
     if diverged:
         console.note(f"{key}, seed {config.seed}: {diverged}")
         return about

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from eval.stats import Interval, wilson
 from suite.charts import LINES, png, titled
 from suite.console import duration
-from suite.report import Cell, Grid, Picture, Report, Section
+from suite.report import Cell, Grid, Picture, Report, Section, ranged
 from suite.reproduce.paper import Ablated
 from suite.reproduce.paper import ablation as printed
 
@@ -242,7 +242,7 @@ def _range(row: Row, name: str, scale: float, digits: int) -> str:
     if not row.over:
         return "diverged"
     mean, least, most = (scale * value for value in row.over[name])
-    return f"{mean:.{digits}f} [{least:.{digits}f}, {most:.{digits}f}]"
+    return ranged(mean, least, most, digits)
 
 
 def _pooled(row: Row, name: str) -> str:

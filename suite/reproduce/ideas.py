@@ -177,12 +177,10 @@ def ideas(config: Config) -> list[Idea]:
 
 
 def _make(config: TrainConfig, console: Console, cache: Path) -> Made:
-    from suite.reproduce.trainings import commit_of, trained
-    from suite.train import curve
+    from suite.reproduce.trainings import commit_of, trained, warm_seconds
 
     policy = trained(config, cache, console).policy
-    seconds = sum(row["seconds"] for row in curve.read(policy.parent) if not row["cold"])
-    return Made(str(policy), seconds, commit_of(policy))
+    return Made(str(policy), warm_seconds(policy.parent), commit_of(policy))
 
 
 def _flown_round(idea: Idea, policies: list[str], config: Config) -> list[dict[str, float]]:

@@ -12,7 +12,7 @@ from eval.stats import Interval
 from eval.trial import TrialResult
 from suite.charts import LINES, png, titled
 from suite.console import duration
-from suite.report import Cell, Grid, Picture, Report, Section
+from suite.report import Cell, Grid, Picture, Report, Section, ranged
 from suite.reproduce.robust_tables import points_cell
 
 if TYPE_CHECKING:
@@ -236,8 +236,7 @@ def _round_grid(
 
 def _range(values: Sequence[float], digits: int) -> str:
     """Return the mean with the least and the most."""
-    mean, least, most = float(np.mean(values)), min(values), max(values)
-    return f"{mean:.{digits}f} [{least:.{digits}f}, {most:.{digits}f}]"
+    return ranged(float(np.mean(values)), min(values), max(values), digits)
 
 
 def _chart(rows: Sequence[Compared]) -> bytes:

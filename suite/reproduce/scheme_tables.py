@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from suite.console import duration
-from suite.report import Cell, Grid, Picture, Report, Section
+from suite.report import Cell, Grid, Picture, Report, Section, ranged
 from suite.reproduce.scheme_charts import scheme_chart
 from suite.reproduce.scheme_curves import FIGURE, METRICS, WANTED, Row, Spread, value_at
 
@@ -130,7 +130,7 @@ def _numbers(title: str, rows: Sequence[Row], pick: Callable[[Row, str], Spread]
         line = [row.words]
         for name, (_, scale, digits) in METRICS.items():
             mean, least, most = (scale * value for value in pick(row, name))
-            line.append(f"{mean:.{digits}f} [{least:.{digits}f}, {most:.{digits}f}]")
+            line.append(ranged(mean, least, most, digits))
         cells.append([Cell(text) for text in [*line, f"{row.diverged} of {row.seeds}"]])
     return Grid(f"{title}: mean over seeds [least, most]", headers, cells)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from suite.console import Console
 from suite.reproduce.cache import digest
+from suite.train import curve
 from suite.train.config import TrainConfig
 from suite.train.repeat import Outcome
 from suite.train.run import train
@@ -37,6 +38,11 @@ def trained_policy(config: TrainConfig, console: Console, cache: Path) -> str:
 def folder_of(config: TrainConfig, cache: Path) -> Path:
     """Return the folder of the run of `config`."""
     return cache / "trainings" / digest(config)
+
+
+def warm_seconds(run: Path) -> float:
+    """Return what the folder's run spent on gradient steps, without those that compile [s]."""
+    return sum(row["seconds"] for row in curve.read(run) if not row["cold"])
 
 
 def commit_of(policy: Path) -> str:

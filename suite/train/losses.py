@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from suite.train.config import LossConfig
 from tracks.field import CURRENT, attractive_field, magnetic_field
+from tracks.gates import rectangle
 from tracks.scene import Gates
 
 UNIT_FIELD = 11.313708498984761
@@ -123,8 +124,8 @@ def guidance_term(
 
 def _square_around(opening_g: jax.Array) -> jax.Array:
     """Return the square (B, 4, 2) around a regular opening (B, V, 2) whose first side is level."""
-    half = -opening_g[..., :1, 1:]
-    return half * jnp.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    side = -2.0 * opening_g[..., :1, 1:]
+    return side * rectangle(1.0, 1.0)
 
 
 def smoothness_terms(
