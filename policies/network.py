@@ -34,7 +34,12 @@ def flat_features(spec: PolicySpec) -> int:
 
 
 def init(key: jax.Array, spec: PolicySpec) -> Params:
-    """Return fresh parameters: torch's uniform defaults, the state branch x 0.5, output x 0.01."""
+    """Return fresh parameters: torch's uniform defaults, the state branch x 0.5.
+
+    Zhang et al. 2025 scale the output by 0.01 as well. Then the first gradient steps, which all ask
+    for the same climb, grow what comes before it until the memory saturates, and some seeds take a
+    thousand iterations to come back.
+    """
     hidden = spec.hidden_size
     fan = {
         "conv1.weight": ((2, 2, 1, CHANNELS[0]), 4),
@@ -55,7 +60,6 @@ def init(key: jax.Array, spec: PolicySpec) -> Params:
         for k, (name, (shape, fan_in)) in zip(keys, fan.items(), strict=True)
     }
     params["state.weight"] *= 0.5
-    params["action.weight"] *= 0.01
     return params
 
 

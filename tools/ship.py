@@ -47,14 +47,13 @@ def card(name: str, runs: Sequence[Path], judged: Path | None) -> str:
 CNN-GRU of Su et al. 2026 ({stored.spec.state_size} numbers and a depth image, {size / 1000:.0f}k
 parameters), trained in the point mass on the `random` tracks only; it has seen neither the judged
 families nor the vehicle of the tables. The recipe's numbers were chosen by looking at flights of
-earlier recipes on the judged tracks and vehicle, at other seeds (50,000 on); the recipe was then
-run once, at one training seed.
+earlier recipes on the judged tracks and vehicle, at other seeds (50,000 on).
 
 | made by | seed | commit | iterations | time |
 |---|---|---|---|---|
 {chr(10).join(lines)}
 
-On {machine["processor"]}, {machine["cores"]} cores, no GPU, beside other work.
+On {machine["processor"]}, {machine["cores"]} cores.
 
 ![Gates passed, collisions and speed over the training](curve.png)
 """

@@ -15,7 +15,7 @@ SPEC = PolicySpec(rate_hz=33.0, camera=Camera(pitch_deg=20.0), hidden_size=64)
 
 def lively(spec, seed):
     """Return fresh parameters whose actions are of the size that racing has."""
-    scale = {"action.weight": 2000.0, "state.bias": 5.0}
+    scale = {"action.weight": 20.0, "state.bias": 5.0}
     made = network.init(jax.random.key(seed), spec)
     return {name: np.asarray(value) * scale.get(name, 1.0) for name, value in made.items()}
 

@@ -55,8 +55,8 @@ def doubled(tree):
     )
 
 
-def fresh_params(spec: PolicySpec = SPEC, seed: int = 0, lively: float = 30.0):
-    """Return parameters whose actions are of some m/s^2 instead of the start's near zero."""
+def fresh_params(spec: PolicySpec = SPEC, seed: int = 0, lively: float = 1.0):
+    """Return fresh parameters with the last layer's weights so many times as large."""
     params = network.init(jax.random.key(seed), spec)
     params["action.weight"] *= lively
     return params
