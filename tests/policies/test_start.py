@@ -37,6 +37,7 @@ def test_one_action_for_all_is_learned_without_saturating_the_memory(seed):
     # memory's mean size comes to 0.85 to 0.91, and nothing that is seen changes it any more.
     params = network.init(jax.random.key(seed), SPEC)
     optimizer = ADAMW.init(params)
+    loss, hidden = jnp.inf, jnp.zeros(1)
     for i in range(30):
         params, optimizer, loss, hidden = learn(params, optimizer, jax.random.key(100 + i))
     assert loss < 0.1
