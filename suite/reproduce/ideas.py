@@ -10,6 +10,7 @@ from suite.console import Console
 from suite.reproduce.schemes import PROJECTION, PROJECTION_DECAY
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from suite.reproduce.document import Place
@@ -83,6 +84,8 @@ class Made(NamedTuple):
     """Spent on gradient steps after those that compile [s]."""
     commit: str
     """That trained it."""
+    diverged: str = ""
+    """What was said where it diverged, and there is no policy to fly."""
 
 
 def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
@@ -90,7 +93,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
 
     Raises:
         ValueError: for anything that cannot be used, before the first training.
-        WorkFailed: where a training diverges; --only leaves its row out.
+        WorkFailed: where a training of the recipe itself diverges; any other leaves its row out.
     """
     import functools
 
@@ -118,6 +121,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     do = functools.partial(_make, cache=place.cache)
     found = all_done(do, list(runs.values()), config.jobs, console, "training")
     made = dict(zip(runs, found, strict=True))
+    chosen, failures = _whole_rows(chosen, made)
     wanted = [(idea.key, seed) for idea in chosen if not idea.round for seed in seeds]
     orders = [Order(Flier(made[which].policy, vehicle), trials) for which in wanted]
     flights = flown(orders, place.cache, console, f"judging {len(orders)} trainings")
@@ -127,7 +131,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
         for idea in chosen
         if idea.round
     }
-    report, numbers = ideas_report(config, chosen, made, judged, measured)
+    report, numbers = ideas_report(config, chosen, made, judged, measured, failures)
     return write_document(place, "ideas", report, numbers, config.seed, console)
 
 
@@ -177,10 +181,41 @@ def ideas(config: Config) -> list[Idea]:
 
 
 def _make(config: TrainConfig, console: Console, cache: Path) -> Made:
-    from suite.reproduce.trainings import commit_of, trained, warm_seconds
+    from suite.errors import WorkFailed
+    from suite.reproduce.trainings import commit_of, folder_of, trained, warm_seconds
 
-    policy = trained(config, cache, console).policy
-    return Made(str(policy), warm_seconds(policy.parent), commit_of(policy))
+    diverged = ""
+    try:
+        trained(config, cache, console)
+    except WorkFailed as failure:
+        diverged = str(failure)
+        console.note(diverged)
+    folder = folder_of(config, cache)
+    policy = folder / "policy"
+    return Made(str(policy), warm_seconds(folder), commit_of(policy), diverged)
+
+
+def _whole_rows(
+    chosen: list[Idea], made: Mapping[tuple[str, int], Made]
+) -> tuple[list[Idea], dict[str, str]]:
+    """Return the rows whose trainings all came to an end, and what the others' seeds said.
+
+    Raises:
+        WorkFailed: where the recipe's own training diverged, with which all are compared.
+    """
+    from suite.errors import WorkFailed
+
+    said = {which: run.diverged for which, run in made.items() if run.diverged}
+    failures = {
+        idea.key: "; ".join(
+            f"seed {s}: {words}" for (key, s), words in said.items() if key == idea.key
+        )
+        for idea in chosen
+        if any(key == idea.key for key, _ in said)
+    }
+    if RECIPE in failures:
+        raise WorkFailed(f"the recipe itself, {failures[RECIPE]}")
+    return [idea for idea in chosen if idea.key not in failures], failures
 
 
 def _flown_round(idea: Idea, policies: list[str], config: Config) -> list[dict[str, float]]:

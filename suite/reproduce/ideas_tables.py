@@ -118,15 +118,17 @@ def ideas_report(
     made: Mapping[tuple[str, int], Made],
     judged: Mapping[tuple[str, int], Sequence[TrialResult]],
     measured: Mapping[str, Sequence[Mapping[str, float]]],
+    failures: Mapping[str, str],
 ) -> tuple[Report, dict[str, Any]]:
     """Return the document and the numbers that go beside it.
 
     Args:
         config: what was asked.
-        chosen: all rows, the recipe first.
+        chosen: all rows that were trained to the end, the recipe first.
         made: every training by its row and seed.
         judged: results of those that the judge flew.
         measured: numbers of the rows with round gates, of each training seed.
+        failures: what was said of the rows that a diverged training leaves out.
     """
     seeds, first = config.training_seeds, chosen[0]
     base = _won([judged[first.key, seed] for seed in seeds])
@@ -167,10 +169,12 @@ def ideas_report(
             f"{config.round_seconds:g} s each",
             "trainings at once": f"{config.jobs}, each on its own share of the cores",
             "vehicle": config.vehicle,
+            **{f"left out, {key}": said for key, said in failures.items()},
         },
         sections=sections,
     )
-    return report, {"config": config, "rows": rows, "round": measured}
+    numbers = {"config": config, "rows": rows, "round": measured, "diverged": failures}
+    return report, numbers
 
 
 def lead(rows: Sequence[Compared]) -> str:

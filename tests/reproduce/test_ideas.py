@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from suite.console import Console
+from suite.errors import WorkFailed
 from suite.reproduce import ideas as module
+from suite.reproduce import trainings
 from suite.reproduce.ideas import Config, ideas
 from suite.reproduce.ideas_tables import compared, lead, over_seeds
 from suite.reproduce.trainings import trained_policy
@@ -103,6 +105,27 @@ def test_the_rows_are_trained_and_judged_once(sky, made, tmp_path, monkeypatch):
     assert "`loss.path_samples=1`" in text and "| 7.0 s |" in text
     assert reproduce(tmp_path, *args) == 0
     assert len(made) == len(rows) * 2 and len(sky.flown) == len(judged) * 6, "all is there"
+
+
+def test_a_training_that_diverges_leaves_its_row_out(sky, made, tmp_path, monkeypatch, capsys):
+    whole = trainings.train
+
+    def train(config, folder, console):
+        if config.seed == 5 and config.episode.finish in worse:
+            raise WorkFailed("training diverged at iteration 7")
+        return whole(config, folder, console)
+
+    monkeypatch.setattr(trainings, "train", train)
+    args = ["ideas", "--trials", "1", "--difficulty", "0", "--training-seeds", "3", "5"]
+    args += ["--only", "finish", "curriculum"]
+    worse = {True}
+    assert reproduce(tmp_path, *args) == 0
+    text, found = page(tmp_path, "ideas")
+    assert [row["key"] for row in found["rows"]] == ["recipe", "curriculum"]
+    assert "left out, finish: seed 5: training diverged at iteration 7" in text
+    worse.add(False)
+    assert reproduce(tmp_path / "other", *args) == 1
+    assert "the recipe itself, seed 5: training diverged" in capsys.readouterr().err
 
 
 def test_round_gates_are_flown_by_the_trainers_own_code(tmp_path, monkeypatch):
