@@ -71,7 +71,8 @@ def curve_numbers(
 ) -> dict[str, jax.Array]:
     """Return the numbers of the curve, scalars each: a row of metrics.jsonl.
 
-    Collisions and speeds are those of steps that count in the loss.
+    Collisions and speeds are those of steps that count in the loss. `memory` is the mean size of the
+    recurrent states: near 1 they are saturated, and nothing that is seen reaches the action.
     """
     counts = records.alive > 0
     speed = jnp.where(counts, records.speed, 0.0)
@@ -83,6 +84,7 @@ def curve_numbers(
         "collided": hit.any(0).mean(),
         "speed": speed.sum() / jnp.maximum(counts.sum(), 1),
         "speed_max": speed.max(0).mean(),
+        "memory": jnp.abs(records.hidden).mean(),
     }
     return numbers | {f"loss_{k}": v.mean() for k, v in records.terms._asdict().items()}
 

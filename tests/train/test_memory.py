@@ -73,6 +73,8 @@ def test_the_curve_is_of_steps_that_count():
     first = np.mean(records.speed[0])
     assert numbers["speed"] == pytest.approx(first) == numbers["speed_max"]
     assert numbers["collided"] == 0
+    assert numbers["memory"] == pytest.approx(np.abs(records.hidden).mean())
+    assert 0 < numbers["memory"] < 0.5, "a fresh network's is far from saturated"
 
 
 def test_remembered_states_are_of_steps_that_counted():
