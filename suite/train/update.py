@@ -71,8 +71,8 @@ def curve_numbers(
 ) -> dict[str, jax.Array]:
     """Return the numbers of the curve, scalars each: a row of metrics.jsonl.
 
-    Collisions and speeds are those of steps that count in the loss. `memory` is the mean size of the
-    recurrent states: near 1 they are saturated, and nothing that is seen reaches the action.
+    Collisions and speeds are those of steps that count in the loss. `memory` is the mean size of
+    the recurrent states: near 1 they are saturated, and nothing that is seen reaches the action.
     """
     counts = records.alive > 0
     speed = jnp.where(counts, records.speed, 0.0)
