@@ -205,14 +205,11 @@ def _whole_rows(
     """
     from suite.errors import WorkFailed
 
-    said = {which: run.diverged for which, run in made.items() if run.diverged}
-    failures = {
-        idea.key: "; ".join(
-            f"seed {s}: {words}" for (key, s), words in said.items() if key == idea.key
-        )
-        for idea in chosen
-        if any(key == idea.key for key, _ in said)
-    }
+    failures: dict[str, str] = {}
+    for (key, seed), run in made.items():
+        if run.diverged:
+            before = f"{failures[key]}; " if key in failures else ""
+            failures[key] = f"{before}seed {seed}: {run.diverged}"
     if RECIPE in failures:
         raise WorkFailed(f"the recipe itself, {failures[RECIPE]}")
     return [idea for idea in chosen if idea.key not in failures], failures

@@ -15,11 +15,14 @@ ADAMW = optax.adamw(2e-3, b2=0.99, weight_decay=1e-2)
 
 def error(params, states, images):
     """Return how far all actions are from CLIMB_B, and the memory after the last."""
-    hidden, total = jnp.zeros((states.shape[1], SPEC.hidden_size)), 0.0
-    for state, image in zip(states, images, strict=True):
-        action, hidden = network.step(params, hidden, state, image)
-        total = total + ((action - CLIMB_B) ** 2).sum(-1).mean()
-    return total / len(states), hidden
+
+    def step(hidden, seen):
+        action, hidden = network.step(params, hidden, *seen)
+        return hidden, ((action - CLIMB_B) ** 2).sum(-1).mean()
+
+    start = jnp.zeros((states.shape[1], SPEC.hidden_size))
+    hidden, errors = jax.lax.scan(step, start, (states, images))
+    return errors.mean(), hidden
 
 
 @jax.jit
