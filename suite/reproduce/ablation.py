@@ -139,16 +139,11 @@ def train_and_measure(
         cache: folder of all runs.
         trials: how many, the seed of their worlds, and the seconds of each.
     """
-    from suite.errors import WorkFailed
-    from suite.reproduce.trainings import commit_of, folder_of, trained, warm_seconds
+    from suite.reproduce.trainings import commit_of, divergence, folder_of, warm_seconds
     from suite.reproduce.validation import make_validation, stored_params
 
     key, config = run
-    diverged = ""
-    try:
-        trained(config, cache, console)
-    except WorkFailed as failure:
-        diverged = str(failure)
+    diverged = divergence(config, cache, console)
     folder = folder_of(config, cache)
     seconds, commit = warm_seconds(folder), commit_of(folder / "policy")
     about = Trained(key, config.seed, seconds, commit, None, diverged)

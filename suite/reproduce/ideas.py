@@ -181,14 +181,10 @@ def ideas(config: Config) -> list[Idea]:
 
 
 def _make(config: TrainConfig, console: Console, cache: Path) -> Made:
-    from suite.errors import WorkFailed
-    from suite.reproduce.trainings import commit_of, folder_of, trained, warm_seconds
+    from suite.reproduce.trainings import commit_of, divergence, folder_of, warm_seconds
 
-    diverged = ""
-    try:
-        trained(config, cache, console)
-    except WorkFailed as failure:
-        diverged = str(failure)
+    diverged = divergence(config, cache, console)
+    if diverged:
         console.note(diverged)
     folder = folder_of(config, cache)
     policy = folder / "policy"

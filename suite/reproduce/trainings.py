@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from suite.console import Console
+from suite.errors import WorkFailed
 from suite.reproduce.cache import digest
 from suite.train import curve
 from suite.train.config import TrainConfig
@@ -28,6 +29,15 @@ def trained(config: TrainConfig, cache: Path, console: Console) -> Outcome:
         WorkFailed: where the training diverges.
     """
     return train(config, folder_of(config, cache), console)
+
+
+def divergence(config: TrainConfig, cache: Path, console: Console) -> str:
+    """Train as `trained` does and return what was said where it diverged, "" where it did not."""
+    try:
+        trained(config, cache, console)
+    except WorkFailed as failure:
+        return str(failure)
+    return ""
 
 
 def trained_policy(config: TrainConfig, console: Console, cache: Path) -> str:
