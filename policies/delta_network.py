@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from policies.draw import uniform
 from policies.gru import gru_update
 from policies.network import leaky_relu
 from policies.spec import ACTION_SIZE
@@ -23,6 +24,7 @@ INPUT_SCALE = (0.2, 0.2, 0.2, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
 """Brings metres a second and m/s^2 to order one."""
 
 
+@jax.jit
 def init(key: jax.Array) -> Params:
     """Return fresh parameters; the output starts at zero, so the model starts as no correction."""
     shapes = {
@@ -35,11 +37,10 @@ def init(key: jax.Array) -> Params:
         "output.weight": (HIDDEN, ACTION_SIZE),
         "output.bias": (ACTION_SIZE,),
     }
-    keys = jax.random.split(key, len(shapes))
     params = {}
-    for k, (name, shape) in zip(keys, shapes.items(), strict=True):
+    for name, drawn in uniform(key, shapes).items():
         bound = (INPUTS if name == "input.weight" else HIDDEN) ** -0.5
-        params[name] = jax.random.uniform(k, shape, jnp.float32, -bound, bound)
+        params[name] = drawn * (2 * bound) - bound
     params["output.weight"] *= 0.0
     params["output.bias"] *= 0.0
     return params

@@ -7,10 +7,13 @@ the wanted net acceleration in body axes. Parameters are a flat dict of float32 
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
 from policies.conv import conv_valid
+from policies.draw import uniform
 from policies.gru import gru_update
 from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
 
@@ -33,6 +36,7 @@ def flat_features(spec: PolicySpec) -> int:
     return rows * columns * CHANNELS[2]
 
 
+@functools.partial(jax.jit, static_argnames="spec")
 def init(key: jax.Array, spec: PolicySpec) -> Params:
     """Return fresh parameters: torch's uniform defaults, the state branch x 0.5.
 
@@ -54,11 +58,8 @@ def init(key: jax.Array, spec: PolicySpec) -> Params:
         "gru.bias_hidden": ((3 * hidden,), hidden),
         "action.weight": ((hidden, ACTION_SIZE), hidden),
     }
-    keys = jax.random.split(key, len(fan))
-    params = {
-        name: jax.random.uniform(k, shape, jnp.float32, -1.0, 1.0) * fan_in**-0.5
-        for k, (name, (shape, fan_in)) in zip(keys, fan.items(), strict=True)
-    }
+    drawn = uniform(key, {name: shape for name, (shape, _) in fan.items()})
+    params = {name: (2 * drawn[name] - 1) * fan_in**-0.5 for name, (_, fan_in) in fan.items()}
     params["state.weight"] *= 0.5
     return params
 
