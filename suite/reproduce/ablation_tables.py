@@ -78,8 +78,7 @@ def verdict(rows: Sequence[Row]) -> str:
     measured = {row.setting: row for row in rows if row.over}
     fields = [row for key, row in measured.items() if key.startswith("field")]
     bare = [row for key, row in measured.items() if not key.startswith("field")]
-    pairs = [(row, measured.get(f"progress {row.weight:g}")) for row in fields]
-    said = [_same_weight(row, other) for row, other in pairs if other is not None]
+    said = _same_weight(fields, measured)
     for words, group in (("with", fields), ("without", bare)):
         if group:
             best = _best(group)
@@ -98,15 +97,23 @@ def _best(rows: Sequence[Row]) -> Row:
     return max(rows, key=lambda row: row.over["success_cross"].mean)
 
 
-def _same_weight(row: Row, other: Row) -> str:
-    """Return what the field brings where nothing else differs."""
-    shares = [100 * one.over["success_rate"].mean for one in (row, other)]
-    speeds = [one.over["v_max"].mean for one in (row, other)]
-    return (
-        f"At lambda_p {row.weight:g} success cross is {_of(row, 'success_cross')} with the field "
-        f"and {_of(other, 'success_cross')} without it, {_against(row, other)}; success rate "
-        f"{shares[0]:.0f} and {shares[1]:.0f} %, v_max {speeds[0]:.1f} and {speeds[1]:.1f} m/s."
+def _same_weight(fields: Sequence[Row], measured: Mapping[str, Row]) -> list[str]:
+    """Return a sentence on the weights at which nothing but the field differs, or none."""
+    pairs = [
+        (row.weight, row.over["success_cross"], measured[key].over["success_cross"])
+        for row in fields
+        if (key := f"progress {row.weight:g}") in measured
+    ]
+    if not pairs:
+        return []
+    listed = ", ".join(
+        f"{100 * on.mean:.0f} and {100 * off.mean:.0f} % at {weight:g}" for weight, on, off in pairs
     )
+    apart = sum(on.least > off.most for _, on, off in pairs)
+    return [
+        f"Success cross with the field and without it, at the same lambda_p of L_p: {listed}; at "
+        f"{apart} of {len(pairs)} weights every seed with it is above every one without."
+    ]
 
 
 def _against(row: Row, other: Row) -> str:
@@ -144,7 +151,7 @@ def beside_paper(rows: Sequence[Row]) -> str:
         )
     ours = {row.setting: row.over["success_cross"].mean for row, _ in pairs}
     parts.append(
-        f"Most success cross: {_most(ours)} here, "
+        f"Most success cross of these rows: {_most(ours)} here, "
         f"{_most({key: row.success_cross for key, row in theirs.items()})} in the paper."
     )
     return " ".join(parts)
