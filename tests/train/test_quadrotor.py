@@ -149,12 +149,13 @@ def test_gradients_of_a_flight_are_those_of_finite_differences(float64, monkeypa
     def score(inputs):
         actions, vel_w = inputs
         body = start(constants, still, vel_w, still + jnp.asarray([1.0, 0.0, 0.0]))
-        total = 0.0
-        for action in actions:
+
+        def one(body, action):
             body = step(body, constants, action, still, key)
             parts = (body.pos_w, body.vel_w, body.rot_w[:, 2])
-            total += sum((w * part).sum() for w, part in zip(weight, parts, strict=True))
-        return total
+            return body, sum((w * part).sum() for w, part in zip(weight, parts, strict=True))
+
+        return jax.lax.scan(one, body, actions)[1].sum()
 
     inputs = (
         jnp.asarray(lively_actions(5, seed=1)),
