@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from suite.train.config import TrainConfig
 
 PROGRESS = (0.4, 0.8, 1.6, 3.2)
-"""lambda_p without the field; the first is also that with it."""
+"""lambda_p of L_p. The paper has the field at the first alone; here it is on and off at each and at
+the recipe's own weight, so that a pair differs in the field and in nothing else."""
 NORMALISED = (1.6, 3.2, 6.4)
 """lambda_p of L_p^norm without the field."""
 
@@ -108,15 +109,11 @@ def settings(config: Config) -> list[Setting]:
         recipe = replace(base, loss=replace(base.loss, **changes))
         return Setting(f"{key} {weight:g}", words, weight, recipe)
 
-    def field(weight: float, words: str) -> Setting:
-        return row("field", words, weight, progress=weight, progress_norm=0.0)
-
     bare = {"field_gain": 0.0, "projection": 0.0}
-    rows = [field(PROGRESS[0], "with the field, L_p")]
-    if base.loss.progress != PROGRESS[0]:
-        rows.append(field(base.loss.progress, "with the field, L_p at the recipe's own weight"))
+    weights = sorted({*PROGRESS, base.loss.progress})
+    rows = [row("field", "with the field, L_p", w, progress=w, progress_norm=0.0) for w in weights]
     rows += [
-        row("progress", "without, L_p", w, progress=w, progress_norm=0.0, **bare) for w in PROGRESS
+        row("progress", "without, L_p", w, progress=w, progress_norm=0.0, **bare) for w in weights
     ]
     rows += [
         row("normalised", "without, L_p^norm", w, progress=0.0, progress_norm=w, **bare)

@@ -74,41 +74,52 @@ def summaries(chosen: Sequence[Setting], results: Sequence[Trained], trials: int
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """Return what came out in sentences: the field against the best row without it."""
-    measured = [row for row in rows if row.over]
-    fields = [row for row in measured if row.setting.startswith("field")]
-    bare = [row for row in measured if not row.setting.startswith("field")]
-    said = []
-    for row in fields:
-        name = row.words[0].upper() + row.words[1:]
-        said.append(
-            f"{name} ({_weight(row)}): success cross {_of(row, 'success_cross')}, success "
-            f"rate {_of(row, 'success_rate')}, v_max {row.over['v_max'].mean:.1f} m/s."
-        )
-    if bare:
-        best = max(bare, key=lambda row: row.over["success_cross"].mean)
-        said.append(
-            f"The most without the field is {_of(best, 'success_cross')} success cross "
-            f"({best.words}, {_weight(best)}), at a success rate of {_of(best, 'success_rate')}."
-        )
-        for row in fields:
-            said.append(_against(row, best))
+    """Return what came out in sentences: the field at the same lambda_p, then best against best."""
+    measured = {row.setting: row for row in rows if row.over}
+    fields = [row for key, row in measured.items() if key.startswith("field")]
+    bare = [row for key, row in measured.items() if not key.startswith("field")]
+    pairs = [(row, measured.get(f"progress {row.weight:g}")) for row in fields]
+    said = [_same_weight(row, other) for row, other in pairs if other is not None]
+    for words, group in (("with", fields), ("without", bare)):
+        if group:
+            best = _best(group)
+            said.append(
+                f"The most {words} the field is {_of(best, 'success_cross')} success cross "
+                f"({best.setting}), at a success rate of {_of(best, 'success_rate')} and a v_max "
+                f"of {best.over['v_max'].mean:.1f} m/s."
+            )
+    if fields and bare:
+        said.append(f"The first is {_against(_best(fields), _best(bare))}.")
     said += [f"Every training of {row.setting} diverged." for row in rows if not row.over]
     return " ".join(said) or "No setting was measured."
 
 
-def _against(row: Row, best: Row) -> str:
-    mine, other = row.over["success_cross"], best.over["success_cross"]
-    name = f"The field at {_weight(row)}"
-    points = 100 * (mine.mean - other.mean)
-    if mine.least > other.most:
-        return f"{name} is {points:.0f} points above that, and its worst seed above the best one."
-    if mine.most < other.least:
-        return f"{name} is {-points:.0f} points below that, and its best seed below the worst one."
-    if round(points) == 0:
-        return f"{name} has as much as that."
-    side = "above" if points > 0 else "below"
-    return f"{name} is {abs(points):.0f} points {side} that, and their seeds overlap."
+def _best(rows: Sequence[Row]) -> Row:
+    return max(rows, key=lambda row: row.over["success_cross"].mean)
+
+
+def _same_weight(row: Row, other: Row) -> str:
+    """Return what the field brings where nothing else differs."""
+    shares = [100 * one.over["success_rate"].mean for one in (row, other)]
+    speeds = [one.over["v_max"].mean for one in (row, other)]
+    return (
+        f"At lambda_p {row.weight:g} success cross is {_of(row, 'success_cross')} with the field "
+        f"and {_of(other, 'success_cross')} without it, {_against(row, other)}; success rate "
+        f"{shares[0]:.0f} and {shares[1]:.0f} %, v_max {speeds[0]:.1f} and {speeds[1]:.1f} m/s."
+    )
+
+
+def _against(row: Row, other: Row) -> str:
+    """Return how the success cross of `row` compares, and whether the seeds agree."""
+    mine, theirs = row.over["success_cross"], other.over["success_cross"]
+    points = round(100 * (mine.mean - theirs.mean))
+    if mine.least > theirs.most:
+        return f"{points} points more, and its worst seed above the best one"
+    if mine.most < theirs.least:
+        return f"{-points} points less, and its best seed below the worst one"
+    if points == 0:
+        return "as much"
+    return f"{abs(points)} points {'more' if points > 0 else 'less'}, and their seeds overlap"
 
 
 def beside_paper(rows: Sequence[Row]) -> str:
@@ -148,10 +159,6 @@ def _most(rates: Mapping[str, float]) -> str:
 def _within(row: Row, paper: Ablated, name: str) -> bool:
     low = min(row.over[name].least, row.pooled[name].low)
     return low <= getattr(paper, name) <= max(row.over[name].most, row.pooled[name].high)
-
-
-def _weight(row: Row) -> str:
-    return f"lambda_p {row.weight:g}"
 
 
 def _of(row: Row, name: str) -> str:
@@ -267,7 +274,7 @@ def _every(results: Sequence[Trained]) -> Grid:
 
 
 def _chart(rows: Sequence[Row]) -> bytes:
-    figure = Figure(figsize=(10.4, 4.2), layout="constrained")
+    figure = Figure(figsize=(10.4, 5.2), layout="constrained")
     left, middle, right = figure.subplots(1, 3, sharey=True)
     shown = [row for row in rows if row.over]
     _bars(left, shown, "success_cross", lambda p: p.success_cross, 100)

@@ -25,7 +25,8 @@ def test_the_papers_rows_are_as_printed():
 
 def test_settings_differ_in_field_and_progress_alone():
     rows = {row.key: row for row in settings(Config())}
-    assert set(rows) - {"field 1.2"} == set(printed()[1])
+    added = {"field 0.8", "field 1.2", "field 1.6", "field 3.2", "progress 1.2"}
+    assert set(rows) - set(printed()[1]) == added
     losses = {key: row.recipe.loss for key, row in rows.items()}
     for key, loss in losses.items():
         kind, weight = key.split()
@@ -36,7 +37,7 @@ def test_settings_differ_in_field_and_progress_alone():
     others = {str(row.recipe).replace(str(row.recipe.loss), "") for row in settings(Config())}
     assert len(others) == 1
     assert "field 0.4" in {row.key for row in settings(Config(preset="paper"))}
-    assert len(settings(Config(preset="paper"))) == 8, "its own weight is the paper's"
+    assert len(settings(Config(preset="paper"))) == 11, "its own weight is one of the paper's"
 
 
 def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, capfd):
@@ -62,7 +63,7 @@ def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, capfd):
     assert field["over"]["success_cross"]["most"] == field["pooled"]["success_cross"]["low"] == 0
     assert field["over"]["success_rate"]["least"] == 1 and field["over"]["v_max"]["mean"] > 0
     assert "| normalised 6.4 | 4 | diverged | - |" in text and "| 1 of 1 |" in text
-    assert "| 95 |" in text and "(lambda_p 0.4): success cross 0 %" in text
+    assert "| 95 |" in text and "The most with the field is 0 %" in text
     capfd.readouterr()
     monkeypatch.setattr("suite.train.run.make_update", None)
     assert reproduce(tmp_path, "ablation", *args) == 0, "nothing is trained again"
@@ -91,7 +92,9 @@ def test_spread_pooled_interval_and_sentences_by_hand():
     assert bare.pooled["success_cross"] == wilson(4, 20)
     assert not gone.over and gone.diverged == 1
     said = verdict([field, bare, gone])
-    assert "is 70 points above that, and its worst seed above the best one" in said
+    assert "(field 0.4), at a success rate of 100 %" in said and "v_max of 6.0 m/s" in said
+    assert "The first is 70 points more, and its worst seed above the best one." in said
+    assert "At lambda_p" not in said, "no weight was trained both ways"
     assert "Every training of normalised 6.4 diverged." in said
     compared = beside_paper([field, bare, gone])
     assert (
@@ -106,7 +109,7 @@ def test_sentences_follow_the_numbers_where_the_field_loses():
     lost = summaries(
         chosen, [*runs_of("field 0.4", 0.1, 0.2), *runs_of("progress 3.2", 0.9, 0.8)], 10
     )
-    assert "is 70 points below that, and its best seed below the worst one" in verdict(lost)
+    assert "The first is 70 points less, and its best seed below the worst one." in verdict(lost)
     compared = beside_paper(lost)
     assert (
         "in 0 of 2 rows: elsewhere field 0.4: 15 % here, 95 % there; progress 3.2: 85" in compared
@@ -115,10 +118,26 @@ def test_sentences_follow_the_numbers_where_the_field_loses():
     mixed = summaries(
         chosen, [*runs_of("field 0.4", 0.1, 0.9), *runs_of("progress 3.2", 0.3, 0.5)], 10
     )
-    assert "is 10 points above that, and their seeds overlap" in verdict(mixed)
+    assert "The first is 10 points more, and their seeds overlap." in verdict(mixed)
     none = summaries(chosen, [*runs_of("field 0.4", 0.0), *runs_of("progress 3.2", 0.0)], 10)
-    assert "has as much as that" in verdict(none)
+    assert "The first is as much." in verdict(none)
     assert "Most success cross: no row here" in beside_paper(none)
+
+
+def test_the_field_is_compared_at_the_same_weight():
+    chosen = settings(Config(only=("field 0.8", "progress 0.8", "field 1.6")))
+    runs = [
+        *runs_of("field 0.8", 0.5, 0.7),
+        *runs_of("progress 0.8", 0.1, 0.2, rate=0.9, v_max=7.0),
+        *runs_of("field 1.6", 0.9, 0.9),
+    ]
+    said = verdict(summaries(chosen, runs, 10))
+    assert (
+        "At lambda_p 0.8 success cross is 60 % (50 to 70 over seeds) with the field and 15 % "
+        "(10 to 20 over seeds) without it, 45 points more, and its worst seed above the best one; "
+        "success rate 100 and 90 %, v_max 5.5 and 7.5 m/s." in said
+    )
+    assert "At lambda_p 1.6" not in said
 
 
 @pytest.mark.parametrize(
@@ -126,7 +145,7 @@ def test_sentences_follow_the_numbers_where_the_field_loses():
     [
         (["--seed", "0"], "--seed 0 is one of --training-seeds"),
         (["--training-seeds", "1", "1"], "--training-seeds is 1 1"),
-        (["--only", "field 0.5"], "Did you mean 'field 0.4'?"),
+        (["--only", "field 0.41"], "Did you mean 'field 0.4'?"),
         (["--preset", "smal"], "Did you mean 'small'?"),
         (["--jobs", "0"], "--jobs is 0"),
         (["--trials", "0"], "--trials is 0"),

@@ -77,15 +77,20 @@ def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
     seen = []
 
     def spy(pos_w, vel_w, rot_w, gate_w, action_b, second_w=None, axis_w=None):
-        seen.append((second_w, axis_w))
+        jax.debug.callback(lambda *shown: seen.append(shown), second_w, axis_w)
         return state_vector(pos_w, vel_w, rot_w, gate_w, action_b, second_w, axis_w)
 
     monkeypatch.setattr(rollout, "state_vector", spy)
     config = replace(small_config(3, 1), spec=replace(SPEC, second_gate=True, gate_axis=True))
     worlds = boxes_worlds(config)._replace(target=np.array([0, 3, 7], np.int32))
-    nudge = jnp.zeros((1, 3, SPEC.hidden_size))
-    with jax.disable_jit():
-        make_rollout(config)(fresh_params(config.spec), nudge, worlds, KEY, blind)
+
+    @jax.jit
+    def fly(params):
+        nudge = jnp.zeros((1, 3, SPEC.hidden_size))
+        make_rollout(config)(params, nudge, worlds, KEY, blind)
+
+    fly(fresh_params(config.spec))  # nothing is returned, so little is compiled
+    jax.effects_barrier()
     center = worlds.scene.gates.center_w
     expected = [center[0, 1], center[1, 4], center[2, 7]]
     np.testing.assert_allclose(seen[0][0], expected, atol=1e-6)
