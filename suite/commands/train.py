@@ -68,6 +68,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from policies.delta_file import load_delta
     from policies.network import fitted
     from policies.policy_file import load_policy_checkpoint
+    from suite.delta.corrected import check_corrects
     from suite.flying import checkpoint_folder
     from suite.train.run import train
 
@@ -79,12 +80,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         params = fitted(params, start.spec, resolved.spec)
     if config.delta is not None:
         stored = load_delta(config.delta)
-        corrects = stored.config.get("fit", {}).get("model", "point")
-        if corrects != config.model:
-            raise ValueError(
-                f"--delta {config.delta} corrects --model {corrects}, and this run has --model "
-                f"{config.model}; train with the model that it was fitted to"
-            )
+        dynamics = resolved.quadrotor or resolved.physics
+        check_corrects(stored.config.get("fit", {}), dynamics, config.delta)
         delta = jax.tree.map(jax.numpy.asarray, stored.params)
     outcome = train(resolved, config.out, console, params, delta)
     last = outcome.last

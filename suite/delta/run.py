@@ -12,6 +12,7 @@ import numpy as np
 from eval.flight_log import FlightLog, read_flights
 from policies.delta_file import save_delta
 from suite.console import Console
+from suite.delta.corrected import corrected
 from suite.delta.fit import Errors, Fit, FitConfig, Network, fit, fit_network
 from suite.delta.windows import cut_windows
 from suite.estimate import Estimate, announce
@@ -19,8 +20,6 @@ from suite.provenance import write_run_record
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.files import plain, write_json, write_text
 
-POINT, QUAD = "point", "quad"
-"""What a Delta Action Model corrects, as `suite train --model` calls it."""
 PLANT_STEPS_S = 4e5
 """Steps of the quadrotor a second that a fit makes, for the estimate."""
 
@@ -78,7 +77,6 @@ def fit_delta(
     with console.progress("fitting", config.iterations) as show:
         result = fit(config, physics, windows, held_windows, show)
     summary = {
-        "model": POINT,
         "windows": {"fit": len(windows.acc_w), "held_out": len(held_windows.acc_w)},
         "point_mass": result.point_mass,
         "fitted_point_mass": result.fitted_point_mass,
@@ -86,7 +84,8 @@ def fit_delta(
         "identified": result.identified,
         "curve": result.curve,
     }
-    _write(config, held, result.params, summary, table(result, config.horizon_s), out)
+    words = table(result, config.horizon_s)
+    _write(config, corrected(physics), held, result.params, summary, words, out)
     return result
 
 
@@ -110,7 +109,6 @@ def fit_quadrotor_delta(
         replay = partial(replay_quadrotor, quad, cut)
         result = fit_network(config, replay, windows, held_windows, show)
     summary = {
-        "model": QUAD,
         "vehicle": quad.vehicle,
         "windows": {"fit": len(windows.start_s), "held_out": len(held_windows.start_s)},
         "without": result.without,
@@ -118,7 +116,7 @@ def fit_quadrotor_delta(
         "curve": result.curve,
     }
     words = quadrotor_table(result, config.horizon_s)
-    _write(config, held, result.params, summary, words, out)
+    _write(config, corrected(quad), held, result.params, summary, words, out)
     return result
 
 
@@ -133,6 +131,7 @@ def _read(
 
 def _write(
     config: FitConfig,
+    of: Mapping[str, Any],
     held: Sequence[FlightLog],
     params: Mapping[str, Any],
     summary: Mapping[str, Any],
@@ -140,9 +139,9 @@ def _write(
     out: Path,
 ) -> None:
     write_run_record(out, config, config.seed)
-    about = {"horizon_s": config.horizon_s, "held_out": [log.name for log in held], **summary}
-    fitted = {**plain(config), "model": summary["model"]}
-    save_delta(out / "delta", params, seed=config.seed, fit=fitted)
+    names = [log.name for log in held]
+    about = {"model": of["model"], "horizon_s": config.horizon_s, "held_out": names, **summary}
+    save_delta(out / "delta", params, seed=config.seed, fit={**plain(config), **of})
     write_json(out / "delta.json", plain(about))
     write_text(out / "table.md", words)
 
