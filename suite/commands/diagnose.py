@@ -30,7 +30,7 @@ class Config:
     fly: str | None = None
     """Fly the plan in simulation with this vehicle (a file or a shipped name); write its logs."""
     recording: bool = True
-    """Whether the held-out flights, measured and simulated, are written as a recording for rerun."""
+    """Whether the held-out flights, measured and simulated, become a recording for rerun."""
     seed: int = 0
     """Seed of the null's draws, of the intervals' and of simulated noise."""
     json: bool = False

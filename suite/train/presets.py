@@ -24,7 +24,7 @@ def racer() -> TrainConfig:
 
 
 def swift() -> TrainConfig:
-    """Return the recipe of `swift`: faster and surer than `racer`, with 18 numbers instead of 12."""
+    """Return the recipe of `swift`: faster, surer than `racer`, with 18 numbers instead of 12."""
     base = racer()
     return replace(
         base,
