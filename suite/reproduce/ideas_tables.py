@@ -13,15 +13,12 @@ from eval.trial import TrialResult
 from suite.charts import LINES, png, titled
 from suite.console import duration
 from suite.report import Cell, Grid, Picture, Report, Section, ranged
+from suite.reproduce import seed_intervals
 from suite.reproduce.robust_tables import points_cell
 
 if TYPE_CHECKING:
     from suite.reproduce.ideas import Config, Idea, Made
 
-DRAWS = 4000
-"""Of the bootstrap."""
-FEWEST_SEEDS = 3
-"""With less, no row is called a gain or a loss."""
 MEANING = (
     "Success: over the trials of all training seeds, with the least and the most of a seed. "
     "Difference: to the recipe on the same trials and training seeds, in points, with a 95 % "
@@ -62,24 +59,7 @@ class Compared(NamedTuple):
     @property
     def verdict(self) -> str:
         """`gain`, `loss` or `unclear`."""
-        if len(self.of_seeds) < FEWEST_SEEDS:
-            return "unclear"
-        if self.difference.low > 0 and min(self.of_seeds) > 0:
-            return "gain"
-        worse = self.difference.high < 0 and max(self.of_seeds) < 0
-        return "loss" if worse else "unclear"
-
-
-def over_seeds(gap: np.ndarray) -> Interval:
-    """Return the mean of `gap` (seeds, trials) with its interval over both."""
-    rng = np.random.default_rng(0)
-    seeds, trials = gap.shape
-    drawn = [
-        gap[rng.integers(0, seeds, seeds)][:, rng.integers(0, trials, trials)].mean()
-        for _ in range(DRAWS)
-    ]
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    return Interval(float(gap.mean()), float(low), float(high))
+        return seed_intervals.verdict(self.difference, self.of_seeds)
 
 
 def compared(
@@ -99,7 +79,7 @@ def compared(
     return Compared(
         key=key,
         success=won.mean(axis=1).tolist(),
-        difference=over_seeds(gap),
+        difference=seed_intervals.crossed(gap),
         of_seeds=gap.mean(axis=1).tolist(),
         v_max=float(np.median([row.v_max for row in every])),
         collisions=float(np.mean([row.ended_by == "collision" for row in every])),

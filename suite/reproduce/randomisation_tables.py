@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from eval.stats import Interval, bootstrap_mean, wilson
+from eval.stats import Interval, wilson
 from eval.trial import TrialSpec
 from suite.report import Cell, Grid, Picture, Report, Section
+from suite.reproduce import seed_intervals
 from suite.reproduce.conditions import Sweep
 from suite.reproduce.robust_charts import sweeps_chart
 from suite.reproduce.robust_tables import Tested, condition_grid, points_cell, tested_numbers
@@ -23,9 +24,27 @@ if TYPE_CHECKING:
 ALL = "all disturbances"
 MEANING = (
     "Success: over all trials under all sizes of the disturbance but the undisturbed one. "
-    "Difference: randomised - fixed, in points, with the 95 % bootstrap interval over trials, each "
-    "drawn with all its conditions. Training seeds are few: the last table shows how they differ."
+    "Difference: randomised - fixed, in points, with a 95 % bootstrap interval that draws training "
+    "seeds anew and the trials of each, a trial with all its conditions. A gain or a loss is where "
+    "it leaves zero out and every seed agrees; with few seeds one of several rows may stand out by "
+    "chance."
 )
+
+
+class Compared(NamedTuple):
+    """Two settings of the recipe under some conditions, all of them together."""
+
+    rates: dict[str, Interval]
+    """Each setting's success, with Wilson intervals."""
+    difference: Interval
+    """In success, the second - the first, over seeds and trials."""
+    of_seeds: list[float]
+    """The difference of each training seed."""
+
+    @property
+    def verdict(self) -> str:
+        """`gain`, `loss` or `unclear`."""
+        return seed_intervals.verdict(self.difference, self.of_seeds)
 
 
 def randomisation_report(
@@ -49,8 +68,9 @@ def randomisation_report(
     disturbed = {sweep.name: points[1:] for sweep, points in grown.items()}
     disturbed[ALL] = [point for points in disturbed.values() for point in points]
     together = {"undisturbed": [base], **disturbed}
+    sizes = [len(share) for share in shares]
     compared = {
-        what: compare({name: np.array([p.won(name) for p in points]) for name in names})
+        what: compare({name: np.array([p.won(name) for p in points]) for name in names}, sizes)
         for what, points in together.items()
     }
     trained = _by_seed(config, shares, base, disturbed[ALL], names)
@@ -100,45 +120,50 @@ def randomisation_report(
     return report, numbers
 
 
-def compare(won: Mapping[str, np.ndarray]) -> dict[str, Interval]:
-    """Return two settings' success over all conditions together, and second - first.
-
-    The interval of the difference is a bootstrap over trials, since a trial's conditions are no
-    independent draws.
+def compare(won: Mapping[str, np.ndarray], sizes: Sequence[int]) -> Compared:
+    """Return two settings' success over all conditions together, and how they differ.
 
     Args:
         won: which trials succeeded, (conditions, trials) bool of each setting.
+        sizes: trials of each training seed, in their order.
     """
     rates = {name: wilson(int(each.sum()), each.size) for name, each in won.items()}
     first, second = (each.mean(axis=0) for each in won.values())
-    return {**rates, "difference": bootstrap_mean(second - first)}
+    gaps = np.split(second - first, np.cumsum(sizes)[:-1])
+    return Compared(rates, seed_intervals.nested(gaps), [float(gap.mean()) for gap in gaps])
 
 
-def _lead(compared: Mapping[str, Mapping[str, Interval]]) -> str:
+def _lead(compared: Mapping[str, Compared]) -> str:
     def said(name: str) -> str:
-        fixed, randomised, _ = (100 * entry.value for entry in compared[name].values())
-        points = points_cell(compared[name]["difference"]).text
+        fixed, randomised = (100 * rate.value for rate in compared[name].rates.values())
+        points = points_cell(compared[name].difference).text
         return (
             f"{randomised:.0f} % succeed where dynamics were randomised in training and "
             f"{fixed:.0f} % where they were not ({points} points)"
         )
 
-    low, high = compared[ALL]["difference"][1:]
-    worth = "buys robustness" if low > 0 else "costs it" if high < 0 else "shows no difference"
-    return (
-        f"Over all disturbances {said(ALL)}; undisturbed {said('undisturbed')}. "
-        f"So randomisation {worth} here."
-    )
+    words = [f"Over all disturbances {said(ALL)}; undisturbed {said('undisturbed')}."]
+    for verdict, meant in (
+        ("gain", "Randomisation gains in"),
+        ("loss", "It loses in"),
+        ("unclear", "These trainings do not tell for"),
+    ):
+        named = [what for what, entry in compared.items() if entry.verdict == verdict]
+        if named:
+            words.append(f"{meant}: {', '.join(named)}.")
+    return " ".join(words)
 
 
-def _summary(compared: Mapping[str, Mapping[str, Interval]]) -> Grid:
-    names = [name for name in next(iter(compared.values())) if name != "difference"]
+def _summary(compared: Mapping[str, Compared]) -> Grid:
+    names = list(next(iter(compared.values())).rates)
     rows = []
     for what, entry in compared.items():
-        rates = [Cell(f"{100 * entry[name].value:.0f}") for name in names]
-        rows.append([Cell(what), *rates, points_cell(entry["difference"])])
+        rates = [Cell(f"{100 * rate.value:.0f}") for rate in entry.rates.values()]
+        of_seeds = " ".join(f"{100 * gap:+.0f}" for gap in entry.of_seeds)
+        told = "" if entry.verdict == "unclear" else entry.verdict
+        rows.append([Cell(what), *rates, points_cell(entry.difference), Cell(of_seeds), Cell(told)])
     headers = ["disturbance", *(f"{name} [%]" for name in names), "difference [points]"]
-    return Grid("", headers, rows)
+    return Grid("", [*headers, "by seed", ""], rows)
 
 
 def _by_seed(

@@ -12,7 +12,7 @@ from suite.errors import WorkFailed
 from suite.reproduce import ideas as module
 from suite.reproduce import trainings
 from suite.reproduce.ideas import Config, ideas
-from suite.reproduce.ideas_tables import compared, lead, over_seeds
+from suite.reproduce.ideas_tables import compared, lead
 from suite.reproduce.trainings import trained_policy
 from suite.train.overrides import override
 from suite.train.worlds import sample_worlds
@@ -68,16 +68,6 @@ def test_differences_and_verdicts_by_hand():
     said = lead([same, better, torn, worse])
     assert said.startswith("Of the recipe's trials 8 % succeed. More succeed with a (+25 [")
     assert "Fewer succeed with c (-100 [-100, -100])." in said and "do not tell for b." in said
-
-
-def test_intervals_are_as_wide_as_seeds_differ():
-    steady, torn = np.full((4, 400), 0.0), np.zeros((4, 400))
-    steady[:, ::2] = torn[::2] = 1.0
-    one, other = over_seeds(steady), over_seeds(torn)
-    assert one.value == other.value == 0.5
-    # Half of 400 trials in every seed: +- 2 sqrt(0.25 / 400); all of every other seed: 0 to 1.
-    assert one.high - one.low == pytest.approx(4 * np.sqrt(0.25 / 400), rel=0.1)
-    assert other.low <= 0.01 and other.high >= 0.99
 
 
 def test_the_rows_are_trained_and_judged_once(sky, made, tmp_path, monkeypatch):

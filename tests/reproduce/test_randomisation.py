@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from suite.reproduce.randomisation import fixed
-from suite.reproduce.randomisation_tables import compare
+from suite.reproduce.randomisation_tables import ALL, _lead, compare
 from suite.train.presets import preset
 from tests.support.documents import page, reproduce
 
@@ -34,20 +34,36 @@ def test_both_settings_of_every_seed_fly_the_same_share(sky, made, tmp_path):
     assert len(sky.flown) == (1 + 4) * 3 * 2 * 2
     text, numbers = page(tmp_path, "randomisation")
     assert list(numbers["compared"]) == ["undisturbed", "wind", "all disturbances"]
-    assert "| wind | 0 | 0 | +0 [+0, +0] |" in text and "shows no difference here" in text
+    assert "| wind | 0 | 0 | +0 [+0, +0] | +0 +0 |" in text and "do not tell for: undis" in text
     assert "| 3 | 3 | 0 | 0 | 0 | 0 |" in text and "| 5 | 3 | 0 | 0 | 0 | 0 |" in text
     assert reproduce(tmp_path, *args) == 0
     assert len(made) == 4 and len(sky.flown) == 60, "the second time all is there"
 
 
 def test_a_trials_conditions_are_one_draw():
-    # Twenty trials; the first ten are won by b alone, under each of five conditions.
-    won = {"a": np.zeros((5, 20), bool), "b": np.tile(np.arange(20) < 10, (5, 1))}
-    once, often = compare({name: each[:1] for name, each in won.items()}), compare(won)
-    assert once["difference"] == often["difference"]
-    assert often["difference"].value == 0.5
-    assert often["difference"].low == pytest.approx(0.3, abs=0.06)
-    assert often["b"].value == 0.5 and often["a"].value == 0
+    # Twenty trials; b alone wins the first half of each seed's, under each of five conditions.
+    first = np.tile([True] * 5 + [False] * 5, 2)
+    won = {"a": np.zeros((5, 20), bool), "b": np.tile(first, (5, 1))}
+    once = compare({name: each[:1] for name, each in won.items()}, [10, 10])
+    often = compare(won, [10, 10])
+    assert once.difference == often.difference
+    assert often.difference.value == 0.5 and often.of_seeds == [0.5, 0.5]
+    assert often.difference.low == pytest.approx(0.3, abs=0.06)
+    assert often.rates["b"].value == 0.5 and often.rates["a"].value == 0
+
+
+def test_a_seed_that_does_not_agree_is_no_gain():
+    won = {"a": np.zeros((1, 90), bool), "b": np.zeros((1, 90), bool)}
+    won["b"][0, :60] = True
+    torn = compare(won, [30, 30, 30])
+    assert torn.of_seeds == [1.0, 1.0, 0.0] and torn.verdict == "unclear"
+    won["b"][0, 60:75] = True
+    agreed = compare(won, [30, 30, 30])
+    assert agreed.verdict == "gain"
+    said = _lead({"undisturbed": torn, ALL: agreed})
+    assert said.endswith(
+        "Randomisation gains in: all disturbances. These trainings do not tell for: undisturbed."
+    )
 
 
 @pytest.mark.parametrize(
