@@ -24,9 +24,13 @@ INPUT_SCALE = (0.2, 0.2, 0.2, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
 """Brings metres a second and m/s^2 to order one."""
 
 
-@jax.jit
 def init(key: jax.Array) -> Params:
     """Return fresh parameters; the output starts at zero, so the model starts as no correction."""
+    return _drawn(key)
+
+
+@jax.jit
+def _drawn(key: jax.Array) -> Params:
     shapes = {
         "input.weight": (INPUTS, HIDDEN),
         "input.bias": (HIDDEN,),

@@ -7,7 +7,7 @@ the wanted net acceleration in body axes. Parameters are a flat dict of float32 
 
 from __future__ import annotations
 
-import functools
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,6 @@ def flat_features(spec: PolicySpec) -> int:
     return rows * columns * CHANNELS[2]
 
 
-@functools.partial(jax.jit, static_argnames="spec")
 def init(key: jax.Array, spec: PolicySpec) -> Params:
     """Return fresh parameters: torch's uniform defaults, the state branch x 0.5.
 
@@ -44,6 +43,11 @@ def init(key: jax.Array, spec: PolicySpec) -> Params:
     for the same climb, grow what comes before it until the memory saturates, and some seeds take a
     thousand iterations to come back.
     """
+    return _drawn(key, spec)
+
+
+@jax.jit(static_argnames="spec")
+def _drawn(key: jax.Array, spec: PolicySpec) -> Params:
     hidden = spec.hidden_size
     fan = {
         "conv1.weight": ((2, 2, 1, CHANNELS[0]), 4),
@@ -70,8 +74,15 @@ def fitted(params: Params, seen: PolicySpec, spec: PolicySpec) -> Params:
     Numbers that `spec` adds to the state get weights of zero, so the policy acts as it did.
 
     Raises:
-        ValueError: where the policy sees what `spec` does not have.
+        ValueError: where the policy sees what `spec` does not have, or they differ in all but that.
     """
+    for entry in dataclasses.fields(spec):
+        has, wanted = getattr(seen, entry.name), getattr(spec, entry.name)
+        if has != wanted and entry.name not in EXTRAS:
+            raise ValueError(
+                f"the policy to start from has spec.{entry.name} {has}, and this run {wanted}; "
+                "train from nothing, or with the policy's own"
+            )
     rows, first = [params["state.weight"][:STATE_SIZE]], STATE_SIZE
     for key in EXTRAS:
         has, wanted = getattr(seen, key), getattr(spec, key)

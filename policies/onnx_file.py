@@ -72,15 +72,7 @@ def read_checked(path: Path) -> onnx.ModelProto:
     Raises:
         PolicyError: where it is damaged, too large, not standard, or points outside its folder.
     """
-    try:
-        size = path.stat().st_size
-        proto = onnx.load_model(path, load_external_data=False)
-    except OSError as error:
-        raise PolicyError(f"{path}: cannot be read ({error.strerror}); check the file") from None
-    except Exception as error:  # protobuf's DecodeError; protobuf is no dependency of ours
-        raise PolicyError(
-            f"{path}: not a whole ONNX file ({_first_line(error)}); export it again"
-        ) from None
+    proto = _graph_of(path)
     if proto.functions or proto.training_info:
         raise PolicyError(f"{path}: holds functions or training graphs; export inference alone")
     for graph in _graphs(proto.graph):
@@ -94,8 +86,9 @@ def read_checked(path: Path) -> onnx.ModelProto:
             if not onnx.defs.has(node.op_type):
                 raise PolicyError(f"{path}: operator {node.op_type!r} is not in the ONNX standard")
     external = [tensor for tensor in _tensors(proto) if tensor.external_data]
+    size = path.stat().st_size
     for tensor in external:
-        size += _check_external(path, tensor)
+        size += _data_file(path, tensor).stat().st_size
     if size > MAX_BYTES:
         raise PolicyError(f"{path}: {size} bytes with its data, allowed are {MAX_BYTES}")
     try:
@@ -107,8 +100,29 @@ def read_checked(path: Path) -> onnx.ModelProto:
     return proto
 
 
-def _check_external(path: Path, tensor: onnx.TensorProto) -> int:
-    """Return the bytes of the file that a tensor's data lie in, which is in the same folder."""
+def files_of(path: Path) -> list[Path]:
+    """Return an ONNX file and the files that its tensors' data lie in, by name.
+
+    Raises:
+        PolicyError: where it is damaged or points outside its folder.
+    """
+    external = {_data_file(path, t) for t in _tensors(_graph_of(path)) if t.external_data}
+    return [path, *sorted(external)]
+
+
+def _graph_of(path: Path) -> onnx.ModelProto:
+    try:
+        return onnx.load_model(path, load_external_data=False)
+    except OSError as error:
+        raise PolicyError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+    except Exception as error:  # protobuf's DecodeError; protobuf is no dependency of ours
+        raise PolicyError(
+            f"{path}: not a whole ONNX file ({_first_line(error)}); export it again"
+        ) from None
+
+
+def _data_file(path: Path, tensor: onnx.TensorProto) -> Path:
+    """Return the file that a tensor's data lie in, which is in the same folder."""
     location = next((e.value for e in tensor.external_data if e.key == "location"), "")
     folder = path.resolve().parent
     file = (folder / location).resolve()
@@ -119,7 +133,7 @@ def _check_external(path: Path, tensor: onnx.TensorProto) -> int:
         )
     if not file.is_file():
         raise PolicyError(f"{path}: tensor {tensor.name!r} is kept in {file}, which is missing")
-    return file.stat().st_size
+    return file
 
 
 def _graphs(graph: onnx.GraphProto) -> Iterator[onnx.GraphProto]:

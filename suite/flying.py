@@ -42,7 +42,7 @@ def default_policy() -> str:
 
 
 def policy_digest(name_or_path: str) -> str:
-    """Return the SHA-256 of a policy's file, or of what flies of its folder, as hex.
+    """Return the SHA-256 of a policy's files, or of what flies of its folder, as hex.
 
     A card or a curve beside it may change and the policy be the same.
     """
@@ -50,8 +50,13 @@ def policy_digest(name_or_path: str) -> str:
     from policies.checkpoint import CONFIG, WEIGHTS
 
     path = shipped.locate(name_or_path)
-    inside = [path / CONFIG, path / WEIGHTS]
-    files = [file for file in inside if file.is_file()] if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():
+        files = [file for file in (path / CONFIG, path / WEIGHTS) if file.is_file()]
+    elif path.suffix == ".onnx":
+        from policies.onnx_file import files_of
+
+        files = files_of(path)
     digest = hashlib.sha256()
     for file in files:
         digest.update(file.name.encode() + b"\0" + file.read_bytes())

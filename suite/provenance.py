@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata as metadata
+import json
 import os
 import platform
 import sys
@@ -84,5 +85,16 @@ def run_record(config: Any, seed: int | None) -> dict[str, Any]:
 
 
 def write_run_record(folder: str | os.PathLike[str], config: Any, seed: int | None) -> None:
-    """Write `run_record` to `folder`/run.json."""
-    write_json(Path(folder) / "run.json", run_record(config, seed))
+    """Write `run_record` to `folder`/run.json.
+
+    The commits of a record that was there are kept as `earlier_commits`: a run that goes on was
+    made by all of them.
+    """
+    path, record = Path(folder) / "run.json", run_record(config, seed)
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))
+        commits = [*before.get("earlier_commits", []), before["git_commit"]]
+    except (OSError, ValueError, KeyError):
+        commits = []
+    record["earlier_commits"] = sorted({*commits} - {record["git_commit"], None})
+    write_json(path, record)

@@ -92,7 +92,7 @@ def make_reward(
         size, change = smoothness_terms(
             weights, body.acc_w, before.acc_w, worlds.constants.time_step
         )
-        behind = progress_term(weights, body.pos_w, body.vel_w, goal_w, jnp.zeros((1, 2)))
+        behind = progress_term(weights, body.pos_w, body.vel_w, goal_w, jnp.zeros((1, 3)))
         terms = RewardTerms(
             collision=COLLISION * (clearance < weights.safety_radius_m),
             avoid=BARRIER * barrier + CLOSING * closing,

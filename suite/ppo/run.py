@@ -13,6 +13,7 @@ from suite.console import Console
 from suite.estimate import Estimate
 from suite.ppo.config import PpoConfig
 from suite.ppo.update import make_update, start_state
+from suite.train.checks import check
 from suite.train.repeat import Method, Outcome, Run, Watch, repeat
 from suite.train.worlds import sample_worlds
 from tracks.files import plain
@@ -46,10 +47,11 @@ def train_ppo(
         watch: measures the policy on the way; its steps are iterations.
 
     Raises:
-        ValueError: where the folder holds another run, or settings do not divide as they must.
+        ValueError: where settings cannot be used, and where the folder holds another run.
         WorkFailed: where a number of the curve stops being finite.
     """
     shared = config.shared
+    check(shared)
     method = Method(
         iterations=config.iterations,
         frames=config.episode.batch * config.episode.steps,

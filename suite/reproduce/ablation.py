@@ -6,7 +6,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.console import Console
-from suite.reproduce.recipes import FourGates, asked_rows, check_sizes, four_gate_recipe
+from suite.reproduce.recipes import (
+    FourGates,
+    asked_rows,
+    check_owned,
+    check_sizes,
+    four_gate_recipe,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -103,14 +109,16 @@ def settings(config: Config) -> list[Setting]:
     Raises:
         ValueError: for a preset, a change or a row that does not exist.
     """
+    fixed = ("progress_norm", "projection")
+    check_owned(config.set, {f"loss.{name}": "it is compared" for name in fixed})
     base = four_gate_recipe(config)
 
     def row(key: str, words: str, weight: float, **changes: float) -> Setting:
         recipe = replace(base, loss=replace(base.loss, **changes))
         return Setting(f"{key} {weight:g}", words, weight, recipe)
 
-    bare = {"field_gain": 0.0, "projection": 0.0}
-    weights = sorted({*PROGRESS, base.loss.progress})
+    bare = {"field_gain": 0.0}
+    weights = sorted({float(f"{weight:g}") for weight in (*PROGRESS, base.loss.progress)})
     rows = [row("field", "with the field, L_p", w, progress=w, progress_norm=0.0) for w in weights]
     rows += [
         row("progress", "without, L_p", w, progress=w, progress_norm=0.0, **bare) for w in weights

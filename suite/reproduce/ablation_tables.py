@@ -15,19 +15,12 @@ from suite.console import duration
 from suite.report import Cell, Grid, Picture, Report, Section, ranged
 from suite.reproduce.paper import Ablated
 from suite.reproduce.paper import ablation as printed
+from suite.reproduce.scheme_curves import Spread, spread
 
 if TYPE_CHECKING:
     from suite.reproduce.ablation import Config, Setting, Trained
 
 METRICS = ("success_cross", "success_rate", "v_max", "v_max_most", "gates")
-
-
-class Over(NamedTuple):
-    """A number over training seeds."""
-
-    mean: float
-    least: float
-    most: float
 
 
 class Row(NamedTuple):
@@ -40,7 +33,7 @@ class Row(NamedTuple):
     seeds: int
     """Trainings, the diverged ones included."""
     diverged: int
-    over: dict[str, Over]
+    over: dict[str, Spread]
     """Of `METRICS`; empty where all diverged."""
     pooled: dict[str, Interval]
     """Wilson intervals of the two successes over the trials of all seeds; empty likewise."""
@@ -61,7 +54,7 @@ def summaries(chosen: Sequence[Setting], results: Sequence[Trained], trials: int
         over, pooled = {}, {}
         if found:
             columns = {name: [numbers[name] for numbers in found] for name in METRICS}
-            over = {n: Over(float(np.mean(c)), min(c), max(c)) for n, c in columns.items()}
+            over = {name: spread(column) for name, column in columns.items()}
             pooled = {
                 name: wilson(sum(round(trials * x) for x in columns[name]), trials * len(found))
                 for name in METRICS[:2]

@@ -22,7 +22,7 @@ def digest(value: Any) -> str:
 
 @functools.cache
 def code_digest(*rooms: str) -> str:
-    """Return 16 hex digits that stand for the code and data of `rooms`.
+    """Return 16 hex digits that stand for the code of `rooms`.
 
     Args:
         rooms: folders of the project, such as "tracks" or "suite/train".

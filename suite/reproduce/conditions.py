@@ -172,6 +172,13 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
     if "command_delay" in vehicle.effects:
         delay = 1e3 * vehicle.effects["command_delay"].delay
 
+    heavier = 0.0
+    if "mass_offset" in vehicle.effects:
+        heavier = 100 * vehicle.effects["mass_offset"].offset / vehicle.mass
+    wind = 0.0
+    if "constant_wind" in vehicle.effects:
+        wind = float(np.linalg.norm(vehicle.effects["constant_wind"].velocity))
+
     def more(first: float, *others: float) -> tuple[float, ...]:
         return (first, *(size for size in others if size > first))
 
@@ -180,9 +187,9 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
               _effect("motor_lag", "time_constant", 1e-3)),
         Sweep("latency", "command delay [ms]", more(delay, 50, 80, 120, 180),
               _effect("command_delay", "delay", 1e-3)),
-        Sweep("mass", "mass above nominal [%]", (0, 10, 20, 40, 60), _heavier),
+        Sweep("mass", "mass above nominal [%]", more(heavier, 10, 20, 40, 60), _heavier),
         Sweep("drag", "drag, times the vehicle's own", (1, 2, 4, 8, 16), _draggier),
-        Sweep("wind", "constant wind [m/s]", (0, 2, 4, 6, 8), _windy),
+        Sweep("wind", "constant wind [m/s]", more(wind, 2, 4, 6, 8), _windy),
         Sweep("depth noise", "standard deviation of inverse depth [1/m]", (0, 0.01, 0.03, 0.1, 0.3),
               _sensing("inverse_depth")),
         Sweep("gate-pose error", "standard deviation per axis [m]", (0, 0.05, 0.1, 0.2, 0.3),

@@ -145,6 +145,11 @@ def ideas(config: Config) -> list[Idea]:
     from suite.train.overrides import override
 
     base = asked_recipe(config.preset, config.set, config.iterations)
+    if base.episode.gate_corners != 4:
+        raise ValueError(
+            f"--set episode.gate_corners={base.episode.gate_corners}: the judge's gates have 4; "
+            "round gates have rows of their own"
+        )
     longer = (
         f"episode.steps={2 * base.episode.steps}",
         f"episode.batch={max(1, base.episode.batch // 2)}",

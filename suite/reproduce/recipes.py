@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -107,12 +107,30 @@ def asked_rows(rows: Sequence[Row], only: Sequence[str], what: str) -> list[Row]
     return [row for row in rows if not only or row.key in only]
 
 
+def check_owned(changes: Sequence[str], owned: Mapping[str, str]) -> None:
+    """Refuse changes of settings that an experiment sets itself and would overwrite.
+
+    Args:
+        changes: as --set takes them.
+        owned: what to do instead, by a setting's path.
+
+    Raises:
+        ValueError: naming the setting and what to do instead.
+    """
+    for change in changes:
+        path = change.partition("=")[0].strip()
+        if path in owned:
+            raise ValueError(f"--set {change!r}: this experiment sets {path}; {owned[path]}")
+
+
 def four_gate_recipe(config: FourGates) -> TrainConfig:
     """Return the recipe that `config` asks for on tracks of four gates.
 
     Raises:
         ValueError: for a preset or a change that does not exist.
     """
+    owned = {"episode.batch": "give --worlds", "optimizer.iterations": "give --iterations"}
+    check_owned(config.set, {**owned, "episode.gates": f"all fly {GATES}, as in the paper"})
     base = asked_recipe(config.preset, config.set, config.iterations)
     return replace(base, episode=replace(base.episode, gates=GATES, batch=config.worlds))
 

@@ -10,7 +10,7 @@ import numpy as np
 from eval.stats import Interval, PairedDifference, paired_success, wilson
 from eval.trial import TrialResult
 from suite.flying import policy_digest
-from suite.report import Cell, Grid, Picture, Report, Section
+from suite.report import Cell, Grid, Picture, Report, Section, percent
 from suite.reproduce.conditions import STATE_UNIT, Condition, Sweep, log_faults
 from suite.reproduce.robust_charts import effects_chart, sweeps_chart
 
@@ -121,7 +121,7 @@ def robust_report(
 
 def _lead(policy: str, effects: Sequence[Tested], grown: Mapping[Sweep, Sequence[Tested]]) -> str:
     base = effects[0].success(policy)
-    text = f"Undisturbed, {policy} succeeds in {_percent(base)} of the trials."
+    text = f"Undisturbed, {policy} succeeds in {percent(base)} of the trials."
     if len(effects) > 1:
         worst = sorted(effects[1:], key=lambda entry: entry.success(policy).value)[:3]
         each = (
@@ -171,15 +171,10 @@ def condition_grid(
             change = Cell("") if same else points_cell(
                 paired_success(entry.won(name), base.won(name))
             )  # fmt: skip
-            row += [Cell(_percent(entry.success(name))), change]
+            row += [Cell(percent(entry.success(name))), change]
         row += [points_cell(paired_success(entry.won(n), entry.won(names[0]))) for n in names[1:]]
         rows.append(row)
     return Grid(title, headers, rows)
-
-
-def _percent(interval: Interval) -> str:
-    value, low, high = (100 * x for x in interval)
-    return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
 
 
 def points_cell(difference: PairedDifference | Interval) -> Cell:

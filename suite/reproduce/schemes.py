@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.choices import at_least
 from suite.console import Console
-from suite.reproduce.recipes import FourGates, asked_rows, check_sizes, four_gate_recipe
+from suite.reproduce.recipes import (
+    FourGates,
+    asked_rows,
+    check_owned,
+    check_sizes,
+    four_gate_recipe,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -121,6 +127,9 @@ def schemes(config: Config) -> list[Scheme]:
     """
     from suite.ppo.config import ppo_like
 
+    compared = ("progress_norm", "projection", "projection_decay")
+    owned = {f"loss.{name}": "it is compared" for name in compared}
+    check_owned(config.set, {"loss.progress": "give --progress", **owned})
     base = four_gate_recipe(config)
     loss = replace(base.loss, progress=config.progress, progress_norm=0.0, projection=0.0)
     ours = replace(base, loss=loss)

@@ -78,7 +78,7 @@ def all_done(
         what: the pieces are, in a few words.
 
     Raises:
-        WorkFailed: where a process ends badly.
+        WorkFailed: as `do` raises it, and where a process ends badly.
     """
     if jobs == 1:
         return [do(piece, console) for piece in pieces]
@@ -86,12 +86,16 @@ def all_done(
     items = [(number, shares[number % jobs], piece) for number, piece in enumerate(pieces)]
     with console.progress(what, len(pieces)) as update:
 
-        def keep(number: int, result: Result) -> None:
+        def keep(number: int, result: Result | WorkFailed) -> None:
+            if isinstance(result, WorkFailed):
+                raise result
             found[number] = result
             update(len(found))
 
         try:
             fly_in_processes(_do_share, do, items, jobs, keep)
+        except WorkFailed:
+            raise
         except RuntimeError as error:
             raise WorkFailed(
                 f"{what}: a process ended badly, what the others finished is kept; the same "
@@ -109,4 +113,7 @@ def _do_share(
         if cores:
             # Before JAX makes its threads: there will be as many as cores.
             os.sched_setaffinity(0, cores)
-        emit(number, do(piece, Silent()))
+        try:
+            emit(number, do(piece, Silent()))
+        except WorkFailed as failure:
+            emit(number, failure)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from eval.stats import Interval
 from eval.table import Cell as Judged
-from suite.report import Cell, Grid
+from suite.report import Cell, Grid, percent
 from suite.reproduce.goals import SURE, goals
 from suite.reproduce.paper import Printed, sim_to_sim
 from tracks.families import JUDGED
@@ -27,12 +26,6 @@ CHART = (
     "Success with 95 % Wilson intervals and median v_max at every level; hollow: printed by the "
     "paper (with Delta Action Model)."
 )
-
-
-def percent(interval: Interval) -> str:
-    """Return a rate with its interval: "94 % [88, 97]"."""
-    value, low, high = (100 * x for x in interval)
-    return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
 
 
 def beside_the_paper(cells: Sequence[Judged]) -> Grid:

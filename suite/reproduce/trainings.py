@@ -56,9 +56,13 @@ def warm_seconds(run: Path) -> float:
 
 
 def commit_of(policy: Path) -> str:
-    """Return the commit that trained `policy` (RUN/policy), "unknown" where nothing says so."""
-    record = policy.parent / "run.json"
+    """Return the commit that trained `policy` (RUN/policy), "unknown" where nothing says so.
+
+    A training that was stopped and gone on with may have several: all of them.
+    """
+    path = policy.parent / "run.json"
     try:
-        return str(json.loads(record.read_text(encoding="utf-8"))["git_commit"])
+        record = json.loads(path.read_text(encoding="utf-8"))
+        return ", ".join([*record.get("earlier_commits", []), str(record["git_commit"])])
     except (OSError, ValueError, KeyError):
         return "unknown"

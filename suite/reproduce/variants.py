@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 OURS, WITH, CONTROL = "ours", "ours, with Delta Action Model", "ours, tuned as long without it"
 LOOP_TRIALS = 10
 """Judged trials a cell in the loop's own tables, which are not shown here."""
+LOOP_ROOMS = ("tracks", "policies", "eval", "suite/train", "suite/delta", "suite/loop")
+"""Code that flies, fits and fine-tunes: a loop that older code ran is not taken for this one's."""
 
 
 class Variant(NamedTuple):
@@ -51,7 +53,7 @@ def variants_of(config: Config, place: Place, console: Console) -> list[Variant]
     chosen = {OURS: policy, **{name: path for name, path in given.items() if path}}
     if config.delta_iterations:
         loop = loop_config(config, policy)
-        folder = place.cache / "loops" / digest([loop, code_digest("tracks", "policies", "eval")])
+        folder = place.cache / "loops" / digest([loop, code_digest(*LOOP_ROOMS)])
         run_loop(loop, folder, Quiet())
         chosen[WITH] = str(folder / "tuned-with" / "policy")
         chosen[CONTROL] = str(folder / "tuned-without" / "policy")

@@ -38,7 +38,8 @@ class PointMassConfig:
     depth_noise: float = 0.02
     """Standard deviation of the noise on the encoded inverse depth [1]."""
     fov_scale: tuple[float, float] = (0.95, 1.05)
-    """Range of a run's field of view as a share of the camera's, drawn per iteration [1]."""
+    """Range by which the images' half widths, as tangents, are scaled: the field of view, drawn per
+    iteration [1]."""
     heading_rate: float = 6.0
     """Rate at which the heading follows the direction to the gate [1/s]."""
 
@@ -147,7 +148,8 @@ class EpisodeConfig:
     """Worlds that start at rest leave the loss at a random step from this share of `steps` on, so
     that the policy cannot count the steps left and go for broke at the end; 1: none leaves."""
     start_speed: float = 6.0
-    """Largest speed of a world that starts on the way [m/s]."""
+    """Largest speed towards the gate of a world that starts on the way; sideways some is added
+    [m/s]."""
     missed_share: float = 0.0
     """Share of the worlds that start on the way which start beside or above their gate's frame, as
     one does that has missed it."""

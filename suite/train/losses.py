@@ -80,7 +80,7 @@ def progress_term(
     pos_w: jax.Array,
     vel_w: jax.Array,
     target_w: jax.Array,
-    lateral_g: jax.Array,
+    place_g: jax.Array,
 ) -> jax.Array:
     """Return L_p with the ablation's variants L_p^norm and L_proj, weighted, (B,).
 
@@ -89,14 +89,15 @@ def progress_term(
         pos_w: (B, 3) [m].
         vel_w: (B, 3) [m/s].
         target_w: (B, 3) the point to fly to [m].
-        lateral_g: (B, 2) the position in the target gate's y-z plane [m].
+        place_g: (B, 3) the position in the target gate's frame [m]; L_proj counts the distance to
+            the gate, whatever point before it `target_w` is.
     """
     to_gate = target_w - pos_w
     distance = _norm(to_gate)
     towards = (vel_w * to_gate).sum(-1) / distance
     total = -config.progress * towards - config.progress_norm * towards / (_norm(vel_w) + 1e-3)
-    near = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(distance))
-    return total + config.projection * (lateral_g * lateral_g).sum(-1) * near
+    near = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(_norm(place_g)))
+    return total + config.projection * (place_g[:, 1:] ** 2).sum(-1) * near
 
 
 def guidance_term(

@@ -106,7 +106,8 @@ def repeat(
     done = int(state.iteration)
     if done < method.iterations or _is_missing(watch, folder, done, method.iterations):
         announce(console, f"training to {folder}", method.estimate)
-        write_run_record(folder, run.config, run.seed)
+        if done < method.iterations:
+            write_run_record(folder, run.config, run.seed)
         state = _iterate(method, run, state, console, watch)
     rows = curve.read(folder)
     last = rows[-max(1, len(rows) // 10) :]

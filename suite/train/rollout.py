@@ -161,7 +161,7 @@ def make_judge(
             collide=weights.collide * collide,
             acceleration=size,
             jerk=change,
-            progress=losses.progress_term(weights, body.pos_w, body.vel_w, goal_w, local[:, 1:]),
+            progress=losses.progress_term(weights, body.pos_w, body.vel_w, goal_w, local),
             guidance=losses.guidance_term(weights, gate, body.pos_w, body.vel_w),
         )
         return terms, distance.min(-1), passed

@@ -18,10 +18,11 @@ from eval.sharding import usable_cores
 from policies import delta_network, network
 from suite.console import Console
 from suite.estimate import Estimate
+from suite.train.checks import check
 from suite.train.config import TrainConfig
 from suite.train.repeat import Method, Outcome, Run, Watch, repeat
 from suite.train.update import device_mesh, make_update, start_state
-from suite.train.worlds import check_worlds, sample_worlds
+from suite.train.worlds import sample_worlds
 from tracks.files import plain
 
 STEPS_PER_CORE_S = 5000.0
@@ -60,11 +61,11 @@ def train(
         watch: measures the policy on the way.
 
     Raises:
-        ValueError: for settings that no world can be made with, and where the folder holds a run
+        ValueError: for settings that cannot be used, and where the folder holds a run
             of another configuration, start or delta.
         WorkFailed: where the loss or the parameters stop being finite.
     """
-    check_worlds(config)
+    check(config)
     mesh = device_mesh(config)
     origin = {"config": plain(config), "from": _digest(params), "delta": _digest(delta)}
     method = Method(

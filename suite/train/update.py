@@ -71,8 +71,9 @@ def curve_numbers(
 ) -> dict[str, jax.Array]:
     """Return the numbers of the curve, scalars each: a row of metrics.jsonl.
 
-    Collisions and speeds are those of steps that count in the loss. `memory` is the mean size of
-    the recurrent states: near 1 they are saturated, and nothing that is seen reaches the action.
+    Gates, collisions and speeds are those of steps that count in the loss. `memory` is the mean
+    size of the recurrent states: near 1 they are saturated, and nothing that is seen reaches the
+    action.
     """
     counts = records.alive > 0
     speed = jnp.where(counts, records.speed, 0.0)
@@ -80,7 +81,7 @@ def curve_numbers(
     numbers = {
         "loss": loss,
         "gradient_norm": jnp.sqrt(sum((leaf * leaf).sum() for leaf in gradient.values())),
-        "gates": records.passed.sum(0).mean(),
+        "gates": (records.passed & counts).sum(0).mean(),
         "collided": hit.any(0).mean(),
         "speed": speed.sum() / jnp.maximum(counts.sum(), 1),
         "speed_max": speed.max(0).mean(),

@@ -39,20 +39,7 @@ class Worlds(NamedTuple):
     stop: Array
     """(B,) step at which a world leaves the loss."""
     fov_scale: Array
-    """(B,) this iteration's field of view as a share of the camera's."""
-
-
-def check_worlds(config: TrainConfig) -> None:
-    """Refuse settings that no world can be made with.
-
-    Raises:
-        ValueError: naming the setting, its value and what is allowed.
-    """
-    corners, spread = config.episode.gate_corners, config.episode.height_spread
-    if corners < 3:
-        raise ValueError(f"episode.gate_corners is {corners}, allowed are 3 and more")
-    if not 0 <= spread < np.inf:
-        raise ValueError(f"episode.height_spread is {spread}, allowed are 0 and more")
+    """(B,) this iteration's scale of the rays across the optical axis."""
 
 
 def difficulty_range(config: TrainConfig, iteration: int) -> tuple[float, float]:

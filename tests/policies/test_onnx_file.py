@@ -6,6 +6,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from policies.errors import PolicyError
+from policies.onnx_file import files_of
 from policies.policy import load_policy
 
 FLOAT = TensorProto.FLOAT
@@ -97,6 +98,7 @@ def test_data_beside_the_file_is_read_and_outside_it_is_refused(tmp_path):
     for location in ("../w.bin", str(tmp_path / "w.bin"), ""):
         refused(write_raw(path, external(location)), "outside the file's folder")
     refused(write_raw(path, external("none.bin")), "missing")
+    assert files_of(write_raw(path, external("w.bin"))) == [path, folder / "w.bin"]
     (folder / "link.bin").symlink_to(tmp_path / "w.bin")
     refused(write_raw(path, external("link.bin")), "outside the file's folder")
 

@@ -155,3 +155,11 @@ def test_a_policy_that_sees_more_is_refused(seen, spec, key):
     params = network.init(jax.random.key(5), seen)
     with pytest.raises(ValueError, match=rf"has spec\.{key}; set spec\.{key}=True"):
         network.fitted(params, seen, spec)
+
+
+def test_a_policy_of_another_size_or_rate_is_refused():
+    params = network.init(jax.random.key(5), SPEC)
+    for changed, words in (({"hidden_size": 32}, "hidden_size 64, and this run 32"),
+                           ({"rate_hz": 60.0}, "rate_hz .*, and this run 60.0")):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            network.fitted(params, SPEC, replace(SPEC, **changed))

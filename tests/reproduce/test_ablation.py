@@ -6,8 +6,9 @@ from eval.stats import wilson
 from suite.errors import WorkFailed
 from suite.reproduce import trainings
 from suite.reproduce.ablation import Config, Trained, settings
-from suite.reproduce.ablation_tables import Over, beside_paper, summaries, verdict
+from suite.reproduce.ablation_tables import beside_paper, summaries, verdict
 from suite.reproduce.paper import ablation as printed
+from suite.reproduce.scheme_curves import Spread
 from tests.support.documents import page, reproduce
 from tests.support.training import boxes_worlds
 
@@ -37,6 +38,8 @@ def test_settings_differ_in_field_and_progress_alone():
     others = {str(row.recipe).replace(str(row.recipe.loss), "") for row in settings(Config())}
     assert len(others) == 1
     assert "field 0.4" in {row.key for row in settings(Config(preset="paper"))}
+    nearly = settings(Config(set=("loss.progress=0.4000001",)))
+    assert [row.key for row in nearly].count("field 0.4") == 1
     assert len(settings(Config(preset="paper"))) == 11, "its own weight is one of the paper's"
 
 
@@ -85,8 +88,8 @@ def test_spread_pooled_interval_and_sentences_by_hand():
         *runs_of("normalised 6.4", None),
     ]
     field, bare, gone = summaries(chosen, runs, 10)
-    assert field.over["success_cross"] == pytest.approx(Over(0.9, 0.8, 1.0))
-    assert field.over["v_max"] == Over(6.0, 5.0, 7.0)
+    assert field.over["success_cross"] == pytest.approx(Spread(0.9, 0.8, 1.0))
+    assert field.over["v_max"] == Spread(6.0, 5.0, 7.0)
     assert field.pooled["success_cross"] == wilson(27, 30)
     assert (bare.seeds, bare.diverged) == (3, 1)
     assert bare.pooled["success_cross"] == wilson(4, 20)
@@ -146,6 +149,9 @@ def test_the_field_is_compared_at_the_same_weight():
         (["--only", "field 0.41"], "Did you mean 'field 0.4'?"),
         (["--preset", "smal"], "Did you mean 'small'?"),
         (["--jobs", "0"], "--jobs is 0"),
+        (["--set", "episode.batch=9"], "this experiment sets episode.batch; give --worlds"),
+        (["--set", "episode.gates=6"], "this experiment sets episode.gates; all fly 4"),
+        (["--set", "loss.projection=3"], "this experiment sets loss.projection; it is compared"),
         (["--trials", "0"], "--trials is 0"),
         (["--seconds", "0"], "--seconds is 0"),
     ],

@@ -44,6 +44,11 @@ def test_a_change_that_the_recipe_has_already_is_no_row():
     assert {"recipe", "curriculum", "L_proj", "round"} < keys
 
 
+def test_a_recipe_with_round_gates_is_refused():
+    with pytest.raises(ValueError, match=r"gate_corners=8: the judge's gates have 4"):
+        ideas(Config(set=("episode.gate_corners=8",)))
+
+
 def flown(*won) -> list[Any]:
     """Return trials with what a row looks at."""
     ends = {1: "finished", 0: "collision"}

@@ -15,6 +15,7 @@ from suite.reproduce.goals import goals, verdict
 from suite.reproduce.paper import sim_to_sim
 from suite.reproduce.seed_tables import spread
 from suite.reproduce.sim_tables import where_it_breaks
+from tests.support.vehicles import with_effects
 
 VEHICLE = load_vehicle("reference")
 
@@ -119,6 +120,15 @@ def test_sweeps_begin_at_the_vehicle_as_it_is_and_grow():
     _, noise = named["state-estimation noise"].make(VEHICLE, 2)
     assert (noise.pos_m, noise.vel) == pytest.approx((0.06, 0.2))
     assert noise.attitude_rad == pytest.approx(np.radians(2)) and noise.correlation_s == 0.5
+
+
+def test_sweeps_of_a_vehicle_with_effects_begin_at_those():
+    own = with_effects(VEHICLE, mass_offset=(0.15,), constant_wind=((3.0, -4.0, 0.0),))
+    named = {sweep.name: sweep for sweep in sweeps(own)}
+    assert named["mass"].sizes == (pytest.approx(20), 40, 60)
+    assert named["wind"].sizes == (5.0, 6, 8)
+    heavy = sweep_conditions(own, named["mass"])[1].vehicle
+    assert heavy.effects["mass_offset"].offset == pytest.approx(0.3)
 
 
 def test_the_cache_is_named_by_all_code_that_flies(tmp_path, monkeypatch):

@@ -20,6 +20,10 @@ def die(piece, console):
     os._exit(7)
 
 
+def diverge(piece, console):
+    raise WorkFailed(f"training {piece} diverged")
+
+
 def test_no_core_is_in_two_shares(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 5, 6, 7, 9})
     assert core_shares(2) == [[3, 5], [6, 7]]
@@ -46,3 +50,9 @@ def test_pieces_come_back_in_order_from_processes_that_share_no_core():
 def test_a_process_that_dies_is_said():
     with pytest.raises(WorkFailed, match=r"dying: a process ended badly.*exit code 7"):
         all_done(die, [1, 2], 2, Console(), "dying")
+
+
+@pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
+def test_work_that_fails_says_so_in_its_own_words():
+    with pytest.raises(WorkFailed, match=r"^training 1 diverged$"):
+        all_done(diverge, [1], 2, Console(), "training")

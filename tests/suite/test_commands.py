@@ -105,3 +105,14 @@ def test_a_run_record_holds_what_is_needed_to_repeat_it(tmp_path):
     assert record["seed"] == 3 and record["schema"] == 1
     assert set(record) >= {"suite_version", "git_commit", "python", "packages", "machine"}
     assert run_record(config, None)["config_type"] == "suite.estimate.Estimate"
+
+
+def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch):
+    from suite.reproduce.trainings import commit_of
+
+    for commit in ("aaa", "aaa", "bbb"):
+        monkeypatch.setattr("suite.provenance.stamp", lambda c=commit, **_: {"git_commit": c})
+        write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3)
+    assert json.loads((tmp_path / "run.json").read_text())["earlier_commits"] == ["aaa"]
+    assert commit_of(tmp_path / "policy") == "aaa, bbb"
+    assert commit_of(tmp_path / "none" / "policy") == "unknown"

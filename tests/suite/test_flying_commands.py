@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
@@ -157,6 +158,22 @@ def test_a_digest_changes_with_any_byte_of_what_flies_and_no_other(tmp_path):
     assert len(set(seen)) == 3
     (folder / "card.md").write_text("words")
     assert policy_digest(str(folder)) == seen[-1]
+
+
+def test_a_digest_changes_with_weights_beside_an_onnx_file(tmp_path):
+    onnx = pytest.importorskip("onnx")
+    weights = onnx.numpy_helper.from_array(np.ones(300, np.float32), "w")
+    node = onnx.helper.make_node("Identity", ["w"], ["action"])
+    graph = onnx.helper.make_graph([node], "g", [], [], [weights])
+    path, seen = tmp_path / "it.onnx", []
+    onnx.save(
+        onnx.helper.make_model(graph), path,
+        save_as_external_data=True, location="w.bin", size_threshold=0,
+    )  # fmt: skip
+    for scale in (1, 2):
+        (tmp_path / "w.bin").write_bytes(np.full(300, scale, np.float32).tobytes())
+        seen.append(policy_digest(str(path)))
+    assert len(set(seen)) == 2
 
 
 def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):

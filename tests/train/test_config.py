@@ -11,6 +11,7 @@ from suite import cli
 from suite.commands.train import Config, resolve
 from suite.console import Console
 from suite.flying import checkpoint_folder
+from suite.train.checks import check
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
 from suite.train.presets import PRESETS, preset
@@ -89,6 +90,11 @@ def test_difficulty_grows_from_its_lower_end():
         ({"gate_corners": 2}, "episode.gate_corners is 2, allowed are 3 and more"),
         ({"height_spread": -1.0}, "episode.height_spread is -1.0, allowed are 0 and more"),
         ({"height_spread": float("nan")}, "episode.height_spread is nan"),
+        ({"batch": 0}, "episode.batch is 0, allowed are 1 and more"),
+        ({"stop_from": 1.5}, "episode.stop_from is 1.5, allowed are 0 to 1"),
+        ({"gates": 9}, "episode.gates is 9, allowed are 1 to 8"),
+        ({"difficulty": (0.5, 0.2)}, "episode.difficulty is .*lower end of the range first"),
+        ({"physics": {"action_delay": (0.0, 3.0)}}, "physics.action_delay is .*allowed are 0 to 2"),
     ],
 )
 def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
@@ -97,6 +103,17 @@ def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
     with pytest.raises(ValueError, match=words):
         train(small_config(**changes), tmp_path / "run", Console())
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_a_seed_that_no_key_is_made_of_is_refused(seed, tmp_path):
+    with pytest.raises(ValueError, match=rf"seed is {seed}, allowed are 0 to 4294967295"):
+        train(replace(small_config(), seed=seed), tmp_path / "run", Console())
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_is_within_the_limits(name):
+    check(preset(name))
 
 
 def test_gates_heights_follow_the_setting():

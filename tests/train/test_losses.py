@@ -132,29 +132,32 @@ def test_progress_is_the_papers_and_differentiates():
     config = LossConfig(progress=0.4)
     rng = np.random.default_rng(2)
     pos, vel, target = (jnp.asarray(rng.normal(0, 3, (5, 3))) for _ in range(3))
-    lateral = (pos - target)[:, 1:]
     to_gate = np.array(target - pos)
     expected = -0.4 * (np.array(vel) * to_gate).sum(-1) / np.linalg.norm(to_gate, axis=-1)
     np.testing.assert_allclose(
-        progress_term(config, pos, vel, target, lateral), expected, atol=1e-9
+        progress_term(config, pos, vel, target, pos - target), expected, atol=1e-9
     )
     for varied in (LossConfig(), LossConfig(progress=0.0, progress_norm=0.7)):
         check_grads(
-            lambda p, v, c=varied: progress_term(c, p, v, target, lateral),
+            lambda p, v, c=varied: progress_term(c, p, v, target, pos - target),
             (pos, vel), order=1, modes=["rev"], atol=1e-6, rtol=1e-6,
         )  # fmt: skip
 
 
-def test_projection_pulls_to_the_axis_and_its_range_carries_no_gradient():
-    """L_proj = |lateral|^2 exp(-beta_3 distance), where only the lateral part is differentiated."""
+@pytest.mark.parametrize("before_m", [0.0, 1.5])
+def test_projection_pulls_to_the_axis_and_its_range_carries_no_gradient(before_m):
+    """L_proj = |lateral|^2 exp(-beta_3 distance), where only the lateral part is differentiated.
+
+    The distance is that of the gate, wherever before it progress is measured to.
+    """
     config = LossConfig(progress=0.0, projection=1.5, projection_decay=0.5)
-    target, vel = jnp.asarray([[4.0, 0.5, 1.0]]), jnp.asarray([[1.0, 2.0, 3.0]])
-    pos = jnp.asarray([[1.0, 1.0, 2.0]])
+    gate, vel = jnp.asarray([[4.0, 0.5, 1.0]]), jnp.asarray([[1.0, 2.0, 3.0]])
+    pos, target = jnp.asarray([[1.0, 1.0, 2.0]]), gate - jnp.asarray([[before_m, 0.0, 0.0]])
 
     def term(pos):
-        return progress_term(config, pos, vel, target, (pos - target)[:, 1:]).sum()
+        return progress_term(config, pos, vel, target, pos - gate).sum()
 
-    distance = np.linalg.norm(np.array(pos - target))
+    distance = np.linalg.norm(np.array(pos - gate))
     near = np.exp(-0.5 * distance)
     assert float(term(pos)) == pytest.approx(1.5 * (0.5**2 + 1.0**2) * near)
     expected = 1.5 * 2 * near * np.array([[0, 0.5, 1.0]])

@@ -64,15 +64,16 @@ def test_the_curve_is_of_steps_that_count():
     worlds = worlds._replace(stop=np.array([1, 1, 1, 1]))
     gradient, loss, records = jax.jit(make_gradient(config))(params, worlds, KEY, None)
     after = np.arange(4)[:, None] > 0
-    # What comes later would be a collision at 100 m/s.
+    # What comes later would be a gate and a collision at 100 m/s.
     records = records._replace(
+        passed=after & np.ones_like(records.passed),
         speed=np.where(after, 100.0, records.speed),
         clearance=np.where(after, -1.0, records.clearance),
     )
     numbers = curve_numbers(loss, gradient, records)
     first = np.mean(records.speed[0])
     assert numbers["speed"] == pytest.approx(first) == numbers["speed_max"]
-    assert numbers["collided"] == 0
+    assert numbers["collided"] == numbers["gates"] == 0
     assert numbers["memory"] == pytest.approx(np.abs(records.hidden).mean())
     assert 0 < numbers["memory"] < 0.5, "a fresh network's is far from saturated"
 
