@@ -23,13 +23,13 @@ class Camera:
     """Pixels down."""
 
 
-def pixel_rays_b(camera: Camera, fov_scale: float = 1.0) -> np.ndarray:
+def pixel_rays_b(camera: Camera) -> np.ndarray:
     """Return the rays through the pixel centres in body axes, (height * width, 3).
 
     Row-major from the top left, as the image is stored. Each ray's component along the optical
     axis is 1, so the ray parameter at a hit is the planar depth itself.
     """
-    half_u, half_v = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) * fov_scale / 2)
+    half_u, half_v = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) / 2)
     left = half_u * (1 - (2 * np.arange(camera.width) + 1) / camera.width)
     up = half_v * (1 - (2 * np.arange(camera.height) + 1) / camera.height)
     up, left = np.meshgrid(up, left, indexing="ij")
