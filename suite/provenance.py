@@ -84,17 +84,22 @@ def run_record(config: Any, seed: int | None) -> dict[str, Any]:
     }
 
 
-def write_run_record(folder: str | os.PathLike[str], config: Any, seed: int | None) -> None:
+def write_run_record(
+    folder: str | os.PathLike[str], config: Any, seed: int | None, goes_on: bool = False
+) -> None:
     """Write `run_record` to `folder`/run.json.
 
-    The commits of a record that was there are kept as `earlier_commits`: a run that goes on was
-    made by all of them.
+    Args:
+        folder: of the run.
+        config: as `run_record` takes it.
+        seed: likewise.
+        goes_on: the run that the folder's record is of goes on; that record's commits are kept as
+            `earlier_commits`, since all of them made the run.
     """
     path, record = Path(folder) / "run.json", run_record(config, seed)
-    try:
+    commits: set[str] = set()
+    if goes_on and path.is_file():
         before = json.loads(path.read_text(encoding="utf-8"))
-        commits = [*before.get("earlier_commits", []), before["git_commit"]]
-    except (OSError, ValueError, KeyError):
-        commits = []
-    record["earlier_commits"] = sorted({*commits} - {record["git_commit"], None})
-    write_json(path, record)
+        commits = {*before.get("earlier_commits", []), before["git_commit"] or "unknown"}
+    earlier = sorted(commits - {record["git_commit"]})
+    write_json(path, {**record, "earlier_commits": earlier} if earlier else record)

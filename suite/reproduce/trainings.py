@@ -63,6 +63,6 @@ def commit_of(policy: Path) -> str:
     path = policy.parent / "run.json"
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        return ", ".join([*record.get("earlier_commits", []), str(record["git_commit"])])
+        return ", ".join([*record.get("earlier_commits", []), record["git_commit"] or "unknown"])
     except (OSError, ValueError, KeyError):
         return "unknown"

@@ -107,7 +107,7 @@ def repeat(
     if done < method.iterations or _is_missing(watch, folder, done, method.iterations):
         announce(console, f"training to {folder}", method.estimate)
         if done < method.iterations:
-            write_run_record(folder, run.config, run.seed)
+            write_run_record(folder, run.config, run.seed, goes_on=done > 0)
         state = _iterate(method, run, state, console, watch)
     rows = curve.read(folder)
     last = rows[-max(1, len(rows) // 10) :]

@@ -112,7 +112,9 @@ def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch
 
     for commit in ("aaa", "aaa", "bbb"):
         monkeypatch.setattr("suite.provenance.stamp", lambda c=commit, **_: {"git_commit": c})
-        write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3)
+        write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3, goes_on=True)
     assert json.loads((tmp_path / "run.json").read_text())["earlier_commits"] == ["aaa"]
     assert commit_of(tmp_path / "policy") == "aaa, bbb"
+    write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3)
+    assert commit_of(tmp_path / "policy") == "bbb", "another run in the same folder"
     assert commit_of(tmp_path / "none" / "policy") == "unknown"
