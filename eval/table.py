@@ -139,7 +139,8 @@ def _pairing(
     return Pairing(policy, against, track, difficulty, len(pairs), interval, success.p_value, speed)
 
 
-def _percent(interval: Interval) -> str:
+def percent(interval: Interval) -> str:
+    """Return a rate with its interval: "94 % [88, 97]"."""
     value, low, high = (100 * x for x in interval)
     return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
 
@@ -160,7 +161,7 @@ def _rows(cells: Sequence[Cell]) -> list[tuple[str, ...]]:
                 cell.track,
                 str(cell.difficulty),
                 str(cell.trials),
-                _percent(cell.success),
+                percent(cell.success),
                 f"{cell.gates_passed:.1f}",
                 _number(cell.v_max),
                 _number(cell.v_mean),

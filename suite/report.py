@@ -11,7 +11,6 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, NamedTuple
 
-from eval.stats import Interval
 from tracks.files import write_text
 
 if TYPE_CHECKING:
@@ -31,12 +30,6 @@ class Cell(NamedTuple):
 def ranged(mean: float, least: float, most: float, digits: int) -> str:
     """Return a mean over training seeds as cells show it, with the least and the most of one."""
     return f"{mean:.{digits}f} [{least:.{digits}f}, {most:.{digits}f}]"
-
-
-def percent(interval: Interval) -> str:
-    """Return a rate with its interval: "94 % [88, 97]"."""
-    value, low, high = (100 * x for x in interval)
-    return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
 
 
 @dataclass(frozen=True)

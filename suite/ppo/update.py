@@ -20,6 +20,7 @@ from suite.ppo import critic
 from suite.ppo.config import PpoConfig
 from suite.ppo.objective import Actor, Sequences, advantages, clipped_loss
 from suite.ppo.rollout import Record, make_rollout
+from suite.train.checks import check_stride
 from suite.train.gradient import encoder_gradient, every
 from suite.train.worlds import Worlds
 
@@ -137,11 +138,7 @@ def make_update(
         raise ValueError(
             f"minibatches is {config.minibatches}, allowed are divisors of episode.batch ({batch})"
         )
-    if config.episode.image_stride < 1 or steps % config.episode.image_stride:
-        raise ValueError(
-            f"episode.image_stride is {config.episode.image_stride}, allowed are divisors of "
-            f"episode.steps ({steps})"
-        )
+    check_stride(config.episode.image_stride, steps)
     rollout = make_rollout(config.shared)
     actor_optimizer, critic_optimizer = make_optimizers(config)
     seed = jax.random.key(np.uint32(config.seed))

@@ -15,7 +15,7 @@ from suite.console import duration
 from suite.report import Cell, Grid, Picture, Report, Section, ranged
 from suite.reproduce.paper import Ablated
 from suite.reproduce.paper import ablation as printed
-from suite.reproduce.scheme_curves import Spread, spread
+from suite.reproduce.seed_intervals import Spread, spread
 
 if TYPE_CHECKING:
     from suite.reproduce.ablation import Config, Setting, Trained

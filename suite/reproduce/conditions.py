@@ -96,7 +96,7 @@ def _with(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     share = np.asarray(DIRECTIONS.get(effect.name, np.ones(none.shape)))
     changed = none + sign * size * share
     if effect.name in vehicle.effects or effect.name == "motor_lag":
-        own = np.asarray(getattr(vehicle.effects.get(effect.name, values), parameter.name), float)
+        own = np.asarray(getattr(_own(vehicle, effect.name), parameter.name), float)
         changed = np.where(np.abs(own - none) > np.abs(changed - none), own, changed)
     value = tuple(changed.tolist()) if changed.ndim else float(changed)
     shown = "(" + ", ".join(f"{v:.3g}" for v in changed) + ")" if changed.ndim else f"{value:.3g}"
@@ -108,6 +108,11 @@ def _with(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
 def with_effect(vehicle: Vehicle, name: str, values: Any) -> Vehicle:
     """Return `vehicle` with the effect `name` at `values` in place of its own."""
     return replace(vehicle, effects=MappingProxyType({**vehicle.effects, name: values}))
+
+
+def _own(vehicle: Vehicle, name: str) -> Any:
+    """Return the values of the effect `name` that `vehicle` has, neutral ones where it has none."""
+    return vehicle.effects.get(name, neutral(EFFECTS[name], vehicle))
 
 
 def sweep_conditions(vehicle: Vehicle, sweep: Sweep) -> list[Condition]:
@@ -135,7 +140,7 @@ def _heavier(vehicle: Vehicle, percent: float) -> tuple[Vehicle, SensorNoise]:
 
 def _draggier(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorNoise]:
     for name in ("linear_drag", "quadratic_drag"):
-        own = vehicle.effects.get(name, neutral(EFFECTS[name], vehicle))
+        own = _own(vehicle, name)
         more = tuple(factor * value for value in own.coefficient)
         vehicle = with_effect(vehicle, name, own._replace(coefficient=more))
     return vehicle, SensorNoise()
@@ -165,19 +170,10 @@ def _estimating(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorNoise]:
 
 def sweeps(vehicle: Vehicle) -> list[Sweep]:
     """Return the sweeps from what `vehicle` is."""
-    lag = 1e3 * vehicle.rotors.time_constant
-    if "motor_lag" in vehicle.effects:
-        lag = 1e3 * vehicle.effects["motor_lag"].time_constant
-    delay = 0.0
-    if "command_delay" in vehicle.effects:
-        delay = 1e3 * vehicle.effects["command_delay"].delay
-
-    heavier = 0.0
-    if "mass_offset" in vehicle.effects:
-        heavier = 100 * vehicle.effects["mass_offset"].offset / vehicle.mass
-    wind = 0.0
-    if "constant_wind" in vehicle.effects:
-        wind = float(np.linalg.norm(vehicle.effects["constant_wind"].velocity))
+    lag = 1e3 * _own(vehicle, "motor_lag").time_constant
+    delay = 1e3 * _own(vehicle, "command_delay").delay
+    heavier = 100 * _own(vehicle, "mass_offset").offset / vehicle.mass
+    wind = float(np.linalg.norm(_own(vehicle, "constant_wind").velocity))
 
     def more(first: float, *others: float) -> tuple[float, ...]:
         return (first, *(size for size in others if size > first))

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from eval.stats import Interval, PairedDifference, paired_success, wilson
+from eval.table import percent
 from eval.trial import TrialResult
 from suite.flying import policy_digest
-from suite.report import Cell, Grid, Picture, Report, Section, percent
+from suite.report import Cell, Grid, Picture, Report, Section
 from suite.reproduce.conditions import STATE_UNIT, Condition, Sweep, log_faults
 from suite.reproduce.robust_charts import effects_chart, sweeps_chart
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from suite.reproduce.seed_intervals import Spread, spread
+
 if TYPE_CHECKING:
     from suite.reproduce.schemes import Learnt, Scheme
 
@@ -22,14 +24,6 @@ FIGURE = ("reward", "v_max", "success_rate", "gates")
 """What the paper's figure shows."""
 WANTED = (1, 2, 3)
 """Mean gates a trial, of four, whose first time the table gives."""
-
-
-class Spread(NamedTuple):
-    """A number over training seeds."""
-
-    mean: float
-    least: float
-    most: float
 
 
 class Row(NamedTuple):
@@ -77,11 +71,6 @@ def summaries(chosen: Sequence[Scheme], results: Sequence[Learnt]) -> list[Row]:
                   {gates: first_times(whole, gates) for gates in WANTED}, compiling)  # fmt: skip
         rows.append(row)
     return rows
-
-
-def spread(values: Sequence[float]) -> Spread:
-    """Return the mean of values with the least and the most of them."""
-    return Spread(float(np.mean(values)), min(values), max(values))
 
 
 def first_times(

@@ -10,7 +10,8 @@ import numpy as np
 from suite.console import duration
 from suite.report import Cell, Grid, Picture, Report, Section, ranged
 from suite.reproduce.scheme_charts import scheme_chart
-from suite.reproduce.scheme_curves import FIGURE, METRICS, WANTED, Row, Spread, value_at
+from suite.reproduce.scheme_curves import FIGURE, METRICS, WANTED, Row, value_at
+from suite.reproduce.seed_intervals import Spread
 
 if TYPE_CHECKING:
     from suite.reproduce.schemes import Config, Learnt, Scheme

@@ -1,8 +1,9 @@
-"""Differences between trainings with intervals over training seeds and trials together."""
+"""Numbers over training seeds: their spread, and differences with intervals over trials as well."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,19 @@ DRAWS = 4000
 """Of the bootstrap."""
 FEWEST_SEEDS = 3
 """With less, nothing is called a gain or a loss."""
+
+
+class Spread(NamedTuple):
+    """A number over training seeds."""
+
+    mean: float
+    least: float
+    most: float
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Return the mean of values with the least and the most of them."""
+    return Spread(float(np.mean(values)), min(values), max(values))
 
 
 def crossed(gap: np.ndarray) -> Interval:

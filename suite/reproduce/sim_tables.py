@@ -6,7 +6,8 @@ import math
 from collections.abc import Sequence
 
 from eval.table import Cell as Judged
-from suite.report import Cell, Grid, percent
+from eval.table import percent
+from suite.report import Cell, Grid
 from suite.reproduce.goals import SURE, goals
 from suite.reproduce.paper import Printed, sim_to_sim
 from tracks.families import JUDGED

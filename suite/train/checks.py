@@ -50,3 +50,15 @@ def check(config: TrainConfig) -> None:
             raise ValueError(f"{path} is {value}, allowed are {allowed}")
         if list(ends) != sorted(ends):
             raise ValueError(f"{path} is {value}; give the lower end of the range first")
+
+
+def check_stride(stride: int, steps: int) -> None:
+    """Refuse an `episode.image_stride` that does not divide `episode.steps`.
+
+    Raises:
+        ValueError: naming both.
+    """
+    if stride < 1 or steps % stride:
+        raise ValueError(
+            f"episode.image_stride is {stride}, allowed are divisors of episode.steps ({steps})"
+        )

@@ -10,6 +10,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from policies import delta_network, network
+from suite.train.checks import check_stride
 from suite.train.config import TrainConfig
 from suite.train.rollout import StepRecord, make_rollout
 from suite.train.worlds import Worlds
@@ -65,10 +66,7 @@ def make_gradient(
         ValueError: where `episode.image_stride` does not divide `episode.steps`.
     """
     steps, stride = config.episode.steps, config.episode.image_stride
-    if stride < 1 or steps % stride:
-        raise ValueError(
-            f"episode.image_stride is {stride}, allowed are divisors of episode.steps ({steps})"
-        )
+    check_stride(stride, steps)
     rollout = make_rollout(config)
     width = config.spec.hidden_size
 

@@ -8,7 +8,7 @@ from suite.reproduce import trainings
 from suite.reproduce.ablation import Config, Trained, settings
 from suite.reproduce.ablation_tables import beside_paper, summaries, verdict
 from suite.reproduce.paper import ablation as printed
-from suite.reproduce.scheme_curves import Spread
+from suite.reproduce.seed_intervals import Spread
 from tests.support.documents import page, reproduce
 from tests.support.training import boxes_worlds
 

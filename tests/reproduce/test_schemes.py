@@ -7,9 +7,10 @@ import pytest
 from suite.ppo.config import PpoConfig
 from suite.reproduce.ablation import Config as AblationConfig
 from suite.reproduce.ablation import settings
-from suite.reproduce.scheme_curves import Spread, first_times, summaries, value_at
+from suite.reproduce.scheme_curves import first_times, summaries, value_at
 from suite.reproduce.scheme_tables import verdict
 from suite.reproduce.schemes import Config, Learnt, curve_of, schemes
+from suite.reproduce.seed_intervals import Spread
 from suite.train.config import TrainConfig
 from tests.reproduce.test_ablation import SMALL
 from tests.support.documents import page, reproduce
