@@ -1,0 +1,172 @@
+"""Digests of what the suite computes, to hold a rebuilding to the same bits.
+
+Run it before and after a change, on one machine, and compare the two files:
+
+    python tools/fingerprint.py --out before.json --work runs/fingerprint-before
+    python tools/fingerprint.py --out after.json --work runs/fingerprint-after
+    python tools/fingerprint.py --compare before.json after.json
+
+It goes through commands alone, so that it runs on any layout of the code: trials of the shipped
+policies (levels 0 and 9, 20 seeds, MuJoCo and MJX), 20 gradient steps in the point mass and in the
+quadrotor, a Delta Action Model in each, and the diagnosis of 20 blind cases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+POLICIES = ("racer", "swift", "swift-tuned")
+STAMPS = ("version", "commit", "git_commit", "schema", "created", "seconds", "out")
+"""Keys that may differ between two versions of the code that compute the same."""
+
+
+def suite(*args: str | Path) -> None:
+    """Run a command of the suite that is installed beside this Python.
+
+    Raises:
+        subprocess.CalledProcessError: where it fails.
+    """
+    program = Path(sys.executable).with_name("suite")
+    subprocess.run([program, *map(str, args)], check=True, stdout=subprocess.DEVNULL)
+
+
+def array_digest(arrays: dict[str, np.ndarray]) -> str:
+    """Return the SHA-256 of named arrays: names, types, shapes and bytes."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
+def parquet_digest(path: Path) -> str:
+    """Return the digest of a table's columns, whatever its metadata."""
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(path)
+    text = json.dumps({name: table[name].to_pylist() for name in sorted(table.column_names)})
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def weights_digest(folder: Path) -> str:
+    """Return the digest of all weights in a checkpoint's folder."""
+    from safetensors.numpy import load_file
+
+    files = sorted(folder.rglob("*.safetensors"))
+    return array_digest({f"{f.name}/{k}": v for f in files for k, v in load_file(f).items()})
+
+
+def json_digest(path: Path) -> str:
+    """Return the digest of a JSON file without the keys of `STAMPS`."""
+
+    def bare(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {k: bare(v) for k, v in value.items() if k not in STAMPS}
+        return [bare(v) for v in value] if isinstance(value, list) else value
+
+    text = json.dumps(bare(json.loads(path.read_text())), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def trials(work: Path) -> dict[str, str]:
+    """Return digests of 120 trials a policy and world."""
+    digests = {}
+    for world in ("mujoco", "mjx"):
+        for policy in POLICIES:
+            out = work / f"eval-{world}-{policy}"
+            suite("eval", "--policy", policy, "--world", world, "--difficulty", "0,9",
+                  "--trials", "20", "--procs", "1", "--out", out)  # fmt: skip
+            digests[f"trials {world} {policy}"] = parquet_digest(out / "trials.parquet")
+    return digests
+
+
+def training(work: Path) -> dict[str, str]:
+    """Return digests of 20 gradient steps: weights and curve."""
+    digests = {}
+    for model in ("point", "quad"):
+        out = work / f"train-{model}"
+        vehicle = ("--vehicle", "racer5") if model == "quad" else ()
+        batch = ("--set", "episode.batch=8") if model == "quad" else ()
+        suite("train", "--preset", "small", "--iterations", "20", "--model", model, "--out", out,
+              *vehicle, *batch)  # fmt: skip
+        digests[f"training {model}"] = weights_digest(out / "policy")
+    return digests
+
+
+def delta(work: Path) -> dict[str, str]:
+    """Return digests of flights and of a Delta Action Model in each of the two dynamics."""
+    flights = work / "flights"
+    suite("collect", "--policy", "racer", "--trials", "2", "--out", flights)
+    digests = {"flights": "".join(parquet_digest(f)[:8] for f in sorted(flights.glob("*.parquet")))}
+    for model in ("point", "quad"):
+        out = work / f"delta-{model}"
+        vehicle = ("--vehicle", "racer5") if model == "quad" else ()
+        suite("delta", flights, "--model", model, *vehicle, "--preset", "small",
+              "--iterations", "30", "--out", out)  # fmt: skip
+        digests[f"delta {model}"] = weights_digest(out / "delta")
+    return digests
+
+
+def diagnosis(work: Path) -> dict[str, str]:
+    """Return digests of the logs and of the diagnosis of some 20 blind cases."""
+    out = work / "blind"
+    suite("blind", "make", "--seed", "424242", "--count", "20", "--out", out)
+    digests = {
+        f"blind log {f.parent.name}/{f.stem}": parquet_digest(f)
+        for f in sorted((out / "cases").rglob("*.parquet"))
+    }
+    suite("blind", "run", "--out", out)
+    for path in sorted(out.rglob("diagnosis.json")):
+        digests[f"diagnosis {path.parent.name}"] = json_digest(path)
+    return digests
+
+
+PARTS: dict[str, Callable[[Path], dict[str, str]]] = {
+    "trials": trials,
+    "training": training,
+    "delta": delta,
+    "diagnosis": diagnosis,
+}
+
+
+def compare(before: Path, after: Path) -> int:
+    """Print what differs between two files of digests; return 1 where something does."""
+    old, new = (json.loads(path.read_text()) for path in (before, after))
+    apart = [name for name in sorted(old | new) if old.get(name) != new.get(name)]
+    for name in apart:
+        print(f"differs: {name}")
+    print(f"{len(old | new) - len(apart)} of {len(old | new)} the same to the bit")
+    return int(bool(apart))
+
+
+def main() -> int:
+    """Write the digests, or compare two files of them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("fingerprint.json"))
+    parser.add_argument("--work", type=Path, default=Path("runs/fingerprint"))
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--compare", nargs=2, type=Path, metavar=("BEFORE", "AFTER"))
+    options = parser.parse_args()
+    if options.compare:
+        return compare(*options.compare)
+    digests: dict[str, str] = {}
+    for part in options.only:
+        shutil.rmtree(options.work / part, ignore_errors=True)
+        digests |= PARTS[part](options.work / part)
+        options.out.write_text(json.dumps(digests, indent=1) + "\n")
+        print(f"{part}: done", file=sys.stderr, flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
