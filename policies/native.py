@@ -9,9 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from policies import network
 from policies.block_policy import BlockPolicy, proven
-from policies.policy_file import load_policy_checkpoint
+from policies.formats.policy_file import load_policy_checkpoint
+from policies.networks import network
 from policies.spec import PolicySpec
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from policies.spec import DepthEncoding
-from tracks.rotation import to_local
-from tracks.scene import Array
+from tracks.geometry.rotation import to_local
+from tracks.geometry.scene import Array
 
 
 def state_vector(

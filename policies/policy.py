@@ -10,7 +10,7 @@ import numpy as np
 from policies import shipped
 from policies.errors import PolicyError
 from policies.spec import PolicySpec
-from tracks.names import closest, unknown_name
+from tracks.common.names import closest, unknown_name
 
 Hidden = Any
 """What a policy remembers of n trials; only the policy itself looks inside."""
@@ -85,15 +85,15 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
     if not path.exists():
         raise _missing(text, path)
     if path.suffix == ".onnx":
-        from policies.onnx_file import load_onnx
+        from policies.formats.onnx_file import load_onnx
 
         return load_onnx(path)
     if path.suffix == ".pt2":
-        from policies.torch_file import load_program
+        from policies.formats.torch_file import load_program
 
         return load_program(path, trust)
     if path.suffix == ".pt":
-        from policies.torch_file import load_script
+        from policies.formats.torch_file import load_script
 
         return load_script(path, trust)
     kinds = ", ".join(f"{suffix} ({kind})" for suffix, kind in SUFFIXES.items())

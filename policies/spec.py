@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from tracks.camera import Camera
+from tracks.geometry.camera import Camera
 
 STATE_SIZE = 12
 """Numbers in the paper's state: v_b (3), third row of R (3), gate in body axes (3), u (3)."""

@@ -17,7 +17,7 @@ from contextlib import contextmanager, nullcontext
 from types import FrameType, ModuleType
 from typing import Any
 
-from suite.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
+from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 
 COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
@@ -88,13 +88,13 @@ def _dispatch(args: list[str]) -> int:
         print(overview(), file=sys.stdout if args else sys.stderr)
         return DONE if args else UNUSABLE
     if args[0] == "--version":
-        from tracks.version import VERSION
+        from tracks.common.version import VERSION
 
         print(f"suite {VERSION}")
         return DONE
     name, *rest = args
     if name not in COMMANDS:
-        from tracks.names import unknown_name
+        from tracks.common.names import unknown_name
 
         raise unknown_name("command", name, COMMANDS)
     return _run(name, rest)
@@ -115,8 +115,8 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 
 
 def _run(name: str, args: list[str]) -> int:
-    from suite.compiled import keep_compiled
-    from suite.console import Console, stdout_kept_clean
+    from suite.common.compiled import keep_compiled
+    from suite.common.console import Console, stdout_kept_clean
 
     keep_compiled()
     try:
@@ -126,7 +126,7 @@ def _run(name: str, args: list[str]) -> int:
     with stdout_kept_clean() if config.json else nullcontext():
         answer = command.run(config, Console())
     if config.json:
-        from tracks.files import to_json
+        from tracks.common.files import to_json
 
         print(to_json(answer, indent=2), flush=True)
     return DONE

@@ -16,13 +16,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from policies.checkpoint import CONFIG, WEIGHTS
-from policies.policy_file import load_policy_checkpoint
-from suite.console import duration
+from policies.formats.checkpoint import CONFIG, WEIGHTS
+from policies.formats.policy_file import load_policy_checkpoint
+from suite.common.console import duration
 from suite.loop.charts import training_chart
 from suite.loop.compare import BEFORE
 from suite.train import curve
-from tracks.files import replacing_folder
+from tracks.common.files import replacing_folder
 
 SHELF = Path(__file__).resolve().parent.parent / "policies" / "shipped"
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tracks.scene import Boxes, Gates, Scene
+from tracks.geometry.scene import Boxes, Gates, Scene
 
 
 @dataclass(frozen=True)

@@ -34,10 +34,10 @@ from eval.effects import (
     weak_motor,
 )
 from eval.effects.interface import Array, Effect, as_arrays, neutral
-from tracks.names import unknown_name
+from tracks.common.names import unknown_name
 
 if TYPE_CHECKING:
-    from eval.vehicle import Vehicle
+    from eval.vehicles.vehicle import Vehicle
 
 # In the order in which they act: what scales a thrust stands after what adds to it, and random
 # wind after the steady wind that it is relative to.

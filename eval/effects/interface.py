@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tracks.scene import Array
+from tracks.geometry.scene import Array
 
 if TYPE_CHECKING:
-    from eval.vehicle import Vehicle
+    from eval.vehicles.vehicle import Vehicle
 
 
 GRAVITY = 9.81

@@ -14,9 +14,9 @@ from dm_control.rl import control
 from dm_env import specs
 
 from eval.envs.race import ACTION_LIMIT, Race
-from eval.trial import Rules
-from eval.vehicle import Vehicle
-from eval.vehicle_file import load_vehicle
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.trial import Rules
 from policies.spec import ACTION_SIZE, PolicySpec
 from tracks.families import make_track
 from tracks.track import Track

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from eval.envs.race import ACTION_LIMIT, STATE_LIMIT, Race
-from eval.trial import Rules
-from eval.vehicle import Vehicle
-from eval.vehicle_file import load_vehicle
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.trial import Rules
 from policies.spec import ACTION_SIZE, PolicySpec
 from tracks.families import make_track
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from eval.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
-from eval.guard import ActionLimits, guard_action
-from eval.plant import uses_noise
-from eval.trial import (
+from eval.judging.guard import ActionLimits, guard_action
+from eval.quadrotor.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
+from eval.quadrotor.plant import uses_noise
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.engine import Eye, compile_model, motion_of, start_state
+from eval.worlds.slots import layout_of, noise_of
+from eval.worlds.trial import (
     ENDINGS,
     FLYING,
     Course,
@@ -21,13 +24,10 @@ from eval.trial import (
     next_gate,
     start_progress,
 )
-from eval.vehicle import Vehicle
-from eval.worlds.engine import Eye, compile_model, motion_of, start_state
-from eval.worlds.slots import layout_of, noise_of
 from policies.observation import encode_depth, state_vector
 from policies.spec import PolicySpec
-from tracks.rotation import to_world
-from tracks.scene import Gates
+from tracks.geometry.rotation import to_world
+from tracks.geometry.scene import Gates
 from tracks.track import Track
 
 ACTION_LIMIT = 20.0
@@ -65,7 +65,7 @@ class Race:
 
     @property
     def ended_by(self) -> str | None:
-        """One of `eval.trial.ENDINGS`, or None while it goes on."""
+        """One of `eval.worlds.trial.ENDINGS`, or None while it goes on."""
         code = int(self.progress.ended[0])
         return None if code == FLYING else ENDINGS[code - 1]
 

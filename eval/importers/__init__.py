@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from eval.flight_log import FlightLog
     from eval.importers.findings import Finding
     from eval.importers.options import ImportOptions
+    from eval.logs.flight_log import FlightLog
 
 FORMATS: dict[str, str] = {
     "px4": "PX4 ULog (.ulg)",
@@ -25,7 +25,7 @@ FORMATS: dict[str, str] = {
     "table": "CSV or Parquet, described by a mapping file (--map)",
     "mcap": "MCAP with ROS 2 messages (pip install 'diffracing-suite[mcap]')",
 }
-"""Name -> what it reads; format NAME is read by eval/importers/NAME_format.py."""
+"""Name -> what it reads; format NAME is read by eval/importers/formats/NAME.py."""
 
 
 class ImportedLog(NamedTuple):
@@ -56,12 +56,12 @@ def import_log(
     from eval.importers.assemble import assemble
     from eval.importers.detect import detect
     from eval.importers.options import ImportOptions
-    from tracks.names import unknown_name
+    from tracks.common.names import unknown_name
 
     told = options or ImportOptions()
     file = Path(path)
     name = format or detect(file, told)
     if name not in FORMATS:
         raise unknown_name("format", name, FORMATS)
-    module = importlib.import_module(f"eval.importers.{name}_format")
+    module = importlib.import_module(f"eval.importers.formats.{name}")
     return ImportedLog(*assemble(module.read(file, told), name, told))

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from eval.flight_check import GROUPS, FlightLogError
-from eval.flight_log import FlightLog, log_from_columns
-from eval.importers.attitude_check import check_attitude
-from eval.importers.findings import Finding, said
-from eval.importers.motion_check import (
+from eval.importers.checks.attitude import check_attitude
+from eval.importers.checks.motion import (
     check_accelerometer,
     check_frames,
     check_rate_command,
     check_velocity,
 )
+from eval.importers.checks.units import check_units
+from eval.importers.findings import Finding, said
 from eval.importers.motors import order_motors
 from eval.importers.options import ImportOptions
 from eval.importers.rows import HOLE_S, HOLE_STEPS, NEEDED, own_rows, row_times, rows_at, slowest
 from eval.importers.signals import Recording, median_step
 from eval.importers.thrust import thrust_command
-from eval.importers.units_check import check_units
+from eval.logs.columns import GROUPS, FlightLogError
+from eval.logs.flight_log import FlightLog, log_from_columns
 
 SLOW_HZ = 40.0
 """Signals that come more rarely than this are worth a word."""

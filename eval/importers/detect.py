@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from eval.flight_check import FlightLogError
 from eval.importers.options import ImportOptions
+from eval.logs.columns import FlightLogError
 
 ULOG = b"ULog\x01\x12\x35"
 MCAP = b"\x89MCAP0\r\n"

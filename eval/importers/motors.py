@@ -8,7 +8,7 @@ from itertools import permutations
 import numpy as np
 
 from eval.importers.findings import Finding
-from eval.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle
 
 SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 """Front right, rear right, rear left, front left: the order of the vehicles that are shipped."""

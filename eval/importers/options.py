@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from eval.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.flight_check import FlightLogError
+from eval.importers.checks.units import TIMES
 from eval.importers.findings import Finding
+from eval.importers.formats.table import read_table
 from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.options import ImportOptions
 from eval.importers.rows import averaged, continuous
 from eval.importers.signals import Recording, Signal, median_step
-from eval.importers.table_format import read_table
-from eval.importers.units_check import TIMES
-from tracks.rotation import rot_to_quat
+from eval.logs.columns import FlightLogError
+from tracks.geometry.rotation import rot_to_quat
 
 FIRST_REACH_S = 15.0
 """The fit begins with this much on both sides of the middle [s]."""

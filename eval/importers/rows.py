@@ -12,9 +12,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from eval.flight_check import FlightLogError
 from eval.importers.frames import turn
 from eval.importers.signals import Recording, Signal, median_step
+from eval.logs.columns import FlightLogError
 
 NEEDED = ("pos", "quat", "rate")
 """The slowest of these sets the rows."""

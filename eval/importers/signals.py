@@ -1,6 +1,6 @@
 """What an importer hands over: signals in the flight log's units and frames, each at its own rate.
 
-Signals are named as the groups of columns in `eval/flight_check.py` (pos, quat, vel, rate,
+Signals are named as the groups of columns in `eval/logs/columns.py` (pos, quat, vel, rate,
 cmd_thrust, cmd_rate, motor, motor_cmd, acc, voltage), and besides `throttle`: normalised
 collective thrust from 0 to 1.
 """
@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.flight_check import FlightLogError
 from eval.importers.findings import Finding
+from eval.logs.columns import FlightLogError
 
 BACKWARDS_MAX = 0.05
 """A signal with a larger share of rows whose time does not increase is refused."""

@@ -19,8 +19,8 @@ import rerun.blueprint as rrb
 
 from eval.view.blueprint import TIMELINE
 from eval.view.recording import APPLICATION, DRONE_HALF_SIZE, time_columns
-from tracks.files import replacing_file
-from tracks.provenance import stamp
+from tracks.common.files import replacing_file
+from tracks.common.provenance import stamp
 
 SCHEMA = 1
 """Version of the recording's entities, in its properties."""

@@ -14,12 +14,12 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from eval.flight import Flight
-from eval.trial import TrialResult
+from eval.logs.flight import Flight
 from eval.view import colours
 from eval.view.colours import SPEED_MAP, hexed
 from eval.view.solids import outline, track_solids
-from tracks.files import replacing_file
+from eval.worlds.trial import TrialResult
+from tracks.common.files import replacing_file
 from tracks.track import Track
 
 Shown = tuple[Track, Flight | None, TrialResult | None]

@@ -19,14 +19,14 @@ from typing import NamedTuple
 import numpy as np
 import rerun as rr
 
-from eval.flight import Flight
-from eval.trial import TrialResult
+from eval.logs.flight import Flight
 from eval.view import colours
 from eval.view.blueprint import TIMELINE, Tab, layout
 from eval.view.solids import flat_normals, joined, track_solids
-from tracks.camera import Camera, optical_axis_b
-from tracks.files import replacing_file
-from tracks.provenance import stamp
+from eval.worlds.trial import TrialResult
+from tracks.common.files import replacing_file
+from tracks.common.provenance import stamp
+from tracks.geometry.camera import Camera, optical_axis_b
 from tracks.track import Track
 
 APPLICATION = "diffracing-suite"

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tracks.meshes import solid_meshes
+from tracks.formats.meshes import solid_meshes
 from tracks.track import Track
 
 

@@ -15,14 +15,14 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter1d
 
-from eval.flight import Flight
-from eval.trial import TrialResult
+from eval.logs.flight import Flight
 from eval.view import colours
 from eval.view.scene3d import SKY, Faces, Lines, look_at, paint
 from eval.view.solids import track_solids
 from eval.view.video_file import write_gif, write_mp4
-from tracks.files import replacing_file
-from tracks.rotation import quat_to_rot
+from eval.worlds.trial import TrialResult
+from tracks.common.files import replacing_file
+from tracks.geometry.rotation import quat_to_rot
 from tracks.track import Track
 
 ENDINGS = (".mp4", ".gif")

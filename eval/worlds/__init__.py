@@ -11,16 +11,16 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from eval.trial import Progress, TrialSpec
-from tracks.names import unknown_name
+from eval.worlds.trial import Progress, TrialSpec
+from tracks.common.names import unknown_name
 from tracks.track import Track
 
 PLAIN = "plain"
-"""The world without slots: `eval.worlds.plain.fly_trial`, one trial after the other."""
+"""The world without slots: `eval.worlds.reference.fly_trial`, one trial after the other."""
 WORLDS = {
     "mujoco": "eval.worlds.mujoco:MujocoWorld",
     "mjx": "eval.worlds.mjx:MjxWorld",
-    PLAIN: "eval.worlds.plain:fly_trial",
+    PLAIN: "eval.worlds.reference:fly_trial",
 }
 """Name to module and class (`World`)."""
 

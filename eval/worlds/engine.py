@@ -5,12 +5,12 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from eval.plant import Motion
-from eval.quadrotor_model import add_quadrotor, set_true_inertia
-from eval.vehicle import Vehicle
-from tracks.camera import Camera, pixel_rays_b
-from tracks.mujoco_scene import add_scene, solid_name
-from tracks.scene import Counts
+from eval.quadrotor.model import add_quadrotor, set_true_inertia
+from eval.quadrotor.plant import Motion
+from eval.vehicles.vehicle import Vehicle
+from tracks.formats.mujoco_scene import add_scene, solid_name
+from tracks.geometry.camera import Camera, pixel_rays_b
+from tracks.geometry.scene import Counts
 from tracks.track import Track
 
 BODY = 1

@@ -19,11 +19,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from eval.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
-from eval.plant import Motion, uses_noise
-from eval.quadrotor_model import add_quadrotor, set_true_inertia
-from eval.tree_rows import select
-from eval.trial import (
+from eval.quadrotor.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
+from eval.quadrotor.model import add_quadrotor, set_true_inertia
+from eval.quadrotor.plant import Motion, uses_noise
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds import Rows, View
+from eval.worlds.collision import NEAR, TOUCH_M, gaps
+from eval.worlds.engine import start_state
+from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
+from eval.worlds.trial import (
     DIVERGED,
     FLYING,
     Course,
@@ -36,17 +40,13 @@ from eval.trial import (
     next_gate,
     start_progress,
 )
-from eval.vehicle import Vehicle
-from eval.worlds import Rows, View
-from eval.worlds.engine import start_state
-from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
-from eval.worlds.touch import NEAR, TOUCH_M, gaps
-from tracks.camera import Camera, pixel_rays_b
-from tracks.cull import nearest_solids
-from tracks.depth import depth_image
-from tracks.mujoco_scene import GROUND
-from tracks.rotation import quat_to_rot, to_world
-from tracks.scene import Array, Scene, pad, stack
+from tracks.common.tree_rows import select
+from tracks.formats.mujoco_scene import GROUND
+from tracks.geometry.camera import Camera, pixel_rays_b
+from tracks.geometry.cull import nearest_solids
+from tracks.geometry.depth import depth_image
+from tracks.geometry.rotation import quat_to_rot, to_world
+from tracks.geometry.scene import Array, Scene, pad, stack
 from tracks.track import Track
 
 with contextlib.redirect_stdout(io.StringIO()):  # its import prints what optional parts are missing

@@ -13,10 +13,13 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from eval.autopilot import fly_step, make_cockpit, start_autopilot
-from eval.plant import Motion, uses_noise
-from eval.tree_rows import packed, select
-from eval.trial import (
+from eval.quadrotor.autopilot import fly_step, make_cockpit, start_autopilot
+from eval.quadrotor.plant import Motion, uses_noise
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds import Rows, View
+from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
+from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
+from eval.worlds.trial import (
     DIVERGED,
     FLYING,
     Progress,
@@ -28,12 +31,9 @@ from eval.trial import (
     next_gate,
     start_progress,
 )
-from eval.vehicle import Vehicle
-from eval.worlds import Rows, View
-from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
-from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
-from tracks.camera import Camera
-from tracks.rotation import to_world
+from tracks.common.tree_rows import packed, select
+from tracks.geometry.camera import Camera
+from tracks.geometry.rotation import to_world
 from tracks.track import Track
 
 _TO_CONTACTS = int(mujoco.mjtStage.mjSTAGE_VEL)

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.trial import Course, TrialSpec
+from eval.worlds.trial import Course, TrialSpec
 from tracks.families import MAX_COUNTS
-from tracks.scene import Counts, Gates, counts
+from tracks.geometry.scene import Counts, Gates, counts
 from tracks.track import Track
 
 

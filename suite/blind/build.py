@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from eval.flight_log import FlightLog
-from eval.vehicle import Vehicle
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle
 from suite.blind.cases import Case
 from suite.blind.hidden import changed_values, draw_change, true_parameters, with_effects
-from suite.blind.information import (
+from suite.blind.oracle.information import (
     ALLOWED,
     REQUIRED,
     THRESHOLD,
@@ -24,15 +24,23 @@ from suite.blind.information import (
     signatures,
     start_of,
 )
+from suite.blind.oracle.strength import given_vehicle
+from suite.blind.oracle.stretches import (
+    EVERY_S,
+    LONG_S,
+    cut,
+    replay,
+    whitened,
+    window_plant,
+    without_start,
+)
 from suite.blind.outside import KINDS, make_outside
 from suite.blind.rotorpy_flight import fly_rotorpy
 from suite.blind.sensors import SENSORS, Sensors, log_of
-from suite.blind.strength import given_vehicle
-from suite.blind.windows import EVERY_S, LONG_S, cut, replay, whitened, window_plant, without_start
-from suite.errors import WorkFailed
-from suite.plans.separating import SEPARATIONS
-from suite.plans.simulate import FlightFailed, Recording, fly
-from suite.plans.trajectory import Trajectory, long_flights, ordinary_flights
+from suite.common.errors import WorkFailed
+from suite.diagnose.plans.separating import SEPARATIONS
+from suite.diagnose.plans.simulate import FlightFailed, Recording, fly
+from suite.diagnose.plans.trajectory import Trajectory, long_flights, ordinary_flights
 
 ROTORPY_FLIGHTS = 4
 """Of the ordinary flights, for RotorPy is slow; its table of strengths has one more."""

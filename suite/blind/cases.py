@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from eval.effects import EFFECTS
+from suite.blind.oracle.strength import vehicle_names
 from suite.blind.outside import KINDS
-from suite.blind.strength import vehicle_names
-from suite.plans.separating import SEPARATIONS
+from suite.diagnose.plans.separating import SEPARATIONS
 
 MULTIPLES = (2.0, 6.0)
 """Strengths of single effects, in the strength at which each can just be detected."""

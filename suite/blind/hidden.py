@@ -11,8 +11,8 @@ import numpy as np
 
 from eval.effects import EFFECTS, all_values
 from eval.effects.interface import at
-from eval.vehicle import Vehicle
-from suite.blind.strength import GUST_LENGTH_M, columns_in_table, detectable_along
+from eval.vehicles.vehicle import Vehicle
+from suite.blind.oracle.strength import GUST_LENGTH_M, columns_in_table, detectable_along
 
 INSIDE = 0.98
 """Share of the way to a physical bound that a strength may go."""

@@ -13,15 +13,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from eval.flight_log import write_flight
-from eval.vehicle_file import save_vehicle
+from eval.logs.flight_log import write_flight
+from eval.quadrotor.vehicle_file import save_vehicle
 from suite.blind.build import build
 from suite.blind.cases import draw_cases, draw_rotorpy_cases
-from suite.blind.strength import TABLE
-from suite.console import Console
-from suite.errors import WorkFailed
-from tracks.files import replacing_folder, write_json
-from tracks.provenance import stamp
+from suite.blind.oracle.strength import TABLE
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from tracks.common.files import replacing_folder, write_json
+from tracks.common.provenance import stamp
 
 SCHEMA = 1
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.plant import Command, Motion, Wrench
-from tracks.names import unknown_name
-from tracks.rotation import to_local
+from eval.quadrotor.plant import Command, Motion, Wrench
+from tracks.common.names import unknown_name
+from tracks.geometry.rotation import to_local
 
 
 class Outside:

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from eval.effects import all_values
-from eval.plant import Command, Motion, Wrench, make_plant, wanted_speed
-from eval.vehicle import Vehicle
+from eval.quadrotor.plant import Command, Motion, Wrench, make_plant, wanted_speed
+from eval.vehicles.vehicle import Vehicle
 from suite.blind.cases import ROTORPY_EFFECTS
-from suite.plans.pilot import Gains, steer
-from suite.plans.simulate import FULL_V, FlightFailed, Recording
-from suite.plans.trajectory import Reference, Trajectory
-from tracks.rotation import quat_to_rot
+from suite.diagnose.plans.pilot import Gains, steer
+from suite.diagnose.plans.simulate import FULL_V, FlightFailed, Recording
+from suite.diagnose.plans.trajectory import Reference, Trajectory
+from tracks.geometry.rotation import quat_to_rot
 
 
 def rotorpy_parameters(truth: Vehicle) -> dict[str, Any]:

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from suite.blind.make import load_manifest
-from suite.console import Console
-from suite.errors import WorkFailed
-from tracks.files import write_json
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from tracks.common.files import write_json
 
 Diagnose = Callable[[Sequence[Path], Path, Path], None]
 """Takes flight logs, the vehicle file and an output folder, and writes `diagnosis.json` there."""

@@ -9,10 +9,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from eval.stats import wilson
+from eval.judging.statistics import wilson
 from suite.blind.make import load_manifest, open_answers
-from tracks.files import write_json, write_text
-from tracks.provenance import stamp
+from tracks.common.files import write_json, write_text
+from tracks.common.provenance import stamp
 
 SCHEMA = 1
 GAP_LIMIT = 1.1

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from eval.effects import apply_log_faults
-from eval.flight_log import FlightLog
-from eval.vehicle import Vehicle
-from suite.plans.simulate import Recording
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.plans.simulate import Recording
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import Any
 
 import tyro
 
-from suite.bench import BENCHES
-from suite.console import Console
-from tracks.files import plain
-from tracks.names import unknown_name
+from suite.common.console import Console
+from suite.experiments.bench import BENCHES
+from tracks.common.files import plain
+from tracks.common.names import unknown_name
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         return {"benches": BENCHES}
     if config.name not in BENCHES:
         raise unknown_name("benchmark", config.name, BENCHES)
-    from suite.bench.compare import load_warnings
+    from suite.experiments.bench.compare import load_warnings
 
     busy = load_warnings()
-    bench = importlib.import_module(f"suite.bench.{config.name}")
+    bench = importlib.import_module(f"suite.experiments.bench.{config.name}")
     result = bench.run()
     answer = {**plain(result), "ratio": result.ratio, "warnings": [*busy, *result.warnings]}
     for side, figure in (("ours", result.ours), ("baseline", result.baseline)):

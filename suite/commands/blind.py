@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from suite.console import Console
+from suite.common.console import Console
 
 if TYPE_CHECKING:
     from suite.blind.make import Manifest
@@ -64,7 +64,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(f"{done} cases diagnosed; score them with `suite blind score`")
         return {"diagnosed": done, "out": str(config.out)}
     from suite.blind.score import report, score_set, shares
-    from tracks.files import plain
+    from tracks.common.files import plain
 
     verdicts = score_set(config.out)
     console.say(report(config.out, verdicts))
@@ -72,7 +72,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 
 def _made(manifest: Manifest, config: Config, console: Console) -> dict[str, Any]:
-    from tracks.files import plain
+    from tracks.common.files import plain
 
     count = len(manifest.cases)
     console.say(f"{count} cases in {config.out / 'cases'}, answers in {config.out / 'answers'}")
@@ -82,7 +82,7 @@ def _made(manifest: Manifest, config: Config, console: Console) -> dict[str, Any
 
 
 def _strengths(console: Console) -> dict[str, Any]:
-    from suite.blind.strength import make_table, save_table, table_size, table_text
+    from suite.blind.oracle.strength import make_table, save_table, table_size, table_text
 
     with console.progress("strengths", table_size()) as update:
         path = save_table(make_table(update))
@@ -92,8 +92,8 @@ def _strengths(console: Console) -> dict[str, Any]:
 
 def _plan(config: Config, console: Console) -> dict[str, Any]:
     from eval.effects import find_effect
-    from suite.plans.separating import plan_for, separations_of
-    from tracks.files import plain
+    from suite.diagnose.plans.separating import plan_for, separations_of
+    from tracks.common.files import plain
 
     names = [find_effect(name).name for name in config.effects]
     if len(names) < 2:

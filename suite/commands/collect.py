@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from suite.console import Console
+from suite.common.console import Console
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
     """
-    from suite.collect import Collection, collect
+    from suite.judging.collect import Collection, collect
 
     collection = Collection(
         policy=config.policy,

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import tyro
 
-from suite.console import Console
+from suite.common.console import Console
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.delta.fit import FitConfig
     from suite.delta.run import fit_delta, fit_quadrotor_delta, quadrotor_table, table
     from suite.train.presets import chosen_model, preset
-    from tracks.files import plain
+    from tracks.common.files import plain
 
     fitting = replace(
         FitConfig(),

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import tyro
 
-from suite.console import Console
+from suite.common.console import Console
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
-    from suite.diagnose.answer import components
+    from suite.diagnose.report.answer import components
     from suite.diagnose.run import Wishes, diagnose_files
 
     wishes = Wishes(

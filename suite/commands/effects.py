@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from suite.console import Console
+from suite.common.console import Console
 
 if TYPE_CHECKING:
     from eval.effects.interface import Effect

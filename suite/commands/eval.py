@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from suite.console import Console
+from suite.common.console import Console
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
     """
-    from suite.evaluate import Judgement, evaluate
+    from suite.judging.evaluate import Judgement, evaluate
 
     judgement = Judgement(
         policies=tuple(config.policy),
@@ -68,7 +68,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError(f"--rerun {config.rerun}: a recording's name must end in .rrd")
     answer = evaluate(judgement, config.out, console)
     if config.rerun:
-        from suite.replay import record_first_trials
+        from suite.judging.replay import record_first_trials
 
         record_first_trials(judgement, config.rerun, console)
         answer["rerun"] = str(config.rerun)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from suite.console import Console
+from suite.common.console import Console
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """
     from importlib.resources import files
 
-    from tracks.files import replacing_file
+    from tracks.common.files import replacing_file
 
     config.out.mkdir(parents=True, exist_ok=True)
     names = []
-    for source in files("suite.example").iterdir():
+    for source in files("suite.diagnose.example").iterdir():
         if source.name.endswith((".parquet", ".toml")):
             with replacing_file(config.out / source.name) as beside:
                 beside.write_bytes(source.read_bytes())

@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from suite.console import Console, size
+from suite.common.console import Console, size
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: where the policy is not ours or a format is unknown.
     """
-    from policies.export import export_policy
-    from suite.flying import default_policy
+    from policies.formats.export import export_policy
+    from suite.judging.flying import default_policy
 
     written = export_policy(config.policy or default_policy(), config.out, config.formats)
     for path in written:

@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from suite.console import Console
+from suite.common.console import Console
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for a file, a mapping or an option that cannot be used.
     """
-    from eval.flight_log import write_flight
     from eval.importers import import_log
     from eval.importers.findings import said
     from eval.importers.options import ImportOptions
-    from eval.vehicle_file import load_vehicle
+    from eval.logs.flight_log import write_flight
+    from eval.quadrotor.vehicle_file import load_vehicle
 
     _check(config)
     options = ImportOptions(

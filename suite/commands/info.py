@@ -7,11 +7,11 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
-from suite.console import Console, size
-from suite.estimate import available_memory_bytes
-from suite.provenance import machine, package_versions
-from tracks.provenance import git_commit
-from tracks.version import VERSION
+from suite.common.console import Console, size
+from suite.common.estimate import available_memory_bytes
+from suite.common.provenance import machine, package_versions
+from tracks.common.provenance import git_commit
+from tracks.common.version import VERSION
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from suite.console import Console
+from suite.common.console import Console
 
 
 @dataclass(frozen=True)

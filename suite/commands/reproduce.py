@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
-from suite.console import Console
-from suite.reproduce import EXPERIMENTS
+from suite.common.console import Console
+from suite.experiments import EXPERIMENTS
 
 if TYPE_CHECKING:
     Experiment = Any
@@ -18,7 +18,7 @@ else:
     Experiment = Union[  # noqa: UP007  (made from the table)
         tuple(
             Annotated[
-                importlib.import_module(f"suite.reproduce.{name}").Config,
+                importlib.import_module(f"suite.experiments.{name}").Config,
                 tyro.conf.subcommand(name),
             ]
             for name in EXPERIMENTS
@@ -50,7 +50,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
     """
-    from suite.reproduce.document import Place
+    from suite.experiments.document import Place
 
     experiment = importlib.import_module(type(config.experiment).__module__)
     return experiment.run(config.experiment, Place(config.out, config.cache), console)

@@ -9,8 +9,8 @@ from typing import Any
 
 import tyro
 
-from suite.choices import is_track_file, parse_levels
-from suite.console import Console
+from suite.common.choices import is_track_file, parse_levels
+from suite.common.console import Console
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     drawn = []
     if is_track_file(config.track):
-        from tracks.custom import load_track
+        from tracks.formats.custom import load_track
 
         tracks = [load_track(Path(config.track))]
     else:

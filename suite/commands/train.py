@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from suite.console import Console
+from suite.common.console import Console
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
 from suite.train.presets import chosen_model, preset, with_iterations
-from tracks.files import plain
+from tracks.common.files import plain
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """
     import jax
 
-    from policies.delta_file import load_delta
-    from policies.network import fitted
-    from policies.policy_file import load_policy_checkpoint
+    from policies.formats.delta_file import load_delta
+    from policies.formats.policy_file import load_policy_checkpoint
+    from policies.networks.network import fitted
     from suite.delta.corrected import check_corrects
-    from suite.flying import checkpoint_folder
+    from suite.judging.flying import checkpoint_folder
     from suite.train.run import train
 
     resolved = resolve(config)

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from suite.choices import at_least
-from suite.console import Console
+from suite.common.choices import at_least
+from suite.common.console import Console
 
 if TYPE_CHECKING:
-    from eval.trial import TrialSpec
     from eval.view.recording import Rollout
-    from suite.evaluate import Judgement
+    from eval.worlds.trial import TrialSpec
+    from suite.judging.evaluate import Judgement
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if recording.suffix != ".rrd":
         raise ValueError(f"--rerun {recording}: a recording's name must end in .rrd")
     judgement, trials = _chosen(config)
-    from eval.vehicle_file import load_vehicle
+    from eval.quadrotor.vehicle_file import load_vehicle
     from eval.view.picture import write_picture
     from eval.view.recording import write_recording
-    from suite.replay import drone_of, fly_again
+    from suite.judging.replay import drone_of, fly_again
 
     console.note(f"flying {len(trials)} trials again")
     rollouts = fly_again(judgement, trials)
@@ -100,8 +100,8 @@ def _name(rollout: Rollout) -> str:
 
 
 def _chosen(config: Config) -> tuple[Judgement, list[TrialSpec]]:
-    from suite.evaluate import Judgement
-    from suite.replay import first_trials, read_judgement
+    from suite.judging.evaluate import Judgement
+    from suite.judging.replay import first_trials, read_judgement
 
     folder = Path(config.run)
     if not (folder / "trials.parquet").is_file():
@@ -114,7 +114,7 @@ def _chosen(config: Config) -> tuple[Judgement, list[TrialSpec]]:
             trust=config.trust,
         )
         return judgement, first_trials(judgement)[: config.count]
-    from eval.results import read_trials
+    from eval.judging.results import read_trials
 
     judgement = read_judgement(folder)
     results = read_trials(folder / "trials.parquet")

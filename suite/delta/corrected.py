@@ -8,7 +8,7 @@ from typing import Any
 
 from suite.delta.replay import nominal_plant
 from suite.train.config import PointMassConfig, QuadrotorConfig
-from tracks.files import plain
+from tracks.common.files import plain
 
 POINT, QUAD = "point", "quad"
 """The two models, as `suite train --model` calls them."""

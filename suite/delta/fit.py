@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from policies import delta_network
+from policies.networks import delta_network
 from suite.delta.replay import Plant, nominal_plant, replay
 from suite.delta.windows import Windows
 from suite.train.config import PointMassConfig

@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eval.flight_log import FlightLog
-from eval.plant import Memory, start_memory
-from policies import delta_network
+from eval.logs.flight_log import FlightLog
+from eval.quadrotor.plant import Memory, start_memory
+from policies.networks import delta_network
 from suite.delta.warm import WARM_S, Warm, gather, remembered
 from suite.train.config import QuadrotorConfig
-from suite.train.quadrotor import Body, Grid, fly_period, plant_of, whole_steps
-from tracks.rotation import to_local
+from suite.train.dynamics.quadrotor import Body, Grid, fly_period, plant_of, whole_steps
+from tracks.geometry.rotation import to_local
 
 
 class QuadWindows(NamedTuple):

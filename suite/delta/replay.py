@@ -7,13 +7,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from policies import delta_network
+from policies.networks import delta_network
 from suite.delta.warm import remembered
 from suite.delta.windows import Windows
-from suite.train import point_mass
 from suite.train.config import PointMassConfig
-from tracks.rotation import to_local, to_world
-from tracks.scene import Array
+from suite.train.dynamics import point_mass
+from tracks.geometry.rotation import to_local, to_world
+from tracks.geometry.scene import Array
 
 
 class Plant(NamedTuple):

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from eval.flight_log import FlightLog, read_flights
-from policies.delta_file import save_delta
-from suite.console import Console
+from eval.logs.flight_log import FlightLog, read_flights
+from policies.formats.delta_file import save_delta
+from suite.common.console import Console
+from suite.common.estimate import Estimate, announce
+from suite.common.provenance import write_run_record
 from suite.delta.corrected import corrected
 from suite.delta.fit import Errors, Fit, FitConfig, Network, fit, fit_network
 from suite.delta.windows import cut_windows
-from suite.estimate import Estimate, announce
-from suite.provenance import write_run_record
 from suite.train.config import PointMassConfig, QuadrotorConfig
-from tracks.files import plain, write_json, write_text
+from tracks.common.files import plain, write_json, write_text
 
 PLANT_STEPS_S = 4e5
 """Steps of the quadrotor a second that a fit makes, for the estimate."""

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from policies import delta_network
-from tracks.rotation import to_local
-from tracks.scene import Array
+from policies.networks import delta_network
+from tracks.geometry.rotation import to_local
+from tracks.geometry.scene import Array
 
 WARM_S = 3.0
 """How far back the network looks before a window [s]."""

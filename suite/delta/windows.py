@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.flight_log import FlightLog
+from eval.logs.flight_log import FlightLog
 from suite.delta.warm import WARM_S, Warm, gather
-from tracks.rotation import quat_to_rot
+from tracks.geometry.rotation import quat_to_rot
 
 HISTORY = 2
 """Decisions before a window whose commands may still be on their way into it."""

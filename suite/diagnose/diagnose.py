@@ -11,21 +11,21 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.flight_log import FlightLog
-from eval.vehicle import Vehicle
-from suite.diagnose.drive import another_controller, choose_drive
-from suite.diagnose.evidence import Frame, State, fit, information
-from suite.diagnose.gap import OVERLAP_S, Gap, measure, worse
-from suite.diagnose.intervals import errors_of
-from suite.diagnose.model import Linear, Model
-from suite.diagnose.parameters import candidates, indices_of, make_space
-from suite.diagnose.rest import Rest, push_of, rest_of
-from suite.diagnose.search import Finding, search, start_state
-from suite.diagnose.select import FEW, folds_of
-from suite.diagnose.split import split
-from suite.diagnose.turbulence import Turbulence, find_turbulence
-from suite.diagnose.verdict import COLOURED, SHAPED, Judgement, judge
-from suite.diagnose.windows import Windows, cut, take
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.hold_out import split
+from suite.diagnose.data.input_source import another_controller, choose_drive
+from suite.diagnose.data.windows import Windows, cut, take
+from suite.diagnose.fit.intervals import errors_of
+from suite.diagnose.fit.model import Linear, Model
+from suite.diagnose.fit.normal_equations import Frame, State, fit, information
+from suite.diagnose.fit.parameters import candidates, indices_of, make_space
+from suite.diagnose.fit.permutation import FEW, folds_of
+from suite.diagnose.fit.search import Finding, search, start_state
+from suite.diagnose.fit.turbulence import Turbulence, find_turbulence
+from suite.diagnose.verdict.gap import OVERLAP_S, Gap, measure, worse
+from suite.diagnose.verdict.residual_structure import Rest, push_of, rest_of
+from suite.diagnose.verdict.verdict import COLOURED, SHAPED, Judgement, judge
 
 HALF_STEP = 0.6
 """Share of a physics step up to which pose and rates may be apart by integration alone."""

@@ -7,22 +7,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from eval.flight_log import FlightLog, read_flights
-from eval.vehicle import Vehicle
-from eval.vehicle_file import load_vehicle, save_vehicle
-from suite.console import Console
+from eval.logs.flight_log import FlightLog, read_flights
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from eval.vehicles.vehicle import Vehicle
+from suite.common.console import Console
+from suite.common.report import write_report
 from suite.delta.run import flight_files
-from suite.diagnose.answer import answer
-from suite.diagnose.blackbox import BlackBoxConfig
-from suite.diagnose.contest import Contests, compare_black_box
 from suite.diagnose.diagnose import Diagnosis, diagnose
-from suite.diagnose.plan import fly_plan, write_plan_of
-from suite.diagnose.proof import as_json, gather
-from suite.diagnose.recording import write_rollouts
-from suite.diagnose.report import page
-from suite.report import write_report
-from tracks.files import plain, write_json
-from tracks.provenance import stamp
+from suite.diagnose.plans.plan import fly_plan, write_plan_of
+from suite.diagnose.report.answer import answer
+from suite.diagnose.report.page import page
+from suite.diagnose.report.recording import write_rollouts
+from suite.diagnose.verdict.black_box import Contests, compare_black_box
+from suite.diagnose.verdict.delta_model import BlackBoxConfig
+from suite.diagnose.verdict.proof import as_json, gather
+from tracks.common.files import plain, write_json
+from tracks.common.provenance import stamp
 
 SCHEMA = 1
 """Version of diagnosis.json."""

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eval.stats import Interval
-from suite.charts import plain_axes, png, titled
+from eval.judging.statistics import Interval
+from suite.common.charts import plain_axes, png, titled
 from suite.loop.compare import BEFORE, WITH, WITHOUT, Line
 from suite.loop.variants import Standing
 

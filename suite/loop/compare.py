@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.stats import (
+from eval.judging.statistics import (
     Interval,
     bootstrap_mean,
     bootstrap_median,
@@ -20,8 +20,8 @@ from eval.stats import (
     paired_success,
     wilson,
 )
-from eval.trial import TrialResult
-from suite.report import Cell, Grid
+from eval.worlds.trial import TrialResult
+from suite.common.report import Cell, Grid
 
 BEFORE, WITHOUT, WITH = "before", "without", "with"
 VARIANTS = (BEFORE, WITHOUT, WITH)

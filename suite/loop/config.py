@@ -6,12 +6,12 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from suite.choices import at_least, is_track_file, parse_levels, parse_tracks
+from suite.common.choices import at_least, is_track_file, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
 from suite.train.presets import finetune, preset, with_iterations
-from tracks.files import to_json
+from tracks.common.files import to_json
 
 RECORDED_FROM = 100_000
 """Recorded flights have seeds this far above the judged trials', so that none is both."""
@@ -46,9 +46,9 @@ class LoopConfig:
     policy: str | None
     """The policy to start from instead of training one: a shipped name or a checkpoint's folder."""
     track: str
-    """As in `suite.choices.parse_tracks`, families only."""
+    """As in `suite.common.choices.parse_tracks`, families only."""
     difficulty: str
-    """As in `suite.choices.parse_levels`."""
+    """As in `suite.common.choices.parse_levels`."""
     trials: int
     """Judged trials of each policy on every track at every level."""
     flights: int
@@ -91,7 +91,7 @@ def resolve(
     Raises:
         ValueError: for an option that cannot be used, naming it and what is allowed.
     """
-    from eval.vehicle_file import load_vehicle
+    from eval.quadrotor.vehicle_file import load_vehicle
 
     size = SIZES.get(recipe, Size())
     training = replace(preset(recipe), seed=seed)
@@ -101,8 +101,8 @@ def resolve(
     training = override(training, changes)
     digests = {"vehicle": hashlib.sha256(to_json(load_vehicle(vehicle)).encode()).hexdigest()}
     if policy is not None:
-        from policies.policy_file import load_policy_checkpoint
-        from suite.flying import checkpoint_folder, policy_digest
+        from policies.formats.policy_file import load_policy_checkpoint
+        from suite.judging.flying import checkpoint_folder, policy_digest
 
         given = load_policy_checkpoint(checkpoint_folder(policy))
         training = replace(training, spec=given.spec)

@@ -18,17 +18,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from eval.results import read_trials
-from eval.vehicle_file import load_vehicle
-from policies.delta_file import load_delta
-from policies.policy_file import load_policy_checkpoint
-from suite.collect import Collection
-from suite.console import Console
+from eval.judging.results import read_trials
+from eval.quadrotor.vehicle_file import load_vehicle
+from policies.formats.delta_file import load_delta
+from policies.formats.policy_file import load_policy_checkpoint
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from suite.common.estimate import Estimate, announce
+from suite.common.report import markdown, rich_table
+from suite.common.stages import Stages, claim
 from suite.delta.run import PLANT_STEPS_S, fit_quadrotor_delta
 from suite.diagnose.run import Wishes, diagnose_files
-from suite.errors import WorkFailed
-from suite.estimate import Estimate, announce
-from suite.evaluate import Judgement
+from suite.judging.collect import Collection
+from suite.judging.evaluate import Judgement
 from suite.loop.hidden_config import HiddenConfig
 from suite.loop.hidden_report import (
     BEFORE,
@@ -48,14 +50,12 @@ from suite.loop.hidden_report import (
 )
 from suite.loop.measured import enough, measure
 from suite.loop.replays import write_replays
-from suite.loop.stages import Stages, claim
 from suite.loop.variants import Standing, cell_grid, overall_grid, standings
 from suite.loop.work import flying, judge, record, take_policy, what_is_left
-from suite.report import markdown, rich_table
 from suite.train import run as training
 from suite.train.config import QuadrotorConfig, TrainConfig
-from tracks.files import plain, write_json, write_text
-from tracks.provenance import stamp
+from tracks.common.files import plain, write_json, write_text
+from tracks.common.provenance import stamp
 
 STAGES = 17
 """How many stages a loop has."""

@@ -6,14 +6,14 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from suite.choices import at_least, parse_levels, parse_tracks
+from suite.common.choices import at_least, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
-from suite.flying import checkpoint_folder
+from suite.judging.flying import checkpoint_folder
 from suite.loop.config import RECORDED_FROM, check_seeds
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
 from suite.train.presets import finetune, preset, with_iterations, with_quadrotor
-from tracks.files import to_json
+from tracks.common.files import to_json
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class HiddenConfig:
     policy: str
     """The policy to start from: a shipped name or a checkpoint's folder."""
     track: str
-    """As in `suite.choices.parse_tracks`, families only."""
+    """As in `suite.common.choices.parse_tracks`, families only."""
     difficulty: str
-    """As in `suite.choices.parse_levels`."""
+    """As in `suite.common.choices.parse_levels`."""
     trials: int
     """Judged trials of each policy on every track at every level."""
     flights: int
@@ -94,9 +94,9 @@ def resolve_hidden(
     Raises:
         ValueError: for an option that cannot be used, naming it and what is allowed.
     """
-    from eval.vehicle_file import load_vehicle
-    from policies.policy_file import load_policy_checkpoint
-    from suite.flying import default_policy, policy_digest
+    from eval.quadrotor.vehicle_file import load_vehicle
+    from policies.formats.policy_file import load_policy_checkpoint
+    from suite.judging.flying import default_policy, policy_digest
 
     size = SIZES.get(recipe, HiddenSize())
     base = replace(preset(recipe), seed=seed)

@@ -7,17 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from eval.vehicle import Vehicle
-from eval.vehicle_file import load_vehicle
-from suite.console import duration
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import Vehicle
+from suite.common.console import duration
+from suite.common.report import Cell, Details, Grid, Links, Picture, Report, Section, write_report
 from suite.loop.charts import success_chart, tuning_chart
 from suite.loop.hidden_config import HiddenConfig
 from suite.loop.variants import Standing
-from suite.report import Cell, Details, Grid, Links, Picture, Report, Section, write_report
 from suite.train import curve
-from tracks.files import to_json
-from tracks.provenance import git_commit
-from tracks.version import VERSION
+from tracks.common.files import to_json
+from tracks.common.provenance import git_commit
+from tracks.common.version import VERSION
 
 NOMINAL, BEFORE = "nominal", "before"
 CONTROL, DELTA, NAMED, BOTH = "control", "delta", "named", "both"

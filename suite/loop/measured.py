@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.flight_log import FlightLog, read_flights, write_flight
-from suite.collect import LIST
-from tracks.files import write_json
-from tracks.rotation import exp_rot, rot_to_quat
+from eval.logs.flight_log import FlightLog, read_flights, write_flight
+from suite.judging.collect import LIST
+from tracks.common.files import write_json
+from tracks.geometry.rotation import exp_rot, rot_to_quat
 
 CONTACT_MARGIN_S = 0.1
 """This much is cut off the end of a flight that did not finish [s]."""

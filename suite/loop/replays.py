@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from suite.choices import parse_levels, parse_tracks
-from suite.evaluate import Judgement
-from suite.flying import trial_list
-from suite.replay import drone_of, fly_again
+from suite.common.choices import parse_levels, parse_tracks
+from suite.judging.evaluate import Judgement
+from suite.judging.flying import trial_list
+from suite.judging.replay import drone_of, fly_again
 
 if TYPE_CHECKING:
-    from eval.trial import TrialSpec
     from eval.view.recording import Rollout
+    from eval.worlds.trial import TrialSpec
 
 
 def shown_trials(judgement: Judgement) -> list[TrialSpec]:
@@ -36,7 +36,7 @@ def write_replays(
         shown: by the name of the picture, what the recording calls the policy and where it is.
         folder: for NAME.png.
     """
-    from eval.vehicle_file import load_vehicle
+    from eval.quadrotor.vehicle_file import load_vehicle
     from eval.view.picture import write_grid
     from eval.view.recording import write_recording
 

@@ -6,11 +6,8 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from suite.console import duration
-from suite.loop.charts import comparison_chart, delta_chart, training_chart
-from suite.loop.compare import BEFORE, CAVEAT, WITH, WITHOUT, Line, grids, verdict
-from suite.loop.config import LoopConfig
-from suite.report import (
+from suite.common.console import duration
+from suite.common.report import (
     Cell,
     Details,
     Grid,
@@ -20,10 +17,13 @@ from suite.report import (
     Section,
     write_report,
 )
+from suite.loop.charts import comparison_chart, delta_chart, training_chart
+from suite.loop.compare import BEFORE, CAVEAT, WITH, WITHOUT, Line, grids, verdict
+from suite.loop.config import LoopConfig
 from suite.train import curve
-from tracks.files import to_json
-from tracks.provenance import git_commit
-from tracks.version import VERSION
+from tracks.common.files import to_json
+from tracks.common.provenance import git_commit
+from tracks.common.version import VERSION
 
 READING = (
     "All three policies fly the same trials in the MuJoCo quadrotor, without the Delta Action "

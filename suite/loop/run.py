@@ -14,16 +14,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from eval.results import read_trials
-from policies.delta_file import load_delta
-from policies.network import fitted
-from policies.policy_file import load_policy_checkpoint
-from suite.collect import Collection
-from suite.console import Console
+from eval.judging.results import read_trials
+from policies.formats.delta_file import load_delta
+from policies.formats.policy_file import load_policy_checkpoint
+from policies.networks.network import fitted
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from suite.common.estimate import Estimate, announce
+from suite.common.report import markdown, rich_table
+from suite.common.stages import Stages, claim
 from suite.delta.run import fit_delta
-from suite.errors import WorkFailed
-from suite.estimate import Estimate, announce
-from suite.evaluate import Judgement
+from suite.judging.collect import Collection
+from suite.judging.evaluate import Judgement
 from suite.loop.compare import (
     BEFORE,
     CAVEAT,
@@ -38,12 +40,10 @@ from suite.loop.compare import (
 from suite.loop.config import LoopConfig
 from suite.loop.replays import write_replays
 from suite.loop.report import write_loop_report
-from suite.loop.stages import Stages, claim
 from suite.loop.work import flying, judge, record, take_policy, what_is_left
-from suite.report import markdown, rich_table
 from suite.train import run as training
-from tracks.files import plain, write_json, write_text
-from tracks.provenance import stamp
+from tracks.common.files import plain, write_json, write_text
+from tracks.common.provenance import stamp
 
 STAGES = 9
 """How many stages a loop has."""

@@ -8,10 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.stats import Interval, bootstrap_mean, bootstrap_median, paired_success, wilson
-from eval.trial import TrialResult
+from eval.judging.statistics import (
+    Interval,
+    bootstrap_mean,
+    bootstrap_median,
+    paired_success,
+    wilson,
+)
+from eval.worlds.trial import TrialResult
+from suite.common.report import Cell, Grid
 from suite.loop.compare import difference_cell, value_text
-from suite.report import Cell, Grid
 
 
 class Difference(NamedTuple):

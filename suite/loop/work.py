@@ -8,20 +8,20 @@ from pathlib import Path
 
 from rich.console import RenderableType
 
-from eval.results import read_trials
-from suite.collect import Collection, collect
-from suite.console import Console
-from suite.estimate import Estimate
-from suite.evaluate import Judgement, evaluate
-from suite.flying import (
+from eval.judging.results import read_trials
+from suite.common.console import Console
+from suite.common.estimate import Estimate
+from suite.common.stages import Stages
+from suite.judging.collect import Collection, collect
+from suite.judging.evaluate import Judgement, evaluate
+from suite.judging.flying import (
     PROCESS_BYTES,
     SECONDS_A_TRIAL,
     START_SECONDS,
     checkpoint_folder,
     options_for,
 )
-from suite.loop.stages import Stages
-from tracks.files import replacing_folder
+from tracks.common.files import replacing_folder
 
 
 class Quiet(Console):

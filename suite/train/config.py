@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from eval.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle
 from policies.spec import PolicySpec
 
 

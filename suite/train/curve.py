@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tracks.files import to_json, write_text
+from tracks.common.files import to_json, write_text
 
 CURVE = "metrics.jsonl"
 """A row a gradient step."""

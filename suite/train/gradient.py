@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from policies import delta_network, network
+from policies.networks import delta_network, network
 from suite.train.checks import check_stride
 from suite.train.config import TrainConfig
 from suite.train.rollout import StepRecord, make_rollout

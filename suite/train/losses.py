@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from suite.train.config import LossConfig
-from tracks.field import CURRENT, attractive_field, magnetic_field
-from tracks.gates import rectangle
-from tracks.scene import Gates
+from tracks.geometry.field import CURRENT, attractive_field, magnetic_field
+from tracks.geometry.gates import rectangle
+from tracks.geometry.scene import Gates
 
 UNIT_FIELD = 11.313708498984761
 """|B| / C_I at the centre of a square gate of 1 m: 8 sqrt(2) [1/m]."""

@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Iterable
 from typing import TypeVar
 
-from tracks.names import unknown_name
+from tracks.common.names import unknown_name
 
 T = TypeVar("T")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from eval.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle
 from policies.spec import PolicySpec
 from suite.train.config import (
     EpisodeConfig,
@@ -15,7 +15,7 @@ from suite.train.config import (
     QuadrotorConfig,
     TrainConfig,
 )
-from tracks.names import unknown_name
+from tracks.common.names import unknown_name
 
 
 def racer() -> TrainConfig:
@@ -145,7 +145,7 @@ def chosen_model(config: TrainConfig, model: str, vehicle: str | None) -> TrainC
     Raises:
         ValueError: where one is given without the other, or the vehicle cannot be used.
     """
-    from eval.vehicle_file import load_vehicle, shipped_vehicles
+    from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 
     if model == "point":
         if vehicle is not None:

@@ -20,18 +20,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Sharding
 
-from policies import network
-from policies.checkpoint import load_arrays, read_config, save_arrays
-from policies.policy_file import save_policy
+from policies.formats.checkpoint import load_arrays, read_config, save_arrays
+from policies.formats.policy_file import save_policy
+from policies.networks import network
+from policies.networks.tree_arrays import tree_from_arrays, tree_to_arrays
 from policies.spec import PolicySpec
-from policies.tree_arrays import tree_from_arrays, tree_to_arrays
-from suite.console import Console
-from suite.errors import WorkFailed
-from suite.estimate import Estimate, announce
-from suite.provenance import write_run_record
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from suite.common.estimate import Estimate, announce
+from suite.common.provenance import write_run_record
 from suite.train import curve
 from suite.train.worlds import Worlds
-from tracks.files import recover_folder
+from tracks.common.files import recover_folder
 
 SAVE_PERIOD_S = 30.0
 """Time between checkpoints [s]."""

@@ -15,18 +15,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from policies import delta_network, network
+from policies.networks import delta_network, network
 from policies.observation import encode_depth, state_vector
 from suite.train import losses
 from suite.train.config import LossConfig, TrainConfig
-from suite.train.dynamics import Body, make_dynamics
+from suite.train.dynamics.interface import Body, make_dynamics
 from suite.train.worlds import Worlds
-from tracks.camera import pixel_rays_b
-from tracks.clearance import nearest_obstacle
-from tracks.crossing import crossing
-from tracks.depth import depth_image
-from tracks.rotation import to_local
-from tracks.scene import Counts, Gates
+from tracks.geometry.camera import pixel_rays_b
+from tracks.geometry.clearance import nearest_obstacle
+from tracks.geometry.crossing import crossing
+from tracks.geometry.depth import depth_image
+from tracks.geometry.rotation import to_local
+from tracks.geometry.scene import Counts, Gates
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
 """Solids of each kind that a training image shows, nearest first; the judge shows all."""

@@ -14,16 +14,16 @@ import jax
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from eval.sharding import usable_cores
-from policies import delta_network, network
-from suite.console import Console
-from suite.estimate import Estimate
+from eval.judging.sharding import usable_cores
+from policies.networks import delta_network, network
+from suite.common.console import Console
+from suite.common.estimate import Estimate
 from suite.train.checks import check
 from suite.train.config import TrainConfig
 from suite.train.repeat import Method, Outcome, Run, Watch, repeat
 from suite.train.update import device_mesh, make_update, start_state
 from suite.train.worlds import sample_worlds
-from tracks.files import plain
+from tracks.common.files import plain
 
 STEPS_PER_CORE_S = 5000.0
 """Gradient steps a second that one processor core makes, for the estimate."""

@@ -11,7 +11,7 @@ import numpy as np
 import optax
 from jax.sharding import Mesh
 
-from policies import delta_network, network
+from policies.networks import delta_network, network
 from suite.train.config import OptimizerConfig, TrainConfig
 from suite.train.gradient import shard_gradient
 from suite.train.rollout import BODY_RADIUS_M, StepRecord

@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.train import dynamics, point_mass
 from suite.train.config import TrainConfig
-from tracks.cull import Bounds, bounds
+from suite.train.dynamics import interface as dynamics
+from suite.train.dynamics import point_mass
 from tracks.families import max_counts, random_track
 from tracks.families.random import Mix
-from tracks.scene import Array, Scene, stack
+from tracks.geometry.cull import Bounds, bounds
+from tracks.geometry.scene import Array, Scene, stack
 from tracks.track import Track, first_gates
 
 
@@ -109,7 +110,7 @@ def _beside_a_gate(
 
 def _quadrotor_constants(config: TrainConfig, iteration: int) -> dynamics.Constants:
     """Return the quadrotors of an iteration, from draws of their own: the tracks stay the same."""
-    from suite.train.quadrotor import Constants, draw_effects
+    from suite.train.dynamics.quadrotor import Constants, draw_effects
 
     assert config.quadrotor is not None
     batch, rng = config.episode.batch, np.random.default_rng([config.seed, iteration, 1])

@@ -4,11 +4,11 @@ import jax
 import numpy as np
 import pytest
 
-from policies import network
-from policies.export import export_policy
-from policies.policy_file import save_policy
+from policies.formats.export import export_policy
+from policies.formats.policy_file import save_policy
+from policies.networks import network
 from policies.spec import PolicySpec
-from tracks.camera import Camera
+from tracks.geometry.camera import Camera
 
 SPEC = PolicySpec(rate_hz=33.0, camera=Camera(pitch_deg=20.0), hidden_size=64)
 

@@ -44,10 +44,12 @@ def test_training_and_flying_our_policy_needs_jax_and_numpy_only(checkpoint, tmp
 
 
 def test_the_blocker_blocks():
-    assert "torch is blocked" in run(BLOCK + "import policies.torch_file").stderr
+    assert "torch is blocked" in run(BLOCK + "import policies.formats.torch_file").stderr
 
 
-@pytest.mark.parametrize("module", ["policies.policy", "policies.checkpoint", "policies.export"])
+@pytest.mark.parametrize(
+    "module", ["policies.policy", "policies.formats.checkpoint", "policies.formats.export"]
+)
 def test_the_doors_import_nothing_heavy(module):
     heavy = ("jax", "safetensors", *BLOCKED.split())
     script = f"import sys, {module}\nprint(sorted(set({heavy!r}) & set(sys.modules)))"

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from policies import shipped
 from policies.block_policy import BlockPolicy
-from policies.embedded_spec import KEY
 from policies.errors import PolicyError
+from policies.formats.embedded_spec import KEY
 from policies.policy import load_policy
 
 

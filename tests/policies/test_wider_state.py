@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from policies import network
 from policies.errors import PolicyError
-from policies.export import export_policy
+from policies.formats.export import export_policy
+from policies.formats.policy_file import save_policy
+from policies.formats.spec_json import spec_from_json, spec_to_json
+from policies.networks import network
 from policies.observation import state_vector
 from policies.policy import load_policy
-from policies.policy_file import save_policy
 from policies.spec import PolicySpec
-from policies.spec_json import spec_from_json, spec_to_json
 from tests.policies.conftest import SPEC, lively
 
 SECOND = replace(SPEC, second_gate=True)

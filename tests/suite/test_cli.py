@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from suite import cli
-from suite.console import Console, duration, size
-from suite.errors import explain
-from tracks.scene import Boxes, Counts, Gates, Scene, Spheres, no_rods, pad
-from tracks.version import VERSION
+from suite.common.console import Console, duration, size
+from suite.common.errors import explain
+from tracks.common.version import VERSION
+from tracks.geometry.scene import Boxes, Counts, Gates, Scene, Spheres, no_rods, pad
 
 HEAVY = ("numpy", "jax", "mujoco", "torch", "tyro", "rich", "scipy", "pyarrow", "argparse")
 SLOW = ("jax", "mujoco", "torch", "dm_control", "trimesh", "matplotlib", "rerun", "scipy")

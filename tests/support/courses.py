@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tracks.scene import Boxes, Gates, Scene, Spheres, no_rods
+from tracks.geometry.scene import Boxes, Gates, Scene, Spheres, no_rods
 from tracks.track import Track
 
 

@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 
 from eval.effects import apply_log_faults
-from eval.flight_log import FlightLog
-from eval.plant import Command, Motion, make_plant, plant_step, start_memory, uses_noise
-from eval.quadrotor_model import add_quadrotor, set_true_inertia
-from tracks.rotation import quat_to_rot
+from eval.logs.flight_log import FlightLog
+from eval.quadrotor.model import add_quadrotor, set_true_inertia
+from eval.quadrotor.plant import Command, Motion, make_plant, plant_step, start_memory, uses_noise
+from tracks.geometry.rotation import quat_to_rot
 
 NOISE = {"pos": 0.002, "att": 0.004, "vel": 0.02, "rate": 0.02, "motor": 4.0, "acc": 0.15}
 EVERY = 5

@@ -4,7 +4,7 @@ import json
 import re
 
 from policies import shipped
-from policies.checkpoint import CONFIG, WEIGHTS
+from policies.formats.checkpoint import CONFIG, WEIGHTS
 from suite import cli
 
 

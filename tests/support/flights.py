@@ -4,10 +4,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from eval.flight import Flight
-from eval.trial import TrialResult
-from tracks.gates import frame_boxes, square_gates
-from tracks.scene import Boxes, Rods, Scene, Spheres
+from eval.logs.flight import Flight
+from eval.worlds.trial import TrialResult
+from tracks.geometry.gates import frame_boxes, square_gates
+from tracks.geometry.scene import Boxes, Rods, Scene, Spheres
 from tracks.track import Track
 
 GRAVITY = np.array([0.0, 0.0, 9.81])

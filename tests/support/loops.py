@@ -5,9 +5,9 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-import eval.judge
+import eval.judging.judge
 import suite.train.run
-from eval.trial import Rules
+from eval.worlds.trial import Rules
 
 
 class Small:
@@ -16,8 +16,8 @@ class Small:
     def __init__(self, monkeypatch):
         self.flown, self.trained = [], []
         self.stop_after: tuple[str, int] | None = None
-        self._fly = eval.judge.fly
-        monkeypatch.setattr(eval.judge, "fly", self.fly)
+        self._fly = eval.judging.judge.fly
+        monkeypatch.setattr(eval.judging.judge, "fly", self.fly)
         monkeypatch.setattr(suite.train.run, "make_update", self.make_update)
 
     def count(self, kind):

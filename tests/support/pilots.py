@@ -58,7 +58,7 @@ class RandomNetwork:
 
         from policies.block_policy import proven
         from policies.native import native_policy
-        from policies.network import init
+        from policies.networks.network import init
 
         self.spec = PolicySpec()
         params = init(jax.random.key(seed), self.spec)

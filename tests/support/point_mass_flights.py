@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eval.flight_log import FlightLog
-from suite.train import point_mass
-from tracks.rotation import rot_to_quat
+from eval.logs.flight_log import FlightLog
+from suite.train.dynamics import point_mass
+from tracks.geometry.rotation import rot_to_quat
 
 RATE_HZ = 30.0
 SOON_S = 1e-3

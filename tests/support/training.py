@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from policies import network
+from policies.networks import network
 from policies.spec import PolicySpec
 from suite.train.config import (
     EpisodeConfig,
@@ -14,8 +14,8 @@ from suite.train.config import (
     TrainConfig,
 )
 from suite.train.worlds import Worlds, sample_worlds
-from tracks.camera import Camera
-from tracks.scene import Boxes, Rods, Scene, Spheres
+from tracks.geometry.camera import Camera
+from tracks.geometry.scene import Boxes, Rods, Scene, Spheres
 
 SPEC = PolicySpec(camera=Camera(width=20, height=20), hidden_size=8)
 

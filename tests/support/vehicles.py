@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.plant import Motion
-from eval.vehicle import Controller, Rotors, Vehicle
+from eval.quadrotor.plant import Motion
+from eval.vehicles.vehicle import Controller, Rotors, Vehicle
 
 PLAIN = Vehicle(
     name="plain",

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tracks.common.names import unknown_name
 from tracks.families import circular, ellipse, random, zigzag
 from tracks.families.layout import GATE_COUNT, Layout
-from tracks.names import unknown_name
-from tracks.scene import Counts
+from tracks.geometry.scene import Counts
 from tracks.track import Track
 
 FAMILIES: dict[str, Callable[[float, np.random.Generator], Layout]] = {

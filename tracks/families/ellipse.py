@@ -15,7 +15,7 @@ from tracks.families.layout import (
     pick_stretch,
     ramp,
 )
-from tracks.obstacles import straight_sites
+from tracks.geometry.obstacles import straight_sites
 
 SPACING_M = 5.0
 OBSTACLE_OFFSET_M = 2.5

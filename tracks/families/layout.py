@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tracks.gates import frame_boxes, square_gates
-from tracks.obstacles import Obstacles, PerStretch, Site, keep_clear, scatter
-from tracks.scene import Boxes, Gates, Scene
+from tracks.geometry.gates import frame_boxes, square_gates
+from tracks.geometry.obstacles import Obstacles, PerStretch, Site, keep_clear, scatter
+from tracks.geometry.scene import Boxes, Gates, Scene
 
 GATE_COUNT = 8
 MIN_HEIGHT_M = 0.8

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from tracks.families.layout import GATE_COUNT, MAX_YAW_NOISE, Layout, furnish, ramp
-from tracks.gates import round_gates, square_gates
-from tracks.obstacles import PerStretch, segment_distance, straight_sites
-from tracks.scene import Gates
+from tracks.geometry.gates import round_gates, square_gates
+from tracks.geometry.obstacles import PerStretch, segment_distance, straight_sites
+from tracks.geometry.scene import Gates
 
 MIN_SPACING_M, MAX_SPACING_M = 2.5, 7.0
 PASSING_M = 1.6

@@ -13,7 +13,7 @@ from tracks.families.layout import (
     noisy_gates,
     ramp,
 )
-from tracks.obstacles import straight_sites
+from tracks.geometry.obstacles import straight_sites
 
 SPACING_M = 5.0
 OBSTACLE_OFFSET_M = 3.6

@@ -1,0 +1,1 @@
+"""Whether a log agrees with itself."""

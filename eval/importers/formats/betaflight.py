@@ -1,0 +1,131 @@
+"""CSV files of `blackbox_decode` (Betaflight).
+
+Betaflight's body is forward-left-up already: roll right, nose down and a turn to the left are
+positive, in the gyro, the set points and the motor mixer alike. Rates are in deg/s, also where
+the header names no unit (ten times that under `blackbox_high_resolution`: the attitude shows it,
+and `units_check.py` puts it right). Units that `blackbox_decode` was told to use stand in brackets
+after a column's name.
+Position and attitude are not logged: --pose brings them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from eval.importers.findings import Finding
+from eval.importers.formats.table import numbers
+from eval.importers.options import ImportOptions
+from eval.importers.signals import Recording, collect
+from eval.logs.columns import FlightLogError
+from eval.logs.files import read_columns
+
+MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
+"""Motors 1 to 4 (x forward, y left): rear right, front right, rear left, front left."""
+DEG = np.pi / 180.0
+ACC_1G = 2048.0
+"""Raw counts of accSmooth per g, on all boards of Betaflight 4."""
+_ROTATION = {"": DEG, "deg/s": DEG, "rad/s": 1.0}
+_ACCELERATION = {"": 9.81 / ACC_1G, "g": 9.81, "m/s2": 1.0}
+_TIME = {"": 1e-6, "us": 1e-6, "ms": 1e-3, "s": 1.0}
+_VOLT = {"": 0.01, "V": 1.0, "mV": 1e-3}
+"""Factors to our units by the unit in the header; raw voltages of Betaflight 4 are in 10 mV."""
+MOST_V = 30.0
+"""A higher voltage is ten times too large: `blackbox_decode` divides by ten to make volts, as was
+right before Betaflight 4 (a quadrotor of more than seven cells and older firmware is rarer)."""
+_UNIT = re.compile(r"^(?P<name>.*?)(?: \((?P<unit>[^()]*)\))?$")
+_ERPM = re.compile(r"^eRPM(?:\(/100\))?\[(\d)\]$")
+
+
+class Blackbox:
+    """The columns of one file, found by name whatever their unit."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the table at `path`."""
+        self.name = str(path)
+        self.columns, _, self.warnings = read_columns(path)
+        self._found: dict[str, tuple[str, str]] = {}
+        for column in self.columns:
+            match = _UNIT.match(column)
+            if match:
+                self._found[match["name"]] = (column, match["unit"] or "")
+
+    def has(self, *names: str) -> bool:
+        """Return whether all the columns are there."""
+        return all(name in self._found for name in names)
+
+    def values(self, names: list[str], factor: Mapping[str, float]) -> np.ndarray:
+        """Return columns (N, C) in our unit.
+
+        Raises:
+            FlightLogError: for a column that is missing, of an unknown unit, or not of numbers.
+        """
+        out = []
+        for name in names:
+            if name not in self._found:
+                raise FlightLogError(self.name, name, None, "missing; is this of blackbox_decode?")
+            column, unit = self._found[name]
+            if unit not in factor:
+                known = ", ".join(repr(u) for u in factor if u)
+                raise FlightLogError(self.name, column, None, f"unit {unit!r}, not of {known}")
+            values = np.asarray(self.columns[column])
+            if name == "time":
+                # Frames that could not be decoded have an X for their time.
+                values = np.array([None if v == "X" else v for v in values.tolist()])
+            out.append(numbers({column: values}, column, self.name) * factor[unit])
+        return np.stack(out, axis=1)
+
+
+def read(path: Path, options: ImportOptions) -> Recording:
+    """Return what the CSV at `path` holds; its motors turn `options.motor_poles` magnets.
+
+    Raises:
+        FlightLogError: where a column of every Betaflight log is missing or unusable.
+    """
+    box = Blackbox(path)
+    findings = [Finding("note", "file", text) for text in box.warnings]
+    time_s = box.values(["time"], _TIME)[:, 0]
+    if np.isfinite(time_s).any():
+        time_s = time_s - np.nanmin(time_s)
+    axes = range(3)
+    gyro = "gyroADC" if box.has("gyroADC[0]") or not box.has("gyroUnfilt[0]") else "gyroUnfilt"
+    parts = {"rate": box.values([f"{gyro}[{k}]" for k in axes], _ROTATION)}
+    if box.has(*(f"accSmooth[{k}]" for k in axes)):
+        parts["acc"] = box.values([f"accSmooth[{k}]" for k in axes], _ACCELERATION)
+    if box.has(*(f"setpoint[{k}]" for k in range(4))):
+        parts["cmd_rate"] = box.values([f"setpoint[{k}]" for k in axes], {"": DEG, "deg/s": DEG})
+        parts["throttle"] = box.values(["setpoint[3]"], {"": 1e-3})
+    elif box.has("rcCommand[3]"):
+        text = "no setpoint columns: sticks are not rates, so there is no rate command"
+        findings.append(Finding("doubt", "command", text))
+    if box.has("vbatLatest"):
+        parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), options.fix, findings)
+    parts |= _motors(box, options.motor_poles, findings)
+    signals, more = collect({name: (time_s, value) for name, value in parts.items()}, box.name)
+    return Recording(box.name, signals, (*findings, *more), MOTOR_SIDE)
+
+
+def _volts(voltage: np.ndarray, fix: bool, findings: list[Finding]) -> np.ndarray:
+    middle = float(np.nanmedian(voltage)) if np.isfinite(voltage).any() else 0.0
+    if middle <= MOST_V:
+        return voltage
+    text = f"{middle:.4g} V in the file: ten times too much, as blackbox_decode writes Betaflight 4"
+    findings.append(Finding("corrected" if fix else "doubt", "voltage", text))
+    return voltage / 10.0 if fix else voltage
+
+
+def _motors(box: Blackbox, poles: int, findings: list[Finding]) -> dict[str, np.ndarray]:
+    """Return rotor speeds [rad/s] from eRPM, which is logged in hundreds."""
+    columns = {match[1]: c for c in box.columns if (match := _ERPM.match(c))}
+    if set(columns) < set("0123"):
+        return {}
+    if poles < 2 or poles % 2:
+        raise FlightLogError(box.name, None, None, f"motor_poles is {poles}: even, 2 or more")
+    raw = [numbers(box.columns, columns[k], box.name) for k in "0123"]
+    turns_per_s = np.stack(raw, axis=1) * 100.0 / (poles / 2) / 60.0
+    text = f"rotor speeds from eRPM of motors with {poles} poles (--motor-poles)"
+    findings.append(Finding("note", "motors", text))
+    return {"motor": 2.0 * np.pi * turns_per_s}

@@ -1,0 +1,218 @@
+"""Logs of the Crazyflie's micro SD card deck.
+
+A file is the byte 0xBC, the format's version (1 or 2) and the number of event kinds; each kind
+has a number, a name and its variables, named `group.name(t)` with t a type code of Python's
+`struct`. Events follow: the kind's number, a time (version 1: 32 bits of milliseconds, version 2:
+64 bits of microseconds) and the variables, little-endian and packed. A CRC-32 of all that ends
+the file; a Crazyflie that was switched off while logging leaves it out. Source: the firmware's
+documentation of the deck and its log variables (Bitcraze).
+
+The firmware's world is z-up and its body forward-left-up. Its gyro is in deg/s, its accelerometer
+in g, and its desired pitch rate has the sign of "nose up", against the gyro's.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+from zlib import crc32
+
+import numpy as np
+
+from eval.importers.detect import USD, read_head
+from eval.importers.findings import Finding
+from eval.importers.options import ImportOptions
+from eval.importers.signals import Recording, collect
+from eval.logs.columns import FlightLogError
+
+CODES = {"b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"} | {
+    "e": "<f2",
+    "f": "<f4",
+    "d": "<f8",
+    "q": "<i8",
+    "Q": "<u8",
+}
+"""Type codes of variables as numpy types."""
+MOTOR_SIDE = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
+"""M1 to M4 (x forward, y left): front right, rear right, rear left, front left."""
+PWM = 65535.0
+RPM = 2.0 * np.pi / 60.0
+DEG = np.pi / 180.0
+XYZ = ("x", "y", "z")
+
+_READINGS: dict[str, list[tuple[tuple[str, ...], Sequence[float]]]] = {
+    "pos": [
+        (tuple(f"stateEstimate.{a}" for a in XYZ), (1.0,) * 3),
+        (tuple(f"stateEstimateZ.{a}" for a in XYZ), (1e-3,) * 3),
+        (tuple(f"locSrv.{a}" for a in XYZ), (1.0,) * 3),
+    ],
+    "quat": [
+        (tuple(f"stateEstimate.q{a}" for a in "wxyz"), (1.0,) * 4),
+        (tuple(f"locSrv.q{a}" for a in "wxyz"), (1.0,) * 4),
+    ],
+    "vel": [
+        (tuple(f"stateEstimate.v{a}" for a in XYZ), (1.0,) * 3),
+        (tuple(f"stateEstimateZ.v{a}" for a in XYZ), (1e-3,) * 3),
+    ],
+    "rate": [
+        (tuple(f"gyro.{a}" for a in XYZ), (DEG,) * 3),
+        (
+            ("stateEstimateZ.rateRoll", "stateEstimateZ.ratePitch", "stateEstimateZ.rateYaw"),
+            (1e-3, -1e-3, 1e-3),
+        ),
+    ],
+    "acc": [(tuple(f"acc.{a}" for a in XYZ), (9.81,) * 3)],
+    "cmd_rate": [
+        (
+            ("controller.rollRate", "controller.pitchRate", "controller.yawRate"),
+            (DEG, -DEG, DEG),
+        )
+    ],
+    "throttle": [
+        (("controller.cmd_thrust",), (1 / PWM,)),
+        (("stabilizer.thrust",), (1 / PWM,)),
+    ],
+    "motor": [(tuple(f"rpm.m{k}" for k in range(1, 5)), (RPM,) * 4)],
+    "voltage": [(("pm.vbat",), (1.0,)), (("pm.vbatMV",), (1e-3,))],
+}
+"""Signal -> variables and factors to our units and signs, the first that are there."""
+
+
+class Kind(NamedTuple):
+    """One kind of event."""
+
+    name: str
+    variables: tuple[str, ...]
+    layout: np.dtype
+
+
+def read(path: Path, options: ImportOptions) -> Recording:
+    """Return what the log at `path` holds.
+
+    Raises:
+        FlightLogError: where it is no such log, of an unknown version, or broken in its header.
+    """
+    if not read_head(path).startswith(USD):
+        raise FlightLogError(str(path), None, None, "not a uSD deck log (its first byte is not BC)")
+    events, findings = decode(path.read_bytes(), str(path))
+    parts = {}
+    for name, readings in _READINGS.items():
+        for variables, factors in readings:
+            found = _find(events, variables)
+            if found is not None:
+                parts[name] = (found[0], found[1] * np.asarray(factors))
+                break
+    packed = _find(events, ("stateEstimateZ.quat",))
+    if "quat" not in parts and packed is not None:
+        parts["quat"] = (packed[0], unpack_quaternion(packed[1][:, 0]))
+    signals, more = collect(parts, str(path))
+    return Recording(str(path), signals, (*findings, *more), MOTOR_SIDE)
+
+
+def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], list[Finding]]:
+    """Return event name -> variable -> values, with the times [s] under `timestamp`.
+
+    Raises:
+        FlightLogError: where the header is broken or nothing follows it.
+    """
+    try:
+        version, kinds, start = _header(data, name)
+    except (struct.error, IndexError, KeyError, UnicodeDecodeError, ValueError) as error:
+        if isinstance(error, FlightLogError):
+            raise
+        reason = f"a uSD deck log whose header is broken ({error}); copy it again"
+        raise FlightLogError(name, None, None, reason) from None
+    findings = []
+    whole = len(data) > start + 4 and crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0]
+    if not whole:
+        text = "the checksum is missing or wrong (switched off while logging?); read to the end"
+        findings.append(Finding("doubt", "file", text))
+    stop = len(data) - 4 if whole else len(data)
+    stamp = struct.Struct("<HI" if version == 1 else "<HQ")
+    found: dict[int, list[bytes]] = {number: [] for number in kinds}
+    at = start
+    while at + stamp.size <= stop:
+        number = int.from_bytes(data[at : at + 2], "little")
+        if number not in kinds:
+            # Without a checksum its four bytes, or the card's old content, may follow the log.
+            if not whole and stop - at <= 4:
+                break
+            text = f"byte {at} starts no known event; {stop - at} bytes after it are not read"
+            findings.append(Finding("doubt", "file", text))
+            break
+        end = at + stamp.size + kinds[number].layout.itemsize
+        if end > stop:
+            break
+        found[number].append(data[at + 2 : end])
+        at = end
+    unit = 1e-3 if version == 1 else 1e-6
+    events = {}
+    for number, kind in kinds.items():
+        clock = np.dtype([("timestamp", "<u4" if version == 1 else "<u8")])
+        layout = np.dtype(clock.descr + (kind.layout.descr if kind.variables else []))
+        table = np.frombuffer(b"".join(found[number]), dtype=layout)
+        events[kind.name] = {v: table[v].astype(np.float64) for v in kind.variables}
+        events[kind.name]["timestamp"] = table["timestamp"].astype(np.float64) * unit
+    if not any(len(event["timestamp"]) for event in events.values()):
+        raise FlightLogError(name, None, None, "holds a header and no event: nothing was logged")
+    return events, findings
+
+
+def unpack_quaternion(packed: np.ndarray) -> np.ndarray:
+    """Return quaternions wxyz (N, 4) of the firmware's 32-bit form, good to about 0.1 deg.
+
+    The two highest bits number the largest of x, y, z, w, which is left out and positive; the
+    others follow in order, each a sign and nine bits that count to 1/sqrt(2).
+    """
+    bits = packed.astype(np.uint64)
+    largest = (bits >> np.uint64(30)).astype(np.int64)
+    small = np.empty((len(bits), 3))
+    for k in range(3):
+        part = (bits >> np.uint64(10 * (2 - k))) & np.uint64(0x3FF)
+        size = (part & np.uint64(0x1FF)).astype(np.float64) / 511.0 * np.sqrt(0.5)
+        small[:, k] = np.where(part >> np.uint64(9), -size, size)
+    rest = np.sqrt(np.clip(1.0 - np.sum(small**2, axis=1), 0.0, 1.0))
+    xyzw = np.empty((len(bits), 4))
+    for index in range(4):
+        rows = largest == index
+        xyzw[rows] = np.insert(small[rows], index, rest[rows], axis=1)
+    return xyzw[:, [3, 0, 1, 2]]
+
+
+def _header(data: bytes, name: str) -> tuple[int, dict[int, Kind], int]:
+    version, count = struct.unpack_from("<HH", data, 1)
+    if version not in (1, 2):
+        reason = f"a uSD deck log of version {version}; 1 and 2 can be read"
+        raise FlightLogError(name, None, None, reason)
+    at = 5
+    kinds = {}
+    for _ in range(count):
+        (number,) = struct.unpack_from("<H", data, at)
+        kind_name, at = _text(data, at + 2)
+        (width,) = struct.unpack_from("<H", data, at)
+        at += 2
+        fields = []
+        for _ in range(width):
+            text, at = _text(data, at)
+            variable, _, code = text.rpartition("(")
+            fields.append((variable, CODES[code.rstrip(")")]))
+        kinds[number] = Kind(kind_name, tuple(v for v, _ in fields), np.dtype(fields))
+    return version, kinds, at
+
+
+def _text(data: bytes, at: int) -> tuple[str, int]:
+    end = data.index(0, at)
+    return data[at:end].decode("utf-8"), end + 1
+
+
+def _find(
+    events: Mapping[str, Mapping[str, np.ndarray]], variables: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return time and values of `variables` from the event that holds them most often."""
+    holding = [e for e in events.values() if all(v in e for v in variables)]
+    best = max(holding, key=lambda event: len(event["timestamp"]), default=None)
+    if best is None or not len(best["timestamp"]):
+        return None
+    return best["timestamp"], np.stack([best[v] for v in variables], axis=1)

@@ -1,0 +1,171 @@
+"""MCAP files with ROS 2 messages, read by `mcap` and `mcap-ros2-support` (an extra).
+
+ROS's worlds are z-up and its bodies forward-left-up; quaternions are xyzw. The velocity of an
+Odometry is in its child frame, the body. A mapping file's [topics] says which topic to take where
+several hold the same kind of message.
+
+| kind | messages |
+|---|---|
+| odometry | nav_msgs/Odometry |
+| pose | geometry_msgs/PoseStamped, PoseWithCovarianceStamped |
+| imu | sensor_msgs/Imu |
+| command | mavros_msgs/AttitudeTarget (body_rate, thrust from 0 to 1) |
+| motors | actuator_msgs/Actuators (velocity), mav_msgs/Actuators (angular_velocities) [rad/s] |
+| battery | sensor_msgs/BatteryState |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eval.importers.detect import MCAP, read_head
+from eval.importers.findings import Finding
+from eval.importers.options import ImportOptions
+from eval.importers.rows import in_world
+from eval.importers.signals import Recording, Signal, collect
+from eval.logs.columns import FlightLogError
+from tracks.common.toml_table import read_toml
+
+KINDS: dict[str, tuple[str, ...]] = {
+    "odometry": ("nav_msgs/Odometry",),
+    "pose": ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"),
+    "imu": ("sensor_msgs/Imu",),
+    "command": ("mavros_msgs/AttitudeTarget",),
+    "motors": ("actuator_msgs/Actuators", "mav_msgs/Actuators"),
+    "battery": ("sensor_msgs/BatteryState",),
+}
+"""Kind of message -> types that hold it, `/msg/` left out."""
+
+
+def read(path: Path, options: ImportOptions) -> Recording:
+    """Return what the MCAP file at `path` holds.
+
+    Raises:
+        FlightLogError: where it is no MCAP file, damaged, or the extra is not installed.
+        ValueError: for a mapping file that cannot be used.
+    """
+    if not read_head(path).startswith(MCAP):
+        raise FlightLogError(str(path), None, None, "not an MCAP file (its first bytes differ)")
+    told = _topics(options.map)
+    found = _messages(path)
+    messages: dict[str, list[tuple[int, Any]]] = {}
+    findings: list[Finding] = []
+    for kind in KINDS:
+        topics = {topic: held for (k, topic), held in found.items() if k == kind}
+        if not topics:
+            continue
+        topic = told.get(kind) or max(topics, key=lambda name: len(topics[name]))
+        if topic not in topics:
+            reason = f"topic {topic!r} has no {' or '.join(KINDS[kind])}; {', '.join(topics)} do"
+            raise FlightLogError(str(path), None, None, reason)
+        if len(topics) > 1 and kind not in told:
+            text = f"{kind} from {topic}; also there: {', '.join(sorted(topics.keys() - {topic}))}"
+            findings.append(Finding("note", "topics", text + ". Choose with [topics] in --map"))
+        messages[kind] = topics[topic]
+    missing = sorted(told.keys() - messages.keys())
+    if missing:
+        reason = f"topic {told[missing[0]]!r} of the mapping is not there"
+        raise FlightLogError(str(path), None, None, reason)
+    signals, more = _signals(messages, str(path))
+    return Recording(str(path), signals, (*findings, *more))
+
+
+def _topics(map_path: Path | None) -> dict[str, str]:
+    if map_path is None:
+        return {}
+    top = read_toml(map_path)
+    told = {}
+    if top.has("topics"):
+        table = top.table("topics")
+        told = {kind: table.text(kind) for kind in KINDS if table.has(kind)}
+        table.close()
+    top.close()
+    return told
+
+
+def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, Any]]]:
+    """Return (kind, topic) -> [(time in ns, message)] of all that is of use."""
+    try:
+        from mcap.reader import make_reader
+        from mcap_ros2.decoder import DecoderFactory
+    except ModuleNotFoundError as error:
+        reason = (
+            f"the package {error.name!r} is missing; install pip install 'diffracing-suite[mcap]'"
+        )
+        raise FlightLogError(str(path), None, None, reason) from None
+    kind_of = {type_: kind for kind, types in KINDS.items() for type_ in types}
+    found: dict[tuple[str, str], list[tuple[int, Any]]] = {}
+    factory = DecoderFactory()
+    try:
+        with path.open("rb") as file:
+            for schema, channel, message in make_reader(file).iter_messages():
+                kind = kind_of.get(schema.name.replace("/msg/", "/")) if schema else None
+                if kind is None:
+                    continue
+                decode = factory.decoder_for(channel.message_encoding, schema)
+                if decode is None:
+                    continue
+                decoded = decode(message.data)
+                when = _stamp(decoded) or message.log_time
+                found.setdefault((kind, channel.topic), []).append((when, decoded))
+    except Exception as error:
+        reason = f"an MCAP file that cannot be read ({type(error).__name__}: {error})"
+        raise FlightLogError(str(path), None, None, reason) from None
+    if not found:
+        types = ", ".join(kind_of)
+        raise FlightLogError(str(path), None, None, f"holds no ROS 2 message of {types}")
+    return found
+
+
+def _stamp(message: Any) -> int:
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    return 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def _signals(
+    messages: dict[str, list[tuple[int, Any]]], name: str
+) -> tuple[dict[str, Signal], tuple[Finding, ...]]:
+    origin = min(when for held in messages.values() for when, _ in held)
+    parts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def take(signal: str, kind: str, value: Callable[[Any], list[float]]) -> None:
+        if kind in messages and signal not in parts:
+            time_s = np.array([(when - origin) * 1e-9 for when, _ in messages[kind]])
+            parts[signal] = (time_s, np.array([value(m) for _, m in messages[kind]], dtype=float))
+
+    def pose(message: Any) -> Any:
+        return message.pose.pose if hasattr(message.pose, "pose") else message.pose
+
+    for kind in ("odometry", "pose"):
+        take("pos", kind, lambda m: _xyz(pose(m).position))
+        take("quat", kind, lambda m: _wxyz(pose(m).orientation))
+    take("vel", "odometry", lambda m: _xyz(m.twist.twist.linear))
+    take("rate", "imu", lambda m: _xyz(m.angular_velocity))
+    take("rate", "odometry", lambda m: _xyz(m.twist.twist.angular))
+    take("acc", "imu", lambda m: _xyz(m.linear_acceleration))
+    take("cmd_rate", "command", lambda m: _xyz(m.body_rate))
+    take("throttle", "command", lambda m: [m.thrust])
+    take("motor", "motors", _speeds)
+    take("voltage", "battery", lambda m: [m.voltage])
+    signals, findings = collect(parts, name)
+    if "vel" in signals and "quat" in signals:
+        signals["vel"] = in_world(signals["vel"], signals["quat"])
+    return signals, findings
+
+
+def _xyz(vector: Any) -> list[float]:
+    return [vector.x, vector.y, vector.z]
+
+
+def _wxyz(quat: Any) -> list[float]:
+    return [quat.w, quat.x, quat.y, quat.z]
+
+
+def _speeds(message: Any) -> list[float]:
+    speeds = message.velocity if hasattr(message, "velocity") else message.angular_velocities
+    four = [abs(float(speed)) for speed in list(speeds)[:4]]
+    return four + [float("nan")] * (4 - len(four))

@@ -1,0 +1,253 @@
+"""PX4 ULog files, read by pyulog.
+
+PX4's world is north-east-down and its body forward-right-down; quaternions are wxyz, body to
+world. The log becomes north-west-up and forward-left-up (`eval/importers/frames.py`). Source of
+the topics and their units: the message definitions of PX4 v1.11 to v1.16.
+
+| signal | topics, the first that is there |
+|---|---|
+| quat | vehicle_attitude, vehicle_odometry |
+| pos, vel | vehicle_local_position, vehicle_odometry |
+| rate | vehicle_angular_velocity, sensor_combined |
+| acc | sensor_combined, vehicle_acceleration |
+| cmd_rate, throttle | vehicle_rates_setpoint |
+| motor | esc_status |
+| voltage | battery_status |
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eval.importers.detect import ULOG, read_head
+from eval.importers.findings import Finding
+from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, turn
+from eval.importers.options import ImportOptions
+from eval.importers.signals import Recording, collect
+from eval.logs.columns import FlightLogError
+
+TOPICS = (
+    "vehicle_attitude",
+    "vehicle_odometry",
+    "vehicle_local_position",
+    "vehicle_angular_velocity",
+    "vehicle_acceleration",
+    "sensor_combined",
+    "vehicle_rates_setpoint",
+    "esc_status",
+    "battery_status",
+)
+QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
+"""PX4's motors 1 to 4 (x forward, y left): front right, rear left, front left, rear right."""
+FIRST_MOTOR = 101
+"""`actuator_function` of Motor1."""
+BODY_FRAME = 3
+"""`velocity_frame` of a velocity in body axes."""
+RPM = 2.0 * np.pi / 60.0
+
+Topic = Mapping[str, np.ndarray]
+Part = tuple[np.ndarray, np.ndarray]
+
+
+def read(path: Path, options: ImportOptions) -> Recording:
+    """Return what the ULog file at `path` holds.
+
+    Raises:
+        FlightLogError: where it is no ULog file or is damaged beyond reading.
+    """
+    if not read_head(path).startswith(ULOG):
+        raise FlightLogError(str(path), None, None, "not a ULog file (its first bytes differ)")
+    log = _load(path)
+    topics: dict[str, Topic] = {}
+    for data in sorted(log.data_list, key=lambda data: -data.multi_id):
+        topics[data.name] = data.data
+    sides, findings = _motor_side(log.initial_parameters)
+    findings += _health(log)
+    parts: dict[str, Part] = {}
+    for name, readers in _READERS.items():
+        for topic, reader in readers:
+            part = reader(topics[topic]) if topic in topics else None
+            if part is not None:
+                parts[name] = part
+                break
+    if "vehicle_local_position" in topics:
+        findings += _resets(topics["vehicle_local_position"])
+    signals, more = collect(parts, str(path))
+    info = log.msg_info_dict
+    about = {key: str(info[key]) for key in ("sys_name", "ver_hw", "ver_sw") if key in info}
+    return Recording(str(path), signals, (*findings, *more), sides, about)
+
+
+def _load(path: Path) -> Any:
+    from pyulog import ULog
+
+    try:
+        # pyulog prints what it makes of damaged files (a finding says it once), and leaves a file
+        # that it opened itself open where it fails.
+        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
+            return ULog(file, list(TOPICS))
+    except Exception as error:
+        reason = f"a ULog file that cannot be read ({type(error).__name__}: {error})"
+        raise FlightLogError(str(path), None, None, reason) from None
+
+
+def _columns(topic: Topic, names: Sequence[str]) -> np.ndarray | None:
+    if any(name not in topic for name in names):
+        return None
+    return np.stack([np.asarray(topic[name], dtype=np.float64) for name in names], axis=1)
+
+
+def _time(topic: Topic) -> np.ndarray:
+    """Return when the values were measured [s]: `timestamp_sample` where the topic has it."""
+    stamp = topic.get("timestamp_sample", topic["timestamp"])
+    stamp = np.where(np.asarray(stamp) > 0, stamp, topic["timestamp"])
+    return stamp.astype(np.float64) * 1e-6
+
+
+def _vector(names: Sequence[str]) -> Callable[[Topic], Part | None]:
+    """Return a reader of a vector in a down-pointing frame, world or body."""
+
+    def read_vector(topic: Topic) -> Part | None:
+        value = _columns(topic, names)
+        return None if value is None else (_time(topic), value * HALF_TURN)
+
+    return read_vector
+
+
+def _local(names: Sequence[str], valid: Sequence[str]) -> Callable[[Topic], Part | None]:
+    def read_local(topic: Topic) -> Part | None:
+        part = _vector(names)(topic)
+        if part is None:
+            return None
+        good = np.ones(len(part[0]), dtype=bool)
+        for flag in valid:
+            good &= np.asarray(topic.get(flag, good)).astype(bool)
+        return (part[0], np.where(good[:, None], part[1], np.nan)) if good.any() else None
+
+    return read_local
+
+
+def _odometry_velocity(topic: Topic) -> Part | None:
+    """Return the velocity where it is in the position's world or in the body.
+
+    Frames are 1 (north-east-down), 2 (of another heading) and 3 (the body) from v1.14 on; before,
+    0, 1 and 3. Both worlds point down, and the position is in the same one.
+    """
+    frame = topic.get("velocity_frame")
+    new = "pose_frame" in topic
+    world = topic.get("pose_frame" if new else "local_frame")
+    value = _columns(topic, [f"velocity[{k}]" for k in range(3)])
+    value = _columns(topic, ["vx", "vy", "vz"]) if value is None else value
+    if frame is None or value is None:
+        return None
+    frame = np.asarray(frame)
+    if np.all(frame == BODY_FRAME):
+        quat = _columns(topic, [f"q[{k}]" for k in range(4)])
+        return None if quat is None else (_time(topic), turn(quat, value) * HALF_TURN)
+    if world is None or not np.all(np.isin(frame, (1, 2) if new else (0, 1)) & (frame == world)):
+        return None
+    return _time(topic), value * HALF_TURN
+
+
+def _odometry_position(topic: Topic) -> Part | None:
+    value = _columns(topic, [f"position[{k}]" for k in range(3)])
+    value = _columns(topic, ["x", "y", "z"]) if value is None else value
+    return None if value is None else (_time(topic), value * HALF_TURN)
+
+
+def _attitude(topic: Topic) -> Part | None:
+    value = _columns(topic, [f"q[{k}]" for k in range(4)])
+    return None if value is None else (_time(topic), value * QUAT_HALF_TURN)
+
+
+def _throttle(topic: Topic) -> Part | None:
+    value = _columns(topic, ["thrust_body[2]"])
+    if value is None:
+        value = _columns(topic, ["thrust"])  # before v1.10, upwards
+        return None if value is None else (_time(topic), value)
+    return _time(topic), -value
+
+
+def _motors(topic: Topic) -> Part | None:
+    """Return rotor speeds [rad/s] of Motor1 to Motor4, wherever they are wired."""
+    speed = _columns(topic, [f"esc[{k}].esc_rpm" for k in range(4)])
+    if speed is None or not np.any(speed):
+        return None
+    wired = _columns(topic, [f"esc[{k}].actuator_function" for k in range(4)])
+    if wired is not None:
+        order = np.argsort(wired[-1])
+        if np.array_equal(wired[-1][order], FIRST_MOTOR + np.arange(4)):
+            speed = speed[:, order]
+    return _time(topic), np.abs(speed) * RPM
+
+
+def _voltage(topic: Topic) -> Part | None:
+    value = _columns(topic, ["voltage_v"])
+    if value is None:
+        return None
+    return _time(topic), np.where(value > 0, value, np.nan)
+
+
+_READERS: dict[str, list[tuple[str, Callable[[Topic], Part | None]]]] = {
+    "quat": [("vehicle_attitude", _attitude), ("vehicle_odometry", _attitude)],
+    "pos": [
+        ("vehicle_local_position", _local(("x", "y", "z"), ("xy_valid", "z_valid"))),
+        ("vehicle_odometry", _odometry_position),
+    ],
+    "vel": [
+        ("vehicle_local_position", _local(("vx", "vy", "vz"), ("v_xy_valid", "v_z_valid"))),
+        ("vehicle_odometry", _odometry_velocity),
+    ],
+    "rate": [
+        ("vehicle_angular_velocity", _vector([f"xyz[{k}]" for k in range(3)])),
+        ("sensor_combined", _vector([f"gyro_rad[{k}]" for k in range(3)])),
+    ],
+    "acc": [
+        ("sensor_combined", _vector([f"accelerometer_m_s2[{k}]" for k in range(3)])),
+        ("vehicle_acceleration", _vector([f"xyz[{k}]" for k in range(3)])),
+    ],
+    "cmd_rate": [("vehicle_rates_setpoint", _vector(("roll", "pitch", "yaw")))],
+    "throttle": [("vehicle_rates_setpoint", _throttle)],
+    "motor": [("esc_status", _motors)],
+    "voltage": [("battery_status", _voltage)],
+}
+
+
+def _motor_side(parameters: Mapping[str, float]) -> tuple[Any, list[Finding]]:
+    names = [[f"CA_ROTOR{k}_P{axis}" for axis in "XY"] for k in range(4)]
+    if all(name in parameters for pair in names for name in pair):
+        side = tuple((float(parameters[x]), -float(parameters[y])) for x, y in names)
+        if all(abs(x) + abs(y) > 0 for x, y in side):
+            return side, []
+    text = "the log does not say where its motors are; taken as PX4's quadrotor X"
+    return QUAD_X, [Finding("note", "motors", text)]
+
+
+def _health(log: Any) -> list[Finding]:
+    findings = []
+    if log.file_corruption:
+        findings.append(Finding("doubt", "file", "damaged in places; what is whole was read"))
+    if log.dropouts:
+        lost = sum(dropout.duration for dropout in log.dropouts) / 1000.0
+        text = f"{len(log.dropouts)} dropouts, {lost:.2g} s in all (a slow memory card)"
+        findings.append(Finding("note", "file", text))
+    factor = float(log.initial_parameters.get("THR_MDL_FAC", 0.0))
+    if factor == 0.0:
+        text = "THR_MDL_FAC is 0: PX4's thrust is the motors' signal, and rises faster than linear"
+        findings.append(Finding("note", "thrust", text))
+    return findings
+
+
+def _resets(topic: Topic) -> list[Finding]:
+    jumps = 0
+    for name in ("xy_reset_counter", "z_reset_counter"):
+        if name in topic:
+            jumps += int(np.count_nonzero(np.diff(np.asarray(topic[name]))))
+    text = f"the estimator moved the position {jumps} times in the log; it jumps there"
+    return [Finding("doubt", "position", text)] if jumps else []

@@ -1,0 +1,1 @@
+"""Trials of a policy flown, judged and counted."""

@@ -1,0 +1,301 @@
+"""The judge: many trials of one policy through one world.
+
+A trial's outcome is set by (track, difficulty, seed) alone, to the bit on one machine: policies
+are always called on the same number of rows, every row is computed by itself, and nothing random
+is shared between trials.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from eval.judging.guard import ActionLimits, guard_action
+from eval.judging.recorder import Recorder
+from eval.judging.sensors import SensorNoise, Sensors, check_noise
+from eval.judging.sharding import fly_in_processes, usable_cores
+from eval.logs.flight import Flight
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds import PLAIN, World, world_class
+from eval.worlds.slots import layout_of
+from eval.worlds.trial import (
+    DIVERGED,
+    ENDINGS,
+    FINISHED,
+    FLYING,
+    Rules,
+    TrialResult,
+    TrialSpec,
+    track_of,
+)
+from policies.observation import encode_depth, state_vector
+from policies.policy import Policy
+from tracks.families import check_family
+from tracks.track import Track
+
+OnResult = Callable[[TrialResult, Flight | None], None]
+"""Called with each trial as it ends, in no set order; the flight where flights are recorded."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """What to record of each flight besides its result."""
+
+    depth: bool = False
+    """Depth images, one a decision of the policy."""
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """How trials are flown; `threads` and `processes` touch no outcome."""
+
+    slots: int = 64
+    """Trials in the air at once, and rows of every call of the policy."""
+    threads: int = 1
+    """Of physics and rays, in each process."""
+    processes: int | None = None
+    """Processes that share the trials; None takes one a core where there is work for them."""
+    rules: Rules = field(default_factory=Rules)
+    """When a trial ends."""
+    limits: ActionLimits = field(default_factory=ActionLimits)
+    """What an action may be."""
+    noise: SensorNoise = field(default_factory=SensorNoise)
+    """What is wrong with the policy's observation."""
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What every process needs to know to fly its share."""
+
+    policy: Any
+    vehicle: Vehicle
+    world: str
+    options: JudgeOptions
+    record: Record | None
+    tracks: Mapping[str, Track]
+
+
+def fly(
+    policy: Policy | Callable[[], Policy],
+    trials: Sequence[TrialSpec],
+    vehicle: Vehicle,
+    world: str = "mujoco",
+    options: JudgeOptions | None = None,
+    on_result: OnResult | None = None,
+    record: Record | None = None,
+    tracks: Mapping[str, Track] | None = None,
+) -> list[TrialResult]:
+    """Fly every trial and return the results in the order of `trials`.
+
+    An interrupt ends it at once; what was handed to `on_result` by then is finished and final.
+
+    Args:
+        policy: who flies, or a function without arguments that makes it; several processes need
+            one that can be pickled, such as `functools.partial(load_policy, name)`.
+        trials: what to fly.
+        vehicle: on what.
+        world: a name in `eval.worlds.WORLDS`.
+        options: how.
+        on_result: called with each trial as it ends.
+        record: what to record of the flights; None records none.
+        tracks: custom tracks by the name that trials call them; others are families.
+
+    Raises:
+        ValueError: for an unknown world or track, noise that cannot be, a policy faster than the
+            physics, or a policy that returns something else than actions.
+        RuntimeError: where a process of its own died.
+    """
+    options = options or JudgeOptions()
+    world_class(world)
+    check_noise(options.noise)
+    for trial in trials:
+        if trial.track not in (tracks or {}):
+            check_family(trial.track)
+    if world == PLAIN and record:
+        raise ValueError("world 'plain' records no flights; record in 'mujoco', which flies alike")
+    task = _Task(policy, vehicle, world, options, record, tracks or {})
+    results: dict[int, TrialResult] = {}
+
+    def keep(index: int, result: TrialResult, flight: Flight | None) -> None:
+        results[index] = result
+        if on_result:
+            on_result(result, flight)
+
+    processes = _process_count(task, len(trials))
+    if processes > 1:
+        fly_in_processes(_fly_share, task, list(enumerate(trials)), processes, keep)
+    else:
+        _fly_share(task, list(enumerate(trials)), keep)
+    return [results[index] for index in range(len(trials))]
+
+
+def _is_policy(policy: object) -> bool:
+    """Return whether this is a policy and not a function or class that makes one."""
+    return hasattr(policy, "act") and not isinstance(policy, type)
+
+
+def _process_count(task: _Task, trials: int) -> int:
+    if task.options.processes is not None:
+        return max(1, min(task.options.processes, trials))
+    # A process takes seconds to start, and a policy object may not be of the kind that travels.
+    if task.world == "mjx" or _is_policy(task.policy) or trials < 4 * task.options.slots:
+        return 1
+    return usable_cores()
+
+
+def _fly_share(
+    task: _Task,
+    share: list[tuple[int, TrialSpec]],
+    emit: Callable[[int, TrialResult, Flight | None], None],
+) -> None:
+    """Fly numbered trials in this process."""
+    policy = task.policy if _is_policy(task.policy) else task.policy()
+    if task.world == PLAIN:
+        for index, trial in share:
+            track = track_of(task.tracks, trial)
+            options = task.options
+            result = world_class(PLAIN)(
+                policy,
+                trial,
+                track,
+                task.vehicle,
+                options.rules,
+                options.limits,
+                options.slots,
+                options.noise,
+            )
+            emit(index, result, None)
+        return
+    layout = layout_of(task.tracks.values())
+    world = world_class(task.world)(
+        task.vehicle, policy.spec.camera, layout, task.options.rules,
+        slots=task.options.slots, threads=task.options.threads,
+    )  # fmt: skip
+    _Slots(task, policy, world).run(share, emit)
+
+
+class _Slots:
+    """The slots of a world with the trial and the policy's memory in each."""
+
+    def __init__(self, task: _Task, policy: Policy, world: World) -> None:
+        rate = policy.spec.rate_hz
+        if not 0 < rate <= 1 / world.dt * (1 + 1e-9):
+            raise ValueError(
+                f"policy {policy.name!r} decides at {rate:g} Hz; allowed is more than 0 and up to "
+                f"the {1 / world.dt:g} Hz of vehicle {task.vehicle.name!r}'s controller.frequency"
+            )
+        self._task, self._policy, self._world = task, policy, world
+        self._steps_a_decision = 1 / (rate * world.dt)
+        n = world.slots
+        self._index = np.full(n, -1)
+        self._trial: list[TrialSpec | None] = [None] * n
+        self._decision = np.zeros(n)
+        self._action_b = np.zeros((n, 3))
+        self._faults = np.zeros((n, 3), int)
+        self._fresh = np.ones(n, bool)
+        self._hidden = policy.start(n)
+        self._recorder = Recorder(n, task.record.depth) if task.record else None
+        noise, range_m = task.options.noise, policy.spec.camera.range_m
+        self._sensors = None if noise.is_none else Sensors(noise, n, rate, range_m)
+
+    def run(
+        self,
+        share: list[tuple[int, TrialSpec]],
+        emit: Callable[[int, TrialResult, Flight | None], None],
+    ) -> None:
+        """Fly the numbered trials; every slot takes the next one when its own has ended."""
+        waiting = list(reversed(share))
+        while waiting or (self._index >= 0).any():
+            self._fill(waiting)
+            self._decide_and_fly()
+            for slot in np.flatnonzero((self._index >= 0) & (self._world.progress.ended != FLYING)):
+                index = int(self._index[slot])
+                result = self._result(int(slot))
+                flight = None
+                if self._recorder:
+                    flight = self._recorder.finish(int(slot), result._asdict())
+                self._index[slot] = -1
+                emit(index, result, flight)
+
+    def _fill(self, waiting: list[tuple[int, TrialSpec]]) -> None:
+        entries = []
+        for slot in np.flatnonzero(self._index < 0).tolist():
+            if not waiting:
+                break
+            self._index[slot], trial = waiting.pop()
+            self._trial[slot] = trial
+            self._decision[slot], self._action_b[slot], self._faults[slot] = 0, 0.0, 0
+            self._fresh[slot] = True
+            if self._recorder:
+                self._recorder.start(slot)
+            track = track_of(self._task.tracks, trial)
+            if self._sensors:
+                self._sensors.start(slot, trial, len(track.scene.gates.center_w))
+            entries.append((slot, track, trial))
+        if entries:
+            self._world.load(entries)
+
+    def _decide_and_fly(self) -> None:
+        """Ask the policy once and fly its answers until its next decision."""
+        spec, flying = self._policy.spec, self._index >= 0
+        seen = self._world.view(flying)
+        if self._sensors:
+            seen = self._sensors.see(seen, self._world.progress.gates, flying)
+        second_w = seen.second_w if spec.second_gate else None
+        axis_w = seen.axis_w if spec.gate_axis else None
+        state = state_vector(
+            seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, self._action_b, second_w, axis_w
+        )
+        state = np.where(flying[:, None], state, 0).astype(np.float32)
+        image = encode_depth(spec.depth, seen.depth_m, spec.camera.range_m).astype(np.float32)
+        asked = time.perf_counter()
+        answer, self._hidden = self._policy.act(self._hidden, state, image, self._fresh | ~flying)
+        took_s = time.perf_counter() - asked
+        guarded = guard_action(
+            self._task.options.limits, answer, self._action_b, took_s, self._policy.name
+        )
+        self._action_b = guarded.action_b
+        self._faults += np.stack([guarded.bad, guarded.limited, guarded.late], axis=-1)
+        self._fresh[:] = False
+        if self._recorder:
+            self._recorder.decided(np.flatnonzero(flying), self._action_b, seen.depth_m)
+        next_at = np.rint((self._decision + 1) * self._steps_a_decision)
+        steps = (next_at - np.rint(self._decision * self._steps_a_decision)).astype(int)
+        self._decision += 1
+        rows = self._world.advance(self._action_b, np.where(flying, steps, 0), bool(self._recorder))
+        for row in rows:
+            if self._recorder:
+                self._recorder.add(row)
+
+    def _result(self, slot: int) -> TrialResult:
+        trial, task = self._trial[slot], self._task
+        assert trial is not None
+        progress = self._world.progress
+        ended, step = int(progress.ended[slot]), int(progress.step[slot])
+        how = ENDINGS[ended - 1]
+        judged = step + (ended != DIVERGED)  # states whose speed is in v_sum
+        return TrialResult(
+            *trial,
+            policy=self._policy.name,
+            vehicle=task.vehicle.name,
+            world=self._world.name,
+            success=ended == FINISHED,
+            gates_passed=int(progress.gates[slot]),
+            ended_by=how,
+            collided_with=self._world.touched(slot) if how == "collision" else None,
+            pos_x=float(progress.pos_w[slot, 0]),
+            pos_y=float(progress.pos_w[slot, 1]),
+            pos_z=float(progress.pos_w[slot, 2]),
+            time_s=step * self._world.dt,
+            v_max=float(progress.v_max[slot]),
+            v_mean=float(progress.v_sum[slot]) / max(judged, 1),
+            gates_8s=int(progress.gates_8s[slot]),
+            gates_035=int(progress.gates_035[slot]),
+            bad_actions=int(self._faults[slot, 0]),
+            limited_actions=int(self._faults[slot, 1]),
+            late_actions=int(self._faults[slot, 2]),
+        )

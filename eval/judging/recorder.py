@@ -1,0 +1,91 @@
+"""Flight records gathered slot by slot while trials fly."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from eval.logs.flight import Flight
+from eval.worlds import Rows
+
+_EMPTY = (
+    0.0,
+    *(np.zeros(size) for size in (3, 4, 3, 3)),
+    0.0,
+    np.zeros(3),
+    np.zeros(4),
+    0,
+    np.zeros(3),
+    False,
+)
+"""Shapes of a row, for a trial that ended where it started."""
+
+
+class Recorder:
+    """Gathers the rows of the flights in N slots; a slot's flight is taken out when it ends."""
+
+    def __init__(self, slots: int, depth: bool) -> None:
+        """Make a recorder.
+
+        Args:
+            slots: how many trials fly at once.
+            depth: whether depth images are kept (3 kB each at 24 x 32).
+        """
+        self._depth = depth
+        self._rows: list[list[tuple[Any, ...]]] = [[] for _ in range(slots)]
+        self._images: list[list[np.ndarray]] = [[] for _ in range(slots)]
+        self._action = np.zeros((slots, 3))
+        self._is_new = np.zeros(slots, bool)
+        self._last_image = [np.zeros(0, np.float32)] * slots
+
+    def start(self, slot: int) -> None:
+        """Begin the flight of a new trial in `slot`."""
+        self._rows[slot], self._images[slot] = [], []
+        self._is_new[slot] = False
+        self._action[slot] = 0.0
+
+    def decided(self, slots: np.ndarray, action_b: np.ndarray, depth_m: np.ndarray) -> None:
+        """Note the actions (N, 3) that the policy just gave for `slots` (k,) and what it saw."""
+        for slot in slots:
+            self._action[slot] = action_b[slot]
+            self._is_new[slot] = True
+            if self._depth:
+                self._last_image[slot] = depth_m[slot].astype(np.float32)
+
+    def add(self, rows: Rows) -> None:
+        """Add one row to the flight of each slot that is due."""
+        for slot in np.flatnonzero(rows.due):
+            new = bool(self._is_new[slot])
+            self._is_new[slot] = False
+            if new and self._depth:
+                self._images[slot].append(self._last_image[slot])
+            values = (np.copy(field[slot]) for field in rows[1:])
+            self._rows[slot].append((*values, self._action[slot].copy(), new))
+
+    def finish(self, slot: int, about: dict[str, Any]) -> Flight:
+        """Return the flight in `slot` with where it comes from."""
+        rows = self._rows[slot] or [_EMPTY]
+        columns = [np.array(column) for column in zip(*rows, strict=True)]
+        if not self._rows[slot]:
+            columns = [column[:0] for column in columns]
+        time_s, pos, quat, vel, rate, thrust, rate_cmd, rotor, gate, action, new = columns
+        images = None
+        if self._depth:
+            images = np.stack(self._images[slot]) if self._images[slot] else np.zeros((0, 0, 0))
+            images = images.astype(np.float32)
+        return Flight(
+            time_s,
+            pos,
+            quat,
+            vel,
+            rate,
+            thrust,
+            rate_cmd,
+            rotor,
+            action,
+            new,
+            gate.astype(np.int32),
+            images,
+            about,
+        )

@@ -1,0 +1,202 @@
+"""What a judgement leaves behind: trials.parquet, table.md, summary.json, and the journal.
+
+The journal is a file of lines, one a finished trial, flushed as it comes: what was flown survives
+a kill, and the same command again flies the rest.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TextIO
+
+from eval.worlds.trial import TrialResult, TrialSpec
+from tracks.common.files import plain, replacing_file, to_json, write_json, write_text
+from tracks.common.provenance import stamp
+
+SCHEMA = 1
+"""Version of the result files."""
+JOURNAL = "trials.journal.jsonl"
+"""Name of the journal in the output folder."""
+
+
+def write_results(
+    folder: str | os.PathLike[str],
+    results: Sequence[TrialResult],
+    *,
+    table_markdown: str,
+    summary: dict[str, Any],
+    seed: int | None,
+) -> None:
+    """Write trials.parquet, table.md and summary.json into `folder`, each whole or not at all.
+
+    Args:
+        folder: made if missing.
+        results: in the order of the rows.
+        table_markdown: from `eval.judging.tables.markdown_table`.
+        summary: what summary.json holds besides the stamp, from `tables.summarise`.
+        seed: the seed that the trials' seeds were made from, or None.
+
+    Raises:
+        OSError: where the folder cannot be written.
+    """
+    header = stamp(SCHEMA, seed)
+    write_trials(Path(folder) / "trials.parquet", results, header)
+    lines = [f"{key}: {value}" for key, value in header.items()]
+    write_text(Path(folder) / "table.md", f"{table_markdown}\n<!-- {'; '.join(lines)} -->\n")
+    write_json(Path(folder) / "summary.json", {**header, **summary})
+
+
+def write_trials(
+    path: str | os.PathLike[str], results: Sequence[TrialResult], header: dict[str, Any]
+) -> None:
+    """Write one row a trial to a Parquet file whose metadata key `suite` holds `header`."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    schema = pa.schema(
+        [pa.field(name, _column_type(kind)) for name, kind in _kinds().items()],
+        metadata={"suite": to_json(header)},
+    )
+    columns = {name: [getattr(result, name) for result in results] for name in TrialResult._fields}
+    with replacing_file(path) as beside:
+        pq.write_table(pa.table(columns, schema=schema), beside)
+
+
+def _kinds() -> dict[str, str]:
+    """Return the type of each field as written; a named tuple wraps it in a ForwardRef."""
+    annotations = TrialResult.__annotations__.items()
+    return {name: getattr(kind, "__forward_arg__", kind) for name, kind in annotations}
+
+
+def _column_type(kind: str) -> Any:
+    import pyarrow as pa
+
+    kinds = {
+        "str": pa.string(),
+        "str | None": pa.string(),
+        "int": pa.int64(),
+        "float": pa.float64(),
+        "bool": pa.bool_(),
+    }
+    return kinds[kind]
+
+
+def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
+    """Read the rows of a trials.parquet.
+
+    Raises:
+        ValueError: where the file is none or lacks a column.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        rows = pq.read_table(path).to_pylist()
+    except (pa.ArrowInvalid, OSError) as error:
+        raise ValueError(
+            f"{path}: not a readable Parquet file ({error}); run suite eval again"
+        ) from error
+    missing = [name for name in TrialResult._fields if rows and name not in rows[0]]
+    if missing:
+        raise ValueError(f"{path}: no column {missing[0]!r}; is it a trials.parquet of this suite?")
+    return [TrialResult(*(row[name] for name in TrialResult._fields)) for row in rows]
+
+
+class Journal:
+    """Finished trials, appended line by line; open it again to go on.
+
+    The first line says what was judged. A last line that a kill cut short is dropped.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], about: dict[str, Any]) -> None:
+        """Open the journal at `path`, made if missing.
+
+        Args:
+            path: the file.
+            about: what sets the outcomes besides the trials: policy with the hash of its file,
+                vehicle, world, options. JSON must be able to hold it.
+
+        Raises:
+            ValueError: where the file there is about something else.
+        """
+        self.path = Path(path)
+        self.done: dict[TrialSpec, TrialResult] = {}
+        """Results read from the file and appended since, by trial."""
+        about = plain(about)
+        keep = 0
+        if self.path.exists():
+            keep = self._read(about)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._file: TextIO = open(self.path, "r+" if keep else "w", encoding="utf-8")
+        if keep:
+            self._file.seek(keep)
+            self._file.truncate()
+        else:
+            self._write({"about": about})
+
+    def _read(self, about: dict[str, Any]) -> int:
+        """Fill `done`; return how many bytes of the file are whole lines."""
+        keep = 0
+        for number, line in enumerate(self.path.read_bytes().splitlines(keepends=True)):
+            if not line.endswith(b"\n"):
+                break
+            try:
+                entry = json.loads(line)
+                result = None if number == 0 else _result(entry)
+            except ValueError as error:
+                raise ValueError(
+                    f"{self.path}: line {number + 1} is not a trial ({error}); move the file away "
+                    "to start again"
+                ) from error
+            if result is not None:
+                self.done[result.trial] = result
+            elif not isinstance(entry, dict) or entry.get("about") != about:
+                raise ValueError(
+                    f"{self.path}: holds trials of another policy, vehicle, world or option; "
+                    "give another --out or move the file away"
+                )
+            keep += len(line)
+        return keep
+
+    def _write(self, entry: dict[str, Any]) -> None:
+        self._file.write(to_json(entry) + "\n")
+        self._file.flush()
+
+    def append(self, result: TrialResult) -> None:
+        """Add a finished trial; it is with the operating system when this returns."""
+        self._write(result._asdict())
+        self.done[result.trial] = result
+
+    def missing(self, trials: Iterable[TrialSpec]) -> list[TrialSpec]:
+        """Return the trials that are yet to be flown."""
+        return [trial for trial in trials if trial not in self.done]
+
+    def close(self) -> None:
+        """Close the file; it stays where it is."""
+        self._file.close()
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _result(entry: Any) -> TrialResult:
+    if not isinstance(entry, dict) or entry.keys() != set(TrialResult._fields):
+        raise ValueError("its keys are not those of a trial")
+    values = dict(entry)
+    for name, kind in TrialResult.__annotations__.items():
+        if kind == "float" and values[name] is None:  # JSON has no NaN
+            values[name] = math.nan
+    return TrialResult(**values)

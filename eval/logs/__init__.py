@@ -1,0 +1,1 @@
+"""Flights as logs: columns, rules and files."""

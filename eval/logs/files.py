@@ -1,0 +1,162 @@
+"""Columns of numbers in Parquet and CSV files, with one JSON text beside them.
+
+Parquet keeps the text in the metadata key `flight`. CSV keeps it in the first row of a column
+`flight`, so that every CSV reader still finds the header in the first line.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from eval.logs.columns import KNOWN, FlightLogError
+from tracks.common.files import replacing_file
+
+METADATA = "flight"
+"""Parquet metadata key and CSV column of the JSON text."""
+PARQUET_MAGIC = b"PAR1"
+
+
+def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
+    """Read the file at `path`, which is told to be Parquet or CSV by its first bytes.
+
+    Returns:
+        Every column by name with NaN where a number is missing; the JSON text, if any; warnings.
+
+    Raises:
+        FlightLogError: where the file is missing, empty, corrupt or neither Parquet nor CSV.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        reason = f"cannot be read: {error.strerror or error}"
+        raise FlightLogError(str(path), None, None, reason) from None
+    if not head:
+        raise FlightLogError(str(path), None, None, "the file is empty; record or copy it again")
+    if head.startswith(PARQUET_MAGIC):
+        return _read_parquet(path)
+    if path.suffix.lower() in (".parquet", ".pq"):
+        raise FlightLogError(
+            str(path), None, None, "not a Parquet file (or cut at its start); copy it again"
+        )
+    if b"\0" in head:
+        raise FlightLogError(
+            str(path), None, None, "neither a Parquet file nor CSV; suite import reads others"
+        )
+    return _read_csv(path)
+
+
+def write_columns(path: Path, columns: Mapping[str, np.ndarray], text: str) -> Path:
+    """Write `columns` and the JSON `text`: beside `path` first, then renamed.
+
+    Raises:
+        FlightLogError: where the ending of `path` is neither `.parquet` nor `.csv`.
+        OSError: where the file cannot be written; nothing is left under its name.
+    """
+    kind = path.suffix.lower()
+    if kind not in (".parquet", ".csv"):
+        raise FlightLogError(str(path), None, None, "the ending must be .parquet or .csv")
+    if METADATA in columns:
+        raise FlightLogError(str(path), METADATA, None, "this name is kept for the metadata")
+    table = pa.table({name: pa.array(values) for name, values in columns.items()})
+    with replacing_file(path) as beside:
+        if kind == ".parquet":
+            table = table.replace_schema_metadata({METADATA: text})
+            pyarrow.parquet.write_table(table, beside)
+        else:
+            rows = [text if k == 0 else None for k in range(table.num_rows)]
+            table = table.append_column(METADATA, pa.array(rows, pa.string()))
+            pyarrow.csv.write_csv(table, beside)
+    return path
+
+
+def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
+    try:
+        # A single handle on the file: `read_table` would take a folder's name for a column.
+        with pyarrow.parquet.ParquetFile(path) as file:
+            table = file.read()
+    except (pa.ArrowException, OSError, ValueError) as error:
+        first = str(error).splitlines()[0]
+        reason = f"a corrupt Parquet file ({first}); copy or record it again"
+        raise FlightLogError(str(path), None, None, reason) from None
+    metadata = table.schema.metadata or {}
+    text = metadata.get(METADATA.encode())
+    decoded = None if text is None else text.decode(errors="replace")
+    return _arrays(table, path), decoded, []
+
+
+def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
+    names = _csv_header(path)
+    bad_rows: list[Any] = []
+
+    def remember(row: Any) -> str:
+        bad_rows.append(row)
+        return "skip"
+
+    def parse(numbers: pa.DataType) -> pa.Table:
+        bad_rows.clear()
+        return pyarrow.csv.read_csv(
+            path,
+            # One thread, because only then are bad rows told with their numbers.
+            read_options=pyarrow.csv.ReadOptions(
+                column_names=names, skip_rows=1, use_threads=False
+            ),
+            parse_options=pyarrow.csv.ParseOptions(invalid_row_handler=remember),
+            convert_options=pyarrow.csv.ConvertOptions(
+                column_types=dict.fromkeys(KNOWN, numbers), strings_can_be_null=True
+            ),
+        )
+
+    try:
+        try:
+            table = parse(pa.float64())
+        except pa.ArrowInvalid:
+            table = parse(pa.string())  # so that the rules can name the first bad value
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        if "Empty CSV" in str(error):
+            raise FlightLogError(str(path), None, None, "a header, but no rows") from None
+        first = str(error).splitlines()[0]
+        raise FlightLogError(str(path), None, None, f"not readable as CSV ({first})") from None
+    warnings = []
+    last = table.num_rows + len(bad_rows)
+    for bad in bad_rows:
+        row = bad.number - 1
+        reason = f"{bad.actual_columns} values where the header has {bad.expected_columns} columns"
+        if row < last:
+            raise FlightLogError(str(path), None, row, reason)
+        warnings.append(f"{path}: row {row}, the last, is left out: {reason}")
+    columns = _arrays(table, path)
+    text = columns.pop(METADATA, np.array([None]))[0]
+    return columns, text if isinstance(text, str) else None, warnings
+
+
+def _csv_header(path: Path) -> list[str]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            names = [name.strip() for name in next(csv.reader(file), [])]
+    except (UnicodeDecodeError, csv.Error):
+        reason = "neither a Parquet file nor CSV in UTF-8"
+        raise FlightLogError(str(path), None, None, reason) from None
+    if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
+        reason = "the first line has no commas; separate the columns by commas"
+        raise FlightLogError(str(path), None, None, reason)
+    return names
+
+
+def _arrays(table: pa.Table, path: Path) -> dict[str, np.ndarray]:
+    columns: dict[str, np.ndarray] = {}
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        if name in columns:
+            raise FlightLogError(str(path), name, None, "this column is there twice")
+        if pa.types.is_null(column.type) or pa.types.is_decimal(column.type):
+            column = column.cast(pa.float64())
+        columns[name] = column.to_numpy()
+    return columns

@@ -1,0 +1,274 @@
+"""Flight logs: one flight as arrays, read from and written to Parquet or CSV.
+
+The columns, their units and the rules that refuse a file are in `eval/logs/columns.py`. What the
+suite records besides (the policy's action, when it decided, the gate it flew to) are columns that
+other readers see as unknown ones; unknown columns of any origin are kept.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eval.logs.columns import GROUPS, KNOWN, FlightLogError, check_columns
+from eval.logs.files import read_columns, write_columns
+from eval.logs.flight import Flight
+from eval.logs.velocity import velocity_from_position
+from tracks.common.files import to_json
+from tracks.common.provenance import stamp
+from tracks.geometry.rotation import quat_to_rot
+
+SCHEMA = 1
+"""Version of the flight log's layout, in the metadata of every file we write."""
+ACTION = ("action_x", "action_y", "action_z")
+QUATERNION_ROUNDING = 1e-12
+"""Quaternions nearer to unit norm than this are taken as they are, so that logs come back equal."""
+
+
+@dataclass(frozen=True)
+class FlightLog:
+    """One flight as arrays on its T rows; a value that is missing is NaN.
+
+    Row k holds what was measured at `time_s[k]` before the command of row k acts; that command
+    holds from `time_s[k]` to `time_s[k + 1]`.
+    """
+
+    name: str
+    """The file, or another name for messages."""
+    time_s: np.ndarray
+    """(T,) increasing; sampling may jitter and rows may be missing [s]."""
+    pos_w: np.ndarray
+    """(T, 3) centre of mass [m]."""
+    quat_wxyz: np.ndarray
+    """(T, 4) body to world, unit norm."""
+    vel_w: np.ndarray
+    """(T, 3) centre of mass [m/s]."""
+    rate_b: np.ndarray
+    """(T, 3) [rad/s]."""
+    thrust_cmd: np.ndarray | None = None
+    """(T,) commanded collective thrust per nominal mass [m/s^2]."""
+    rate_cmd_b: np.ndarray | None = None
+    """(T, 3) commanded body rates [rad/s]; there with `thrust_cmd`."""
+    rotor_speed: np.ndarray | None = None
+    """(T, 4) measured, in the vehicle file's order [rad/s]."""
+    rotor_speed_cmd: np.ndarray | None = None
+    """(T, 4) commanded [rad/s]."""
+    acc_b: np.ndarray | None = None
+    """(T, 3) specific force, as an accelerometer has it [m/s^2]."""
+    voltage: np.ndarray | None = None
+    """(T,) battery [V]."""
+    extra: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Unknown columns by name, (T,) each, as they were in the file."""
+    about: Mapping[str, Any] = field(default_factory=dict)
+    """The JSON of metadata key `flight`: vehicle, source, notes, track, seed, ..."""
+    velocity_derived: bool = False
+    """True where `vel_w` was not in the file but comes from `pos_w`."""
+    warnings: tuple[str, ...] = ()
+    """What was odd about the file but not refused."""
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last row [s]."""
+        return float(self.time_s[-1] - self.time_s[0])
+
+    @property
+    def speed(self) -> np.ndarray:
+        """(T,) magnitude of `vel_w` [m/s]."""
+        return np.linalg.norm(self.vel_w, axis=1)
+
+    @property
+    def rot_w(self) -> np.ndarray:
+        """(T, 3, 3) body to world; NaN where the quaternion is missing."""
+        return quat_to_rot(self.quat_wxyz)
+
+    @property
+    def whole(self) -> np.ndarray:
+        """(T,) bool: rows in which nothing of the state and of the flown command is missing."""
+        parts = [self.pos_w, self.quat_wxyz, self.vel_w, self.rate_b]
+        if self.thrust_cmd is not None and self.rate_cmd_b is not None:
+            parts += [self.thrust_cmd[:, None], self.rate_cmd_b]
+        elif self.rotor_speed is not None:
+            parts.append(self.rotor_speed)
+        return np.all(np.isfinite(np.concatenate(parts, axis=1)), axis=1)
+
+    @property
+    def action_b(self) -> np.ndarray | None:
+        """(T, 3) the policy's action in use [m/s^2], or None in logs that are not ours."""
+        return self._numbers(ACTION)
+
+    @property
+    def policy_step(self) -> np.ndarray | None:
+        """(T,) bool: rows that start to fly a new action, or None in logs that are not ours."""
+        values = self._numbers(("policy_step",))
+        return None if values is None else values[:, 0] > 0
+
+    @property
+    def gate(self) -> np.ndarray | None:
+        """(T,) int32: the next gate's number from 0 (-1: missing), or None in others' logs."""
+        values = self._numbers(("gate",))
+        return None if values is None else np.nan_to_num(values[:, 0], nan=-1).astype(np.int32)
+
+    def _numbers(self, names: tuple[str, ...]) -> np.ndarray | None:
+        columns = [self.extra.get(name) for name in names]
+        numbers = [
+            c.astype(np.float64) for c in columns if c is not None and c.dtype.kind in "fiub"
+        ]
+        return np.stack(numbers, axis=1) if len(numbers) == len(names) else None
+
+
+_FIELDS = {
+    "pos": "pos_w",
+    "quat": "quat_wxyz",
+    "vel": "vel_w",
+    "rate": "rate_b",
+    "cmd_thrust": "thrust_cmd",
+    "cmd_rate": "rate_cmd_b",
+    "motor": "rotor_speed",
+    "motor_cmd": "rotor_speed_cmd",
+    "acc": "acc_b",
+    "voltage": "voltage",
+}
+
+
+def log_from_flight(flight: Flight, name: str = "flight") -> FlightLog:
+    """Return a recorded `flight` as a log, its action, decisions and gates as extra columns."""
+    extra = dict(zip(ACTION, np.asarray(flight.action_b).T, strict=True))
+    extra |= {"policy_step": np.asarray(flight.policy_step), "gate": np.asarray(flight.gate)}
+    return FlightLog(
+        name,
+        flight.time_s,
+        flight.pos_w,
+        flight.quat_wxyz,
+        flight.vel_w,
+        flight.rate_b,
+        flight.thrust_cmd,
+        flight.rate_cmd_b,
+        flight.rotor_speed,
+        extra=extra,
+        about=flight.about,
+    )
+
+
+def log_from_columns(
+    columns: Mapping[str, np.ndarray], about: Mapping[str, Any], name: str
+) -> FlightLog:
+    """Return the log that `columns` (column name to (T,) values) hold, or refuse them.
+
+    Rows without a time are left out, as nothing can be known of when they were. Quaternions are
+    made unit. A missing velocity is derived (`eval/logs/velocity.py`).
+
+    Raises:
+        FlightLogError: where the columns break a rule; it names column, row and reason.
+    """
+    checked, rows, warnings = check_columns(columns, name)
+
+    values: dict[str, np.ndarray] = {}
+    for key, attribute in _FIELDS.items():
+        if GROUPS[key][0] in checked:
+            parts = [checked[column] for column in GROUPS[key]]
+            values[attribute] = parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
+    time_s, quat = checked["time"], values["quat_wxyz"]
+    norm = np.linalg.norm(quat, axis=1, keepdims=True)
+    off = np.abs(norm - 1) > QUATERNION_ROUNDING
+    values["quat_wxyz"] = np.where(off, quat / norm, quat)
+    derived = "vel_w" not in values
+    if derived:
+        values["vel_w"] = velocity_from_position(time_s, values["pos_w"])
+    extra = {key: np.asarray(columns[key])[rows] for key in columns if key not in KNOWN}
+    return FlightLog(
+        name=name,
+        time_s=time_s,
+        extra=extra,
+        about=dict(about),
+        velocity_derived=derived,
+        warnings=tuple(warnings),
+        **values,
+    )
+
+
+def columns_from_log(log: FlightLog) -> dict[str, np.ndarray]:
+    """Return the columns of `log` by name; a derived velocity is left out, as it was not measured.
+
+    Raises:
+        FlightLogError: where an array's length is not that of `time_s`.
+    """
+    columns = {"time": np.asarray(log.time_s, dtype=np.float64)}
+    for key, attribute in _FIELDS.items():
+        values = getattr(log, attribute)
+        if values is None or (key == "vel" and log.velocity_derived):
+            continue
+        parts = np.asarray(values, dtype=np.float64).reshape(len(values), -1).T
+        columns |= dict(zip(GROUPS[key], parts, strict=True))
+    columns |= {key: np.asarray(values) for key, values in log.extra.items()}
+    for column, values in columns.items():
+        if len(values) != len(log.time_s):
+            reason = f"{len(values)} values, but `time` has {len(log.time_s)}"
+            raise FlightLogError(log.name, column, None, reason)
+    return columns
+
+
+def read_flight(path: str | Path) -> FlightLog:
+    """Read a flight from a Parquet or CSV file.
+
+    Raises:
+        FlightLogError: where the file cannot be read or breaks a rule; the message has the file,
+            the column, the first bad row (counted from 1) and the reason.
+    """
+    columns, text, warnings = read_columns(Path(path))
+    about: Any = {}
+    if text is not None:
+        try:
+            about = json.loads(text)
+        except ValueError:
+            about = None
+        if not isinstance(about, dict):
+            warnings.append(f"{path}: metadata `flight` is not a JSON object; ignored")
+            about = {}
+    log = log_from_columns(columns, about, str(path))
+    return replace(log, warnings=(*warnings, *log.warnings))
+
+
+def read_flights(paths: Iterable[str | Path]) -> tuple[list[FlightLog], list[str]]:
+    """Read many flights; a bad one is named in the warnings and the rest are used.
+
+    Returns:
+        The flights in the order of `paths`, and the warnings of all files.
+
+    Raises:
+        FlightLogError: where no flight is left, with the reason of every file.
+    """
+    flights: list[FlightLog] = []
+    warnings: list[str] = []
+    refused: list[str] = []
+    for path in paths:
+        try:
+            flights.append(read_flight(path))
+            warnings.extend(flights[-1].warnings)
+        except FlightLogError as error:
+            refused.append(str(error))
+            warnings.append(f"not used: {error}")
+    if not flights:
+        reasons = "\n".join(refused) if refused else "no file was given"
+        raise FlightLogError("flights", None, None, f"none can be used\n{reasons}")
+    return flights, warnings
+
+
+def write_flight(path: str | Path, log: FlightLog) -> Path:
+    """Write `log` as Parquet (`.parquet`) or CSV (`.csv`), at once and under its name when whole.
+
+    Parquet holds `log.about` with the keys of `provenance.stamp` as JSON in the metadata key
+    `flight`; CSV holds the same JSON in the first row of a column `flight`.
+
+    Raises:
+        FlightLogError: where the log would be refused on reading, or the ending is another.
+        OSError: where the file cannot be written; nothing is left under its name.
+    """
+    columns = columns_from_log(log)
+    check_columns(columns, log.name)
+    about = {**log.about, **stamp(SCHEMA, log.about.get("seed"))}
+    return write_columns(Path(path), columns, to_json(about))

@@ -1,0 +1,58 @@
+"""Rotor thrusts for a wanted collective thrust and torque, within what the rotors can give."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tracks.geometry.scene import Array
+
+NEGLIGIBLE = 1e-9
+"""Thrusts below this are rounding [N]."""
+
+
+def mixer_matrix(position_b: Array, spin: Array, torque_per_thrust: float) -> np.ndarray:
+    """Return the matrix (4, 4) from rotor thrusts [N] to (force along z, torque about x, y, z).
+
+    Args:
+        position_b: (4, 3) hubs [m].
+        spin: (4,) +1 counter-clockwise seen from above.
+        torque_per_thrust: k_Q / k_T [m].
+    """
+    x, y, _ = np.asarray(position_b, dtype=float).T
+    return np.stack([np.ones(4), y, -x, -np.asarray(spin, dtype=float) * torque_per_thrust])
+
+
+def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> Array:
+    """Return the rotor thrusts (..., 4) [N], each in [0, thrust_max].
+
+    Where the exact solution is out of range, roll and pitch are scaled down together until they
+    fit side by side, the collective is clamped to what is then feasible, and yaw gets what is
+    left: direction of thrust before its size, size before heading.
+
+    Args:
+        unmixer: (4, 4) inverse of `mixer_matrix`.
+        thrust_max: largest thrust of one rotor [N].
+        force_z: (...,) wanted collective [N].
+        torque_b: (..., 3) wanted torque [N m].
+    """
+    xp = torque_b.__array_namespace__()
+    per_force, per_yaw = unmixer[:, 0], unmixer[:, 3]
+    # Written out: a matrix product may round a row differently at another batch size.
+    level = torque_b[..., 0, None] * unmixer[:, 1] + torque_b[..., 1, None] * unmixer[:, 2]
+    yaw = torque_b[..., 2, None] * per_yaw
+    exact = force_z[..., None] * per_force + level + yaw
+    outside = xp.any((exact < 0.0) | (exact > thrust_max), axis=-1, keepdims=True)
+
+    spread = xp.max(level, axis=-1, keepdims=True) - xp.min(level, axis=-1, keepdims=True)
+    level = level * (thrust_max / xp.maximum(spread, thrust_max))
+    lowest = xp.max(-level / per_force, axis=-1)
+    highest = xp.min((thrust_max - level) / per_force, axis=-1)
+    force = xp.minimum(xp.maximum(force_z, lowest), highest)
+    without_yaw = xp.clip(force[..., None] * per_force + level, 0.0, thrust_max)
+    room = xp.where(yaw > 0.0, thrust_max - without_yaw, without_yaw)
+    asked = xp.abs(yaw)
+    # What is asked beyond the room by rounding alone is left to the clip.
+    beyond = asked > xp.maximum(room, NEGLIGIBLE)
+    share = xp.where(beyond, room / xp.where(beyond, asked, 1.0), 1.0)
+    limited = without_yaw + xp.min(share, axis=-1, keepdims=True) * yaw
+    return xp.where(outside, xp.clip(limited, 0.0, thrust_max), exact)

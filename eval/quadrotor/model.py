@@ -1,0 +1,136 @@
+"""The quadrotor as a MuJoCo body: what a MuJoCo user expects, with the true mass and inertia.
+
+A world that flies the plant leaves the actuators at zero and puts the plant's wrench into
+`qfrc_applied` of the free joint: `[R force_b, torque_b]`, since a free joint's forces are in
+world axes and its torques in body axes, and the body's origin is its centre of mass. (The rotors'
+actuators alone could not carry the drag, tilt and trim of the effects.) A user without the plant
+flies the four actuators, whose control is a rotor's thrust in newton.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from eval.quadrotor.plant import make_plant
+from eval.vehicles.vehicle import Vehicle
+
+BODY = "quadrotor"
+"""Name of the body and of its free joint."""
+CAMERA = "depth"
+COLLIDES = "quadrotor box"
+"""Name of the only geom of the quadrotor that collides."""
+VISUAL_GROUP = 2
+"""Geom group of what is only looked at; rays that collide with nothing else skip it."""
+
+
+def rotor_name(index: int) -> str:
+    """Return the name of the site and of the actuator of rotor `index`, counted from 0."""
+    return f"rotor_{index + 1}"
+
+
+def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
+    """Add `vehicle` to the world body of `spec`, with its effects on mass, inertia and gravity.
+
+    The body's origin is the true centre of mass. Gravity of the whole model is set, for a tilted
+    frame. After compiling, call `set_true_inertia`.
+
+    Args:
+        spec: to be added to; its integrator must stay Euler for parity with the JAX quadrotor.
+        vehicle: what is added.
+
+    Raises:
+        ValueError: where an effect leaves no mass.
+    """
+    constants = make_plant(vehicle, 1.0 / vehicle.controller.frequency).constants
+    spec.option.gravity = constants.gravity_w
+    body = spec.worldbody.add_body(name=BODY)
+    body.add_freejoint(name=BODY)
+    body.explicitinertial = True
+    body.mass = float(constants.mass)
+    body.inertia = _possible(constants.inertia)
+    # Geometry is given from the nominal centre of mass, the body's frame sits in the true one.
+    origin = -constants.com_offset_b
+    body.add_geom(
+        name=COLLIDES,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=vehicle.body.half_size,
+        pos=origin,
+        mass=0.0,
+        rgba=[0.15, 0.15, 0.18, 1.0],
+    )
+    ratio = constants.torque_coefficient / constants.thrust_coefficient
+    for index, hub in enumerate(constants.rotor_position_b):
+        spin = vehicle.rotors.spin[index]
+        name = rotor_name(index)
+        body.add_site(name=name, pos=hub, size=[0.005, 0.005, 0.005])
+        _add_visuals(body, name, origin, hub, spin)
+        spec.add_actuator(
+            name=name,
+            target=name,
+            trntype=mujoco.mjtTrn.mjTRN_SITE,
+            gear=[0.0, 0.0, 1.0, 0.0, 0.0, -spin * float(ratio[index])],
+            ctrllimited=True,
+            ctrlrange=[0.0, vehicle.rotors.thrust_max],
+        )
+    _add_camera(body, vehicle, origin)
+
+
+def set_true_inertia(model: mujoco.MjModel, vehicle: Vehicle) -> None:
+    """Set the true inertia in a compiled `model`.
+
+    MuJoCo's compiler refuses moments of inertia that break the triangle inequality, which a
+    fitted or assumed `inertia_scale` of a flat quadrotor easily does by a few percent; its
+    dynamics do not mind.
+    """
+    constants = make_plant(vehicle, 1.0 / vehicle.controller.frequency).constants
+    model.body(BODY).inertia[:] = constants.inertia
+    # For a lone free body MuJoCo steps with constants that it derived from the inertia.
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def _possible(inertia: np.ndarray) -> np.ndarray:
+    """Return `inertia` (3,) with its largest moment cut to the sum of the other two."""
+    others = inertia.sum() - inertia
+    return np.minimum(inertia, others * (1.0 - 1e-9))
+
+
+def _add_visuals(
+    body: mujoco.MjsBody, name: str, origin: np.ndarray, hub: np.ndarray, spin: int
+) -> None:
+    look = {"contype": 0, "conaffinity": 0, "group": VISUAL_GROUP, "mass": 0.0}
+    body.add_geom(
+        name=f"{name} arm",
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=[*origin, *hub],
+        size=[0.006, 0.0, 0.0],
+        rgba=[0.15, 0.15, 0.18, 1.0],
+        **look,
+    )
+    # One colour a direction of spin.
+    rgba = [0.9, 0.35, 0.1, 0.5] if spin > 0 else [0.2, 0.5, 0.9, 0.5]
+    body.add_geom(
+        name=f"{name} disk",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        pos=hub + [0.0, 0.0, 0.012],
+        size=[0.0635, 0.002, 0.0],
+        rgba=rgba,
+        **look,
+    )
+
+
+def _add_camera(body: mujoco.MjsBody, vehicle: Vehicle, origin: np.ndarray) -> None:
+    pitch = np.deg2rad(vehicle.camera.pitch_deg)
+    # MuJoCo's cameras look along their -z with y up.
+    right = [0.0, -1.0, 0.0]
+    up = [-np.sin(pitch), 0.0, np.cos(pitch)]
+    back = [-np.cos(pitch), 0.0, -np.sin(pitch)]
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.stack([right, up, back], axis=-1).ravel())
+    body.add_camera(
+        name=CAMERA,
+        pos=origin,
+        quat=quat,
+        fovy=vehicle.camera.fov_deg[1],
+        resolution=[vehicle.camera.width, vehicle.camera.height],
+    )

@@ -1,0 +1,64 @@
+"""Rotor speed follows its command with a first-order lag; thrust goes with its square."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from tracks.geometry.scene import Array
+
+NEGLIGIBLE = 1e-6
+"""Thrusts below this are none [N]."""
+
+
+class Spin(NamedTuple):
+    """What the rotors do during one physics step; means are exact for a constant command."""
+
+    end: Array
+    """(..., 4) speed at the end of the step [rad/s]."""
+    mean: Array
+    """(..., 4) mean speed over the step [rad/s]."""
+    mean_square: Array
+    """(..., 4) mean of the squared speed over the step [(rad/s)^2]."""
+
+
+def speed_command(thrust: Array, thrust_coefficient: float) -> Array:
+    """Return the speeds (..., 4) [rad/s] that nominally give `thrust` (..., 4) >= 0 [N]."""
+    xp = thrust.__array_namespace__()
+    # A rotor at its lower limit is asked for zero or for what rounding left of it, where the
+    # root's slope has no bound; gradients would drown in it.
+    pushes = thrust > NEGLIGIBLE
+    return xp.where(pushes, xp.sqrt(xp.where(pushes, thrust, 1.0) / thrust_coefficient), 0.0)
+
+
+def follow(speed: Array, command: Array, time_constant: Array, dt: Array) -> Spin:
+    """Return the rotors' step under dOmega/dt = (command - Omega) / time_constant.
+
+    The thrust of a step is that of the mean square and not of the speed at one of its ends, so
+    that lags far shorter than a step still count, to first order: a time constant of 0 follows
+    at once, and the gradient with respect to it exists there.
+
+    Args:
+        speed: (..., 4) at the start of the step [rad/s].
+        command: (..., 4) held during the step [rad/s].
+        time_constant: (...,) [s].
+        dt: length of the step [s].
+    """
+    xp = speed.__array_namespace__()
+    time_constant = xp.asarray(time_constant)
+    lags = time_constant > 0.0
+    left = xp.where(lags, xp.exp(-dt / xp.where(lags, time_constant, 1.0)), 0.0)
+    steps = (time_constant / dt)[..., None]
+    left = left[..., None]
+    behind = speed - command
+    mean = command + behind * steps * (1.0 - left)
+    mean_square = (
+        command**2
+        + 2.0 * command * behind * steps * (1.0 - left)
+        + behind**2 * 0.5 * steps * (1.0 - left**2)
+    )
+    return Spin(command + behind * left, mean, mean_square)
+
+
+def steady(speed: Array) -> Spin:
+    """Return the step of rotors that hold `speed` (..., 4) [rad/s], as when it was measured."""
+    return Spin(speed, speed, speed**2)

@@ -1,0 +1,80 @@
+"""Whether a vehicle can exist and fly: the physical checks behind the vehicle file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from eval.quadrotor.mixer import mixer_matrix
+from eval.vehicles.vehicle import Vehicle
+
+
+def check_vehicle(vehicle: Vehicle) -> None:
+    """Refuse nominal values that no quadrotor can have, or that cannot hover.
+
+    Raises:
+        ValueError: with the key, the value and what is allowed.
+    """
+    rotors, controller, camera = vehicle.rotors, vehicle.controller, vehicle.camera
+    _positive("mass", vehicle.mass, "kg")
+    _positive("inertia", vehicle.inertia, "kg m^2")
+    x, y, z = vehicle.inertia
+    # A flat body has A + B = C exactly; rounding must not refuse it.
+    if 2.0 * max(x, y, z) > (x + y + z) * (1.0 + 1e-12):
+        raise ValueError(
+            f"inertia = {list(vehicle.inertia)}: no body has this; the largest must be at most "
+            "the sum of the other two"
+        )
+    _positive("rotors.thrust_coefficient", rotors.thrust_coefficient, "N/(rad/s)^2")
+    _positive("rotors.torque_coefficient", rotors.torque_coefficient, "N m/(rad/s)^2")
+    _positive("rotors.speed_max", rotors.speed_max, "rad/s")
+    _between("rotors.time_constant", rotors.time_constant, 0.0, 0.5, "s")
+    _positive("controller.rate_gain", controller.rate_gain, "1/s")
+    _between("controller.frequency", controller.frequency, 50.0, 10000.0, "Hz")
+    _positive("controller.attitude_gain", controller.attitude_gain, "1/s")
+    _positive("controller.rate_max", controller.rate_max, "rad/s")
+    _positive("body.half_size", vehicle.body.half_size, "m")
+    _between("camera.pitch_deg", camera.pitch_deg, -90.0, 90.0, "deg")
+    for angle in camera.fov_deg:
+        _between("camera.fov_deg", angle, 1.0, 170.0, "deg")
+    _positive("camera.range", camera.range_m, "m")
+    _check_rotors(vehicle)
+
+
+def _check_rotors(vehicle: Vehicle) -> None:
+    rotors = vehicle.rotors
+    matrix = mixer_matrix(
+        rotors.position, rotors.spin, rotors.torque_coefficient / rotors.thrust_coefficient
+    )
+    # Rows of one size, so that the rank says something about the layout and not about units.
+    rows = matrix / np.maximum(np.linalg.norm(matrix, axis=1, keepdims=True), 1e-300)
+    if np.linalg.matrix_rank(rows, tol=1e-6) < 4:
+        raise ValueError(
+            f"rotors.position = {[list(hub) for hub in rotors.position]}, rotors.spin = "
+            f"{list(rotors.spin)}: these rotors cannot make roll, pitch and yaw independently; "
+            "diagonal neighbours usually spin the same way"
+        )
+    hover = np.linalg.solve(matrix, [vehicle.mass * GRAVITY, 0.0, 0.0, 0.0])
+    if hover.min() <= 0.0:
+        raise ValueError(
+            f"rotors.position = {[list(hub) for hub in rotors.position]}: the origin (centre of "
+            "mass) must lie between the rotors, so that all of them push up in hover"
+        )
+    if hover.max() >= rotors.thrust_max:
+        raise ValueError(
+            f"rotors.speed_max = {rotors.speed_max}: too weak to hover; a rotor gives "
+            f"{rotors.thrust_max:.3g} N and {hover.max():.3g} N are needed"
+        )
+
+
+def _positive(key: str, value: Any, unit: str) -> None:
+    if np.min(value) <= 0.0:
+        shown = list(value) if isinstance(value, tuple) else value
+        raise ValueError(f"{key} = {shown}: must be above 0 {unit}")
+
+
+def _between(key: str, value: float, low: float, high: float, unit: str) -> None:
+    if not low <= value <= high:
+        raise ValueError(f"{key} = {value}: must be from {low:g} to {high:g} {unit}")

@@ -1,0 +1,1 @@
+"""The vehicle as data, and the vehicle files that are shipped."""

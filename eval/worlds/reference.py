@@ -1,0 +1,175 @@
+"""The world `plain`: one trial as a loop of MuJoCo steps, to be read from top to bottom.
+
+It is the reference that the batched worlds are held against, so it shares the vehicle with them
+and nothing else: it keeps its own count of gates and decides on its own when a trial ends.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from eval.judging.guard import ActionLimits, guard_action
+from eval.judging.sensors import SensorNoise, Sensors
+from eval.quadrotor.autopilot import fly_step, make_cockpit, start_autopilot
+from eval.quadrotor.plant import Motion, uses_noise
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds import View
+from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
+from eval.worlds.slots import layout_of, noise_of
+from eval.worlds.trial import Rules, TrialResult, TrialSpec
+from policies.observation import encode_depth, state_vector
+from policies.policy import Policy
+from tracks.geometry.crossing import crossing, is_near
+from tracks.geometry.rotation import to_world
+from tracks.track import Track
+
+
+def fly_trial(
+    policy: Policy,
+    trial: TrialSpec,
+    track: Track,
+    vehicle: Vehicle,
+    rules: Rules | None = None,
+    limits: ActionLimits | None = None,
+    rows: int = 64,
+    noise: SensorNoise | None = None,
+) -> TrialResult:
+    """Fly one trial.
+
+    Args:
+        policy: who flies.
+        trial: which.
+        track: the trial's.
+        vehicle: on what.
+        rules: when a trial ends.
+        limits: what an action may be; a deadline is not looked at here.
+        rows: of the policy's inputs; all but the first are zero. The rows of a call to the policy
+            are as many as in the batched worlds, since some policies answer otherwise then.
+        noise: what is wrong with the policy's observation.
+    """
+    rules, limits = rules or Rules(), limits or ActionLimits()
+    cockpit = make_cockpit(vehicle)
+    dt, spec = cockpit.dt, policy.spec
+    model = compile_model(track, vehicle, dt, layout_of([track]).solids)
+    data = mujoco.MjData(model)
+    data.qpos[:] = start_state(track)
+    mujoco.mj_step1(model, data)  # contacts of the first state
+    gates, count = track.scene.gates, len(track.scene.gates.center_w)
+    draws = np.zeros((1, 3))
+    if uses_noise(cockpit.plant):
+        draws = noise_of(trial, round(rules.time_limit_s / dt) + 2)
+    eye, hidden = Eye(spec.camera), policy.start(rows)
+    pilot = start_autopilot(cockpit, motion_of(data), draws[:1] if len(draws) > 1 else None)
+    sensors = None
+    if noise and not noise.is_none:
+        sensors = Sensors(noise, 1, spec.rate_hz, spec.camera.range_m)
+        sensors.start(0, trial, count)
+    action_b, bad, limited, decisions = np.zeros((1, 3)), 0, 0, 0
+    passed = passed_8s = passed_035 = 0
+    speeds: list[float] = []
+    before_w = data.qpos[:3].copy()
+    ended_by, collided_with, step = None, None, 0
+
+    while True:
+        # Judge the state that the last step led to.
+        motion = motion_of(data)
+        pos_w = motion.pos_w[0]
+        if not _is_flight(motion, rules):
+            ended_by = "diverged"
+            break
+        speeds.append(float(np.sqrt((motion.vel_w[0] ** 2).sum())))
+        if data.ncon > 0:
+            ended_by, collided_with = "collision", contact_name(model, data)
+        else:
+            gate = (gates.center_w[passed], gates.rot_w[passed], gates.opening_g[passed])
+            passed += bool(crossing(*gate, before_w, pos_w)[0])
+            if passed_035 < count:
+                near_w = gates.center_w[passed_035]
+                passed_035 += bool(is_near(near_w, pos_w, rules.near_radius_m))
+            if passed == count:
+                ended_by = "finished"
+            elif motion.rot_w[0, 2, 2] < 0:
+                ended_by = "tipped"
+            elif step >= round(rules.time_limit_s / dt):
+                ended_by = "timeout"
+        if step <= round(rules.short_window_s / dt):
+            passed_8s = passed
+        before_w = pos_w
+        if ended_by is not None:
+            break
+
+        # Ask the policy when it is its time.
+        gate_w = gates.center_w[None, passed]
+        if step == np.rint(decisions * (1 / (spec.rate_hz * dt))):
+            second_w = gates.center_w[None, min(passed + 1, count - 1)]
+            depth = eye.image(model, data, pos_w, motion.rot_w[0])
+            axis_w = gates.rot_w[None, passed, :, 0]
+            seen = View(
+                motion.pos_w, motion.rot_w, motion.vel_w, gate_w, second_w, axis_w, depth[None]
+            )
+            if sensors:
+                seen = sensors.see(seen, np.array([passed]), np.array([True]))
+            state = state_vector(
+                seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, action_b,
+                seen.second_w if spec.second_gate else None,
+                seen.axis_w if spec.gate_axis else None,
+            )  # fmt: skip
+            image = encode_depth(spec.depth, seen.depth_m, spec.camera.range_m)
+            fresh = np.full(rows, decisions == 0)
+            answer, hidden = policy.act(hidden, _padded(state, rows), _padded(image, rows), fresh)
+            guarded = guard_action(limits, np.asarray(answer)[:1], action_b, 0.0, policy.name)
+            action_b = guarded.action_b
+            bad, limited = bad + int(guarded.bad[0]), limited + int(guarded.limited[0])
+            decisions += 1
+
+        # Fly one step.
+        blow = draws[None, step + 1] if len(draws) > 1 else None
+        pilot, wrench = fly_step(cockpit, pilot, motion, action_b, gate_w, np.array([step]), blow)
+        step += 1
+        if not (np.abs([wrench.force_b, wrench.torque_b]) <= rules.wrench_limit).all():
+            ended_by = "diverged"
+            break
+        data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
+        data.qfrc_applied[3:] = wrench.torque_b[0]
+        mujoco.mj_step2(model, data)
+        mujoco.mj_step1(model, data)
+
+    # The speed at a contact is not "before any contact".
+    free = speeds[:-1] if ended_by == "collision" else speeds
+    return TrialResult(
+        *trial,
+        policy=policy.name,
+        vehicle=vehicle.name,
+        world="plain",
+        success=ended_by == "finished",
+        gates_passed=passed,
+        ended_by=ended_by,
+        collided_with=collided_with,
+        pos_x=float(before_w[0]),
+        pos_y=float(before_w[1]),
+        pos_z=float(before_w[2]),
+        time_s=step * dt,
+        v_max=max(free, default=0.0),
+        v_mean=sum(speeds) / max(len(speeds), 1),
+        gates_8s=passed_8s,
+        gates_035=passed_035,
+        bad_actions=bad,
+        limited_actions=limited,
+        late_actions=0,
+    )
+
+
+def _is_flight(motion: Motion, rules: Rules) -> bool:
+    """Return whether the state is finite and no faster than a quadrotor can be."""
+    return bool(
+        np.isfinite(motion.pos_w).all()
+        and (np.abs(motion.vel_w) <= rules.speed_limit).all()
+        and (np.abs(motion.rate_b) <= rules.rate_limit).all()
+    )
+
+
+def _padded(values: np.ndarray, rows: int) -> np.ndarray:
+    padded = np.zeros((rows, *values.shape[1:]), np.float32)
+    padded[0] = values[0]
+    return padded

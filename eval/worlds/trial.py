@@ -1,0 +1,220 @@
+"""What a trial is, when it ends and what it scores; the same rules in every world.
+
+The rules are pure functions of arrays over many trials (N rows) and take numpy and JAX alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from tracks.families import make_track
+from tracks.geometry.crossing import NEAR_RADIUS_M, crossing, is_near
+from tracks.geometry.scene import Array, Gates
+from tracks.track import Track
+
+FLYING = 0
+"""The code in `Progress.ended` of a trial that goes on."""
+ENDINGS = ("finished", "collision", "tipped", "timeout", "diverged")
+"""What `ended_by` can be; `Progress.ended` holds 1 + the index."""
+FINISHED, COLLISION, TIPPED, TIMEOUT, DIVERGED = range(1, 6)
+
+
+class TrialSpec(NamedTuple):
+    """What sets a trial's outcome, besides the policy and the vehicle."""
+
+    track: str
+    """Name of the family, or path of a custom track's file."""
+    difficulty: int
+    """Level, 0 to 9."""
+    seed: int
+    """Seed of the track and of everything random in the trial."""
+
+
+class TrialResult(NamedTuple):
+    """How a trial went: a row of trials.parquet."""
+
+    track: str
+    difficulty: int
+    seed: int
+    policy: str
+    vehicle: str
+    world: str
+    success: bool
+    """All gates in order, no collision, in time."""
+    gates_passed: int
+    ended_by: str
+    """One of `ENDINGS`."""
+    collided_with: str | None
+    """The solid's name, or None unless `ended_by` is collision."""
+    pos_x: float
+    """Position of the centre of mass at the end, world [m]; the last finite one if diverged."""
+    pos_y: float
+    pos_z: float
+    time_s: float
+    """Time at the end [s]; a finished trial's lap time."""
+    v_max: float
+    """Largest |vel_w| before any contact [m/s]."""
+    v_mean: float
+    """Mean |vel_w| [m/s]."""
+    gates_8s: int
+    """Gates passed within 8 s."""
+    gates_035: int
+    """Gates by the baseline's rule: within 0.35 m of the centres, in order."""
+    bad_actions: int
+    """Actions that were not finite; the last good one was flown instead."""
+    limited_actions: int
+    """Actions larger than the limit, shortened to it."""
+    late_actions: int
+    """Actions that came after the deadline, where one is set; the last one was flown on."""
+
+    @property
+    def trial(self) -> TrialSpec:
+        """The trial that this is the result of."""
+        return TrialSpec(self.track, self.difficulty, self.seed)
+
+    @property
+    def ending(self) -> str:
+        """How it ended, for people: "collision with gate 3 frame"."""
+        return self.ended_by + (f" with {self.collided_with}" if self.collided_with else "")
+
+
+def track_of(tracks: Mapping[str, Track], trial: TrialSpec) -> Track:
+    """Return the track that `trial` is flown on: one of the custom `tracks`, or its family's."""
+    if trial.track in tracks:
+        return tracks[trial.track]
+    return make_track(trial.track, trial.difficulty, trial.seed)
+
+
+@dataclass(frozen=True)
+class Rules:
+    """When a trial ends and what counts."""
+
+    time_limit_s: float = 20.0
+    """A trial ends at this time [s]."""
+    short_window_s: float = 8.0
+    """Gates passed by this time count as `gates_8s` [s]."""
+    near_radius_m: float = NEAR_RADIUS_M
+    """The baseline's rule: a gate counts within this distance of its centre [m]."""
+    speed_limit: float = 1e3
+    """A body faster than this [m/s] has diverged."""
+    rate_limit: float = 1e4
+    """A body turning faster than this [rad/s] has diverged."""
+    wrench_limit: float = 1e6
+    """A force [N] or torque [N m] on the body beyond this has diverged."""
+
+
+class Course(NamedTuple):
+    """The gates of N trials, padded to the same number by repeating the last."""
+
+    gates: Gates
+    """(N, G, ...)."""
+    count: Array
+    """(N,) gates to pass, int32."""
+
+
+class Progress(NamedTuple):
+    """Where trials stand; every array is (N,) but `pos_w`."""
+
+    step: Array
+    """Physics steps flown, int32."""
+    ended: Array
+    """`FLYING` or one of the codes above, int32."""
+    gates: Array
+    """Gates crossed in order: also the number of the next gate, int32."""
+    gates_8s: Array
+    """Gates crossed within `Rules.short_window_s`, int32."""
+    gates_035: Array
+    """Gates by the baseline's rule, int32."""
+    v_max: Array
+    """[m/s]."""
+    v_sum: Array
+    """Sum of |vel_w| over the states judged so far [m/s]."""
+    pos_w: Array
+    """(N, 3) position at the last state judged [m]."""
+
+
+def start_progress(pos_w: Array) -> Progress:
+    """Return the progress of trials about to start at pos_w (N, 3)."""
+    xp = pos_w.__array_namespace__()
+    count, real = xp.zeros(pos_w.shape[0], dtype=xp.int32), xp.zeros_like(pos_w[:, 0])
+    return Progress(count, count, count, count, count, real, real, pos_w)
+
+
+def next_gate(course: Course, number: Array) -> Gates:
+    """Return each row's gate `number` (N,), past the last one the last, with arrays (N, ...)."""
+    xp = number.__array_namespace__()
+    rows = xp.arange(number.shape[0])
+    return Gates(*(field[rows, xp.minimum(number, course.count - 1)] for field in course.gates))
+
+
+def has_diverged(rules: Rules, pos_w: Array, vel_w: Array, rate_b: Array) -> Array:
+    """Return which states (N, 3) are not finite or beyond any flight, (N,) bool."""
+    xp = pos_w.__array_namespace__()
+    speed_fits = (xp.abs(vel_w) <= rules.speed_limit).all(-1)  # a comparison with NaN is false
+    rate_fits = (xp.abs(rate_b) <= rules.rate_limit).all(-1)
+    return ~(xp.isfinite(pos_w).all(-1) & speed_fits & rate_fits)
+
+
+def is_wrench(rules: Rules, force_b: Array, torque_b: Array) -> Array:
+    """Return which forces and torques (N, 3) are finite and within any flight's, (N,) bool."""
+    xp = force_b.__array_namespace__()
+    both = xp.concatenate([force_b, torque_b], axis=-1)
+    return (xp.abs(both) <= rules.wrench_limit).all(-1)  # a comparison with NaN is false
+
+
+def judge_state(
+    rules: Rules,
+    progress: Progress,
+    course: Course,
+    dt: float,
+    pos_w: Array,
+    rot_w: Array,
+    vel_w: Array,
+    contact: Array,
+    diverged: Array,
+) -> Progress:
+    """Judge the states that trials have reached at their physics step `progress.step`.
+
+    A contact found in a state counts before a gate crossed on the way to it: a trial that touches
+    the last gate's frame in the step in which it crosses has not finished.
+
+    Args:
+        rules: when a trial ends.
+        progress: of N trials; rows that have ended are returned as they are.
+        course: the gates of each trial's track.
+        dt: length of a physics step [s].
+        pos_w: (N, 3) [m].
+        rot_w: (N, 3, 3) body to world.
+        vel_w: (N, 3) [m/s].
+        contact: (N,) bool, the body touches something.
+        diverged: (N,) bool, the state is none; its numbers are not looked at.
+    """
+    xp = pos_w.__array_namespace__()
+    flying = progress.ended == FLYING
+    live = flying & ~diverged
+    free = live & ~contact
+    gate = next_gate(course, progress.gates)
+    passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, progress.pos_w, pos_w)
+    gates = progress.gates + (passed & free & (progress.gates < course.count))
+    near = is_near(next_gate(course, progress.gates_035).center_w, pos_w, rules.near_radius_m)
+    gates_035 = progress.gates_035 + (near & free & (progress.gates_035 < course.count))
+    speed = xp.sqrt((vel_w * vel_w).sum(-1))
+    last_step, short_step = round(rules.time_limit_s / dt), round(rules.short_window_s / dt)
+
+    ended = xp.where(free & (progress.step >= last_step), TIMEOUT, progress.ended)
+    ended = xp.where(free & (rot_w[:, 2, 2] < 0), TIPPED, ended)
+    ended = xp.where(free & (gates >= course.count), FINISHED, ended)
+    ended = xp.where(live & contact, COLLISION, ended)
+    ended = xp.where(flying & diverged, DIVERGED, ended)
+    return Progress(
+        step=progress.step,
+        ended=ended.astype(xp.int32),
+        gates=gates.astype(xp.int32),
+        gates_8s=xp.where(progress.step <= short_step, gates, progress.gates_8s).astype(xp.int32),
+        gates_035=gates_035.astype(xp.int32),
+        v_max=xp.where(free, xp.maximum(progress.v_max, speed), progress.v_max),
+        v_sum=xp.where(live, progress.v_sum + speed, progress.v_sum),
+        pos_w=xp.where(live[:, None], pos_w, progress.pos_w),
+    )

@@ -1,0 +1,1 @@
+"""Policies as files: our checkpoints, ONNX, torch."""

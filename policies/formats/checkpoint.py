@@ -1,0 +1,213 @@
+"""A checkpoint is a folder: weights.safetensors holds arrays, config.json says what they are.
+
+Neither file can run code when it is read. The config carries the weights' SHA-256, so a file that
+was cut short, mixed up with another or changed is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from policies.errors import PolicyError
+from tracks.common.files import recover_folder, replacing_folder, to_json
+from tracks.common.provenance import stamp
+
+WEIGHTS = "weights.safetensors"
+CONFIG = "config.json"
+SCHEMA = 1
+"""Version of the folder's layout; files of a newer one are refused."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a checkpoint holds."""
+
+    arrays: dict[str, np.ndarray]
+    """Arrays by name, of the shapes and types they were saved with."""
+    config: dict[str, Any]
+    """The whole of config.json: kind, the provenance stamp, weights and the caller's."""
+
+
+def save_arrays(
+    folder: Path,
+    arrays: Mapping[str, Any],
+    *,
+    kind: str,
+    seed: int | None,
+    extra: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write arrays and what they are as a checkpoint, replacing the one that was there.
+
+    A kill at any moment leaves the old checkpoint or the new one, whole.
+
+    Args:
+        folder: the checkpoint's folder.
+        arrays: numpy or JAX arrays by name, of any shape.
+        kind: what this is ("policy", "delta", "training"); loading asks for it again.
+        seed: the seed that made it, if one did.
+        extra: more for config.json (see `tracks.common.files.to_json`).
+
+    Returns:
+        `folder`.
+
+    Raises:
+        ValueError: where `extra` has a key that the checkpoint itself writes.
+        OSError: where the disk refuses; what was there stays.
+    """
+    from safetensors.numpy import save
+
+    # safetensors writes a strided view's memory as it lies, so every array is made C-contiguous.
+    contiguous = {name: np.asarray(value, order="C") for name, value in arrays.items()}
+    weights = save(contiguous, metadata={"format": "np"})
+    config = {"kind": kind, **stamp(SCHEMA, seed)}
+    config["weights"] = {"sha256": hashlib.sha256(weights).hexdigest(), "bytes": len(weights)}
+    clash = sorted(config.keys() & (extra or {}).keys())
+    if clash:
+        raise ValueError(f"extra: {clash} are written by the checkpoint itself; use other names")
+    config |= dict(extra or {})
+    with replacing_folder(folder) as beside:
+        (beside / WEIGHTS).write_bytes(weights)
+        (beside / CONFIG).write_text(to_json(config, indent=2) + "\n", encoding="utf-8")
+    return folder
+
+
+def load_arrays(folder: Path, *, kind: str, finite: bool = True) -> Stored:
+    """Read a checkpoint back.
+
+    Args:
+        folder: the checkpoint's folder.
+        kind: what it has to be.
+        finite: refuse NaN and infinity in the arrays.
+
+    Raises:
+        PolicyError: where a file is missing, cut short, changed, of another kind or a newer
+            schema, or an array is not finite; the message names the file and what to do.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    recover_folder(folder)
+    config = read_config(folder)
+    if config["kind"] != kind:
+        raise PolicyError(
+            f"{folder / CONFIG}: kind is {config['kind']!r}, expected {kind!r}; "
+            f"give a checkpoint of that kind"
+        )
+    path = folder / WEIGHTS
+    weights = _read(path)
+    expected = config["weights"]
+    if len(weights) != expected["bytes"]:
+        raise PolicyError(
+            f"{path}: {len(weights)} bytes, {CONFIG} says {expected['bytes']}; "
+            "the file is cut short or another's: copy the whole folder again"
+        )
+    digest = hashlib.sha256(weights).hexdigest()
+    if digest != expected["sha256"]:
+        raise PolicyError(
+            f"{path}: sha256 is {digest[:12]}…, {CONFIG} says {expected['sha256'][:12]}…; "
+            "the file was changed or mixed up with another: copy the whole folder again"
+        )
+    try:
+        arrays = load(weights)
+    except (SafetensorError, KeyError, ValueError) as error:
+        raise PolicyError(
+            f"{path}: not a safetensors file ({error}); train or copy again"
+        ) from None
+    if finite:
+        check_finite(path, arrays)
+    return Stored(arrays, config)
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Read and check a checkpoint's config.json alone.
+
+    Raises:
+        PolicyError: where it is missing, is not JSON, or one of the keys that every checkpoint
+            has is missing or of the wrong type.
+    """
+    path = folder / CONFIG
+    try:
+        config = json.loads(_read(path))
+    except ValueError as error:
+        raise PolicyError(
+            f"{path}: not JSON ({error}); the file is damaged: copy the whole folder again"
+        ) from None
+    if not isinstance(config, dict):
+        raise PolicyError(f"{path}: holds a {type(config).__name__}, expected an object")
+    _require(path, config, "schema", int)
+    if config["schema"] != SCHEMA:
+        raise PolicyError(
+            f"{path}: schema is {config['schema']}, this suite reads {SCHEMA}; "
+            "update the suite or export the checkpoint with the one that wrote it"
+        )
+    _require(path, config, "kind", str)
+    _require(path, config, "weights", dict)
+    _require(path, config["weights"], "sha256", str)
+    _require(path, config["weights"], "bytes", int)
+    return config
+
+
+def check_finite(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Refuse NaN and infinity.
+
+    Raises:
+        PolicyError: naming the file, the array and how many of its values are not finite.
+    """
+    for name, value in arrays.items():
+        if np.issubdtype(value.dtype, np.inexact):
+            bad = int(value.size - np.isfinite(value).sum())
+            if bad:
+                raise PolicyError(
+                    f"{path}: {name!r} holds {bad} of {value.size} values that are NaN or "
+                    "infinite; take an earlier checkpoint of that run"
+                )
+
+
+def check_shapes(
+    path: Path, arrays: Mapping[str, np.ndarray], expected: Mapping[str, tuple[int, ...]]
+) -> None:
+    """Refuse arrays that are not float32 of exactly the expected names and shapes.
+
+    Raises:
+        PolicyError: naming the file, the array, its shape and the shape expected.
+    """
+    missing, unknown = expected.keys() - arrays.keys(), arrays.keys() - expected.keys()
+    if missing or unknown:
+        raise PolicyError(
+            f"{path}: missing arrays {sorted(missing)}, unknown arrays {sorted(unknown)}; "
+            "the weights are another network's: use the suite's version that wrote them"
+        )
+    for name, shape in expected.items():
+        value = arrays[name]
+        if value.shape != shape or value.dtype != np.float32:
+            raise PolicyError(
+                f"{path}: {name!r} is {value.dtype} {value.shape}, expected float32 {shape}; "
+                f"the weights do not fit {CONFIG}"
+            )
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise PolicyError(
+            f"{path}: missing; a checkpoint is a folder with {WEIGHTS} and {CONFIG}"
+        ) from None
+    except OSError as error:
+        raise PolicyError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+
+
+def _require(path: Path, table: Mapping[str, Any], key: str, kind: type) -> None:
+    value = table.get(key)
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise PolicyError(
+            f"{path}: key {key!r} is {value!r}, expected a value of type {kind.__name__}; "
+            "the file is damaged or not a checkpoint's: copy the whole folder again"
+        )

@@ -1,0 +1,44 @@
+"""The `PolicySpec` inside a torch or ONNX file: one JSON object under the key `policy.json`."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from policies.errors import PolicyError
+from policies.formats.spec_json import spec_from_json, spec_to_json
+from policies.spec import PolicySpec
+from tracks.common.files import to_json
+from tracks.common.provenance import stamp
+
+KEY = "policy.json"
+"""Name of the extra file in a torch archive, and of the metadata entry in ONNX."""
+SCHEMA = 1
+
+
+def embed(spec: PolicySpec, name: str, seed: int | None) -> str:
+    """Return the text that goes under `KEY`."""
+    data = {**stamp(SCHEMA, seed), "name": name, "spec": spec_to_json(spec)}
+    return to_json(data)
+
+
+def extract(text: str | bytes | None, where: str) -> PolicySpec:
+    """Return the spec that a file holds; the default one where it holds none.
+
+    Args:
+        text: what stands under `KEY`, or None.
+        where: the file, for the message.
+
+    Raises:
+        PolicyError: where the text is not JSON, of a newer schema, or not a spec.
+    """
+    if not text:
+        return PolicySpec()
+    where = f"{where}: {KEY}"
+    try:
+        data: Any = json.loads(text)
+    except ValueError as error:
+        raise PolicyError(f"{where}: not JSON ({error}); write it again") from None
+    if not isinstance(data, dict) or data.get("schema", SCHEMA) != SCHEMA:
+        raise PolicyError(f"{where}: expected an object with schema {SCHEMA}; update the suite")
+    return spec_from_json(data.get("spec", {}), f"{where}: spec")

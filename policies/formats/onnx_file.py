@@ -1,0 +1,164 @@
+"""ONNX files as `Policy`: standard operators only, run by onnxruntime on one CPU thread."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+
+from policies.block_policy import BlockPolicy, proven
+from policies.errors import PolicyError
+from policies.formats.embedded_spec import KEY, extract
+from policies.formats.program_inputs import INPUTS, check_inputs
+
+MAX_BYTES = 512 * 2**20
+"""Larger files, external data included, are refused."""
+_STANDARD = ("", "ai.onnx")
+
+
+def load_onnx(path: Path) -> BlockPolicy:
+    """Return the policy of an ONNX file.
+
+    Raises:
+        PolicyError: where the file is damaged, uses operators outside the standard or data
+            outside its folder, or its inputs and outputs do not fit.
+    """
+    proto = read_checked(path)
+    text = next((entry.value for entry in proto.metadata_props if entry.key == KEY), None)
+    spec = extract(text, str(path))
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.use_deterministic_compute = True
+    options.log_severity_level = 4
+    try:
+        session = onnxruntime.InferenceSession(
+            proto.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # onnxruntime's own exceptions share no public base
+        raise PolicyError(
+            f"{path}: onnxruntime {onnxruntime.__version__} cannot load it "
+            f"({_first_line(error)}); export it for an older opset"
+        ) from error
+    for value in (*session.get_inputs(), *session.get_outputs()):
+        if value.type != "tensor(float)":
+            raise PolicyError(f"{path}: {value.name!r} is {value.type}, expected tensor(float)")
+    found = {value.name: tuple(value.shape) for value in session.get_inputs()}
+    order = sorted(found, key=(*INPUTS, *found).index)
+    block, hidden_shape = check_inputs({name: found[name] for name in order}, spec, str(path))
+    outputs = [value.name for value in session.get_outputs()]
+    if len(outputs) != 1 + (hidden_shape != (0,)):
+        raise PolicyError(
+            f"{path}: outputs are {', '.join(outputs)}; expected the action and, where there is an "
+            "input 'hidden', its new value, in this order; see docs/policies.md"
+        )
+
+    def model(
+        state: np.ndarray, image: np.ndarray, hidden: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        feed = {"state": state, "image": image, "hidden": hidden}
+        action, *after = session.run(outputs, {name: feed[name] for name in found})
+        return np.asarray(action), np.asarray(after[0]) if after else hidden
+
+    return proven(BlockPolicy(path.name, spec, model, hidden_shape, block, block), str(path))
+
+
+def read_checked(path: Path) -> onnx.ModelProto:
+    """Read an ONNX file, its external data included, and check that it is harmless.
+
+    Raises:
+        PolicyError: where it is damaged, too large, not standard, or points outside its folder.
+    """
+    proto = _graph_of(path)
+    if proto.functions or proto.training_info:
+        raise PolicyError(f"{path}: holds functions or training graphs; export inference alone")
+    for graph in _graphs(proto.graph):
+        for node in graph.node:
+            if node.domain not in _STANDARD:
+                raise PolicyError(
+                    f"{path}: operator {node.op_type!r} is of domain {node.domain!r}; only "
+                    "standard operators are loaded: export without custom operators or "
+                    "runtime-specific optimisation"
+                )
+            if not onnx.defs.has(node.op_type):
+                raise PolicyError(f"{path}: operator {node.op_type!r} is not in the ONNX standard")
+    external = [tensor for tensor in _tensors(proto) if tensor.external_data]
+    size = path.stat().st_size
+    for tensor in external:
+        size += _data_file(path, tensor).stat().st_size
+    if size > MAX_BYTES:
+        raise PolicyError(f"{path}: {size} bytes with its data, allowed are {MAX_BYTES}")
+    try:
+        if external:
+            onnx.load_external_data_for_model(proto, str(path.resolve().parent))
+        onnx.checker.check_model(proto)
+    except Exception as error:
+        raise PolicyError(f"{path}: breaks the ONNX standard ({_first_line(error)})") from error
+    return proto
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return an ONNX file and the files that its tensors' data lie in, by name.
+
+    Raises:
+        PolicyError: where it is damaged or points outside its folder.
+    """
+    external = {_data_file(path, t) for t in _tensors(_graph_of(path)) if t.external_data}
+    return [path, *sorted(external)]
+
+
+def _graph_of(path: Path) -> onnx.ModelProto:
+    try:
+        return onnx.load_model(path, load_external_data=False)
+    except OSError as error:
+        raise PolicyError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+    except Exception as error:  # protobuf's DecodeError; protobuf is no dependency of ours
+        raise PolicyError(
+            f"{path}: not a whole ONNX file ({_first_line(error)}); export it again"
+        ) from None
+
+
+def _data_file(path: Path, tensor: onnx.TensorProto) -> Path:
+    """Return the file that a tensor's data lie in, which is in the same folder."""
+    location = next((e.value for e in tensor.external_data if e.key == "location"), "")
+    folder = path.resolve().parent
+    file = (folder / location).resolve()
+    if not location or Path(location).is_absolute() or not file.is_relative_to(folder):
+        raise PolicyError(
+            f"{path}: tensor {tensor.name!r} is kept in {location!r}, outside the file's folder; "
+            "export with the data inside"
+        )
+    if not file.is_file():
+        raise PolicyError(f"{path}: tensor {tensor.name!r} is kept in {file}, which is missing")
+    return file
+
+
+def _graphs(graph: onnx.GraphProto) -> Iterator[onnx.GraphProto]:
+    """Yield a graph and all graphs inside its nodes."""
+    yield graph
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                yield from _graphs(attribute.g)
+            for inner in attribute.graphs:
+                yield from _graphs(inner)
+
+
+def _tensors(proto: onnx.ModelProto) -> Iterator[Any]:
+    """Yield every tensor that is stored anywhere in the file."""
+    for graph in _graphs(proto.graph):
+        yield from graph.initializer
+        for sparse in graph.sparse_initializer:
+            yield from (sparse.values, sparse.indices)
+        for node in graph.node:
+            for attribute in node.attribute:
+                yield from (attribute.t, *attribute.tensors)
+                for sparse in (attribute.sparse_tensor, *attribute.sparse_tensors):
+                    yield from (sparse.values, sparse.indices)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

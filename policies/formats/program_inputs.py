@@ -1,0 +1,60 @@
+"""The inputs that a policy from elsewhere must have, whatever its format."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from policies.block_policy import BLOCK
+from policies.errors import PolicyError
+from policies.formats.embedded_spec import KEY
+from policies.spec import PolicySpec
+
+INPUTS = ("state", "image", "hidden")
+"""Names of a program's inputs, in order; a policy without memory leaves the last out."""
+
+
+def check_inputs(
+    shapes: dict[str, tuple[Any, ...]], spec: PolicySpec, where: str
+) -> tuple[int, tuple[int, ...]]:
+    """Return (rows a block, shape of a row's hidden state) from a program's inputs.
+
+    Args:
+        shapes: by input name, in order; sizes that are not ints are free.
+        spec: what the file says of its camera.
+        where: the file, for the message.
+
+    Raises:
+        PolicyError: where names, ranks or sizes are not those of an observation.
+    """
+    if tuple(shapes) not in (INPUTS, INPUTS[:2]):
+        raise PolicyError(inputs_message(where, tuple(shapes)))
+    rows = {shape[0] for shape in shapes.values() if shape and isinstance(shape[0], int)}
+    block = rows.pop() if rows else BLOCK
+    hidden = shapes.get("hidden", (None, 0))[1:]
+    if rows or not hidden or not all(isinstance(size, int) for size in hidden):
+        raise PolicyError(
+            f"{where}: inputs have shapes {shapes}; all need the batch as first axis, and the "
+            "other axes of 'hidden' must be fixed"
+        )
+    image = (spec.camera.height, spec.camera.width)
+    for name, expected in (("state", (spec.state_size,)), ("image", image)):
+        found = shapes[name][1:]
+        free = len(found) == len(expected) and all(
+            size == want or not isinstance(size, int)
+            for size, want in zip(found, expected, strict=True)
+        )
+        if not free:
+            raise PolicyError(
+                f"{where}: input {name!r} has shape {shapes[name]}, expected (batch, "
+                f"{', '.join(map(str, expected))}); the camera's size, second_gate and gate_axis "
+                f"stand in {KEY}"
+            )
+    return block, tuple(hidden)
+
+
+def inputs_message(where: str, names: tuple[str, ...]) -> str:
+    """Return the error's message for a program whose inputs have other names."""
+    return (
+        f"{where}: inputs are {', '.join(names) or 'none'}; expected {', '.join(INPUTS)} in this "
+        "order (hidden may be left out); see docs/policies.md"
+    )

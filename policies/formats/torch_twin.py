@@ -1,0 +1,62 @@
+"""Our network as a torch module, for export and for people who deploy with torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import nn
+
+from policies.networks.layouts import image_weight, kernel_oihw, rows_are_outputs
+from policies.networks.network import CHANNELS, LEAK, flat_features
+from policies.spec import ACTION_SIZE, PolicySpec
+
+CONVOLUTIONS = ("conv1", "conv2", "conv3")
+LINEAR = ("state", "action")
+
+
+class TorchTwin(nn.Module):
+    """The CNN-GRU of `policies.networks.network` with torch's layers and layouts."""
+
+    def __init__(self, spec: PolicySpec) -> None:
+        """Make the layers; `load_params` fills them."""
+        super().__init__()
+        self.pool = nn.MaxPool2d(2)
+        self.conv1 = nn.Conv2d(1, CHANNELS[0], 2, stride=2, bias=False)
+        self.conv2 = nn.Conv2d(CHANNELS[0], CHANNELS[1], 3, bias=False)
+        self.conv3 = nn.Conv2d(CHANNELS[1], CHANNELS[2], 3, bias=False)
+        self.image = nn.Linear(flat_features(spec), spec.hidden_size, bias=False)
+        self.state = nn.Linear(spec.state_size, spec.hidden_size)
+        self.gru = nn.GRUCell(spec.hidden_size, spec.hidden_size)
+        self.action = nn.Linear(spec.hidden_size, ACTION_SIZE, bias=False)
+        self.leak = nn.LeakyReLU(LEAK)
+
+    def forward(
+        self, state: torch.Tensor, image: torch.Tensor, hidden: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (action_b (N, 3) [m/s^2], hidden' (N, hidden)); see `network.step`."""
+        x = self.pool(image.unsqueeze(1))
+        x = self.leak(self.conv1(x))
+        x = self.leak(self.conv2(x))
+        x = self.leak(self.conv3(x))
+        x = self.leak(self.image(x.flatten(1)) + self.state(state))
+        hidden = self.gru(x, hidden)
+        return self.action(self.leak(hidden)), hidden
+
+
+def torch_twin(params: Mapping[str, np.ndarray], spec: PolicySpec) -> TorchTwin:
+    """Return the module with the network's parameters in it, in evaluation mode."""
+    arrays = {f"{name}.weight": kernel_oihw(params[f"{name}.weight"]) for name in CONVOLUTIONS}
+    arrays |= {f"{name}.weight": rows_are_outputs(params[f"{name}.weight"]) for name in LINEAR}
+    arrays |= {
+        "image.weight": image_weight(params, spec),
+        "state.bias": np.array(params["state.bias"]),
+        "gru.weight_ih": rows_are_outputs(params["gru.weight_input"]),
+        "gru.weight_hh": rows_are_outputs(params["gru.weight_hidden"]),
+        "gru.bias_ih": np.array(params["gru.bias_input"]),
+        "gru.bias_hh": np.array(params["gru.bias_hidden"]),
+    }
+    twin = TorchTwin(spec).eval()
+    twin.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
+    return twin.requires_grad_(False)

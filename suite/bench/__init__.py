@@ -1,9 +1,0 @@
-"""Benchmarks: our hot paths against plain implementations of the same, in turn in one run."""
-
-from __future__ import annotations
-
-BENCHES: dict[str, str] = {
-    "train": "gradient steps a second against a plain torch-eager loop of the same method",
-    "diagnose": "refits a minute of six numbers against mujoco.sysid on the same flights",
-}
-"""Name -> one-line summary; the bench NAME is suite/bench/NAME.py with `run() -> Comparison`."""

@@ -1,0 +1,1 @@
+"""What flights can say about each parameter, without a diagnosis."""

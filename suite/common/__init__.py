@@ -1,0 +1,1 @@
+"""What commands share: console, errors, reports, charts, work."""

@@ -1,0 +1,105 @@
+"""What a run was made of: versions, machine, command and resolved configuration."""
+
+from __future__ import annotations
+
+import importlib.metadata as metadata
+import json
+import os
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+from eval.judging.sharding import usable_cores
+from tracks.common.files import write_json
+from tracks.common.provenance import stamp
+
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "jax",
+    "jaxlib",
+    "optax",
+    "safetensors",
+    "mujoco",
+    "mujoco-mjx",
+    "dm-control",
+    "gymnasium",
+    "trimesh",
+    "torch",
+    "onnx",
+    "onnxruntime",
+    "pyarrow",
+    "rerun-sdk",
+)
+"""The packages that can change a result."""
+
+
+def package_versions() -> dict[str, str | None]:
+    """Return the installed version of each of `PACKAGES`, None where it is missing."""
+    versions: dict[str, str | None] = {}
+    for name in PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = None
+    return versions
+
+
+def machine() -> dict[str, Any]:
+    """Return the machine's system, processor, usable cores and memory [bytes]."""
+    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return {
+        "system": platform.platform(),
+        "processor": _processor(),
+        "cores": usable_cores(),
+        "memory_bytes": pages,
+    }
+
+
+def _processor() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in text.splitlines() if "model name" in line]
+    return names[0] if names else platform.machine()
+
+
+def run_record(config: Any, seed: int | None) -> dict[str, Any]:
+    """Return all that is needed to repeat a run: the stamp, versions, machine and `config`.
+
+    Args:
+        config: the resolved configuration, a dataclass.
+        seed: the run's seed, None where it has none.
+    """
+    return {
+        **stamp(schema=1, seed=seed),
+        "python": platform.python_version(),
+        "packages": package_versions(),
+        "machine": machine(),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "config_type": f"{type(config).__module__}.{type(config).__qualname__}",
+        "config": config,
+    }
+
+
+def write_run_record(
+    folder: str | os.PathLike[str], config: Any, seed: int | None, goes_on: bool = False
+) -> None:
+    """Write `run_record` to `folder`/run.json.
+
+    Args:
+        folder: of the run.
+        config: as `run_record` takes it.
+        seed: likewise.
+        goes_on: the run that the folder's record is of goes on; that record's commits are kept as
+            `earlier_commits`, since all of them made the run.
+    """
+    path, record = Path(folder) / "run.json", run_record(config, seed)
+    commits: set[str] = set()
+    if goes_on and path.is_file():
+        before = json.loads(path.read_text(encoding="utf-8"))
+        commits = {*before.get("earlier_commits", []), before["git_commit"] or "unknown"}
+    earlier = sorted(commits - {record["git_commit"]})
+    write_json(path, {**record, "earlier_commits": earlier} if earlier else record)

@@ -1,0 +1,1 @@
+"""Flight logs as what is fitted to: windows, noise, hold-out."""

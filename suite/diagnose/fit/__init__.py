@@ -1,0 +1,1 @@
+"""The model, its normal equations, and the search for what is missing."""

@@ -1,0 +1,141 @@
+"""Every fitted number of the catalogue as one vector, and the candidates that may explain a gap."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from eval.effects import EFFECTS, all_values
+from eval.effects.interface import at
+from eval.vehicles.vehicle import Vehicle
+from tracks.geometry.scene import Array
+
+NOT_FITTED = ("gusts",)
+"""Random wind cannot be flown again, so no rollout can fit it."""
+
+
+Layout = tuple[tuple[str, str, int | None], ...]
+"""Effect, parameter and component of each number."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One number of the vector."""
+
+    effect: str
+    parameter: str
+    component: int | None
+    """Which of a vector, or None for a plain number."""
+    neutral: float
+    """Where the effect is absent."""
+    low: float
+    high: float
+    start: float
+    """As the vehicle file has it."""
+    step: float
+    """Usual magnitude, to scale equations."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A way to explain a gap: numbers that are fitted together."""
+
+    name: str
+    """Of the effect; `weak_motor` comes once a rotor."""
+    indices: tuple[int, ...]
+    """Places in the vector."""
+    label: str
+    """For people: the name, and the rotor where it is one of four."""
+
+
+@dataclass(frozen=True)
+class Space:
+    """The vector of all numbers that can be fitted on a vehicle."""
+
+    entries: tuple[Entry, ...]
+    base: Mapping[str, Any]
+    """Values of every effect, as the vehicle file has them."""
+
+    def array(self, field: str) -> np.ndarray:
+        """Return `field` of all entries, (P,)."""
+        return np.array([getattr(entry, field) for entry in self.entries])
+
+    def effects(self, theta: Array) -> dict[str, Any]:
+        """Return the values of every effect for `theta` (P,), numpy or JAX."""
+        return effects_at(self.layout, self.base, theta)
+
+    @property
+    def layout(self) -> Layout:
+        """Which number of the vector is what; the same for every vehicle."""
+        return tuple((e.effect, e.parameter, e.component) for e in self.entries)
+
+
+def effects_at(layout: Layout, base: Mapping[str, Any], theta: Array) -> dict[str, Any]:
+    """Return `base` with the numbers `theta` (P,) in their places; all may be traced."""
+    xp = theta.__array_namespace__()
+    values = {name: value._asdict() for name, value in base.items()}
+    place = {entry: i for i, entry in enumerate(layout)}
+    for (name, parameter, component), i in place.items():
+        if component is None:
+            values[name][parameter] = theta[i]
+        elif component == 0:
+            old = xp.asarray(getattr(base[name], parameter))
+            parts = [
+                theta[place[name, parameter, k]] if (name, parameter, k) in place else old[k]
+                for k in range(old.shape[0])
+            ]
+            values[name][parameter] = xp.stack(parts)
+    return {name: type(base[name])(**fields) for name, fields in values.items()}
+
+
+def make_space(vehicle: Vehicle) -> Space:
+    """Return the vector of `vehicle`: all but what no flight can tell."""
+    base, entries = all_values(vehicle), []
+    for name, effect in EFFECTS.items():
+        if name in NOT_FITTED:
+            continue
+        for parameter in effect.parameters:
+            if not parameter.fitted:
+                continue
+            now = np.atleast_1d(np.asarray(getattr(base[name], parameter.name), dtype=float))
+            for k in range(max(parameter.size, 1)):
+                if k in parameter.unseen:
+                    continue
+                entries.append(
+                    Entry(
+                        effect=name,
+                        parameter=parameter.name,
+                        component=k if parameter.size else None,
+                        neutral=at(parameter.neutral, vehicle),
+                        low=at(parameter.low, vehicle),
+                        high=at(parameter.high, vehicle),
+                        start=float(now[k]),
+                        step=parameter.typical[1],
+                    )
+                )
+    return Space(tuple(entries), base)
+
+
+def candidates(space: Space, voltage: bool, accelerometer: bool) -> list[Candidate]:
+    """Return what may be named on logs with or without a voltage and an accelerometer."""
+    found = []
+    for name in EFFECTS:
+        at_ = [i for i, e in enumerate(space.entries) if e.effect == name]
+        if not at_ or (name == "accelerometer_bias" and not accelerometer):
+            continue
+        if name == "battery_sag":
+            wanted = "per_volt" if voltage else "rate"
+            at_ = [i for i in at_ if space.entries[i].parameter == wanted]
+        if name == "weak_motor":
+            found += [Candidate(name, (i,), f"{name} {k + 1}") for k, i in enumerate(at_)]
+        else:
+            found.append(Candidate(name, tuple(at_), name))
+    return found
+
+
+def indices_of(chosen: Sequence[Candidate]) -> list[int]:
+    """Return the places of all numbers of `chosen`, in order and once each."""
+    return sorted({i for candidate in chosen for i in candidate.indices})

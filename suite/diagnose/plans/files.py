@@ -1,0 +1,88 @@
+"""Commanded trajectories as files: one CSV of set points a flight, and what they are for.
+
+`plan.json` holds the numbers that make each trajectory again; the CSV holds where to be, how fast,
+how accelerated and where to look at every hundredth of a second, for autopilots that follow set
+points.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from suite.diagnose.plans.trajectory import Trajectory
+from tracks.common.files import write_json, write_text
+from tracks.common.provenance import stamp
+
+SCHEMA = 1
+"""Version of plan.json."""
+RATE_HZ = 100.0
+"""Of the set points."""
+COLUMNS = (
+    "time",
+    *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"),
+    "yaw",
+)
+"""Of a CSV: s, m, m/s, m/s^2 in the world, and rad about world z."""
+NAME = "plan.json"
+
+
+def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
+    """Write `ways` in `folder`; return what plan.json holds.
+
+    Args:
+        folder: made where it is missing.
+        ways: one a flight.
+        words: what the flights are for, for people.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    flights = []
+    for number, way in enumerate(ways, 1):
+        name = f"{number}_{way.kind}.csv"
+        time_s = np.arange(0.0, way.duration_s + 0.5 / RATE_HZ, 1.0 / RATE_HZ)
+        wanted = way.reference(time_s)
+        table = np.column_stack([time_s, wanted.pos_w, wanted.vel_w, wanted.acc_w, wanted.yaw])
+        rows = [",".join(COLUMNS), *(",".join(f"{v:.6g}" for v in row) for row in table)]
+        write_text(folder / name, "\n".join(rows) + "\n")
+        flights.append(
+            {
+                "file": name,
+                "trajectory": asdict(way),
+                "room": np.ptp(wanted.pos_w, axis=0).tolist(),
+                "top_speed": float(np.linalg.norm(wanted.vel_w, axis=1).max()),
+                "top_acceleration": float(np.linalg.norm(wanted.acc_w, axis=1).max()),
+                "flown": None,
+            }
+        )
+    plan = {"flights": flights, "words": list(words)}
+    write_json(folder / NAME, {**plan, **stamp(SCHEMA, None)})
+    return plan
+
+
+def read_plan(folder: Path) -> list[Trajectory]:
+    """Return the trajectories of the plan in `folder`.
+
+    Raises:
+        ValueError: where there is none, or one that cannot be read, naming file and key.
+    """
+    path = folder / NAME
+    try:
+        plan = json.loads(path.read_text(encoding="utf-8"))
+        return [_trajectory(flight["trajectory"], path) for flight in plan["flights"]]
+    except (OSError, KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: no plan: {error}; suite diagnose --plan writes one") from error
+
+
+def _trajectory(values: Mapping[str, Any], path: Path) -> Trajectory:
+    known = {field.name for field in fields(Trajectory)}
+    strange = sorted(set(values) - known)
+    if strange:
+        raise ValueError(
+            f"{path}: trajectory: unknown key {strange[0]!r}; allowed: {sorted(known)}"
+        )
+    return Trajectory(**values)

@@ -1,0 +1,1 @@
+"""A diagnosis as JSON, HTML and recording."""

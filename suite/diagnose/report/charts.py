@@ -1,0 +1,203 @@
+"""Charts of a diagnosis as PNG."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from suite.common.charts import plain_axes, png, titled
+from suite.diagnose.fit.permutation import Score
+from suite.diagnose.verdict.black_box import Contests
+from suite.diagnose.verdict.gap import HORIZONS_S, Gap, interval
+from suite.diagnose.verdict.proof import by_group
+from suite.diagnose.verdict.where import GROUPS, UNITS, Where, binned
+
+BEFORE, AFTER, WRONG, BOX = "#8b93a1", "#2463c9", "#e0892b", "#7a5cb8"
+FLOOR = "#1d2430"
+SHOWN = 14
+"""Candidates in the chart."""
+HORIZON = 1
+"""Place among the horizons of what is drawn against conditions: 0.5 s."""
+CELLS = 7
+"""Places at which the drift is averaged."""
+
+
+def gains_chart(scores: Sequence[Score], threshold: float | None, named: set[str]) -> bytes:
+    """Return the gains of the best candidates, and what chance reaches.
+
+    Args:
+        scores: best first.
+        threshold: gain that the best of all candidates reaches by chance once in a hundred.
+        named: labels of what was named.
+    """
+    shown = list(scores[:SHOWN])[::-1]
+    figure = Figure(figsize=(8.2, 0.6 + 0.27 * len(shown)), layout="constrained")
+    axes = figure.subplots()
+    gains = np.maximum([s.gain for s in shown], 0.0)
+    colours = [AFTER if s.candidate.label in named else "#c3c8d1" for s in shown]
+    axes.barh(range(len(shown)), gains, color=colours, height=0.7)
+    axes.set_yticks(range(len(shown)), [s.candidate.label for s in shown])
+    if threshold is not None and threshold > 0.0:
+        axes.axvline(threshold, color=WRONG, lw=1.5)
+        axes.annotate(
+            "chance, once in 100", (threshold, 0), xytext=(4, -2), textcoords="offset points",
+            color=WRONG, fontsize=8,
+        )  # fmt: skip
+    axes.set_xscale("symlog", linthresh=10.0)
+    axes.set_xlim(left=0.0)
+    titled(axes, "Fall of the squared error on stretches left out [noise variances]")
+    return png(figure)
+
+
+def where_chart(where: Where) -> bytes:
+    """Return errors of 0.5 s rollouts over their noise floor, against what was flown."""
+    figure = Figure(figsize=(11.0, 7.4), layout="constrained")
+    grid = figure.subplots(len(GROUPS), len(UNITS), sharey="row", squeeze=False)
+    series = [("as given", where.before, BEFORE)]
+    if where.after is not where.before:
+        series.append(("with what was named", where.after, AFTER))
+    for column, (condition, unit) in enumerate(UNITS.items()):
+        edges = where.edges[condition]
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        for label, over, colour in series:
+            table, _ = binned(where, over, condition)
+            rows = by_group(table[HORIZON])
+            for row in range(len(GROUPS)):
+                grid[row][column].plot(
+                    middle, rows[:, row], "o-", ms=3.5, lw=1.5, color=colour, label=label
+                )
+        grid[-1][column].set_xlabel(f"{condition} [{unit}]", fontsize=9)
+    for row, group in enumerate(GROUPS):
+        for axes in grid[row]:
+            axes.axhline(1.0, color=FLOOR, lw=0.8, ls=":")
+            axes.set_yscale("log")
+            _few_ticks(axes)
+            plain_axes(axes)
+        grid[row][0].set_ylabel(f"{group}\nerror / noise floor", fontsize=9)
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False, fontsize=9)
+    return png(figure)
+
+
+def drift_chart(where: Where) -> bytes:
+    """Return what acceleration the model lacks against velocity, and its turn against rates."""
+    figure = Figure(figsize=(11.0, 5.2), layout="constrained")
+    grid = figure.subplots(2, 3)
+    series = [(where.drift_before, BEFORE, "as given")]
+    if where.after is not where.before:
+        series.append((where.drift_after, AFTER, "with what was named"))
+    for axis in range(3):
+        name = "xyz"[axis]
+        for row, (state, scale) in enumerate(((where.vel_b, 1.0), (where.rate_b, 180.0 / np.pi))):
+            axes = grid[row][axis]
+            for drift, colour, label in series:
+                _binned_means(axes, state[:, axis], scale * drift[:, 3 * row + axis], colour, label)
+            axes.axhline(0.0, color=FLOOR, lw=0.8, ls=":")
+            plain_axes(axes)
+        grid[0][axis].set_title(
+            f"lacking acceleration along body {name} [m/s²]", loc="left", fontsize=9
+        )
+        grid[0][axis].set_xlabel(f"velocity along body {name} [m/s]", fontsize=8)
+        grid[1][axis].set_title(f"lacking turn about body {name} in 0.5 s [deg]", loc="left",
+                                fontsize=9)  # fmt: skip
+        grid[1][axis].set_xlabel(f"rate about body {name} [rad/s]", fontsize=8)
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False, fontsize=9)
+    return png(figure)
+
+
+def gap_chart(rows: Sequence[tuple[str, Gap, str]], speed: np.ndarray, seed: int) -> bytes:
+    """Return gaps with their intervals, and each rollout's error against its speed.
+
+    Args:
+        rows: label, gap and colour, from top to bottom.
+        speed: (W,) of the held-out rollouts at their starts [m/s].
+        seed: of the intervals' draws.
+    """
+    figure = Figure(figsize=(11.0, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for place, (_, gap, colour) in enumerate(rows[::-1]):
+        low, high = interval(gap.score, seed)
+        left.plot([low, high], [place, place], color=colour, lw=2.5, solid_capstyle="butt")
+        left.plot(gap.rms, place, "o", ms=7, color=colour)
+    left.set_yticks(range(len(rows)), [label for label, _, _ in rows[::-1]])
+    left.set_ylim(-0.6, len(rows) - 0.4)
+    left.axvline(1.0, color=FLOOR, lw=0.8, ls=":")
+    _from_one(left, [interval(gap.score, seed)[1] for _, gap, _ in rows])
+    titled(left, "Gap on held-out flights, 1 is the noise floor")
+    for label, gap, colour in rows:
+        if len(gap.score) == len(speed):
+            right.plot(speed, np.sqrt(gap.score), "o", ms=3.5, color=colour, label=label)
+    right.axhline(1.0, color=FLOOR, lw=0.8, ls=":")
+    right.set_yscale("log")
+    _few_ticks(right)
+    right.set_xlabel("speed at the start [m/s]", fontsize=9)
+    titled(right, "Each held-out rollout")
+    return png(figure)
+
+
+def contest_chart(found: Contests, seed: int) -> bytes:
+    """Return the gaps of the named effect and of the black box, inside and outside."""
+    sides = [found.held_out] + ([found.outside] if found.outside else [])
+    figure = Figure(figsize=(11.0, 2.4), layout="constrained")
+    for axes, side in zip(figure.subplots(1, 2), sides, strict=False):
+        rows = [("as given", side.before, BEFORE)]
+        if side.named is not None:
+            rows.append(("named effect", side.named, AFTER))
+        rows.append(("Delta Action Model", side.black_box, BOX))
+        for place, (_, gap, colour) in enumerate(rows[::-1]):
+            low, high = interval(gap.score, seed)
+            axes.plot([low, high], [place, place], color=colour, lw=2.5, solid_capstyle="butt")
+            axes.plot(gap.rms, place, "o", ms=7, color=colour)
+        axes.set_yticks(range(len(rows)), [label for label, _, _ in rows[::-1]])
+        axes.set_ylim(-0.6, len(rows) - 0.4)
+        axes.axvline(1.0, color=FLOOR, lw=0.8, ls=":")
+        _from_one(axes, [interval(gap.score, seed)[1] for _, gap, _ in rows])
+        titled(axes, f"Gap on {side.judged_on}")
+    for axes in figure.axes[len(sides) :]:
+        axes.set_axis_off()
+    return png(figure)
+
+
+def _binned_means(
+    axes: Axes, state: np.ndarray, drift: np.ndarray, colour: str, label: str
+) -> None:
+    good = np.isfinite(drift)
+    state, drift = state[good], drift[good]
+    if not len(state):
+        return
+    axes.plot(state, drift, ".", ms=2.5, color=colour, alpha=0.3)
+    edges = np.unique(np.quantile(state, np.linspace(0.0, 1.0, CELLS + 1)))
+    place = np.clip(np.searchsorted(edges, state, side="right") - 1, 0, max(len(edges) - 2, 0))
+    rows = [place == b for b in np.unique(place)]
+    middle = [state[row].mean() for row in rows]
+    mean = [drift[row].mean() for row in rows]
+    error = [1.96 * drift[row].std() / np.sqrt(row.sum()) for row in rows]
+    axes.errorbar(middle, mean, error, fmt="o-", ms=4, lw=1.5, color=colour, label=label)
+
+
+def _from_one(axes: Axes, highest: Sequence[float]) -> None:
+    axes.set_xscale("log")
+    axes.set_xlim(0.8, 1.25 * max(*highest, 1.5))
+    _few_ticks(axes, "x")
+
+
+def _few_ticks(axes: Axes, which: str = "y") -> None:
+    """Write numbers as people do on a logarithmic axis."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+    low, high = axis.get_view_interval()
+    if high / max(low, 1e-9) > 300.0:
+        axis.set_major_locator(LogLocator())
+
+
+COLOURS: Mapping[str, str] = {"before": BEFORE, "after": AFTER, "wrong": WRONG, "box": BOX}
+"""Of what is compared."""
+HORIZON_S = HORIZONS_S[HORIZON]

@@ -1,0 +1,145 @@
+"""The Delta Action Model in the quadrotor that is diagnosed: what a black box removes of a gap.
+
+The paper's network (Su et al. 2026, Sec. III-D) takes velocity in body axes, attitude and the net
+acceleration that the command asks for. Its output is added to the body's acceleration, as in the
+point mass; three more outputs turn the body, since these commands hold body rates besides. It is
+fitted by gradients through the rollouts of the windows, to the same errors by which names are
+judged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from eval.effects.interface import GRAVITY
+from eval.quadrotor.plant import Motion
+from policies.networks import delta_network
+from suite.diagnose.data.windows import Windows
+from suite.diagnose.fit.model import BATCH, Model
+from suite.diagnose.fit.rollout import STATE, Feedback
+from suite.diagnose.verdict.gap import Gap, gap_of, true_starts
+from tracks.geometry.rotation import to_local
+
+PERIOD_S = 0.02
+"""The network decides this often, and its correction is held [s]."""
+OUTPUT_SCALE = (1.0, 1.0, 1.0, 5.0, 5.0, 5.0)
+"""Brings m/s^2 and rad/s^2 to order one."""
+
+
+@dataclass(frozen=True)
+class BlackBoxConfig:
+    """The fit of the black box."""
+
+    iterations: int = 300
+    """Gradient steps, of a dozen windows each."""
+    rate: float = 5e-3
+    """Peak learning rate; it falls to zero as a cosine."""
+    seed: int = 0
+    """Of the network and of the batches."""
+
+
+def fit_black_box(
+    model: Model,
+    windows: Windows,
+    sigma: np.ndarray,
+    config: BlackBoxConfig,
+    show: Callable[[int, str], None] = lambda *_: None,
+) -> dict[str, np.ndarray]:
+    """Return the network fitted to `windows`.
+
+    Args:
+        model: with the numbers of the vehicle file.
+        windows: of the flights that are fitted.
+        sigma: (19,) noise of each channel.
+        config: of the fit.
+        show: called with (iteration, words) as it goes.
+    """
+    theta = model.space.array("start")
+    offset = true_starts(model, theta, windows)
+    weight = 1.0 / _floors(model, theta, offset, windows, sigma)
+    optimizer = optax.adam(optax.cosine_decay_schedule(config.rate, config.iterations))
+
+    def loss(params: Any, offset: Any, windows: Windows, weight: Any) -> Any:
+        over = _apart(model, theta, params, offset, windows)[..., :STATE] * weight
+        # Far from the record a square would let one window decide.
+        return (jnp.sqrt(1.0 + over**2) - 1.0).mean()
+
+    @jax.jit
+    def update(params: Any, state: Any, *batch: Any) -> tuple[Any, Any, Any]:
+        value, gradient = jax.value_and_grad(loss)(params, *batch)
+        change, state = optimizer.update(gradient, state)
+        return optax.apply_updates(params, change), state, value
+
+    rng = np.random.default_rng(config.seed)
+    with jax.enable_x64(True):
+        params = _start(config.seed)
+        state = optimizer.init(params)
+        for iteration in range(config.iterations):
+            rows = rng.choice(len(offset), BATCH, replace=len(offset) < BATCH)
+            batch = (offset[rows], Windows(*(f[rows] for f in windows)), weight[rows])
+            params, state, value = update(params, state, *batch)
+            if not np.isfinite(value):
+                raise FloatingPointError(f"the black box's fit diverged at step {iteration + 1}")
+            show(iteration + 1, f"error {float(value):.2f}")
+        return {name: np.asarray(value) for name, value in params.items()}
+
+
+def black_box_gap(
+    model: Model, params: dict[str, np.ndarray], windows: Windows, sigma: np.ndarray
+) -> Gap:
+    """Return the gap on `windows` that is left with the fitted network."""
+    theta = model.space.array("start")
+    offset = true_starts(model, theta, windows)
+    linear = model.linearise(theta, offset, windows, model.starts)
+    fly = jax.jit(lambda x, w: _apart(model, theta, params, x, w))
+    parts = []
+    with jax.enable_x64(True):
+        for first in range(0, len(offset), BATCH):
+            rows = np.minimum(np.arange(first, first + BATCH), len(offset) - 1)
+            parts.append(np.asarray(fly(offset[rows], Windows(*(f[rows] for f in windows)))))
+    residual = -np.concatenate(parts)[: len(offset)]
+    return gap_of(linear._replace(residual=residual), windows, sigma)
+
+
+def _start(seed: int) -> dict[str, Any]:
+    params = {k: jnp.asarray(v, float) for k, v in delta_network.init(jax.random.key(seed)).items()}
+    params["output.weight"] = jnp.zeros((delta_network.HIDDEN, len(OUTPUT_SCALE)))
+    params["output.bias"] = jnp.zeros(len(OUTPUT_SCALE))
+    return params
+
+
+def _apart(model: Model, theta: Any, params: Any, offset: Any, windows: Windows) -> Any:
+    """Return simulated - measured (B, N, 19) under the network."""
+    count, every = len(offset), max(1, round(PERIOD_S / model.dt))
+    scale, up = jnp.asarray(OUTPUT_SCALE), jnp.array([0.0, 0.0, 1.0])
+
+    def act(memory: Any, motion: Motion, order: Any, index: Any) -> tuple[Any, Any]:
+        def decide(_: Any) -> Any:
+            row3 = motion.rot_w[:, 2]
+            action_b = order[:, :1] * up - GRAVITY * row3
+            vel_b = to_local(motion.rot_w, motion.vel_w)
+            push, hidden = delta_network.step(params, memory[0], vel_b, row3, action_b)
+            return hidden, scale * push
+
+        memory = jax.lax.cond(index % every == 0, decide, lambda _: memory, None)
+        return memory, memory[1]
+
+    start = (jnp.zeros((count, delta_network.HIDDEN)), jnp.zeros((count, len(OUTPUT_SCALE))))
+    return model.fly(theta, offset, windows, None, Feedback(start, act))[0]
+
+
+def _floors(
+    model: Model, theta: np.ndarray, offset: np.ndarray, windows: Windows, sigma: np.ndarray
+) -> np.ndarray:
+    """Return what noise makes of a perfect model's errors, (W, N, 12)."""
+    own = np.where(np.isfinite(sigma), sigma, 0.0)[:STATE]
+    linear = model.linearise(theta, offset, windows, model.starts)
+    slope = linear.slope[..., :STATE, :STATE]
+    return np.sqrt(own**2 + ((slope * own) ** 2).sum(axis=-1)) + 1e-9

@@ -1,0 +1,109 @@
+"""`suite bench diagnose`: the diagnosis's refit against `mujoco.sysid` on the same data.
+
+Both fit mass, centre of mass and inertia, six numbers, to the same stretches of five flights of
+10 s, from the same start, in turn. Timed is the fit alone: reading logs is done, the compiled
+programs are loaded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from suite.common.errors import WorkFailed
+from suite.diagnose.data.noise import noise_of
+from suite.diagnose.fit.intervals import errors_of
+from suite.diagnose.fit.model import Model
+from suite.diagnose.fit.normal_equations import Sums, fit, make_frame
+from suite.diagnose.fit.search import start_state, trusted
+from suite.experiments.bench.compare import Comparison, Figure, in_turn
+from suite.experiments.bench.rigid_body import Task, make_task
+
+SEED = 20_001
+"""Of the truth, the flights and their noise; no blind case and no tuning used it."""
+ROUNDS = 3
+
+
+def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Comparison:
+    """Time both refits in turn and compare what they say.
+
+    Args:
+        seed: of the truth, the flights and their noise.
+        duration_s: of each of the five flights.
+        rounds: how often each side is timed, after one call to warm up.
+
+    Raises:
+        WorkFailed: where `mujoco.sysid` is not installed whole.
+    """
+    from suite.experiments.bench import sysid_baseline
+
+    if not sysid_baseline.is_installed():
+        raise WorkFailed("mujoco.sysid lacks some of its packages: pip install 'mujoco[sysid]'")
+    task = make_task(seed, duration_s)
+    model = Model(task.nominal, task.space, driven_by_rotors=True, voltage=False)
+    problem = sysid_baseline.prepare(task, _noise(model, task))
+    answers: dict[str, tuple[np.ndarray, Sums]] = {}
+
+    def ours() -> None:
+        answers["ours"] = refit(model, task)
+
+    def theirs() -> None:
+        answers["mujoco.sysid"] = sysid_baseline.refit(problem)
+
+    seconds = in_turn(ours, theirs, rounds)
+    details = {
+        **_agreement(task, answers),
+        "stretches": len(task.windows.flight),
+        "seed": seed,
+        "seconds": dict(zip(answers, seconds, strict=True)),
+    }
+    first, second = (Figure(60.0 / each, "refits/min") for each in seconds)
+    return Comparison("diagnose", first, second, details=details)
+
+
+def refit(model: Model, task: Task) -> tuple[np.ndarray, Sums]:
+    """Return the fitted numbers (K,) and their normal equations, as the diagnosis does it.
+
+    Noise, slopes along what is free in every stretch, and the Gauss-Newton rounds on stretches as
+    long as the model can be trusted, which get longer as the numbers get better.
+    """
+    indices, state = list(task.indices), start_state(model, task.windows)
+    seen = 0
+    while True:
+        linear = model.linearise(state.theta, state.offset, task.windows, [*indices, *model.starts])
+        view = trusted(task.windows, linear.residual)
+        frame = make_frame(linear, noise_of(linear.residual, task.windows), view)
+        state, sums = fit(model, view, frame, state, indices)
+        if view.seen.sum() <= seen:
+            return state.theta[indices], sums
+        seen = view.seen.sum()
+
+
+def _noise(model: Model, task: Task) -> np.ndarray:
+    begin = start_state(model, task.windows)
+    residual = model.residual(begin.theta, begin.offset, task.windows)
+    return noise_of(residual, task.windows)
+
+
+def _agreement(task: Task, answers: Mapping[str, tuple[np.ndarray, Sums]]) -> dict[str, Any]:
+    """Return each side's numbers, and how far they are apart over the joint 95 % half-width.
+
+    The half-widths are worked out in the same way for both, from how stretches disagree; the joint
+    one is their root sum of squares.
+    """
+    widths = {side: errors_of(sums) for side, (_, sums) in answers.items()}
+    first, second = (values for values, _ in answers.values())
+    apart = np.abs(first - second) / np.hypot(*widths.values())
+    rows = {}
+    for k, name in enumerate(task.names):
+        rows[name] = {
+            "truth": float(f"{task.truth[k]:.4g}"),
+            **{
+                side: f"{values[k]:.4g} +- {widths[side][k]:.2g}"
+                for side, (values, _) in answers.items()
+            },
+            "apart_over_joint": round(float(apart[k]), 2),
+        }
+    return {**rows, "inside_the_joint_interval": f"{(apart <= 1.0).sum()} of {len(rows)}"}

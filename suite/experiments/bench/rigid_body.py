@@ -1,0 +1,103 @@
+"""What both sides of the diagnosis benchmark are given: the same stretches of the same flights.
+
+Motors drive both: a loop around the rotors is no part of a MuJoCo model, and mass, centre of mass
+and inertia are what MuJoCo's own identification is made for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from eval.effects import EFFECTS, all_values
+from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.windows import Windows, cut
+from suite.diagnose.fit.parameters import Space, make_space
+
+REFITTED = ("mass_offset", "com_offset", "inertia_scale")
+"""Effects whose numbers are fitted; between them six that a flight can tell."""
+GIVEN = "bare"
+"""The vehicle that both believe in."""
+SENSORS = "full"
+"""What is logged."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """Stretches and what is asked of them."""
+
+    nominal: Vehicle
+    """What both sides start from."""
+    space: Space
+    """The catalogue's numbers on that vehicle."""
+    indices: tuple[int, ...]
+    """Places of the numbers that are fitted, K of them."""
+    truth: np.ndarray
+    """(K,) what was flown."""
+    windows: Windows
+    """Stretches of 1 s, driven by measured rotor speeds."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Each number as "effect.parameter component"."""
+        entries = [self.space.entries[i] for i in self.indices]
+        return tuple(f"{e.effect}.{e.parameter} {e.component or 0}" for e in entries)
+
+    def array(self, field: str) -> np.ndarray:
+        """Return a field of the fitted numbers' entries, (K,)."""
+        return self.space.array(field)[list(self.indices)]
+
+
+def make_task(seed: int, duration_s: float = 10.0) -> Task:
+    """Return five flights of MuJoCo with other mass, centre of mass and inertia, cut.
+
+    Args:
+        seed: of the truth, the flights and the noise.
+        duration_s: of each flight.
+    """
+    from suite.blind.oracle.strength import given_vehicle
+    from suite.blind.sensors import SENSORS as ALL
+    from suite.blind.sensors import log_of
+    from suite.diagnose.plans.simulate import FlightFailed, fly
+    from suite.diagnose.plans.trajectory import ordinary_flights
+
+    def attempt(number: int) -> Task:
+        rng = np.random.default_rng([seed, number])
+        truth = replace(nominal, effects=MappingProxyType(_drawn(nominal, rng)))
+        flights = fly(nominal, truth, ordinary_flights(rng, duration_s), sensors.rate_hz)
+        logs = [
+            log_of(flight, truth, sensors, rng, f"flight {i}") for i, flight in enumerate(flights)
+        ]
+        windows, _ = cut(logs, nominal, driven_by_rotors=True)
+        assert windows is not None
+        return Task(
+            nominal, space, indices, make_space(truth).array("start")[list(indices)], windows
+        )
+
+    nominal, sensors = given_vehicle(GIVEN), ALL[SENSORS]
+    space = make_space(nominal)
+    indices = tuple(i for i, entry in enumerate(space.entries) if entry.effect in REFITTED)
+    number = 0
+    while True:
+        with contextlib.suppress(FlightFailed):  # too heavy for its pilot; most draws are not
+            return attempt(number)
+        number += 1
+
+
+def _drawn(nominal: Vehicle, rng: np.random.Generator) -> dict[str, Any]:
+    """Return the effects' values: every number off by a usual size, to either side."""
+    neutral, values = all_values(nominal), dict[str, Any]()
+    for name in REFITTED:
+        fields = {}
+        for parameter in EFFECTS[name].parameters:
+            size = max(parameter.size, 1)
+            shift = rng.uniform(*parameter.typical, size) * rng.choice((-1.0, 1.0), size)
+            shift[list(parameter.unseen)] = 0.0
+            now = np.atleast_1d(np.asarray(getattr(neutral[name], parameter.name), float)) + shift
+            fields[parameter.name] = tuple(now.tolist()) if parameter.size else float(now[0])
+        values[name] = type(neutral[name])(**fields)
+    return values

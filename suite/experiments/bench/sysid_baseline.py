@@ -1,0 +1,201 @@
+"""The same refit by `mujoco.sysid`: finite differences of rollouts in MuJoCo's C engine.
+
+The quadrotor is MuJoCo's own model, its actuators' controls are the rotors' thrusts, its bounds and
+typical sizes are ours, and residuals are over the measurement's noise, so that both sides lower the
+same error. A stretch starts in its measured state: `mujoco.sysid` has no start that is left free.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import os
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from eval.quadrotor.model import BODY, add_quadrotor, rotor_name
+from eval.quadrotor.plant import make_plant
+from suite.diagnose.data.windows import SLICES, step_s
+from suite.diagnose.fit.normal_equations import Sums
+from suite.experiments.bench.rigid_body import Task
+
+POSE = 13
+"""Numbers of qpos and qvel of a free body."""
+FILL_S = 1e-3
+"""Between rows that hold nothing [s]."""
+
+
+class Problem(NamedTuple):
+    """What is prepared once and not timed."""
+
+    task: Task
+    params: Any
+    """`mujoco.sysid.ParameterDict` at the nominal values."""
+    residual: Any
+    """(x, params) -> residuals over their noise."""
+
+
+def is_installed() -> bool:
+    """Say whether `mujoco.sysid` has all that it needs."""
+    import mujoco.sysid as sysid
+
+    return hasattr(sysid, "optimize")
+
+
+def prepare(task: Task, sigma: np.ndarray) -> Problem:
+    """Return the task as `mujoco.sysid` takes it.
+
+    Args:
+        task: what is fitted to what.
+        sigma: (19,) noise of the channels.
+    """
+    import mujoco.sysid as sysid
+
+    dt = step_s(task.nominal)
+    spec = mujoco.MjSpec()
+    spec.option.timestep = dt
+    add_quadrotor(spec, task.nominal)
+    # What was measured, computed by nobody: `mujoco.sysid` asks for its size.
+    spec.add_sensor(name="measured", type=mujoco.mjtSensor.mjSENS_USER, dim=POSE)
+    base = spec.compile()
+    windows = task.windows
+    names = [str(w) for w in range(len(windows.flight))]
+    sequences = sysid.ModelSequences(
+        "quadrotor",
+        spec,
+        names,
+        [_start(base, windows, w) for w in range(len(names))],
+        [_thrusts(task, w, dt) for w in range(len(names))],
+        [_measured(task, w) for w in range(len(names))],
+    )
+    scale = 1.0 / np.where(np.isfinite(sigma[:12]), sigma[:12], np.inf)
+
+    def modify_residual(
+        params: Any,
+        predicted: Any,
+        measured: Any,
+        model: Any,
+        return_pred_all: bool,
+        state: np.ndarray,
+        **_: Any,
+    ) -> tuple[np.ndarray, Any, Any]:
+        # The state after step k stands in row k - 1, behind the time. The first row is the start.
+        rows = np.clip(np.rint(measured.times[1:] / dt).astype(int), 1, len(state)) - 1
+        apart = _difference(state[rows, 1 : 1 + POSE], measured.data[1:])
+        return np.where(np.isfinite(apart), apart, 0.0) * scale, measured, measured
+
+    residual = sysid.build_residual_fn(
+        models_sequences=[sequences],
+        build_model=lambda params, _: _built(base, task, params.as_vector()),
+        modify_residual=modify_residual,
+        n_threads=os.cpu_count() or 1,
+        resample_true=False,
+    )
+    params = sysid.ParameterDict()
+    start, low, high = (task.array(field) for field in ("start", "low", "high"))
+    params.add(sysid.Parameter("numbers", start, low, high))
+    return Problem(task, params, residual)
+
+
+def refit(problem: Problem) -> tuple[np.ndarray, Sums]:
+    """Return the fitted numbers (K,) and their normal equations, stretch by stretch."""
+    import mujoco.sysid as sysid
+
+    # Its optimiser can be told to print nothing, `sysid.optimize` cannot.
+    with contextlib.redirect_stdout(io.StringIO()):
+        params, result = sysid.optimize(
+            problem.params.copy(),
+            problem.residual,
+            verbose=False,
+            x_scale=problem.task.array("step"),
+        )
+    values = np.asarray(params.as_vector())
+    parts = problem.residual(values, params)[0]
+    residual = np.concatenate(parts)
+    count = len(problem.task.windows.flight)
+    slope = np.asarray(result.jac).reshape(count, -1, len(values))
+    apart = residual.reshape(count, -1)
+    turned = np.swapaxes(slope, 1, 2)
+    error = (apart**2).sum(1)
+    return values, Sums(
+        turned @ slope, -(turned @ apart[..., None])[..., 0], error, np.zeros((count, 12))
+    )
+
+
+def _built(base: Any, task: Task, values: np.ndarray) -> Any:
+    """Return a copy of the compiled model with the numbers in their places."""
+    theta = task.space.array("start")
+    theta[list(task.indices)] = values
+    effects = task.space.effects(theta)
+    model = copy.copy(base)
+    body = model.body(BODY)
+    body.mass[:] = task.nominal.mass + effects["mass_offset"].offset
+    body.inertia[:] = np.asarray(task.nominal.inertia) * effects["inertia_scale"].scale
+    hubs = np.asarray(task.nominal.rotors.position) - effects["com_offset"].offset
+    for index, hub in enumerate(hubs):
+        model.site(rotor_name(index)).pos[:] = hub
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def _start(model: Any, windows: Any, w: int) -> np.ndarray:
+    import mujoco.sysid as sysid
+
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.asarray(windows.rot_w[w]).ravel())
+    pose = np.concatenate([windows.pos_w[w], quat])
+    return sysid.create_initial_state(
+        model, pose, np.concatenate([windows.vel_w[w], windows.rate_b[w]])
+    )
+
+
+def _thrusts(task: Task, w: int, dt: float) -> Any:
+    import mujoco.sysid as sysid
+
+    constants = make_plant(task.nominal, dt).constants
+    thrust = constants.thrust_coefficient * np.asarray(task.windows.rotor_speed[w]) ** 2
+    # The last control is not applied by `mujoco.sysid`: one more row gives all steps.
+    thrust = np.concatenate([thrust, thrust[-1:]])
+    return sysid.TimeSeries(dt * np.arange(len(thrust)), thrust)
+
+
+def _measured(task: Task, w: int) -> Any:
+    import mujoco.sysid as sysid
+
+    windows = task.windows
+    quats = np.empty((len(windows.row_s[w]), 4))
+    for quat, rot_w in zip(quats, windows.row_rot_w[w], strict=True):
+        mujoco.mju_mat2Quat(quat, np.asarray(rot_w).ravel())
+    rows = [windows.row_pos_w[w], quats, windows.row_vel_w[w], windows.row_rate_b[w]]
+    values = np.concatenate(rows, axis=1)
+    seen = np.asarray(windows.seen[w])[:, :12]
+    # Three angles are four numbers of a quaternion.
+    values[~seen[:, [0, 1, 2, 3, 3, 3, 3, 6, 7, 8, 9, 10, 11]]] = np.nan
+    # A stretch with fewer rows is filled up with rows of nothing, whose times must still rise.
+    times, filled = np.array(windows.row_s[w]), ~seen.any(axis=1)
+    times[filled] = times.max() + FILL_S * np.arange(1, filled.sum() + 1)
+    return sysid.TimeSeries(times, values)
+
+
+def _difference(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return simulated - measured (N, 12), the attitude as a small rotation in body axes."""
+    w, x, y, z = np.moveaxis(measured[:, 3:7] * [1, -1, -1, -1], -1, 0)
+    a, b, c, d = np.moveaxis(simulated[:, 3:7], -1, 0)
+    turn = np.stack(
+        [
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
+        axis=-1,
+    )
+    turn *= 2.0 * np.sign(w * a - x * b - y * c - z * d)[:, None]
+    apart = np.zeros((len(measured), 12))
+    apart[:, SLICES["position"]] = simulated[:, :3] - measured[:, :3]
+    apart[:, SLICES["attitude"]] = turn
+    apart[:, SLICES["velocity"]] = simulated[:, 7:10] - measured[:, 7:10]
+    apart[:, SLICES["rates"]] = simulated[:, 10:13] - measured[:, 10:13]
+    return apart

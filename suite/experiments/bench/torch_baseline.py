@@ -1,0 +1,221 @@
+"""The trainer's method as a plain torch-eager loop: the baseline of `suite bench train`.
+
+Same network, point mass, losses, field, delays and noise as `suite.train`, one step after another
+with the encoder inside the loop, and backward through it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+
+from policies.formats.torch_twin import torch_twin
+from suite.experiments.bench import torch_scene
+from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
+from suite.train.config import TrainConfig
+from suite.train.dynamics.point_mass import GRAVITY, Constants
+from suite.train.losses import APPROACH_FREE_M, MAX_PULL, UNIT_FIELD
+from suite.train.rollout import BEYOND_M
+from suite.train.worlds import Worlds
+from tracks.geometry.camera import pixel_rays_b
+from tracks.geometry.scene import Gates
+
+
+class Body(NamedTuple):
+    """State of the point mass as tensors; shapes and units are `point_mass.Body`'s."""
+
+    pos_w: Tensor
+    vel_w: Tensor
+    thrust_w: Tensor
+    acc_w: Tensor
+    rot_w: Tensor
+    heading_w: Tensor
+    commands_w: Tensor
+
+
+def to_torch(tree: Any) -> Any:
+    """Return a tree of named tuples with its arrays as tensors."""
+    if isinstance(tree, tuple):
+        return type(tree)(*(to_torch(part) for part in tree))
+    return torch.as_tensor(tree)
+
+
+def _fade(x: Tensor, factor: Tensor) -> Tensor:
+    return x * factor + (x * (1 - factor)).detach()
+
+
+def _norm(vector: Tensor) -> Tensor:
+    return ((vector * vector).sum(-1) + 1e-12).sqrt()
+
+
+def attitude(thrust_w: Tensor, heading_w: Tensor) -> Tensor:
+    """Return body to world (B, 3, 3); see `suite.train.dynamics.point_mass.attitude`."""
+    force = thrust_w + torch.tensor([0.0, 0.0, GRAVITY])
+    size = force.norm(dim=-1, keepdim=True)
+    up = torch.where(size > 1e-3, force / size.clamp(min=1e-3), torch.tensor([0.0, 0.0, 1.0]))
+    left = torch.linalg.cross(up, heading_w)
+    left = left / left.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    return torch.stack([torch.linalg.cross(left, up), left, up], -1)
+
+
+def step(
+    body: Body, constants: Constants, action: Tensor, target_w: Tensor, config: TrainConfig
+) -> Body:
+    """Advance one policy period; see `suite.train.dynamics.point_mass.step`."""
+    dt = constants.time_step[:, None]
+    history = torch.cat([to_world(body.rot_w, action)[:, None], body.commands_w], 1)
+    share = (1.0 - (constants.delay[:, None] - torch.arange(3.0)).abs()).clamp(min=0)
+    keep = (-constants.lag[:, None] * dt).exp()
+    thrust = (share[..., None] * history).sum(1) * (1 - keep) + body.thrust_w * keep
+    air_b = to_local(body.rot_w, body.vel_w - constants.wind_w)
+    acc = thrust - to_world(body.rot_w, constants.drag * air_b)
+    fade = (-config.loss.gradient_decay * dt).exp()
+    pos, vel = _fade(body.pos_w, fade), _fade(body.vel_w, fade)
+    pos = pos + vel * dt + 0.5 * body.acc_w * dt * dt
+    vel = vel + 0.5 * (body.acc_w + acc) * dt
+    with torch.no_grad():
+        towards = (target_w - pos) * torch.tensor([1.0, 1.0, 0.0])
+        towards = towards / towards.norm(dim=-1, keepdim=True).clamp(min=1e-3)
+        blend = (-config.physics.heading_rate * dt).exp()
+        heading = body.heading_w * blend + towards * (1 - blend)
+        size = heading.norm(dim=-1, keepdim=True)
+        heading = torch.where(size > 1e-3, heading / size.clamp(min=1e-3), body.heading_w)
+        rot = attitude(thrust, heading)
+    return Body(pos, vel, thrust, acc, rot, heading, history[:, :2])
+
+
+class Baseline:
+    """A policy in torch, its optimiser and the loss of a batch of worlds."""
+
+    def __init__(self, config: TrainConfig, params: Mapping[str, Any]) -> None:
+        """Take over the parameters of `policies.networks.network`.
+
+        Raises:
+            ValueError: for `loss.field_square`, which it does not have.
+        """
+        if config.loss.field_square:
+            raise ValueError("loss.field_square is True, allowed for the torch baseline is False")
+        self.config = config
+        self.network = torch_twin(params, config.spec).requires_grad_(True)
+        rate, decay = config.optimizer.rate, config.optimizer.weight_decay
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), rate, weight_decay=decay)
+        self.rays = torch.as_tensor(pixel_rays_b(config.spec.camera), dtype=torch.float32)
+
+    def update(self, worlds: Worlds) -> float:
+        """Make one gradient step on `worlds` (tensors) and return the loss."""
+        self.optimizer.zero_grad()
+        loss = self.loss(worlds)
+        loss.backward()
+        if self.config.optimizer.clip > 0:
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.optimizer.clip)
+        self.optimizer.step()
+        return float(loss.detach())
+
+    def loss(self, worlds: Worlds) -> Tensor:
+        """Return the mean loss over steps and worlds of a rollout."""
+        config, physics = self.config, self.config.physics
+        count = worlds.pos_w.shape[0]
+        zero = torch.zeros(count, 3)
+        body = Body(
+            worlds.pos_w, worlds.vel_w, zero, zero, attitude(zero, worlds.heading_w),
+            worlds.heading_w, torch.zeros(count, 2, 3),
+        )  # fmt: skip
+        camera = config.spec.camera
+        images = [torch.zeros(count, camera.height, camera.width)] * physics.image_delay
+        upright = torch.zeros(count, config.spec.state_size)
+        upright[:, 5] = 1.0
+        states = [upright] * physics.state_delay
+        hidden = worlds.hidden
+        action, target, alive = zero, worlds.target.long(), torch.ones(count)
+        total = torch.zeros(())
+        for number in range(config.episode.steps):
+            gate, target_w = self.target_gate(worlds.scene.gates, target)
+            images.append(self.look(worlds, body))
+            seen = [to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w)]
+            numbers = [seen[0], body.rot_w[:, 2], seen[1], action]
+            if config.spec.second_gate:
+                _, second_w = self.target_gate(worlds.scene.gates, target, ahead=1)
+                numbers.append(to_local(body.rot_w, second_w - body.pos_w))
+            if config.spec.gate_axis:
+                numbers.append(to_local(body.rot_w, gate.rot_w[:, :, 0]))
+            states.append(torch.cat(numbers, -1))
+            action, hidden = self.network(states.pop(0), images.pop(0), hidden)
+            constants = worlds.constants
+            assert isinstance(constants, Constants)  # the baseline flies the point mass alone
+            before, body = body, step(body, constants, action, target_w, config)
+            passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
+            passed = passed & (target < worlds.scene.gates.center_w.shape[1])
+            aim = self.target_gate(worlds.scene.gates, target + passed * config.loss.pass_first)
+            loss, clearance = self.judge(worlds, before, body, gate, *aim)
+            total = total + (loss * alive).mean()
+            alive = alive * (clearance > -config.loss.crash_depth_m) * (number + 1 < worlds.stop)
+            target = target + passed
+            if config.episode.finish:
+                alive = alive * (target < worlds.scene.gates.center_w.shape[1])
+        return total / config.episode.steps
+
+    def target_gate(self, gates: Gates, target: Tensor, ahead: int = 0) -> tuple[Gates, Tensor]:
+        """Return each world's current gate, or the one `ahead`, and the point to fly to (B, 3)."""
+        count = gates.center_w.shape[1]
+        rows = torch.arange(len(target))
+        gate = Gates(*(array[rows, (target + ahead).clamp(max=count - 1)] for array in gates))
+        beyond = torch.where(target >= count, BEYOND_M, 0.0)[:, None]
+        return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
+
+    @torch.no_grad()
+    def look(self, worlds: Worlds, body: Body) -> Tensor:
+        """Return the encoded images (B, height, width) with their noise."""
+        camera, encoding = self.config.spec.camera, self.config.spec.depth
+        axis = self.rays.mean(0)
+        rays = axis + (self.rays - axis) * worlds.fov_scale[0]
+        depth = torch_scene.depth_image(worlds.scene, body.pos_w, body.rot_w, rays, camera.range_m)
+        image = encoding.scale / depth.clamp(encoding.near, camera.range_m) - encoding.offset
+        image = image + self.config.physics.depth_noise * torch.randn_like(image)
+        return image.reshape(-1, camera.height, camera.width)
+
+    def judge(
+        self, worlds: Worlds, before: Body, body: Body, gate: Gates, aim: Gates, aim_w: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the loss of a step (B,) and the smallest distance on its path (B,)."""
+        config = self.config.loss
+        share = (torch.arange(config.path_samples) + 1.0) / config.path_samples
+        path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
+        distance, away = torch_scene.nearest_obstacle(worlds.scene, path.detach())
+        gap = distance + ((path - path.detach()) * away).sum(-1) - config.safety_radius_m
+        barrier = torch.nn.functional.softplus(config.barrier_slope * gap, threshold=1e3)
+        closing = (-(away * body.vel_w.detach()[:, None]).sum(-1)).clamp(min=0)
+        collide = closing * (1.0 - gap).clamp(min=0) ** 2
+        loss = config.clearance * config.barrier_height * barrier.mean(-1)
+        loss = loss + config.collide * collide.mean(-1)
+
+        jerk = (body.acc_w - before.acc_w) / worlds.constants.time_step[:, None]
+        loss = loss + config.acceleration * (body.acc_w**2).sum(-1)
+        loss = loss + config.jerk * (jerk**2).sum(-1)
+
+        local = to_local(aim.rot_w, body.pos_w - aim.center_w).detach()
+        off = local[:, 1:].norm(dim=-1) + local[:, 0].clamp(min=0)
+        ahead = (aim_w == aim.center_w).all(-1)  # past the last gate the point is no gate's centre
+        shift = ahead * (off - APPROACH_FREE_M).clamp(0.0, config.approach_m)
+        to_gate = aim_w - shift[:, None] * aim.rot_w[:, :, 0] - body.pos_w
+        towards = (body.vel_w * to_gate).sum(-1) / _norm(to_gate)
+        loss = loss - config.progress * towards
+        loss = loss - config.progress_norm * towards / (_norm(body.vel_w) + 1e-3)
+        lateral = to_local(aim.rot_w, body.pos_w - aim.center_w)[:, 1:]
+        near = (-config.projection_decay * _norm(to_gate).detach()).exp()
+        loss = loss + config.projection * (lateral**2).sum(-1) * near
+
+        pull = self.pull(gate, body.pos_w.detach(), body.vel_w.detach())
+        guidance = (pull * (body.pos_w - body.pos_w.detach())).sum(-1)
+        return loss - config.field_gain * guidance, distance.amin(-1)
+
+    def pull(self, gate: Gates, pos_w: Tensor, vel_w: Tensor) -> Tensor:
+        """Return u_A (B, 3), 1 across the centre of a gate of 1 m."""
+        decay = self.config.loss.field_decay
+        field = torch_scene.magnetic_field(gate, pos_w)
+        size = field.norm(dim=-1)
+        aligned = (vel_w * field).sum(-1) / (vel_w.norm(dim=-1) * size + 1e-5)
+        pull = ((1 - aligned) / size.clamp(min=1e-9) ** decay)[:, None] * field
+        pull = pull / (2e-5 * UNIT_FIELD) ** (1 - decay)
+        return pull * (MAX_PULL / _norm(pull)).clamp(max=1.0)[:, None]

@@ -1,0 +1,198 @@
+"""`suite bench train`: gradient steps a second against a plain torch-eager loop.
+
+Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids at
+the CPU preset: batch 64, 150 steps, 24x32 images, two threads.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from suite.experiments.bench.compare import Comparison, Figure
+from suite.train.config import TrainConfig
+from suite.train.presets import preset
+from suite.train.worlds import Worlds, sample_worlds
+from tracks.geometry.scene import PARKED_Z, Counts, Gates
+
+SOLIDS = Counts(boxes=44, cylinders=8, capsules=6, spheres=6)
+"""The 64 solids of every world: 32 bars of the gates' frames, 12 other boxes, 20 round ones."""
+BATCH, STEPS, THREADS = 64, 150, 2
+UNTRUSTED_BELOW = 2000.0
+"""A free machine of two cores makes at least this many steps a second with the baseline."""
+ROUNDS = 4
+ENOUGH_S = 60.0
+"""No further round is started after this; a free machine does all of them in that time [s]."""
+
+
+def bench_config(batch: int = BATCH, steps: int = STEPS) -> TrainConfig:
+    """Return the CPU preset at the bench's size, on one device."""
+    base = preset("racer")
+    return replace(base, devices=1, episode=replace(base.episode, batch=batch, steps=steps))
+
+
+def bench_worlds(config: TrainConfig, seed: int = 0) -> Worlds:
+    """Return worlds of the training distribution with exactly SOLIDS solids each, none parked.
+
+    Solids that a track lacks are set at random within 4 m of its gates, off the line.
+    """
+    worlds = sample_worlds(config, seed)
+    rng = np.random.default_rng(seed)
+    scene = worlds.scene
+    kinds = {
+        name: type(part)(*(array[:, :limit].copy() for array in part))
+        for name, part, limit in (
+            (name, getattr(scene, name), getattr(SOLIDS, name))
+            for name in ("boxes", "cylinders", "capsules", "spheres")
+        )
+    }
+    for part in kinds.values():
+        missing = part.center_w[..., 2] < PARKED_Z / 2
+        part.center_w[missing] = _beside(scene.gates, missing, rng)
+        for name, low, high in (("half_size", 0.05, 0.25), ("radius", 0.1, 0.3)):
+            if hasattr(part, name):
+                array = getattr(part, name)
+                array[missing] = rng.uniform(low, high, array[missing].shape)
+        if hasattr(part, "half_length"):
+            part.half_length[missing] = rng.uniform(0.1, 0.8, missing.sum())
+    return worlds._replace(scene=scene._replace(**kinds, triangles=scene.triangles[:, :0]))
+
+
+def _beside(gates: Gates, missing: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    world, _ = np.nonzero(missing)
+    center = gates.center_w[world, rng.integers(0, gates.center_w.shape[1], len(world))]
+    angle, away = rng.uniform(0, 2 * np.pi, len(world)), rng.uniform(1.5, 4.0, len(world))
+    shift = np.stack([away * np.cos(angle), away * np.sin(angle), rng.uniform(-1, 1, len(world))])
+    return center + shift.T
+
+
+def work_per_step(config: TrainConfig) -> float:
+    """Return the floating-point operations of the network for one gradient step of one world.
+
+    Counted from its sizes, two for each product and sum: the encoder runs forward twice (once for
+    the rollout, once to be differentiated) and backward once at twice the cost; the recurrent part
+    forward once and backward once. Rays, distances and dynamics are not counted, so the share of
+    the machine's rate is a lower bound.
+    """
+    from policies.networks.network import CHANNELS, flat_features
+    from policies.spec import ACTION_SIZE
+
+    spec = config.spec
+    rows, columns, hidden = spec.camera.height // 4, spec.camera.width // 4, spec.hidden_size
+    first, second, third = CHANNELS
+    encoder = rows * columns * 4 * first
+    encoder += (rows - 2) * (columns - 2) * 9 * first * second
+    encoder += (rows - 4) * (columns - 4) * 9 * second * third
+    encoder += flat_features(spec) * hidden
+    recurrent = spec.state_size * hidden + 6 * hidden * hidden + hidden * ACTION_SIZE
+    return 2.0 * (4 * encoder + 3 * recurrent)
+
+
+def matrix_rate(seconds: float = 1.0) -> float:
+    """Return the machine's float32 matrix-product rate [FLOP/s], the best of some seconds."""
+    import torch
+
+    size = 1536
+    a, b = torch.randn(size, size), torch.randn(size, size)
+    best, until = np.inf, time.perf_counter() + seconds
+    while time.perf_counter() < until:
+        started = time.perf_counter()
+        torch.mm(a, b)
+        best = min(best, time.perf_counter() - started)
+    return 2.0 * size**3 / best
+
+
+def _ours(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
+    import jax
+
+    from suite.train.update import device_mesh, make_update, start_state
+
+    update, state = make_update(config, device_mesh(config)), start_state(config)
+
+    def call() -> Any:
+        nonlocal state
+        state, numbers = update(state, worlds)
+        return jax.block_until_ready((state, numbers))
+
+    return call
+
+
+def _baseline(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
+    from suite.experiments.bench.torch_baseline import Baseline, to_torch
+    from suite.train.update import start_state
+
+    params = {k: np.asarray(v) for k, v in start_state(config).params.items()}
+    side, tensors = Baseline(config, params), to_torch(worlds)
+    return lambda: side.update(tensors)
+
+
+def run(batch: int = BATCH, steps: int = STEPS, rounds: int = ROUNDS) -> Comparison:
+    """Time both sides in turn and return the best round of each.
+
+    Args:
+        batch: worlds.
+        steps: policy periods of a rollout.
+        rounds: how often each side is timed, after one call to warm up.
+    """
+    with _two_cores():
+        return _compare(batch, steps, rounds)
+
+
+@contextmanager
+def _two_cores() -> Iterator[None]:
+    """Hold the process to THREADS cores: JAX's threads follow what a process may run on."""
+    import torch
+
+    torch.set_num_threads(THREADS)
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(allowed)[:THREADS])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def _compare(batch: int, steps: int, rounds: int) -> Comparison:
+    config = bench_config(batch, steps)
+    worlds = bench_worlds(config)
+    sides = (_ours(config, worlds), _baseline(config, worlds))
+    taken: tuple[list[float], list[float]] = ([], [])
+    for side in sides:
+        side()
+    machine = matrix_rate()
+    until = time.perf_counter() + ENOUGH_S
+    for done in range(rounds):
+        if done and time.perf_counter() > until:
+            break
+        for seconds, side in zip(taken, sides, strict=True):
+            started = time.perf_counter()
+            side()
+            seconds.append(time.perf_counter() - started)
+    ours, baseline = (batch * steps / min(seconds) for seconds in taken)
+    warnings = ()
+    if baseline < UNTRUSTED_BELOW:
+        warnings = (
+            f"the baseline makes {baseline:.0f} steps/s; on a free machine of two cores it makes "
+            f"{UNTRUSTED_BELOW:.0f} or more: it is not to be trusted, run again on a free machine",
+        )
+    work = work_per_step(config)
+    details = {
+        "share_of_matrix_rate": round(ours * work / machine, 4),
+        "matrix_rate_gflop_s": round(machine / 1e9, 1),
+        "network_mflop_a_step": round(work / 1e6, 2),
+        "solids": sum(SOLIDS),
+        "batch": batch,
+        "steps": steps,
+        "rounds_s": {"ours": taken[0], "baseline": taken[1]},
+    }
+    unit = "gradient steps/s"
+    return Comparison("train", Figure(ours, unit), Figure(baseline, unit), warnings, details)

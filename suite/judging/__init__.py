@@ -1,0 +1,1 @@
+"""What `suite eval`, `collect` and `view` do."""

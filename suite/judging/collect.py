@@ -1,0 +1,167 @@
+"""Record flights as logs: one Parquet file each, and a list of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from eval.logs.columns import DURATION_MIN
+from suite.common.choices import at_least, parse_levels, parse_tracks
+from suite.common.console import Console
+from suite.common.estimate import Estimate, announce
+from suite.common.provenance import write_run_record
+from suite.judging.flying import (
+    PROCESS_BYTES,
+    SECONDS_A_TRIAL,
+    START_SECONDS,
+    about_policy,
+    custom_tracks,
+    default_policy,
+    options_for,
+    trial_list,
+    who_flies,
+)
+from tracks.common.files import plain, write_json
+from tracks.common.provenance import stamp
+
+if TYPE_CHECKING:
+    from eval.logs.flight import Flight
+    from eval.worlds.trial import TrialResult, TrialSpec
+
+LIST = "flights.json"
+"""Name of the list of flights in the output folder."""
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What is to be recorded."""
+
+    policy: str = ""
+    """A shipped name, a checkpoint's folder or a policy file; empty: the shipped default."""
+    track: str = "all"
+    """As in `suite.common.choices.parse_tracks`."""
+    difficulty: str = "0,3"
+    """As in `suite.common.choices.parse_levels`."""
+    trials: int = 5
+    """Flights on every track at every level."""
+    vehicle: str = "reference"
+    """A shipped vehicle's name or a vehicle file."""
+    world: str = "mujoco"
+    """Where it flies."""
+    seed: int = 100_000
+    """Seed of the first trial; the others follow by one."""
+    trust: bool = False
+    """Also load policy files that can run code."""
+
+
+def collect(collection: Collection, out: Path, console: Console) -> dict[str, Any]:
+    """Fly and write a log a flight into `out`; the same call after an interruption goes on.
+
+    Returns:
+        What flights.json holds: the stamp, what was collected, and the flights as rows of results
+        with their `file` (null for a flight that is no log: under one second, or refused with a
+        warning because its numbers break a rule of flight logs).
+
+    Raises:
+        ValueError: for anything in `collection` that cannot be used, or where `out` holds the
+            flights of another collection.
+    """
+    from eval.judging.judge import Record, fly
+    from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.worlds import world_class
+    from policies.policy import load_policy
+
+    world_class(collection.world)
+    at_least("--trials", collection.trials, 1)
+    at_least("--seed", collection.seed, 0)
+    names = parse_tracks(collection.track)
+    levels = parse_levels(collection.difficulty)
+    trials = trial_list(names, levels, collection.trials, collection.seed)
+    vehicle, tracks = load_vehicle(collection.vehicle), custom_tracks(names)
+    asked = collection.policy or default_policy()
+    policy = load_policy(asked, collection.trust)
+    out = Path(out)
+    about = {"collection": collection, "policy": about_policy(asked, policy), "vehicle": vehicle}
+    rows = _rows_there(out, plain(about))
+    missing = [trial for trial in trials if trial not in rows]
+    options = options_for(len(missing), None, collection.world)
+    seconds = START_SECONDS + len(missing) * SECONDS_A_TRIAL / (options.processes or 1)
+    what = f"{len(missing)} flights in the {collection.world} world"
+    announce(console, what, Estimate(seconds, PROCESS_BYTES * (options.processes or 1)))
+
+    def write_list() -> dict[str, Any]:
+        flights = [rows[trial] for trial in trials if trial in rows]
+        found = {**stamp(1, collection.seed), **about, "flights": flights}
+        write_json(out / LIST, found)
+        return found
+
+    with console.progress("flights", len(trials)) as update:
+
+        def keep(result: TrialResult, flight: Flight | None) -> None:
+            name = None
+            if flight is not None and result.time_s >= DURATION_MIN:
+                name = _write_log(out, result, flight, console)
+            rows[result.trial] = {"file": name, **result._asdict()}
+            write_list()
+            update(len(rows), result.ended_by)
+
+        if missing:
+            fly(
+                who_flies(policy, asked, collection.trust, options.processes),
+                missing,
+                vehicle,
+                collection.world,
+                options,
+                keep,
+                Record(depth=False),
+                tracks,
+            )
+    found = write_list()
+    write_run_record(out, collection, collection.seed)
+    logs = [row for row in rows.values() if row["file"]]
+    seconds = sum(row["time_s"] for row in logs)
+    console.say(f"{len(logs)} flights, {seconds:.0f} s, in {out}")
+    if len(logs) < len(rows):
+        short = sum(row["time_s"] < DURATION_MIN for row in rows.values())
+        console.say(
+            f"{len(rows) - len(logs)} without a log, {short} of them under {DURATION_MIN:g} s"
+        )
+    return {**found, "out": str(out)}
+
+
+def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console) -> str | None:
+    """Return the name of the log that was written, None with a warning where it is refused."""
+    from eval.logs.columns import FlightLogError
+    from eval.logs.flight_log import log_from_flight, write_flight
+
+    name = f"{Path(result.track).stem}-{result.difficulty}-{result.seed}.parquet"
+    try:
+        write_flight(out / name, log_from_flight(flight, name))
+    except FlightLogError as error:
+        console.note(f"warning: no log of this flight: {error}")
+        return None
+    return name
+
+
+def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, dict[str, Any]]:
+    """Return the rows of an earlier, interrupted call of the same collection."""
+    from eval.worlds.trial import TrialSpec
+
+    path = out / LIST
+    if not path.is_file():
+        return {}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        same = {key: found[key] for key in about} == about
+        rows = {
+            TrialSpec(row["track"], row["difficulty"], row["seed"]): row for row in found["flights"]
+        }
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not a list of flights ({error}); move it away") from error
+    if not same:
+        raise ValueError(f"{path}: of another collection; give another --out or move it away")
+    return {
+        t: row for t, row in rows.items() if row["file"] is None or (out / row["file"]).is_file()
+    }

@@ -1,0 +1,1 @@
+"""What flies in training: the point mass or the quadrotor."""

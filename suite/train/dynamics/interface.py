@@ -1,0 +1,82 @@
+"""What flies in a rollout: the point mass, or the quadrotor around a vehicle file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+
+from suite.train.config import TrainConfig
+from suite.train.dynamics import point_mass
+from tracks.geometry.scene import Array
+
+
+class Body(Protocol):
+    """What a rollout reads of a state; all but these is the dynamics' own."""
+
+    @property
+    def pos_w(self) -> jax.Array:
+        """(B, 3) [m]."""
+        ...
+
+    @property
+    def vel_w(self) -> jax.Array:
+        """(B, 3) [m/s]."""
+        ...
+
+    @property
+    def acc_w(self) -> jax.Array:
+        """(B, 3) net acceleration [m/s^2]."""
+        ...
+
+    @property
+    def rot_w(self) -> jax.Array:
+        """(B, 3, 3) body to world."""
+        ...
+
+
+class Constants(Protocol):
+    """What is drawn once per world."""
+
+    @property
+    def time_step(self) -> Array:
+        """(B,) the policy's period [s]."""
+        ...
+
+
+class Dynamics(NamedTuple):
+    """Two pure functions over B worlds; `Body` and constants are pytrees of arrays (B, ...)."""
+
+    start: Callable[[Any, jax.Array, jax.Array, jax.Array], Any]
+    """(constants, pos_w (B, 3), vel_w (B, 3), heading_w (B, 3)) -> body, upright."""
+    step: Callable[[Any, Any, jax.Array, jax.Array, jax.Array], Any]
+    """(body, constants, action_b (B, 3), target_w (B, 3), key) -> body one policy period later."""
+
+
+def make_dynamics(config: TrainConfig) -> Dynamics:
+    """Return what `config` trains through."""
+    if config.quadrotor is not None:
+        # The trainer of the point mass stays clear of the judge's physics.
+        from suite.train.dynamics.quadrotor import quadrotor_dynamics
+
+        period = 1.0 / config.spec.rate_hz
+        start, step = quadrotor_dynamics(config.quadrotor, period, config.loss.gradient_decay)
+        return Dynamics(start, step)
+
+    def start_point(
+        _: point_mass.Constants, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
+    ) -> point_mass.Body:
+        return point_mass.start(pos_w, vel_w, heading_w)
+
+    def step_point(
+        body: point_mass.Body,
+        constants: point_mass.Constants,
+        action_b: jax.Array,
+        target_w: jax.Array,
+        _: jax.Array,
+    ) -> point_mass.Body:
+        rate, decay = config.physics.heading_rate, config.loss.gradient_decay
+        return point_mass.step(body, constants, action_b, target_w, rate, decay)
+
+    return Dynamics(start_point, step_point)

@@ -1,0 +1,128 @@
+"""The differentiable point mass with first-order lag (Zhang et al. 2025; Su et al. 2026, III-B).
+
+Only position, velocity and acceleration carry gradients; attitude follows the thrust direction and
+carries none.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from tracks.geometry.rotation import to_local, to_world
+from tracks.geometry.scene import Array
+
+GRAVITY = 9.81
+"""[m/s^2]."""
+
+
+class Constants(NamedTuple):
+    """What is drawn once per world, by numpy or JAX."""
+
+    lag: Array
+    """(B,) rate at which the acceleration follows the command [1/s]."""
+    drag: Array
+    """(B, 3) linear drag in body axes [1/s]."""
+    wind_w: Array
+    """(B, 3) [m/s]."""
+    time_step: Array
+    """(B,) [s]."""
+    delay: Array
+    """(B,) delay of a command in time steps, within [0, 2]."""
+
+
+class Body(NamedTuple):
+    """State of the point mass."""
+
+    pos_w: jax.Array
+    """(B, 3) [m]."""
+    vel_w: jax.Array
+    """(B, 3) [m/s]."""
+    thrust_w: jax.Array
+    """(B, 3) lagged commanded net acceleration, drag not counted [m/s^2]."""
+    acc_w: jax.Array
+    """(B, 3) net acceleration [m/s^2]."""
+    rot_w: jax.Array
+    """(B, 3, 3) body to world."""
+    heading_w: jax.Array
+    """(B, 3) unit, horizontal: where the nose should point."""
+    commands_w: jax.Array
+    """(B, 2, 3) the last commands, latest first [m/s^2]."""
+
+
+def attitude(thrust_w: jax.Array, heading_w: jax.Array) -> jax.Array:
+    """Return body to world (B, 3, 3): z along the specific force, x towards the heading.
+
+    Args:
+        thrust_w: (B, 3) net acceleration that the thrust makes with gravity [m/s^2].
+        heading_w: (B, 3) unit, horizontal.
+    """
+    force = thrust_w + jnp.asarray([0.0, 0.0, GRAVITY])
+    size = jnp.linalg.norm(force, axis=-1, keepdims=True)
+    up = jnp.where(size > 1e-3, force / jnp.maximum(size, 1e-3), jnp.asarray([0.0, 0.0, 1.0]))
+    left = jnp.cross(up, heading_w)
+    left = left / jnp.maximum(jnp.linalg.norm(left, axis=-1, keepdims=True), 1e-6)
+    return jnp.stack([jnp.cross(left, up), left, up], axis=-1)
+
+
+def start(pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> Body:
+    """Return a body that hovers or coasts at vel_w (B, 3) [m/s] in pos_w (B, 3) [m], upright."""
+    zero = jnp.zeros_like(pos_w)
+    rot_w = attitude(zero, heading_w)
+    commands = jnp.zeros((pos_w.shape[0], 2, 3), pos_w.dtype)
+    return Body(pos_w, vel_w, zero, zero, rot_w, heading_w, commands)
+
+
+def faded(x: jax.Array, factor: jax.Array | float) -> jax.Array:
+    """Return x, with its gradient multiplied by factor (gradient decay of Zhang et al. 2025)."""
+    return x * factor + jax.lax.stop_gradient(x * (1 - factor))
+
+
+def step(
+    body: Body,
+    constants: Constants,
+    action_b: jax.Array,
+    target_w: jax.Array,
+    heading_rate: float,
+    gradient_decay: float,
+) -> Body:
+    """Return the body one policy period later.
+
+    The command acts `delay` steps late; between two commands the mean over the step is taken.
+
+    Args:
+        body: now.
+        constants: of each world.
+        action_b: (B, 3) wanted net acceleration in the body axes of now [m/s^2].
+        target_w: (B, 3) the gate that the nose turns to [m].
+        heading_rate: of the first-order turn of the nose [1/s].
+        gradient_decay: rate at which gradients of position and velocity fade back in time [1/s].
+    """
+    dt = constants.time_step[:, None]
+    command = to_world(jax.lax.stop_gradient(body.rot_w), action_b)
+    history = jnp.concatenate([command[:, None], body.commands_w], axis=1)
+    age = jnp.arange(3.0)
+    share = jnp.maximum(0.0, 1.0 - jnp.abs(constants.delay[:, None] - age))
+    wanted = (share[..., None] * history).sum(1)
+
+    keep = jnp.exp(-constants.lag[:, None] * dt)
+    thrust = wanted * (1 - keep) + body.thrust_w * keep
+    rot = jax.lax.stop_gradient(body.rot_w)
+    air_b = to_local(rot, body.vel_w - constants.wind_w)
+    acc = thrust - to_world(rot, constants.drag * air_b)
+    fade = jnp.exp(-gradient_decay * dt)
+    pos, vel = faded(body.pos_w, fade), faded(body.vel_w, fade)
+    pos = pos + vel * dt + 0.5 * body.acc_w * dt * dt
+    vel = vel + 0.5 * (body.acc_w + acc) * dt
+
+    flat = jnp.asarray([1.0, 1.0, 0.0])
+    towards = jax.lax.stop_gradient(target_w - pos) * flat
+    towards = towards / jnp.maximum(jnp.linalg.norm(towards, axis=-1, keepdims=True), 1e-3)
+    blend = jnp.exp(-heading_rate * dt)
+    heading = body.heading_w * blend + towards * (1 - blend)
+    size = jnp.linalg.norm(heading, axis=-1, keepdims=True)
+    heading = jnp.where(size > 1e-3, heading / jnp.maximum(size, 1e-3), body.heading_w)
+    rot = attitude(jax.lax.stop_gradient(thrust), heading)
+    return Body(pos, vel, thrust, acc, rot, heading, history[:, :2])

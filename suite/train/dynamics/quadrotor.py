@@ -1,0 +1,270 @@
+"""The judge's quadrotor as the trainer's dynamics: one policy period with gradients.
+
+The equations are those of the judge (`eval.quadrotor`: autopilot, plant, rigid body): the
+action becomes collective thrust and body rates in the attitude loop, again at each of its steps
+with the attitude of that moment; rate loop, mixer, rotors and effects turn those into motion. A
+period holds a whole number of attitude steps and physics steps, so the steps are a little shorter
+or longer than the judge's, and by default there are half as many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from eval.effects import EFFECTS, as_arrays, neutral
+from eval.effects.interface import Values, at
+from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading
+from eval.quadrotor.plant import (
+    Command,
+    Memory,
+    Motion,
+    Plant,
+    make_plant,
+    plant_step,
+    start_memory,
+    uses_noise,
+)
+from eval.quadrotor.rigid_body import euler_step
+from eval.vehicles.vehicle import Vehicle
+from suite.train.config import QuadrotorConfig
+from suite.train.dynamics.point_mass import attitude, faded
+from tracks.geometry.scene import Array
+
+
+class Constants(NamedTuple):
+    """What is drawn once per world."""
+
+    time_step: Array
+    """(B,) the policy's period [s]."""
+    effects: dict[str, Values]
+    """Values (B, ...) by name, of the effects that vary; the vehicle has the others."""
+
+
+class Body(NamedTuple):
+    """State of the quadrotor at a decision of the policy."""
+
+    pos_w: jax.Array
+    """(B, 3) centre of mass [m]."""
+    vel_w: jax.Array
+    """(B, 3) [m/s]."""
+    acc_w: jax.Array
+    """(B, 3) mean net acceleration over the last period [m/s^2]."""
+    rot_w: jax.Array
+    """(B, 3, 3) body to world."""
+    rate_b: jax.Array
+    """(B, 3) [rad/s]."""
+    heading_w: jax.Array
+    """(B, 3) wanted heading, horizontal unit vectors."""
+    memory: Memory
+    """The plant's (B, ...): rotor speeds and the commands on their way."""
+    time_s: jax.Array
+    """(B,) since the start [s]."""
+
+
+class Grid(NamedTuple):
+    """How a policy period is cut."""
+
+    attitude: int
+    """Steps of the attitude loop."""
+    physics: int
+    """Physics steps in each of them."""
+    dt: float
+    """Length of a physics step [s]."""
+
+
+def whole_steps(steps: float) -> int:
+    """Return the nearest whole number from 1 on; a half goes down, whichever way it was rounded."""
+    return max(1, round(steps - 1e-6))
+
+
+def grid(config: QuadrotorConfig, period_s: float) -> Grid:
+    """Return the grid nearest to the configured frequencies for a policy period."""
+    attitude_steps = whole_steps(period_s * config.attitude_hz)
+    physics = whole_steps(period_s * config.physics_hz / attitude_steps)
+    return Grid(attitude_steps, physics, period_s / (attitude_steps * physics))
+
+
+def draw_effects(
+    config: QuadrotorConfig, batch: int, rng: np.random.Generator
+) -> dict[str, Values]:
+    """Return values (B, ...) of the effects that vary, drawn around the vehicle's own."""
+    vehicle = config.vehicle
+
+    def own(name: str) -> Any:
+        return as_arrays(vehicle.effects.get(name, neutral(EFFECTS[name], vehicle)))
+
+    def either_way(*shape: int) -> np.ndarray:
+        return rng.uniform(-1.0, 1.0, (batch, *shape))
+
+    mass = own("mass_offset").offset + vehicle.mass
+    drag = own("linear_drag").coefficient + config.drag_spread * either_way(3)
+    delay = own("command_delay").delay + config.delay_spread_s * either_way()
+    wind = rng.standard_normal((batch, 3)) * np.asarray(config.wind_std)
+    fields: dict[str, tuple[np.ndarray, ...]] = {
+        "linear_drag": (np.maximum(drag, 0.0),),
+        "constant_wind": (own("constant_wind").velocity + wind,),
+        "motor_lag": (own("motor_lag").time_constant * (1 + config.lag_spread * either_way()),),
+        "command_delay": (np.clip(delay, 0.0, longest_delay(config)),),
+        "mass_offset": (mass * (1 + config.mass_std * rng.standard_normal(batch)) - vehicle.mass,),
+        "rate_gain": (own("rate_gain").scale * (1 + config.gain_spread * either_way(3)),),
+    }
+    return {
+        name: EFFECTS[name].values(*(np.asarray(x, np.float32) for x in values))
+        for name, values in fields.items()
+    }
+
+
+def longest_delay(config: QuadrotorConfig) -> float:
+    """Return the longest delay of commands in any world [s]."""
+    own = config.vehicle.effects.get("command_delay")
+    limit = at(EFFECTS["command_delay"].parameters[0].high, config.vehicle)
+    delay = 0.0 if own is None else float(own.delay)
+    return min(delay + config.delay_spread_s, max(limit, delay))
+
+
+def plant_of(
+    config: QuadrotorConfig, effects: dict[str, Values], dt: float, varies: bool = True
+) -> Plant:
+    """Return the plants of B worlds for steps of `dt` [s].
+
+    Args:
+        config: the vehicle.
+        effects: values (B, ...) in place of the vehicle's own, by name.
+        dt: length of a physics step [s].
+        varies: whether the delay is among `effects`.
+    """
+    own: dict[str, Any] = dict(config.vehicle.effects)
+    longest = longest_delay(config) if varies else None
+    return make_plant(config.vehicle, dt, {**own, **effects}, longest)
+
+
+def start_body(plant: Plant, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> Body:
+    """Return bodies (B, ...) that hovered until now, upright, at vel_w [m/s]."""
+    batch = pos_w.shape[:1]
+    zero = jnp.zeros_like(pos_w)
+    return Body(
+        pos_w=pos_w,
+        vel_w=vel_w,
+        acc_w=zero,
+        rot_w=attitude(zero, heading_w),
+        rate_b=zero,
+        heading_w=heading_w,
+        memory=start_memory(plant, batch, jnp),
+        time_s=jnp.zeros(batch, pos_w.dtype),
+    )
+
+
+def fly_period(
+    vehicle: Vehicle,
+    plant: Plant,
+    cut: Grid,
+    body: Body,
+    action_b: jax.Array,
+    heading: Callable[[jax.Array, jax.Array], jax.Array],
+    noise: jax.Array | None = None,
+    yaw_rate: jax.Array | None = None,
+) -> Body:
+    """Return the bodies one policy period later, without any fading of gradients.
+
+    Args:
+        vehicle: whose attitude loop flies.
+        plant: of B worlds, for steps of `cut.dt`.
+        cut: how the period is cut.
+        body: now.
+        action_b: (B, 3) wanted net acceleration in body axes [m/s^2], held for the period.
+        heading: (heading_w (B, 3), pos_w (B, 3)) -> the wanted heading an attitude step later.
+        noise: (attitude, physics, B, 3) normal draws for random wind, or None.
+        yaw_rate: (B,) commanded about body z in place of what the heading asks for [rad/s].
+    """
+    controller, dt = vehicle.controller, cut.dt
+
+    def physics(
+        carry: tuple[Memory, Motion, jax.Array], draws: jax.Array | None, command: Command
+    ) -> tuple[tuple[Memory, Motion, jax.Array], None]:
+        memory, motion, time_s = carry
+        memory, wrench = plant_step(plant, memory, motion, command, time_s, draws)
+        return (memory, euler_step(plant, motion, wrench), time_s + dt), None
+
+    def loop(carry: Any, draws: jax.Array | None) -> tuple[Any, None]:
+        heading_w, memory, motion, time_s = carry
+        heading_w = jax.lax.stop_gradient(heading(heading_w, motion.pos_w))
+        force_w = action_to_force(action_b, motion.rot_w)
+        command = attitude_command(controller, force_w, motion.rot_w, heading_w)
+        if yaw_rate is not None:
+            command = command._replace(rate_b=command.rate_b.at[:, 2].set(yaw_rate))
+        inner, _ = jax.lax.scan(
+            lambda c, d: physics(c, d, command),
+            (memory, motion, time_s),
+            draws,
+            length=cut.physics,
+            unroll=min(cut.physics, 2),
+        )
+        return (heading_w, *inner), None
+
+    motion = Motion(body.pos_w, body.rot_w, body.vel_w, body.rate_b)
+    start = (body.heading_w, body.memory, motion, body.time_s)
+    (heading_w, memory, motion, time_s), _ = jax.lax.scan(loop, start, noise, length=cut.attitude)
+    return Body(
+        pos_w=motion.pos_w,
+        vel_w=motion.vel_w,
+        acc_w=(motion.vel_w - body.vel_w) / (cut.attitude * cut.physics * dt),
+        rot_w=motion.rot_w,
+        rate_b=motion.rate_b,
+        heading_w=heading_w,
+        memory=memory,
+        time_s=time_s,
+    )
+
+
+def quadrotor_dynamics(
+    config: QuadrotorConfig, period_s: float, gradient_decay: float
+) -> tuple[Callable[..., Body], Callable[..., Body]]:
+    """Return start and step as in `suite.train.dynamics.interface.Dynamics`.
+
+    Args:
+        config: the vehicle and how finely it is stepped.
+        period_s: the policy's [s].
+        gradient_decay: rate at which gradients of the motion fade back in time [1/s].
+    """
+    cut = grid(config, period_s)
+    left = float(np.exp(-gradient_decay * period_s))
+    turn_s = cut.physics * cut.dt
+
+    def start(
+        constants: Constants, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
+    ) -> Body:
+        return start_body(plant_of(config, constants.effects, cut.dt), pos_w, vel_w, heading_w)
+
+    # What happens inside a period is computed again on the way back: kept, it would be many times
+    # all the rest of a rollout.
+    @jax.checkpoint
+    def step(
+        body: Body,
+        constants: Constants,
+        action_b: jax.Array,
+        target_w: jax.Array,
+        key: jax.Array,
+    ) -> Body:
+        plant = plant_of(config, constants.effects, cut.dt)
+        noise = None
+        if uses_noise(plant):
+            shape = (cut.attitude, cut.physics, *body.pos_w.shape)
+            noise = jax.random.normal(jax.random.fold_in(key, 1), shape)
+
+        def towards(heading_w: jax.Array, pos_w: jax.Array) -> jax.Array:
+            return blend_heading(heading_w, target_w - pos_w, turn_s)
+
+        body = body._replace(
+            pos_w=faded(body.pos_w, left),
+            vel_w=faded(body.vel_w, left),
+            rot_w=faded(body.rot_w, left),
+            rate_b=faded(body.rate_b, left),
+        )
+        return fly_period(config.vehicle, plant, cut, body, action_b, towards, noise)
+
+    return start, step

@@ -1,0 +1,87 @@
+"""The value of a state: an MLP on what the simulator knows.
+
+The critic is asymmetric (Pinto et al. 2018): it is not flown, so it sees the true state and the
+nearest obstacle instead of the image, and learns from a rollout what an image would need many for.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from suite.train.dynamics.interface import Body
+from suite.train.rollout import NEAR, target_gate
+from suite.train.worlds import Worlds
+from tracks.geometry.clearance import nearest_obstacle
+from tracks.geometry.rotation import to_local
+
+Params = dict[str, jax.Array]
+
+AHEAD_S = (0.0, 0.1, 0.2, 0.4, 0.8)
+"""Times at which the critic sees how close a solid is, along the present velocity [s]."""
+FEATURES = 29 + 2 * len(AHEAD_S)
+"""Numbers that the critic sees."""
+REACH_M = 2.0
+"""Obstacles further away than this look the same [m]."""
+TOUCH_M = 0.2
+"""Distance over which an obstacle becomes urgent [m]."""
+
+
+def features(worlds: Worlds, body: Body, target: jax.Array) -> jax.Array:
+    """Return what the critic sees of worlds that have passed `target` (B,) gates, (B, FEATURES).
+
+    Position, velocity, acceleration, the next gate, the drone's forward and up axes and the
+    direction away from the nearest obstacle, in the frame of the current gate and scaled to numbers
+    around one; the position again where it is near; how close solids are now and further on; when
+    and where the gate's plane is reached, were the velocity kept; the opening's half width and how
+    many gates are left.
+    """
+    gates = worlds.scene.gates
+    gate, _ = target_gate(gates, target)
+    following, _ = target_gate(gates, target, ahead=1)
+    times = jnp.asarray(AHEAD_S)[:, None]
+    path_w = body.pos_w[:, None] + times * body.vel_w[:, None]
+    distance, away_w = nearest_obstacle(worlds.scene, path_w, NEAR)
+    pos_g = to_local(gate.rot_w, body.pos_w - gate.center_w)
+    vel_g = to_local(gate.rot_w, body.vel_w)
+    half_width = gate.opening_g.max((1, 2))[:, None]
+    until = jnp.clip(-pos_g[:, :1] / jnp.maximum(vel_g[:, :1], 0.1), 0.0, 2.0)
+    crossed = pos_g[:, 1:] + until * vel_g[:, 1:]
+    left = gates.center_w.shape[1] - target
+    columns = [
+        pos_g / 5.0,
+        vel_g / 5.0,
+        to_local(gate.rot_w, body.acc_w) / 10.0,
+        to_local(gate.rot_w, following.center_w - gate.center_w) / 5.0,
+        to_local(gate.rot_w, body.rot_w[:, :, 0]),
+        to_local(gate.rot_w, body.rot_w[:, :, 2]),
+        to_local(gate.rot_w, away_w[:, 0]),
+        jnp.tanh(2.0 * pos_g),
+        jnp.clip(distance, -REACH_M, REACH_M),
+        jnp.exp(-jnp.maximum(distance, -TOUCH_M) / TOUCH_M),
+        until,
+        jnp.clip(crossed / half_width, -3.0, 3.0),
+        2.0 * half_width,
+        jnp.minimum(left, 2)[:, None] - 1.0,
+    ]
+    return jnp.concatenate(columns, axis=-1)
+
+
+def init(key: jax.Array, width: int) -> Params:
+    """Return fresh parameters of an MLP with two hidden layers of `width`, near zero in value."""
+    sizes = [(FEATURES, width), (width, width), (width, 1)]
+    params: Params = {}
+    for number, (k, (rows, columns)) in enumerate(
+        zip(jax.random.split(key, len(sizes)), sizes, strict=True)
+    ):
+        last = 0.01 if columns == 1 else 1.0
+        params[f"weight{number}"] = last * rows**-0.5 * jax.random.normal(k, (rows, columns))
+        params[f"bias{number}"] = jnp.zeros(columns)
+    return params
+
+
+def value(params: Params, seen: jax.Array) -> jax.Array:
+    """Return the values (...) of states seen as (..., FEATURES)."""
+    x = jnp.tanh(seen @ params["weight0"] + params["bias0"])
+    x = jnp.tanh(x @ params["weight1"] + params["bias1"])
+    return (x @ params["weight2"] + params["bias2"])[..., 0]

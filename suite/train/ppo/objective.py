@@ -1,0 +1,104 @@
+"""The advantages and the clipped objective of PPO (Schulman et al. 2016, 2017)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from policies.networks import network
+from suite.train.ppo.config import PpoConfig
+from suite.train.ppo.rollout import log_probability
+
+
+class Actor(NamedTuple):
+    """What acts while it learns: the policy and its exploration."""
+
+    params: network.Params
+    """The policy's."""
+    log_deviation: jax.Array
+    """(3,) logarithm of the exploration's standard deviation on each axis [m/s^2]."""
+
+
+class Sequences(NamedTuple):
+    """What the objective needs of a rollout's worlds: (T, B, ...) but for the start."""
+
+    state: jax.Array
+    """(T, B, state_size)."""
+    action_b: jax.Array
+    """(T, B, 3)."""
+    log_prob: jax.Array
+    """Of the actions, under the policy that flew."""
+    done: jax.Array
+    """Bool: the episode ended with the step."""
+    advantage: jax.Array
+    """Normalised."""
+    start: jax.Array
+    """(1, B, hidden) recurrent state with which every episode of a world starts."""
+
+
+def advantages(
+    reward: jax.Array, value: jax.Array, done: jax.Array, discount: float, trace: float
+) -> jax.Array:
+    """Return the generalised advantage estimates (T, B) (Schulman et al. 2016, Eq. 16).
+
+    An episode that is cut by the rollout's end goes on with the value there; one that ended in a
+    collision is worth nothing afterwards.
+
+    Args:
+        reward: (T, B).
+        value: (T + 1, B) of the states before each step, and after the last.
+        done: (T, B) bool, the step ended its episode.
+        discount: gamma.
+        trace: lambda.
+    """
+    going = 1.0 - done
+    error = reward + discount * going * value[1:] - value[:-1]
+
+    def back(later: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        delta, keep = now
+        total = delta + discount * trace * keep * later
+        return total, total
+
+    return jax.lax.scan(back, jnp.zeros_like(error[0]), (error, going), reverse=True)[1]
+
+
+def action_means(params: network.Params, embeddings: jax.Array, sequences: Sequences) -> jax.Array:
+    """Return the policy's actions (T, B, 3) along its episodes, from embeddings (T, B, hidden)."""
+    start = sequences.start[0]
+
+    def step(
+        hidden: jax.Array, now: tuple[jax.Array, jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        embedding, state, done = now
+        mean, hidden = network.recur(params, hidden, embedding, state)
+        return jnp.where(done[:, None], start, hidden), mean
+
+    return jax.lax.scan(step, start, (embeddings, sequences.state, sequences.done))[1]
+
+
+def clipped_loss(
+    config: PpoConfig, actor: Actor, embeddings: jax.Array, sequences: Sequences
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Return minus the clipped objective (Schulman et al. 2017, Eq. 7) and numbers of the curve.
+
+    Args:
+        config: clip and weight of the entropy.
+        actor: with gradient.
+        embeddings: (T, B, hidden) of the images, with gradient.
+        sequences: the rollout's.
+    """
+    mean = action_means(actor.params, embeddings, sequences)
+    log_ratio = log_probability(mean, actor.log_deviation, sequences.action_b) - sequences.log_prob
+    ratio = jnp.exp(log_ratio)
+    held = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
+    gain = jnp.minimum(ratio * sequences.advantage, held * sequences.advantage).mean()
+    # A normal distribution's entropy but for a constant.
+    entropy = actor.log_deviation.sum()
+    numbers = {
+        # Schulman's estimate of the divergence, which is never negative.
+        "divergence": (ratio - 1.0 - log_ratio).mean(),
+        "clipped": (jnp.abs(ratio - 1.0) > config.clip).mean(),
+    }
+    return -gain - config.entropy * entropy, numbers

@@ -1,0 +1,105 @@
+"""The reward of one step, for any policy's rollout (Su et al. 2026, Table "Reward Function").
+
+It is the yardstick of the comparison of training schemes, so its weights are constants: no
+training's own weights change it. What the table leaves open is taken from `LossConfig`, as the
+differentiable trainer has it: beta_2 is `barrier_slope`, r_q is `safety_radius_m`, and the nearest
+obstacle is looked up at `path_samples` points of the step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from suite.train.config import TrainConfig
+from suite.train.dynamics.interface import Body
+from suite.train.losses import obstacle_terms, progress_term, smoothness_terms
+from suite.train.rollout import NEAR, target_gate
+from suite.train.worlds import Worlds
+from tracks.geometry.clearance import nearest_obstacle
+from tracks.geometry.crossing import crossing
+
+COLLISION = -30.0
+"""lambda_1, of a step that comes closer to a solid than r_q [1]."""
+BARRIER = -6.0
+"""lambda_2, of ln(1 + e^{beta_2 (|d| - r_q)}) [1]."""
+CLOSING = -3.0
+"""lambda_3, of v^c max(1 - |d| + r_q, 0)^2 [s/m^3]."""
+ACCELERATION = -1e-2
+"""lambda_4, of |a|^2 [s^4/m^2]."""
+JERK = -1e-3
+"""lambda_5, of |(a_k - a_{k-1}) / dt|^2 [s^6/m^2]."""
+PASS = 110.0
+"""lambda_6, of a step that passes the gate [1]."""
+PROGRESS = 0.4
+"""lambda_7, of the speed towards the gate [s/m]."""
+
+
+class RewardTerms(NamedTuple):
+    """Weighted terms, (B,) each; their sum is the reward of the step."""
+
+    collision: jax.Array
+    avoid: jax.Array
+    smooth: jax.Array
+    passing: jax.Array
+    progress: jax.Array
+
+    def total(self) -> jax.Array:
+        """Return the reward (B,)."""
+        return self.collision + self.avoid + self.smooth + self.passing + self.progress
+
+
+def make_reward(
+    config: TrainConfig,
+) -> Callable[..., tuple[RewardTerms, jax.Array, jax.Array]]:
+    """Return reward(worlds, before, body, target) -> (terms, clearance, passed), (B,) each.
+
+    It scores the step from `before` to `body` of worlds that have passed `target` (B,) gates: the
+    weighted terms, the smallest signed distance to a solid on the way [m] and whether a gate was
+    passed. A gate is passed where the judge says so, by crossing its opening, instead of within
+    r_th of its centre; such a step's progress is towards the next gate.
+
+    Args:
+        config: beta_2, r_q and the points of a step's path are those of its `loss`.
+    """
+    weights = replace(
+        config.loss,
+        barrier_height=1.0,
+        acceleration=-ACCELERATION,
+        jerk=-JERK,
+        progress=PROGRESS,
+        progress_norm=0.0,
+        projection=0.0,
+    )
+
+    def reward(
+        worlds: Worlds, before: Body, body: Body, target: jax.Array
+    ) -> tuple[RewardTerms, jax.Array, jax.Array]:
+        gates = worlds.scene.gates
+        gate, _ = target_gate(gates, target)
+        passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, before.pos_w, body.pos_w)
+        passed = passed & (target < gates.center_w.shape[1])
+        _, goal_w = target_gate(gates, target + passed)
+        share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
+        path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
+        distance, away = nearest_obstacle(worlds.scene, path, NEAR)
+        clearance = distance.min(-1)
+        barrier, closing = obstacle_terms(weights, distance, away, path, body.vel_w)
+        size, change = smoothness_terms(
+            weights, body.acc_w, before.acc_w, worlds.constants.time_step
+        )
+        behind = progress_term(weights, body.pos_w, body.vel_w, goal_w, jnp.zeros((1, 3)))
+        terms = RewardTerms(
+            collision=COLLISION * (clearance < weights.safety_radius_m),
+            avoid=BARRIER * barrier + CLOSING * closing,
+            smooth=-size - change,
+            passing=PASS * passed,
+            progress=-behind,
+        )
+        return terms, clearance, passed
+
+    return reward

@@ -1,0 +1,151 @@
+"""A rollout with exploration and without gradients, in the trainer's worlds and dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from policies.networks import network
+from policies.observation import state_vector
+from suite.train.config import TrainConfig
+from suite.train.dynamics.interface import make_dynamics
+from suite.train.ppo import critic
+from suite.train.ppo.reward import RewardTerms, make_reward
+from suite.train.rollout import BODY_RADIUS_M, make_look, queue, states_at_start, target_gate
+from suite.train.worlds import Worlds
+
+
+class Memory(NamedTuple):
+    """What an episode carries from step to step."""
+
+    body: Any
+    """Of the dynamics."""
+    target: jax.Array
+    """(B,) gates passed, counted from the track's first."""
+    hidden: jax.Array
+    """(B, hidden) of the policy."""
+    action_b: jax.Array
+    """(B, 3) the last action [m/s^2]."""
+    images: jax.Array
+    """(B, image_delay, height, width) on their way, oldest first."""
+    states: jax.Array
+    """(B, state_delay, state_size) on their way, oldest first."""
+
+
+class Record(NamedTuple):
+    """What a step leaves behind, (B, ...) each."""
+
+    image: jax.Array
+    """(B, height, width) that the policy saw."""
+    state: jax.Array
+    """(B, state_size) that it saw."""
+    action_b: jax.Array
+    """(B, 3) what it did [m/s^2]."""
+    log_prob: jax.Array
+    """Logarithm of the density of that action."""
+    seen: jax.Array
+    """(B, critic.FEATURES) what the critic saw before the step."""
+    reward: RewardTerms
+    """Of the step."""
+    done: jax.Array
+    """Bool: the drone touched a solid, and the world starts again."""
+    hidden: jax.Array
+    """(B, hidden) recurrent state after the step."""
+    passed: jax.Array
+    """Bool: a gate was passed."""
+    speed: jax.Array
+    """[m/s]."""
+
+
+def log_probability(mean: jax.Array, log_deviation: jax.Array, action: jax.Array) -> jax.Array:
+    """Return the log density (...) of actions (..., 3) around mean (..., 3).
+
+    Args:
+        mean: (..., 3) [m/s^2].
+        log_deviation: (3,) logarithm of the standard deviation, the same in every state.
+        action: (..., 3) [m/s^2].
+    """
+    away = (action - mean) * jnp.exp(-log_deviation)
+    return -(0.5 * away * away + log_deviation + 0.5 * jnp.log(2 * jnp.pi)).sum(-1)
+
+
+def chosen(done: jax.Array, fresh: Any, going: Any) -> Any:
+    """Return the rows of `fresh` where done (B,), and of `going` elsewhere, for trees (B, ...)."""
+
+    def pick(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+    return jax.tree.map(pick, fresh, going)
+
+
+def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]:
+    """Return rollout(params, log_deviation, worlds, key) -> (records (T, B, ...), seen (B, F)).
+
+    An episode ends where the drone touches a solid; its world then starts again as it started,
+    with the recurrent state that it had. `seen` is what the critic sees after the last step.
+    """
+    spec, physics = config.spec, config.physics
+    look, reward, dynamics = make_look(config), make_reward(config), make_dynamics(config)
+
+    def rollout(
+        params: network.Params, log_deviation: jax.Array, worlds: Worlds, key: jax.Array
+    ) -> tuple[Record, jax.Array]:
+        batch = worlds.pos_w.shape[0]
+        start = Memory(
+            body=dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w),
+            target=worlds.target,
+            hidden=jnp.asarray(worlds.hidden),
+            action_b=jnp.zeros((batch, 3)),
+            # An image of zeros is embedded as zeros, which is how the trainer's rollouts start.
+            images=jnp.zeros((batch, physics.image_delay, spec.camera.height, spec.camera.width)),
+            states=states_at_start(batch, config),
+        )
+
+        def step(memory: Memory, key: jax.Array) -> tuple[Memory, Record]:
+            before = memory.body
+            seen = critic.features(worlds, before, memory.target)
+            gate, target_w = target_gate(worlds.scene.gates, memory.target)
+            second_w = None
+            if spec.second_gate:
+                _, second_w = target_gate(worlds.scene.gates, memory.target, ahead=1)
+            axis_w = gate.rot_w[:, :, 0] if spec.gate_axis else None
+            state = state_vector(
+                before.pos_w,
+                before.vel_w,
+                before.rot_w,
+                target_w,
+                memory.action_b,
+                second_w,
+                axis_w,
+            )
+            state, states = queue(memory.states, state)
+            image, images = queue(memory.images, look(worlds, before, key))
+            mean, hidden = network.step(params, memory.hidden, state, image)
+            noise = jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
+            action = mean + jnp.exp(log_deviation) * noise
+            body = dynamics.step(before, worlds.constants, action, target_w, key)
+            terms, clearance, passed = reward(worlds, before, body, memory.target)
+            done = clearance < BODY_RADIUS_M
+            record = Record(
+                image=image,
+                state=state,
+                action_b=action,
+                log_prob=log_probability(mean, log_deviation, action),
+                seen=seen,
+                reward=terms,
+                done=done,
+                hidden=hidden,
+                passed=passed,
+                speed=jnp.linalg.norm(body.vel_w, axis=-1),
+            )
+            target = memory.target + passed
+            going = Memory(body, target, hidden, action, images, states)
+            return chosen(done, start, going), record
+
+        last, records = jax.lax.scan(step, start, jax.random.split(key, config.episode.steps))
+        return records, critic.features(worlds, last.body, last.target)
+
+    return rollout

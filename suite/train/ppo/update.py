@@ -1,0 +1,212 @@
+"""One iteration of PPO: a rollout, its advantages, passes of the policy, passes of the critic.
+
+Worlds are the units of minibatches, and a world's whole rollout is backpropagated through. As in
+the differentiable trainer, a minibatch's images are encoded at once, outside the loop over steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from policies.networks import network
+from suite.train.checks import check_stride
+from suite.train.gradient import encoder_gradient, every
+from suite.train.ppo import critic
+from suite.train.ppo.config import PpoConfig
+from suite.train.ppo.objective import Actor, Sequences, advantages, clipped_loss
+from suite.train.ppo.rollout import Record, make_rollout
+from suite.train.worlds import Worlds
+
+
+class PpoState(NamedTuple):
+    """All that a run carries from one iteration to the next."""
+
+    actor: Actor
+    """The policy and its exploration."""
+    critic: critic.Params
+    """The value's."""
+    optimizer: optax.OptState
+    """Of the actor."""
+    critic_optimizer: optax.OptState
+    """Of the critic."""
+    iteration: jax.Array
+    """Iterations done, a scalar."""
+    hidden: jax.Array
+    """(B, hidden) recurrent states from random steps of the last rollout."""
+
+    @property
+    def params(self) -> network.Params:
+        """The policy's parameters."""
+        return self.actor.params
+
+
+def make_optimizers(
+    config: PpoConfig,
+) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
+    """Return the actor's and the critic's optimiser."""
+    steps = config.iterations * config.epochs * config.minibatches
+    rate = optax.linear_schedule(config.rate, 0.0, max(1, steps))
+    actor = optax.chain(optax.clip_by_global_norm(config.gradient_clip), optax.adam(rate))
+    return actor, optax.adam(config.critic_rate)
+
+
+def start_state(config: PpoConfig) -> PpoState:
+    """Return the state before the first iteration; the policy starts as the trainer's does."""
+    params = network.init(jax.random.key(config.seed), config.spec)
+    # With its type said: a weak one would have the second iteration compiled again.
+    actor = Actor(params, jnp.full(3, math.log(config.deviation), jnp.float32))
+    value = critic.init(jax.random.fold_in(jax.random.key(config.seed), 1), config.critic_size)
+    actor_optimizer, critic_optimizer = make_optimizers(config)
+    return PpoState(
+        actor=actor,
+        critic=value,
+        optimizer=actor_optimizer.init(actor),
+        critic_optimizer=critic_optimizer.init(value),
+        iteration=jnp.zeros((), int),
+        hidden=jnp.zeros((config.episode.batch, config.spec.hidden_size)),
+    )
+
+
+def shuffled(key: jax.Array, count: int, epochs: int, parts: int) -> jax.Array:
+    """Return indices (epochs * parts, count // parts): each epoch is a new order of all."""
+    orders = [jax.random.permutation(k, count) for k in jax.random.split(key, epochs)]
+    return jnp.stack(orders).reshape(epochs * parts, count // parts)
+
+
+def actor_gradient(
+    config: PpoConfig, actor: Actor, images: jax.Array, sequences: Sequences, key: jax.Array
+) -> tuple[Actor, dict[str, jax.Array]]:
+    """Return the gradient of the clipped loss and numbers of the curve.
+
+    Args:
+        config: the run.
+        actor: to differentiate at.
+        images: (T, B, height, width).
+        sequences: (T, B, ...) that go with them.
+        key: picks the images whose encoder gradient is taken, with `episode.image_stride`.
+    """
+    steps, batch = images.shape[:2]
+    embeddings = network.encode(actor.params, images.reshape(-1, *images.shape[2:]))
+    embeddings = embeddings.reshape(steps, batch, -1)
+    (loss, numbers), (direct, cotangents) = jax.value_and_grad(
+        clipped_loss, argnums=(1, 2), has_aux=True
+    )(config, actor, embeddings, sequences)
+    stride = config.episode.image_stride
+    first = jax.random.randint(key, (), 0, stride)
+    images, cotangents = (
+        every(stride, first, array).reshape(-1, *array.shape[2:])
+        for array in (images, stride * cotangents)
+    )
+    through_images = encoder_gradient(actor.params, images, cotangents)
+    params = jax.tree.map(jnp.add, direct.params, through_images)
+    return direct._replace(params=params), {"loss": loss, **numbers}
+
+
+def curve_numbers(records: Record) -> dict[str, jax.Array]:
+    """Return a rollout's numbers of the curve; gates and collisions are of the first episodes."""
+    first = jnp.cumprod(
+        1 - jnp.concatenate([jnp.zeros_like(records.done[:1]), records.done[:-1]]), 0
+    )
+    numbers = {
+        "reward": records.reward.total().mean(),
+        "gates": (records.passed * first).sum(0).mean(),
+        "collided": records.done.any(0).mean(),
+        "speed": records.speed.mean(),
+        "speed_max": records.speed.max(0).mean(),
+    }
+    return numbers | {f"reward_{k}": v.mean() for k, v in records.reward._asdict().items()}
+
+
+def make_update(
+    config: PpoConfig,
+) -> Callable[[PpoState, Worlds], tuple[PpoState, dict[str, jax.Array]]]:
+    """Return update(state, worlds) -> (state', numbers of the curve), compiled on first call.
+
+    Raises:
+        ValueError: where `minibatches` does not divide `episode.batch`, or `episode.image_stride`
+            `episode.steps`.
+    """
+    batch, steps = config.episode.batch, config.episode.steps
+    if config.minibatches < 1 or batch % config.minibatches:
+        raise ValueError(
+            f"minibatches is {config.minibatches}, allowed are divisors of episode.batch ({batch})"
+        )
+    check_stride(config.episode.image_stride, steps)
+    rollout = make_rollout(config.shared)
+    actor_optimizer, critic_optimizer = make_optimizers(config)
+    seed = jax.random.key(np.uint32(config.seed))
+
+    def teach_actor(
+        state: PpoState, images: jax.Array, sequences: Sequences, key: jax.Array
+    ) -> tuple[PpoState, dict[str, jax.Array]]:
+        def learn(
+            held: tuple[Actor, optax.OptState], part: tuple[jax.Array, jax.Array]
+        ) -> tuple[tuple[Actor, optax.OptState], dict[str, jax.Array]]:
+            (actor, optimizer), (rows, key) = held, part
+            taken = Sequences(*(array[:, rows] for array in sequences))
+            gradient, numbers = actor_gradient(config, actor, images[:, rows], taken, key)
+            squares = [(leaf * leaf).sum() for leaf in jax.tree.leaves(gradient)]
+            numbers["gradient_norm"] = jnp.sqrt(jnp.stack(squares).sum())
+            change, optimizer = actor_optimizer.update(gradient, optimizer, actor)
+            # optax types any tree of parameters; it gives back the one it was given.
+            return (cast(Actor, optax.apply_updates(actor, change)), optimizer), numbers
+
+        rows = shuffled(key, batch, config.epochs, config.minibatches)
+        parts = rows, jax.random.split(key, len(rows))
+        (actor, optimizer), numbers = jax.lax.scan(learn, (state.actor, state.optimizer), parts)
+        return state._replace(actor=actor, optimizer=optimizer), numbers
+
+    def teach_critic(state: PpoState, seen: jax.Array, goal: jax.Array, key: jax.Array) -> PpoState:
+        def loss_of(params: critic.Params, rows: jax.Array) -> jax.Array:
+            return ((critic.value(params, seen[:, rows]) - goal[:, rows]) ** 2).mean()
+
+        def learn(
+            held: tuple[critic.Params, optax.OptState], rows: jax.Array
+        ) -> tuple[tuple[critic.Params, optax.OptState], None]:
+            params, optimizer = held
+            gradient = jax.grad(loss_of)(params, rows)
+            change, optimizer = critic_optimizer.update(gradient, optimizer, params)
+            return (cast(critic.Params, optax.apply_updates(params, change)), optimizer), None
+
+        rows = shuffled(key, batch, config.critic_epochs, config.minibatches)
+        held = state.critic, state.critic_optimizer
+        (params, optimizer), _ = jax.lax.scan(learn, held, rows)
+        return state._replace(critic=params, critic_optimizer=optimizer)
+
+    @jax.jit
+    def update(state: PpoState, worlds: Worlds) -> tuple[PpoState, dict[str, jax.Array]]:
+        keys = jax.random.split(jax.random.fold_in(seed, state.iteration), 4)
+        worlds = worlds._replace(hidden=state.hidden * worlds.remembers[:, None])
+        actor = state.actor
+        records, last_seen = rollout(actor.params, actor.log_deviation, worlds, keys[0])
+        value = critic.value(state.critic, jnp.concatenate([records.seen, last_seen[None]]))
+        reward = config.reward_scale * records.reward.total()
+        advantage = advantages(reward, value, records.done, config.discount, config.trace)
+        goal = advantage + value[:-1]
+        sequences = Sequences(
+            state=records.state,
+            action_b=records.action_b,
+            log_prob=records.log_prob,
+            done=records.done,
+            advantage=(advantage - advantage.mean()) / (advantage.std() + 1e-8),
+            start=worlds.hidden[None],
+        )
+        state, numbers = teach_actor(state, records.image, sequences, keys[1])
+        state = teach_critic(state, records.seen, goal, keys[2])
+        step = jax.random.randint(keys[3], (batch,), 0, steps)
+        hidden = records.hidden[step, jnp.arange(batch)]
+        state = state._replace(iteration=state.iteration + 1, hidden=hidden)
+        numbers = curve_numbers(records) | jax.tree.map(jnp.mean, numbers)
+        numbers["value_loss"] = (advantage**2).mean()
+        numbers["explained"] = 1.0 - advantage.var() / (goal.var() + 1e-8)
+        numbers["deviation"] = jnp.exp(actor.log_deviation).mean()
+        return state, numbers
+
+    return update

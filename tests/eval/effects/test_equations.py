@@ -1,0 +1,308 @@
+"""Each effect against numbers worked by hand from its equation, and what all have in common."""
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from eval.effects import EFFECTS, apply_log_faults
+from eval.quadrotor.plant import (
+    Command,
+    Motion,
+    make_plant,
+    plant_step,
+    spin_step,
+    start_memory,
+    uses_noise,
+)
+from eval.quadrotor.rigid_body import accelerations
+from eval.quadrotor.rotors import steady
+from tests.support.flights import small_log
+from tests.support.vehicles import PLAIN, at_rest, with_effects
+
+# All four rotors at 1000 rad/s push 1.6 N each; their torques about z cancel.
+SPEED = np.full(4, 1000.0)
+MOVING = Motion(np.zeros(3), np.eye(3), np.array([3.0, -2.0, 1.0]), np.array([1.0, 2.0, -0.5]))
+YAWED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def wrench(vehicle, motion=MOVING, speed=SPEED, time_s=0.0, **more):
+    plant = make_plant(vehicle, 0.002)
+    _, acting = spin_step(plant, start_memory(plant, ()), motion, steady(speed), time_s, **more)
+    return acting
+
+
+def added(motion=MOVING, speed=SPEED, **effects):
+    """Return force and torque that effects add to those of the plain rotors."""
+    plain = wrench(PLAIN, motion, speed)
+    full = wrench(with_effects(**effects), motion, speed)
+    return full.force_b - plain.force_b, full.torque_b - plain.torque_b
+
+
+def near(actual, expected, tolerance=1e-9):
+    np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=tolerance)
+
+
+def test_rotors_alone():
+    force, torque = wrench(PLAIN)
+    near(force, [0.0, 0.0, 6.4])
+    near(torque, [0.0, 0.0, 0.0])
+    # Rotor 1 alone, front right, counter-clockwise: rolls left, pitches up, yaws clockwise.
+    force, torque = wrench(PLAIN, speed=np.array([1000.0, 0.0, 0.0, 0.0]))
+    near(force, [0.0, 0.0, 1.6])
+    near(torque, [-0.16, -0.12, -0.022])
+
+
+def test_linear_drag():
+    force, torque = added(linear_drag=((0.3, 0.2, 0.1),))
+    near(force, [-0.675, 0.3, -0.075])
+    near(torque, 0.0)
+
+
+def test_drags_take_the_true_mass():
+    force = wrench(with_effects(linear_drag=((0.3, 0.2, 0.1),), mass_offset=(0.25,))).force_b
+    near(force, [-0.9, 0.4, 6.3])
+
+
+def test_quadratic_drag():
+    # |v| = sqrt(14) = 3.7416574
+    force, torque = added(quadratic_drag=((0.01, 0.02, 0.04),))
+    near(force, [-0.084187291, 0.112249722, -0.112249722])
+    near(torque, 0.0)
+
+
+def test_rotor_drag():
+    force, torque = added(rotor_drag=(2e-5,))
+    near(force, [-0.24, 0.16, 0.0])
+    near(torque, 0.0)
+
+
+def test_inflow():
+    force, _ = added(inflow=(1e-4,))
+    near(force, [0.0, 0.0, -0.4])
+    # One rotor faster than the others loses more: rotor 3, rear left.
+    _, torque = added(speed=np.array([1000.0, 1000.0, 1500.0, 1000.0]), inflow=(1e-4,))
+    near(torque, [-0.05 * 0.1, -0.05 * 0.075, 0.0])
+
+
+def test_translational_lift():
+    force, torque = added(translational_lift=(0.01,))
+    near(force, [0.0, 0.0, 0.0975])
+    near(torque, 0.0)
+
+
+def test_blade_flapping():
+    force, torque = added(blade_flapping=(1e-6,))
+    near(force, 0.0)
+    near(torque, [-0.008, -0.012, 0.0])
+
+
+def test_ground_effect():
+    low = at_rest(0.05)
+    # g (r / 4 z)^2 = (0.0635 / 0.2)^2 = 0.10080625
+    near(added(low, ground_effect=(1.0, 0.0635))[0], [0.0, 0.0, 6.4 * (1 / 0.89919375 - 1)])
+    # Capped at a factor of 1.5, also on and below the ground.
+    near(added(at_rest(0.01), ground_effect=(1.0, 0.0635))[0], [0.0, 0.0, 3.2])
+    near(added(at_rest(-0.2), ground_effect=(1.0, 0.0635))[0], [0.0, 0.0, 3.2])
+
+
+def test_ground_effect_is_felt_by_each_rotor_at_its_own_height():
+    angle = 0.3  # rolled right side down: left rotors are higher
+    c, s = np.cos(angle), np.sin(angle)
+    rolled = at_rest(0.1)._replace(rot_w=np.array([[1, 0, 0], [0, c, -s], [0, s, c]]))
+    high, low = 0.1 + 0.1 * s, 0.1 - 0.1 * s
+    more = [1.6 * (1 / (1 - (0.0635 / (4 * z)) ** 2) - 1) for z in (high, low)]
+    force, torque = added(rolled, ground_effect=(1.0, 0.0635))
+    near(force, [0.0, 0.0, 2 * sum(more)])
+    near(torque, [2 * 0.1 * (more[0] - more[1]), 0.0, 0.0])
+
+
+def test_constant_wind_acts_through_drag_only():
+    near(added(constant_wind=((1.0, 0.0, 0.0),))[0], 0.0)
+    still = Motion(np.zeros(3), YAWED, np.zeros(3), np.zeros(3))
+    wind: dict[str, Any] = {"constant_wind": ((1.0, 0.0, 0.5),), "linear_drag": ((0.3, 0.2, 0.1),)}
+    # Facing world y, the wind along world x comes from the left and blows to the right.
+    near(added(still, **wind)[0], [0.0, -0.15, 0.0375])
+
+
+def test_gusts_have_their_intensity_colour_and_mean():
+    vehicle = with_effects(gusts=(1.5, 4.0), linear_drag=((1.0, 1.0, 1.0),))
+    plant = make_plant(vehicle, 0.02)
+    assert uses_noise(plant)
+    rng = np.random.default_rng(1)
+    n, steps = 400, 200
+    motion = Motion(
+        np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)), np.tile([8.0, 0, 0], (n, 1)),
+        np.zeros((n, 3)),
+    )  # fmt: skip
+    memory = start_memory(plant, (n,), noise=rng.standard_normal((n, 3)))
+    winds = []
+    for _ in range(steps):
+        noise = rng.standard_normal((n, 3))
+        memory, _ = spin_step(plant, memory, motion, steady(np.tile(SPEED, (n, 1))), 0.0, noise)
+        winds.append(memory.wind["gusts"])
+    winds = np.array(winds)
+    np.testing.assert_allclose(winds.std(axis=(0, 1)), [1.5, 1.5, 0.75], rtol=0.05)
+    np.testing.assert_allclose(winds.mean(axis=(0, 1)), 0.0, atol=0.08)
+    # At 8 m/s of airspeed the wind of 4 m length forgets itself in 0.5 s, here 25 steps.
+    kept = (winds[25:] * winds[:-25]).mean(axis=(0, 1)) / (winds**2).mean(axis=(0, 1))
+    np.testing.assert_allclose(kept, np.exp(-1.0), atol=0.05)
+
+
+def test_gusts_without_noise_are_absent():
+    near(added(gusts=(2.0, 4.0), linear_drag=((0.3, 0.2, 0.1),))[0], [-0.675, 0.3, -0.075])
+
+
+def test_motor_lag_replaces_the_time_constant():
+    plant = make_plant(with_effects(motor_lag=(0.05,)), 0.05)
+    memory = start_memory(plant, ())._replace(rotor_speed=SPEED)
+    # 6.25 N over four rotors of k_T asks for the speed that gives it.
+    wanted = 2000.0
+    command = Command(np.array(4 * 1.6e-6 * wanted**2 / 0.75), np.zeros(3))
+    memory, _ = plant_step(plant, memory, at_rest(), command, 0.0)
+    near(memory.rotor_speed, 1000.0 + 1000.0 * (1.0 - np.exp(-1.0)))
+
+
+@pytest.mark.parametrize(("delay", "acts_at"), [(0.0, 0), (0.004, 2), (0.03, 15)])
+def test_command_delay(delay, acts_at):
+    plant = make_plant(with_effects(command_delay=(delay,)), 0.002)
+    memory = start_memory(plant, ())
+    pushes = []
+    for _ in range(20):
+        command = Command(np.array(15.0), np.zeros(3))
+        memory, acting = plant_step(plant, memory, at_rest(), command, 0.0)
+        pushes.append(acting.force_b[2])
+    expected = np.where(np.arange(20) < acts_at, 9.81 * 0.75, 15.0 * 0.75)
+    near(pushes, expected)
+
+
+def test_command_delay_between_steps_gives_the_mean_of_the_step():
+    plant = make_plant(with_effects(command_delay=(0.005,)), 0.002)
+    memory = start_memory(plant, ())
+    thrusts = [10.0, 20.0, 12.0, 12.0, 12.0]
+    pushes = []
+    for thrust in thrusts:
+        memory, acting = plant_step(
+            plant, memory, at_rest(), Command(np.array(thrust), np.zeros(3)), 0.0
+        )
+        pushes.append(acting.force_b[2] / 0.75)
+    near(pushes, [9.81, 9.81, (9.81 + 10.0) / 2, 15.0, 16.0])
+
+
+def test_thrust_scale_leaves_yaw_torque():
+    force, torque = wrench(with_effects(thrust_scale=(0.9,)), speed=np.array([1000.0, 0, 0, 0]))
+    near(force, [0.0, 0.0, 1.44])
+    near(torque, [-0.144, -0.108, -0.022])
+
+
+def test_battery_sag():
+    near(wrench(with_effects(battery_sag=(0.001, 0.0)), time_s=50.0).force_b[2], 6.4 * 0.95)
+    by_voltage = with_effects(battery_sag=(0.001, 0.05))
+    near(wrench(by_voltage, time_s=50.0, voltage_drop=np.array(2.0)).force_b[2], 6.4 * 0.9)
+    # A judge without voltage goes by time.
+    near(wrench(by_voltage, time_s=50.0).force_b[2], 6.4 * 0.95)
+
+
+def test_mass_offset():
+    plant = make_plant(with_effects(mass_offset=(0.1,)), 0.002)
+    hover = Command(np.array(9.81), np.zeros(3))
+    _, acting = plant_step(plant, start_memory(plant, ()), at_rest(), hover, 0.0)
+    acc, _ = accelerations(plant, at_rest(), acting)
+    near(acc, [0.0, 0.0, 9.81 * 0.75 / 0.85 - 9.81])
+
+
+def test_com_offset():
+    # Ahead of the rotors' centre the weight pitches the nose down (+y), on the left it rolls left.
+    near(added(com_offset=((0.01, 0.0, 0.0),))[1], [0.0, 0.064, 0.0])
+    near(added(com_offset=((0.0, 0.01, 0.0),))[1], [-0.064, 0.0, 0.0])
+    near(added(com_offset=((0.0, 0.0, 0.01),))[1], 0.0)
+
+
+def test_torque_trim():
+    force, torque = added(torque_trim=((0.01, -0.02, 0.003),))
+    near(force, 0.0)
+    near(torque, [0.01, -0.02, 0.003])
+
+
+def test_inertia_scale_and_rate_gain():
+    start, command = at_rest(), Command(np.array(9.81), np.array([1.0, -1.0, 0.5]))
+    cases: list[tuple[dict[str, Any], list[float]]] = [
+        ({}, [20.0, -20.0, 4.0]),
+        ({"inertia_scale": ((0.8, 1.25, 2.0),)}, [25.0, -16.0, 2.0]),
+        ({"rate_gain": ((0.5, 1.5, 2.0),)}, [10.0, -30.0, 8.0]),
+    ]
+    for effects, expected in cases:
+        plant = make_plant(with_effects(**effects), 0.002)
+        _, acting = plant_step(plant, start_memory(plant, ()), start, command, 0.0)
+        near(accelerations(plant, start, acting)[1], expected)
+
+
+def test_gyroscopic_terms_of_the_true_inertia():
+    plant = make_plant(with_effects(inertia_scale=((2.0, 1.0, 1.0),)), 0.002)
+    none = wrench(PLAIN)._replace(torque_b=np.zeros(3))
+    # J w = (0.005, 0.0042, -0.00215); -w x J w = (0.0022, 0.00035, 0.0058) by hand.
+    near(accelerations(plant, MOVING, none)[1], [0.0022 / 0.005, 0.00035 / 0.0021, 0.0058 / 0.0043])
+
+
+def test_rotor_gyroscopic():
+    speed = np.array([1200.0, 1000.0, 1200.0, 1000.0])
+    force, torque = added(speed=speed, rotor_gyroscopic=(2e-5,))
+    near(force, 0.0)
+    near(torque, [-0.016, 0.008, 0.0])
+
+
+def test_angular_damping():
+    near(added(angular_damping=((1.0, 2.0, 0.5),))[1], [-0.0025, -0.0084, 0.001075])
+
+
+def test_weak_motor():
+    # Rotor 2 is rear right, clockwise: without its tenth the body rolls right and pitches up.
+    vehicle = with_effects(weak_motor=((1.0, 0.9, 1.0, 1.0),))
+    near(wrench(vehicle).force_b, [0.0, 0.0, 6.24])
+    near(wrench(vehicle).torque_b, [0.016, -0.012, -0.0022])
+
+
+def test_thrust_tilt():
+    force, torque = added(thrust_tilt=((0.01, 0.02),))
+    near(force, [6.4 * 0.02, -6.4 * 0.01, -6.4 * 0.00025], tolerance=1e-4)
+    near(torque, 0.0)
+
+
+def test_frame_tilt():
+    plant = make_plant(with_effects(frame_tilt=((0.01, 0.02),)), 0.002)
+    gravity = plant.constants.gravity_w
+    near(gravity, [-0.1962, 0.0981, -9.81 + 0.00245], tolerance=2e-4)
+    near(np.linalg.norm(gravity), 9.81)
+
+
+def test_sensor_biases():
+    log = small_log()
+    vehicle = with_effects(gyro_bias=((0.1, 0.0, -0.2),), accelerometer_bias=((0.0, 0.5, 0.0),))
+    faulty = apply_log_faults(vehicle.effects, log)
+    near(faulty["rate_b"][2], [0.1, 0.0, 0.8])
+    near(faulty["acc_b"][2], [0.0, 0.5, 9.81])
+    assert faulty["pos_w"] is log["pos_w"]
+    assert "acc_b" not in apply_log_faults(vehicle.effects, {"time_s": log["time_s"]})
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_clock_offset_logs_an_older_pose(xp):
+    log = {name: xp.asarray(values) for name, values in small_log().items()}
+    faulty = apply_log_faults(with_effects(clock_offset=(0.015,)).effects, log)
+    np.testing.assert_allclose(faulty["pos_w"][:, 0], 3.0 * (log["time_s"] - 0.015), atol=1e-6)
+    np.testing.assert_allclose(faulty["vel_w"][4, 0], 3.05, rtol=1e-6)
+    quat = np.asarray(faulty["quat_wxyz"])
+    np.testing.assert_allclose(np.linalg.norm(quat, axis=-1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(
+        quat[:, 3] / quat[:, 0], np.tan(0.5 * (small_log()["time_s"] - 0.015)), atol=1e-5
+    )
+    for name in ("rate_b", "acc_b", "thrust_cmd", "time_s"):
+        assert faulty[name] is log[name]
+
+
+def test_every_effect_of_the_catalogue_has_its_own_test():
+    source = Path(__file__).read_text(encoding="utf-8")
+    by_hand = [name for name in EFFECTS if f"{name}=(" in source or f'"{name}": (' in source]
+    assert by_hand == list(EFFECTS)

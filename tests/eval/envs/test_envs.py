@@ -1,0 +1,131 @@
+"""The environments by their libraries' own checkers, and against the judge."""
+
+import os
+import warnings
+
+os.environ.setdefault("MUJOCO_GL", "disable")
+
+import numpy as np
+import pytest
+from absl.testing import absltest
+from dm_env import test_utils
+from gymnasium.utils.env_checker import check_env
+
+from eval.envs.race import ACTION_LIMIT
+from eval.judging.judge import JudgeOptions, fly
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import Rules, TrialSpec
+from policies.spec import PolicySpec
+from tests.support.pilots import Pursuit
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # of the renderers that dm_control looks for
+    from eval.envs.dm_control_env import load
+
+from eval.envs.gymnasium_env import RaceEnv
+
+EVEN = PolicySpec(rate_hz=50.0)  # a whole number of physics steps, so that the judge flies alike
+
+
+def test_gymnasium_checker():
+    check_env(RaceEnv(rules=Rules(time_limit_s=0.5)), skip_render_check=True)
+
+
+def test_gymnasium_tracks_are_set_by_the_seed():
+    env = RaceEnv("circular", 5, rules=Rules(time_limit_s=0.2))
+    first, info = env.reset(seed=3)
+    again, info_again = env.reset(seed=3)
+    assert info == info_again and all(np.array_equal(first[k], again[k]) for k in first)
+    other, info_other = env.reset()
+    assert info_other != info and not np.array_equal(first["image"], other["image"])
+    _, chosen = env.reset(options={"track_seed": 12})
+    assert chosen["track_seed"] == 12
+
+
+def test_step_before_reset_is_refused():
+    with pytest.raises(RuntimeError, match="reset"):
+        RaceEnv().step(np.zeros(3, np.float32))
+
+
+class TestDmControl(test_utils.EnvironmentTestMixin, absltest.TestCase):
+    """dm_env's own conformance tests."""
+
+    def make_object_under_test(self, **unused):
+        return load(rules=Rules(time_limit_s=0.5))
+
+    def make_action_sequence(self):
+        spec = self.environment.action_spec()
+        rng = np.random.default_rng(0)
+        for _ in range(40):
+            yield rng.uniform(spec.minimum, spec.maximum)
+
+
+def pursue(policy, observation):
+    state, image = observation["state"][None], observation["image"][None]
+    action, _ = policy.act(policy.start(1), state, image, np.zeros(1, bool))
+    return action[0]
+
+
+def judged(policy, trial, rules):
+    (result,) = fly(
+        policy, [trial], load_vehicle("reference"), options=JudgeOptions(slots=1, rules=rules)
+    )
+    return result
+
+
+@pytest.mark.parametrize("trial", [TrialSpec("ellipse", 0, 0), TrialSpec("circular", 9, 1)])
+def test_environments_fly_what_the_judge_flies(trial):
+    rules, policy = Rules(time_limit_s=2.5), Pursuit(spec=EVEN)
+    expected = judged(policy, trial, rules)
+
+    env = RaceEnv(trial.track, trial.difficulty, trial.seed, spec=EVEN, rules=rules)
+    observation, _ = env.reset()
+    over, terminated, info, total = False, False, {}, 0.0
+    while not over:
+        observation, reward, terminated, truncated, info = env.step(
+            pursue(policy, observation) / ACTION_LIMIT
+        )
+        over, total = terminated or truncated, total + reward
+    assert (info["gates"], info["ended_by"]) == (expected.gates_passed, expected.ended_by)
+    assert terminated == (expected.ended_by != "timeout")
+    end = np.array([expected.pos_x, expected.pos_y, expected.pos_z])
+    # The action was divided and multiplied on its way.
+    assert env._race is not None and env._race.progress.pos_w[0] == pytest.approx(end, abs=1e-5)
+
+    other = load(*trial, spec=EVEN, rules=rules)
+    step = other.reset()
+    summed = 0.0
+    while not step.last():
+        step = other.step(pursue(policy, step.observation))
+        summed += step.reward
+    assert step.discount == (1.0 if expected.ended_by == "timeout" else 0.0)
+    assert np.array_equal(other.physics.race.progress.pos_w[0], end)
+    assert summed == pytest.approx(total, abs=1e-4)
+
+
+def test_a_crash_costs_and_progress_pays():
+    env = RaceEnv("zigzag", 0, 0)
+    env.reset()
+    down = np.array([0, 0, -1], np.float32)
+    rewards, over, info = [], False, {}
+    while not over:
+        _, reward, over, _, info = env.step(down)
+        rewards.append(reward)
+    assert rewards[-1] < -4 and info["ended_by"] in ("collision", "tipped")
+
+    start, _ = env.reset()
+    policy, total = Pursuit(), 0.0
+    observation = start
+    for _ in range(30):
+        observation, reward, *_ = env.step(pursue(policy, observation) / ACTION_LIMIT)
+        total += reward
+    before, after = (np.linalg.norm(o["state"][6:9]) for o in (start, observation))
+    assert total == pytest.approx(before - after, abs=1e-5)
+
+
+def test_nonsense_actions_do_not_break_it():
+    env = RaceEnv("zigzag", 0, 0)
+    env.reset()
+    for value in (np.nan, np.inf, 1e30):
+        observation, reward, *_ = env.step(np.full(3, value, np.float32))
+        assert np.isfinite(observation["state"]).all() and np.isfinite(reward)

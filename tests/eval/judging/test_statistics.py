@@ -1,0 +1,97 @@
+"""Intervals against published numbers and against their own promise."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eval.judging.statistics import (
+    bootstrap_median,
+    mcnemar_exact,
+    paired_bootstrap,
+    paired_success,
+    wilson,
+)
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    # Newcombe 1998, Statistics in Medicine 17, 857-872, Table I, method 3.
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611),
+     (1, 29, 0.0061, 0.1718)],
+)  # fmt: skip
+def test_wilson_published(successes, trials, low, high):
+    found = wilson(successes, trials)
+    assert found == pytest.approx((successes / trials, low, high), abs=5e-5)
+
+
+@given(st.integers(1, 200), st.data())
+def test_wilson_is_where_the_score_test_rejects(trials, data):
+    successes = data.draw(st.integers(0, trials))
+    rate, low, high = wilson(successes, trials)
+    assert 0 <= low <= rate <= high <= 1
+    for end in (low, high):
+        if 0 < end < 1:
+            assert abs(rate - end) == pytest.approx(1.959964 * (end * (1 - end) / trials) ** 0.5)
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(1, 0), (-1, 5), (6, 5)])
+def test_wilson_refuses(successes, trials):
+    with pytest.raises(ValueError, match="successes"):
+        wilson(successes, trials)
+
+
+def pairs(both, only_first, only_second, neither):
+    first = [True] * (both + only_first) + [False] * (only_second + neither)
+    second = [True] * both + [False] * only_first + [True] * only_second + [False] * neither
+    return np.array(first), np.array(second)
+
+
+@pytest.mark.parametrize(
+    ("table", "value", "low", "high"),
+    # Newcombe 1998, Statistics in Medicine 17, 2635-2650, method 10; the second is the worked
+    # example of Altman et al. 2000, Statistics with Confidence, Table 6.2.
+    [((36, 12, 2, 0), 0.2, 0.0569, 0.3404), ((14, 5, 0, 22), 0.122, 0.011, 0.226)],
+)
+def test_paired_success_published(table, value, low, high):
+    found = paired_success(*pairs(*table))
+    assert found[:3] == pytest.approx((value, low, high), abs=6e-4)
+    first, second = pairs(*table)
+    turned = paired_success(second, first)
+    assert turned[:3] == pytest.approx((-found.value, -found.high, -found.low))
+
+
+def test_paired_success_without_discordance_still_has_width():
+    found = paired_success(*pairs(10, 0, 0, 0))
+    assert found.value == 0 and found.low < 0 < found.high and found.p_value == 1
+
+
+@pytest.mark.parametrize(
+    ("b", "c", "p"), [(0, 5, 2 / 32), (5, 0, 2 / 32), (0, 0, 1.0), (3, 3, 1.0), (10, 2, 0.03857)]
+)
+def test_mcnemar(b, c, p):
+    assert mcnemar_exact(b, c) == pytest.approx(p, abs=5e-6)
+
+
+def test_bootstrap_covers_the_true_median():
+    rng = np.random.default_rng(0)
+    draws = rng.exponential(size=(200, 60))
+    intervals = [bootstrap_median(row, seed=i, resamples=500) for i, row in enumerate(draws)]
+    covered = np.mean([low <= np.log(2) <= high for _, low, high in intervals])
+    assert 0.9 <= covered <= 0.99
+
+
+def test_bootstrap_repeats_and_has_no_value_without_trials():
+    values = np.arange(9.0) ** 2
+    assert bootstrap_median(values, 3) == bootstrap_median(values, 3)
+    assert bootstrap_median(values, 3) != bootstrap_median(values[::2], 3)
+    assert bootstrap_median(values).value == 16
+    assert np.isnan(bootstrap_median(np.array([]))).all()
+
+
+def test_paired_bootstrap_is_of_the_differences():
+    first = np.array([1.0, 2.0, 30.0, 4.0])
+    found = paired_bootstrap(first, first - 0.5)
+    assert found == (0.5, 0.5, 0.5)
+    with pytest.raises(ValueError, match="pairs"):
+        paired_bootstrap(first, first[:2])

@@ -1,0 +1,182 @@
+"""From an action to a command: frames, limits, and every attitude that has no obvious answer."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
+from eval.vehicles.vehicle import Controller
+from tracks.geometry.rotation import exp_rot
+
+CONTROLLER = Controller(rate_gain=(20.0, 20.0, 8.0), frequency=500.0)
+NORTH = np.array([1.0, 0.0, 0.0])
+LEVEL = np.eye(3)
+HOVER = np.array([0.0, 0.0, 9.81])
+
+
+def command(force_w, rot_w=LEVEL, heading_w=NORTH):
+    return attitude_command(CONTROLLER, np.asarray(force_w, dtype=float), rot_w, heading_w)
+
+
+def test_action_is_in_body_axes_and_gravity_in_the_world():
+    yawed = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    np.testing.assert_allclose(
+        action_to_force(np.array([1.0, 0.0, 0.5]), yawed), [0.0, 1.0, 10.31], atol=1e-12
+    )
+
+
+def test_hover_asks_for_hover():
+    thrust, rate = command(HOVER)
+    assert thrust == pytest.approx(9.81)
+    np.testing.assert_allclose(rate, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("force_w", "heading_w", "expected"),
+    [
+        # Forward: nose down, +y, at 8 1/s; left: roll left side down, -x.
+        ([9.81 * np.tan(0.1), 0.0, 9.81], NORTH, [0.0, 0.8, 0.0]),
+        ([0.0, 9.81 * np.tan(0.1), 9.81], NORTH, [-0.8, 0.0, 0.0]),
+        # Heading 0.2 rad to the left: yaw left at 4 1/s.
+        (HOVER, [np.cos(0.2), np.sin(0.2), 0.0], [0.0, 0.0, 0.8]),
+        # Right behind: as fast as it goes.
+        (HOVER, [np.cos(3.0), np.sin(3.0), 0.0], [0.0, 0.0, 6.0]),
+        ([9.81, 0.0, 0.0], NORTH, [0.0, 6.0, 0.0]),
+    ],
+)
+def test_rates_by_hand(force_w, heading_w, expected):
+    np.testing.assert_allclose(command(force_w, LEVEL, np.array(heading_w)).rate_b, expected)
+
+
+def test_thrust_is_what_body_z_can_give_and_never_negative():
+    assert command([5.0, 0.0, 8.0]).thrust == pytest.approx(8.0)
+    assert command([0.0, 0.0, -5.0]).thrust == 0.0
+
+
+def test_no_force_holds_the_tilt():
+    tilted = Rotation.from_euler("xyz", [0.4, -0.3, 0.0]).as_matrix()
+    np.testing.assert_allclose(command([1e-9, 0.0, -1e-9], tilted).rate_b[:2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(command([0.0, 0.0, 0.0], LEVEL).rate_b, 0.0, atol=1e-12)
+
+
+def test_force_along_the_heading_holds_the_heading():
+    pitched = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    thrust, rate = command([15.0, 0.0, 0.0], pitched)
+    assert thrust == pytest.approx(15.0)
+    np.testing.assert_allclose(rate, 0.0, atol=1e-9)
+
+
+def test_upside_down_rolls_over():
+    _, rate = command([0.0, 0.0, -9.81])
+    np.testing.assert_allclose(np.abs(rate), [6.0, 0.0, 0.0], atol=1e-9)
+
+
+DIRECTIONS = st.lists(st.floats(-1, 1), min_size=3, max_size=3).map(np.array)
+ANGLES = st.floats(-np.pi, np.pi)
+
+
+def test_following_the_rates_arrives():
+    """From any attitude, a body that turns as commanded ends up where it was asked to be."""
+    rng, n = np.random.default_rng(0), 1000
+    up_w = rng.normal(size=(n, 3))
+    up_w /= np.linalg.norm(up_w, axis=1, keepdims=True)
+    heading = rng.uniform(-np.pi, np.pi, n)
+    heading_w = np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=-1)
+    rot_w = exp_rot(rng.uniform(-3.1, 3.1, (n, 3)))
+    for _ in range(300):
+        rate_b = command(12.0 * up_w, rot_w, heading_w).rate_b
+        assert np.all(np.abs(rate_b) <= 6.0)
+        rot_w = rot_w @ exp_rot(0.01 * rate_b)
+    np.testing.assert_allclose(rot_w[..., 2], up_w, atol=1e-3)
+    flat = heading_w - (heading_w * up_w).sum(-1, keepdims=True) * up_w
+    length = np.linalg.norm(flat, axis=-1)
+    ahead = (rot_w[..., 0] * flat).sum(-1) / np.maximum(length, 1e-9)
+    assert np.all(ahead[length > 0.01] > 0.999)
+
+
+@given(DIRECTIONS, st.lists(st.floats(-3.1, 3.1), min_size=3, max_size=3), ANGLES)
+def test_the_error_is_the_turn_to_the_goal(direction, start, heading):
+    """The tilt by the shortest arc and then the yaw lead exactly to where it was asked to be."""
+    size = np.linalg.norm(direction)
+    up_w = direction / size if size > 0.1 else np.array([0.0, 0.0, 1.0])
+    heading_w = np.array([np.cos(heading), np.sin(heading), 0.0])
+    rot_w = exp_rot(np.array(start))
+    unlimited = replace(CONTROLLER, rate_max=(100.0, 100.0, 100.0))
+    rate = attitude_command(unlimited, 12.0 * up_w, rot_w, heading_w).rate_b
+    tilt, yaw = np.array([rate[0] / 8.0, rate[1] / 8.0, 0.0]), np.array([0.0, 0.0, rate[2] / 4.0])
+    tilted = rot_w @ exp_rot(tilt)
+    np.testing.assert_allclose(tilted[:, 2], up_w, atol=1e-5)
+    flat = heading_w - (heading_w @ up_w) * up_w
+    if np.linalg.norm(flat) > 0.01 and up_w @ rot_w[:, 2] > -0.999:
+        turned = tilted @ exp_rot(yaw)
+        np.testing.assert_allclose(turned[:, 0], flat / np.linalg.norm(flat), atol=1e-4)
+
+
+def test_tilt_is_corrected_whatever_the_heading():
+    """The thrust's direction does not wait for the heading: no yaw in the tilt's rates."""
+    force = [3.0, -2.0, 9.0]
+    rates = [
+        command(force, LEVEL, np.array([np.cos(a), np.sin(a), 0.0])).rate_b for a in (0.0, 1.0, 3.0)
+    ]
+    np.testing.assert_allclose([rate[:2] for rate in rates], [rates[0][:2]] * 3)
+
+
+SLOPE = jax.jit(
+    jax.jacobian(lambda f, r, h: attitude_command(CONTROLLER, f, r, h), argnums=(0, 1, 2))
+)
+
+
+@pytest.mark.parametrize(
+    ("force_w", "heading_w"),
+    [
+        ([0.0, 0.0, 9.81], [1.0, 0.0, 0.0]),
+        ([0.0, 0.0, -9.81], [1.0, 0.0, 0.0]),
+        ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]),
+        ([9.81, 0.0, 0.0], [1.0, 0.0, 0.0]),
+        ([1.0, 2.0, 9.81], [0.0, 1.0, 0.0]),
+        ([0.0, 0.0, 9.81], [-1.0, 0.0, 0.0]),
+    ],
+)
+def test_gradients_are_finite_everywhere(force_w, heading_w):
+    slope = SLOPE(*(jax.numpy.asarray(part) for part in (force_w, LEVEL, heading_w)))
+    assert all(bool(jax.numpy.all(jax.numpy.isfinite(part))) for part in jax.tree.leaves(slope))
+
+
+def test_heading_turns_with_first_order():
+    gate = np.array([0.0, 4.0, 2.0])
+    heading = blend_heading(NORTH, gate, 0.1)
+    left = np.arctan2(heading[0], heading[1])
+    assert left == pytest.approx(np.pi / 2 * np.exp(-0.6))
+    # Two half steps are one whole step.
+    twice = blend_heading(blend_heading(NORTH, gate, 0.05), gate, 0.05)
+    np.testing.assert_allclose(twice, heading, atol=1e-12)
+
+
+def test_heading_leaves_a_gate_right_behind_and_holds_for_one_straight_above():
+    heading = NORTH
+    for _ in range(100):
+        heading = blend_heading(heading, np.array([-1.0, 0.0, 0.0]), 0.02)
+    np.testing.assert_allclose(heading, [-1.0, 0.0, 0.0], atol=1e-4)
+    np.testing.assert_allclose(blend_heading(NORTH, np.array([0.0, 0.0, 3.0]), 0.1), NORTH)
+
+
+def test_level_heading():
+    pitched = Rotation.from_euler("ZY", [0.5, 0.7]).as_matrix()
+    np.testing.assert_allclose(level_heading(pitched), [np.cos(0.5), np.sin(0.5), 0.0], atol=1e-12)
+    down = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    np.testing.assert_allclose(np.linalg.norm(level_heading(down)), 1.0)
+
+
+def test_batches_are_rows():
+    rng = np.random.default_rng(0)
+    force, rot = rng.normal(size=(4, 5, 3)), exp_rot(rng.normal(size=(4, 5, 3)))
+    heading = level_heading(exp_rot(rng.normal(size=(4, 5, 3))))
+    together = attitude_command(CONTROLLER, force, rot, heading)
+    alone = attitude_command(CONTROLLER, force[2, 3], rot[2, 3], heading[2, 3])
+    np.testing.assert_allclose(together.rate_b[2, 3], alone.rate_b, atol=1e-12)
+    assert together.thrust.shape == (4, 5)

@@ -1,0 +1,176 @@
+"""The vehicle file: shipped ones, round trips, and refusals that say what and why."""
+
+import copy
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eval.quadrotor.vehicle_file import (
+    SHIPPED,
+    VehicleFileError,
+    load_vehicle,
+    parse_vehicle,
+    save_vehicle,
+    shipped_vehicles,
+    vehicle_table,
+)
+from tests.support.vehicles import PLAIN, drawn_effects, with_effects
+from tracks.common.toml_text import to_toml
+
+TABLE = tomllib.loads((SHIPPED / "racer5.toml").read_text())
+
+
+def test_shipped_vehicles_load():
+    assert {"reference", "racer5"} <= set(shipped_vehicles())
+    for name in shipped_vehicles():
+        assert load_vehicle(name).name == name
+
+
+def test_reference_is_what_the_tables_fly():
+    vehicle = load_vehicle("reference")
+    weight = vehicle.mass * 9.81
+    assert 4 * vehicle.rotors.thrust_max / weight == pytest.approx(3.0, rel=1e-6)
+    assert vehicle.rotors.time_constant == 0.03
+    assert vehicle.controller.rate_max == (6.0, 6.0, 6.0)
+    assert vehicle.effects["command_delay"].delay == 0.03
+    assert vehicle.effects["linear_drag"].coefficient == (0.18, 0.18, 0.72)
+    assert vehicle.effects["quadratic_drag"].coefficient == (0.01, 0.01, 0.04)
+    assert len(vehicle.effects) == 3
+
+
+def test_what_may_be_left_out_has_the_documented_default():
+    vehicle = load_vehicle("racer5")
+    assert vehicle.controller.attitude_gain == (8.0, 8.0, 4.0)
+    assert vehicle.body.half_size == (0.064, 0.064, 0.025)
+    assert vehicle.camera.fov_deg == (78.4, 63.8)
+    assert (vehicle.camera.pitch_deg, vehicle.camera.range_m) == (15.0, 10.0)
+
+
+def test_every_effect_survives_a_round_trip(tmp_path):
+    for seed in range(5):
+        vehicle = drawn_effects(np.random.default_rng(seed))
+        save_vehicle(vehicle, tmp_path / "v.toml", comment="first line\nsecond line")
+        assert load_vehicle(tmp_path / "v.toml") == vehicle
+
+
+def test_arrays_are_written_as_numbers(tmp_path):
+    vehicle = with_effects(linear_drag=(np.array([0.1, 0.2, 0.3]),), mass_offset=(np.array(0.1),))
+    save_vehicle(vehicle, tmp_path / "v.toml")
+    loaded = load_vehicle(tmp_path / "v.toml")
+    assert loaded == with_effects(linear_drag=((0.1, 0.2, 0.3),), mass_offset=(0.1,))
+
+
+def test_an_impossible_vehicle_is_not_written(tmp_path):
+    with pytest.raises(ValueError, match=r"linear_drag\.coefficient"):
+        save_vehicle(with_effects(linear_drag=((-1.0, 0.0, 0.0),)), tmp_path / "v.toml")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_weak_motor_takes_one_or_several():
+    table = copy.deepcopy(TABLE)
+    table["effects"] = {"weak_motor": {"index": 3, "scale": 0.9}}
+    assert parse_vehicle(table).effects["weak_motor"].scale == (1.0, 1.0, 0.9, 1.0)
+    table["effects"] = {"weak_motor": {"index": [4, 1], "scale": [0.8, 0.95]}}
+    vehicle = parse_vehicle(table)
+    assert vehicle.effects["weak_motor"].scale == (0.95, 1.0, 1.0, 0.8)
+    assert parse_vehicle(vehicle_table(vehicle)) == vehicle
+
+
+REFUSED = [
+    ("mass", 0.0, "mass = 0.0.*above 0"),
+    ("mass", "heavy", "mass = 'heavy'.*number"),
+    ("mass", float("nan"), "mass = nan.*finite"),
+    ("mass", True, "mass = True.*number"),
+    ("mass", None, "mass: missing"),
+    ("name", "", "name"),
+    ("schema", 2, "schema = 2"),
+    ("wings", 2, "wings: unknown key.*allowed"),
+    ("massa", 2, "massa: unknown key; did you mean 'mass'"),
+    ("inertia", [0.001, 0.001], "inertia.*list of 3"),
+    ("inertia", [0.001, 0.001, 0.003], "inertia.*sum of the other two"),
+    ("inertia", [0.001, -0.001, 0.001], "inertia.*above 0"),
+    ("rotors", 4, "rotors = 4: must be a table"),
+    ("rotors.spin", [1, 1, -1, 2], r"rotors\.spin.*1 .*or -1"),
+    ("rotors.spin", [1, -1, 1], r"rotors\.spin.*list of 4"),
+    ("rotors.spin", [1, 1, 1, 1], "independently"),
+    ("rotors.spin", [1, -1, -1, 1], "independently"),
+    ("rotors.position", [[0, 0, 0]] * 3, r"rotors\.position.*4 lists"),
+    ("rotors.position", [[0.1, 0.1], [0, 0, 0], [0, 0, 0], [0, 0, 0]], r"position\[0\]"),
+    ("rotors.position", [[0.2, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [0.2, 0.1, 0]], "between"),
+    ("rotors.speed_max", 1000.0, "too weak to hover"),
+    ("rotors.time_constant", -0.1, r"rotors\.time_constant = -0\.1.*from 0"),
+    ("rotors.thrust_coefficient", 0.0, r"rotors\.thrust_coefficient"),
+    ("rotors.torque", 0.0, r"rotors\.torque: unknown key"),
+    ("controller.frequency", 10.0, r"controller\.frequency.*from 50"),
+    ("controller.rate_gain", [20.0, 20.0, 0.0], r"controller\.rate_gain"),
+    ("controller.rate_max", 6.0, r"controller\.rate_max.*list of 3"),
+    ("body", {"half_size": [0.1, 0.1, 0.0]}, r"body\.half_size"),
+    ("camera", {"fov_deg": [180.0, 60.0]}, r"camera\.fov_deg"),
+    ("camera", {"pitch": 3}, r"camera\.pitch: unknown key; did you mean 'pitch_deg'"),
+    ("effects", {"linear_drga": {}}, "linear_drga.*Did you mean 'linear_drag'"),
+    ("effects", {"linear_drag": {"coef": 1}}, r"effects\.linear_drag\.coef: unknown key"),
+    ("effects", {"linear_drag": {"coefficient": 0.3}}, r"linear_drag\.coefficient.*list of 3"),
+    ("effects", {"linear_drag": {"coefficient": [0.1, 0.1, -0.1]}}, "from 0 to 5 1/s"),
+    ("effects", {"linear_drag": 3}, r"must be a table \[effects\.linear_drag\]"),
+    ("effects", {"battery_sag": {}}, "give rate or per_volt"),
+    ("effects", {"gusts": {"intensity": 1.0}}, r"gusts\.length: missing"),
+    ("effects", {"mass_offset": {"offset": -0.7}}, r"mass_offset\.offset = -0\.7.*-0\.375"),
+    ("effects", {"weak_motor": {"index": 5, "scale": 0.9}}, "weak_motor.*from 1 to 4"),
+    ("effects", {"weak_motor": {"index": [1, 1], "scale": [0.9, 0.9]}}, "different"),
+    ("effects", {"weak_motor": {"index": [1], "scale": 0.9}}, "both numbers or both lists"),
+    ("effects", {"weak_motor": {"index": 1, "scale": "low"}}, "must be a number"),
+    ("effects", {"weak_motor": {"index": 1, "scale": -0.5}}, "from 0 to 1.5"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "message"), REFUSED)
+def test_a_bad_file_is_refused_by_key_and_value(tmp_path, key, value, message):
+    table = copy.deepcopy(TABLE)
+    *sections, last = key.split(".")
+    inner = table
+    for section in sections:
+        inner = inner[section]
+    if value is None:
+        del inner[last]
+    else:
+        inner[last] = value
+    path = tmp_path / "bad.toml"
+    path.write_text(to_toml(table))
+    with pytest.raises(VehicleFileError, match=message) as refusal:
+        load_vehicle(path)
+    assert str(path) in str(refusal.value)
+
+
+def test_unreadable_files_are_refused(tmp_path):
+    with pytest.raises(VehicleFileError, match="no such file"):
+        load_vehicle(tmp_path / "none.toml")
+    with pytest.raises(VehicleFileError, match="cannot be read"):
+        load_vehicle(tmp_path)
+    path = tmp_path / "bad.toml"
+    path.write_text("mass = = 3")
+    with pytest.raises(VehicleFileError, match="not valid TOML"):
+        load_vehicle(path)
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(VehicleFileError, match="as text"):
+        load_vehicle(path)
+    with pytest.raises(ValueError, match="Did you mean 'racer5'"):
+        load_vehicle("racer")
+
+
+KEYS = st.text("abcdefghij_", min_size=1, max_size=5)
+NUMBERS = st.integers(-(2**60), 2**60) | st.floats(allow_nan=False)
+ENTRIES = NUMBERS | st.text(st.characters(exclude_categories=["Cs"])) | st.booleans()
+
+
+@given(st.dictionaries(KEYS, ENTRIES | st.lists(ENTRIES) | st.dictionaries(KEYS, ENTRIES)))
+def test_toml_text_reads_back_equal(table):
+    assert tomllib.loads(to_toml(table)) == table
+
+
+@given(st.integers(0, 10**6))
+def test_tables_and_vehicles_are_two_views_of_one_thing(seed):
+    vehicle = drawn_effects(np.random.default_rng(seed), PLAIN)
+    assert parse_vehicle(vehicle_table(vehicle)) == vehicle

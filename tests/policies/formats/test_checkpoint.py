@@ -1,0 +1,190 @@
+"""A checkpoint comes back to the bit, survives a kill, and is refused by name when damaged."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from policies.errors import PolicyError
+from policies.formats.checkpoint import CONFIG, WEIGHTS, load_arrays, save_arrays
+
+ARRAYS = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "step": np.int64(7)}
+
+
+def save(folder, arrays=ARRAYS, **extra):
+    return save_arrays(folder, arrays, kind="policy", seed=3, extra=extra)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.dictionaries(
+        st.text("abc.'[]µ", min_size=1, max_size=8),
+        hnp.arrays(
+            st.sampled_from([np.float32, np.float64, np.int32, np.uint32, np.bool_]),
+            hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
+        ),
+        max_size=4,
+    )
+)
+def test_arrays_come_back_to_the_bit(tmp_path_factory, arrays):
+    folder = tmp_path_factory.mktemp("round") / "checkpoint"
+    save(folder, arrays)
+    back = load_arrays(folder, kind="policy", finite=False).arrays
+    assert back.keys() == arrays.keys()
+    for name, value in arrays.items():
+        assert back[name].dtype == value.dtype and back[name].shape == value.shape
+        assert back[name].tobytes() == value.tobytes()
+
+
+def test_transposed_and_jax_arrays_are_stored_as_they_read(tmp_path):
+    import jax.numpy as jnp
+
+    strided = np.arange(6.0).reshape(2, 3).T
+    save(tmp_path / "c", {"t": strided, "j": jnp.ones((2, 2))})
+    back = load_arrays(tmp_path / "c", kind="policy").arrays
+    np.testing.assert_array_equal(back["t"], strided)
+    np.testing.assert_array_equal(back["j"], np.ones((2, 2)))
+
+
+def test_the_config_says_what_the_weights_are(tmp_path):
+    config = json.loads((save(tmp_path / "c", note={"x": 1}) / CONFIG).read_text())
+    assert {"kind", "schema", "suite_version", "git_commit", "seed", "weights"} <= config.keys()
+    assert (config["kind"], config["seed"], config["note"]) == ("policy", 3, {"x": 1})
+    with pytest.raises(ValueError, match="kind"):
+        save(tmp_path / "c", kind="delta")
+
+
+@settings(max_examples=40, deadline=None)
+@given(file=st.sampled_from([WEIGHTS, CONFIG]), keep=st.floats(0, 1, exclude_max=True))
+def test_a_file_cut_anywhere_is_refused_by_name(tmp_path_factory, file, keep):
+    folder = save(tmp_path_factory.mktemp("cut") / "c")
+    path = folder / file
+    whole = path.read_bytes().rstrip()
+    path.write_bytes(whole[: int(keep * len(whole))])
+    with pytest.raises(PolicyError) as caught:
+        load_arrays(folder, kind="policy")
+    assert str(path) in str(caught.value)
+    assert file == CONFIG or "cut short" in str(caught.value)
+
+
+@settings(max_examples=40, deadline=None)
+@given(at=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
+def test_a_changed_byte_of_the_weights_is_refused(tmp_path_factory, at, flip):
+    folder = save(tmp_path_factory.mktemp("flip") / "c")
+    data = bytearray((folder / WEIGHTS).read_bytes())
+    data[int(at * len(data))] ^= flip
+    (folder / WEIGHTS).write_bytes(data)
+    with pytest.raises(PolicyError, match="sha256"):
+        load_arrays(folder, kind="policy")
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    key=st.sampled_from(["schema", "kind", "weights", "weights.sha256", "weights.bytes"]),
+    value=st.one_of(st.none(), st.booleans(), st.floats(allow_nan=False), st.text(), st.just([])),
+)
+def test_a_damaged_config_is_refused_by_key(tmp_path_factory, key, value):
+    folder = save(tmp_path_factory.mktemp("key") / "c")
+    config = json.loads((folder / CONFIG).read_text())
+    table = config["weights"] if "." in key else config
+    if table[key.split(".")[-1]] == value:
+        return
+    table[key.split(".")[-1]] = value
+    (folder / CONFIG).write_text(json.dumps(config))
+    with pytest.raises(PolicyError, match=r"config\.json|weights\.safetensors"):
+        load_arrays(folder, kind="policy")
+
+
+@pytest.mark.parametrize("file", [WEIGHTS, CONFIG])
+def test_a_missing_file_is_named(tmp_path, file):
+    (save(tmp_path / "c") / file).unlink()
+    with pytest.raises(PolicyError, match=f"{file}: missing"):
+        load_arrays(tmp_path / "c", kind="policy")
+
+
+def test_another_kind_a_newer_schema_and_a_wrong_top_level_are_refused(tmp_path):
+    folder = save(tmp_path / "c")
+    with pytest.raises(PolicyError, match="kind is 'policy', expected 'delta'"):
+        load_arrays(folder, kind="delta")
+    config = json.loads((folder / CONFIG).read_text())
+    (folder / CONFIG).write_text(json.dumps(config | {"schema": 2}))
+    with pytest.raises(PolicyError, match="schema is 2"):
+        load_arrays(folder, kind="policy")
+    (folder / CONFIG).write_text("[1]")
+    with pytest.raises(PolicyError, match="expected an object"):
+        load_arrays(folder, kind="policy")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_weights_that_are_not_finite_are_refused_unless_asked_for(tmp_path, bad):
+    save(tmp_path / "c", {"w": np.array([1.0, bad], np.float32)})
+    with pytest.raises(PolicyError, match="'w' holds 1 of 2"):
+        load_arrays(tmp_path / "c", kind="policy")
+    load_arrays(tmp_path / "c", kind="policy", finite=False)
+
+
+@pytest.mark.parametrize("fail_at", range(1, 12))
+@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
+def test_a_stop_at_any_system_call_leaves_one_whole_checkpoint(
+    tmp_path, monkeypatch, fail_at, error
+):
+    folder = tmp_path / "c"
+    save(folder, note=1)
+    calls = 0
+
+    def stopping(real):
+        def call(*arguments, **options):
+            nonlocal calls
+            calls += 1
+            if calls == fail_at:
+                raise error
+            return real(*arguments, **options)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        for name in ("replace", "fsync"):
+            patch.setattr(os, name, stopping(getattr(os, name)))
+        patch.setattr(type(folder), "write_bytes", stopping(type(folder).write_bytes))
+        patch.setattr(type(folder), "write_text", stopping(type(folder).write_text))
+        try:
+            save(folder, {"a": np.ones(2)}, note=2)
+        except (OSError, KeyboardInterrupt):
+            pass
+        else:
+            assert fail_at > calls
+    assert load_arrays(folder, kind="policy").config["note"] in (1, 2)
+    assert [p.name for p in tmp_path.iterdir()] == ["c"]
+
+
+DYING_SAVE = """
+import os, sys, pathlib, numpy as np
+from policies.formats.checkpoint import save_arrays
+real, done = os.replace, []
+def dying(source, target):
+    if len(done) == int(sys.argv[2]):
+        os._exit(9)
+    done.append(source)
+    real(source, target)
+os.replace = dying
+arrays = {"a": np.ones(2, np.float32)}
+save_arrays(pathlib.Path(sys.argv[1]), arrays, kind="policy", seed=3, extra={"note": 2})
+"""
+
+
+@pytest.mark.parametrize("renames", [0, 1])
+def test_a_kill_before_or_between_the_two_renames_is_recovered_from(tmp_path, renames):
+    folder = tmp_path / "c"
+    save(folder, note=1)
+    killed = subprocess.run([sys.executable, "-c", DYING_SAVE, str(folder), str(renames)])
+    assert killed.returncode == 9
+    assert folder.exists() == (renames == 0)
+    assert load_arrays(folder, kind="policy").config["note"] == 1 + renames
+    save(folder, note=3)
+    assert load_arrays(folder, kind="policy").config["note"] == 3

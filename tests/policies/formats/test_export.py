@@ -1,0 +1,91 @@
+"""The checkpoint, the torch program and the ONNX file are one policy."""
+
+import json
+import zipfile
+
+import jax.numpy as jnp
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from policies.errors import PolicyError
+from policies.formats.embedded_spec import KEY
+from policies.formats.export import export_policy
+from policies.formats.torch_twin import torch_twin
+from policies.networks import network
+from policies.policy import load_policy
+from tests.policies.conftest import SPEC
+
+
+def rollout(policy, n, steps):
+    """Actions of a recurrent rollout of random observations, (steps, n, 3)."""
+    rng = np.random.default_rng(7)
+    hidden, actions = policy.start(n), []
+    for _ in range(steps):
+        state = rng.normal(size=(n, 12)).astype(np.float32)
+        image = rng.uniform(-0.3, 9.4, (n, 24, 32)).astype(np.float32)
+        action, hidden = policy.act(hidden, state, image, rng.random(n) < 0.1)
+        actions.append(action)
+    return np.stack(actions)
+
+
+def test_the_three_are_equal_over_a_rollout(checkpoint, exported):
+    ours = rollout(load_policy(checkpoint), 70, 40)
+    assert np.abs(ours).std() > 1.0
+    for file in ("tiny.pt2", "tiny.onnx"):
+        policy = load_policy(exported / file)
+        assert policy.spec == SPEC
+        np.testing.assert_allclose(rollout(policy, 70, 40), ours, atol=5e-5, rtol=1e-5)
+
+
+def test_the_twin_is_our_network_layer_for_layer(params):
+    rng = np.random.default_rng(0)
+    state, image, hidden = (
+        rng.normal(size=(5, *shape)).astype(np.float32) for shape in ((12,), (24, 32), (64,))
+    )
+    ours = network.step(params, *map(jnp.asarray, (hidden, state, image)))
+    with torch.no_grad():
+        theirs = torch_twin(params, SPEC)(*map(torch.from_numpy, (state, image, hidden)))
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-5, rtol=1e-5)
+
+
+def test_the_files_carry_where_they_come_from(exported):
+    onnx_text = next(p.value for p in onnx.load(exported / "tiny.onnx").metadata_props)
+    with zipfile.ZipFile(exported / "tiny.pt2") as archive:
+        name = next(n for n in archive.namelist() if n.endswith(KEY))
+        torch_text = archive.read(name)
+    for text in (onnx_text, torch_text):
+        data = json.loads(text)
+        assert {"schema", "suite_version", "git_commit", "seed", "name", "spec"} <= data.keys()
+        assert (data["name"], data["seed"]) == ("tiny", 1)
+
+
+def test_plain_torch_and_plain_onnxruntime_run_the_files_at_any_batch(exported):
+    import onnxruntime
+
+    program = torch.export.load(exported / "tiny.pt2").module()
+    session = onnxruntime.InferenceSession(exported / "tiny.onnx")
+    assert [v.name for v in session.get_outputs()] == ["action", "hidden_next"]
+    for n in (1, 3):
+        feed = {"state": (n, 12), "image": (n, 24, 32), "hidden": (n, 64)}
+        feed = {name: np.ones(shape, np.float32) for name, shape in feed.items()}
+        by_torch = program(*(torch.from_numpy(value) for value in feed.values()))
+        by_onnx = session.run(None, feed)
+        for a, b in zip(by_torch, by_onnx, strict=True):
+            np.testing.assert_allclose(a.numpy(), np.asarray(b), atol=2e-5, rtol=1e-5)
+
+
+def test_what_cannot_be_exported_is_refused(tmp_path, checkpoint, exported):
+    with pytest.raises(PolicyError, match="not a shipped policy"):
+        export_policy(exported / "tiny.onnx", tmp_path)
+    with pytest.raises(ValueError, match="unknown format 'onx'. Did you mean 'onnx'"):
+        export_policy(checkpoint, tmp_path, ["onx"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_exporting_again_replaces_the_file(tmp_path, checkpoint):
+    for _ in range(2):
+        assert export_policy(checkpoint, tmp_path, ["onnx"]) == [tmp_path / "tiny.onnx"]
+    assert [p.name for p in tmp_path.iterdir()] == ["tiny.onnx"]

@@ -1,0 +1,155 @@
+"""ONNX from elsewhere: standard operators, data inside the folder, the observation's inputs."""
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from policies.errors import PolicyError
+from policies.formats.onnx_file import files_of
+from policies.policy import load_policy
+
+FLOAT = TensorProto.FLOAT
+
+
+def value(name, *shape, kind=FLOAT):
+    return helper.make_tensor_value_info(name, kind, shape)
+
+
+def model(nodes, inputs=None, outputs=None, tensors=(), domains=("",), functions=()):
+    inputs = inputs or [value("state", "n", 12), value("image", "n", 24, 32)]
+    outputs = outputs or [value("action", "n", 3)]
+    graph = helper.make_graph(nodes, "g", inputs, outputs, list(tensors))
+    opsets = [helper.make_opsetid(domain, 17 if domain == "" else 1) for domain in domains]
+    return helper.make_model(graph, opset_imports=opsets, ir_version=8, functions=list(functions))
+
+
+MATRIX = numpy_helper.from_array(np.eye(12, 3, dtype=np.float32), "w")
+PRODUCT = helper.make_node("MatMul", ["state", "w"], ["action"])
+
+
+def save(folder, proto):
+    onnx.save(proto, folder / "it.onnx")
+    return folder / "it.onnx"
+
+
+def refused(path, said):
+    with pytest.raises(PolicyError, match=said) as caught:
+        load_policy(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("rows", ["n", 5, 1])
+def test_a_policy_without_memory_and_of_any_batch_flies(tmp_path, rows):
+    inputs = [value("image", rows, 24, 32), value("state", rows, 12)]
+    path = save(tmp_path, model([PRODUCT], inputs, [value("u", rows, 3)], [MATRIX]))
+    proto = onnx.load(path)
+    proto.graph.output[0].name = proto.graph.node[0].output[0] = "u"
+    policy = load_policy(save(tmp_path, proto))
+    state = np.random.default_rng(0).normal(size=(7, 12)).astype(np.float32)
+    image = np.zeros((7, 24, 32), np.float32)
+    action, _ = policy.act(policy.start(7), state, image, np.zeros(7, bool))
+    np.testing.assert_array_equal(action, state[:, :3])
+
+
+def test_custom_operators_are_refused_also_inside_branches(tmp_path):
+    custom = helper.make_node("Evil", ["state"], ["action"], domain="com.evil")
+    refused(save(tmp_path, model([custom], domains=("", "com.evil"))), "domain 'com.evil'")
+    inner = helper.make_graph([custom], "inner", [], [value("action", "n", 3)])
+    branch = helper.make_node("If", ["flag"], ["action"], then_branch=inner, else_branch=inner)
+    flag = numpy_helper.from_array(np.array(True), "flag")
+    refused(save(tmp_path, model([branch], tensors=[flag], domains=("", "com.evil"))), "'com.evil'")
+    refused(save(tmp_path, model([helper.make_node("Evil", ["state"], ["action"])])), "standard")
+
+
+def test_functions_are_refused(tmp_path):
+    function = helper.make_function(
+        "local", "F", ["x"], ["y"], [helper.make_node("Abs", ["x"], ["y"])],
+        [helper.make_opsetid("", 17)],
+    )  # fmt: skip
+    proto = model([PRODUCT], tensors=[MATRIX], domains=("", "local"), functions=[function])
+    refused(save(tmp_path, proto), "holds functions")
+
+
+def external(location):
+    tensor = TensorProto()
+    tensor.CopyFrom(MATRIX)
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value=location)
+    return model([PRODUCT], tensors=[tensor])
+
+
+def write_raw(path, proto):
+    path.write_bytes(proto.SerializeToString())
+    return path
+
+
+def test_data_beside_the_file_is_read_and_outside_it_is_refused(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for place in (folder / "w.bin", tmp_path / "w.bin"):
+        place.write_bytes(MATRIX.raw_data)
+    path = write_raw(folder / "it.onnx", external("w.bin"))
+    policy = load_policy(path)
+    state = np.ones((1, 12), np.float32)
+    action, _ = policy.act(policy.start(1), state, np.zeros((1, 24, 32)), np.zeros(1, bool))
+    np.testing.assert_array_equal(action, [[1, 1, 1]])
+    for location in ("../w.bin", str(tmp_path / "w.bin"), ""):
+        refused(write_raw(path, external(location)), "outside the file's folder")
+    refused(write_raw(path, external("none.bin")), "missing")
+    assert files_of(write_raw(path, external("w.bin"))) == [path, folder / "w.bin"]
+    (folder / "link.bin").symlink_to(tmp_path / "w.bin")
+    refused(write_raw(path, external("link.bin")), "outside the file's folder")
+
+
+def test_a_file_that_is_too_large_is_refused(exported, monkeypatch):
+    from policies.formats import onnx_file
+
+    monkeypatch.setattr(onnx_file, "MAX_BYTES", 1000)
+    refused(exported / "tiny.onnx", "allowed are 1000")
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "said"),
+    [
+        ([value("obs", "n", 12)], None, "inputs are obs; expected state, image, hidden"),
+        ([value("state", "n", 12)], None, "inputs are state; expected"),
+        ([value("state", "n", 13), value("image", "n", 24, 32)], None, r"expected \(batch, 12\)"),
+        ([value("state", "n", 12), value("image", "n", 1, 24, 32)], None, "24, 32"),
+        ([value("state", 2, 12), value("image", 3, 24, 32)], None, "batch as first axis"),
+        (
+            [value("state", "n", 12), value("image", "n", 24, 32), value("hidden", "n", "h")],
+            None,
+            "must be fixed",
+        ),
+        (
+            [value("state", "n", 12), value("image", "n", 24, 32), value("hidden", "n", 4)],
+            None,
+            "outputs are action; expected the action and",
+        ),
+        (
+            [value("state", "n", 12), value("image", "n", 24, 32, kind=TensorProto.DOUBLE)],
+            None,
+            r"'image' is tensor\(double\)",
+        ),
+    ],
+)
+def test_inputs_that_are_no_observation_are_refused(tmp_path, inputs, outputs, said):
+    weight = MATRIX
+    if inputs[0].name == "state" and inputs[0].type.tensor_type.shape.dim[1].dim_value == 13:
+        weight = numpy_helper.from_array(np.eye(13, 3, dtype=np.float32), "w")
+    node = helper.make_node("MatMul", [inputs[0].name, "w"], ["action"])
+    first = inputs[0].type.tensor_type.shape.dim[0]
+    rows = first.dim_value or first.dim_param
+    outputs = outputs or [value("action", rows, 3)]
+    refused(save(tmp_path, model([node], inputs, outputs, [weight])), said)
+
+
+def test_a_model_that_breaks_the_standard_is_refused(tmp_path):
+    broken = helper.make_node("MatMul", ["state", "nowhere"], ["action"])
+    refused(write_raw(tmp_path / "it.onnx", model([broken])), "breaks the ONNX standard")
+    (tmp_path / "it.onnx").write_bytes(b"\xff" * 100)
+    refused(tmp_path / "it.onnx", "not a whole ONNX file")
+    (tmp_path / "it.onnx").write_bytes(b"")
+    refused(tmp_path / "it.onnx", "it.onnx")

@@ -1,0 +1,127 @@
+"""The scorer on answers and diagnoses written by hand."""
+
+import json
+
+import pytest
+
+from suite.blind.score import report, score_case, shares
+from tracks.common.files import write_json
+
+TRUTH = {
+    "kind": "single",
+    "effects": [
+        {
+            "name": "rotor_drag",
+            "parameters": {"coefficient": 3e-5},
+            "multiple": 2.0,
+            "required": ["linear_drag"],
+            "allowed": ["linear_drag", "quadratic_drag"],
+        }
+    ],
+}
+NULL = {"kind": "null", "effects": []}
+OUTSIDE = {"kind": "outside", "effects": [], "outside": {"name": "tether", "multiple": 6.0}}
+
+
+def effect(name, *alternatives, **parameters):
+    table = {key: {"value": 0.0, "ci95": span} for key, span in parameters.items()}
+    return {"name": name, "alternatives": list(alternatives), "parameters": table}
+
+
+def said(*effects, verdict="named", after=0.5, floor=0.5):
+    return {
+        "verdict": verdict,
+        "effects": list(effects),
+        "gap": {"after": after, "noise_floor": floor},
+    }
+
+
+@pytest.mark.parametrize(
+    ("effects", "found", "extra"),
+    [
+        ([effect("rotor_drag", "linear_drag")], True, 0),
+        ([effect("linear_drag", "rotor_drag")], True, 0),
+        ([effect("rotor_drag", "linear_drag", "quadratic_drag")], True, 0),
+        ([effect("rotor_drag")], False, 0),
+        ([effect("rotor_drag", "linear_drag", "inflow")], False, 0),
+        ([effect("linear_drag")], False, 1),
+        ([effect("rotor_drag", "linear_drag"), effect("inflow")], True, 1),
+        ([effect("rotor_drag", "linear_drag"), effect("linear_drag", "rotor_drag")], True, 1),
+        ([], False, 0),
+    ],
+)
+def test_sets_are_held_to_what_the_data_can_tell(effects, found, extra):
+    verdict = score_case("c", TRUTH, said(*effects), 1.0)
+    assert (verdict.found, verdict.extra) == (found, extra)
+    assert verdict.exact == (found and not extra)
+
+
+def test_two_effects_need_both():
+    second = {**TRUTH["effects"][0], "name": "mass_offset", "required": [], "allowed": []}
+    pair = {"kind": "pair", "effects": [*TRUTH["effects"], second]}
+    one, other = effect("rotor_drag", "linear_drag"), effect("mass_offset")
+    assert score_case("c", pair, said(other, one), 1.0).exact
+    assert not score_case("c", pair, said(one), 1.0).found
+
+
+def test_intervals_count_by_component_and_leave_out_what_cannot_be_seen():
+    truth = {
+        "kind": "single",
+        "effects": [
+            {
+                "name": "com_offset",
+                "parameters": {"offset": [0.001, 0.002, None]},
+                "multiple": 2.0,
+                "required": [],
+                "allowed": [],
+            }
+        ],
+    }
+    found = effect("com_offset", offset=[[0.0, 0.002], [0.003, 0.004], None])
+    assert score_case("c", truth, said(found), 1.0).covered == (True, False)
+    other = effect("torque_trim", "com_offset", offset=[[0.0, 1.0]])
+    assert score_case("c", truth, said(other), 1.0).covered == ()
+
+
+def test_a_weak_motor_is_matched_by_its_number():
+    truth = {
+        "kind": "single",
+        "effects": [
+            {
+                "name": "weak_motor",
+                "parameters": {"scale": [1.0, 1.0, 0.9, 1.0]},
+                "multiple": 2.0,
+                "required": [],
+                "allowed": [],
+            }
+        ],
+    }
+    found = effect("weak_motor", scale=[0.88, 0.92])
+    found["parameters"]["index"] = {"value": 3}
+    assert score_case("c", truth, said(found), 1.0).covered == (True,)
+    found["parameters"]["index"] = {"value": 2}
+    assert score_case("c", truth, said(found), 1.0).covered == (False,)
+
+
+def test_the_table_counts_and_the_files_are_written(tmp_path):
+    right = effect("rotor_drag", "linear_drag", coefficient=[1e-5, 5e-5])
+    verdicts = [
+        score_case("a", TRUTH, said(right, after=0.56), 3.0),
+        score_case("b", NULL, said(verdict="no_gap"), 1.0),
+        score_case("c", NULL, said(effect("inflow")), 2.0),
+        score_case("d", OUTSIDE, said(verdict="unknown"), 2.0),
+        score_case("e", OUTSIDE, None, None),
+    ]
+    lines = {s.what: (s.count, s.of) for s in shares(verdicts)}
+    assert lines["single effects: named, nothing else"] == (1, 1)
+    assert lines["nulls: something named"] == (1, 2)
+    assert lines["outside the catalogue: `unknown` or `partly`"] == (1, 2)
+    assert lines["95 % intervals that hold the truth"] == (1, 1)
+    assert lines["gap after within 1.1 of the noise floor, where named"] == (0, 1)
+    assert lines["diagnosis failed"] == (1, 5)
+    half = next(s for s in shares(verdicts) if s.what == "nulls: something named")
+    assert (half.low, half.high) == pytest.approx((0.0945, 0.9055), abs=1e-3)  # Wilson, 1 of 2
+    write_json(tmp_path / "manifest.json", {"cases": {}, "answers": {}, "failed": {}})
+    text = report(tmp_path, verdicts)
+    assert "| c | null |" in text and "| a |" not in text
+    assert json.loads((tmp_path / "table.json").read_text())["seconds_median"] == 2.0

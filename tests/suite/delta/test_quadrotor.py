@@ -1,0 +1,150 @@
+"""Flights of the judge cut into windows and flown again in the trainer's quadrotor."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from eval.judging.judge import JudgeOptions, Record, fly
+from eval.logs.flight_log import log_from_flight, write_flight
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import Rules, TrialSpec
+from policies.formats.delta_file import load_delta
+from policies.networks import delta_network
+from policies.spec import PolicySpec
+from suite.common.console import Console
+from suite.delta.fit import FitConfig, window_errors
+from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor
+from suite.delta.run import fit_quadrotor_delta
+from suite.delta.warm import Warm, remembered
+from suite.train.config import QuadrotorConfig
+from tests.support.courses import straight
+from tests.support.pilots import Pursuit
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tracks.geometry.camera import Camera
+
+TRUE = with_effects(
+    with_lag(PLAIN, 0.03),
+    linear_drag=((0.2, 0.2, 0.5),),
+    command_delay=(0.03,),
+    com_offset=((0.01, -0.004, 0.0),),
+)
+BARE = replace(TRUE, effects={k: v for k, v in TRUE.effects.items() if k != "com_offset"})
+
+
+@pytest.fixture(scope="module")
+def logs():
+    """Logs of four flights along gates that stand about, at 15 decisions a second."""
+    tracks = {}
+    for k in range(4):
+        track = straight(distances=(4.0, 8.0, 40.0), height=8.0)
+        gates = track.scene.gates
+        center = gates.center_w + [0.0, 1.5 * k - 2.0, 0.5 * k]
+        scene = track.scene._replace(gates=gates._replace(center_w=center))
+        tracks[f"course {k}"] = replace(track, scene=scene)
+    found = []
+
+    def keep(result, flight):
+        found.append(log_from_flight(flight, f"{result.track}.parquet"))
+
+    spec = PolicySpec(rate_hz=15.0, camera=Camera(width=8, height=8))
+    fly(
+        Pursuit(speed=3.0, gain=1.5, spec=spec),
+        [TrialSpec(name, 0, 0) for name in tracks],
+        TRUE,
+        options=JudgeOptions(slots=4, processes=1, rules=Rules(time_limit_s=3.0)),
+        on_result=keep,
+        record=Record(),
+        tracks=tracks,
+    )
+    return found
+
+
+def errors_of(logs, vehicle, delta=None, horizon_s=1.0):
+    config = QuadrotorConfig(vehicle)
+    windows, cut = cut_quadrotor_windows(logs, config, horizon_s, 0.3)
+    replay = partial(replay_quadrotor, config, cut)
+    pos, vel = jax.jit(partial(window_errors, replay))(windows, delta)
+    return np.asarray(pos), np.asarray(vel), windows
+
+
+def test_flights_of_the_judge_replay_as_they_were_flown(logs):
+    """Steps of 5 ms for the judge's 2 ms: centimetres after a second."""
+    pos, vel, windows = errors_of(logs, TRUE)
+    moved = np.linalg.norm(windows.pos_w[:, -1] - windows.pos_w[:, 0], axis=-1)
+    assert len(pos) > 12 and np.median(moved) > 1
+    assert pos.max() < 0.05 and vel.max() < 0.1
+    assert np.median(errors_of(logs, BARE)[0]) > 10 * np.median(pos)
+
+
+def test_windows_start_at_decisions_with_what_was_under_way(logs):
+    config = QuadrotorConfig(TRUE)
+    windows, cut = cut_quadrotor_windows(logs, config, 0.5, 0.3)
+    assert cut == (1, 2, pytest.approx(0.005))
+    assert np.all(windows.decides[:, 0] == 1)
+    assert windows.decides.sum(1).min() >= 7 and windows.decides.sum(1).max() <= 8
+    log = logs[0]
+    first = int(np.searchsorted(log.time_s, windows.start_s[0] + 1e-4)) - 1
+    np.testing.assert_allclose(windows.pos_w[0, 0], log.pos_w[first], atol=1e-5)
+    np.testing.assert_allclose(windows.rotor_speed[0], log.rotor_speed[first], rtol=1e-6)
+    # 30 ms of delay are 6 steps of 5 ms: the row before the start twice, newest first.
+    rows = first - 1 - np.arange(6) // 2
+    np.testing.assert_allclose(windows.past[0, :6, 0], log.thrust_cmd[rows], rtol=1e-6)
+    np.testing.assert_allclose(windows.past[0, :6, 1:], log.rate_cmd_b[rows], atol=1e-6)
+
+
+def test_a_constant_delta_acts_as_the_action(logs):
+    push = np.array([1.0, -0.5, 0.2], np.float32)
+    config = QuadrotorConfig(TRUE)
+    windows, cut = cut_quadrotor_windows(logs, config, 0.5, 0.3)
+    replay = jax.jit(partial(replay_quadrotor, config, cut))
+    delta = delta_network.init(jax.random.key(0))
+    np.testing.assert_array_equal(replay(windows, None)[0], replay(windows, delta)[0])
+    delta["output.bias"] = jnp.asarray(push)
+    pos, _, correction = replay(windows, delta)
+    np.testing.assert_allclose(correction, np.broadcast_to(push, correction.shape), rtol=1e-6)
+    shifted = replay(windows._replace(action_b=windows.action_b + push), None)[0]
+    np.testing.assert_allclose(pos, shifted, atol=1e-5)
+
+
+def test_the_network_remembers_the_flight_before_a_window(logs):
+    """The state before a window is that of the network run over the flight's decisions."""
+    params = delta_network.init(jax.random.key(1))
+    windows = cut_quadrotor_windows(logs[:1], QuadrotorConfig(TRUE), 0.5, 0.3)[0]
+    hidden = np.asarray(remembered(params, windows.warm))
+    log, number = logs[0], 3
+    at = np.flatnonzero(log.policy_step)
+    at = at[log.time_s[at] < windows.start_s[number] - 1e-4]
+    state = delta_network.start(1)
+    for row in at[-45:]:
+        vel_b = log.rot_w[row].T @ log.vel_w[row]
+        inputs = (vel_b, log.rot_w[row][2], log.action_b[row])
+        state = delta_network.step(params, state, *(jnp.asarray(x[None]) for x in inputs))[1]
+    np.testing.assert_allclose(hidden[number], state[0], atol=1e-5)
+    assert np.abs(hidden[number]).max() > 1e-2
+    blank = Warm(np.ones((2, 4, 9)), np.zeros((2, 4)))
+    assert not np.any(remembered(params, blank))
+
+
+def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path):
+    for log in logs:
+        write_flight(tmp_path / "logs" / log.name.replace(" ", "-"), log)
+    config = FitConfig(horizon_s=0.5, iterations=60, batch=32, rate=1e-2, held_out=0.3)
+    quad = QuadrotorConfig(BARE)
+    result = fit_quadrotor_delta(config, quad, [tmp_path / "logs"], tmp_path / "out", Console())
+    assert result.without.position_m > 0.05
+    assert result.with_delta.position_m < 0.6 * result.without.position_m
+    stored = load_delta(tmp_path / "out" / "delta")
+    assert stored.config["fit"]["model"] == "quad"
+    for name, value in result.params.items():
+        np.testing.assert_array_equal(stored.params[name], value)
+    assert "| quadrotor with Delta Action Model |" in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_logs_without_actions_are_refused(logs):
+    bare = replace(logs[0], extra={})
+    with pytest.raises(ValueError, match="action_x.*suite collect"):
+        cut_quadrotor_windows([bare], QuadrotorConfig(load_vehicle("reference")), 1.0, 0.2)

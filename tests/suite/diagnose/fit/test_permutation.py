@@ -1,0 +1,91 @@
+"""The null of the search on sums whose truth is known: p-values are what they say."""
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from suite.diagnose.fit.normal_equations import Sums
+from suite.diagnose.fit.parameters import candidates, make_space
+from suite.diagnose.fit.permutation import folds_of, score
+from tests.support.vehicles import PLAIN
+
+SPACE = make_space(PLAIN)
+NAMES = ("linear_drag", "rotor_drag", "thrust_scale", "gyro_bias", "com_offset", "frame_tilt")
+AMONG = [c for c in candidates(SPACE, False, False) if c.name in NAMES]
+MIDDLE = 0.5 * (SPACE.array("low") + SPACE.array("high"))
+WINDOWS, ROWS = 20, 12
+FOLD = folds_of(np.repeat(np.arange(4), 5), np.tile(np.arange(5.0), 4))
+DRAWS = 200
+
+
+def sums(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
+    """Sums of windows of noise, plus `size` of what `truth` does in each of them.
+
+    Args:
+        rng: of the noise and of the slopes.
+        colour: correlation of one row's noise with the next within a window.
+        truth: name of the effect that is there.
+        size: of it, in units of the noise.
+        alike: share of the slope of `truth` in those of all other effects.
+    """
+    count = len(SPACE.entries)
+    slope = rng.standard_normal((WINDOWS, ROWS, count))
+    noise = rng.standard_normal((WINDOWS, ROWS))
+    for row in range(1, ROWS):
+        noise[:, row] = colour * noise[:, row - 1] + np.sqrt(1 - colour**2) * noise[:, row]
+    if truth is not None:
+        true = next(c for c in AMONG if c.name == truth).indices[0]
+        slope += alike * slope[..., true, None] * (np.arange(count) != true)
+        noise = noise + size * slope[..., true]
+    slope = slope / SPACE.array("step")
+    turned = np.swapaxes(slope, 1, 2)
+    cross = (turned @ noise[..., None])[..., 0]
+    return Sums(turned @ slope, cross, (noise**2).sum(axis=1), np.zeros(0))
+
+
+def best_of(draws, **options):
+    return [score(sums(np.random.default_rng([7, k]), **options), MIDDLE, SPACE, [], AMONG, FOLD,
+                  seed=k)[0] for k in range(draws)]  # fmt: skip
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.9])
+def test_p_values_of_noise_are_uniform_also_where_it_is_coloured(colour):
+    p_values = [found.p_value for found in best_of(DRAWS, colour=colour)]
+    assert kstest(p_values, "uniform").pvalue > 0.005
+    # Of 200 nulls 2 are expected at or below 1 %; 8 or more come with a chance of 0.1 %.
+    assert np.sum(np.array(p_values) <= 0.01) < 8
+
+
+def test_chance_is_the_gain_that_one_null_in_a_hundred_exceeds():
+    above = [found.gain > found.chance for found in best_of(DRAWS)]
+    assert np.sum(above) < 8
+
+
+def test_the_true_effect_wins_over_one_that_looks_like_it():
+    found = best_of(20, truth="rotor_drag", size=0.6, alike=1.0)
+    # Gains on data left out are noisy; what looks alike is told apart by whole fits afterwards.
+    assert sum(one.candidate.name == "rotor_drag" for one in found) >= 18
+    assert max(one.p_value for one in found) <= 0.01
+
+
+def test_a_wrong_effect_adds_nothing_beside_the_true_one():
+    true = next(c for c in AMONG if c.name == "rotor_drag")
+    others = [c for c in AMONG if c != true]
+    p_values = []
+    for k in range(60):
+        rng = np.random.default_rng([9, k])
+        made = sums(rng, truth="rotor_drag", size=0.6, alike=1.0)
+        scores = score(made, MIDDLE, SPACE, list(true.indices), others, FOLD, seed=k)
+        p_values.append(scores[0].p_value)
+    # The null shuffles the named effect's own part as well, which makes it the more careful.
+    assert np.sum(np.array(p_values) <= 0.01) < 5
+
+
+def test_other_seeds_draw_another_null_and_one_seed_the_same():
+    made = sums(np.random.default_rng(1))
+    first, again, other = (
+        score(made, MIDDLE, SPACE, [], AMONG, FOLD, seed=seed) for seed in (1, 1, 2)
+    )
+    assert first == again
+    assert [s.gain for s in first] == [s.gain for s in other]
+    assert first[0].chance != other[0].chance

@@ -1,0 +1,113 @@
+"""Flights that tell a set apart: written, read back, flown, and diagnosed with the old ones."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eval.logs.flight_log import read_flight
+from suite.blind.sensors import SENSORS, log_of
+from suite.diagnose.diagnose import diagnose
+from suite.diagnose.plans.files import COLUMNS, read_plan, write_plan
+from suite.diagnose.plans.plan import fly_plan, sets_of, ways_for, write_plan_of
+from suite.diagnose.plans.separating import SEPARATIONS
+from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.trajectory import Trajectory
+from suite.diagnose.report.answer import answer
+from suite.diagnose.verdict.separate import OTHERWISE, advice
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+
+LAGGED = with_lag(PLAIN, 0.03)
+SET = {"effects": [{"name": "rotor_drag", "alternatives": ["linear_drag"]}]}
+
+
+class Found:
+    """As much of a diagnosis as a plan needs."""
+
+    class finding:  # noqa: N801
+        sigma = np.repeat([0.002, 0.004, np.nan, 0.02, np.nan, np.nan], [3, 3, 3, 3, 3, 4])
+
+
+def test_a_plan_comes_back_from_its_file(tmp_path):
+    ways = [Trajectory("punches", 3.0, speed=2.0), Trajectory("hover", 2.0, turn="sweep")]
+    plan = write_plan(tmp_path / "plan", ways, ["fly them"])
+    assert read_plan(tmp_path / "plan") == ways
+    table = np.loadtxt(tmp_path / "plan" / plan["flights"][0]["file"], delimiter=",", skiprows=1)
+    assert table.shape == (301, len(COLUMNS))
+    wanted = ways[0].reference(table[:, 0])
+    np.testing.assert_allclose(table[:, 1:4], wanted.pos_w, atol=1e-5)
+    np.testing.assert_allclose(table[:, 4:7], wanted.vel_w, atol=1e-4)
+    assert plan["flights"][0]["top_speed"] == pytest.approx(
+        np.linalg.norm(wanted.vel_w, axis=1).max()
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", '{"flights": [{}]}', '{"flights": [{"trajectory": {"sort": "hover"}}]}']
+)
+def test_a_bad_plan_is_refused_by_name(tmp_path, text):
+    (tmp_path / "plan.json").write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match="plan.json"):
+        read_plan(tmp_path)
+
+
+def test_the_plan_is_for_the_sets_and_only_for_them():
+    assert sets_of(SET) == [{"rotor_drag", "linear_drag"}]
+    ways, words = ways_for(SET)
+    entry = next(e for e in SEPARATIONS if set(e.pair) == {"rotor_drag", "linear_drag"})
+    assert {way.kind for way in ways} == {way.kind for way in entry.separating}
+    assert len(ways) == 2 * len(entry.separating) and entry.words in words[0]
+    alone = {"effects": [{"name": "rotor_drag", "alternatives": []}]}
+    assert ways_for(alone) == ([], [])
+
+
+def test_nothing_is_written_where_nothing_is_left_to_tell(tmp_path):
+    plan = write_plan_of({"effects": []}, tmp_path / "plan")
+    assert plan["flights"] == [] and not (tmp_path / "plan").exists()
+
+
+def test_advice_is_that_of_the_plans():
+    assert advice("linear_drag", "rotor_drag").startswith("linear_drag from rotor_drag: ")
+    assert OTHERWISE not in advice("linear_drag", "rotor_drag")
+    assert OTHERWISE in advice("inflow", "gyro_bias")
+
+
+def test_a_plan_is_flown_with_the_noise_of_the_logs(tmp_path):
+    plan = write_plan(tmp_path / "plan", [Trajectory("hover", 3.0), Trajectory("low", 2.0)], [])
+    wild = dict(plan["flights"][1])
+    wild["trajectory"] = {**wild["trajectory"], "kind": "circle", "speed": 60.0, "duration_s": 4.0}
+    plan["flights"].append(wild)
+    flown = fly_plan(plan, Found, LAGGED, LAGGED, tmp_path / "plan", 3)  # type: ignore[arg-type]
+    names = [flight["flown"] for flight in flown["flights"]]
+    assert names[0] and names[1] and names[2] is None
+    assert len(flown["warnings"]) == 1 and "could not be flown" in flown["warnings"][0]
+    log = read_flight(tmp_path / "plan" / names[0])
+    assert log.velocity_derived and log.rotor_speed is None
+    still = log.time_s > 1.5
+    assert 0.001 < np.std(log.pos_w[still, 2]) < 0.003
+    assert json.loads((tmp_path / "plan" / "plan.json").read_text())["flights"][0]["flown"]
+
+
+@pytest.mark.slow
+def test_flying_the_plan_turns_the_set_into_a_name(tmp_path):
+    truth = with_effects(LAGGED, rotor_drag=(3e-5,))
+    entry = next(e for e in SEPARATIONS if set(e.pair) == {"rotor_drag", "linear_drag"})
+    ways = [*entry.blurred, *entry.blurred]
+    rng = np.random.default_rng(5)
+    logs = [
+        log_of(recording, truth, SENSORS["estimator"], rng, f"old_{k}")
+        for k, recording in enumerate(fly(LAGGED, truth, ways))
+    ]
+    first = diagnose(logs, LAGGED)
+    found = answer(first)
+    (effect,) = found["effects"]
+    assert {effect["name"], *effect["alternatives"]} >= {"rotor_drag", "linear_drag"}
+    plan = write_plan_of(found, tmp_path / "plan")
+    plan = fly_plan(plan, first, LAGGED, truth, tmp_path / "plan", 1)
+    new = [read_flight(tmp_path / "plan" / flight["flown"]) for flight in plan["flights"]]
+    again = answer(diagnose([*logs, *(replace(log, about={}) for log in new)], LAGGED))
+    (effect,) = again["effects"]
+    assert (effect["name"], effect["alternatives"]) == ("rotor_drag", [])
+    low, high = effect["parameters"]["coefficient"]["ci95"]
+    assert low < 3e-5 < high

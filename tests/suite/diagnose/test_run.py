@@ -1,0 +1,99 @@
+"""What a diagnosis writes: every step in the report, a recording that loads, a plan."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eval.logs.flight_log import read_flight, write_flight
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from suite.cli import main
+from tests.support.diagnosis_flights import fly
+from tests.support.recordings import columns
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+
+LAGGED = with_lag(PLAIN, 0.03)
+STEPS = (
+    "1. The logs and their faults",
+    "2. The measurement noise",
+    "3. Where they disagree",
+    "4. The candidates",
+    "5. What could stand in its place",
+    "6. What is left",
+    "7. The evidence",
+    "8. What was written",
+)
+
+
+@pytest.fixture(scope="module")
+def diagnosed(tmp_path_factory):
+    """A diagnosis of a drag with rotor speeds in the logs, by the command line."""
+    folder = tmp_path_factory.mktemp("diagnosis")
+    truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
+    paths = [
+        str(write_flight(folder / f"{k}.parquet", fly(truth, k, duration_s=6.0, motors=True)))
+        for k in range(3)
+    ]
+    save_vehicle(LAGGED, folder / "v.toml")
+    out = folder / "out"
+    line = [*paths, "--vehicle", str(folder / "v.toml"), "--out", str(out), "--plan"]
+    assert main(["diagnose", *line, "--drive", "commands", "--seed", "3"]) == 0
+    return out
+
+
+def test_every_step_is_in_the_report(diagnosed):
+    text = (diagnosed / "report.html").read_text(encoding="utf-8")
+    heads = re.findall(r"<h2>(.*?)</h2>", text)
+    assert [head for head in heads if head[0].isdigit()] == list(STEPS)
+    assert "Actuators, apart from the air" in heads
+    assert text.count("data:image/png;base64,") >= 4
+    assert "<script" not in text and not re.search(r'(src|href)="https?:', text)
+    for link in re.findall(r'href="([^"]+)"', text):
+        assert (diagnosed / link).is_file()
+
+
+def test_the_numbers_beside_the_names_are_in_the_json(diagnosed):
+    found = json.loads((diagnosed / "diagnosis.json").read_text(encoding="utf-8"))
+    assert found["seed"] == 3 and found["black_box"] is None
+    assert "velocity" in found["disagreement"]["before"]
+    by_speed = found["disagreement"]["by"]["speed"]
+    assert by_speed["edges"] == sorted(by_speed["edges"])
+    rollouts = sum(by_speed["rollouts"])
+    assert rollouts > 20
+    before, after = (by_speed[key]["0.5 s"]["velocity"] for key in ("before", "after"))
+    assert max(after) < 1.5 and before[-1] > 2.0 and before[-1] >= before[0]
+    assert found["actuators"][0]["followed"] > 0.9
+    assert abs(found["kinematics"]["gyro_bias"]["value"][0]) < 0.01
+    effect = found["effects"][0]
+    assert found["plan"]["flights"] == [] or effect["alternatives"]
+    assert load_vehicle(diagnosed / "vehicle.toml").effects
+
+
+def test_the_recording_holds_what_was_measured_and_simulated(diagnosed):
+    found = columns(diagnosed / "recording.rrd")
+    entities = {entity for entity, _ in found}
+    simulated = ["simulated\\ as\\ given", "simulated\\ with\\ what\\ was\\ named"]
+    for who in ("measured", *simulated):
+        assert f"/flight_0/world/{who}/drone" in entities
+        assert f"/flight_0/velocity_x/{who}" in entities
+    errors = []
+    for who in simulated:
+        _, values = found[f"/flight_0/error_velocity/{who}", "Scalars:scalars"]
+        errors.append(float(np.sqrt(np.nanmean(np.array(values, dtype=float) ** 2))))
+    assert errors[1] < 0.5 * errors[0]
+    times, poses = found["/flight_0/world/measured/drone", "Transform3D:translation"]
+    (held_out,) = json.loads((diagnosed / "diagnosis.json").read_text())["gap"]["held_out"]
+    log = read_flight(diagnosed.parent / Path(held_out).name)
+    assert len(poses) == len(log.time_s)
+    np.testing.assert_allclose(np.array(poses)[:, 0], log.pos_w, atol=1e-5)
+    assert times is not None and (np.diff(times) > 0).all()
+
+
+def test_the_recording_opens_with_the_command_that_people_have(diagnosed):
+    line = [sys.executable, "-m", "rerun", "rrd", "verify", str(diagnosed / "recording.rrd")]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,78 @@
+"""The black box in the diagnosed quadrotor: it starts as nothing, learns, and stays a black box."""
+
+import jax
+import numpy as np
+import pytest
+
+from suite.diagnose.data.windows import CHANNELS, cut, take
+from suite.diagnose.diagnose import diagnose
+from suite.diagnose.fit.model import BATCH, Model
+from suite.diagnose.fit.parameters import make_space
+from suite.diagnose.fit.rollout import KNOTS
+from suite.diagnose.verdict.black_box import compare_black_box
+from suite.diagnose.verdict.delta_model import BlackBoxConfig, _start, black_box_gap, fit_black_box
+from suite.diagnose.verdict.gap import measure, true_starts
+from tests.support.diagnosis_flights import NOISE, fly
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+
+LAGGED = with_lag(PLAIN, 0.03)
+TRUTH = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
+SIGMA = np.repeat(
+    [NOISE["pos"], NOISE["att"], NOISE["vel"], NOISE["rate"], np.nan], [3, 3, 3, 3, CHANNELS - 12]
+)
+
+
+@pytest.fixture(scope="module")
+def few():
+    """A model, and as many windows as it flies at once."""
+    log = fly(TRUTH, 0, duration_s=7.0)
+    windows, _ = cut([log], LAGGED, False, 0.5)
+    assert windows is not None and len(windows.flight) >= BATCH
+    return Model(LAGGED, make_space(LAGGED), False, False), take(windows, np.arange(BATCH))
+
+
+def test_a_network_that_was_not_fitted_changes_nothing(few):
+    model, windows = few
+    params = {name: np.asarray(value) for name, value in _start(0).items()}
+    plain = measure(model, model.space.array("start"), windows, SIGMA)
+    boxed = black_box_gap(model, params, windows, SIGMA)
+    np.testing.assert_allclose(boxed.score, plain.score, rtol=1e-6)
+    assert plain.rms > 2.0
+
+
+def test_its_output_pushes_the_body(few):
+    model, windows = few
+    theta = model.space.array("start")
+    push = np.array([0.3, -0.2, 0.5, 0.0, 0.0, 0.0])
+    params = {name: np.asarray(value) for name, value in _start(0).items()}
+    params["output.bias"] = push
+    offset = true_starts(model, theta, windows)
+    same = np.broadcast_to(push, (BATCH, KNOTS, 6))
+    with jax.enable_x64(True):
+        apart = np.asarray(jax.jit(model.fly)(theta, offset, windows, same)[0])
+    boxed = black_box_gap(model, params, windows, SIGMA)
+    at = np.abs(np.asarray(windows.row_s) - 1.0).argmin(axis=1)
+    error = apart[np.arange(BATCH), at][:, :3]
+    rms = np.sqrt((error**2).sum(axis=1).mean())
+    assert boxed.table[1.0]["position"][0] == pytest.approx(rms, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_it_learns_and_the_named_effect_holds_up_better_outside():
+    logs = [fly(TRUTH, k, duration_s=8.0, speed=3.0 + k) for k in range(5)]
+    result = diagnose(logs, LAGGED)
+    found = compare_black_box(result, logs, LAGGED, BlackBoxConfig(iterations=200))
+    inside, outside = found.held_out, found.outside
+    assert outside is not None and inside.named is not None and outside.named is not None
+    assert inside.black_box.rms < 0.5 * inside.before.rms
+    assert outside.named.rms < 1.3 < outside.black_box.rms
+    assert outside.judged >= 6 and outside.fitted >= 6
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_network(few):
+    model, windows = few
+    config = BlackBoxConfig(iterations=3, seed=4)
+    one, two = (fit_black_box(model, windows, SIGMA, config) for _ in range(2))
+    assert all(np.array_equal(one[name], two[name]) for name in one)
+    assert np.abs(one["output.weight"]).max() > 0.0

@@ -1,0 +1,52 @@
+"""Flights of the documents, cut short: one second a trial, a few at a time."""
+
+from dataclasses import replace
+
+import pytest
+
+from eval.worlds.trial import Rules
+from suite.experiments import flights
+from suite.train.repeat import Outcome
+from tests.support.documents import another_racer
+
+
+class Sky:
+    """Counts the trials that are flown, and stops where it is told to."""
+
+    def __init__(self, monkeypatch):
+        self.flown = []
+        self.stop_after = None
+        self._fly = flights.fly
+        monkeypatch.setattr(flights, "fly", self.fly)
+        monkeypatch.setattr(flights, "usable_cores", lambda: 1)
+
+    def fly(self, policy, trials, vehicle, options, on_result):
+        def keep(result, flight):
+            self.flown.append((policy.name, vehicle, options.noise, result.trial))
+            on_result(result, flight)
+            if self.stop_after == len(self.flown):
+                self.stop_after = None
+                raise KeyboardInterrupt
+
+        options = replace(options, slots=8, rules=Rules(time_limit_s=1.0))
+        return self._fly(policy, trials, vehicle, options=options, on_result=keep)
+
+
+@pytest.fixture
+def sky(monkeypatch):
+    return Sky(monkeypatch)
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Return the configurations that were trained; each gives racer, with another digest."""
+    configs = []
+
+    def stand_in(config, folder, console):
+        if not (folder / "policy").is_dir():
+            configs.append(config)
+            another_racer(folder / "policy", 1000 + len(configs))
+        return Outcome(folder / "policy", 1, {})
+
+    monkeypatch.setattr("suite.experiments.trainings.train", stand_in)
+    return configs

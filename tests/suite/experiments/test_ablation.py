@@ -1,0 +1,163 @@
+"""The ablation at a size of seconds, and its rows and sentences by hand."""
+
+import pytest
+
+from eval.judging.statistics import wilson
+from suite.common.errors import WorkFailed
+from suite.experiments import trainings
+from suite.experiments.ablation import Config, Trained, settings
+from suite.experiments.ablation_tables import beside_paper, summaries, verdict
+from suite.experiments.paper import ablation as printed
+from suite.experiments.seed_intervals import Spread
+from tests.support.documents import page, reproduce
+from tests.support.training import boxes_worlds
+
+SMALL = ("spec.hidden_size=8", "spec.camera.width=20", "spec.camera.height=20", "episode.steps=6")
+TINY = ["--set", *SMALL, "--iterations", "2", "--worlds", "2", "--trials", "3", "--seconds", "0.5"]
+
+
+def test_the_papers_rows_are_as_printed():
+    source, rows = printed()
+    assert "with and without AVF" in source and len(rows) == 8
+    assert [row.success_cross for row in rows.values()] == [0.95, 0, 0, 0, 0.28, 0, 0, 0.58]
+    assert sum(row.success_rate for row in rows.values()) == pytest.approx(6.25)
+    assert sum(row.v_max for row in rows.values()) == pytest.approx(51.6)
+
+
+def test_settings_differ_in_field_and_progress_alone():
+    rows = {row.key: row for row in settings(Config())}
+    added = {"field 0.8", "field 1.2", "field 1.6", "field 3.2", "progress 1.2"}
+    assert set(rows) - set(printed()[1]) == added
+    losses = {key: row.recipe.loss for key, row in rows.items()}
+    for key, loss in losses.items():
+        kind, weight = key.split()
+        assert (loss.field_gain > 0) == (kind == "field")
+        normalised = kind == "normalised"
+        assert (loss.progress_norm, loss.progress)[:: 1 if normalised else -1] == (float(weight), 0)
+        assert rows[key].recipe.episode.gates == 4 and loss.projection == 0
+    others = {str(row.recipe).replace(str(row.recipe.loss), "") for row in settings(Config())}
+    assert len(others) == 1
+    assert "field 0.4" in {row.key for row in settings(Config(preset="paper"))}
+    nearly = settings(Config(set=("loss.progress=0.4000001",)))
+    assert [row.key for row in nearly].count("field 0.4") == 1
+    assert len(settings(Config(preset="paper"))) == 11, "its own weight is one of the paper's"
+
+
+def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, capfd):
+    args = [*TINY, "--only", "field 0.4", "normalised 6.4", "--training-seeds", "4"]
+    train, made = trainings.train, []
+
+    def diverging(config, folder, console):
+        made.append((config.loss.progress_norm, config.seed))
+        if config.loss.progress_norm:
+            raise WorkFailed("training diverged at iteration 1")
+        return train(config, folder, console)
+
+    monkeypatch.setattr(trainings, "train", diverging)
+    monkeypatch.setattr("suite.train.run.sample_worlds", boxes_worlds)
+    monkeypatch.setattr("suite.experiments.validation.sample_worlds", boxes_worlds)
+    assert reproduce(tmp_path, "ablation", *args) == 0
+    assert made == [(0, 4), (6.4, 4)]
+    text, numbers = page(tmp_path, "ablation")
+    field, normalised = numbers["rows"]
+    assert (field["seeds"], field["diverged"]) == (1, 0)
+    assert (normalised["seeds"], normalised["diverged"]) == (1, 1)
+    # In half a second nobody passes four gates; who has not moved far hits nothing.
+    assert field["over"]["success_cross"]["most"] == field["pooled"]["success_cross"]["low"] == 0
+    assert field["over"]["success_rate"]["least"] == 1 and field["over"]["v_max"]["mean"] > 0
+    assert "| normalised 6.4 | 4 | diverged | - |" in text and "| 1 of 1 |" in text
+    assert "| 95 |" in text and "The most with the field is 0 %" in text
+    capfd.readouterr()
+    monkeypatch.setattr("suite.train.run.make_update", None)
+    assert reproduce(tmp_path, "ablation", *args) == 0, "nothing is trained again"
+    assert (tmp_path / "docs" / "ablation.md").read_text() == text
+
+
+def runs_of(key, *cross, rate=1.0, v_max=5.0):
+    for seed, value in enumerate(cross):
+        numbers = {"success_cross": value, "success_rate": rate, "v_max": v_max + seed,
+                   "v_max_most": v_max + 2, "gates": 4.0}  # fmt: skip
+        yield Trained(key, seed, 60.0, "c", numbers if value is not None else None)
+
+
+def test_spread_pooled_interval_and_sentences_by_hand():
+    chosen = settings(Config(only=("field 0.4", "progress 3.2", "normalised 6.4")))
+    runs = [
+        *runs_of("field 0.4", 0.9, 1.0, 0.8),
+        *runs_of("progress 3.2", 0.3, 0.1, None, rate=0.3),
+        *runs_of("normalised 6.4", None),
+    ]
+    field, bare, gone = summaries(chosen, runs, 10)
+    assert field.over["success_cross"] == pytest.approx(Spread(0.9, 0.8, 1.0))
+    assert field.over["v_max"] == Spread(6.0, 5.0, 7.0)
+    assert field.pooled["success_cross"] == wilson(27, 30)
+    assert (bare.seeds, bare.diverged) == (3, 1)
+    assert bare.pooled["success_cross"] == wilson(4, 20)
+    assert not gone.over and gone.diverged == 1
+    said = verdict([field, bare, gone])
+    assert "(field 0.4), at a success rate of 100 %" in said and "v_max of 6.0 m/s" in said
+    assert "The first is 70 points more, and its worst seed above the best one." in said
+    assert "at the same lambda_p" not in said, "no weight was trained both ways"
+    assert "Every training of normalised 6.4 diverged." in said
+    compared = beside_paper([field, bare, gone])
+    assert (
+        "success cross lies within the range of our seeds or their pooled interval in 2 of 2"
+        in (compared)
+    )
+    assert "Most success cross of these rows: field 0.4 here, field 0.4 in the paper" in compared
+
+
+def test_sentences_follow_the_numbers_where_the_field_loses():
+    chosen = settings(Config(only=("field 0.4", "progress 3.2")))
+    lost = summaries(
+        chosen, [*runs_of("field 0.4", 0.1, 0.2), *runs_of("progress 3.2", 0.9, 0.8)], 10
+    )
+    assert "The first is 70 points less, and its best seed below the worst one." in verdict(lost)
+    compared = beside_paper(lost)
+    assert (
+        "in 0 of 2 rows: elsewhere field 0.4: 15 % here, 95 % there; progress 3.2: 85" in compared
+    )
+    assert "Most success cross of these rows: progress 3.2 here, field 0.4 in the paper" in compared
+    mixed = summaries(
+        chosen, [*runs_of("field 0.4", 0.1, 0.9), *runs_of("progress 3.2", 0.3, 0.5)], 10
+    )
+    assert "The first is 10 points more, and their seeds overlap." in verdict(mixed)
+    none = summaries(chosen, [*runs_of("field 0.4", 0.0), *runs_of("progress 3.2", 0.0)], 10)
+    assert "The first is as much." in verdict(none)
+    assert "Most success cross of these rows: no row here" in beside_paper(none)
+
+
+def test_the_field_is_compared_at_the_same_weight():
+    chosen = settings(Config(only=("field 0.8", "progress 0.8", "field 1.6")))
+    runs = [
+        *runs_of("field 0.8", 0.5, 0.7),
+        *runs_of("progress 0.8", 0.1, 0.2, rate=0.9, v_max=7.0),
+        *runs_of("field 1.6", 0.9, 0.9),
+    ]
+    said = verdict(summaries(chosen, runs, 10))
+    assert said.startswith(
+        "Success cross with the field and without it, at the same lambda_p of L_p: 60 and 15 % at "
+        "0.8; at 1 of 1 weights every seed with it is above every one without. The most"
+    )
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--seed", "0"], "--seed 0 is one of --training-seeds"),
+        (["--training-seeds", "1", "1"], "--training-seeds is 1 1"),
+        (["--only", "field 0.41"], "Did you mean 'field 0.4'?"),
+        (["--preset", "smal"], "Did you mean 'small'?"),
+        (["--jobs", "0"], "--jobs is 0"),
+        (["--set", "episode.batch=9"], "this experiment sets episode.batch; give --worlds"),
+        (["--set", "episode.gates=6"], "this experiment sets episode.gates; all fly 4"),
+        (["--set", "loss.projection=3"], "this experiment sets loss.projection; it is compared"),
+        (["--trials", "0"], "--trials is 0"),
+        (["--seconds", "0"], "--seconds is 0"),
+    ],
+)
+def test_what_cannot_be_used_is_said_before_anything_is_trained(args, words, tmp_path, capsys):
+    assert reproduce(tmp_path, "ablation", *args) == 2
+    said = capsys.readouterr().err
+    assert words in said and len(said.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())

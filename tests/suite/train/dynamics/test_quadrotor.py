@@ -1,0 +1,296 @@
+"""The trainer's quadrotor: parity with the judge, gradients, and what varies between worlds."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from eval.effects import EFFECTS
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.mujoco import MujocoWorld
+from eval.worlds.slots import layout_of
+from eval.worlds.trial import Rules, TrialSpec
+from suite.commands.train import Config, resolve
+from suite.train.config import QuadrotorConfig
+from suite.train.dynamics import quadrotor
+from suite.train.dynamics.quadrotor import Constants, grid, quadrotor_dynamics
+from suite.train.gradient import make_gradient
+from suite.train.rollout import make_rollout
+from suite.train.worlds import sample_worlds
+from tests.support.courses import straight
+from tests.support.training import (
+    SPEC,
+    boxes_worlds,
+    doubled,
+    fresh_params,
+    small_config,
+)
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tracks.geometry.camera import Camera
+
+REFERENCE = load_vehicle("reference")
+HIDDEN = with_effects(
+    with_lag(PLAIN, 0.02),
+    linear_drag=((0.3, 0.2, 0.1),),
+    rotor_drag=(3e-5,),
+    command_delay=(0.037,),
+    com_offset=((0.01, -0.006, 0.0),),
+    rate_gain=((0.6, 0.7, 1.2),),
+)
+"""Effects that a point mass cannot hold."""
+ALIKE = {
+    "mass_std": 0.0,
+    "lag_spread": 0.0,
+    "drag_spread": 0.0,
+    "delay_spread_s": 0.0,
+    "gain_spread": 0.0,
+    "wind_std": (0.0, 0.0, 0.0),
+}
+"""All worlds have the vehicle file's quadrotor."""
+FAR_W = np.array([40.0, 5.0, 3.0])
+"""A gate that is never reached."""
+
+
+@pytest.fixture
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def lively_actions(decisions, batch=2, seed=0):
+    """Return actions (decisions, batch, 3) of some m/s^2 that turn around before the floor."""
+    rng = np.random.default_rng(seed)
+    phase = rng.uniform(0, 6.3, (batch, 3))
+    wave = np.sin(0.5 * np.arange(decisions)[:, None, None] + phase)
+    return wave * [4.0, 4.0, 1.5] + [0.0, 0.0, 0.5]
+
+
+def fly_trainer(config, actions, rate_hz):
+    """Return positions and attitudes of the trainer's quadrotor from rest after each decision."""
+    start, step = quadrotor_dynamics(config, 1 / rate_hz, 0.0)
+    batch = actions.shape[1]
+    effects = quadrotor.draw_effects(config, batch, np.random.default_rng(0))
+    constants = Constants(np.full(batch, 1 / rate_hz), doubled(effects))
+    towards = jnp.tile(jnp.asarray([1.0, 0.0, 0.0]), (batch, 1))
+    still = jnp.zeros((batch, 3))
+    body = start(constants, still + jnp.asarray([0.0, 0.0, 10.0]), still, towards)
+    key, target = jax.random.key(0), jnp.tile(jnp.asarray(FAR_W), (batch, 1))
+
+    @jax.jit
+    def fly(body, actions):
+        def one(body, action):
+            body = step(body, constants, action, target, key)
+            return body, (body.pos_w, body.rot_w, body.vel_w)
+
+        return jax.lax.scan(one, body, actions)[1]
+
+    return [np.asarray(x) for x in fly(body, jnp.asarray(actions))]
+
+
+def fly_judge(vehicle, actions, rate_hz):
+    """Return the same of the judge's MuJoCo world."""
+    batch = actions.shape[1]
+    track = straight(distances=(FAR_W[0],), height=10.0)
+    gates = track.scene.gates._replace(center_w=FAR_W[None])
+    track = replace(track, scene=track.scene._replace(gates=gates))
+    world = MujocoWorld(vehicle, Camera(width=2, height=2), layout_of([track]), Rules(), batch)
+    world.load([(k, track, TrialSpec("straight", 0, k)) for k in range(batch)])
+    decided = np.rint(np.arange(len(actions) + 1) / (rate_hz * world.dt)).astype(int)
+    rows = []
+    for action, steps in zip(actions, np.diff(decided), strict=True):
+        world.advance(action, np.full(batch, steps), record=False)
+        seen = world.view(np.zeros(batch, bool))
+        rows.append((seen.pos_w, seen.rot_w, seen.vel_w))
+    assert not world.progress.ended.any(), "the flight must be free"
+    return [np.stack(column) for column in zip(*rows, strict=True)]
+
+
+@pytest.mark.parametrize("vehicle", [REFERENCE, HIDDEN], ids=["reference", "hidden"])
+def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(float64, vehicle):
+    """At 20 Hz a period is 5 steps of the judge's attitude loop, 25 of its physics."""
+    config = QuadrotorConfig(vehicle, physics_hz=500.0, **ALIKE)
+    assert grid(config, 0.05) == (5, 5, 0.002)
+    actions = lively_actions(40)
+    ours, judged = fly_trainer(config, actions, 20.0), fly_judge(vehicle, actions, 20.0)
+    assert np.ptp(judged[0], axis=0).max() > 1.0 and judged[1][..., 2, 2].min() < 0.95
+    for one, two in zip(ours, judged, strict=True):
+        # Both in double precision; effects are drawn in single, which is what is left.
+        np.testing.assert_allclose(one, two, atol=2e-5)
+
+
+@pytest.mark.parametrize("vehicle", [REFERENCE, HIDDEN], ids=["reference", "hidden"])
+def test_training_steps_stay_near_the_judges(float64, vehicle):
+    """At 15 Hz with 250 Hz physics: 7 steps of 9.5 ms for the judge's 6 or 7 of 10 ms."""
+    config = QuadrotorConfig(vehicle, **ALIKE)
+    cut = grid(config, 1 / 15)
+    assert cut[:2] == (7, 2) and cut.dt == pytest.approx(1 / 15 / 14)
+    actions = lively_actions(15)
+    ours, judged = fly_trainer(config, actions, 15.0), fly_judge(vehicle, actions, 15.0)
+    assert np.all(np.linalg.norm(judged[0][-1] - [0.0, 0.0, 10.0], axis=-1) > 0.4)
+    assert np.linalg.norm(ours[0] - judged[0], axis=-1).max() < 0.02
+    assert np.linalg.norm(ours[2] - judged[2], axis=-1).max() < 0.1
+
+
+def test_gradients_of_a_flight_are_those_of_finite_differences(float64, monkeypatch):
+    """Through attitude loop, rate loop, mixer, rotors, delay and effects; heading held."""
+    monkeypatch.setattr(quadrotor, "blend_heading", lambda heading_w, *_: heading_w)
+    config = QuadrotorConfig(HIDDEN)
+    start, step = quadrotor_dynamics(config, 1 / 15, 0.0)
+    rng = np.random.default_rng(3)
+    effects = doubled(quadrotor.draw_effects(config, 2, rng))
+    constants = Constants(np.full(2, 1 / 15), effects)
+    weight = [jnp.asarray(rng.normal(size=(2, 3))) for _ in range(3)]
+    still, key = jnp.zeros((2, 3)), jax.random.key(0)
+
+    @jax.jit
+    @jax.value_and_grad
+    def score(inputs):
+        actions, vel_w = inputs
+        body = start(constants, still, vel_w, still + jnp.asarray([1.0, 0.0, 0.0]))
+
+        def one(body, action):
+            body = step(body, constants, action, still, key)
+            parts = (body.pos_w, body.vel_w, body.rot_w[:, 2])
+            return body, jnp.stack([w * part for w, part in zip(weight, parts, strict=True)])
+
+        return jax.lax.scan(one, body, actions)[1].sum()
+
+    inputs = (
+        jnp.asarray(lively_actions(5, seed=1)),
+        jnp.asarray(rng.normal(size=(2, 3))),
+    )
+    slopes = score(inputs)[1]
+    for which in range(2):
+        direction = rng.normal(size=inputs[which].shape)
+
+        def moved(size, which=which, direction=direction):
+            changed = list(inputs)
+            changed[which] = changed[which] + size * direction
+            return score(tuple(changed))[0]
+
+        expected = float(moved(1e-6) - moved(-1e-6)) / 2e-6
+        assert abs(expected) > 1e-2
+        assert float((slopes[which] * direction).sum()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatch):
+    """The whole of a blind policy's loss: no decay, no field, no closing speed, heading held."""
+    monkeypatch.setattr(quadrotor, "blend_heading", lambda heading_w, *_: heading_w)
+    config = small_config(
+        batch=2,
+        steps=5,
+        loss={"gradient_decay": 0.0, "field_gain": 0.0, "collide": 0.0, "barrier_slope": -4.0},
+    )
+    config = replace(config, quadrotor=QuadrotorConfig(HIDDEN))
+    params, worlds = doubled(fresh_params()), doubled(boxes_worlds(config))
+    rollout = make_rollout(config)
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(params):
+        nudge = jnp.zeros((5, 2, SPEC.hidden_size))
+        blind = lambda p, image: jnp.zeros((2, SPEC.hidden_size))  # noqa: E731
+        return rollout(params, nudge, worlds, jax.random.key(5), blind, None)[0]
+
+    gradient = loss(params)[1]
+    rng = np.random.default_rng(0)
+    for name in ("state.weight", "gru.weight_hidden", "action.weight"):
+        direction = rng.normal(size=params[name].shape)
+        ahead, behind = (
+            loss({**params, name: params[name] + h * direction})[0] for h in (1e-6, -1e-6)
+        )
+        slope = float(ahead - behind) / 2e-6
+        assert abs(slope) > 1e-4
+        assert float((gradient[name] * direction).sum()) == pytest.approx(slope, rel=1e-4)
+
+
+def test_gradients_of_the_motion_fade_as_those_of_the_point_mass(float64):
+    config = QuadrotorConfig(PLAIN, **ALIKE)
+    still = jnp.zeros((1, 3))
+    effects = doubled(quadrotor.draw_effects(config, 1, np.random.default_rng(0)))
+    constants = Constants(np.full(1, 0.05), effects)
+
+    def end(pos_w, decay):
+        start, step = quadrotor_dynamics(config, 0.05, decay)
+        body = start(constants, pos_w, still, still + jnp.asarray([1.0, 0.0, 0.0]))
+        for _ in range(3):
+            body = step(body, constants, still, still + 5.0, jax.random.key(0))
+        return body.pos_w[0, 0]
+
+    slope = jax.grad(end)(still, 0.916)[0, 0]
+    assert float(slope) == pytest.approx(np.exp(-0.916 * 0.15), rel=1e-9)
+
+
+def test_quadrotors_vary_around_the_vehicle_and_the_tracks_stay_the_same():
+    point = small_config(batch=64)
+    quad = replace(point, quadrotor=QuadrotorConfig(HIDDEN))
+    one, two, again = sample_worlds(point, 3), sample_worlds(quad, 3), sample_worlds(quad, 3)
+    np.testing.assert_array_equal(one.pos_w, two.pos_w)
+    np.testing.assert_array_equal(one.scene.boxes.center_w, two.scene.boxes.center_w)
+    assert isinstance(two.constants, quadrotor.Constants)
+    assert isinstance(again.constants, quadrotor.Constants)
+    effects = two.constants.effects
+    for name, value in effects.items():
+        for field, repeated in zip(value, again.constants.effects[name], strict=True):
+            np.testing.assert_array_equal(field, repeated)
+            assert field.shape[0] == 64 and np.ptp(field, axis=0).min() > 0, name
+    assert effects["command_delay"].delay.mean() == pytest.approx(0.037, abs=0.003)
+    assert np.all(np.abs(effects["command_delay"].delay - 0.037) <= 0.01 + 1e-6)
+    assert effects["motor_lag"].time_constant.mean() == pytest.approx(0.02, rel=0.1)
+    np.testing.assert_allclose(effects["rate_gain"].scale.mean(0), [0.6, 0.7, 1.2], rtol=0.05)
+    np.testing.assert_allclose(effects["linear_drag"].coefficient.mean(0), [0.3, 0.2, 0.1], atol=0.03)  # noqa: E501  # fmt: skip
+    assert np.all(effects["linear_drag"].coefficient >= 0)
+    assert "com_offset" not in effects, "what does not vary stays the vehicle's"
+    bare = quadrotor.draw_effects(QuadrotorConfig(PLAIN), 8, np.random.default_rng(0))
+    assert np.all(bare["motor_lag"].time_constant == 0)
+    assert np.all((bare["command_delay"].delay >= 0) & (bare["command_delay"].delay <= 0.01))
+
+
+@pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.log is None])
+def test_every_effect_of_a_vehicle_file_flies_in_training(name):
+    """A typical strength of it changes where the quadrotor is after half a second."""
+    changed = {
+        p.name: np.asarray(getattr(_neutral(name), p.name)) + p.typical[1]
+        for p in EFFECTS[name].parameters
+    }
+    vehicle = replace(PLAIN, effects={name: EFFECTS[name].values(**changed)})
+    flown = [
+        fly_trainer(QuadrotorConfig(v, **{**ALIKE, "drag_spread": 0.3}), lively_actions(7), 15.0)
+        for v in (PLAIN, vehicle)
+    ]
+    assert np.isfinite(flown[1][0]).all()
+    if name != "ground_effect":  # too high above the ground
+        assert np.abs(flown[0][0] - flown[1][0]).max() > 1e-5
+
+
+def _neutral(name):
+    from eval.effects.interface import neutral
+
+    return neutral(EFFECTS[name], PLAIN)
+
+
+def test_the_trainers_own_method_takes_a_finite_gradient():
+    config = replace(small_config(), quadrotor=QuadrotorConfig(HIDDEN))
+    worlds, params = boxes_worlds(config), fresh_params()
+    gradient, loss, records = jax.jit(make_gradient(config))(
+        params, worlds, jax.random.key(5), None
+    )
+    assert np.isfinite(float(loss)) and records.image.shape == (6, 4, 20, 20)
+    sizes = {name: float(np.abs(np.asarray(g)).max()) for name, g in gradient.items()}
+    assert all(np.isfinite(size) for size in sizes.values()) and min(sizes.values()) > 1e-8, sizes
+
+
+def test_the_command_line_asks_for_model_and_vehicle_together(tmp_path):
+    config = resolve(Config(model="quad", vehicle="reference"))
+    assert config.quadrotor is not None and config.quadrotor.vehicle == REFERENCE
+    changed = resolve(Config(model="quad", vehicle="racer5", set=("quadrotor.physics_hz=500",)))
+    assert changed.quadrotor is not None and changed.quadrotor.physics_hz == 500.0
+    assert resolve(Config()).quadrotor is None
+    with pytest.raises(ValueError, match="--model quad needs --vehicle.*reference"):
+        resolve(Config(model="quad"))
+    with pytest.raises(ValueError, match="--vehicle is racer5.*add --model quad"):
+        resolve(Config(vehicle="racer5"))
+    with pytest.raises(ValueError, match="Did you mean 'racer5'"):
+        resolve(Config(model="quad", vehicle="racer6"))

@@ -1,0 +1,115 @@
+"""The reward against numbers worked by hand: one world, one gate ahead, one sphere beside."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from suite.train.config import LossConfig
+from suite.train.dynamics import point_mass
+from suite.train.ppo.reward import make_reward
+from tests.support.training import boxes_worlds, small_config
+from tracks.geometry.gates import square_gates
+from tracks.geometry.scene import Gates, Spheres
+
+CONFIG = small_config(1, 1, loss={"barrier_slope": -8.0, "safety_radius_m": 0.2})
+DT = 0.1
+CENTERS = np.array([[0.0, 0, 50], [0, 4, 50]])
+"""Of the two gates, both flown through along x; the ground is too far down to matter."""
+
+
+def worlds_with(sphere_w, radius=0.5):
+    """Return a world of two gates and a sphere; the gates' frames are no solids."""
+    worlds = boxes_worlds(CONFIG)
+    zero, one = np.zeros(2), np.ones(2)
+    gates = Gates(*(x[None] for x in square_gates(CENTERS, zero, one, 0.2 * one, 0.1 * one)))
+    boxes = type(worlds.scene.boxes)(*(array[:, :0] for array in worlds.scene.boxes))
+    spheres = Spheres(np.array([[sphere_w]], float), np.array([[radius]]))
+    scene = worlds.scene._replace(gates=gates, boxes=boxes, spheres=spheres)
+    assert isinstance(worlds.constants, point_mass.Constants)
+    constants = worlds.constants._replace(time_step=np.full(1, DT))
+    return jax.tree.map(jnp.asarray, worlds._replace(scene=scene, constants=constants))
+
+
+def body_at(pos_w, vel_w=(0.0, 0, 0), acc_w=(0.0, 0, 0)):
+    pos, vel, acc = (jnp.asarray([x], float) for x in (pos_w, vel_w, acc_w))
+    return point_mass.start(pos, vel, jnp.asarray([[1.0, 0, 0]]))._replace(acc_w=acc)
+
+
+def rewarded(before, body, sphere_w=(0, 0, 90), target=0, config=CONFIG):
+    """Return (terms as numbers by name, their sum, clearance, passed) of the step."""
+    terms, clearance, passed = make_reward(config)(
+        worlds_with(sphere_w), before, body, jnp.asarray([target])
+    )
+    named = {name: float(term[0]) for name, term in terms._asdict().items()}
+    return named, float(terms.total()[0]), float(clearance[0]), bool(passed[0])
+
+
+def test_far_from_everything_there_is_progress_and_smoothness_alone():
+    before = body_at((-3, 0, 54), acc_w=(1, 0, 0))
+    body = body_at((-3, 0, 54), vel_w=(5, 7, 0), acc_w=(1, 2, 0))
+    terms, total, _, passed = rewarded(before, body)
+    # The gate is 5 m away in direction (3, 0, -4) / 5; the acceleration changed by 2 in 0.1 s.
+    assert terms["progress"] == pytest.approx(0.4 * 5 * 3 / 5, rel=1e-5)
+    assert terms["smooth"] == pytest.approx(-1e-2 * 5 - 1e-3 * 20**2, rel=1e-5)
+    assert terms["collision"] == terms["passing"] == 0 and not passed
+    assert terms["avoid"] == pytest.approx(0, abs=1e-6)
+    assert total == pytest.approx(sum(terms.values()))
+
+
+def test_a_solid_that_comes_closer_costs_by_distance_and_closing_speed():
+    place = (-3.0, 0, 50)
+    body = body_at(place, vel_w=(0, 2, 0))
+    # A sphere of 0.5 m whose centre is 0.9 m to the left: 0.4 m away, closing in at 2 m/s.
+    terms, _, clearance, _ = rewarded(body_at(place), body, sphere_w=(-3, 0.9, 50))
+    assert clearance == pytest.approx(0.4, abs=1e-5)
+    barrier = np.log1p(np.exp(-8.0 * (0.4 - 0.2)))
+    assert terms["avoid"] == pytest.approx(-6 * barrier - 3 * 2 * (1 - 0.4 + 0.2) ** 2, rel=1e-4)
+    assert terms["collision"] == 0
+    away, *_ = rewarded(body_at(place), body_at(place, (0, -2, 0)), sphere_w=(-3, 0.9, 50))
+    assert away["avoid"] == pytest.approx(-6 * barrier, rel=1e-4)
+
+
+@pytest.mark.parametrize(("gap", "collision"), [(0.21, 0.0), (0.19, -30.0), (-0.1, -30.0)])
+def test_a_collision_is_coming_closer_than_the_safety_radius(gap, collision):
+    place = (-3.0, 0, 50)
+    terms, *_ = rewarded(body_at(place), body_at(place), sphere_w=(-3, 0.5 + gap, 50))
+    assert terms["collision"] == collision
+
+
+def test_a_collision_on_the_way_counts():
+    before, body = body_at((-4, 0, 50)), body_at((-2, 0, 50))
+    terms, _, clearance, _ = rewarded(before, body, sphere_w=(-3, 0.6, 50))
+    assert clearance == pytest.approx(0.1, abs=1e-5) and terms["collision"] == -30
+
+
+def test_a_pass_pays_once_and_the_progress_is_to_the_next_gate():
+    before = body_at((-0.1, 0.3, 50))
+    body = body_at((0.1, 0.3, 50), vel_w=(2, 3, 0))
+    terms, _, _, passed = rewarded(before, body)
+    assert passed and terms["passing"] == 110
+    to_next = np.array([-0.1, 3.7])
+    assert terms["progress"] == pytest.approx(
+        0.4 * (to_next @ [2, 3]) / np.linalg.norm(to_next), rel=1e-5
+    )
+    beside, *_ = rewarded(before, body, target=1)
+    beyond, *_ = rewarded(before, body, target=2)
+    assert beside["passing"] == beyond["passing"] == 0
+    backwards, *_ = rewarded(body_at((0.1, 0.3, 50)), body_at((-0.1, 0.3, 50)))
+    assert backwards["passing"] == 0
+
+
+def test_a_trainings_own_weights_change_nothing():
+    before, body = body_at((-3, 0, 50)), body_at((-2.9, 0.1, 50), (1, 2, 0), (1, 2, 3))
+    shared = {"barrier_slope": -8.0, "safety_radius_m": 0.2, "path_samples": 4}
+    own = LossConfig(
+        clearance=1.0, collide=7.0, acceleration=1.0, jerk=1.0, progress=9.0, progress_norm=3.0,
+        projection=2.0, approach_m=1.0, pass_first=True, barrier_height=5.0, field_gain=0.0,
+        crash_depth_m=1.0, **shared,
+    )  # fmt: skip
+    near = (-2.9, 0.9, 50)
+    assert rewarded(before, body, near, config=replace(CONFIG, loss=own)) == rewarded(
+        before, body, near
+    )

@@ -1,0 +1,251 @@
+"""Every loss term against its equation and finite differences; the field; what is cut."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from scipy.spatial.transform import Rotation
+
+from suite.train.config import LossConfig
+from suite.train.losses import (
+    MAX_PULL,
+    guidance_term,
+    obstacle_terms,
+    progress_term,
+    smoothness_terms,
+)
+from tracks.geometry.clearance import nearest_obstacle
+from tracks.geometry.field import attractive_field, magnetic_field
+from tracks.geometry.gates import round_gates, square_gates
+from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def one_of_each() -> Scene:
+    """Return a batch of one world with a box, a cylinder, a capsule and a sphere, all apart."""
+    turn = Rotation.from_euler("ZYX", [0.5, 0.4, -0.3]).as_matrix()
+    gates = square_gates(np.array([[50.0, 0, 5]]), *(np.ones(1) * x for x in (0, 1, 0.1, 0.1)))
+    axis = turn[:, :1].T
+    scene = Scene(
+        Gates(*gates),
+        Boxes(np.array([[0.0, 0, 5]]), turn[None], np.array([[0.5, 0.3, 0.8]])),
+        Rods(np.array([[5.0, 0, 5]]), axis, np.array([0.4]), np.array([0.7])),
+        Rods(np.array([[10.0, 0, 5]]), axis, np.array([0.4]), np.array([0.7])),
+        Spheres(np.array([[15.0, 0, 5]]), np.array([0.5])),
+        np.zeros((0, 3, 3)),
+    )
+    return jax.tree.map(lambda x: jnp.asarray(x)[None], scene)
+
+
+nearest = jax.jit(nearest_obstacle)
+
+
+def around(count=30, seed=0):
+    """Return (1, S, 3) points around the four solids' centres, outside and inside."""
+    rng = np.random.default_rng(seed)
+    center = np.array([0.0, 5, 10, 15])[rng.integers(0, 4, count)]
+    point = rng.uniform(-1.0, 1.0, (count, 3)) + [0, 0, 5]
+    point[:, 0] += center
+    return jnp.asarray(point)[None]
+
+
+def terms_at(path_w, vel_w, config):
+    """Return both terms (S,), every point being the path of a world of its own."""
+    distance, away = nearest(one_of_each(), jax.lax.stop_gradient(path_w))
+    points = jnp.swapaxes(path_w, 0, 1)
+    vel = jnp.broadcast_to(vel_w, away[0].shape)
+    return obstacle_terms(config, distance[0][:, None], away[0][:, None], points, vel)
+
+
+def test_obstacle_terms_are_the_papers():
+    config = LossConfig(barrier_height=2.0, barrier_slope=-8.0, safety_radius_m=0.15)
+    vel, path = np.array([1.0, 2.0, -1.0]), around()
+    distance, away = (np.array(x[0]) for x in nearest(one_of_each(), path))
+    gap, closing = distance - 0.15, np.maximum(0.0, -(away @ vel))
+    barrier, collide = terms_at(path, jnp.asarray(vel), config)
+    np.testing.assert_allclose(barrier, 2.0 * np.log1p(np.exp(-8.0 * gap)), rtol=1e-9)
+    np.testing.assert_allclose(collide, closing * np.maximum(1 - gap, 0) ** 2, rtol=1e-9)
+
+
+def test_the_terms_of_a_step_are_means_over_its_path():
+    config, path = LossConfig(barrier_slope=-8.0), around(4, seed=2)
+    vel = jnp.asarray([[1.0, 2.0, -1.0]])
+    distance, away = nearest(one_of_each(), path)
+    whole = obstacle_terms(config, distance, away, path, vel)
+    for term, parts in zip(whole, terms_at(path, vel, config), strict=True):
+        assert float(term[0]) == pytest.approx(float(parts.mean()))
+
+
+def test_obstacle_terms_push_away_from_every_kind_of_solid_outside_and_inside():
+    path = around(300)
+    distance, away = (np.array(x[0]) for x in nearest(one_of_each(), path))
+    near = distance < 1.0
+    assert (distance < 0).sum() > 20 and near.sum() > 200
+    config = LossConfig(barrier_slope=-8.0)
+    for index in (0, 1):
+        # Closing in at 2 m/s on whatever is nearest, point by point.
+        push = -jax.grad(lambda p, i=index: terms_at(p, -2.0 * away, config)[i].sum())(path)
+        push = np.array(push)[0][near]
+        towards_free = (push * away[near]).sum(-1)
+        assert np.all(towards_free > 0)
+        np.testing.assert_allclose(towards_free, np.linalg.norm(push, axis=-1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_obstacle_gradients_are_those_of_the_true_distance(index):
+    """Central differences look the nearest obstacle up again at each moved point."""
+    config = LossConfig(barrier_slope=-8.0)
+    path, vel = around(40, seed=5), np.array([1.0, -1.5, 0.7])
+    gradient = jax.grad(lambda p: terms_at(p, jnp.asarray(vel), config)[index].sum())(path)
+    # The closing speed has no gradient on purpose, so the differences hold it as well.
+    closing = np.maximum(-(np.array(nearest(one_of_each(), path)[1][0]) @ vel), 0)[:, None]
+    direction, step = np.random.default_rng(1).normal(size=(40, 3)), 1e-6
+    moved = [path + sign * step * direction for sign in (1, -1)]
+    ways = [nearest(one_of_each(), point)[1][0] for point in moved]
+    values = [terms_at(p, -closing * a, config)[index] for p, a in zip(moved, ways, strict=True)]
+    slope = np.array(values[0] - values[1]) / (2 * step)
+    assert np.abs(slope).max() > 0.1
+    np.testing.assert_allclose((gradient[0] * direction).sum(-1), slope, rtol=1e-4, atol=1e-6)
+
+
+def test_the_closing_speed_carries_no_gradient():
+    path, away = around(1), jnp.asarray([[[0.0, 0, 1]]])
+    config = LossConfig()
+
+    def collide(vel):
+        return obstacle_terms(config, jnp.asarray([[0.3]]), away, path, vel)[1].sum()
+
+    vel = jnp.asarray([[0.0, 0.0, -2.0]])
+    assert collide(2 * vel) == pytest.approx(2 * float(collide(vel)))
+    assert not np.any(jax.grad(collide)(vel))
+
+
+def test_progress_is_the_papers_and_differentiates():
+    config = LossConfig(progress=0.4)
+    rng = np.random.default_rng(2)
+    pos, vel, target = (jnp.asarray(rng.normal(0, 3, (5, 3))) for _ in range(3))
+    to_gate = np.array(target - pos)
+    expected = -0.4 * (np.array(vel) * to_gate).sum(-1) / np.linalg.norm(to_gate, axis=-1)
+    np.testing.assert_allclose(
+        progress_term(config, pos, vel, target, pos - target), expected, atol=1e-9
+    )
+    for varied in (LossConfig(), LossConfig(progress=0.0, progress_norm=0.7)):
+        check_grads(
+            lambda p, v, c=varied: progress_term(c, p, v, target, pos - target),
+            (pos, vel), order=1, modes=["rev"], atol=1e-6, rtol=1e-6,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("before_m", [0.0, 1.5])
+def test_projection_pulls_to_the_axis_and_its_range_carries_no_gradient(before_m):
+    """L_proj = |lateral|^2 exp(-beta_3 distance), where only the lateral part is differentiated.
+
+    The distance is that of the gate, wherever before it progress is measured to.
+    """
+    config = LossConfig(progress=0.0, projection=1.5, projection_decay=0.5)
+    gate, vel = jnp.asarray([[4.0, 0.5, 1.0]]), jnp.asarray([[1.0, 2.0, 3.0]])
+    pos, target = jnp.asarray([[1.0, 1.0, 2.0]]), gate - jnp.asarray([[before_m, 0.0, 0.0]])
+
+    def term(pos):
+        return progress_term(config, pos, vel, target, pos - gate).sum()
+
+    distance = np.linalg.norm(np.array(pos - gate))
+    near = np.exp(-0.5 * distance)
+    assert float(term(pos)) == pytest.approx(1.5 * (0.5**2 + 1.0**2) * near)
+    expected = 1.5 * 2 * near * np.array([[0, 0.5, 1.0]])
+    np.testing.assert_allclose(jax.grad(term)(pos), expected, atol=1e-9)
+
+
+def test_smoothness_is_the_papers_and_differentiates():
+    config = LossConfig(acceleration=0.01, jerk=0.001)
+    rng = np.random.default_rng(4)
+    acc, before = (jnp.asarray(rng.normal(0, 5, (3, 3))) for _ in range(2))
+    dt = jnp.asarray([0.03, 0.04, 0.05])
+    size, change = smoothness_terms(config, acc, before, dt)
+    np.testing.assert_allclose(size, 0.01 * np.linalg.norm(acc, axis=-1) ** 2)
+    rate = np.linalg.norm(np.array(acc - before) / np.array(dt)[:, None], axis=-1)
+    np.testing.assert_allclose(change, 0.001 * rate**2)
+    check_grads(
+        lambda a, b: smoothness_terms(config, a, b, dt), (acc, before),
+        order=1, modes=["rev"], atol=1e-4, rtol=1e-5,
+    )  # fmt: skip
+
+
+def unit_gate(count, yaw=0.4):
+    ones = np.ones(count)
+    gates = square_gates(
+        np.tile([1.0, -2.0, 1.5], (count, 1)), yaw * ones, ones, 0.2 * ones, 0.1 * ones
+    )
+    return Gates(*(jnp.asarray(x) for x in gates))
+
+
+@partial(jax.jit, static_argnums=0)
+def pull_at(config, gates, pos, vel):
+    return -jax.grad(lambda p: guidance_term(config, gates, p, vel).sum())(pos)
+
+
+def test_the_field_enters_as_minus_its_vector_with_the_strength_it_says():
+    config = LossConfig(field_gain=0.42)
+    gates = unit_gate(20)
+    rng = np.random.default_rng(6)
+    away = rng.normal(0, 1.0, (20, 3))
+    pos = gates.center_w + away
+    vel = jnp.asarray(rng.normal(0, 3, (20, 3)))
+    term = guidance_term(config, gates, pos, vel)
+    np.testing.assert_array_equal(term, np.zeros(20))
+    pull = pull_at(config, gates, pos, vel)
+
+    centers, rot, opening = (np.array(x) for x in (gates.center_w, gates.rot_w, gates.opening_g))
+    center, sideways = centers[:1], rot[:1, :, 1]
+    unit_field = magnetic_field(center, rot[:1], opening[:1], center)
+    at_center = attractive_field(unit_field, sideways, config.field_decay)
+    field = magnetic_field(centers, rot, opening, np.array(pos))
+    u_a = attractive_field(field, np.array(vel), config.field_decay)
+    expected = 0.42 * u_a / np.linalg.norm(at_center)
+    far = np.linalg.norm(expected, axis=-1) < 0.42 * MAX_PULL
+    assert far.sum() > 15
+    np.testing.assert_allclose(pull[far], expected[far], rtol=1e-6)
+    middle = jnp.tile(jnp.asarray(center), (20, 1))
+    at = pull_at(config, gates, middle, jnp.tile(jnp.asarray(sideways), (20, 1)))
+    np.testing.assert_allclose(at[0], 0.42 * rot[0, :, 0], atol=1e-6)
+
+
+def test_a_round_gate_pulls_as_itself_or_as_the_square_around_it():
+    ones, rng = np.ones(20), np.random.default_rng(8)
+    octagon = round_gates(np.zeros((20, 3)), 0.4 * ones, ones, 0.2 * ones, 0.1 * ones, 8)
+    square = square_gates(np.zeros((20, 3)), 0.4 * ones, ones, 0.2 * ones, 0.1 * ones)
+    octagon, square = (Gates(*(jnp.asarray(x) for x in g)) for g in (octagon, square))
+    pos, vel = (jnp.asarray(rng.normal(0, size, (20, 3))) for size in (1.0, 3.0))
+    own = pull_at(LossConfig(), octagon, pos, vel)
+    borrowed = pull_at(LossConfig(field_square=True), octagon, pos, vel)
+    np.testing.assert_allclose(borrowed, pull_at(LossConfig(), square, pos, vel), rtol=1e-5)
+    assert np.abs(own - borrowed).max() > 0.1
+    unchanged = pull_at(LossConfig(field_square=True), square, pos, vel)
+    np.testing.assert_allclose(unchanged, borrowed, rtol=1e-5)
+
+
+def test_the_field_is_held_near_the_wires_and_carries_no_gradient_itself():
+    config = LossConfig(field_gain=0.42)
+    gates = unit_gate(1, yaw=0.0)
+    wire = gates.center_w + jnp.asarray([[0.0, 0.5 + 1e-5, 0.0]])
+    vel = jnp.asarray([[1.0, 2.0, 0.0]])
+    pull = pull_at(config, gates, wire, vel)
+    assert np.linalg.norm(pull) == pytest.approx(0.42 * MAX_PULL, rel=1e-6)
+    assert np.all(
+        np.isfinite(pull_at(config, gates, gates.center_w + jnp.asarray([[0.0, 0.5, 0.5]]), vel))
+    )
+
+    def of_velocity(vel):
+        return guidance_term(config, gates, wire - 0.3, vel).sum()
+
+    assert not np.any(jax.grad(of_velocity)(vel))
+    bend = jax.jacrev(jax.grad(lambda p: guidance_term(config, gates, p, vel).sum()))(wire - 0.3)
+    assert not np.any(bend)

@@ -1,0 +1,243 @@
+"""The whole rollout: gradients, what is cut out of them, and how the field enters."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from policies.networks import delta_network, network
+from policies.observation import state_vector
+from suite.train.dynamics import point_mass
+from suite.train.gradient import encoder_gradient, make_gradient
+from suite.train.losses import UNIT_FIELD
+from suite.train.rollout import make_rollout, target_gate
+from tests.support.training import (
+    SPEC,
+    boxes_worlds,
+    doubled,
+    fresh_params,
+    largest_difference,
+    small_config,
+)
+from tracks.geometry.field import attractive_field, magnetic_field
+
+TILTED = Rotation.from_euler("ZYX", [0.7, -0.3, 0.2]).as_matrix()
+KEY = jax.random.key(5)
+
+
+def blind(params, image):
+    """Return embeddings of nothing, for tests that are not about images."""
+    return jnp.zeros((image.shape[0], SPEC.hidden_size))
+
+
+def loss_of(config, encode=blind):
+    """Return loss(params, worlds, delta, field_gain) of the plain loop with `encode` inside."""
+
+    def loss(params, worlds, delta=None, field_gain=0.0):
+        weighted = replace(config, loss=replace(config.loss, field_gain=field_gain))
+        nudge = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
+        return make_rollout(weighted)(params, nudge, worlds, KEY, encode, delta)[0]
+
+    return loss
+
+
+CONFIG = small_config(batch=3, steps=4)
+gradient_of = jax.jit(jax.grad(loss_of(CONFIG)))
+
+
+@pytest.fixture(scope="module")
+def two_pass():
+    """Return (config, worlds, params, gradient, loss, records) of the trainer's own method."""
+    config = small_config(physics={"depth_noise": 0.02})
+    worlds, params = boxes_worlds(config), fresh_params()
+    return config, worlds, params, *jax.jit(make_gradient(config))(params, worlds, KEY, None)
+
+
+def test_images_outside_the_loop_give_the_gradient_of_the_plain_loop(two_pass):
+    """The sums run in another order in float32: 1e-4 of each array's largest entry."""
+    config, worlds, params, gradient, loss, _ = two_pass
+    plain = jax.jit(jax.value_and_grad(loss_of(config, network.encode)))
+    expected_loss, expected = plain(params, worlds, None, config.loss.field_gain)
+    assert float(loss) == pytest.approx(float(expected_loss), rel=1e-5)
+    sizes = {k: float(np.abs(np.array(g)).max()) for k, g in expected.items()}
+    assert min(sizes.values()) > 1e-7, sizes
+    assert largest_difference(gradient, expected) < 1e-4
+
+
+def test_the_encoders_gradient_does_not_depend_on_its_chunks(two_pass, monkeypatch):
+    params = two_pass[2]
+    rng = np.random.default_rng(0)
+    images = jnp.asarray(rng.normal(size=(12, 20, 20)), jnp.float32)
+    cotangents = jnp.asarray(rng.normal(size=(12, 8)), jnp.float32)
+    whole = encoder_gradient(params, images, cotangents)
+    monkeypatch.setattr("suite.train.gradient.CHUNK", 5)
+    assert largest_difference(encoder_gradient(params, images, cotangents), whole) < 1e-5
+
+
+def test_records_are_those_of_the_flight(two_pass):
+    config, worlds, _, _, loss, records = two_pass
+    assert records.image.shape == (6, 4, 20, 20) and records.pos_w.shape == (6, 4, 3)
+    assert float(sum(term.mean() for term in records.terms)) == pytest.approx(float(loss), rel=1e-5)
+    first = np.linalg.norm(np.array(records.pos_w[0]) - worlds.pos_w, axis=-1)
+    assert np.all(first < 8 * 0.05)
+    assert np.ptp(np.array(records.image)) > 1
+
+
+@pytest.fixture
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def held_attitude(float64, monkeypatch):
+    """Hold the attitude: its gradient is cut on purpose, so differences must not move it."""
+    held = jnp.asarray(TILTED)
+    monkeypatch.setattr(
+        point_mass, "attitude", lambda thrust, _: jnp.broadcast_to(held, (*thrust.shape[:-1], 3, 3))
+    )
+
+
+def test_the_rollouts_gradient_is_that_of_finite_differences(held_attitude):
+    """Where nothing is cut: no decay, no field, no closing speed, attitude held."""
+    config = small_config(
+        steps=8,
+        physics={"state_delay": 1, "image_delay": 1},
+        loss={"gradient_decay": 0.0, "field_gain": 0.0, "collide": 0.0, "barrier_slope": -4.0},
+    )
+    both = jax.jit(jax.value_and_grad(loss_of(config)))
+    params, worlds = doubled(fresh_params()), doubled(boxes_worlds(config))
+    gradient = both(params, worlds)[1]
+    rng = np.random.default_rng(0)
+    for name in ("state.weight", "gru.weight_hidden", "gru.bias_input", "action.weight"):
+        direction = rng.normal(size=params[name].shape)
+        ahead, behind = (
+            both({**params, name: params[name] + h * direction}, worlds)[0] for h in (1e-5, -1e-5)
+        )
+        slope = float(ahead - behind) / 2e-5
+        assert abs(slope) > 1e-4
+        assert float((gradient[name] * direction).sum()) == pytest.approx(slope, rel=1e-5)
+
+
+def fly(params, worlds):
+    """Return positions and velocities (T, B, 3) of a blind flight: a plain loop of its own."""
+    body = point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w)
+    batch = worlds.pos_w.shape[0]
+    hidden, action = jnp.zeros((batch, SPEC.hidden_size)), jnp.zeros((batch, 3))
+    positions, velocities = [], []
+    _, target_w = target_gate(worlds.scene.gates, worlds.target)
+    for _ in range(CONFIG.episode.steps):
+        state = state_vector(body.pos_w, body.vel_w, body.rot_w, target_w, action)
+        action, hidden = network.recur(params, hidden, blind(params, state), state)
+        body = point_mass.step(body, worlds.constants, action, target_w, 6.0, 0.916)
+        positions.append(body.pos_w)
+        velocities.append(body.vel_w)
+    return jnp.stack(positions), jnp.stack(velocities)
+
+
+def pull_at(worlds, pos_w, vel_w):
+    """Return u_A of every world's first gate, 1 across the centre of a gate of 1 m."""
+    gate, _ = target_gate(worlds.scene.gates, worlds.target)
+    field = magnetic_field(gate.center_w, gate.rot_w, gate.opening_g, pos_w)
+    decay = CONFIG.loss.field_decay
+    return attractive_field(field, vel_w, decay) / (2e-5 * UNIT_FIELD) ** (1 - decay)
+
+
+def test_the_field_enters_as_the_paper_says(float64):
+    """Eq. final_optimization: the gradient changes by -u_A pulled back through the positions."""
+    worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
+    with_field, without = (gradient_of(params, worlds, None, gain) for gain in (0.42, 0.0))
+    change = jax.tree.map(jnp.subtract, with_field, without)
+
+    @jax.jit
+    def pulled_back(params):
+        (pos, vel), back = jax.vjp(lambda p: fly(p, worlds), params)
+        pull = 0.42 * pull_at(worlds, pos, vel)
+        return back((-pull / (pos.shape[0] * pos.shape[1]), jnp.zeros_like(vel)))[0]
+
+    expected = pulled_back(params)
+    used = [name for name in expected if np.abs(np.array(expected[name])).max() > 0]
+    assert {"state.weight", "gru.weight_input", "action.weight"} <= set(used)
+    assert largest_difference({k: change[k] for k in used}, {k: expected[k] for k in used}) < 1e-6
+
+
+def test_more_of_the_same_worlds_give_the_same_gradient(float64):
+    worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
+    many = jax.tree.map(lambda x: jnp.concatenate([jnp.asarray(x)] * 3), worlds)
+    once, again = (gradient_of(params, w, None, 5.0) for w in (worlds, many))
+    used = [name for name in once if np.abs(np.array(once[name])).max() > 0]
+    assert largest_difference({k: again[k] for k in used}, {k: once[k] for k in used}) < 1e-9
+
+
+@pytest.mark.parametrize(("steps", "batch"), [(4, 2), (8, 6)])
+def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64, steps, batch):
+    """A world that hangs still: every step pulls alike, so the mean is one step's pull."""
+    still = {"drag": (0.0, 0.0), "drag_up": (0.0, 0.0), "wind_std": (0.0, 0.0, 0.0)}
+    config = small_config(batch, steps, physics=still, rest_share=1.0)
+    worlds, params = doubled(boxes_worlds(config)), doubled(fresh_params(lively=0.0))
+    loss = loss_of(config)
+
+    @jax.jit
+    def start_gradient(gain):
+        move = lambda pos: loss(params, worlds._replace(pos_w=pos), None, gain)  # noqa: E731
+        return jax.grad(move)(worlds.pos_w)
+
+    # Decay fades what comes back through the steps: step k's pull by its k-th power.
+    fade = np.exp(-config.loss.gradient_decay * np.array(worlds.constants.time_step))
+    share = np.mean([fade ** (k + 1) for k in range(steps)], axis=0)
+    pull = 0.42 * np.array(pull_at(worlds, worlds.pos_w, worlds.vel_w)) * share[:, None]
+    change = np.array(start_gradient(0.0) - start_gradient(0.42))
+    np.testing.assert_allclose(change * batch, pull, rtol=1e-6, atol=1e-9)
+
+
+def test_images_carry_no_gradient_to_the_state(float64):
+    worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
+
+    @jax.jit
+    def start_gradient(free, held):
+        def encode(params, image):
+            bright = image.mean((1, 2))[:, None] * jnp.ones(SPEC.hidden_size)
+            return free * bright + held * jax.lax.stop_gradient(bright)
+
+        loss = loss_of(CONFIG, encode)
+        return jax.grad(lambda p: loss(params, worlds._replace(pos_w=p)))(worlds.pos_w)
+
+    seen = start_gradient(1.0, 0.0)
+    np.testing.assert_allclose(seen, start_gradient(0.0, 1.0), atol=1e-12)
+    assert np.abs(np.array(seen - start_gradient(0.0, 0.0))).max() > 1e-6
+
+
+def test_a_delta_action_is_frozen_and_changes_the_gradient(float64):
+    worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
+    delta = doubled(delta_network.init(jax.random.key(1)))
+    base, unmoved = (gradient_of(params, worlds, d, 0.0) for d in (None, delta))
+    used = [name for name in base if np.abs(np.array(base[name])).max() > 0]
+
+    def apart(gradient):
+        return largest_difference({k: gradient[k] for k in used}, {k: base[k] for k in used})
+
+    assert unmoved.keys() == params.keys() and apart(unmoved) < 1e-9
+    delta["output.weight"] += 0.5
+    assert apart(gradient_of(params, worlds, delta, 0.0)) > 1e-2
+
+
+def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
+    config, worlds, params = two_pass[:3]
+    inside = worlds.scene.gates.center_w[:, 0]
+    boxes = worlds.scene.boxes
+    wall = np.array(boxes.half_size)
+    wall[:2, 0] = 3.0
+    center = np.array(boxes.center_w)
+    center[:2, 0] = inside[:2]
+    moved = worlds._replace(
+        pos_w=np.array(inside), vel_w=0 * worlds.vel_w,
+        scene=worlds.scene._replace(boxes=boxes._replace(center_w=center, half_size=wall)),
+    )  # fmt: skip
+    nudge = jnp.zeros((6, 4, SPEC.hidden_size))
+    _, records = jax.jit(make_rollout(config), static_argnums=4)(params, nudge, moved, KEY, blind)
+    total = np.abs(sum(np.array(term) for term in records.terms))
+    assert np.all(total[0] > 0)
+    assert not np.any(total[1:, :2]) and np.all(total[1:, 2:] > 0)

@@ -1,0 +1,293 @@
+"""A run in a folder: the same curve with and without stops, kills and faults."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from functools import cache
+
+import jax
+import numpy as np
+import pytest
+
+from policies.formats.checkpoint import load_arrays, read_config
+from policies.formats.policy_file import load_policy_checkpoint
+from policies.networks import delta_network
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from suite.train import curve, repeat, run
+from suite.train.dynamics import point_mass
+from tests.support.training import boxes_worlds, fresh_params, small_config
+
+CONFIG = small_config(physics={"depth_noise": 0.02})
+
+
+make_update = run.make_update
+
+
+@cache
+def compiled_update(config, mesh):
+    return make_update(config, mesh)
+
+
+def update_of(config, mesh, delta=None):
+    """Return the trainer's update, compiled once for all tests."""
+    return compiled_update(config, mesh) if delta is None else make_update(config, mesh, delta)
+
+
+@pytest.fixture(autouse=True)
+def _small_scenes(monkeypatch):
+    monkeypatch.setattr(run, "sample_worlds", boxes_worlds)
+    monkeypatch.setattr(run, "make_update", update_of)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Return the folder of a run that was never stopped."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "sample_worlds", boxes_worlds)
+        patch.setattr(run, "make_update", update_of)
+        run.train(CONFIG, folder, Console())
+    return folder
+
+
+def rows(folder):
+    """Return the curve without the machine's speed."""
+    found = curve.read(folder)
+    assert all(row.pop(key) >= 0 for row in found for key in ("steps_per_s", "seconds", "cold"))
+    return found
+
+
+def assert_same_run(folder, whole):
+    ours, theirs = (load_arrays(f / "state", kind="training").arrays for f in (folder, whole))
+    assert ours.keys() == theirs.keys()
+    for name, value in theirs.items():
+        np.testing.assert_array_equal(ours[name], value, err_msg=name)
+    assert rows(folder) == rows(whole)
+    policies = [load_policy_checkpoint(f / "policy").params for f in (folder, whole)]
+    for name, value in policies[1].items():
+        np.testing.assert_array_equal(policies[0][name], value)
+
+
+def stop_at(monkeypatch, iteration, error=KeyboardInterrupt):
+    """Let `error` come while iteration - 1 is computed; call the result to let it pass again."""
+
+    def worlds(config, i):
+        if i == iteration:
+            raise error
+        return boxes_worlds(config, i)
+
+    monkeypatch.setattr(run, "sample_worlds", worlds)
+    return lambda: monkeypatch.setattr(run, "sample_worlds", boxes_worlds)
+
+
+def test_a_run_leaves_its_policy_its_curve_and_what_it_was(whole):
+    assert [row["iteration"] for row in curve.read(whole)] == list(range(6))
+    losses = [row["loss"] for row in curve.read(whole)]
+    assert np.all(np.isfinite(losses)) and np.ptp(losses) > 0
+    assert json.loads((whole / "run.json").read_text())["config"]["episode"]["batch"] == 4
+    policy = load_policy_checkpoint(whole / "policy")
+    assert policy.spec == CONFIG.spec
+    assert policy.config["training"]["iteration"] == 6
+    fresh = run.start_state(CONFIG).params
+    assert all(np.any(policy.params[name] != np.array(value)) for name, value in fresh.items())
+
+
+def test_a_stopped_run_resumes_exactly(whole, tmp_path, monkeypatch):
+    go_on = stop_at(monkeypatch, 4)
+    with pytest.raises(KeyboardInterrupt):
+        run.train(CONFIG, tmp_path, Console())
+    assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1, 2]
+    assert read_config(tmp_path / "state")["training"]["iteration"] == 3
+    go_on()
+    assert run.train(CONFIG, tmp_path, Console()).iterations == 6
+    assert_same_run(tmp_path, whole)
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing after it is written."""
+
+
+@pytest.mark.parametrize("dies_in", ["append", "save_policy", "save_arrays"])
+def test_a_kill_in_the_middle_of_saving_leaves_a_run_that_resumes(
+    dies_in, whole, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(repeat, "SAVE_PERIOD_S", 0.0)
+    owner = curve if dies_in == "append" else repeat
+    real, calls = getattr(owner, dies_in), []
+
+    def dying(*args, **kwargs):
+        calls.append(0)
+        if len(calls) > 2:
+            raise Killed
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(owner, dies_in, dying)
+    with pytest.raises(Killed):
+        run.train(CONFIG, tmp_path, Console())
+    assert read_config(tmp_path / "state")["training"]["iteration"] == 2
+    load_policy_checkpoint(tmp_path / "policy")
+    with (tmp_path / curve.CURVE).open("a") as file:
+        file.write('{"iteration": 2, "lo')
+    monkeypatch.setattr(owner, dies_in, real)
+    run.train(CONFIG, tmp_path, Console())
+    assert_same_run(tmp_path, whole)
+
+
+def test_a_kill_between_the_two_renames_of_the_state_loses_nothing(whole, tmp_path, monkeypatch):
+    go_on = stop_at(monkeypatch, 4)
+    with pytest.raises(KeyboardInterrupt):
+        run.train(CONFIG, tmp_path, Console())
+    go_on()
+    part = tmp_path / ".state-x.part"
+    (part / "replaced").mkdir(parents=True)
+    os.replace(tmp_path / "state", part / "state")
+    done = []
+
+    def counted(*args):
+        update = update_of(*args)
+        return lambda *a: (done.append(0), update(*a))[1]
+
+    monkeypatch.setattr(run, "make_update", counted)
+    run.train(CONFIG, tmp_path, Console())
+    assert len(done) == 3
+    assert_same_run(tmp_path, whole)
+
+
+def test_rows_written_twice_by_an_interrupted_save_count_once(tmp_path):
+    for first in (0, 1):
+        curve.append(tmp_path, [{"iteration": i, "loss": 1.0} for i in range(first, 3)])
+    assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1, 2]
+
+
+BARE = """
+import os, sys
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("mujoco", "torch", "dm_control", "gymnasium", "trimesh", "onnx"):
+            raise ImportError("blocked: " + name)
+sys.meta_path.insert(0, Blocker())
+from pathlib import Path
+import tracks.common.files
+from suite.common.console import Console
+from suite.train import repeat, run
+from tests.support.training import boxes_worlds, small_config
+run.sample_worlds, repeat.SAVE_PERIOD_S = boxes_worlds, 0.0
+real, renamed = os.replace, []
+def replace(source, target):
+    if Path(target).name == "state":
+        renamed.append(0)
+        if len(renamed) == 3:
+            os._exit(9)
+    real(source, target)
+os.replace = replace
+run.train(small_config(physics={"depth_noise": 0.02}), Path(sys.argv[1]), Console())
+"""
+
+
+def test_a_bare_machine_trains_and_a_real_kill_while_saving_loses_nothing(whole, tmp_path, root):
+    done = subprocess.run(
+        [sys.executable, "-c", BARE, str(tmp_path)], capture_output=True, text=True, cwd=root
+    )
+    assert done.returncode == 9, done.stderr
+    assert not (tmp_path / "state").exists()
+    run.train(CONFIG, tmp_path, Console())
+    assert_same_run(tmp_path, whole)
+
+
+def test_numbers_that_are_not_finite_stop_the_run_before_they_are_kept(tmp_path, monkeypatch):
+    def worlds(config, iteration):
+        good = boxes_worlds(config, iteration)
+        if iteration < 2:
+            return good
+        assert isinstance(good.constants, point_mass.Constants)
+        lag = good.constants.lag * np.float32(np.nan)
+        return good._replace(constants=good.constants._replace(lag=lag))
+
+    monkeypatch.setattr(run, "sample_worlds", worlds)
+    with pytest.raises(WorkFailed, match="diverged at iteration 2: .*loss, .* not finite"):
+        run.train(CONFIG, tmp_path, Console())
+    stored = load_arrays(tmp_path / "state", kind="training")
+    assert stored.config["training"]["iteration"] == 2
+    assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1]
+
+
+def test_a_folder_with_another_run_is_refused(whole):
+    other = replace(CONFIG, episode=replace(CONFIG.episode, rest_share=0.5))
+    with pytest.raises(ValueError, match="differs in episode"):
+        run.train(other, whole, Console())
+    with pytest.raises(ValueError, match="differs in --from, --delta"):
+        delta = delta_network.init(jax.random.key(0))
+        run.train(CONFIG, whole, Console(), fresh_params(), delta)
+    with pytest.raises(ValueError, match="remove the folder"):
+        run.train(replace(CONFIG, seed=1), whole, Console())
+
+
+def test_a_finished_run_is_not_done_again(whole, monkeypatch):
+    def never(*_):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(run, "make_update", never)
+    outcome = run.train(CONFIG, whole, Console())
+    assert outcome.iterations == 6 and outcome.policy == whole / "policy"
+    assert outcome.last["loss"] == curve.read(whole)[-1]["loss"]
+
+
+def test_a_delta_action_stays_as_it_is_while_the_policy_is_trained_under_it(whole, tmp_path):
+    delta = delta_network.init(jax.random.key(1))
+    delta["output.weight"] += 0.3
+    before = {name: np.array(value) for name, value in delta.items()}
+    run.train(CONFIG, tmp_path, Console(), None, delta)
+    for name, value in before.items():
+        np.testing.assert_array_equal(delta[name], value)
+    assert rows(tmp_path)[0]["loss"] != rows(whole)[0]["loss"]
+    arrays = load_arrays(tmp_path / "state", kind="training").arrays
+    assert arrays.keys() == load_arrays(whole / "state", kind="training").arrays.keys()
+
+
+TWO_DEVICES = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+import numpy as np
+from jax.sharding import Mesh
+from suite.train.gradient import shard_gradient
+from suite.train.update import device_mesh
+from tests.support.training import boxes_worlds, fresh_params, largest_difference, small_config
+config = small_config()
+assert device_mesh(config).size == 2
+args = (fresh_params(), boxes_worlds(config), jax.random.key(0), None)
+results = []
+for count in (1, 2):
+    mesh = Mesh(np.array(jax.devices()[:count]), ("worlds",))
+    gradient, loss, records = jax.jit(shard_gradient(config, mesh))(*args)
+    results.append((gradient, loss, records.pos_w, records.terms))
+print(largest_difference(results[1], results[0]))
+"""
+
+
+def test_two_devices_give_the_gradient_of_one(root):
+    """Without noise, which each device draws for its own worlds; the sums differ in order."""
+    done = subprocess.run(
+        [sys.executable, "-c", TWO_DEVICES], capture_output=True, text=True, cwd=root
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) < 1e-4
+
+
+def test_thirty_iterations_on_an_easy_course_reduce_the_loss(tmp_path, monkeypatch):
+    """Eight worlds without obstacles, the same every time: there is nothing to gain but speed."""
+    optimizer = {"iterations": 30, "rate": 1e-2, "warmup": 3}
+    config = small_config(8, 24, optimizer=optimizer, difficulty=(0.0, 0.0), rest_share=1.0)
+    worlds = boxes_worlds(config)
+    boxes = worlds.scene.boxes
+    gone = boxes._replace(center_w=boxes.center_w - np.array([0, 0, 1000], np.float32))
+    worlds = worlds._replace(scene=worlds.scene._replace(boxes=gone))
+    monkeypatch.setattr(run, "sample_worlds", lambda *_: worlds)
+    run.train(config, tmp_path, Console(), fresh_params())
+    found = curve.read(tmp_path)
+    losses = [row["loss"] for row in found]
+    assert losses[0] - losses[-1] > 0.04
+    assert np.mean(np.diff(losses) < 0) > 0.8
+    assert found[-1]["speed"] > 1.1 * found[0]["speed"]

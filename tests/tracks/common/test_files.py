@@ -1,0 +1,102 @@
+"""Files appear whole or not at all, and the JSON we write is strict."""
+
+import errno
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from tracks.common import files
+from tracks.common.names import closest, unknown_name
+from tracks.common.provenance import stamp
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_beside_it(tmp_path):
+    target = tmp_path / "a.json"
+    files.write_text(target, "old")
+    with pytest.raises(OSError, match="No space"), files.replacing_file(target) as beside:
+        beside.write_text("half")
+        assert target.read_text() == "old"
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert target.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_the_path_beside_keeps_the_suffix_and_missing_folders_are_made(tmp_path):
+    target = tmp_path / "deep" / "b.parquet"
+    with files.replacing_file(target) as beside:
+        assert beside.suffix == ".parquet"
+        assert not target.exists()
+        beside.write_bytes(b"x")
+    assert target.read_bytes() == b"x"
+
+
+def test_a_file_that_is_there_is_replaced(tmp_path):
+    for text in ("old", "new"):
+        files.write_text(tmp_path / "a.txt", text)
+    assert (tmp_path / "a.txt").read_text() == "new"
+
+
+def test_a_folder_is_replaced_whole(tmp_path):
+    target = tmp_path / "checkpoint"
+    for step in ("1", "2"):
+        with files.replacing_folder(target) as beside:
+            (beside / f"step_{step}").write_text(step)
+    assert [p.name for p in target.iterdir()] == ["step_2"]
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint"]
+
+
+def test_a_folder_that_fails_leaves_the_old_one(tmp_path):
+    target = tmp_path / "checkpoint"
+    with files.replacing_folder(target) as beside:
+        (beside / "weights").write_text("good")
+    with pytest.raises(KeyboardInterrupt), files.replacing_folder(target) as beside:
+        (beside / "weights").write_text("ba")
+        raise KeyboardInterrupt
+    assert (target / "weights").read_text() == "good"
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint"]
+
+
+def test_json_is_strict_and_takes_what_the_suite_holds():
+    @dataclass
+    class Config:
+        rate: float
+
+    class Pair(NamedTuple):
+        left: int
+        right: object
+
+    value = {
+        "nan": float("nan"),
+        "array": np.array([1.0, np.inf]),
+        "number": np.float32(0.5),
+        "flag": np.bool_(True),
+        "config": Config(30.0),
+        "pair": Pair(1, Path("x")),
+        3: {1},
+    }
+    assert json.loads(files.to_json(value)) == {
+        "nan": None,
+        "array": [1.0, None],
+        "number": 0.5,
+        "flag": True,
+        "config": {"rate": 30.0},
+        "pair": {"left": 1, "right": "x"},
+        "3": [1],
+    }
+
+
+def test_an_unknown_name_is_told_the_nearest_and_all():
+    error = unknown_name("track", "Elipse", ["zigzag", "circular", "ellipse"])
+    assert "'Elipse'" in str(error) and "Did you mean 'ellipse'?" in str(error)
+    assert "zigzag, circular, ellipse" in str(error)
+    assert closest("qqq", ["zigzag"]) is None
+
+
+def test_a_stamp_carries_version_commit_and_seed():
+    keys = stamp(schema=1, seed=7)
+    assert list(keys) == ["schema", "suite_version", "git_commit", "seed"]
+    assert (keys["schema"], keys["seed"]) == (1, 7)

@@ -1,0 +1,227 @@
+"""Custom tracks: the example, round trips, and bad files refused by file, key and value."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from tracks.families import FAMILIES, make_track
+from tracks.formats.custom import load_track
+from tracks.formats.custom_save import save_track
+
+GATE = """
+[[gates]]
+center = [0, 0, 1.5]
+width = 1.0
+height = 1.0
+"""
+
+
+def write(folder, text):
+    path = folder / "track.toml"
+    path.write_text(text)
+    return path
+
+
+def leaves(scene):
+    return [a for part in scene for a in (part if isinstance(part, tuple) else (part,))]
+
+
+def test_the_example_is_read_as_it_says(root):
+    track = load_track(root / "tracks" / "examples" / "yard.toml")
+    gates = track.scene.gates
+    assert (track.family, track.level, track.seed) == ("yard", 0, 0)
+    assert gates.opening_g.shape == (4, 12, 2)
+    assert np.allclose(
+        gates.opening_g[0, :4], [[-0.55, -0.5], [0.55, -0.5], [0.55, 0.5], [-0.55, 0.5]]
+    )
+    assert np.allclose(gates.opening_g[0, 4:], gates.opening_g[0, 3])
+    yaw, pitch = np.deg2rad([15, 5])
+    ahead = [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)]
+    assert np.allclose(gates.rot_w[1, :, 0], ahead)
+    assert np.allclose(gates.rot_w[3, :, 0], [-1, 0, 0])
+    assert np.allclose(np.linalg.det(gates.rot_w), 1)
+    assert track.names[48:] == (
+        "crate", "pole", "capsule 0", "ball", "yard mesh part 0", "yard mesh part 1",
+    )  # fmt: skip
+    assert np.allclose(track.scene.boxes.half_size[48], 0.3)
+    assert np.allclose(track.scene.cylinders.half_length, 1.5)
+    assert np.allclose(track.scene.capsules.axis_w, [[np.sqrt(0.5), np.sqrt(0.5), 0]])
+    # The mesh is turned by 90 degrees about its origin and moved: its far end lies along y.
+    assert np.allclose(track.scene.triangles.reshape(-1, 3).max(0), [2.6, 9.2, 1.1])
+    assert track.mesh_sizes == (8, 6) and len(track.scene.triangles) == 14
+
+
+def test_roll_is_right_side_down(tmp_path):
+    track = load_track(write(tmp_path, GATE + "roll_deg = 10\n"))
+    assert track.scene.gates.rot_w[0, 2, 1] == pytest.approx(np.sin(np.deg2rad(10)))
+
+
+def test_a_start_left_out_is_before_gate_0_and_faces_it(tmp_path):
+    track = load_track(write(tmp_path, GATE + "yaw_deg = 90\n"))
+    assert np.allclose(track.start_pos_w, [0, -2.5, 1.5])
+    assert track.start_yaw == pytest.approx(np.pi / 2)
+    assert track.family == "track"
+
+
+def test_clockwise_polygons_are_turned_round(tmp_path):
+    gate = GATE.replace(
+        "width = 1.0\nheight = 1.0", "polygon = [[0, 0.5], [0.5, -0.4], [-0.5, -0.4]]"
+    )
+    opening = load_track(write(tmp_path, gate)).scene.gates.opening_g[0]
+    after = np.roll(opening, -1, axis=0)
+    assert np.all(opening[:, 0] * after[:, 1] - opening[:, 1] * after[:, 0] > 0)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_saved_track_comes_back(tmp_path, family):
+    track = make_track(family, 8, 2)
+    save_track(track, tmp_path / "copy.toml")
+    again = load_track(tmp_path / "copy.toml")
+    assert again.names == track.names and again.family == family
+    assert again.start_yaw == pytest.approx(track.start_yaw)
+    assert np.array_equal(again.start_pos_w, track.start_pos_w)
+    for mine, theirs in zip(leaves(track.scene), leaves(again.scene), strict=True):
+        assert np.allclose(mine, theirs, rtol=0, atol=1e-9)
+    assert [path.name for path in tmp_path.iterdir()] == ["copy.toml"]
+
+
+def test_meshes_and_polygons_come_back(tmp_path, root):
+    track = load_track(root / "tracks" / "examples" / "yard.toml")
+    save_track(track, tmp_path / "yard.toml")
+    again = load_track(tmp_path / "yard.toml")
+    assert again.names == track.names and again.mesh_sizes == track.mesh_sizes
+    for mine, theirs in zip(leaves(track.scene)[:-1], leaves(again.scene)[:-1], strict=True):
+        assert np.allclose(mine, theirs, rtol=0, atol=1e-9)
+
+    middles = [np.sort(t.scene.triangles.mean(1), axis=0) for t in (track, again)]
+    assert np.allclose(*middles, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+def test_meshes_come_from_any_common_file(tmp_path, suffix):
+    two = [trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere(2, 0.5)]
+    two[1].apply_translation([3, 0, 0])
+    trimesh.util.concatenate(two).export(tmp_path / f"two.{suffix}")
+    text = GATE + f'[[meshes]]\nfile = "two.{suffix}"\nposition = [0, 0, 1]\nscale = 0.5\n'
+    track = load_track(write(tmp_path, text))
+    assert sorted(track.mesh_sizes) == [12, 320]
+    assert np.allclose(
+        np.ptp(track.scene.triangles.reshape(-1, 3), axis=0), [1.75 + 0.25, 0.5, 0.5], atol=0.02
+    )
+
+
+BAD = {
+    "no gate": ("schema = 1\n", "holds no gate"),
+    "not toml": ("gates = [\n", "is not TOML"),
+    "unknown key at the top": ("gate = 3\n" + GATE, "key 'gate'.*Did you mean 'gates'"),
+    "unknown key": (GATE + "yaw = 3\n", r"key 'yaw' in \[gates\[0\]\].*Did you mean 'yaw_deg'"),
+    "schema": ("schema = 2\n" + GATE, "schema is 2, allowed is"),
+    "missing": ("[[gates]]\nwidth = 1\nheight = 1\n", r"\[gates\[0\]\] has no 'center'"),
+    "missing height": ("[[gates]]\ncenter=[0,0,1]\nwidth = 1\n", r"has no 'height'"),
+    "no opening": ("[[gates]]\ncenter = [0, 0, 1]\n", "allowed is one of: width and height"),
+    "two openings": (GATE + "radius = 0.5\n", r"\['width', 'radius'\], allowed is one of"),
+    "not a number": (GATE.replace("width = 1.0", 'width = "1"'), "width is '1'.*a number above 0"),
+    "a boolean": (GATE.replace("width = 1.0", "width = true"), "width is True"),
+    "nan": (GATE.replace("1.5]", "nan]"), r"gates\[0\].center.*allowed is a list of 3 numbers"),
+    "two numbers": (GATE.replace(", 1.5]", "]"), "center is .0, 0.*list of 3 numbers"),
+    "negative": (GATE + "frame_width = -0.1\n", "frame_width is -0.1.*above 0"),
+    "underground": (GATE.replace("1.5]", "0.3]"), "at least 0.20 m higher"),
+    "few corners": (
+        GATE.replace("width = 1.0\nheight = 1.0", "radius = 1\ncorners = 2"),
+        "corners is 2.*from 3 to 64",
+    ),
+    "dented": (
+        GATE.replace(
+            "width = 1.0\nheight = 1.0",
+            "polygon = [[-1, -1], [1, -1], [0.1, 0], [1, 1], [-1, 1]]",
+        ),
+        "polygon is.*convex",
+    ),
+    "star": (
+        GATE.replace(
+            "width = 1.0\nheight = 1.0",
+            "polygon = [[0, 1], [-0.6, -0.8], [0.95, 0.3], [-0.95, 0.3], [0.6, -0.8]]",
+        ),
+        "polygon is.*convex",
+    ),
+    "beside its centre": (
+        GATE.replace("width = 1.0\nheight = 1.0", "polygon = [[1, -1], [2, -1], [2, 1], [1, 1]]"),
+        "around",
+    ),
+    "flat polygon": (
+        GATE.replace("width = 1.0\nheight = 1.0", "polygon = [[0, 1], [0, 2]]"),
+        "list of 3 or more",
+    ),
+    "no table array": ("spheres = 3\n" + GATE, "spheres is 3, allowed is tables"),
+    "sphere": (GATE + "[[spheres]]\ncenter=[0,0,0]\nradius=0\n", r"spheres\[0\].radius is 0"),
+    "size": (GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[1,1,0]\n", r"boxes\[0\].size is \[1, 1, 0\]"),
+    "axis": (
+        GATE + "[[capsules]]\ncenter=[0,0,0]\nradius=1\nlength=1\naxis=[0,0,0]\n",
+        "not zero",
+    ),
+    "quat": (GATE + "quat_wxyz = [0, 0, 0, 0]\n", "quat_wxyz.*not zero"),
+    "both rotations": (GATE + "quat_wxyz = [1, 0, 0, 0]\nyaw_deg = 3\n", "key 'yaw_deg'"),
+    "twice": (
+        GATE + 2 * '[[spheres]]\nname = "x"\ncenter=[0,0,0]\nradius=1\n',
+        r"spheres\[1\].name is 'x'",
+    ),
+    "reserved": (GATE + '[[spheres]]\nname = "ground"\ncenter=[0,0,0]\nradius=1\n', "'ground'"),
+    "start": ("[start]\nposition = [0, 0, -1]\n" + GATE, "start.position.*above the ground"),
+    "start in a box": (
+        "[start]\nposition = [0, 0, 1]\n" + GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[3,3,3]\n",
+        "start.position is .*inside 'box 0'",
+    ),
+    "start in a capsule": (
+        "[start]\nposition = [0, 0, 1]\n"
+        + GATE
+        + "[[capsules]]\ncenter=[0,0,0]\nradius=1\nlength=1\n",
+        "inside 'capsule 0'",
+    ),
+    "gate above, no start": (GATE + "pitch_deg = 90\n", "start.position is None.*straight up"),
+    "start key": ("[start]\nyaw = 1\n" + GATE, r"key 'yaw' in \[start\]"),
+    "no mesh": (GATE + '[[meshes]]\nfile = "none.stl"\n', "none.stl: no such mesh file"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_file_is_refused_by_name(tmp_path, case):
+    text, said = BAD[case]
+    path = write(tmp_path, text)
+    with pytest.raises(ValueError, match=said) as caught:
+        load_track(path)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_a_start_inside_a_mesh_is_refused_however_it_is_wound(tmp_path):
+    place = "[start]\nposition = [0.4, 0, 1]\n"
+    path = write(tmp_path, place + GATE + '[[meshes]]\nfile = "part.obj"\nposition=[0,0,1]\n')
+    box = trimesh.creation.box((1, 1, 1))
+    for faces in (box.faces, box.faces[:, ::-1]):
+        trimesh.Trimesh(box.vertices, faces, process=False).export(tmp_path / "part.obj")
+        with pytest.raises(ValueError, match="inside 'mesh 0'"):
+            load_track(path)
+    path = write(tmp_path, path.read_text().replace("0.4, 0, 1", "0.6, 0, 1"))
+    assert load_track(path).start_pos_w[0] == 0.6
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ValueError, match="none.toml: cannot be read"):
+        load_track(tmp_path / "none.toml")
+
+
+def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
+    path = write(tmp_path, GATE + '[[meshes]]\nfile = "part.stl"\n')
+    good = trimesh.creation.box((1, 1, 1))
+    dented = good.subdivide()
+    top = np.argmax(dented.vertices @ [0, 0, 1] - np.linalg.norm(dented.vertices[:, :2], axis=-1))
+    dented.vertices[top, 2] -= 0.8
+    dented.apply_translation([4, 0, 0])
+    trimesh.util.concatenate([good, dented]).export(tmp_path / "part.stl")
+    with pytest.raises(ValueError, match=r"part.stl: part \d of 2 .*not convex.*split it"):
+        load_track(path)
+    trimesh.Trimesh(good.vertices, good.faces[:-1]).export(tmp_path / "part.stl")
+    with pytest.raises(ValueError, match=r"part 0 of 1 .11 triangles. is not closed"):
+        load_track(path)
+    (tmp_path / "part.stl").write_bytes(b"nothing of the kind")
+    with pytest.raises(ValueError, match="part.stl"):
+        load_track(path)

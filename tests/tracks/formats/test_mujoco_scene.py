@@ -1,0 +1,120 @@
+"""A scene as MuJoCo model: every solid in its place, named, colliding; one size if padded."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from mujoco import batch
+
+from tracks.families import FAMILIES, MAX_COUNTS, make_track
+from tracks.formats.custom import load_track
+from tracks.formats.mujoco_scene import GROUND, PARKED, add_scene, solid_name
+from tracks.geometry.scene import PARKED_Z, Counts
+
+
+def model_of(track, pad_to=None, drone=False):
+    spec = mujoco.MjSpec()
+    add_scene(spec, track.scene, track.names, track.mesh_sizes, pad_to)
+    if drone:
+        body = spec.worldbody.add_body(name="drone", pos=track.start_pos_w)
+        body.add_freejoint()
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        body.add_geom(name="drone", type=box, size=[0.064, 0.064, 0.025], mass=0.75)
+    return spec.compile()
+
+
+def geom_names(model):
+    return [model.geom(i).name for i in range(model.ngeom)]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_geoms_are_the_solids_in_order(family):
+    track = make_track(family, 7, 3)
+    model = model_of(track)
+    assert [solid_name(name) for name in geom_names(model)] == [*track.names, GROUND]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    scene = track.scene
+    solids = (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)
+    center_w = np.concatenate([kind.center_w for kind in solids])
+    assert np.allclose(data.geom_xpos[:-1], center_w)
+    boxes = len(scene.boxes.center_w)
+    assert np.allclose(data.geom_xmat[:boxes].reshape(-1, 3, 3), scene.boxes.rot_w)
+    assert np.allclose(model.geom_size[:boxes], scene.boxes.half_size)
+    rods = np.concatenate([scene.cylinders.axis_w, scene.capsules.axis_w])
+    axis = data.geom_xmat.reshape(-1, 3, 3)[boxes : boxes + len(rods), :, 2]
+    assert np.allclose(axis, rods)
+    assert data.ncon == 0
+    assert np.all(model.geom_contype == 1) and np.all(model.geom_conaffinity == 1)
+
+
+def test_padded_scenes_fly_in_one_batch_and_padding_is_out_of_the_way():
+    tracks = [make_track(family, level, 1) for family in FAMILIES for level in (0, 9)]
+    models = [model_of(track, MAX_COUNTS, drone=True) for track in tracks]
+    assert {model.ngeom for model in models} == {sum(MAX_COUNTS) + 2}
+    worlds = batch.Batch(models[0], len(models))
+    worlds.set_models(models)
+    for track, model in zip(tracks, models, strict=True):
+        parked = [i for i, name in enumerate(geom_names(model)) if solid_name(name) == PARKED]
+        assert len(parked) == sum(MAX_COUNTS) - len(track.names)
+        assert np.all(model.geom_pos[parked, 2] == PARKED_Z)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        assert data.ncon == 0
+
+
+@pytest.mark.parametrize("kind", ["gate 4 frame", "plate", "pillar", "small", "ground"])
+def test_the_drone_collides_with_every_solid_and_it_is_named(kind):
+    track = make_track("zigzag", 9, 2)
+    model = model_of(track, MAX_COUNTS, drone=True)
+    data = mujoco.MjData(model)
+    drone = model.geom("drone").id
+    for i in range(model.ngeom):
+        if not solid_name(model.geom(i).name).startswith(kind) or model.geom(i).name == GROUND:
+            continue
+        # Not at the very centre: there MuJoCo finds no contact between a box and a cylinder.
+        data.qpos[:3] = model.geom_pos[i] + [0.01, 0.005, 0.005]
+        mujoco.mj_forward(model, data)
+        touched = {g for contact in data.contact for g in contact.geom}
+        assert {i, drone} <= touched
+    data.qpos[:3] = [-8, 0, 0.01]
+    mujoco.mj_forward(model, data)
+    touched = {model.geom(g).name for contact in data.contact for g in contact.geom}
+    assert touched == {"drone", GROUND}
+
+
+def test_meshes_are_their_convex_parts(root):
+    track = load_track(root / "tracks" / "examples" / "yard.toml")
+    model = model_of(track)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    first = 0
+    for name, size in zip(track.names[-2:], track.mesh_sizes, strict=True):
+        corners = track.scene.triangles[first : first + size].reshape(-1, 3)
+        first += size
+        geom = model.geom(name)
+        mesh = model.geom_dataid[geom.id]
+        begin = model.mesh_vertadr[mesh]
+        vertex = model.mesh_vert[begin : begin + model.mesh_vertnum[mesh]]
+        placed = data.geom_xpos[geom.id] + vertex @ data.geom_xmat[geom.id].reshape(3, 3).T
+        gap = np.linalg.norm(placed[:, None] - corners, axis=-1)
+        assert gap.min(0).max() < 1e-5 and gap.min(1).max() < 1e-5
+
+
+def test_what_does_not_fit_is_refused():
+    track = make_track("zigzag", 9, 0)
+    with pytest.raises(ValueError, match="more than the 40"):
+        add_scene(mujoco.MjSpec(), track.scene, track.names, pad_to=Counts(40, 20, 20, 20))
+    with pytest.raises(ValueError, match="3 names for"):
+        add_scene(mujoco.MjSpec(), track.scene, track.names[:3])
+    scene = track.scene._replace(triangles=np.zeros((2, 3, 3)))
+    with pytest.raises(ValueError, match="mesh_sizes add up to 0, the scene has 2"):
+        add_scene(mujoco.MjSpec(), scene)
+
+
+def test_a_scene_without_names_gets_names_by_kind():
+    track = make_track("circular", 4, 0)
+    spec = mujoco.MjSpec()
+    add_scene(spec, jax.tree.map(np.float32, track.scene))
+    names = geom_names(spec.compile())
+    assert names[0] == "boxes 0" and "spheres 0" in names and len(set(names)) == len(names)

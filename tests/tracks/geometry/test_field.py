@@ -1,0 +1,150 @@
+"""The field against a numerical line integral, and what Maxwell says of it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tracks.geometry.field import attractive_field, magnetic_field
+from tracks.geometry.gates import rectangle, regular_polygon
+
+UPRIGHT = (np.zeros(3), np.eye(3))
+SQUARE = rectangle(1.0, 1.0)
+seeds = st.integers(0, 10_000)
+
+
+def by_line_integral(center_w, rot_w, opening, point_w, current=2e-5, pieces=4000):
+    """Biot and Savart, C * integral of dl x r / |r|^3 along the rim, by the midpoint rule."""
+    corner = center_w + np.column_stack([np.zeros(len(opening)), opening]) @ rot_w.T
+    share = ((np.arange(pieces) + 0.5) / pieces)[:, None]
+    total = np.zeros_like(point_w)
+    for begin, end in zip(corner, np.roll(corner, -1, axis=0), strict=True):
+        away = point_w[:, None] - (begin + share * (end - begin))
+        cubed = np.linalg.norm(away, axis=-1, keepdims=True) ** 3
+        total += (np.cross((end - begin) / pieces, away) / cubed).sum(1)
+    return current * total
+
+
+def away_from_rim(opening, point, least=0.1):
+    side = np.roll(opening, -1, axis=0) - opening
+    corner = np.column_stack([np.zeros(len(opening)), opening])
+    side = np.column_stack([np.zeros(len(side)), side])
+    share = np.sum((point[:, None] - corner) * side, -1) / np.sum(side**2, -1)
+    gap = point[:, None] - corner - np.clip(share, 0, 1)[..., None] * side
+    return np.linalg.norm(gap, axis=-1).min(-1) > least
+
+
+@pytest.mark.parametrize(
+    "opening", [SQUARE, rectangle(1.3, 0.7), regular_polygon(3, 0.4), regular_polygon(12, 0.5)]
+)
+def test_the_field_is_the_line_integral(opening):
+    rng = np.random.default_rng(len(opening))
+    point_g = rng.uniform(-2, 2, (60, 3))
+    point_g = point_g[away_from_rim(opening, point_g)]
+    rot_w, center_w = Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3)
+    point_w = center_w + point_g @ rot_w.T
+    field = magnetic_field(center_w, rot_w, opening, point_w)
+    expected = by_line_integral(center_w, rot_w, opening, point_w)
+    assert np.allclose(field, expected, rtol=1e-4, atol=1e-9)
+
+
+def test_strengths_on_the_axis_of_a_1_m_gate():
+    axis = np.array([[x, 0.0, 0.0] for x in (0, 1, 2, 3, 5)])
+    field = magnetic_field(*UPRIGHT, SQUARE, axis)
+    strength = np.linalg.norm(field, axis=-1) ** 0.7
+    assert np.allclose(strength, [2.8e-3, 6.2e-4, 1.8e-4, 8e-5, 2.8e-5], rtol=0.05)
+    # A square loop's centre: 4 * (2 / sqrt 2) / half side.
+    assert field[0, 0] == pytest.approx(2e-5 * 4 * np.sqrt(2) / 0.5, rel=1e-6)
+
+
+def test_it_threads_the_opening_in_flight_direction_and_returns_outside():
+    inside = np.random.default_rng(0).uniform(-0.45, 0.45, (100, 3)) * [2, 1, 1]
+    assert np.all(magnetic_field(*UPRIGHT, SQUARE, inside)[:, 0] > 0)
+    beside = np.array([[0, 0.8, 0], [0, 0, -0.9], [0, 1.5, 1.5]], float)
+    assert np.all(magnetic_field(*UPRIGHT, SQUARE, beside)[:, 0] < 0)
+    back = magnetic_field(np.zeros(3), np.diag([-1.0, -1.0, 1.0]), SQUARE, inside)
+    assert np.all(back[:, 0] < 0)
+    # Flow lines converge before the gate and spread behind it.
+    before, behind = magnetic_field(*UPRIGHT, SQUARE, np.array([[-1, 0.3, 0], [1, 0.3, 0.0]]))
+    assert before[1] < 0 < behind[1]
+
+
+@given(seeds)
+def test_divergence_is_zero_and_so_is_curl_off_the_wire(seed):
+    rng = np.random.default_rng(seed)
+    opening = (SQUARE, regular_polygon(5, 0.5))[seed % 2]
+    point = rng.uniform(-1.5, 1.5, (40, 3))
+    point = point[away_from_rim(opening, point, 0.2)]
+    h = 1e-4
+    gradient = np.stack(
+        [
+            (magnetic_field(*UPRIGHT, opening, point + h * e)
+             - magnetic_field(*UPRIGHT, opening, point - h * e)) / (2 * h)
+            for e in np.eye(3)
+        ],
+        axis=-1,
+    )  # fmt: skip
+    scale = np.linalg.norm(gradient, axis=(1, 2))
+    divergence = np.trace(gradient, axis1=1, axis2=2)
+    curl = gradient - np.swapaxes(gradient, 1, 2)
+    assert np.all(np.abs(divergence) < 1e-5 * scale)
+    assert np.all(np.abs(curl).max((1, 2)) < 1e-5 * scale)
+
+
+def test_far_away_it_is_a_dipole():
+    direction = Rotation.from_quat(np.random.default_rng(3).normal(size=(20, 4))).as_matrix()[:, 0]
+    near, far = (magnetic_field(*UPRIGHT, SQUARE, r * direction) for r in (20.0, 40.0))
+    ratio = np.linalg.norm(near, axis=-1) / np.linalg.norm(far, axis=-1)
+    assert np.allclose(ratio, 8, rtol=0.01)
+    # C * area * (3 (m . r) r - m) / r^3
+    dipole = 2e-5 * (3 * direction[:, :1] * direction - [1, 0, 0]) / 20**3
+    assert np.allclose(near, dipole, rtol=0.02, atol=1e-12)
+
+
+@given(seeds)
+def test_turning_everything_turns_the_field(seed):
+    rng = np.random.default_rng(seed)
+    turn, shift = Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3)
+    point = rng.uniform(-2, 2, (20, 3))
+    field = magnetic_field(*UPRIGHT, SQUARE, point)
+    turned = magnetic_field(shift, turn, SQUARE, point @ turn.T + shift)
+    assert np.allclose(turned, field @ turn.T, rtol=1e-6, atol=1e-12)
+
+
+def test_padding_corners_add_nothing_and_the_wire_is_safe():
+    padded = np.concatenate([SQUARE, SQUARE[-1:], SQUARE[-1:]])
+    point = np.random.default_rng(1).uniform(-2, 2, (50, 3))
+    expected = magnetic_field(*UPRIGHT, SQUARE, point)
+    assert np.allclose(magnetic_field(*UPRIGHT, padded, point), expected, rtol=1e-9, atol=0)
+    on_wire = np.array([[0, 0.5, 0], [0, 0.5, 0.5], [0, 0.1, -0.5], [0, 0.5, 3.0]])
+    for library in (np, jnp):
+        args = [library.asarray(a) for a in (*UPRIGHT, padded, on_wire)]
+        assert library.isfinite(magnetic_field(*args)).all()
+
+
+def test_both_libraries_and_any_leading_shape():
+    rng = np.random.default_rng(2)
+    point = rng.uniform(-3, 3, (6, 3))
+    field = magnetic_field(*UPRIGHT, SQUARE, point)
+    center, rot, corners = (np.broadcast_to(a, (2, 3, *a.shape)) for a in (*UPRIGHT, SQUARE))
+    shaped = magnetic_field(center, rot, corners, point.reshape(2, 3, 3))
+    assert np.allclose(shaped.reshape(6, 3), field)
+    batched = jax.vmap(lambda p: magnetic_field(jnp.zeros(3), jnp.eye(3), jnp.asarray(SQUARE), p))
+    assert np.allclose(batched(jnp.asarray(point)), field, rtol=2e-3, atol=1e-8)
+
+
+def test_attraction_fades_with_alignment_and_keeps_the_fields_direction():
+    field = magnetic_field(*UPRIGHT, SQUARE, np.array([-0.5, 0.2, 0.1]))
+    unit, size = field / np.linalg.norm(field), np.linalg.norm(field)
+    along = attractive_field(field, 1e4 * unit)
+    against = attractive_field(field, -1e4 * unit)
+    at_rest = attractive_field(field, np.zeros(3))
+    assert np.linalg.norm(along) < 1e-3 * size**0.7
+    assert np.allclose(against, 2 * size**0.7 * unit, rtol=1e-3)
+    assert np.allclose(at_rest, size**0.7 * unit)
+    aligned = 3 * size / (3 * size + 1e-5)
+    assert np.allclose(attractive_field(field, 3 * unit), (1 - aligned) * size**0.7 * unit)
+    assert np.all(attractive_field(np.zeros(3), np.ones(3)) == 0)

@@ -1,0 +1,1 @@
+"""What every room leans on: files, names, provenance, TOML."""

@@ -1,0 +1,38 @@
+"""Nested tuples and dicts of arrays (N, ...), one row a vehicle: rows chosen and rows laid out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tracks.geometry.scene import Array
+
+
+def select(mask: Array, new: Any, old: Any) -> Any:
+    """Return `new` in the rows where `mask` (N,) and `old` elsewhere.
+
+    Both are arrays (N, ...), or alike nested tuples and dicts of such.
+    """
+    if isinstance(new, dict):
+        return {name: select(mask, new[name], old[name]) for name in new}
+    if isinstance(new, tuple):
+        parts = [select(mask, a, b) for a, b in zip(new, old, strict=True)]
+        return type(new)(*parts) if hasattr(new, "_fields") else tuple(parts)
+    xp = mask.__array_namespace__()
+    return xp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
+
+
+def packed(tree: Any) -> Any:
+    """Return nested tuples and dicts of numpy arrays with every array laid out row by row.
+
+    numpy adds up in an order that depends on how an array lies in memory, and a concatenation
+    lies as its parts do; without this a row's last bit could depend on the rows beside it.
+    Arrays of JAX have one layout and are passed on.
+    """
+    if isinstance(tree, dict):
+        return {name: packed(part) for name, part in tree.items()}
+    if isinstance(tree, tuple):
+        parts = [packed(part) for part in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    return np.ascontiguousarray(tree) if isinstance(tree, np.ndarray) else tree

@@ -1,0 +1,1 @@
+"""A scene in other forms: track files, meshes, MuJoCo."""

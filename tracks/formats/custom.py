@@ -1,0 +1,236 @@
+"""Tracks from TOML files: gates of any convex shape, every kind of solid, meshes, a start.
+
+`examples/` beside this file holds one with every key. Positions are in the world frame in metres,
+angles in degrees; relative mesh files are looked for beside the TOML file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from tracks.common.toml_table import Table, read_toml
+from tracks.formats.convex_parts import load_convex_parts
+from tracks.geometry.gates import frame_boxes, rectangle, regular_polygon
+from tracks.geometry.rotation import quat_to_rot
+from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
+from tracks.track import Track
+
+_START_BEHIND_M = 2.5
+_SINGULAR = {"boxes": "box", "meshes": "mesh"}
+
+
+def load_track(path: str | os.PathLike[str]) -> Track:
+    """Return the track of a TOML file; its family is the file's `name`, level and seed are 0.
+
+    Raises:
+        ValueError: naming the file, the key, its value and what is allowed, where something is
+            missing, unknown, of the wrong shape or impossible (a gate below the ground, an
+            opening or a mesh that is not convex, a start inside a solid).
+    """
+    top = read_toml(Path(path))
+    top.whole("schema", 1, least=1, most=1)
+    name = top.text("name", top.path.stem)
+    gate_tables = top.tables("gates")
+    if not gate_tables:
+        raise ValueError(f"{top.path}: holds no gate; add at least one [[gates]]")
+    gates = _gates(gate_tables)
+    start_pos_w, start_yaw = _start(top, gates)
+
+    names = _Names([f"gate {i} frame" for i in range(len(gate_tables))])
+    boxes, box_names = _read(top, "boxes", _box, names)
+    cylinders, cylinder_names = _read(top, "cylinders", _rod, names)
+    capsules, capsule_names = _read(top, "capsules", _rod, names)
+    spheres, sphere_names = _read(top, "spheres", _sphere, names)
+    meshes, mesh_names = _meshes(top, names)
+    top.close()
+
+    frames = frame_boxes(gates)
+    bars = gates.opening_g.shape[1]
+    frame_names = [f"gate {i} frame" for i in range(len(gate_tables)) for _ in range(bars)]
+    solids = Boxes(*_columns(boxes, [(3,), (3, 3), (3,)]))
+    scene = Scene(
+        gates,
+        Boxes(*(np.concatenate(pair) for pair in zip(frames, solids, strict=True))),
+        Rods(*_columns(cylinders, [(3,), (3,), (), ()])),
+        Rods(*_columns(capsules, [(3,), (3,), (), ()])),
+        Spheres(*_columns(spheres, [(3,), ()])),
+        np.concatenate([np.zeros((0, 3, 3)), *meshes]),
+    )
+    solid_names = (*box_names, *cylinder_names, *capsule_names, *sphere_names, *mesh_names)
+    sizes = tuple(len(mesh) for mesh in meshes)
+    all_names = (*frame_names, *solid_names)
+    track = Track(name, 0, 0, 0.0, scene, start_pos_w, start_yaw, all_names, sizes)
+    _refuse_start_inside(top, track)
+    return track
+
+
+class _Names:
+    """Gives every solid a name of its own and refuses those given twice."""
+
+    def __init__(self, taken: list[str]) -> None:
+        self._taken = set(taken)
+
+    def __call__(self, table: Table, kind: str, number: int) -> str:
+        name = table.text("name", f"{_SINGULAR.get(kind, kind[:-1])} {number}")
+        if name in self._taken or "/" in name or name in ("ground", "parked"):
+            raise table.error(
+                "name", name, "a name no other solid has, without '/', not 'ground' or 'parked'"
+            )
+        self._taken.add(name)
+        return name
+
+
+def _read(
+    top: Table, kind: str, read: Callable[[Table], tuple], names: _Names
+) -> tuple[list[tuple], list[str]]:
+    rows, labels = [], []
+    for number, table in enumerate(top.tables(kind)):
+        rows.append(read(table))
+        labels.append(names(table, kind, number))
+        table.close()
+    return rows, labels
+
+
+def _columns(rows: list[tuple], shapes: list[tuple[int, ...]]) -> list[np.ndarray]:
+    if not rows:
+        return [np.zeros((0, *shape)) for shape in shapes]
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
+def _gates(tables: list[Table]) -> Gates:
+    rows, openings = [], []
+    for table in tables:
+        center, rot = table.vector("center", 3), rotation(table)
+        opening = _opening(table)
+        width = table.number("frame_width", 0.2, above=0)
+        depth = table.number("frame_depth", 0.05, above=0)
+        table.close()
+        lowest = (center[2] + opening @ rot[2, 1:]).min()
+        if lowest < 0:
+            allowed = f"at least {-lowest:.2f} m higher: the opening reaches below the ground"
+            raise table.error("center", center.tolist(), allowed)
+        rows.append((center, rot, width, depth))
+        openings.append(opening)
+    corners = max(map(len, openings))
+    padded = [np.concatenate([o, np.tile(o[-1], (corners - len(o), 1))]) for o in openings]
+    center, rot, width, depth = (np.array(column) for column in zip(*rows, strict=True))
+    return Gates(center, rot, np.array(padded), width, depth)
+
+
+def _opening(table: Table) -> np.ndarray:
+    """Return the corners (V, 2) of one of: width and height; corners and radius; polygon."""
+    given = [key for key in ("width", "radius", "polygon") if table.has(key)]
+    if len(given) != 1:
+        raise table.error(
+            "opening",
+            given,
+            "one of: width and height; radius with corners (of a regular polygon); polygon",
+        )
+    if given == ["width"]:
+        return rectangle(table.number("width", above=0), table.number("height", above=0))
+    if given == ["radius"]:
+        corners = table.whole("corners", 12, least=3, most=64)
+        return regular_polygon(corners, table.number("radius", above=0))
+    return _convex(table, table.points("polygon", 2, least=3))
+
+
+def _convex(table: Table, polygon: np.ndarray) -> np.ndarray:
+    """Return the polygon counter-clockwise; refuse one that is not convex or crosses itself."""
+    side = np.roll(polygon, -1, axis=0) - polygon
+    after = np.roll(side, -1, axis=0)
+    turn = np.arctan2(
+        side[:, 0] * after[:, 1] - side[:, 1] * after[:, 0], np.sum(side * after, axis=-1)
+    )
+    same_way = (turn > 1e-6).all() or (turn < -1e-6).all()
+    if not same_way or not np.isclose(abs(turn.sum()), 2 * np.pi):
+        allowed = "the corners [y, z] of a convex polygon in order, no three of them in line"
+        raise table.error("polygon", polygon.tolist(), allowed)
+    if turn[0] < 0:
+        polygon = polygon[::-1]
+    after = np.roll(polygon, -1, axis=0)
+    if (polygon[:, 0] * after[:, 1] - polygon[:, 1] * after[:, 0] <= 0).any():
+        raise table.error("polygon", polygon.tolist(), "corners around [0, 0], the gate's centre")
+    return polygon
+
+
+def rotation(table: Table) -> np.ndarray:
+    """Return the rotation (3, 3) of a table: `quat_wxyz`, or yaw, then pitch, then roll [deg].
+
+    Pitch is positive nose up, roll positive right side down, body axes forward-left-up.
+    """
+    if table.has("quat_wxyz"):
+        return quat_to_rot(_unit(table, "quat_wxyz", table.vector("quat_wxyz", 4)))
+    turned = np.deg2rad([table.number(f"{angle}_deg", 0.0) for angle in ("yaw", "pitch", "roll")])
+    (cy, cp, cr), (sy, sp, sr) = np.cos(turned), np.sin(turned)
+    yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    pitch = np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]])
+    roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    return yaw @ pitch @ roll
+
+
+def _unit(table: Table, key: str, vector: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vector)
+    if length < 1e-6:
+        raise table.error(key, vector.tolist(), "a vector that is not zero")
+    return vector / length
+
+
+def _start(top: Table, gates: Gates) -> tuple[np.ndarray, float]:
+    ahead = gates.rot_w[0, :, 0] * [1.0, 1.0, 0.0]
+    level = np.linalg.norm(ahead)
+    pos_w = gates.center_w[0] - _START_BEHIND_M * ahead / max(level, 1e-9)
+    table = top.table("start") if top.has("start") else Table(top.path, "start", {})
+    if level < 1e-6 and not table.has("position"):
+        raise table.error("position", None, "a position: gate 0 is flown straight up or down")
+    pos_w = table.vector("position", 3, pos_w.tolist())
+    if pos_w[2] <= 0:
+        raise table.error("position", pos_w.tolist(), "a position above the ground (z > 0)")
+    to_gate = gates.center_w[0] - pos_w
+    yaw_deg = table.number("yaw_deg", float(np.rad2deg(np.arctan2(to_gate[1], to_gate[0]))))
+    table.close()
+    return pos_w, float(np.deg2rad(yaw_deg))
+
+
+def _refuse_start_inside(top: Table, track: Track) -> None:
+    # Here, so that only those who read a track pay for the import of trimesh.
+    from tracks.formats.meshes import solid_meshes
+
+    for name, mesh in solid_meshes(track):
+        # All solids are convex: inside is on one side of every face, whichever way they are wound.
+        side = np.sum((track.start_pos_w - mesh.triangles[:, 0]) * mesh.face_normals, axis=-1)
+        if np.all(side < 0) or np.all(side > 0):
+            allowed = f"a position outside of every solid; this one is inside {name!r}"
+            raise top.error("start.position", track.start_pos_w.tolist(), allowed)
+
+
+def _box(table: Table) -> tuple:
+    return table.vector("center", 3), rotation(table), table.vector("size", 3, above=0) / 2
+
+
+def _rod(table: Table) -> tuple:
+    axis = _unit(table, "axis", table.vector("axis", 3, (0.0, 0.0, 1.0)))
+    radius, length = table.number("radius", above=0), table.number("length", above=0)
+    return table.vector("center", 3), axis, radius, length / 2
+
+
+def _sphere(table: Table) -> tuple:
+    return table.vector("center", 3), table.number("radius", above=0)
+
+
+def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
+    meshes, labels = [], []
+    for number, table in enumerate(top.tables("meshes")):
+        file = top.path.parent / table.text("file")
+        position, rot = table.vector("position", 3, (0.0, 0.0, 0.0)), rotation(table)
+        scale = table.number("scale", 1.0, above=0)
+        name = names(table, "meshes", number)
+        table.close()
+        parts = load_convex_parts(file)
+        for part, triangles in enumerate(parts):
+            meshes.append(scale * triangles @ rot.T + position)
+            labels.append(name if len(parts) == 1 else f"{name} part {part}")
+    return meshes, labels

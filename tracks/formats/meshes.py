@@ -1,0 +1,85 @@
+"""A track's solids as triangle meshes, to look at or to check geometry against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import trimesh
+
+from tracks.geometry.scene import PARKED_Z, Rods
+from tracks.track import Track
+
+_SECTIONS = 24
+"""Facets around cylinders and capsules."""
+
+
+def solid_meshes(track: Track) -> list[tuple[str, trimesh.Trimesh]]:
+    """Return (name, mesh) of every solid in the order of `Track.names`, in the world frame.
+
+    Parked bars (of openings with fewer corners than the track's most) are left out; the ground,
+    the plane z = 0, is no mesh. Round solids are polyhedra inscribed in them.
+    """
+    scene = track.scene
+    first = np.cumsum((0, *track.mesh_sizes))
+    meshes = [
+        *(_box(*box) for box in zip(*scene.boxes, strict=True)),
+        *_rods(scene.cylinders, _cylinder),
+        *_rods(scene.capsules, _capsule),
+        *(_sphere(*ball) for ball in zip(*scene.spheres, strict=True)),
+        *(
+            trimesh.Trimesh(**trimesh.triangles.to_kwargs(scene.triangles[begin:end]))
+            for begin, end in zip(first, first[1:], strict=False)
+        ),
+    ]
+    named = zip(track.names, meshes, strict=True)
+    return [(name, mesh) for name, mesh in named if mesh.bounds[1, 2] > PARKED_Z / 2]
+
+
+def named_meshes(track: Track) -> dict[str, trimesh.Trimesh]:
+    """Return one mesh a name in the world frame: the bars of a gate's frame are one mesh."""
+    parts: dict[str, list[trimesh.Trimesh]] = {}
+    for name, mesh in solid_meshes(track):
+        parts.setdefault(name, []).append(mesh)
+    return {name: _joined(meshes) for name, meshes in parts.items()}
+
+
+def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
+
+
+def _transform(center_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rot_w, center_w
+    return matrix
+
+
+def _box(center_w: np.ndarray, rot_w: np.ndarray, half_size: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.creation.box(extents=2 * half_size, transform=_transform(center_w, rot_w))
+
+
+def _sphere(center_w: np.ndarray, radius: float) -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    return mesh.apply_translation(center_w)
+
+
+def _cylinder(radius: float, half_length: float) -> trimesh.Trimesh:
+    return trimesh.creation.cylinder(radius=radius, height=2 * half_length, sections=_SECTIONS)
+
+
+def _capsule(radius: float, half_length: float) -> trimesh.Trimesh:
+    mesh = trimesh.creation.capsule(radius=radius, height=2 * half_length, count=[_SECTIONS] * 2)
+    # Centred whatever the library's own origin is.
+    return mesh.apply_translation(-mesh.bounds.mean(axis=0))
+
+
+def _rods(rods: Rods, make: Callable[[float, float], trimesh.Trimesh]) -> list[trimesh.Trimesh]:
+    meshes = []
+    for center_w, axis_w, radius, half_length in zip(*rods, strict=True):
+        matrix = np.array(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis_w))
+        matrix[:3, 3] = center_w
+        meshes.append(make(radius, half_length).apply_transform(matrix))
+    return meshes

@@ -1,0 +1,137 @@
+"""A scene as MuJoCo geoms in the world body.
+
+Every solid collides, so that MuJoCo's rays see it too; geoms of the world body never collide with
+one another. Geoms come kind by kind in the order of `Track.names`, each kind followed by its
+padding, and the ground last.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from tracks.geometry.scene import Counts, Scene, pad
+
+GROUND = "ground"
+PARKED = "parked"
+_BAR = "/"
+
+
+def solid_name(geom_name: str) -> str:
+    """Return the solid's name ("gate 3 frame") of a geom's name ("gate 3 frame/2")."""
+    return geom_name.split(_BAR)[0]
+
+
+def add_scene(
+    spec: mujoco.MjSpec,
+    scene: Scene,
+    names: tuple[str, ...] = (),
+    mesh_sizes: tuple[int, ...] = (),
+    pad_to: Counts | None = None,
+) -> None:
+    """Add the scene's solids and the ground plane to the world body of `spec`.
+
+    A geom is named after its solid; the bars of a frame, which share a name, and padding get a
+    running number ("gate 3 frame/2"): see `solid_name`. Padding solids are parked far below the
+    ground, so that scenes padded alike compile to models of the same sizes (as
+    `mujoco.batch.Batch.set_models` asks for).
+
+    Args:
+        spec: to be added to.
+        scene: not batched.
+        names: as `Track.names`; solids are named by kind and number where it is empty.
+        mesh_sizes: as `Track.mesh_sizes`.
+        pad_to: numbers of primitive solids to pad to; meshes are never padded.
+
+    Raises:
+        ValueError: where the scene holds more solids of a kind than `pad_to`, or names and solids
+            do not match in number.
+    """
+    real = [len(kind[0]) for kind in (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)]
+    if sum(mesh_sizes) != len(scene.triangles):
+        raise ValueError(
+            f"mesh_sizes add up to {sum(mesh_sizes)}, the scene has {len(scene.triangles)} "
+            "triangles; give the number of triangles of each mesh"
+        )
+    if names and len(names) != sum(real) + len(mesh_sizes):
+        raise ValueError(
+            f"{len(names)} names for {sum(real) + len(mesh_sizes)} solids; give one a solid"
+        )
+    if pad_to is not None:
+        scene = pad(scene, pad_to._replace(triangles=len(scene.triangles)))
+    give_name = _Names(names, real)
+    world = spec.worldbody
+    geom = mujoco.mjtGeom
+
+    def add(kind: int, shape: Any, pos: np.ndarray, quat: np.ndarray, size: np.ndarray) -> None:
+        for number in range(len(pos)):
+            world.add_geom(
+                name=give_name(kind, number),
+                type=shape,
+                pos=pos[number],
+                quat=quat[number],
+                size=size[number],
+            )
+
+    boxes, spheres = scene.boxes, scene.spheres
+    add(0, geom.mjGEOM_BOX, boxes.center_w, _quats(boxes.rot_w), boxes.half_size)
+    rods_kinds = ((scene.cylinders, geom.mjGEOM_CYLINDER), (scene.capsules, geom.mjGEOM_CAPSULE))
+    for kind, (rods, shape) in enumerate(rods_kinds, start=1):
+        size = np.stack([rods.radius, rods.half_length, 0 * rods.radius], axis=-1)
+        add(kind, shape, rods.center_w, _axis_quats(rods.axis_w), size)
+    size = np.stack([spheres.radius, 0 * spheres.radius, 0 * spheres.radius], axis=-1)
+    still = np.tile([1.0, 0.0, 0.0, 0.0], (len(size), 1))
+    add(3, geom.mjGEOM_SPHERE, spheres.center_w, still, size)
+    _add_meshes(spec, scene.triangles, mesh_sizes, give_name)
+    world.add_geom(name=GROUND, type=geom.mjGEOM_PLANE, size=[0, 0, 1])
+
+
+class _Names:
+    """Deals out unique geom names, solid by solid."""
+
+    def __init__(self, names: tuple[str, ...], real: list[int]) -> None:
+        self._names = names
+        self._real = real
+        self._first = np.concatenate([[0], np.cumsum(real)])
+        self._used: dict[str, int] = {}
+
+    def __call__(self, kind: int, number: int) -> str:
+        name = PARKED
+        if kind == len(self._real) or number < self._real[kind]:
+            fallback = f"{Scene._fields[kind + 1]} {number}"
+            name = self._names[self._first[kind] + number] if self._names else fallback
+        seen = self._used.get(name, 0)
+        self._used[name] = seen + 1
+        return name if seen == 0 else f"{name}{_BAR}{seen}"
+
+
+def _add_meshes(
+    spec: mujoco.MjSpec, triangles: np.ndarray, mesh_sizes: tuple[int, ...], give_name: _Names
+) -> None:
+    first = 0
+    for number, size in enumerate(mesh_sizes):
+        corners = np.asarray(triangles[first : first + size], float).reshape(-1, 3)
+        first += size
+        name = give_name(4, number)
+        # Only the vertices: MuJoCo collides and casts rays against their convex hull.
+        vertices = np.unique(corners, axis=0)
+        spec.add_mesh(name=name, uservert=vertices.ravel().tolist())
+        spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+
+
+def _quats(rot: np.ndarray) -> np.ndarray:
+    """Return the quaternions (N, 4) wxyz of rotations (N, 3, 3)."""
+    quats = np.empty((len(rot), 4))
+    for quat, matrix in zip(quats, np.asarray(rot, float).reshape(-1, 9), strict=True):
+        mujoco.mju_mat2Quat(quat, matrix)
+    return quats
+
+
+def _axis_quats(axis: np.ndarray) -> np.ndarray:
+    """Return quaternions (N, 4) wxyz that turn z into the given unit axes (N, 3)."""
+    x, y, z = np.asarray(axis, float).T
+    quat = np.stack([1 + z, -y, x, 0 * z], axis=-1)
+    quat[z < -1 + 1e-12] = [0.0, 1.0, 0.0, 0.0]
+    return quat / np.linalg.norm(quat, axis=-1, keepdims=True)

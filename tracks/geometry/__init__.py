@@ -1,0 +1,1 @@
+"""Geometry on a scene: depth, clearance, the attractive field, crossings."""

@@ -1,0 +1,151 @@
+"""The nearest point on any solid or the ground, and signed distance to it (JAX, batched).
+
+Inside a solid the distance is negative and the nearest point lies on the surface in the direction
+out of the solid, so that a repulsive gradient always points to free space.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from tracks.geometry.cull import nearest_solids
+from tracks.geometry.scene import Array, Boxes, Counts, Rods, Scene, Spheres
+
+_TINY = 1e-9
+
+
+def _norm(vector: Array) -> Array:
+    return jnp.sqrt((vector * vector).sum(-1))
+
+
+def _direction(vector: Array, length: Array) -> Array:
+    """Return vector / length, and world z where the length is zero."""
+    up = jnp.asarray([0.0, 0.0, 1.0])
+    return jnp.where(length[..., None] > _TINY, vector / jnp.maximum(length, _TINY)[..., None], up)
+
+
+def _box(boxes: Boxes, point_w: Array) -> tuple[Array, Array]:
+    local = (point_w[..., None, :] - boxes.center_w)[..., None, :] @ boxes.rot_w
+    local = local[..., 0, :]
+    beyond = jnp.abs(local) - boxes.half_size
+    outside = jnp.maximum(beyond, 0.0)
+    deepest = beyond.max(-1)
+    is_inside = deepest < 0
+    push = jnp.where(beyond >= deepest[..., None], 1.0, 0.0)
+    length = _norm(outside)
+    away = jnp.where(is_inside[..., None], push, _direction(outside, length))
+    away = away * jnp.where(local < 0, -1.0, 1.0)
+    normal = (boxes.rot_w @ away[..., None])[..., 0]
+    return jnp.where(is_inside, deepest, length), _direction(normal, _norm(normal))
+
+
+def _sphere(spheres: Spheres, point_w: Array) -> tuple[Array, Array]:
+    away = point_w[..., None, :] - spheres.center_w
+    length = _norm(away)
+    return length - spheres.radius, _direction(away, length)
+
+
+def _capsule(rods: Rods, point_w: Array) -> tuple[Array, Array]:
+    away = point_w[..., None, :] - rods.center_w
+    along = jnp.clip((away * rods.axis_w).sum(-1), -rods.half_length, rods.half_length)
+    away = away - along[..., None] * rods.axis_w
+    length = _norm(away)
+    return length - rods.radius, _direction(away, length)
+
+
+def _cylinder(rods: Rods, point_w: Array) -> tuple[Array, Array]:
+    away = point_w[..., None, :] - rods.center_w
+    along = (away * rods.axis_w).sum(-1)
+    radial = away - along[..., None] * rods.axis_w
+    radius = _norm(radial)
+    side, end = radius - rods.radius, jnp.abs(along) - rods.half_length
+    outward = _direction(radial, radius)
+    endward = rods.axis_w * jnp.where(along < 0, -1.0, 1.0)[..., None]
+    out_side, out_end = jnp.maximum(side, 0.0), jnp.maximum(end, 0.0)
+    length = jnp.hypot(out_side, out_end)
+    corner = out_side[..., None] * outward + out_end[..., None] * endward
+    inside = jnp.where((side > end)[..., None], outward, endward)
+    is_inside = (side < 0) & (end < 0)
+    normal = jnp.where(is_inside[..., None], inside, _direction(corner, length))
+    return jnp.where(is_inside, jnp.maximum(side, end), length), normal
+
+
+def _triangle(corners: Array, point_w: Array) -> tuple[Array, Array]:
+    """Distance to a triangle (unsigned): Ericson 2005, Real-Time Collision Detection, 5.1.5."""
+    a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
+    p = point_w[..., None, :]
+    normal = jnp.cross(b - a, c - a)
+    normal = normal / jnp.maximum(_norm(normal), _TINY)[..., None]
+    plane = p - ((p - a) * normal).sum(-1)[..., None] * normal
+
+    def on_left(start: Array, end: Array) -> Array:
+        return (jnp.cross(end - start, plane - start) * normal).sum(-1) >= 0
+
+    def on_edge(start: Array, end: Array) -> Array:
+        edge = end - start
+        square = jnp.maximum((edge * edge).sum(-1), _TINY)
+        share = jnp.clip(((p - start) * edge).sum(-1) / square, 0, 1)
+        return start + share[..., None] * edge
+
+    nearest = jnp.stack([on_edge(a, b), on_edge(b, c), on_edge(c, a)])
+    gap = _norm(p - nearest)
+    best = jnp.take_along_axis(nearest, gap.argmin(0)[None, ..., None], axis=0)[0]
+    over = on_left(a, b) & on_left(b, c) & on_left(c, a)
+    away = p - jnp.where(over[..., None], plane, best)
+    length = _norm(away)
+    return length, _direction(away, length)
+
+
+def distances(scene: Scene, point_w: Array) -> tuple[Array, Array]:
+    """Return signed distances to every solid and the ground, and the directions away from them.
+
+    Args:
+        scene: arrays (..., N, ...) whose leading shape broadcasts with that of point_w.
+        point_w: (..., 3) [m].
+
+    Returns:
+        distance (..., N + 1) [m] in the order boxes, cylinders, capsules, spheres, triangles,
+        ground; away (..., N + 1, 3) unit vectors along which the distance grows.
+    """
+    kinds = [
+        (_box, scene.boxes, scene.boxes.center_w),
+        (_cylinder, scene.cylinders, scene.cylinders.center_w),
+        (_capsule, scene.capsules, scene.capsules.center_w),
+        (_sphere, scene.spheres, scene.spheres.center_w),
+        (_triangle, scene.triangles, scene.triangles[..., 0]),
+    ]
+    found = [f(solids, point_w) for f, solids, rows in kinds if rows.shape[-2] > 0]
+    ground = point_w[..., None, 2]
+    up = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0]), (*ground.shape, 3))
+    distance = jnp.concatenate([d for d, _ in found] + [ground], axis=-1)
+    return distance, jnp.concatenate([n for _, n in found] + [up], axis=-2)
+
+
+def nearest_obstacle(
+    scene: Scene, point_w: Array, limits: Counts | None = None
+) -> tuple[Array, Array]:
+    """Return the signed distance (B, S) [m] to the nearest solid and its direction (B, S, 3).
+
+    Args:
+        scene: batched, (B, ...).
+        point_w: (B, S, 3) points of a short stretch of path in each world [m].
+        limits: look only at this many solids of each kind, those whose bounding spheres are
+            nearest to the middle of the stretch; None looks at all, which is exact.
+
+    Returns:
+        distance and the unit vectors along which it grows; the nearest surface point is
+        point - distance * away.
+    """
+    if limits is not None:
+        scene = nearest_solids(scene, point_w[:, point_w.shape[1] // 2], limits)
+    spread = type(scene)(*(_with_points_axis(part) for part in scene))
+    distance, away = distances(spread, point_w)
+    best = distance.argmin(-1)[..., None]
+    nearest = jnp.take_along_axis(distance, best, axis=-1)[..., 0]
+    return nearest, jnp.take_along_axis(away, best[..., None], axis=-2)[..., 0, :]
+
+
+def _with_points_axis(part: Array) -> Array:
+    if isinstance(part, tuple):
+        return type(part)(*(array[:, None] for array in part))
+    return part[:, None]

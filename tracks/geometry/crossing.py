@@ -1,0 +1,50 @@
+"""When a gate counts as passed: the plane crossed inside the opening, in flight direction."""
+
+from __future__ import annotations
+
+from tracks.geometry.rotation import to_local
+from tracks.geometry.scene import Array
+
+NEAR_RADIUS_M = 0.35
+"""Yu et al. 2025 count a gate as passed within this distance of its centre [m]."""
+
+
+def is_inside(opening_g: Array, point_g: Array) -> Array:
+    """Return whether (y, z) points (..., 2) lie in the convex opening (..., V, 2)."""
+    xp = point_g.__array_namespace__()
+    edge = xp.roll(opening_g, -1, axis=-2) - opening_g
+    away = point_g[..., None, :] - opening_g
+    turn = edge[..., 0] * away[..., 1] - edge[..., 1] * away[..., 0]
+    return (turn >= 0).all(-1)
+
+
+def crossing(
+    center_w: Array, rot_w: Array, opening_g: Array, before_w: Array, after_w: Array
+) -> tuple[Array, Array]:
+    """Return (passed, missed), each (...) bool, for a straight step from before_w to after_w.
+
+    Args:
+        center_w: (..., 3) opening's centre [m].
+        rot_w: (..., 3, 3) gate to world.
+        opening_g: (..., V, 2) corners (y, z), counter-clockwise [m].
+        before_w: (..., 3) start of the step [m].
+        after_w: (..., 3) its end [m].
+
+    Returns:
+        passed: the plane was crossed in flight direction inside the opening; missed: it was
+        crossed in flight direction outside of it.
+    """
+    xp = before_w.__array_namespace__()
+    before, after = to_local(rot_w, before_w - center_w), to_local(rot_w, after_w - center_w)
+    crosses = (before[..., 0] < 0) & (after[..., 0] >= 0)
+    travel = after[..., 0] - before[..., 0]
+    share = -before[..., 0] / xp.where(crosses, travel, 1.0)
+    point = before[..., 1:] + share[..., None] * (after - before)[..., 1:]
+    inside = is_inside(opening_g, point)
+    return crosses & inside, crosses & ~inside
+
+
+def is_near(center_w: Array, point_w: Array, radius_m: float = NEAR_RADIUS_M) -> Array:
+    """Return whether point_w (..., 3) is within radius_m of the gate's centre (..., 3)."""
+    away = point_w - center_w
+    return (away * away).sum(-1) <= radius_m**2

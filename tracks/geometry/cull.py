@@ -1,0 +1,107 @@
+"""The solids of a scene that matter at a place: what cannot be seen or is far is left out.
+
+Scenes are batched here, (B, ...), and stay static in shape: the K best solids of each kind are
+gathered, where K is the caller's `Counts`. A kind with no more than K solids is passed on whole.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from tracks.geometry.scene import Array, Counts, Scene
+
+
+class Bounds(NamedTuple):
+    """Bounding spheres of one kind of solid."""
+
+    center_w: Array
+    """(..., N, 3) [m]."""
+    radius: Array
+    """(..., N) [m]."""
+
+
+def bounds(scene: Scene) -> list[tuple[str, Bounds]]:
+    """Return the bounding spheres of every kind, under its field's name in `Scene`.
+
+    Takes numpy and JAX arrays, with any leading batch shape.
+    """
+    half = scene.boxes.half_size
+    xp = half.__array_namespace__()
+    rods = [
+        (
+            name,
+            Bounds(
+                rod.center_w,
+                xp.hypot(rod.radius, rod.half_length) if flat else rod.radius + rod.half_length,
+            ),
+        )
+        for name, rod, flat in (
+            ("cylinders", scene.cylinders, True),
+            ("capsules", scene.capsules, False),
+        )
+    ]
+    return [
+        ("boxes", Bounds(scene.boxes.center_w, xp.sqrt((half * half).sum(-1)))),
+        *rods,
+        ("spheres", Bounds(scene.spheres.center_w, scene.spheres.radius)),
+    ]
+
+
+def _gather(solids: Any, index: Array) -> Any:
+    def pick(array: Array) -> Array:
+        return jax.vmap(lambda rows, i: rows[i])(array, index)
+
+    return jax.tree.map(pick, solids)
+
+
+def _keep(scene: Scene, scores: dict[str, Array], limits: Counts) -> Scene:
+    kept = {}
+    for name, score in scores.items():
+        limit = getattr(limits, name)
+        if score.shape[-1] > limit:
+            kept[name] = _gather(getattr(scene, name), jax.lax.top_k(-score, limit)[1])
+    return scene._replace(**kept)
+
+
+def nearest_solids(scene: Scene, pos_w: Array, limits: Counts) -> Scene:
+    """Keep the solids whose bounding spheres are nearest to pos_w (B, 3)."""
+    scores = {}
+    for name, ball in bounds(scene):
+        away = ball.center_w - pos_w[:, None]
+        scores[name] = jnp.sqrt((away * away).sum(-1)) - ball.radius
+    return _keep(scene, scores, limits)
+
+
+def visible_solids(
+    scene: Scene, pos_w: Array, rot_w: Array, rays_b: Array, range_m: float, limits: Counts
+) -> Scene:
+    """Keep the nearest solids whose bounding spheres reach into the cone around the rays.
+
+    Args:
+        scene: batched, (B, ...).
+        pos_w: (B, 3) camera positions [m].
+        rot_w: (B, 3, 3) body to world.
+        rays_b: (R, 3) rays in body axes; the cone around their mean holds them all.
+        range_m: planar depth beyond which nothing is seen [m].
+        limits: how many of each kind to keep.
+    """
+    unit = rays_b / jnp.linalg.norm(rays_b, axis=-1, keepdims=True)
+    axis_b = unit.mean(0) / jnp.linalg.norm(unit.mean(0))
+    cosine = (unit @ axis_b).min()
+    sine = jnp.sqrt(1 - cosine**2)
+    reach = range_m * jnp.linalg.norm(rays_b, axis=-1).max()
+    axis_w = rot_w @ axis_b
+    scores = {}
+    for name, ball in bounds(scene):
+        away = ball.center_w - pos_w[:, None]
+        squared = (away * away).sum(-1)
+        along = (away * axis_w[:, None]).sum(-1)
+        across = jnp.sqrt(jnp.maximum(squared - along * along, 0.0))
+        outside_cone = across * cosine - along * sine > ball.radius
+        distance = jnp.sqrt(squared) - ball.radius
+        unseen = (outside_cone & (distance > 0)) | (distance > reach)
+        scores[name] = jnp.where(unseen, 1e6 + distance, distance)
+    return _keep(scene, scores, limits)

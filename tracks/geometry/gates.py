@@ -1,0 +1,141 @@
+"""Gates: openings as convex polygons and their frames as one box a side."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tracks.geometry.scene import PARKED_Z, Boxes, Gates
+
+
+def yaw_rotation(yaw: np.ndarray | float) -> np.ndarray:
+    """Return rotations about world z by `yaw` (...) [rad], local to world, (..., 3, 3)."""
+    yaw = np.asarray(yaw, float)
+    rot = np.zeros((*yaw.shape, 3, 3))
+    rot[..., 0, 0] = rot[..., 1, 1] = np.cos(yaw)
+    rot[..., 1, 0] = np.sin(yaw)
+    rot[..., 0, 1] = -rot[..., 1, 0]
+    rot[..., 2, 2] = 1.0
+    return rot
+
+
+def rectangle(width: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
+    """Return the corners (y, z) of a centred rectangle, counter-clockwise, (..., 4, 2) [m]."""
+    half = np.stack([np.asarray(width, float), np.asarray(height, float)], axis=-1) / 2
+    return half[..., None, :] * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def regular_polygon(corners: int, radius: float) -> np.ndarray:
+    """Return a regular polygon around the origin, counter-clockwise, (corners, 2) [m].
+
+    Args:
+        corners: number of corners, at least 3; the first side is level and at the bottom.
+        radius: of the inscribed circle [m], so that a circular gate's clear width is kept.
+    """
+    angle = 2 * np.pi * (np.arange(corners) - 0.5) / corners - np.pi / 2
+    circumradius = radius / np.cos(np.pi / corners)
+    return circumradius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def square_gates(
+    center_w: np.ndarray,
+    yaw: np.ndarray,
+    side: np.ndarray,
+    frame_width: np.ndarray,
+    frame_depth: np.ndarray,
+) -> Gates:
+    """Return upright gates with square openings.
+
+    Args:
+        center_w: (G, 3) opening centres [m].
+        yaw: (G,) flight directions about world z [rad].
+        side: (G,) side lengths of the openings [m].
+        frame_width: (G,) widths of the bars around the openings [m].
+        frame_depth: (G,) extents of the frames along the flight direction [m].
+    """
+    return Gates(center_w, yaw_rotation(yaw), rectangle(side, side), frame_width, frame_depth)
+
+
+def round_gates(
+    center_w: np.ndarray,
+    yaw: np.ndarray,
+    diameter: np.ndarray,
+    frame_width: np.ndarray,
+    frame_depth: np.ndarray,
+    corners: int,
+) -> Gates:
+    """Return upright gates whose openings are regular polygons.
+
+    Args:
+        center_w: (G, 3) opening centres [m].
+        yaw: (G,) flight directions about world z [rad].
+        diameter: (G,) of the openings' inscribed circles [m].
+        frame_width: (G,) widths of the bars around the openings [m].
+        frame_depth: (G,) extents of the frames along the flight direction [m].
+        corners: of every opening; the more, the rounder.
+
+    Raises:
+        ValueError: for fewer than three corners.
+    """
+    if corners < 3:
+        raise ValueError(f"gates with {corners} corners cannot be made, allowed are 3 and more")
+    opening = np.asarray(diameter, float)[:, None, None] * regular_polygon(corners, 0.5)
+    return Gates(center_w, yaw_rotation(yaw), opening, frame_width, frame_depth)
+
+
+def frame_boxes(gates: Gates) -> Boxes:
+    """Return the frames' bars, one box a side of the opening, gate by gate, (G * V) boxes.
+
+    A bar lies outside its side of the opening and is lengthened so that neighbours close the
+    corner between them. Where corners repeat (openings padded to V corners), the bar is parked.
+    """
+    corner = np.asarray(gates.opening_g, float)
+    side = np.roll(corner, -1, axis=-2) - corner
+    length = np.linalg.norm(side, axis=-1)
+    real = length > 1e-9
+    along = np.where(real[..., None], side, [1.0, 0.0]) / np.where(real, length, 1.0)[..., None]
+    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    width = np.asarray(gates.frame_width, float)[:, None]
+    end, start = _corner_extensions(along, real, width)
+    middle = (
+        corner + along * ((length + end - start) / 2)[..., None] + outward * width[..., None] / 2
+    )
+
+    rot_gate = np.asarray(gates.rot_w, float)[:, None]
+    zero = np.zeros(length.shape)
+    center_g = np.stack([zero, middle[..., 0], middle[..., 1]], axis=-1)
+    axis_y = np.stack([zero, along[..., 0], along[..., 1]], axis=-1)
+    axis_z = np.stack([zero, -along[..., 1], along[..., 0]], axis=-1)
+    axis_x = np.broadcast_to([1.0, 0.0, 0.0], axis_y.shape)
+    rot_w = rot_gate @ np.stack([axis_x, axis_y, axis_z], axis=-1)
+    center_w = np.asarray(gates.center_w)[:, None] + (rot_gate @ center_g[..., None])[..., 0]
+    half_depth = np.broadcast_to(np.asarray(gates.frame_depth, float)[:, None], length.shape) / 2
+    half_width = np.broadcast_to(width, length.shape) / 2
+    half_size = np.stack([half_depth, (length + end + start) / 2, half_width], axis=-1)
+
+    center_w = np.where(real[..., None], center_w, [0.0, 0.0, PARKED_Z])
+    half_size = np.where(real[..., None], half_size, 1e-3)
+    return Boxes(center_w.reshape(-1, 3), rot_w.reshape(-1, 3, 3), half_size.reshape(-1, 3))
+
+
+def _corner_extensions(
+    along: np.ndarray, real: np.ndarray, width: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much each bar is lengthened at its end and at its start, (G, V) each.
+
+    `width * tan(turn / 2)` brings the outer edges of neighbours together; sharper corners than a
+    right angle are capped at one width, so that no spike sticks out.
+    """
+    gates, corners = real.shape
+    end = np.zeros((gates, corners))
+    start = np.zeros((gates, corners))
+    if real.all():
+        cosine = np.sum(along * np.roll(along, -1, axis=1), axis=-1)
+        end = width * np.minimum(np.sqrt((1 - cosine) / np.maximum(1 + cosine, 1e-9)), 1.0)
+        return end, np.roll(end, 1, axis=1)
+    for gate in range(gates):
+        sides = np.flatnonzero(real[gate])
+        cosine = np.sum(along[gate, sides] * along[gate, np.roll(sides, -1)], axis=-1)
+        ratio = np.minimum(np.sqrt((1 - cosine) / np.maximum(1 + cosine, 1e-9)), 1.0)
+        end[gate, sides] = width[gate, 0] * ratio
+        start[gate, np.roll(sides, -1)] = end[gate, sides]
+    return end, start

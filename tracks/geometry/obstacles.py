@@ -1,0 +1,219 @@
+"""Obstacles scattered off the flight line: plates, small solids, pillars, objects on the ground.
+
+Sizes are the baseline's (Yu et al. 2025). The kinds of solids are dealt out evenly over a track
+(a shuffled deck, not independent draws), which bounds how many of a kind a track can hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from tracks.geometry.gates import yaw_rotation
+from tracks.geometry.rotation import quat_to_rot
+from tracks.geometry.scene import Boxes, Gates, Rods, Spheres
+
+BOX, CYLINDER, CAPSULE, SPHERE = range(4)
+KIND_NAMES = ("box", "cylinder", "capsule", "sphere")
+GATE_DISTANCE_M = 1.5
+"""Least level distance of an obstacle's centre from a gate's centre [m]."""
+CORRIDOR_HALF_LENGTH_M = 1.5
+"""The axis of a gate is kept free this far before and behind it [m]."""
+CORRIDOR_CLEARANCE_M = 0.4
+"""Least level distance between an obstacle and a gate's axis [m]."""
+START_CLEARANCE_M = 0.6
+"""Least level distance between an obstacle and the line from the start to gate 0 [m]."""
+_TRIES = 24
+
+Site = Callable[[np.random.Generator, np.ndarray], np.ndarray]
+"""Draws level positions (n, 2) for obstacles of the given stretches (n,)."""
+
+
+class PerStretch(NamedTuple):
+    """How many obstacles each stretch holds, (S,) integers each."""
+
+    plates: np.ndarray
+    """Square plates in the air at any orientation."""
+    small: np.ndarray
+    """Small boxes, cylinders, capsules and spheres in the air."""
+    pillars: np.ndarray
+    """Standing cylinders and boxes."""
+    ground: np.ndarray
+    """Small solids lying on the ground."""
+
+
+class KeepClear(NamedTuple):
+    """Level lines that obstacles keep away from, and the gates' centres."""
+
+    begin: np.ndarray
+    """(K, 2) [m]."""
+    end: np.ndarray
+    """(K, 2) [m]."""
+    clearance_m: np.ndarray
+    """(K,) between a line and an obstacle's surface."""
+    center: np.ndarray
+    """(G, 2) gate centres [m]."""
+
+
+class Obstacles(NamedTuple):
+    """Solids of each kind and their names."""
+
+    boxes: Boxes
+    cylinders: Rods
+    capsules: Rods
+    spheres: Spheres
+    names: tuple[str, ...]
+    """In the order boxes, cylinders, capsules, spheres."""
+
+
+def keep_clear(gates: Gates, start_pos_w: np.ndarray) -> KeepClear:
+    """Return what obstacles must leave free: each gate's axis and the way to the first gate."""
+    center = gates.center_w[:, :2]
+    reach = CORRIDOR_HALF_LENGTH_M * gates.rot_w[:, :2, 0]
+    clearance = np.full(len(center) + 1, CORRIDOR_CLEARANCE_M)
+    clearance[-1] = START_CLEARANCE_M
+    return KeepClear(
+        np.concatenate([center - reach, start_pos_w[None, :2]]),
+        np.concatenate([center + reach, center[:1]]),
+        clearance,
+        center,
+    )
+
+
+def segment_distance(point: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return distances from points to line segments, any dimension D on the last axis.
+
+    Args:
+        point: (..., D) [m].
+        begin: (..., D) [m], broadcast against `point`.
+        end: (..., D) [m], broadcast against `point`.
+    """
+    way = end - begin
+    share = np.sum((point - begin) * way, -1) / np.maximum(np.sum(way * way, -1), 1e-12)
+    nearest = begin + np.clip(share, 0.0, 1.0)[..., None] * way
+    return np.sqrt(np.sum((point - nearest) ** 2, -1))
+
+
+def straight_sites(gates: Gates, first: np.ndarray, offset_m: float) -> Site:
+    """Return a site that lies up to `offset_m` beside the line from gate `first[s]` to the next.
+
+    Args:
+        gates: the gates in flight order; the last is followed by gate 0.
+        first: (S,) index of the gate that each stretch leaves.
+        offset_m: largest level distance from the line [m].
+    """
+    begin = gates.center_w[first, :2]
+    way = gates.center_w[(first + 1) % len(gates.center_w), :2] - begin
+    side = np.stack([-way[:, 1], way[:, 0]], -1) / np.linalg.norm(way, axis=-1)[:, None]
+
+    def site(rng: np.random.Generator, stretch: np.ndarray) -> np.ndarray:
+        share = rng.random((len(stretch), 2))
+        offset = offset_m * (2 * share[:, 1:] - 1)
+        return begin[stretch] + share[:, :1] * way[stretch] + offset * side[stretch]
+
+    return site
+
+
+def scatter(
+    rng: np.random.Generator, per_stretch: PerStretch, site: Site, clear: KeepClear
+) -> Obstacles:
+    """Return obstacles drawn from `rng`, none of them in a gate's way or the start's.
+
+    An obstacle that finds no free place in 24 tries is left out.
+    """
+    numbers = [int(n.sum()) for n in per_stretch]
+    plates, small, pillars, ground = numbers
+    total = sum(numbers)
+    stretch = np.concatenate([np.repeat(np.arange(len(n)), n) for n in per_stretch])
+    kind = np.concatenate(
+        [
+            np.full(plates, BOX),
+            rng.permutation(np.arange(small) % 4),
+            rng.permutation(np.arange(pillars) % 2),
+            rng.permutation(np.arange(ground) % 4),
+        ]
+    )
+    in_air = np.arange(total) < plates + small
+    standing = ~in_air
+    is_pillar = standing & (np.arange(total) < plates + small + pillars)
+
+    # `size` is a box's half sizes; for the other kinds (radius, unused, half length).
+    size = rng.uniform(0.1, 0.3, (total, 3))
+    box = kind == BOX
+    size[box] = rng.uniform(0.05, 0.25, (int(box.sum()), 3))
+    size[:plates, :2] = rng.uniform(0.2, 0.5, (plates, 1))
+    size[:plates, 2] = rng.uniform(0.02, 0.04, plates)
+    size[is_pillar, :2] = rng.uniform(0.1, 0.5, (pillars, 1))
+    size[is_pillar, 2] = rng.uniform(0.5, 1.5, pillars)
+
+    rot_w = yaw_rotation(rng.uniform(-np.pi, np.pi, total))
+    rot_w[in_air] = _random_rotations(rng, plates + small)
+    lying = (kind == CAPSULE) & standing
+    rot_w[lying] = rot_w[lying][:, :, [1, 2, 0]]
+
+    height = rng.uniform(0.5, 3.0, total)
+    round_low = (kind == SPHERE) | (kind == CAPSULE)
+    height[standing] = np.where(round_low, size[:, 0], size[:, 2])[standing]
+
+    xy, kept = _place(rng, stretch, _level_radius(kind, size, is_pillar), site, clear)
+    center_w = np.concatenate([xy, height[:, None]], axis=-1)
+    labels = _labels(numbers, kind)
+
+    def of(wanted: int) -> np.ndarray:
+        return np.flatnonzero(kept & (kind == wanted))
+
+    b, c, p, s = (of(wanted) for wanted in range(4))
+    return Obstacles(
+        Boxes(center_w[b], rot_w[b], size[b]),
+        Rods(center_w[c], rot_w[c][:, :, 2], size[c, 0], size[c, 2]),
+        Rods(center_w[p], rot_w[p][:, :, 2], size[p, 0], size[p, 2]),
+        Spheres(center_w[s], size[s, 0]),
+        tuple(labels[i] for i in np.concatenate([b, c, p, s])),
+    )
+
+
+def _labels(numbers: list[int], kind: np.ndarray) -> list[str]:
+    plates, small, pillars, ground = numbers
+    names = [KIND_NAMES[k] for k in kind[plates:]]
+    return [
+        *(f"plate {i}" for i in range(plates)),
+        *(f"small {name} {i}" for i, name in enumerate(names[:small])),
+        *(f"pillar {i}" for i in range(pillars)),
+        *(f"ground {name} {i}" for i, name in enumerate(names[small + pillars :])),
+    ]
+
+
+def _level_radius(kind: np.ndarray, size: np.ndarray, is_pillar: np.ndarray) -> np.ndarray:
+    """Return how far each obstacle can reach from its centre in the level plane, (n,) [m]."""
+    across = np.where(kind == BOX, np.hypot(size[:, 0], size[:, 1]), size[:, 0])
+    bounding = np.hypot(across, size[:, 2])
+    bounding = np.where(kind == CAPSULE, size[:, 0] + size[:, 2], bounding)
+    bounding = np.where(kind == SPHERE, size[:, 0], bounding)
+    return np.where(is_pillar, across, bounding)
+
+
+def _place(
+    rng: np.random.Generator, stretch: np.ndarray, radius: np.ndarray, site: Site, clear: KeepClear
+) -> tuple[np.ndarray, np.ndarray]:
+    xy = np.zeros((len(stretch), 2))
+    todo = np.arange(len(stretch))
+    for _ in range(_TRIES):
+        if not len(todo):
+            break
+        xy[todo] = site(rng, stretch[todo])
+        point = xy[todo, None]
+        distance = segment_distance(point, clear.begin, clear.end)
+        blocks = np.any(distance < clear.clearance_m + radius[todo, None], axis=-1)
+        gap = np.sum((point - clear.center) ** 2, axis=-1)
+        todo = todo[blocks | np.any(gap < GATE_DISTANCE_M**2, axis=-1)]
+    kept = np.ones(len(stretch), bool)
+    kept[todo] = False
+    return xy, kept
+
+
+def _random_rotations(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Return `n` uniformly distributed rotations, (n, 3, 3), from normal quaternions."""
+    quat = rng.normal(size=(n, 4))
+    return quat_to_rot(quat / np.linalg.norm(quat, axis=-1, keepdims=True))

@@ -1,0 +1,94 @@
+"""Rotations: vectors turned, quaternions, matrices and the exponential map (numpy and JAX).
+
+Products are written out and summed over the last axes: a matrix product may round a row differently
+at another batch size, and a trial's outcome must not depend on the trials beside it.
+"""
+
+from __future__ import annotations
+
+from tracks.geometry.scene import Array
+
+
+def to_world(rot_w: Array, vector: Array) -> Array:
+    """Return vectors (..., 3) in the axes of a body or gate turned to world axes.
+
+    Args:
+        rot_w: (..., 3, 3) body or gate to world.
+        vector: (..., 3) in its axes.
+    """
+    return (rot_w * vector[..., None, :]).sum(-1)
+
+
+def to_local(rot_w: Array, vector_w: Array) -> Array:
+    """Return world vectors (..., 3) in the axes of a body or gate.
+
+    Args:
+        rot_w: (..., 3, 3) body or gate to world.
+        vector_w: (..., 3).
+    """
+    return (rot_w * vector_w[..., :, None]).sum(-2)
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return a x b (..., 3); numpy's own is several times slower on small arrays."""
+    xp = a.__array_namespace__()
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return xp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
+def quat_to_rot(quat_wxyz: Array) -> Array:
+    """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    xp = quat_wxyz.__array_namespace__()
+    w, x, y, z = (quat_wxyz[..., i] for i in range(4))
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rot_to_quat(rot: Array) -> Array:
+    """Return the unit quaternions (..., 4) wxyz with w >= 0 of rotation matrices (..., 3, 3)."""
+    xp = rot.__array_namespace__()
+    xx, yy, zz = rot[..., 0, 0], rot[..., 1, 1], rot[..., 2, 2]
+    # Four times the outer product of the quaternion with itself; its largest row is exact.
+    wx, wy, wz = (
+        rot[..., 2, 1] - rot[..., 1, 2],
+        rot[..., 0, 2] - rot[..., 2, 0],
+        rot[..., 1, 0] - rot[..., 0, 1],
+    )
+    xy, xz, yz = (
+        rot[..., 1, 0] + rot[..., 0, 1],
+        rot[..., 0, 2] + rot[..., 2, 0],
+        rot[..., 2, 1] + rot[..., 1, 2],
+    )
+    rows = (
+        (1 + xx + yy + zz, wx, wy, wz),
+        (wx, 1 + xx - yy - zz, xy, xz),
+        (wy, xy, 1 - xx + yy - zz, yz),
+        (wz, xz, yz, 1 - xx - yy + zz),
+    )
+    outer = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    size = xp.stack([rows[i][i] for i in range(4)], axis=-1)
+    best = xp.argmax(size, axis=-1)[..., None, None]
+    quat = xp.take_along_axis(outer, best, axis=-2)[..., 0, :]
+    quat = quat / xp.sqrt(xp.sum(quat**2, axis=-1, keepdims=True))
+    return xp.where(quat[..., :1] < 0.0, -quat, quat)
+
+
+def exp_rot(vector: Array) -> Array:
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues)."""
+    xp = vector.__array_namespace__()
+    squared = xp.sum(vector**2, axis=-1)[..., None, None]
+    # Below this the series is exact to rounding, and the root has no finite slope at zero.
+    small = squared < 1e-8
+    angle = xp.sqrt(xp.where(small, 1.0, squared))
+    first = xp.where(small, 1.0 - squared / 6.0, xp.sin(angle) / angle)
+    second = xp.where(small, 0.5 - squared / 24.0, (1.0 - xp.cos(angle)) / angle**2)
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    zero = xp.zeros_like(x)
+    rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
+    skew = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    return xp.eye(3) + first * skew + second * xp.matmul(skew, skew)
