@@ -20,8 +20,16 @@ from suite.delta.windows import cut_windows
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain, write_json, write_text
 
-PLANT_STEPS_S = 4e5
-"""Steps of the quadrotor a second that a fit makes, for the estimate."""
+PLANT_STEPS_S, POINT_STEPS_S = 4e5, 1.5e5
+"""Steps of the quadrotor and of the point mass a second that a fit makes, for the estimate."""
+
+
+def fitting_estimate(config: FitConfig, steps: float, through_quadrotor: bool) -> Estimate:
+    """Return about how long a fit takes with windows of `steps`, and what memory it needs."""
+    work = config.iterations * config.batch * steps
+    if through_quadrotor:
+        return Estimate(40 + work / PLANT_STEPS_S, 1.5e9)
+    return Estimate(20 + work / POINT_STEPS_S, 8e8)
 
 
 def flight_files(paths: Sequence[Path]) -> list[Path]:
@@ -72,8 +80,8 @@ def fit_delta(
     known, held = _read(config, paths, console)
     windows = cut_windows(known, config.horizon_s, config.stride_s)
     held_windows = cut_windows(held, config.horizon_s, config.stride_s)
-    work = config.iterations * config.batch * windows.action_b.shape[1]
-    announce(console, "fitting the Delta Action Model", Estimate(20 + work / 1.5e5, 8e8))
+    needs = fitting_estimate(config, windows.action_b.shape[1], False)
+    announce(console, "fitting the Delta Action Model", needs)
     with console.progress("fitting", config.iterations) as show:
         result = fit(config, physics, windows, held_windows, show)
     summary = {
@@ -102,9 +110,8 @@ def fit_quadrotor_delta(
     known, held = _read(config, paths, console)
     windows, cut = cut_quadrotor_windows(known, quad, config.horizon_s, config.stride_s)
     held_windows, _ = cut_quadrotor_windows(held, quad, config.horizon_s, config.stride_s)
-    work = config.iterations * config.batch * windows.action_b.shape[1] * cut.physics
-    words = "fitting the Delta Action Model through the quadrotor"
-    announce(console, words, Estimate(40 + work / PLANT_STEPS_S, 1.5e9))
+    needs = fitting_estimate(config, windows.action_b.shape[1] * cut.physics, True)
+    announce(console, "fitting the Delta Action Model through the quadrotor", needs)
     with console.progress("fitting", config.iterations) as show:
         replay = partial(replay_quadrotor, quad, cut)
         result = fit_network(config, replay, windows, held_windows, show)

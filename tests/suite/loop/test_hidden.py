@@ -21,19 +21,21 @@ from policies.formats.delta_file import save_delta
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import delta_network
 from suite import cli
-from suite.loop import hidden
-from suite.loop.hidden_report import LABELS, VARIANTS, hidden_effects, verdict
+from suite.delta.run import flight_files
+from suite.loop import work
+from suite.loop.hidden_effect import LABELS, VARIANTS, hidden_effects, verdict
 from suite.loop.measured import CONTACT_MARGIN_S, Noise, cut_end, enough, measure, noisy
-from suite.loop.variants import cell_grid, overall_grid, standings
+from suite.loop.standings import cell_grid, overall_grid, standings
 from tests.support.loops import Small
 
 EXAMPLE = "examples/hidden.toml"
 ARGS = ["--world", EXAMPLE, "--preset", "small", "--track", "zigzag", "--difficulty", "0"]
 ARGS += ["--trials", "3", "--flights", "3", "--finetune-iterations", "2", "--seed", "4"]
 ARGS += ["--set", "episode.batch=2"]
+TUNED = [variant.name for variant in VARIANTS if variant.tuned]
 STAGES = ["given", "eval-nominal", "eval-before", "flights", "measured", "diagnosis"]
-STAGES += ["delta-control", "delta-named", *(f"tuned-{name}" for name in hidden.TUNED)]
-STAGES += [*(f"eval-{name}" for name in hidden.TUNED), "replays"]
+STAGES += ["delta-control", "delta-named", *(f"tuned-{name}" for name in TUNED)]
+STAGES += [*(f"eval-{name}" for name in TUNED), "replays"]
 
 
 def answer(effects):
@@ -58,8 +60,8 @@ class Stub(Small):
     def __init__(self, monkeypatch, effects=(NAMED,)):
         super().__init__(monkeypatch)
         self.effects, self.diagnosed, self.fitted = list(effects), [], []
-        monkeypatch.setattr(hidden, "diagnose_files", self.diagnose)
-        monkeypatch.setattr(hidden, "fit_quadrotor_delta", self.fit)
+        monkeypatch.setattr("suite.diagnose.run.diagnose_files", self.diagnose)
+        monkeypatch.setattr(work, "fit_quadrotor_delta", self.fit)
 
     def diagnose(self, paths, vehicle, drive, out, console):
         logs, _ = read_flights(paths)
@@ -72,7 +74,7 @@ class Stub(Small):
         (out / "diagnosis.json").write_text(json.dumps(answer(self.effects)))
 
     def fit(self, config, quad, paths, out, console):
-        self.fitted.append((quad.vehicle, sorted(path.name for path in paths)))
+        self.fitted.append((quad.vehicle, sorted(path.name for path in flight_files(paths))))
         params = delta_network.init(jax.random.key(0))
         shift = 0.01 if "com_offset" in quad.vehicle.effects else 0.02
         params = {k: np.asarray(v) + shift for k, v in params.items()}
@@ -99,8 +101,8 @@ def test_the_loop_leaves_tables_report_and_recording(whole):
     for name in ("table.md", "loop.json", "report.html", "recording.rrd", "run.json"):
         assert (out / name).stat().st_size > 100, name
     found = json.loads((out / "loop.json").read_text())
-    assert list(found["stage_seconds"]) == STAGES and len(STAGES) == hidden.STAGES
-    assert [one["name"] for one in found["standings"]] == list(VARIANTS)
+    assert list(found["stage_seconds"]) == STAGES
+    assert [one["name"] for one in found["standings"]] == list(LABELS)
     assert found["diagnosis"]["effects"][0]["name"] == "com_offset"
     table = (out / "table.md").read_text()
     assert found["verdict"] in table and "com_offset (or torque_trim)" in found["verdict"]
@@ -114,7 +116,7 @@ def test_the_loop_leaves_tables_report_and_recording(whole):
 
 def test_only_the_judge_flies_the_hidden_vehicle(whole):
     out, stub = whole
-    rows = {name: read_trials(out / f"eval-{name}" / "trials.parquet") for name in VARIANTS}
+    rows = {name: read_trials(out / f"eval-{name}" / "trials.parquet") for name in LABELS}
     for name, trials in rows.items():
         assert {row.vehicle for row in trials} == {"reference" if name == "nominal" else "hidden"}
         assert [row.trial for row in trials] == [("zigzag", 0, seed) for seed in (4, 5, 6)]
@@ -133,7 +135,7 @@ def test_all_are_tuned_alike_on_the_same_tracks(whole):
         assert all(np.array_equal(starts[0], other) for other in starts[1:])
     plain = [config for config, _, _ in stub.trained]
     assert all(one.optimizer == plain[0].optimizer and one.loss == plain[0].loss for one in plain)
-    weights = [load_policy_checkpoint(out / f"tuned-{name}" / "policy") for name in hidden.TUNED]
+    weights = [load_policy_checkpoint(out / f"tuned-{name}" / "policy") for name in TUNED]
     values = [float(np.ravel(one.params["action.weight"])[0]) for one in weights]
     # The stand-in leans by the tracks and the delta alone: named and control agree, delta differs.
     assert values[0] == values[2] and len({values[0], values[1], values[3]}) == 3
