@@ -60,7 +60,8 @@ def _dots(
     dots: Sequence[tuple[str, str, Sequence[Interval]]],
     *,
     apart: float,
-    **style: float,
+    ms: float,
+    lw: float,
 ) -> None:
     """Draw label, colour and intervals of all policies, `apart` of a cell; the last cell is all."""
     percent = title.endswith("[%]")
@@ -68,7 +69,7 @@ def _dots(
         value, low, high = (100 if percent else 1) * np.array(intervals).T
         at = np.arange(len(cells)) + apart * (number - 0.5 * (len(dots) - 1))
         reach = np.maximum([value - low, high - value], 0)
-        axes.errorbar(at, value, reach, color=colour, label=label, fmt="o", **style)
+        axes.errorbar(at, value, reach, color=colour, label=label, fmt="o", ms=ms, lw=lw)
     titled(axes, title)
     axes.set_xticks(range(len(cells)), cells, fontsize=8)
     if len(cells) > 1:

@@ -118,8 +118,13 @@ def _line(track: str, level: int | None, rows: Mapping[str, Sequence[TrialResult
         apart: Callable[[np.ndarray, np.ndarray], Interval],
     ) -> Measure:
         before, without, with_delta = columns(field)
-        values = (alone(values) for values in (before, without, with_delta))
-        return Measure(*values, apart(with_delta, without), apart(with_delta, before))
+        return Measure(
+            before=alone(before),
+            without=alone(without),
+            with_delta=alone(with_delta),
+            with_minus_without=apart(with_delta, without),
+            with_minus_before=apart(with_delta, before),
+        )
 
     medians_apart = partial(paired_bootstrap, seed=seed)
     _, without, with_delta = columns("success")

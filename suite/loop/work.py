@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate
 from suite.common.stages import Stage
-from suite.delta.run import fit_delta, fit_quadrotor_delta, fitting_estimate
+from suite.delta.run import fit_delta, fitting_estimate
 from suite.judging.collect import Collection, collect
 from suite.judging.evaluate import Judgement, evaluate
 from suite.judging.flying import (
@@ -228,7 +229,7 @@ def read_diagnosis(out: Path) -> dict[str, Any]:
     return json.loads((out / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
 
 
-def named_effects(found: dict[str, Any]) -> str:
+def named_effects(found: Mapping[str, Any]) -> str:
     """Return the effects that diagnosis.json names, with their rivals, in words."""
     parts = []
     for effect in found["effects"]:
@@ -243,10 +244,7 @@ def _fit(run: LoopRun, model: DeltaModel) -> Stage:
     def work(folder: Path) -> None:
         tuning = run.tuning(model.diagnosed)
         try:
-            if tuning.quadrotor is None:
-                fit_delta(fit, tuning.physics, [run.logs], folder, run.console)
-            else:
-                fit_quadrotor_delta(fit, tuning.quadrotor, [run.logs], folder, run.console)
+            fit_delta(fit, tuning.quadrotor or tuning.physics, [run.logs], folder, run.console)
         except ValueError as error:
             raise WorkFailed(
                 f"the Delta Action Model cannot be fitted to the flights in {run.logs}: {error}; "

@@ -23,7 +23,7 @@ from policies.networks import delta_network
 from suite import cli
 from suite.delta.run import flight_files
 from suite.loop import work
-from suite.loop.hidden_effect import LABELS, VARIANTS, hidden_effects, verdict
+from suite.loop.hidden_effect import LABELS, LOOP, hidden_effects, verdict
 from suite.loop.measured import CONTACT_MARGIN_S, Noise, cut_end, enough, measure, noisy
 from suite.loop.standings import cell_grid, overall_grid, standings
 from tests.support.loops import Small
@@ -32,7 +32,7 @@ EXAMPLE = "examples/hidden.toml"
 ARGS = ["--world", EXAMPLE, "--preset", "small", "--track", "zigzag", "--difficulty", "0"]
 ARGS += ["--trials", "3", "--flights", "3", "--finetune-iterations", "2", "--seed", "4"]
 ARGS += ["--set", "episode.batch=2"]
-TUNED = [variant.name for variant in VARIANTS if variant.tuned]
+TUNED = [variant.name for variant in LOOP.variants if variant.tuned]
 STAGES = ["given", "eval-nominal", "eval-before", "flights", "measured", "diagnosis"]
 STAGES += ["delta-control", "delta-named", *(f"tuned-{name}" for name in TUNED)]
 STAGES += [*(f"eval-{name}" for name in TUNED), "replays"]
@@ -61,7 +61,7 @@ class Stub(Small):
         super().__init__(monkeypatch)
         self.effects, self.diagnosed, self.fitted = list(effects), [], []
         monkeypatch.setattr("suite.diagnose.run.diagnose_files", self.diagnose)
-        monkeypatch.setattr(work, "fit_quadrotor_delta", self.fit)
+        monkeypatch.setattr(work, "fit_delta", self.fit)
 
     def diagnose(self, paths, vehicle, drive, out, console):
         logs, _ = read_flights(paths)
