@@ -93,6 +93,8 @@ def fit_delta(
         console.note(f"warning: {warning}")
     parts, about = split(logs, config.held_out, config.seed), corrected(dynamics)
     work: Callable[[Any, Any, Callable[[int, str], None]], DeltaFit]
+    known: Any
+    held_out: Any
     if isinstance(dynamics, QuadrotorConfig):
         from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor
 
