@@ -44,7 +44,7 @@ from tracks.common.files import replacing_folder, write_json
 
 DIAGNOSED_S = 80.0
 """The diagnosis gets about this much flight, of all tracks and levels in turn [s]."""
-DRIVE = "commands"
+INPUT_SOURCE = "commands"
 """The judge's rate loop is the vehicle file's, so the diagnosis need not ask whose it is; driven by
 rotor speeds a wrong torque runs away within a second."""
 DIAGNOSIS = Estimate(90.0, 1.5e9)
@@ -205,7 +205,7 @@ def _diagnose(run: LoopRun) -> Stage:
 
         listed = json.loads((run.logs / "diagnosed.json").read_text(encoding="utf-8"))
         paths = [run.logs / name for name in listed["files"]]
-        wishes = Wishes(drive=DRIVE, seed=run.config.seed)
+        wishes = Wishes(drive=INPUT_SOURCE, seed=run.config.seed)
         try:
             diagnose_files(paths, run.config.vehicle, wishes, folder, run.console)
         except ValueError as error:
