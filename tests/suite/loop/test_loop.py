@@ -1,6 +1,7 @@
 """The declarations, the stages that they ask for, and what a report is made of."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from suite.common.stages import is_done
 from suite.loop import charts, delta_action, hidden_effect, work
 from suite.loop.config import resolve
 from suite.loop.report import errors_row
+from suite.loop.variants import DeltaModel, Variant
 from suite.loop.work import LoopRun, Quiet, plan
 
 LOOPS = (delta_action.LOOP, hidden_effect.LOOP)
@@ -31,6 +33,19 @@ def test_a_declaration_names_what_it_has(loop):
     diagnosed = {model.folder: model.diagnosed for model in loop.models}
     for variant in loop.variants:
         assert variant.delta is None or variant.diagnosed == diagnosed[variant.delta]
+
+
+def test_another_variant_is_another_two_stages():
+    longer = Variant("longer", "judging another", "for longer", delta="other")
+    loop = replace(
+        delta_action.LOOP,
+        variants=(*delta_action.LOOP.variants, longer),
+        models=(*delta_action.LOOP.models, DeltaModel("other", "fitting another")),
+    )
+    run = LoopRun(loop, resolve(recipe="small"), Path("out"), Quiet())
+    names = [stage.name for stage in plan(run)]
+    assert names.index("other") < names.index("tuned-longer") < names.index("eval-longer")
+    assert len(names) == 9 + 3
 
 
 def test_the_first_policy_is_trained_or_taken():
