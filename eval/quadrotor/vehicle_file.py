@@ -17,8 +17,8 @@ from typing import Any
 
 from eval.effects import EFFECTS, find_effect
 from eval.effects.interface import Effect, at
-from eval.quadrotor.vehicle_check import check_vehicle
 from eval.vehicles.vehicle import Body, Controller, Rotors, Vehicle
+from eval.vehicles.vehicle_check import check_vehicle
 from tracks.common.files import write_text
 from tracks.common.names import closest, unknown_name
 from tracks.common.toml_text import to_toml

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from eval.judging.judge import JudgeOptions, Record, fly
-from eval.quadrotor.model import add_quadrotor
+from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.collision import TOUCH_M, gaps
-from eval.worlds.engine import compile_model
+from eval.worlds.engine import BODY, compile_model
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import Rules, TrialSpec
 from tests.support.pilots import Pursuit
@@ -124,6 +124,5 @@ def test_touching_is_what_mujoco_says():
 
 
 def test_quadrotor_model_is_the_first_body():
-    spec = mujoco.MjSpec()
-    add_quadrotor(spec, VEHICLE)
-    assert spec.compile().body(1).name == "quadrotor"
+    model = compile_quadrotor(mujoco.MjSpec(), VEHICLE, 0.002)
+    assert model.body(BODY).name == "quadrotor"

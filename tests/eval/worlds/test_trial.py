@@ -90,19 +90,19 @@ def test_crossing_outside_the_opening_does_not_count(world):
 def test_diverged_ends_that_trial_only(world, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo would leave its log here
     module = {"mujoco": mujoco_world, "plain": plain_world}[world]
-    original = module.fly_step
+    original = module.autopilot_step
 
-    def broken(cockpit, pilot, motion, action_b, gate_w, step, noise=None):
-        pilot, wrench = original(cockpit, pilot, motion, action_b, gate_w, step, noise)
+    def broken(autopilot, state, motion, action_b, gate_w, step, noise=None):
+        state, wrench = original(autopilot, state, motion, action_b, gate_w, step, noise)
         ill = (motion.pos_w[:, 0] > 0.5) & (gate_w[:, 0] > 2.0)
         wrench.force_b[ill] = np.nan
-        return pilot, wrench
+        return state, wrench
 
     well, ill = straight((0.8, 1.6), name="well"), straight((2.4, 3.2), name="ill")
     trials = [TrialSpec("well", 0, 0), TrialSpec("ill", 0, 0), TrialSpec("well", 0, 1)]
     tracks, options = {"well": well, "ill": ill}, JudgeOptions(slots=4)
     before = fly(Pursuit(3.0), trials, VEHICLE, world, options, tracks=tracks)
-    monkeypatch.setattr(module, "fly_step", broken)
+    monkeypatch.setattr(module, "autopilot_step", broken)
     after = fly(Pursuit(3.0), trials, VEHICLE, world, options, tracks=tracks)
     assert (after[0], after[2]) == (before[0], before[2])
     assert before[1].ended_by == "finished"
@@ -115,13 +115,13 @@ def test_diverged_ends_that_trial_only(world, monkeypatch, tmp_path):
 def test_state_beyond_any_flight_is_diverged(world, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     module = {"mujoco": mujoco_world, "plain": plain_world}[world]
-    original = module.fly_step
+    original = module.autopilot_step
 
-    def kicked(cockpit, pilot, motion, action_b, gate_w, step, noise=None):
-        pilot, wrench = original(cockpit, pilot, motion, action_b, gate_w, step, noise)
-        return pilot, wrench._replace(force_b=np.where(step[:, None] == 7, 1e5, wrench.force_b))
+    def kicked(autopilot, state, motion, action_b, gate_w, step, noise=None):
+        state, wrench = original(autopilot, state, motion, action_b, gate_w, step, noise)
+        return state, wrench._replace(force_b=np.where(step[:, None] == 7, 1e5, wrench.force_b))
 
-    monkeypatch.setattr(module, "fly_step", kicked)
+    monkeypatch.setattr(module, "autopilot_step", kicked)
     result = one(Steady(), straight(), world, Rules(speed_limit=100.0))
     assert (result.ended_by, result.time_s) == ("diverged", pytest.approx(8 * 0.002))
     assert all(map(math.isfinite, result[10:16])) and list(tmp_path.iterdir()) == []
