@@ -1,4 +1,4 @@
-"""One race on MuJoCo's plain C engine, driven action by action: what both environments wrap."""
+"""One race on MuJoCo's C engine, driven action by action: what both environments wrap."""
 
 from __future__ import annotations
 
@@ -97,16 +97,16 @@ class Race:
             motion, step = motion_of(data), before.step
             gate_w = next_gate(self._course, before.gates).center_w
             noise = None if self._draws is None else self._draws[step + 1]
-            self._loops, (force_b, torque_b) = autopilot_step(
+            self._loops, wrench = autopilot_step(
                 self.autopilot, self._loops, motion, self.action_b, gate_w, step, noise
             )
-            good = bool(is_wrench(self.rules, force_b, torque_b)[0])
+            good = bool(is_wrench(self.rules, wrench)[0])
             if good:
-                data.qfrc_applied[:3] = to_world(motion.rot_w, force_b)[0]
-                data.qfrc_applied[3:] = torque_b[0]
+                data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
+                data.qfrc_applied[3:] = wrench.torque_b[0]
                 mujoco.mj_step2(self.model, data)
             self.progress = before._replace(step=step + np.int32(1))
-            if good and not has_diverged(self.rules, *_state(data))[0]:
+            if good and not has_diverged(self.rules, motion_of(data))[0]:
                 mujoco.mj_step1(self.model, data)
                 self._judge(data, bad_wrench=False)
             else:
@@ -126,9 +126,7 @@ class Race:
                 self.progress,
                 self._course,
                 self.autopilot.dt,
-                motion.pos_w,
-                motion.rot_w,
-                motion.vel_w,
+                motion,
                 np.array([data.ncon > 0]),
                 np.array([bad_wrench]),
             )
@@ -150,10 +148,6 @@ class Race:
             "state": np.clip(state, -STATE_LIMIT, STATE_LIMIT).astype(np.float32),
             "image": image.astype(np.float32),
         }
-
-
-def _state(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return data.qpos[None, :3], data.qvel[None, :3], data.qvel[None, 3:]
 
 
 def _distance(a_w: np.ndarray, b_w: np.ndarray) -> float:

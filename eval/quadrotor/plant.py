@@ -169,14 +169,9 @@ def assemble(
     dt: float,
     max_delay: float | None = None,
 ) -> Plant:
-    """Return the plant of a nominal quadrotor with effects; every array may be traced.
+    """Return the plant of a `nominal_quadrotor` with effects; every array may be traced.
 
-    Args:
-        nominal: from `nominal_quadrotor`.
-        constants: the same.
-        values: of effects, as arrays, by name.
-        dt: length of a step [s].
-        max_delay: as `make_plant` has it.
+    The arguments are those of `make_plant`; `values` are arrays.
     """
     for name, value in in_order(values):
         change = EFFECTS[name].constants

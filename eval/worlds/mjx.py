@@ -24,7 +24,7 @@ from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows, View
-from eval.worlds.collision import NEAR, TOUCH_M, gaps
+from eval.worlds.collision import CONTACT_M, NEAR, box_distances
 from eval.worlds.engine import start_state
 from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
 from eval.worlds.trial import (
@@ -161,14 +161,14 @@ class MjxWorld:
         self, state: Flying, which: Array, bad: Array, course: Course, near: Scene
     ) -> Flying:
         """Judge the current states of the slots in `which`; lost ones come back at rest."""
-        pos_w, rot_w, vel_w, rate_b = _motion(state.qpos, state.qvel)
-        diverged = bad | has_diverged(self._rules, pos_w, vel_w, rate_b)
-        gap = gaps(near, pos_w, rot_w, self._half_size, self._middle_b)
-        contact = (gap <= jnp.where(jnp.arange(gap.shape[1]) < gap.shape[1] - 1, TOUCH_M, 0)).any(
-            -1
-        )
+        motion = _motion(state.qpos, state.qvel)
+        diverged = bad | has_diverged(self._rules, motion)
+        pos_w, rot_w, _, _ = motion
+        distance = box_distances(near, pos_w, rot_w, self._half_size, self._middle_b)
+        is_ground = jnp.arange(distance.shape[1]) == distance.shape[1] - 1
+        contact = (distance <= jnp.where(is_ground, 0, CONTACT_M)).any(-1)
         verdict = judge_state(
-            self._rules, state.progress, course, self.dt, pos_w, rot_w, vel_w, contact, diverged
+            self._rules, state.progress, course, self.dt, motion, contact, diverged
         )
         progress = select(which, verdict, state.progress)
         lost = progress.ended == DIVERGED
@@ -179,7 +179,7 @@ class MjxWorld:
         # Types of their own: one that Python's numbers gave would compile everything twice.
         return jax.tree.map(lambda a: a.astype(a.dtype), judged)
 
-    def touched(self, slot: int) -> str:
+    def collided_with(self, slot: int) -> str:
         """Return the name of the solid that the trial in `slot` collided with."""
         track = self._tracks[slot]
         assert track is not None
@@ -187,8 +187,8 @@ class MjxWorld:
         scene = pad(track.scene._replace(gates=gates), self._layout.solids)
         scene = jax.tree.map(lambda a: jnp.asarray(a[None], jnp.float32), scene)
         pos_w, rot_w, _, _ = _motion(self._state.qpos[slot][None], self._state.qvel[slot][None])
-        gap = np.asarray(_gaps(scene, pos_w, rot_w, self._half_size, self._middle_b))[0]
-        return _solid_names(track, self._layout)[int(gap.argmin())]
+        distance = _box_distances(scene, pos_w, rot_w, self._half_size, self._middle_b)
+        return _solid_names(track, self._layout)[int(np.asarray(distance)[0].argmin())]
 
     def view(self, wanted: np.ndarray) -> View:
         """Return what can be observed now."""
@@ -250,13 +250,13 @@ class MjxWorld:
             flying = (steps > done) & (state.progress.ended == FLYING)
             motion, step = _motion(state.qpos, state.qvel), state.progress.step
             gate_w = next_gate(course, state.progress.gates).center_w
-            loops, (force_b, torque_b) = autopilot_step(
+            loops, wrench = autopilot_step(
                 self._autopilot, state.loops, motion, action_b, gate_w, step, draws
             )
             loops = select(flying, loops, state.loops)
-            bad = ~is_wrench(self._rules, force_b, torque_b)
-            force_w = to_world(motion.rot_w, force_b)
-            applied = jnp.concatenate([force_w, torque_b], axis=-1)
+            bad = ~is_wrench(self._rules, wrench)
+            force_w = to_world(motion.rot_w, wrench.force_b)
+            applied = jnp.concatenate([force_w, wrench.torque_b], axis=-1)
             qpos, qvel = self._integrate(state.qpos, state.qvel, applied)
             go = flying & ~bad
             moved = Flying(
@@ -298,7 +298,7 @@ class MjxWorld:
         )  # fmt: skip
 
 
-_gaps = jax.jit(gaps)
+_box_distances = jax.jit(box_distances)
 
 
 def _motion(qpos: Array, qvel: Array) -> Motion:
@@ -309,7 +309,7 @@ def _motion(qpos: Array, qvel: Array) -> Motion:
 
 
 def _solid_names(track: Track, layout: Layout) -> list[str]:
-    """Return a name for every column of `gaps` on the padded scene."""
+    """Return a name for every column of `box_distances` on the padded scene."""
     names, left = [], list(track.names)
     scene = track.scene
     kinds = (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)

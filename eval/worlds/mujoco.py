@@ -91,7 +91,7 @@ class MujocoWorld:
         # Live views: state in, contacts and orientation of the current state out.
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._applied = self._batch.bind("qfrc_applied")
-        self._touching = self._batch.bind("ncon")
+        self._contacts = self._batch.bind("ncon")
         self._xmat = self._batch.bind("xmat")
         # Rays want the solids' places only, and those do not move: one MjData a slot serves all.
         self._seen = [mujoco.MjData(model)] * self.slots
@@ -137,24 +137,15 @@ class MujocoWorld:
 
     def _judge(self, which: np.ndarray, bad_wrench: np.ndarray) -> None:
         """Judge the current states of the slots in `which`."""
-        pos_w, rot_w, vel_w, rate_b = self._motion()
-        diverged = bad_wrench | has_diverged(self._rules, pos_w, vel_w, rate_b)
-        contact = self._touching > 0
+        motion, contact = self._motion(), self._contacts > 0
+        diverged = bad_wrench | has_diverged(self._rules, motion)
         with np.errstate(invalid="ignore", over="ignore"):  # of rows that have diverged
             judged = judge_state(
-                self._rules,
-                self._progress,
-                self._course,
-                self.dt,
-                pos_w,
-                rot_w,
-                vel_w,
-                contact,
-                diverged,
+                self._rules, self._progress, self._course, self.dt, motion, contact, diverged
             )
         self._progress = select(which, judged, self._progress)
 
-    def touched(self, slot: int) -> str:
+    def collided_with(self, slot: int) -> str:
         """Return the name of the solid that the trial in `slot` collided with."""
         return contact_name(self._models[slot], self._batch.get_data(slot))
 
@@ -197,17 +188,17 @@ class MujocoWorld:
             step, motion = self._progress.step, self._motion()
             gate_w = next_gate(self._course, self._progress.gates).center_w
             speed_before = self._loops.plant.rotor_speed
-            loops, (force_b, torque_b) = autopilot_step(
+            loops, wrench = autopilot_step(
                 self._autopilot, self._loops, motion, action_b, gate_w, step, self._draws(step)
             )
             self._loops = packed(select(flying, loops, self._loops))
             if record:
                 due = flying & (step % self._autopilot.attitude_every == 0)
                 rows += self._rows(due, speed_before)
-            bad = ~is_wrench(self._rules, force_b, torque_b)
+            bad = ~is_wrench(self._rules, wrench)
             go = flying & ~bad
-            self._applied[:, :3] = to_world(motion.rot_w, force_b)
-            self._applied[:, 3:] = torque_b
+            self._applied[:, :3] = to_world(motion.rot_w, wrench.force_b)
+            self._applied[:, 3:] = wrench.torque_b
             self._batch.step(np.flatnonzero(go).astype(np.int32), stage=_TO_CONTACTS)
             self._progress = self._progress._replace(step=step + flying)
             self._judge(flying, bad)

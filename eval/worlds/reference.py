@@ -1,6 +1,6 @@
-"""The world `plain`: one trial as a loop of MuJoCo steps, to be read from top to bottom.
+"""The world `reference`: one trial as a loop of MuJoCo steps, to be read from top to bottom.
 
-It is the reference that the batched worlds are held against, so it shares the vehicle with them
+The batched worlds are held against it, so it shares the vehicle with them
 and nothing else: it keeps its own count of gates and decides on its own when a trial ends.
 """
 
@@ -14,7 +14,7 @@ from eval.judging.sensors import SensorNoise, Sensors
 from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import View
+from eval.worlds import REFERENCE, View
 from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import layout_of, noise_of
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
@@ -143,7 +143,7 @@ def fly_trial(
         *trial,
         policy=policy.name,
         vehicle=vehicle.name,
-        world="plain",
+        world=REFERENCE,
         success=ended_by == "finished",
         gates_passed=passed,
         ended_by=ended_by,

@@ -1,6 +1,6 @@
 """The judge's quadrotor as the trainer's dynamics: one policy period with gradients.
 
-The equations are those of the judge (`eval.quadrotor`: autopilot, plant, rigid body): the
+The equations are those of the judge (`eval.quadrotor`: attitude, stepper, rigid body): the
 action becomes collective thrust and body rates in the attitude loop, again at each of its steps
 with the attitude of that moment; rate loop, mixer, rotors and effects turn those into motion. A
 period holds a whole number of attitude steps and physics steps, so the steps are a little shorter

@@ -10,7 +10,7 @@ import pytest
 from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds.collision import TOUCH_M, gaps
+from eval.worlds.collision import CONTACT_M, box_distances
 from eval.worlds.engine import BODY, compile_model
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import Rules, TrialSpec
@@ -115,10 +115,10 @@ def test_touching_is_what_mujoco_says():
     assert gates is not None
     batch = jax.tree.map(lambda a: np.repeat(a, n, 0), stack([scene], MAX_COUNTS))
     half = np.asarray(VEHICLE.body.half_size, np.float32)
-    found = jax.jit(gaps)(
+    found = jax.jit(box_distances)(
         batch, pos.astype(np.float32), rot.astype(np.float32), half, np.zeros(3, np.float32)
     )
-    found = (np.asarray(found) <= TOUCH_M).any(-1)
+    found = (np.asarray(found) <= CONTACT_M).any(-1)
     assert 0.2 < hits.mean() < 0.8
     assert (hits == found).mean() > 0.98
 

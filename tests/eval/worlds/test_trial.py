@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import eval.worlds.mujoco as mujoco_world
-import eval.worlds.reference as plain_world
+import eval.worlds.reference as reference_world
 from eval.judging.judge import JudgeOptions, fly
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
@@ -15,7 +15,7 @@ from tests.support.courses import straight
 from tests.support.pilots import Pursuit, Steady
 
 VEHICLE = load_vehicle(Path(mujoco_world.__file__).parent.parent / "vehicles" / "reference.toml")
-WORLDS = ["mujoco", "plain"]
+WORLDS = ["mujoco", "reference"]
 RULES = Rules()
 
 
@@ -89,7 +89,7 @@ def test_crossing_outside_the_opening_does_not_count(world):
 @pytest.mark.parametrize("world", WORLDS)
 def test_diverged_ends_that_trial_only(world, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo would leave its log here
-    module = {"mujoco": mujoco_world, "plain": plain_world}[world]
+    module = {"mujoco": mujoco_world, "reference": reference_world}[world]
     original = module.autopilot_step
 
     def broken(autopilot, state, motion, action_b, gate_w, step, noise=None):
@@ -114,7 +114,7 @@ def test_diverged_ends_that_trial_only(world, monkeypatch, tmp_path):
 @pytest.mark.parametrize("world", WORLDS)
 def test_state_beyond_any_flight_is_diverged(world, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    module = {"mujoco": mujoco_world, "plain": plain_world}[world]
+    module = {"mujoco": mujoco_world, "reference": reference_world}[world]
     original = module.autopilot_step
 
     def kicked(autopilot, state, motion, action_b, gate_w, step, noise=None):
