@@ -17,9 +17,8 @@ from tracks.geometry.scene import stack
 VEHICLE = load_vehicle("reference")
 
 
-@pytest.mark.parametrize(
-    ("turn", "expected"), [(0.0, 2.95 - 0.1), (np.pi / 4, 2.95 - 0.15 / 2**0.5)]
-)
+# The box's front face, and its front edge once it is turned by 45 degrees.
+@pytest.mark.parametrize(("turn", "reach"), [(0.0, 0.1), (np.pi / 4, 0.15 / 2**0.5)])
 def test_distance_to_a_wall_and_to_the_ground_by_hand(turn, reach):
     scene = stack([straight(wall_at=3.0).scene], MAX_COUNTS)
     pos_w, rot_w = np.array([[0.0, 0.0, 1.5]]), exp_rot(np.array([[0.0, 0.0, turn]]))

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import eval.worlds.mujoco as mujoco_world
-import eval.worlds.reference as reference_world
 from eval.judging.judge import JudgeOptions, fly
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds import mujoco as mujoco_world
+from eval.worlds import reference as reference_world
 from eval.worlds.trial import Rules, TrialSpec
 from tests.support.courses import straight
 from tests.support.pilots import Pursuit, Steady
