@@ -29,7 +29,7 @@ def test_a_recording_is_what_the_stepper_makes_of_its_commands():
     assert (len(flight.time_s), len(hover.time_s), flight.period) == (750, 500, 5)
     np.testing.assert_allclose(flight.acting.thrust, 1.1 * flight.command.thrust)
     np.testing.assert_array_equal(flight.extra.force_b, np.tile([0.3, 0.0, 0.0], (750, 1)))
-    assert FULL_V > flight.voltage[0] > flight.voltage[-1]
+    assert FULL_V == flight.voltage[0] > flight.voltage[-1]
     plant = make_plant(VEHICLE, flight.dt)
     state = PlantState(flight.rotor_speed, np.zeros((750, 4, 0)), {})
     state, wrench = plant_step(plant, state, flight.motion, Inputs(flight.acting), flight.time_s)
