@@ -19,7 +19,7 @@ from tracks.geometry.scene import Array
 def whole_steps(delay: Array, dt: Any) -> tuple[Array, Array]:
     """Return `delay` (...,) [s] as whole steps of `dt` [s] and the share of a step that is left."""
     steps = delay / dt
-    # 0.03 s are 15 steps of 0.002 s in spite of rounding.
+    # 0.043 s are 43 steps of 0.001 s in spite of rounding.
     whole = steps.__array_namespace__().floor(steps + 1e-9)
     return whole, steps - whole
 

@@ -78,7 +78,6 @@ class MujocoWorld:
         self._noise: list[np.ndarray] | None = None
         if uses_noise(self._autopilot.plant):
             self._noise = [np.zeros((1, 3))] * slots
-        self._contact_names = [""] * slots
 
     @property
     def progress(self) -> Progress:

@@ -36,9 +36,11 @@ def test_a_recording_is_what_the_stepper_makes_of_its_commands():
     np.testing.assert_allclose(state.rotor_speed[:-1], flight.rotor_speed[1:], rtol=1e-12)
     wrench = wrench._replace(force_b=wrench.force_b + flight.extra.force_b)
     np.testing.assert_allclose(wrench.force_b[:-1] / 0.75, flight.acc_b[1:], atol=1e-9)
-    acc_w, _ = accelerations(plant, flight.motion, wrench)
+    acc_w, turn_b = accelerations(plant, flight.motion, wrench)
     moved = np.diff(flight.motion.vel_w, axis=0) / flight.dt
     np.testing.assert_allclose(moved, acc_w[:-1], atol=1e-8)
+    turned = np.diff(flight.motion.rate_b, axis=0) / flight.dt
+    np.testing.assert_allclose(turned, turn_b[:-1], atol=1e-8)
 
 
 def test_a_flight_into_the_ground_fails_with_its_time():
