@@ -141,7 +141,7 @@ def plant_step(
     if inputs.push_b is not None:
         constants, push_b = plant.constants, inputs.push_b
         wrench = Wrench(
-            wrench.force_b + constants.mass[..., None] * push_b[..., :3],
+            wrench.force_b + _mass(plant) * push_b[..., :3],
             wrench.torque_b + constants.inertia * push_b[..., 3:],
         )
     return state._replace(wind=winds), wrench
@@ -190,7 +190,7 @@ def rollout(
             remembered, push_b = feedback.act(remembered, motion, now, index)
             now = now._replace(push_b=push_b)
         state, motion, wrench = step(plant, state, motion, now, start_s + index * plant.dt)
-        acc_b = wrench.force_b / plant.constants.mass[..., None]
+        acc_b = wrench.force_b / _mass(plant)
         return (state, motion, remembered), (motion, state.rotor_speed, acc_b)
 
     begin = (start, motion, None if feedback is None else feedback.start)
@@ -201,6 +201,15 @@ def rollout(
         (motions, speeds),
     )
     return Rollout(motions, speeds, acc_b, last)
+
+
+def _mass(plant: Plant) -> Array:
+    """Return the true mass beside vectors (..., 3); one of a single plant stays a plain number.
+
+    XLA rounds a division by a number otherwise than one by an array of one.
+    """
+    mass = plant.constants.mass
+    return mass[..., None] if mass.ndim else mass
 
 
 def _flow(
