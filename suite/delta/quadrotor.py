@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from eval.quadrotor.plant import Memory, start_memory
+from eval.quadrotor.stepper import PlantState, hover_state
 from policies.networks import delta_network
 from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before, state_after
 from suite.delta.windows import refuse_none, stacked
@@ -146,9 +146,9 @@ def replay_quadrotor(
     """
     plant = plant_of(config, {}, cut.dt, varies=False)
     count = windows.pos_w.shape[0]
-    hover = start_memory(plant, (count,), jnp)
+    hover = hover_state(plant, (count,), jnp)
     speed = jnp.asarray(windows.rotor_speed)
-    memory = Memory(
+    state = PlantState(
         jnp.where(jnp.isfinite(speed), speed, hover.rotor_speed),
         jnp.swapaxes(jnp.asarray(windows.past), 1, 2),
         hover.wind,
@@ -161,7 +161,7 @@ def replay_quadrotor(
         rot_w=jnp.asarray(windows.rot_w),
         rate_b=jnp.asarray(windows.rate_b),
         heading_w=zero.at[:, 0].set(1.0),
-        memory=memory,
+        plant=state,
         time_s=jnp.asarray(windows.start_s),
     )
 

@@ -15,10 +15,11 @@ from jaxtyping import Float, Shaped, jaxtyped
 
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
 from eval.quadrotor.mixer import mix
-from eval.quadrotor.plant import Motion, Wrench, make_plant, plant_step, start_memory
+from eval.quadrotor.plant import Motion, Wrench, make_plant
 from eval.quadrotor.rate_loop import rate_torque
 from eval.quadrotor.rigid_body import accelerations, euler_step
 from eval.quadrotor.rotors import follow, speed_command
+from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.observation import encode_depth, state_vector
 from policies.spec import DepthEncoding
@@ -37,12 +38,10 @@ def commanded(force_w, rot_w, heading_w):
 
 def flown(pos_w, rot_w, vel_w, rate_b, thrust, rate_cmd_b):
     xp = pos_w.__array_namespace__()
-    memory = start_memory(PLANT, thrust.shape, xp)
+    state, now = hover_state(PLANT, thrust.shape, xp), Motion(pos_w, rot_w, vel_w, rate_b)
     command = commanded(vel_w, rot_w, vel_w)._replace(thrust=thrust, rate_b=rate_cmd_b)
-    memory, wrench = plant_step(
-        PLANT, memory, Motion(pos_w, rot_w, vel_w, rate_b), command, 0 * thrust
-    )
-    return memory.rotor_speed, *wrench
+    state, wrench = plant_step(PLANT, state, now, Inputs(command), 0 * thrust)
+    return state.rotor_speed, *wrench
 
 
 def moved(pos_w, rot_w, vel_w, rate_b, force_b, torque_b):
