@@ -17,7 +17,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from eval.view.blueprint import TIMELINE, tabbed
+from eval.view.blueprint import tabbed
 from eval.view.recording import APPLICATION, DRONE_HALF_SIZE, time_columns
 from tracks.common.files import replacing_file
 from tracks.common.provenance import stamp
