@@ -36,7 +36,8 @@ def tabbed(parts: Sequence[rrb.Container], shown_s: tuple[float, float]) -> rrb.
     The viewer has no setting for where the time stands, but a loop over a selection begins at the
     selection's first moment. A file without it opens at its last moment, when all is over.
     """
-    begin, end = (round(1e9 * time) for time in shown_s)
+    # Short of the last moment, where a viewer that is still loading would stop.
+    begin, end = (round(1e9 * time) for time in (shown_s[0], shown_s[1] - 0.05))
     return rrb.Blueprint(
         parts[0] if len(parts) == 1 else rrb.Tabs(*parts, active_tab=0),
         rrb.TimePanel(
