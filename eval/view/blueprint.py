@@ -31,13 +31,13 @@ def layout(tabs: Sequence[Tab], shown_s: tuple[float, float]) -> rrb.Blueprint:
 
 
 def tabbed(parts: Sequence[rrb.Container], shown_s: tuple[float, float]) -> rrb.Blueprint:
-    """Return a blueprint with one tab for each of `parts`, first and last second of its loop [s].
+    """Return a blueprint with a tab for each of `parts`, which plays from `shown_s[0]` to `[1]` [s].
 
     The viewer has no setting for where the time stands, but a loop over a selection begins at the
-    selection's first moment. A file without it opens at its last moment, when all is over.
+    selection's first moment. A file without it opens at its last moment, when all is over. (A
+    viewer that is slow to load plays from the start to the end and stops there: 0.41.)
     """
-    # Short of the last moment, where a viewer that is still loading would stop.
-    begin, end = (round(1e9 * time) for time in (shown_s[0], shown_s[1] - 0.05))
+    begin, end = (round(1e9 * time) for time in shown_s)
     return rrb.Blueprint(
         parts[0] if len(parts) == 1 else rrb.Tabs(*parts, active_tab=0),
         rrb.TimePanel(

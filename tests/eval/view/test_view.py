@@ -319,6 +319,7 @@ def test_the_video_shows_drone_depth_and_gates():
     assert greens[0] == 0 < max(greens[2:])
     # Beside it, in the right third and at its middle: what it saw, pixel for pixel.
     seen = np.asarray(frames[0])[75:195, 320:480]
+    assert flight.depth_m is not None
     want = colours.depth_colours(flight.depth_m[0], DEPTH_RANGE_M)
     np.testing.assert_array_equal(seen[2::5, 2::5], want)
     without = next(video_frames(*rollout("finished", None, False), VideoOptions((480, 270), 5)))
