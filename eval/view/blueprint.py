@@ -31,7 +31,7 @@ def layout(tabs: Sequence[Tab], shown_s: tuple[float, float]) -> rrb.Blueprint:
 
 
 def tabbed(parts: Sequence[rrb.Container], shown_s: tuple[float, float]) -> rrb.Blueprint:
-    """Return a blueprint with a tab for each of `parts`, which plays from `shown_s[0]` to `[1]` [s].
+    """Return a blueprint with a tab for each of `parts`, which plays between two times [s].
 
     The viewer has no setting for where the time stands, but a loop over a selection begins at the
     selection's first moment. A file without it opens at its last moment, when all is over. (A
