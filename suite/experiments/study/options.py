@@ -1,30 +1,29 @@
-"""The recipe and the training seeds that an experiment's options ask for."""
+"""What options of experiments have in common: what is allowed, and the recipe they ask for."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Any
 
-from suite.common.choices import at_least
-
-if TYPE_CHECKING:
-    from suite.train.config import TrainConfig
-
-
-class Keyed(Protocol):
-    """A row of an experiment."""
-
-    @property
-    def key(self) -> str:
-        """Its name."""
-        ...
-
-
-Row = TypeVar("Row", bound=Keyed)
+from suite.common.choices import at_least, parse_levels
+from suite.common.side_by_side import check_jobs
+from suite.train.config import TrainConfig
 
 GATES = 4
 """Of the paper's tracks in its ablation and its comparison of schemes."""
+LEAST = {
+    "trials": 1,
+    "seed": 0,
+    "iterations": 1,
+    "worlds": 1,
+    "seconds": 0.5,
+    "measurements": 1,
+    "round_trials": 1,
+    "round_seconds": 0.5,
+    "delta_iterations": 0,
+}
+"""The smallest value of options by their fields' names."""
 
 
 @dataclass(frozen=True)
@@ -49,41 +48,33 @@ class FourGates:
     """Of the unseen worlds; none of the training seeds."""
 
 
-def asked_recipe(name: str, changes: Sequence[str], iterations: int | None) -> TrainConfig:
-    """Return the preset `name` with `changes` and, unless None, its own number of gradient steps.
-
-    Raises:
-        ValueError: for a preset, a change or a number that cannot be used.
-    """
-    from suite.train.overrides import override
-    from suite.train.presets import preset, with_iterations
-
-    recipe = override(preset(name), changes)
-    if iterations is None:
-        return recipe
-    at_least("--iterations", iterations, 1)
-    return with_iterations(recipe, iterations)
-
-
-def check_seeds(seeds: Sequence[int]) -> None:
-    """Refuse training seeds that cannot be used.
+def check(config: Any) -> None:
+    """Refuse numbers of an experiment's options that cannot be used, by their fields' names.
 
     Raises:
         ValueError: naming the option and what is allowed.
     """
+    given = vars(config)
+    seeds = given.get("training_seeds", (0,))
     if len(set(seeds)) < len(seeds) or not seeds:
         said = " ".join(map(str, seeds)) or "empty"
         raise ValueError(f"--training-seeds is {said}; give each once")
     for seed in seeds:
         at_least("--training-seeds", seed, 0)
+    for field, least in LEAST.items():
+        if given.get(field) is not None:
+            at_least(f"--{field.replace('_', '-')}", given[field], least)
+    if isinstance(config, FourGates):
+        _check_unseen("--seed", config.seed, seeds)
+    if "round_seed" in given:
+        _check_unseen("--round-seed", given["round_seed"], seeds)
+    if "jobs" in given:
+        check_jobs(given["jobs"])
+    if "difficulty" in given:
+        parse_levels(given["difficulty"])
 
 
-def check_unseen(option: str, seed: int, training_seeds: Sequence[int]) -> None:
-    """Refuse a seed of worlds that a training has seen.
-
-    Raises:
-        ValueError: naming the option and what is allowed.
-    """
+def _check_unseen(option: str, seed: int, training_seeds: Sequence[int]) -> None:
     at_least(option, seed, 0)
     if seed in training_seeds:
         raise ValueError(
@@ -92,26 +83,11 @@ def check_unseen(option: str, seed: int, training_seeds: Sequence[int]) -> None:
         )
 
 
-def asked_rows(rows: Sequence[Row], only: Sequence[str], what: str) -> list[Row]:
-    """Return the rows whose keys are in `only`, all where it is empty.
-
-    Raises:
-        ValueError: for a key that no row has; `what` says what a row is.
-    """
-    from tracks.common.names import unknown_name
-
-    names = [row.key for row in rows]
-    for name in only:
-        if name not in names:
-            raise unknown_name(what, name, names)
-    return [row for row in rows if not only or row.key in only]
-
-
 def check_owned(changes: Sequence[str], owned: Mapping[str, str]) -> None:
-    """Refuse changes of settings that an experiment sets itself and would overwrite.
+    """Refuse changes, as --set takes them, of settings that an experiment sets itself.
 
     Args:
-        changes: as --set takes them.
+        changes: SETTING=VALUE each.
         owned: what to do instead, by a setting's path.
 
     Raises:
@@ -123,6 +99,19 @@ def check_owned(changes: Sequence[str], owned: Mapping[str, str]) -> None:
             raise ValueError(f"--set {change!r}: this experiment sets {path}; {owned[path]}")
 
 
+def asked_recipe(config: Any) -> TrainConfig:
+    """Return --preset with --set and, unless it is None, --iterations.
+
+    Raises:
+        ValueError: for a preset or a change that does not exist.
+    """
+    from suite.train.overrides import override
+    from suite.train.presets import preset, with_iterations
+
+    recipe = override(preset(config.preset), config.set)
+    return recipe if config.iterations is None else with_iterations(recipe, config.iterations)
+
+
 def four_gate_recipe(config: FourGates) -> TrainConfig:
     """Return the recipe that `config` asks for on tracks of four gates.
 
@@ -131,19 +120,15 @@ def four_gate_recipe(config: FourGates) -> TrainConfig:
     """
     owned = {"episode.batch": "give --worlds", "optimizer.iterations": "give --iterations"}
     check_owned(config.set, {**owned, "episode.gates": f"all fly {GATES}, as in the paper"})
-    base = asked_recipe(config.preset, config.set, config.iterations)
+    base = asked_recipe(config)
     return replace(base, episode=replace(base.episode, gates=GATES, batch=config.worlds))
 
 
-def check_sizes(config: FourGates) -> None:
-    """Refuse numbers that cannot be used.
+def recipe_words(config: Any) -> str:
+    """Return --preset and --set as they were asked for."""
+    return " ".join([config.preset, *config.set])
 
-    Raises:
-        ValueError: naming the option and what is allowed.
-    """
-    check_seeds(config.training_seeds)
-    check_unseen("--seed", config.seed, config.training_seeds)
-    at_least("--trials", config.trials, 1)
-    at_least("--seconds", config.seconds, 0.5)
-    at_least("--iterations", config.iterations, 1)
-    at_least("--worlds", config.worlds, 1)
+
+def judged_seeds(config: Any) -> str:
+    """Return the first and the last seed of the judged trials."""
+    return f"{config.seed} to {config.seed + config.trials - 1}"

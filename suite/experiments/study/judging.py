@@ -6,30 +6,36 @@ cache, and each trial goes there as it ends; documents that share flights share 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from eval.judging.judge import JudgeOptions, fly
 from eval.judging.results import Journal
 from eval.judging.sensors import SensorNoise
 from eval.judging.sharding import fly_in_processes, usable_cores
+from eval.judging.tables import Cell, summarise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy, load_policy
+from suite.common.choices import parse_levels
 from suite.common.console import Console
 from suite.common.estimate import Estimate, announce
-from suite.experiments.cache import code_digest, digest, engines
+from suite.experiments.study.cache import code_digest, digest, engines
 from suite.judging.flying import (
     PROCESS_BYTES,
     SECONDS_A_TRIAL,
     START_SECONDS,
     TRIALS_A_PROCESS,
     policy_digest,
+    trial_list,
 )
+from tracks.families import JUDGED
+
+Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -53,13 +59,9 @@ class Order:
 
 
 def flown(
-    orders: Sequence[Order],
-    cache: Path,
-    console: Console,
-    what: str,
-    processes: int | None = None,
-) -> list[list[TrialResult]]:
-    """Return the results of every order, in its order; those not in `cache` are flown first.
+    orders: Mapping[Key, Order], cache: Path, console: Console, what: str
+) -> dict[Key, list[TrialResult]]:
+    """Return the results of every order; those not in `cache` are flown first.
 
     An interrupt keeps what was flown.
 
@@ -68,49 +70,64 @@ def flown(
         cache: folder of the journals.
         console: where progress goes.
         what: a few words on what is flown.
-        processes: that share the flights; None takes what is worth it.
 
     Raises:
         ValueError: for a policy that cannot be loaded, before the first flight.
     """
-    about = [_about(order.flier) for order in orders]
-    keys = [digest(entry) for entry in about]
-    by_key: dict[str, list[Order]] = {}
-    for key, order in zip(keys, orders, strict=True):
-        by_key.setdefault(key, []).append(order)
-    fliers = [same[0].flier for same in by_key.values()]
+    about = {key: _about(order.flier) for key, order in orders.items()}
+    names = {key: digest(entry) for key, entry in about.items()}
+    fliers = {names[key]: order.flier for key, order in orders.items()}
+    wanted: dict[str, dict[TrialSpec, None]] = {name: {} for name in fliers}
+    for key, order in orders.items():
+        wanted[names[key]].update(dict.fromkeys(order.trials))
     with ExitStack() as stack:
         journals = {
-            key: stack.enter_context(Journal(cache / "trials" / f"{key}.jsonl", entry))
-            for key, entry in dict(zip(keys, about, strict=True)).items()
+            name: stack.enter_context(Journal(cache / "trials" / f"{name}.jsonl", entry))
+            for name, entry in {names[key]: entry for key, entry in about.items()}.items()
         }
-        wanted = [
-            list(dict.fromkeys(chain(*(order.trials for order in same))))
-            for same in by_key.values()
-        ]
-        open_journals = list(journals.values())
-        missing = [j.missing(trials) for j, trials in zip(open_journals, wanted, strict=True)]
-        left, total = sum(map(len, missing)), sum(map(len, wanted))
+        missing = [journals[name].missing(list(trials)) for name, trials in wanted.items()]
+        left, total = sum(map(len, missing)), sum(map(len, wanted.values()))
         if left < total:
             console.note(f"{what}: {total - left} of {total} trials were flown before")
         if left:
-            processes = processes or min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
+            processes = min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
             seconds = START_SECONDS + left * SECONDS_A_TRIAL / processes
             announce(
                 console, f"{what}: {left} trials", Estimate(seconds, processes * PROCESS_BYTES)
             )
-            numbers = count(total - left + 1)
+            numbers, open_journals = count(total - left + 1), list(journals.values())
             with console.progress(what, total) as update:
 
                 def keep(number: int, result: TrialResult) -> None:
                     open_journals[number].append(result)
                     update(next(numbers))
 
-                _fly(fliers, _shares(missing, processes), processes, keep)
-    return [
-        [journals[key].done[trial] for trial in order.trials]
-        for key, order in zip(keys, orders, strict=True)
-    ]
+                work = list(fliers.values()), _shares(missing, processes)
+                if processes > 1:
+                    fly_in_processes(_fly_shares, *work, processes, keep)
+                else:
+                    _fly_shares(*work, keep)
+    return {
+        key: [journals[names[key]].done[trial] for trial in order.trials]
+        for key, order in orders.items()
+    }
+
+
+def judged_cells(
+    orders: Mapping[str, Order], cache: Path, console: Console, what: str
+) -> tuple[dict[str, list[TrialResult]], dict[str, list[Cell]]]:
+    """Return results and their cells, as `flown` does, by what tables call the policies."""
+    results = flown(orders, cache, console, what)
+    return results, {
+        name: summarise([row._replace(policy=name) for row in rows])["cells"]
+        for name, rows in results.items()
+    }
+
+
+def trials_of(config: Any, levels: Sequence[int] | None = None) -> list[TrialSpec]:
+    """Return an experiment's judged trials, at `levels` or those of its --difficulty."""
+    levels = parse_levels(config.difficulty) if levels is None else levels
+    return trial_list(JUDGED, levels, config.trials, config.seed)
 
 
 def _about(flier: Flier) -> dict[str, Any]:
@@ -135,18 +152,6 @@ def _shares(missing: Sequence[list[TrialSpec]], processes: int) -> list[Share]:
         pieces = max(1, min(processes, len(trials) // TRIALS_A_PROCESS))
         shares += [(number, trials[k::pieces]) for k in range(pieces) if trials]
     return shares
-
-
-def _fly(
-    fliers: list[Flier],
-    shares: list[Share],
-    processes: int,
-    keep: Callable[[int, TrialResult], None],
-) -> None:
-    if processes > 1:
-        fly_in_processes(_fly_shares, fliers, shares, processes, keep)
-    else:
-        _fly_shares(fliers, shares, keep)
 
 
 def _fly_shares(

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from eval.judging.tables import Cell
-from suite.experiments.paper import sim_to_sim
+from eval.judging.tables import Cell, percent
+from suite.common.report import Grid
+from suite.experiments.pages.paper import sim_to_sim
+from suite.experiments.pages.tables import table
 
 SURE = 0.90
 """Where others won all of their few trials, our Wilson interval must reach down to this."""
@@ -46,20 +48,11 @@ def goals(cells: Sequence[Cell]) -> list[Goal]:
             continue
         rate = max(other.won / other.trials for other in others)
         v_max = max(other.v_max for other in others)
-        reached = SURE - cell.success.low if rate == 1 else rate - cell.success.value
+        missed = SURE - cell.success.low if rate == 1 else rate - cell.success.value
         floor = FLOORS[cell.difficulty]
-        found.append(
-            Goal(
-                cell.track,
-                cell.difficulty,
-                rate,
-                max(0.0, reached),
-                floor,
-                max(0.0, floor - cell.success.value),
-                v_max,
-                max(0.0, v_max - cell.v_max.value),
-            )
-        )
+        of_floor, of_speed = floor - cell.success.value, v_max - cell.v_max.value
+        rates = rate, max(0.0, missed), floor, max(0.0, of_floor)
+        found.append(Goal(cell.track, cell.difficulty, *rates, v_max, max(0.0, of_speed)))
     return found
 
 
@@ -85,3 +78,35 @@ def verdict(found: Sequence[Goal]) -> str:
             f"by {slowest.v_max_miss:.1f} m/s."
         )
     return text.rstrip(";") + ("" if text.endswith(".") else ".")
+
+
+def goal_grid(cells: Sequence[Cell]) -> Grid:
+    """Return by how much each cell of one policy misses what is asked of it."""
+    by_key = {(cell.track, cell.difficulty): cell for cell in cells}
+    headers = ["track", "level", "success", "best of the others", "missed by", "floor",
+               "missed by", "v_max [m/s]", "largest of the others", "missed by"]  # fmt: skip
+    lines = [
+        (
+            goal.track,
+            str(goal.level),
+            percent(by_key[goal.track, goal.level].success),
+            f"{100 * goal.success:.0f} %",
+            _missed(100 * goal.success_miss, "points"),
+            f"{100 * goal.floor:.0f} %",
+            _missed(100 * goal.floor_miss, "points"),
+            f"{by_key[goal.track, goal.level].v_max.value:.2f}",
+            f"{goal.v_max:.1f}",
+            _missed(goal.v_max_miss, "m/s"),
+        )
+        for goal in goals(cells)
+    ]
+    note = (
+        "Asked of success: the better of the paper's and the baseline's rate; where that is 10 of "
+        f"10, a Wilson interval from {100 * SURE:.0f} % up. The floor is what the shipped policy "
+        "is to reach. Asked of v_max: the largest of the printed ones."
+    )
+    return table(headers, lines, note=note)
+
+
+def _missed(by: float, unit: str) -> str:
+    return f"{by:.1f} {unit}" if by else "met"

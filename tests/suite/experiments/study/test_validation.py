@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.experiments.validation import (
+from suite.experiments.study.validation import (
     make_flight,
     make_validation,
     measured,

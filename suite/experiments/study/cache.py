@@ -10,7 +10,7 @@ from typing import Any
 from suite.common.provenance import machine, package_versions
 from tracks.common.files import to_json
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 NO_RESULT = ("view", "importers", "envs")
 """Folders whose code changes no flight."""
 

@@ -32,9 +32,9 @@ class Place:
 def write_document(
     place: Place,
     name: str,
+    config: Any,
     report: Report,
     numbers: Mapping[str, Any],
-    seed: int | None,
     console: Console,
 ) -> dict[str, Any]:
     """Write `name`.md, its figures `name`.png, `name`-2.png, ... and `name`.json to `place.out`.
@@ -44,9 +44,9 @@ def write_document(
     Args:
         place: where.
         name: of the page.
+        config: what was asked; its `seed` is what every seed was made from, or the first one.
         report: what the page says; its facts come first, then command, commit and machine.
-        numbers: what `name`.json holds besides the stamp.
-        seed: what every seed was made from, or the first one.
+        numbers: what `name`.json holds besides the stamp and `config`.
         console: told what was written.
 
     Returns:
@@ -55,7 +55,7 @@ def write_document(
     Raises:
         OSError: where a file cannot be written.
     """
-    header = stamp(SCHEMA, seed)
+    header = stamp(SCHEMA, config.seed)
     facts = {**report.facts, **_provenance(header)}
     figures: list[str] = []
 
@@ -79,7 +79,7 @@ def write_document(
     for section in report.sections:
         blocks += [f"## {section.title}", *map(part, section.parts)]
     blocks.append("<!-- " + "; ".join(f"{key}: {value}" for key, value in header.items()) + " -->")
-    answer = {**header, "made_by": facts, **numbers}
+    answer = {**header, "made_by": facts, "config": config, **numbers}
     write_json(place.out / f"{name}.json", answer)
     page = place.out / f"{name}.md"
     write_text(page, "\n\n".join(blocks) + "\n")
