@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from eval.effects.interface import Sample
+from eval.effects.log_faults import lateness, measured, restored
 from eval.quadrotor.plant import Command, Memory, Motion, Plant, Wrench, spin_step, wanted_speed
 from eval.quadrotor.rigid_body import euler_step
 from eval.quadrotor.rotors import follow, steady
@@ -65,30 +67,29 @@ def fly_windows(
         feedback: the same from the simulated state, in place of `push`.
     """
     dt = float(plant.dt)
-    gyro = values["gyro_bias"].bias
     before, warm = round(HISTORY_S / dt) + 1, round(WARM_S / dt)
     steps = windows.command.shape[1] - before - warm
     command = _late(windows.command, plant.constants.delay, dt, before)
+    start = restored(values, _sample(windows.rate_b, windows.pos_w, windows.rot_w, windows.vel_w))
     motion = Motion(
-        windows.pos_w + offset[:, :3],
-        jnp.matmul(windows.rot_w, exp_rot(offset[:, 3:6])),
-        windows.vel_w + offset[:, 6:9],
-        windows.rate_b - gyro + offset[:, 9:STATE],
+        start.pos_w + offset[:, :3],
+        jnp.matmul(start.rot_w, exp_rot(offset[:, 3:6])),
+        start.vel_w + offset[:, 6:9],
+        start.rate_b + offset[:, 9:STATE],
     )
+    # Before the start only rates are known.
+    warm_rate_b = restored(values, _sample(jnp.swapaxes(windows.warm_rate_b, 0, 1))).rate_b
 
     def ask(order: Any, rate_b: Any) -> Any:
         return wanted_speed(plant, Command(order[:, 0], order[:, 1:]), rate_b)
 
     def warm_up(speed: Any, inputs: Any) -> Any:
         order, rate_b = inputs
-        wanted = ask(order, rate_b - gyro)
+        wanted = ask(order, rate_b)
         return follow(speed, wanted, plant.constants.time_constant, plant.dt).end, None
 
     order = jnp.swapaxes(command, 0, 1)
-    warm_rate_b = jnp.swapaxes(jnp.asarray(windows.warm_rate_b), 0, 1)
-    speed, _ = jax.lax.scan(
-        warm_up, ask(order[0], warm_rate_b[0] - gyro), (order[:warm], warm_rate_b)
-    )
+    speed, _ = jax.lax.scan(warm_up, ask(order[0], warm_rate_b[0]), (order[:warm], warm_rate_b))
 
     def step(carry: Any, inputs: Any) -> Any:
         speed, motion, remembered = carry
@@ -140,12 +141,11 @@ def difference(plant: Plant, values: Mapping[str, Any], flown: Flown, windows: W
     """Return simulated - measured (B, N, 19) of `flown`, zero where nothing was measured."""
     dt, (track, speeds, forces) = float(plant.dt), flown
     steps = speeds.shape[1] - 1
-    gyro, accelerometer = values["gyro_bias"].bias, values["accelerometer_bias"].bias
-    pose = _at(windows.row_s - values["clock_offset"].offset, dt, steps)
+    pose = _at(windows.row_s - lateness(values), dt, steps)
     now = _at(windows.row_s, dt, steps)
-    pos_w, rot_w, vel_w = _pose(track, pose, dt)
-    rate_b = _pick(track.rate_b, now, dt)
-    turn = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), rot_w)
+    rate_b, force_b = _pick(track.rate_b, now, dt), _pick(forces, now, dt)
+    seen = measured(values, Sample(*_pose(track, pose, dt), rate_b, force_b))
+    turn = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), seen.rot_w)
     attitude = 0.5 * jnp.stack(
         [
             turn[..., 2, 1] - turn[..., 1, 2],
@@ -155,16 +155,25 @@ def difference(plant: Plant, values: Mapping[str, Any], flown: Flown, windows: W
         axis=-1,
     )
     parts = [
-        pos_w - windows.row_pos_w,
+        seen.pos_w - windows.row_pos_w,
         attitude,
-        vel_w - windows.row_vel_w,
-        rate_b + gyro - windows.row_rate_b,
-        _pick(forces, now, dt) + accelerometer - windows.row_acc_b,
+        seen.vel_w - windows.row_vel_w,
+        seen.rate_b - windows.row_rate_b,
+        seen.acc_b - windows.row_acc_b,
         _pick(speeds, now, dt) - windows.row_rotor_speed,
     ]
     apart = jnp.concatenate(parts, axis=-1)
     assert apart.shape[-1] == CHANNELS
     return jnp.where(windows.seen, apart, 0.0)
+
+
+def _sample(rate_b: Any, pos_w: Any = None, rot_w: Any = None, vel_w: Any = None) -> Sample:
+    """Return a sample (..., 3) without an accelerometer, and at rest where no pose is given."""
+    rate_b = jnp.asarray(rate_b)
+    still = jnp.zeros_like(rate_b)
+    if pos_w is None:
+        pos_w, rot_w, vel_w = still, jnp.broadcast_to(jnp.eye(3), (*still.shape, 3)), still
+    return Sample(pos_w, rot_w, vel_w, rate_b, still)
 
 
 def _hats(steps: int) -> np.ndarray:

@@ -191,7 +191,7 @@ def slopes():
 
 
 # Faults of a log do not act on the flight, a neutral gust's length and a rotor's radius neither.
-IN_FLIGHT = [name for name, effect in EFFECTS.items() if effect.log is None]
+IN_FLIGHT = [name for name, effect in EFFECTS.items() if effect.in_flight]
 
 
 @pytest.mark.parametrize("name", IN_FLIGHT)
