@@ -236,7 +236,7 @@ def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
         entry = SEPARATIONS[case.separation]
         added = entry.separating if case.kind == "separated" else ()
         return [*entry.blurred, *entry.blurred, *added]
-    if any(EFFECTS[name].slow for name in case.hidden):
+    if case.kind != "outside" and any(EFFECTS[name].slow for name in case.hidden):
         return long_flights(rng)
     return ordinary_flights(rng)
 
