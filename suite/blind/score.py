@@ -237,19 +237,15 @@ def _covered(truth: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[boo
         values = value if isinstance(value, list) else [value]
         intervals = interval if isinstance(value, list) else [interval]
         if "index" in found:
-            values, intervals = _at_index(found["index"]["value"], values, interval)
+            # Components (from 1) that are given alone, such as one weak rotor.
+            index = found["index"]["value"]
+            index, intervals = (
+                (index, interval) if isinstance(index, list) else ([index], [interval])
+            )
+            values = [values[int(number) - 1] for number in index]
         for one, span in zip(values, intervals, strict=False):
             if one is not None and span is not None and None not in span:
                 yield bool(span[0] <= one <= span[1])
-
-
-def _at_index(
-    index: int | list[int], values: Sequence[Any], interval: Any
-) -> tuple[list[Any], list[Any]]:
-    """Return true values and intervals of the components (from 1) that a diagnosis gives alone."""
-    lone = not isinstance(index, list)
-    which, spans = ([index], [interval]) if lone else (index, interval)
-    return [values[int(number) - 1] for number in which], spans
 
 
 def _as_hoped(v: Verdict) -> bool:
