@@ -1,4 +1,4 @@
-"""Staircase: eight gates in a line, each higher than the one before."""
+"""An effect, a track family, a log format and a world that a package adds to the suite."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ FIN_DRAG = Effect(
 
 
 def staircase(d: float, rng: np.random.Generator) -> Layout:
-    """Return a flight of stairs of difficulty `d` along world x."""
+    """Staircase: eight gates in a line along world x, each higher than the one before."""
     step = np.arange(GATE_COUNT)
     center_w = np.stack([5.0 * step, 0.0 * step, 0.8 + (0.05 + 0.12 * d) * step], axis=-1)
     gates = noisy_gates(rng, d, center_w, np.zeros(GATE_COUNT))

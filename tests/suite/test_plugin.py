@@ -72,7 +72,7 @@ def test_all_four_are_used_by_commands(installed, tmp_path, root):
     )
     assert list(effects["effects"])[-1] == "fin_drag"
     assert tracks["families"]["staircase"] == {
-        "about": "Staircase: eight gates in a line, each higher than the one before.",
+        "about": "Staircase: eight gates in a line along world x, each higher than the one before.",
         "judged": False,
     }
     assert drawn["tracks"][0]["gates"] == 8
