@@ -33,8 +33,8 @@ from suite.blind.oracle.stretches import (
     LONG_S,
     cut,
     replay,
+    stretch_plant,
     whitened,
-    window_plant,
     without_start,
 )
 from suite.blind.outside import KINDS, make_outside
@@ -218,12 +218,12 @@ def _outside(
 
 def unnameable(nominal: Vehicle, flights: Sequence[Recording], sensors: Sensors) -> float:
     """Return the log-likelihood ratio that the whole catalogue, fitted together, leaves over."""
-    windows = cut(flights)
-    basis, base = start_of(nominal, windows, sensors)
-    plant = window_plant(nominal)
-    with_it = replay(windows, plant, outside=True, has_voltage=bool(sensors.voltage))
+    stretches = cut(flights)
+    basis, base = start_of(nominal, stretches, sensors)
+    plant = stretch_plant(nominal)
+    with_it = replay(stretches, plant, outside=True, has_voltage=bool(sensors.voltage))
     seen = without_start(basis, whitened(sensors, with_it, base)).ravel()
-    _, columns = signatures(nominal, windows, sensors)
+    _, columns = signatures(nominal, stretches, sensors)
     flat = columns.reshape(len(columns), -1).T
     size = np.linalg.norm(flat, axis=0)
     flat = flat[:, size > 0.0] / size[size > 0.0]

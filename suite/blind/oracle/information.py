@@ -22,11 +22,11 @@ from eval.vehicles.vehicle import Vehicle
 from suite.blind.oracle.stretches import (
     DELAY_STEP_S,
     Channels,
-    Windows,
+    Stretches,
     replay,
     state_columns,
+    stretch_plant,
     whitened,
-    window_plant,
     without_start,
 )
 from suite.blind.sensors import Sensors
@@ -98,21 +98,21 @@ def columns_of(has_voltage: bool, names: Sequence[str] | None = None) -> tuple[C
 
 
 def information(
-    nominal: Vehicle, windows: Windows, sensors: Sensors, names: Sequence[str] | None = None
+    nominal: Vehicle, stretches: Stretches, sensors: Sensors, names: Sequence[str] | None = None
 ) -> Information:
-    """Return what `windows` say about effects (all, or `names`), from the `nominal` vehicle on."""
-    columns, moved = signatures(nominal, windows, sensors, names)
+    """Return what stretches say about effects (all, or `names`), from the `nominal` vehicle on."""
+    columns, moved = signatures(nominal, stretches, sensors, names)
     flat = moved.reshape(len(columns), -1)
     return Information(columns, flat @ flat.T)
 
 
 def signatures(
-    nominal: Vehicle, windows: Windows, sensors: Sensors, names: Sequence[str] | None = None
+    nominal: Vehicle, stretches: Stretches, sensors: Sensors, names: Sequence[str] | None = None
 ) -> tuple[tuple[Column, ...], np.ndarray]:
     """Return the columns and (P, W, D) what a unit of each does to the logged channels."""
     has_voltage = bool(sensors.voltage)
     columns = columns_of(has_voltage, names)
-    basis, base = start_of(nominal, windows, sensors)
+    basis, base = start_of(nominal, stretches, sensors)
     moved = {}
     flown = [c for c in columns if EFFECTS[c.effect].in_flight]
     if flown:
@@ -120,9 +120,9 @@ def signatures(
         steps = np.array(
             [DELAY_STEP_S if c.spec.unit == "s" else 0.1 * c.spec.typical[0] for c in flown]
         )
-        plant = window_plant(nominal, _changed(nominal, flown, steps))
-        motion = Motion(*(np.broadcast_to(f, (len(flown), *f.shape)) for f in windows.motion))
-        apart = whitened(sensors, replay(windows, plant, motion, has_voltage=has_voltage), base)
+        plant = stretch_plant(nominal, _changed(nominal, flown, steps))
+        motion = Motion(*(np.broadcast_to(f, (len(flown), *f.shape)) for f in stretches.motion))
+        apart = whitened(sensors, replay(stretches, plant, motion, has_voltage=has_voltage), base)
         moved = dict(zip(flown, apart / steps[:, None, None], strict=True))
     for column in columns:
         if column not in moved:
@@ -130,16 +130,18 @@ def signatures(
     return columns, without_start(basis, np.stack([moved[column] for column in columns]))
 
 
-def start_of(nominal: Vehicle, windows: Windows, sensors: Sensors) -> tuple[np.ndarray, Channels]:
+def start_of(
+    nominal: Vehicle, stretches: Stretches, sensors: Sensors
+) -> tuple[np.ndarray, Channels]:
     """Return the basis of what an unknown start explains, and the stretches of `nominal`."""
-    plant = window_plant(nominal)
-    base = replay(windows, plant, has_voltage=bool(sensors.voltage))
-    return state_columns(windows, plant, sensors, base), base
+    plant = stretch_plant(nominal)
+    base = replay(stretches, plant, has_voltage=bool(sensors.voltage))
+    return state_columns(stretches, plant, sensors, base), base
 
 
 def gust_strength(
     nominal: Vehicle,
-    windows: Windows,
+    stretches: Stretches,
     sensors: Sensors,
     name: str,
     rng: np.random.Generator,
@@ -150,12 +152,12 @@ def gust_strength(
     It adds a covariance to the noise; with lambda its whitened eigenvalues for s = 1, a stretch
     adds (s^2 lambda - log(1 + s^2 lambda)) / 2.
     """
-    basis, base = start_of(nominal, windows, sensors)
+    basis, base = start_of(nominal, stretches, sensors)
     wind = EFFECTS[name].values(1.0, *neutral(EFFECTS[name], nominal)[1:])
-    plant = window_plant(nominal, {**nominal.effects, name: wind})
-    count = len(windows.start_s)
-    draws = rng.standard_normal((len(windows.command.thrust) + 1, GUST_DRAWS, count, 3))
-    channels = replay(windows, plant, has_voltage=bool(sensors.voltage), draws=draws)
+    plant = stretch_plant(nominal, {**nominal.effects, name: wind})
+    count = len(stretches.start_s)
+    draws = rng.standard_normal((len(stretches.command.thrust) + 1, GUST_DRAWS, count, 3))
+    channels = replay(stretches, plant, has_voltage=bool(sensors.voltage), draws=draws)
     moved = without_start(basis, whitened(sensors, channels, base))
     gram = np.einsum("kwd,lwd->wkl", moved, moved) / GUST_DRAWS
     eigenvalues = np.maximum(np.linalg.eigvalsh(gram), 0.0)

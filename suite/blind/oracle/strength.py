@@ -27,7 +27,7 @@ from suite.blind.oracle.information import (
     gust_strength,
     information,
 )
-from suite.blind.oracle.stretches import EVERY_S, Windows, cut
+from suite.blind.oracle.stretches import EVERY_S, Stretches, cut
 from suite.blind.sensors import SENSORS
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import long_flights, ordinary_flights
@@ -92,7 +92,7 @@ def strengths(vehicle: str, sensors: str, names: Sequence[str]) -> dict[str, Any
 
 
 @cache
-def _flown(vehicle: str, sensors: str, slow: bool) -> tuple[Windows, np.random.Generator]:
+def _flown(vehicle: str, sensors: str, slow: bool) -> tuple[Stretches, np.random.Generator]:
     """Return the stretches that strengths are worked out on, and the random numbers after them."""
     given, rng = given_vehicle(vehicle), np.random.default_rng(FLIGHTS_SEED)
     ways = ordinary_flights(rng), long_flights(rng)
