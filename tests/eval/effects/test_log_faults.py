@@ -1,5 +1,7 @@
 """A fault is written once, and serves logged arrays and simulated samples alike."""
 
+from typing import cast
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -63,7 +65,7 @@ def test_what_is_added_must_be_an_effect_of_its_name():
     with pytest.raises(ValueError, match="'heavier'.*'mass_offset'.*the same"):
         EFFECTS.register("heavier", MASS)
     with pytest.raises(ValueError, match="must be an eval.effects.interface.Effect"):
-        EFFECTS.register("heavier", lambda vehicle: vehicle)
+        EFFECTS.register("heavier", cast(Effect, "heavier"))
     by_vehicle = Parameter("x", "1", lambda vehicle: vehicle.mass, 0.0, 1.0, (0.1, 0.2))
     fault = Effect("odd", "", "", "", tuple, (by_vehicle,), late=lambda values: values.x)
     with pytest.raises(ValueError, match="must be numbers"):

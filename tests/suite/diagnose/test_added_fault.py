@@ -35,6 +35,7 @@ def test_the_simulated_log_has_it():
     """Residuals of a flight without noise all but vanish where the model has the true fault."""
     ways = [Trajectory("figure_eight", duration_s=4.0, speed=4.0, size=2.0, turn="wobble")]
     windows, _ = cut(logs_of(ways, None), GIVEN, False)
+    assert windows is not None
     space = make_space(GIVEN)
     model, start = Model(GIVEN, space, False, False), space.array("start")
     true = start.copy()
