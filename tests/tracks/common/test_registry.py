@@ -43,9 +43,8 @@ def test_ours_come_first_and_in_order_and_added_ones_after(monkeypatch):
     found = table(z=1, y="math:tau")
     found.register("x", 5)
     assert list(found) == ["z", "y", "a", "b", "x"] and len(found) == 5
-    assert found["y"] == pytest.approx(6.283, abs=1e-3) and found["b"] == pytest.approx(
-        3.1416, abs=1e-4
-    )
+    assert found["y"] == pytest.approx(6.283, abs=1e-3)
+    assert found["b"] == pytest.approx(3.1416, abs=1e-4)
 
 
 def test_one_of_ours_is_found_without_asking_packages_or_importing(monkeypatch):
