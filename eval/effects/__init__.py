@@ -1,8 +1,11 @@
-"""The catalogue of physical effects; adding one is adding its file and its name here."""
+"""The catalogue of physical effects; adding one is adding its file and its name here.
+
+Another package adds one with an entry point of the group `diffracing_suite.effects`, a program for
+its own process with `EFFECTS.register(effect.name, effect)`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from eval.effects import (
@@ -33,15 +36,24 @@ from eval.effects import (
     translational_lift,
     weak_motor,
 )
-from eval.effects.interface import Array, Effect, as_arrays, neutral
-from tracks.common.names import unknown_name
+from eval.effects.interface import Effect, as_arrays, neutral
+from tracks.common.registry import Registry
 
 if TYPE_CHECKING:
     from eval.vehicles.vehicle import Vehicle
 
-# In the order in which they act: what scales a thrust stands after what adds to it, and random
-# wind after the steady wind that it is relative to.
-EFFECTS: dict[str, Effect] = {
+
+def _wrong(name: str, effect: Any) -> str | None:
+    if not isinstance(effect, Effect):
+        return f"a {type(effect).__name__}; must be an eval.effects.interface.Effect"
+    if effect.name != name:
+        return f"its Effect is called {effect.name!r}; both names must be the same"
+    if not effect.in_flight and any(callable(p.neutral) for p in effect.parameters):
+        return "a fault of the log; its neutral values must be numbers"
+    return None
+
+
+_OWN = {
     module.EFFECT.name: module.EFFECT
     for module in (
         linear_drag,
@@ -72,6 +84,9 @@ EFFECTS: dict[str, Effect] = {
         clock_offset,
     )
 }
+# In the order in which they act: what scales a thrust stands after what adds to it, and random
+# wind after the steady wind that it is relative to; what other packages add acts last.
+EFFECTS: Registry[Effect] = Registry("effect", "diffracing_suite.effects", _OWN, _wrong)
 
 
 def find_effect(name: str) -> Effect:
@@ -80,24 +95,7 @@ def find_effect(name: str) -> Effect:
     Raises:
         ValueError: for an unknown name, with the nearest one.
     """
-    if name not in EFFECTS:
-        raise unknown_name("effect", name, EFFECTS)
-    return EFFECTS[name]
-
-
-def apply_log_faults(effects: Mapping[str, object], log: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the arrays of `log` (T rows, by their names in a flight log) with every fault applied.
-
-    Args:
-        effects: the vehicle's effects; those that are no fault of a log are passed over.
-        log: `time_s` (T,), `pos_w` (T, 3), `quat_wxyz` (T, 4), `vel_w`, `rate_b` and, where
-            there is one, `acc_b`; other entries are kept. A log's or a flight's own fields fit.
-    """
-    log = dict(log)
-    for effect in EFFECTS.values():
-        if effect.log is not None and effect.name in effects:
-            log.update(effect.log(effects[effect.name], log))
-    return log
+    return EFFECTS.find(name)
 
 
 def all_values(vehicle: Vehicle) -> dict[str, Any]:

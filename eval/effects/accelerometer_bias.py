@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
-from eval.effects.interface import Array, Effect, Parameter
+from eval.effects.interface import Array, Effect, Parameter, Sample
 
 
 class AccelerometerBias(NamedTuple):
@@ -15,11 +14,9 @@ class AccelerometerBias(NamedTuple):
     """(3,) added to the true value, body axes [m/s^2]."""
 
 
-def log_of(values: AccelerometerBias, log: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the changed `acc_b` (T, 3), or nothing where the log has none."""
-    if log.get("acc_b") is None:
-        return {}
-    return {"acc_b": log["acc_b"] + values.bias}
+def measure(values: AccelerometerBias, sample: Sample) -> Sample:
+    """Return the sample with the bias on its `acc_b`."""
+    return sample._replace(acc_b=sample.acc_b + values.bias)
 
 
 EFFECT = Effect(
@@ -39,5 +36,7 @@ EFFECT = Effect(
             size=3,
         ),
     ),
-    log=log_of,
+    measure=measure,
+    of_log=True,
+    needs=("acc_b",),
 )

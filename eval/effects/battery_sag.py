@@ -32,6 +32,11 @@ def thrust_of(values: BatterySag, flow: Flow, thrust: Array) -> Array:
     return thrust * per_axis(xp.maximum(xp.asarray(1.0 - lost), 0.0))
 
 
+def with_voltage(values: BatterySag, fall: float) -> BatterySag:
+    """Return the loss a volt that is `values.rate` where the voltage falls by `fall` [V/s]."""
+    return BatterySag(0.0, values.rate / fall)
+
+
 EFFECT = Effect(
     name="battery_sag",
     summary="Thrust falls while the battery empties",
@@ -47,6 +52,7 @@ EFFECT = Effect(
             high=0.05,
             typical=(2e-4, 2e-3),
             required=False,
+            voltage=False,
         ),
         Parameter(
             name="per_volt",
@@ -56,7 +62,10 @@ EFFECT = Effect(
             high=1.0,
             typical=(0.02, 0.15),
             required=False,
+            voltage=True,
         ),
     ),
     thrust=thrust_of,
+    slow=True,
+    with_voltage=with_voltage,
 )

@@ -41,6 +41,7 @@ EFFECT = Effect(
             typical=(0.002, 0.01),
             size=3,
             unseen=(2,),
+            direction=(0.6, 0.8, 0.0),
         ),
     ),
     constants=constants_of,

@@ -36,4 +36,5 @@ EFFECT = Effect(
         ),
     ),
     constants=constants_of,
+    needs=("command",),
 )

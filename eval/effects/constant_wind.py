@@ -34,6 +34,7 @@ EFFECT = Effect(
             high=30.0,
             typical=(1.0, 5.0),
             size=3,
+            direction=(-0.6, 0.8, 0.0),
         ),
     ),
     wind=wind_of,

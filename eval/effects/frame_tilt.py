@@ -34,7 +34,9 @@ EFFECT = Effect(
             high=0.35,
             typical=(0.005, 0.035),
             size=2,
+            direction=(0.6, 0.8),
         ),
     ),
     constants=constants_of,
+    of_log=True,
 )

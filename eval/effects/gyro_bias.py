@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
-from eval.effects.interface import Array, Effect, Parameter
+from eval.effects.interface import Array, Effect, Parameter, Sample
 
 
 class GyroBias(NamedTuple):
@@ -15,11 +14,9 @@ class GyroBias(NamedTuple):
     """(3,) added to the true value, body axes [rad/s]."""
 
 
-def log_of(values: GyroBias, log: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the changed `rate_b` (T, 3), or nothing where the log has none."""
-    if log.get("rate_b") is None:
-        return {}
-    return {"rate_b": log["rate_b"] + values.bias}
+def measure(values: GyroBias, sample: Sample) -> Sample:
+    """Return the sample with the bias on its `rate_b`."""
+    return sample._replace(rate_b=sample.rate_b + values.bias)
 
 
 EFFECT = Effect(
@@ -39,5 +36,6 @@ EFFECT = Effect(
             size=3,
         ),
     ),
-    log=log_of,
+    measure=measure,
+    of_log=True,
 )

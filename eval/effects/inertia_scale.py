@@ -34,6 +34,7 @@ EFFECT = Effect(
             high=5.0,
             typical=(0.05, 0.25),
             size=3,
+            signs=(1, -1),
         ),
     ),
     constants=constants_of,

@@ -113,9 +113,38 @@ class Parameter:
     """Whether flights can tell it; a given constant of the vehicle otherwise."""
     unseen: tuple[int, ...] = ()
     """Components that no flight can tell; a diagnosis reports them as null."""
+    voltage: bool | None = None
+    """True where it acts only with a voltage in the log, False only without, None with both."""
+    one_at_a_time: bool = False
+    """Each component is a fault of its own, and a vehicle mostly has one of them."""
+    whole: bool = False
+    """Usual magnitudes are values, not differences from neutral."""
+    signs: tuple[int, ...] = (1,)
+    """Ways in which it usually differs from neutral, as far as they are not mirror images."""
+    direction: tuple[float, ...] = ()
+    """Unit vector along which the components usually share a size; else each has all of it."""
+
+    def upwards(self, vehicle: Vehicle) -> bool:
+        """Return whether it can only be above the value with which nothing acts."""
+        return at(self.low, vehicle) >= (0.0 if self.whole else at(self.neutral, vehicle))
 
 
 Values = Any  # the effect's own NamedTuple of floats, tuples or arrays
+
+
+class Sample(NamedTuple):
+    """What a log may hold of N moments; a fault of the log changes it."""
+
+    pos_w: Array
+    """(..., 3) [m]."""
+    rot_w: Array
+    """(..., 3, 3) body to world."""
+    vel_w: Array
+    """(..., 3) [m/s]."""
+    rate_b: Array
+    """(..., 3) [rad/s]."""
+    acc_b: Array
+    """(..., 3) specific force [m/s^2]."""
 
 
 @dataclass(frozen=True)
@@ -145,13 +174,45 @@ class Effect:
     """Returns an added force on the centre of mass in body axes (..., 3) [N]."""
     torque: Callable[[Values, Flow], Array] | None = None
     """Returns an added torque in body axes (..., 3) [N m]."""
-    log: Callable[[Values, Mapping[str, Array]], dict[str, Array]] | None = None
-    """A fault of the log, not of the flight: takes the arrays of a flight log by name (`time_s`,
-    `pos_w`, `quat_wxyz`, `vel_w`, `rate_b`, `acc_b`, ...) and returns the ones it changes."""
+    measure: Callable[[Values, Sample], Sample] | None = None
+    """A fault of the log: returns what is logged of what truly was. Values as far on the other side
+    of neutral undo it, at least to first order."""
+    late: Callable[[Values], Array] | None = None
+    """A fault of the log: by how much later than they were poses and velocities are logged [s]."""
+    of_log: bool = False
+    """Marks the log and not the vehicle, also where it acts in flight as a tilted frame does."""
+    needs: tuple[str, ...] = ()
+    """What a log must have to show it: `acc_b`, or `command` for what acts between commands and
+    rotor speeds."""
+    slow: bool = False
+    """Shows over minutes of flight and hardly within seconds."""
+    with_voltage: Callable[[Values, float], Values] | None = None
+    """For parameters that hang on the voltage: returns the values that act by a voltage which falls
+    by so many V/s as these act by time."""
     read: Callable[[Mapping[str, Any]], Values] | None = None
     """Reads a vehicle file's table where it is not simply the parameters."""
     write: Callable[[Values], dict[str, Any]] | None = None
     """The inverse of `read`."""
+
+    @property
+    def in_flight(self) -> bool:
+        """Whether it changes the flight, and not only its log."""
+        return self.measure is None and self.late is None
+
+    @property
+    def random(self) -> bool:
+        """Whether it acts by chance, so that no rollout repeats it."""
+        return self.gust is not None
+
+    def told(self, voltage: bool) -> tuple[Parameter, ...]:
+        """Return the parameters that flights can tell with a voltage in their logs, or without."""
+        return tuple(p for p in self.parameters if p.fitted and p.voltage in (None, voltage))
+
+    def components(self, voltage: bool) -> tuple[tuple[Parameter, int], ...]:
+        """Return the components of these that can be seen; 0 stands for a plain number."""
+        return tuple(
+            (p, k) for p in self.told(voltage) for k in range(p.size or 1) if k not in p.unseen
+        )
 
 
 def at(bound: Bound, vehicle: Vehicle) -> float:

@@ -33,6 +33,7 @@ EFFECT = Effect(
             low=lambda vehicle: -0.5 * vehicle.mass,
             high=lambda vehicle: vehicle.mass,
             typical=(0.04, 0.2),
+            signs=(1, -1),
         ),
     ),
     constants=constants_of,

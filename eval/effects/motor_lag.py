@@ -33,7 +33,9 @@ EFFECT = Effect(
             low=0.0,
             high=0.5,
             typical=(0.02, 0.06),
+            whole=True,
         ),
     ),
     constants=constants_of,
+    needs=("command",),
 )

@@ -34,7 +34,9 @@ EFFECT = Effect(
             high=5.0,
             typical=(0.1, 0.3),
             size=3,
+            signs=(-1, 1),
         ),
     ),
     constants=constants_of,
+    needs=("command",),
 )

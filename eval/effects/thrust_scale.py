@@ -35,6 +35,7 @@ EFFECT = Effect(
             low=0.3,
             high=2.0,
             typical=(0.05, 0.15),
+            signs=(-1, 1),
         ),
     ),
     constants=constants_of,

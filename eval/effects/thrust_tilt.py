@@ -34,6 +34,7 @@ EFFECT = Effect(
             high=0.35,
             typical=(0.0035, 0.035),
             size=2,
+            direction=(0.6, 0.8),
         ),
     ),
     constants=constants_of,

@@ -34,6 +34,7 @@ EFFECT = Effect(
             high=0.5,
             typical=(0.005, 0.05),
             size=3,
+            direction=(0.6, 0.8, 0.0),
         ),
     ),
     torque=torque_of,

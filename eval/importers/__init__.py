@@ -3,12 +3,12 @@
     imported = import_log("log.ulg")
     write_flight("flight.parquet", imported.log)
 
-A format is a module with `read(path, options) -> Recording`. docs/import.md says what each reads.
+A format is a module with `SUMMARY`, `detect` and `read` (`eval.importers.formats.Format`).
+docs/import.md says what each reads.
 """
 
 from __future__ import annotations
 
-import importlib
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,15 +17,6 @@ if TYPE_CHECKING:
     from eval.importers.findings import Finding
     from eval.importers.options import ImportOptions
     from eval.logs.flight_log import FlightLog
-
-FORMATS: dict[str, str] = {
-    "px4": "PX4 ULog (.ulg)",
-    "betaflight": "CSV of blackbox_decode; needs --pose",
-    "crazyflie": "log of the Crazyflie's micro SD card deck",
-    "table": "CSV or Parquet, described by a mapping file (--map)",
-    "mcap": "MCAP with ROS 2 messages (pip install 'diffracing-suite[mcap]')",
-}
-"""Name -> what it reads; format NAME is read by eval/importers/formats/NAME.py."""
 
 
 class ImportedLog(NamedTuple):
@@ -46,7 +37,8 @@ def import_log(
 
     Args:
         path: the file.
-        format: a name of `FORMATS`; by default told by the file's first bytes.
+        format: a name of `eval.importers.formats.FORMATS`; by default told by the file's first
+            bytes.
         options: see `eval.importers.options`.
 
     Raises:
@@ -55,13 +47,10 @@ def import_log(
     """
     from eval.importers.assemble import assemble
     from eval.importers.detect import detect
+    from eval.importers.formats import FORMATS
     from eval.importers.options import ImportOptions
-    from tracks.common.names import unknown_name
 
     told = options or ImportOptions()
     file = Path(path)
     name = format or detect(file, told)
-    if name not in FORMATS:
-        raise unknown_name("format", name, FORMATS)
-    module = importlib.import_module(f"eval.importers.formats.{name}")
-    return ImportedLog(*assemble(module.read(file, told), name, told))
+    return ImportedLog(*assemble(FORMATS.find(name).read(file, told), name, told))

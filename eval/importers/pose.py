@@ -207,7 +207,7 @@ def _refine(
     slope = (later - sooner) / (2.0 * step)
     turn = _kabsch(seen - seen.mean(0), gyro - gyro.mean(0))
     turned = seen @ turn.T
-    # The size is left open: a gyro in other units is for `units_check.py` to find.
+    # The size is left open: a gyro in other units is for `checks/units.py` to find.
     centred = turned - turned.mean(0)
     size = float(np.sum(gyro * centred) / max(np.sum(centred**2), 1e-12))
     rest = gyro - size * turned

@@ -1,28 +1,35 @@
 """Worlds: where trials are flown. The table of names; modules are imported when asked for.
 
+Another package adds one with an entry point of the group `diffracing_suite.worlds`, a program for
+its own process with `WORLDS.register(name, a_class)`.
+
 A world flies the trials in a fixed number of slots and knows nothing of policies: it is given
 actions and hands back what a policy needs to see.
 """
 
 from __future__ import annotations
 
-import importlib
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from eval.worlds.trial import Progress, TrialSpec
-from tracks.common.names import unknown_name
+from tracks.common.registry import Registry
 from tracks.track import Track
 
 REFERENCE = "reference"
 """The world without slots: `eval.worlds.reference.fly_trial`, one trial after the other."""
-WORLDS = {
-    "mujoco": "eval.worlds.mujoco:MujocoWorld",
-    "mjx": "eval.worlds.mjx:MjxWorld",
-    REFERENCE: "eval.worlds.reference:fly_trial",
-}
-"""Name to module and class (`World`)."""
+WORLDS: Registry[Any] = Registry(
+    "world",
+    "diffracing_suite.worlds",
+    {
+        "mujoco": "eval.worlds.mujoco:MujocoWorld",
+        "mjx": "eval.worlds.mjx:MjxWorld",
+        REFERENCE: "eval.worlds.reference:fly_trial",
+    },
+    lambda name, world: None if callable(world) else f"{world!r}; must be a class (`World`)",
+)
+"""Name to class (`World`), called with (vehicle, camera, layout, rules, slots=, threads=)."""
 
 
 class View(NamedTuple):
@@ -109,7 +116,4 @@ def world_class(name: str) -> Any:
     Raises:
         ValueError: where there is no such world.
     """
-    if name not in WORLDS:
-        raise unknown_name("world", name, WORLDS)
-    module, attribute = WORLDS[name].split(":")
-    return getattr(importlib.import_module(module), attribute)
+    return WORLDS.find(name)

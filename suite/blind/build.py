@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from eval.effects import EFFECTS, all_values
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.cases import Case
@@ -18,9 +19,11 @@ from suite.blind.oracle.information import (
     THRESHOLD,
     Information,
     alternatives,
+    columns_of,
     detectable,
     information,
     left_over,
+    log_ratio,
     signatures,
     start_of,
 )
@@ -30,8 +33,8 @@ from suite.blind.oracle.stretches import (
     LONG_S,
     cut,
     replay,
+    stretch_plant,
     whitened,
-    window_plant,
     without_start,
 )
 from suite.blind.outside import KINDS, make_outside
@@ -39,7 +42,7 @@ from suite.blind.rotorpy_flight import fly_rotorpy
 from suite.blind.sensors import SENSORS, Sensors, log_of
 from suite.common.errors import WorkFailed
 from suite.diagnose.plans.separating import SEPARATIONS
-from suite.diagnose.plans.simulate import FlightFailed, Recording, fly
+from suite.diagnose.plans.simulate import FALL_V_PER_S, FlightFailed, Recording, fly
 from suite.diagnose.plans.trajectory import Trajectory, long_flights, ordinary_flights
 
 ROTORPY_FLIGHTS = 4
@@ -97,33 +100,22 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
             change, multiple = _blurred_strength(case, nominal, name, change), case.multiple
         changes[name], multiples[name] = change, multiple
         effects[name] = changed_values(nominal, table, name, change, rng)
-    truth = with_effects(nominal, effects)
     has_voltage = bool(sensors.voltage)
-    if case.separation >= 0 and "battery_sag" in effects:
-        effects["battery_sag"] = effects["battery_sag"]._replace(per_volt=0.0)
-        if has_voltage:
-            # Per volt what the battery would lose a second at the rate at which its voltage falls.
-            rate = effects["battery_sag"].rate
-            effects["battery_sag"] = effects["battery_sag"]._replace(rate=0.0, per_volt=rate / 0.02)
-            changes["battery_sag"] = changes["battery_sag"] / 0.02
-        truth = with_effects(nominal, effects)
+    if case.separation >= 0 and has_voltage:
+        _by_voltage(nominal, changes, effects)
+    truth = with_effects(nominal, effects)
     if case.simulator == "rotorpy":
         ways = ways[:ROTORPY_FLIGHTS]
         flights = fly_rotorpy(nominal, truth, ways, sensors.rate_hz)
     else:
         flights = fly(nominal, truth, ways, sensors.rate_hz, rng=rng, has_voltage=has_voltage)
     answer: dict[str, Any] = {"kind": case.kind, "verdict": "no_gap", "effects": []}
-    named = {name: change for name, change in changes.items() if name != "gusts"}
+    named = {name: change for name, change in changes.items() if not EFFECTS[name].random}
     info = long = None
     if named:
-        stride = 4 if max(way.duration_s for way in ways) > 30.0 else 1
-        windows = cut(flights, every_s=stride * EVERY_S)
-        found = information(nominal, (), sensors, windows)
-        info = Information(found.columns, stride * found.matrix)
+        info = _information(nominal, flights, sensors, ways, EVERY_S)
         length = min(LONG_S, 0.5 * max(way.duration_s for way in ways))
-        far = cut(flights, every_s=stride * length, horizon_s=length)
-        found = information(nominal, (), sensors, far)
-        long = Information(found.columns, stride * found.matrix)
+        long = _information(nominal, flights, sensors, ways, length)
         if case.kind == "pair":
             _check_pair(info, named, nominal)
     for name in case.hidden:
@@ -136,9 +128,7 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
             "allowed": [],
         }
         if info is not None and long is not None and name in named:
-            rows = info.rows_of(name)
-            ratio = named[name] @ info.matrix[np.ix_(rows, rows)] @ named[name]
-            entry["sigma"] = float(np.sqrt(ratio))
+            entry["sigma"] = float(np.sqrt(2.0 * log_ratio(info.block(name), named[name])))
             rests = alternatives(info, named, nominal, bool(sensors.acc))[name]
             hidden = alternatives(long, named, nominal, bool(sensors.acc))[name]
             entry["required"] = [o for o in rests if hidden.get(o, np.inf) < REQUIRED]
@@ -151,6 +141,30 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
     return _built(case, nominal, truth, sensors, ways, flights, answer, rng)
 
 
+def _by_voltage(nominal: Vehicle, changes: dict[str, np.ndarray], effects: dict[str, Any]) -> None:
+    """Let act by the voltage, in place, what would act by time where no voltage is logged."""
+    for name in effects:
+        convert = EFFECTS[name].with_voltage
+        if convert is not None:
+            effects[name] = convert(effects[name], FALL_V_PER_S)
+            given = all_values(nominal)[name]
+            columns = columns_of(True, [name])
+            changes[name] = np.array([c.value(effects[name]) - c.value(given) for c in columns])
+
+
+def _information(
+    nominal: Vehicle,
+    flights: Sequence[Recording],
+    sensors: Sensors,
+    ways: Sequence[Trajectory],
+    length_s: float,
+) -> Information:
+    """Return what stretches of `length_s` say; of long flights every fourth, counted as often."""
+    stride = 4 if max(way.duration_s for way in ways) > 30.0 else 1
+    found = information(nominal, cut(flights, stride * length_s, length_s), sensors)
+    return Information(found.columns, stride * found.matrix)
+
+
 def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarray) -> np.ndarray:
     """Return `change` scaled to `case.multiple` times what the gentle flights alone can show.
 
@@ -158,8 +172,9 @@ def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarra
     """
     sensors = SENSORS["capture"]
     ways = SEPARATIONS[case.separation].blurred
-    info = information(nominal, fly(nominal, nominal, [*ways, *ways], sensors.rate_hz), sensors)
-    return case.multiple * detectable(info, name, change) * change
+    flights = fly(nominal, nominal, [*ways, *ways], sensors.rate_hz)
+    info = information(nominal, cut(flights), sensors)
+    return case.multiple * detectable(info.block(name), change) * change
 
 
 def _outside(
@@ -203,12 +218,12 @@ def _outside(
 
 def unnameable(nominal: Vehicle, flights: Sequence[Recording], sensors: Sensors) -> float:
     """Return the log-likelihood ratio that the whole catalogue, fitted together, leaves over."""
-    windows = cut(flights)
-    basis, base = start_of(nominal, windows, sensors)
-    plant = window_plant(nominal)
-    with_it = replay(windows, plant, outside=True, has_voltage=bool(sensors.voltage))
+    stretches = cut(flights)
+    basis, base = start_of(nominal, stretches, sensors)
+    plant = stretch_plant(nominal)
+    with_it = replay(stretches, plant, outside=True, has_voltage=bool(sensors.voltage))
     seen = without_start(basis, whitened(sensors, with_it, base)).ravel()
-    _, columns = signatures(nominal, windows, sensors)
+    _, columns = signatures(nominal, stretches, sensors)
     flat = columns.reshape(len(columns), -1).T
     size = np.linalg.norm(flat, axis=0)
     flat = flat[:, size > 0.0] / size[size > 0.0]
@@ -221,7 +236,7 @@ def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
         entry = SEPARATIONS[case.separation]
         added = entry.separating if case.kind == "separated" else ()
         return [*entry.blurred, *entry.blurred, *added]
-    if "battery_sag" in case.hidden:
+    if case.kind != "outside" and any(EFFECTS[name].slow for name in case.hidden):
         return long_flights(rng)
     return ordinary_flights(rng)
 

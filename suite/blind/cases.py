@@ -9,6 +9,7 @@ import numpy as np
 from eval.effects import EFFECTS
 from suite.blind.oracle.strength import vehicle_names
 from suite.blind.outside import KINDS
+from suite.blind.rotorpy_flight import ROTORPY_EFFECTS
 from suite.diagnose.plans.separating import SEPARATIONS
 
 MULTIPLES = (2.0, 6.0)
@@ -17,23 +18,8 @@ FULL = {"null": 100, "outside": 40, "pair": 20, "blurred": 15, "separated": 15}
 """Cases of a full set besides the single effects."""
 SETS = {"tuning": 1_000_000, "published": 2_000_000}
 """Seeds of the two sets; the published one is run once."""
-ROTORPY_EFFECTS = (
-    "quadratic_drag",
-    "rotor_drag",
-    "inflow",
-    "translational_lift",
-    "blade_flapping",
-    "motor_lag",
-    "thrust_scale",
-    "mass_offset",
-    "com_offset",
-    "inertia_scale",
-)
-"""Effects that RotorPy's own equations have."""
 ROTORPY_NULLS = 10
 """Cases of its set that hide nothing."""
-NEEDS_DRAG = ("constant_wind", "gusts")
-"""Effects that a vehicle without drag does not feel."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +113,7 @@ def _drawn(rng: np.random.Generator, kind: str, index: int, seed: int) -> Case:
         vehicle, sensors = _equipment(rng, ())
         return Case(kind, (name,), float(rng.choice([3.0, 6.0])), vehicle, sensors, number)
     if kind == "pair":
-        pool = [name for name in EFFECTS if name not in ("gusts", "battery_sag")]
+        pool = [name for name, effect in EFFECTS.items() if not (effect.random or effect.slow)]
         first, second = (pool[i] for i in rng.choice(len(pool), 2, replace=False))
         vehicle, sensors = _equipment(rng, (first, second))
         return Case(kind, (first, second), MULTIPLES[1], vehicle, sensors, number)
@@ -149,8 +135,8 @@ def _drawn(rng: np.random.Generator, kind: str, index: int, seed: int) -> Case:
 def _equipment(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[str, str]:
     vehicle = str(rng.choice(vehicle_names()))
     sensors = str(rng.choice(["capture", "estimator", "full"]))
-    if set(names) & set(NEEDS_DRAG):
-        vehicle = "dragged"
-    if "accelerometer_bias" in names and sensors == "capture":
+    if any(EFFECTS[name].wind for name in names):
+        vehicle = "dragged"  # without drag no wind is felt
+    if sensors == "capture" and any("acc_b" in EFFECTS[name].needs for name in names):
         sensors = "estimator"
     return vehicle, sensors

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS, all_values
-from eval.effects.interface import at
 from eval.vehicles.vehicle import Vehicle
-from suite.blind.oracle.strength import GUST_LENGTH_M, columns_in_table, detectable_along
+from suite.blind.oracle.strength import columns_in_table, detectable_along
 
 INSIDE = 0.98
 """Share of the way to a physical bound that a strength may go."""
@@ -34,14 +33,14 @@ def draw_change(
         ValueError: where the flights of the table do not show the effect at all.
     """
     columns = columns_in_table(nominal.name, sensors, effect)
-    room = np.array([_room(nominal, effect, *column) for column in columns])
-    if effect == "weak_motor":
-        direction = -np.eye(len(columns))[rng.integers(len(columns))]
+    room = np.array([column.room(nominal) for column in columns])
+    if columns[0].spec.one_at_a_time:
+        alone = np.eye(len(columns))[rng.integers(len(columns))]
+        direction = columns[0].spec.signs[0] * alone
     else:
         sign = rng.choice([-1.0, 1.0], len(columns))
         # Where there is no way down from the given value, or none that is usual, it goes up.
-        upwards = (room[:, 0] > -1e-9) | np.array([c[0] == "time_constant" for c in columns])
-        upwards |= effect in ("linear_drag", "quadratic_drag")
+        upwards = (room[:, 0] > -1e-9) | np.array([c.spec.upwards(nominal) for c in columns])
         direction = rng.uniform(0.5, 1.0, len(columns)) * np.where(upwards, 1.0, sign)
     unit = detectable_along(nominal.name, sensors, effect, direction)
     if not np.isfinite(unit):
@@ -63,14 +62,14 @@ def changed_values(
     given = all_values(nominal)[effect]
     fields = {key: np.array(value, dtype=float) for key, value in given._asdict().items()}
     columns = columns_in_table(nominal.name, sensors, effect)
-    for (parameter, component), step in zip(columns, change, strict=True):
-        value = fields[parameter]
-        value[(component,) if value.ndim else ()] += step
-    if effect == "gusts":
-        fields["length"] = np.array(GUST_LENGTH_M)
-    if effect == "com_offset":
-        # Cannot be seen, so it may be anything.
-        fields["offset"][2] = rng.uniform(-0.005, 0.005)
+    for column, step in zip(columns, change, strict=True):
+        value = fields[column.parameter]
+        value[(column.component,) if value.ndim else ()] += step
+    for parameter in EFFECTS[effect].parameters:
+        for component in parameter.unseen:
+            # Cannot be seen, so it may be anything.
+            size = 0.5 * parameter.typical[1]
+            fields[parameter.name][component] = rng.uniform(-size, size)
     plain = {k: tuple(v.tolist()) if v.ndim else float(v) for k, v in fields.items()}
     return type(given)(**plain)
 
@@ -83,19 +82,9 @@ def with_effects(nominal: Vehicle, effects: Mapping[str, Any]) -> Vehicle:
 def true_parameters(effect: str, values: Any, has_voltage: bool) -> dict[str, Any]:
     """Return what a diagnosis should find: totals, with null for what no flight can tell."""
     found: dict[str, Any] = {}
-    for parameter in EFFECTS[effect].parameters:
+    for parameter in EFFECTS[effect].told(has_voltage):
         value = getattr(values, parameter.name)
-        sags = effect == "battery_sag" and (parameter.name == "per_volt") != has_voltage
-        if not parameter.fitted or sags:
-            continue
         if parameter.size:
             value = [None if i in parameter.unseen else v for i, v in enumerate(value)]
         found[parameter.name] = value
     return found
-
-
-def _room(nominal: Vehicle, effect: str, parameter: str, component: int) -> tuple[float, float]:
-    spec = next(p for p in EFFECTS[effect].parameters if p.name == parameter)
-    value = getattr(all_values(nominal)[effect], parameter)
-    given = float(value[component]) if value.ndim else float(value)
-    return at(spec.low, nominal) - given, at(spec.high, nominal) - given

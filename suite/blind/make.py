@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +82,7 @@ def make_set(
         {name: _hash(out / "answers" / f"{name}.json") for name in made},
         {name: "not made" for name in failed},
     )
-    write_json(out / "manifest.json", {**stamp(SCHEMA, seed), **_fields(manifest)})
+    write_json(out / "manifest.json", {**stamp(SCHEMA, seed), **asdict(manifest)})
     # The reasons say what was hidden.
     write_json(out / "answers" / "failed.json", failed)
     return manifest
@@ -141,7 +141,3 @@ def _same_set(out: Path, wanted: dict[str, Any]) -> None:
 
 def _hash(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _fields(manifest: Manifest) -> dict[str, Any]:
-    return {"cases": manifest.cases, "answers": manifest.answers, "failed": manifest.failed}

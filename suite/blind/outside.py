@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Command, Motion, Wrench
 from tracks.common.names import unknown_name
 from tracks.geometry.rotation import to_local
+
+Law = Callable[[float, float, Motion, Wrench, float], np.ndarray]
 
 
 class Outside:
@@ -33,15 +36,6 @@ class Outside:
     def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
         """Return an acceleration (N, 3) in the world that is added [m/s^2]."""
         return np.zeros_like(motion.pos_w)
-
-
-class PowerDrag(Outside):
-    """Drag with |v|^1.6."""
-
-    def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return -s |v|^0.6 v."""
-        speed = np.sqrt((motion.vel_w**2).sum(-1, keepdims=True))
-        return -self.strength * speed**0.6 * motion.vel_w
 
 
 class SlungLoad(Outside):
@@ -87,55 +81,6 @@ class Hysteresis(Outside):
         return Command(np.maximum(self._acting, 0.0), command.rate_b)
 
 
-class HeadingForce(Outside):
-    """A sideways push that changes its sign twice a turn of the heading."""
-
-    def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return s cos(2 yaw) along body y."""
-        yaw = np.arctan2(motion.rot_w[:, 1, 0], motion.rot_w[:, 0, 0])
-        return self.strength * np.cos(2.0 * yaw)[:, None] * motion.rot_w[:, :, 1]
-
-
-class Wake(Outside):
-    """Thrust lost while sinking into the own wake."""
-
-    def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return -s (sinking speed beyond 0.5 m/s)^2 along body z."""
-        sinking = np.maximum(-motion.vel_w[:, 2:] - 0.5, 0.0)
-        return -self.strength * sinking**2 * motion.rot_w[:, :, 2]
-
-
-class Tether(Outside):
-    """A spring to a place in the world."""
-
-    ANCHOR_W = np.array([1.0, -1.0, 0.0])
-
-    def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return -s (pos - anchor)."""
-        return -self.strength * (motion.pos_w - self.ANCHOR_W)
-
-
-class Ripple(Outside):
-    """Thrust that pulses at 3.1 Hz."""
-
-    def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return s sin(2 pi 3.1 t) of the thrust."""
-        share = self.strength * np.sin(2.0 * np.pi * 3.1 * time_s)
-        return share * wrench.force_b[:, 2:] / self.mass * motion.rot_w[:, :, 2]
-
-
-class Updraft(Outside):
-    """A column of rising air at one place."""
-
-    CENTER_W = np.array([2.0, 1.0])
-
-    def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return s exp(-r^2 / 2 (0.9 m)^2) upwards, r from the column's middle."""
-        square = ((motion.pos_w[:, :2] - self.CENTER_W) ** 2).sum(-1)
-        push = self.strength * np.exp(-0.5 * square / 0.9**2)
-        return push[:, None] * np.array([0.0, 0.0, 1.0])
-
-
 class BentThrust(Outside):
     """A thrust curve that is bent and not only scaled."""
 
@@ -146,11 +91,59 @@ class BentThrust(Outside):
         return Command(np.maximum(bent, 0.0), command.rate_b)
 
 
+class Push(Outside):
+    """An acceleration in the world that follows from the state alone."""
+
+    def __init__(self, strength: float, mass: float, law: Law) -> None:
+        """Prepare; `law` takes (strength, mass, motion, wrench, time) and returns (N, 3)."""
+        super().__init__(strength, mass)
+        self._law = law
+
+    def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
+        """Return what the law says."""
+        return self._law(self.strength, self.mass, motion, wrench, time_s)
+
+
+def _power_drag(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
+    """Drag with |v|^1.6: -s |v|^0.6 v."""
+    speed = np.sqrt((motion.vel_w**2).sum(-1, keepdims=True))
+    return -s * speed**0.6 * motion.vel_w
+
+
+def _heading_force(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
+    """A sideways push that changes its sign twice a turn: s cos(2 yaw) along body y."""
+    yaw = np.arctan2(motion.rot_w[:, 1, 0], motion.rot_w[:, 0, 0])
+    return s * np.cos(2.0 * yaw)[:, None] * motion.rot_w[:, :, 1]
+
+
+def _wake(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
+    """Sinking into the own wake: -s (sinking speed beyond 0.5 m/s)^2 along body z."""
+    sinking = np.maximum(-motion.vel_w[:, 2:] - 0.5, 0.0)
+    return -s * sinking**2 * motion.rot_w[:, :, 2]
+
+
+def _tether(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
+    """A spring to a place in the world: -s (pos - anchor)."""
+    return -s * (motion.pos_w - np.array([1.0, -1.0, 0.0]))
+
+
+def _ripple(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
+    """Thrust that pulses at 3.1 Hz: s sin(2 pi 3.1 t) of it."""
+    share = s * np.sin(2.0 * np.pi * 3.1 * t)
+    return share * wrench.force_b[:, 2:] / m * motion.rot_w[:, :, 2]
+
+
+def _updraft(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
+    """A column of rising air: s exp(-r^2 / 2 (0.9 m)^2) upwards, r from the column's middle."""
+    square = ((motion.pos_w[:, :2] - np.array([2.0, 1.0])) ** 2).sum(-1)
+    return (s * np.exp(-0.5 * square / 0.9**2))[:, None] * np.array([0.0, 0.0, 1.0])
+
+
 @dataclass(frozen=True)
 class Kind:
     """One kind of physics outside the catalogue."""
 
-    make: Callable[[float, float], Outside]
+    make: Callable[..., Outside]
     """From strength and true mass [kg]."""
     unit: str
     """Of the strength."""
@@ -161,14 +154,14 @@ class Kind:
 
 
 KINDS: dict[str, Kind] = {
-    "power_drag": Kind(PowerDrag, "m^-0.6 s^-0.4", 0.08, 0.4),
+    "power_drag": Kind(partial(Push, law=_power_drag), "m^-0.6 s^-0.4", 0.08, 0.4),
     "slung_load": Kind(SlungLoad, "kg", 0.03, 0.12),
     "hysteresis": Kind(Hysteresis, "m/s^2", 1.0, 3.0),
-    "heading_force": Kind(HeadingForce, "m/s^2", 0.5, 2.5),
-    "wake": Kind(Wake, "1/m", 0.3, 1.2),
-    "tether": Kind(Tether, "1/s^2", 0.1, 0.6),
-    "ripple": Kind(Ripple, "1", 0.05, 0.3),
-    "updraft": Kind(Updraft, "m/s^2", 1.0, 5.0),
+    "heading_force": Kind(partial(Push, law=_heading_force), "m/s^2", 0.5, 2.5),
+    "wake": Kind(partial(Push, law=_wake), "1/m", 0.3, 1.2),
+    "tether": Kind(partial(Push, law=_tether), "1/s^2", 0.1, 0.6),
+    "ripple": Kind(partial(Push, law=_ripple), "1", 0.05, 0.3),
+    "updraft": Kind(partial(Push, law=_updraft), "m/s^2", 1.0, 5.0),
     "bent_thrust": Kind(BentThrust, "1", 0.1, 0.4),
 }
 """Kinds by name."""

@@ -7,7 +7,7 @@ drag and lift of a rotor go by the hub's own airspeed, which damps turning a lit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,11 +16,25 @@ from eval.effects import all_values
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
-from suite.blind.cases import ROTORPY_EFFECTS
 from suite.diagnose.plans.pilot import Gains, steer
 from suite.diagnose.plans.simulate import FULL_V, FlightFailed, Recording
 from suite.diagnose.plans.trajectory import Reference, Trajectory
 from tracks.geometry.rotation import quat_to_rot
+
+THEIRS: Mapping[str, Callable[[Any, float], Mapping[str, float]]] = {
+    "quadratic_drag": lambda values, mass: dict(
+        zip(("c_Dx", "c_Dy", "c_Dz"), map(float, mass * values.coefficient), strict=True)
+    ),
+    "rotor_drag": lambda values, mass: {"k_d": float(values.coefficient)},
+    "inflow": lambda values, mass: {"k_z": float(values.coefficient)},
+    "translational_lift": lambda values, mass: {"k_h": 0.25 * mass * float(values.coefficient)},
+    "blade_flapping": lambda values, mass: {"k_flap": -float(values.coefficient)},
+}
+"""Our effect -> RotorPy's parameters of it, from its values and the true mass [kg]."""
+ROTORPY_EFFECTS = (
+    *THEIRS, "motor_lag", "thrust_scale", "mass_offset", "com_offset", "inertia_scale"
+)  # fmt: skip
+"""Effects that RotorPy's own equations have; the later ones change constants that it is given."""
 
 
 def rotorpy_parameters(truth: Vehicle) -> dict[str, Any]:
@@ -36,13 +50,11 @@ def rotorpy_parameters(truth: Vehicle) -> dict[str, Any]:
             )
     values = all_values(truth)
     constants = make_plant(truth, 1.0 / truth.controller.frequency).constants
-    mass, inertia = float(constants.mass), constants.inertia
-    drag = mass * values["quadratic_drag"].coefficient
+    mass = float(constants.mass)
     return {
         "mass": mass,
-        **dict(zip(("Ixx", "Iyy", "Izz"), map(float, inertia), strict=True)),
+        **dict(zip(("Ixx", "Iyy", "Izz"), map(float, constants.inertia), strict=True)),
         **dict.fromkeys(("Ixy", "Ixz", "Iyz"), 0.0),
-        **dict(zip(("c_Dx", "c_Dy", "c_Dz"), map(float, drag), strict=True)),
         "num_rotors": 4,
         "rotor_pos": {f"r{i + 1}": hub for i, hub in enumerate(constants.rotor_position_b)},
         # Its sign is that of the torque on the body, ours that of the rotor's turning.
@@ -51,12 +63,9 @@ def rotorpy_parameters(truth: Vehicle) -> dict[str, Any]:
         "rotor_speed_max": truth.rotors.speed_max,
         "k_eta": float(constants.thrust_coefficient[0]),
         "k_m": float(constants.torque_coefficient[0]),
-        "k_d": float(values["rotor_drag"].coefficient),
-        "k_z": float(values["inflow"].coefficient),
-        "k_h": 0.25 * mass * float(values["translational_lift"].coefficient),
-        "k_flap": -float(values["blade_flapping"].coefficient),
         "tau_m": float(constants.time_constant),
         "motor_noise_std": 0.0,
+        **{key: v for name, of in THEIRS.items() for key, v in of(values[name], mass).items()},
     }
 
 

@@ -9,7 +9,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from eval.effects import EFFECTS
 from eval.judging.statistics import wilson
+from suite.blind.cases import MULTIPLES
 from suite.blind.make import load_manifest, open_answers
 from tracks.common.files import write_json, write_text
 from tracks.common.provenance import stamp
@@ -118,18 +120,19 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
     by = {kind: [v for v in verdicts if v.kind == kind] for kind in {v.kind for v in verdicts}}
     single, null = by.get("single", []), by.get("null", [])
     told = ("unknown", "partly")
-    gaps = [v for v in verdicts if v.found and "gusts" not in v.hidden and v.gap_ratio is not None]
+    by_chance = {name for name, effect in EFFECTS.items() if effect.random}
+    gaps = [v for v in verdicts
+            if v.found and not by_chance & set(v.hidden) and v.gap_ratio is not None]  # fmt: skip
     intervals = [inside for v in verdicts for inside in v.covered]
-    multiples = sorted({2.0, 6.0})
     lines = [
         ("single effects: named, nothing else", [v.exact for v in single], "95 %"),
         *(
             (
                 f"  of these at {m:g} times detectable",
-                [v.exact for v in single if _near(v.multiple, multiples) == m],
+                [v.exact for v in single if _near(v.multiple, MULTIPLES) == m],
                 "",
             )
-            for m in multiples
+            for m in MULTIPLES
         ),
         ("single effects: named, others perhaps too", [v.found for v in single], ""),
         ("single effects: verdict `named`", [v.verdict == "named" for v in single], ""),
@@ -227,29 +230,22 @@ def _doubles(sets: Sequence[tuple[str, ...]], pairs: dict[int, int], names: set[
 
 
 def _covered(truth: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[bool]:
-    table = _weak_motor_as_list(found)
     for name, value in truth.items():
-        interval = (table.get(name) or {}).get("ci95")
+        interval = (found.get(name) or {}).get("ci95")
         if interval is None:
             continue
         values = value if isinstance(value, list) else [value]
         intervals = interval if isinstance(value, list) else [interval]
+        if "index" in found:
+            # Components (from 1) that are given alone, such as one weak rotor.
+            index = found["index"]["value"]
+            index, intervals = (
+                (index, interval) if isinstance(index, list) else ([index], [interval])
+            )
+            values = [values[int(number) - 1] for number in index]
         for one, span in zip(values, intervals, strict=False):
             if one is not None and span is not None and None not in span:
                 yield bool(span[0] <= one <= span[1])
-
-
-def _weak_motor_as_list(found: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return parameters with `index` and `scale` of weak rotors as a scale for each rotor."""
-    if "index" not in found or "scale" not in found:
-        return found
-    index, interval = found["index"]["value"], found["scale"].get("ci95")
-    if not isinstance(index, list):
-        index, interval = [index], [interval]
-    spans: list[Any] = [None] * 4
-    for number, span in zip(index, interval or [], strict=False):
-        spans[int(number) - 1] = span
-    return {"scale": {"ci95": spans}}
 
 
 def _as_hoped(v: Verdict) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eval.effects import apply_log_faults
+from eval.effects.log_faults import apply_log_faults
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.plans.simulate import Recording

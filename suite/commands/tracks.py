@@ -64,7 +64,9 @@ def _list(console: Console) -> dict[str, Any]:
 
     families = {}
     for name, make in FAMILIES.items():
-        about = (sys.modules[make.__module__].__doc__ or "").split("\n\n")[0]
+        # A file of its own says what it is at its head, a function among others in its own words.
+        alone = getattr(make, "__name__", "") == "make"
+        about = ((sys.modules[make.__module__] if alone else make).__doc__ or "").split("\n\n")[0]
         families[name] = {"about": " ".join(about.split()), "judged": name in JUDGED}
         console.say(f"{name:<10}{families[name]['about']}")
     console.say()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS
+from eval.effects.log_faults import lateness
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.hold_out import split
@@ -115,9 +116,8 @@ def diagnose(
             "the null is drawn from the measured noise"
         )
     windows, apart = take(cut_, inside), take(cut_, ~inside)
-    among = candidates(space, voltage, any(log.acc_b is not None for log in logs))
-    if by_rotors:
-        among = [c for c in among if c.name not in ("motor_lag", "command_delay", "rate_gain")]
+    has = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
+    among = candidates(space, voltage, has if by_rotors else has | {"command"})
     say(f"{len(windows.flight)} stretches of 1 s to fit, {len(apart.flight)} held out")
     known = Linear(*(part[inside] for part in linear))
     finding = search(model, windows, among, say, known, seed)
@@ -200,14 +200,14 @@ def _without_names(model: Model, finding: Finding) -> Finding:
 
 def _of_another_integrator(model: Model, finding: Finding) -> list[str]:
     """Return a warning where a clock's offset may be a simulator's way to integrate."""
-    if all(one.candidate.name != "clock_offset" for one in finding.named):
-        return []
-    offset = float(model.space.effects(finding.state.theta)["clock_offset"].offset)
-    if abs(offset) > HALF_STEP * model.dt:
-        return []
+    values = model.space.effects(finding.state.theta)
+    named = dict.fromkeys(one.candidate.name for one in finding.named)
+    late = {name: float(lateness({name: values[name]})) for name in named if EFFECTS[name].late}
     return [
-        f"clock_offset: {1e3 * offset:.2g} ms is about half a physics step; flights of a simulator "
+        f"{name}: {1e3 * offset:.2g} ms is about half a physics step; flights of a simulator "
         "that integrates in another way look like this"
+        for name, offset in late.items()
+        if abs(offset) <= HALF_STEP * model.dt
     ]
 
 
@@ -268,6 +268,6 @@ def _with_effects(
             values.append(tuple(plain.tolist()) if plain.ndim else float(plain))
         effects[name] = type(fitted[name])(*values)
     if turbulence:
-        effects["gusts"] = EFFECTS["gusts"].values(turbulence.intensity, turbulence.length)
+        effects[turbulence.effect] = turbulence.values
     ordered = {name: effects[name] for name in EFFECTS if name in effects}
     return replace(vehicle, effects=MappingProxyType(ordered))

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from eval.effects import apply_log_faults
+from eval.effects.log_faults import apply_log_faults
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Command, Motion, make_plant, uses_noise

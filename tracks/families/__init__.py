@@ -1,23 +1,38 @@
-"""Track families by name. A new one is a file with `make(d, rng) -> Layout` and an entry here."""
+"""Track families by name. A new one is a file with `make(d, rng) -> Layout` and an entry here.
+
+Another package adds one with an entry point of the group `diffracing_suite.tracks`, a program for
+its own process with `FAMILIES.register(name, make)`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from tracks.common.names import unknown_name
+from tracks.common.registry import Registry
 from tracks.families import circular, ellipse, random, zigzag
 from tracks.families.layout import GATE_COUNT, Layout
-from tracks.geometry.scene import Counts
+from tracks.geometry.scene import Counts, counts
 from tracks.track import Track
 
-FAMILIES: dict[str, Callable[[float, np.random.Generator], Layout]] = {
-    "zigzag": zigzag.make,
-    "circular": circular.make,
-    "ellipse": ellipse.make,
-    "random": random.make,
-}
+
+def _wrong(name: str, make: Any) -> str | None:
+    return None if callable(make) else f"{make!r}; must be a function (d, rng) -> Layout"
+
+
+FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
+    "track family",
+    "diffracing_suite.tracks",
+    {
+        "zigzag": zigzag.make,
+        "circular": circular.make,
+        "ellipse": ellipse.make,
+        "random": random.make,
+    },
+    _wrong,
+)
 JUDGED = ("zigzag", "circular", "ellipse")
 """The families of the tables; `random` is what policies are trained on."""
 LEVELS = range(10)
@@ -41,7 +56,8 @@ def make_track(family: str, level: int, seed: int) -> Track:
         seed: 0 or more.
 
     Raises:
-        ValueError: where the family is unknown, the level out of range or the seed negative.
+        ValueError: where the family is unknown, the level out of range or the seed negative, or
+            where the family makes more than fits the worlds' scenes.
     """
     check_family(family)
     if level not in LEVELS:
@@ -51,7 +67,9 @@ def make_track(family: str, level: int, seed: int) -> Track:
     level, seed = int(level), int(seed)
     rng = np.random.default_rng(np.random.SeedSequence([seed, level, *family.encode()]))
     d = (level + rng.random()) / 10
-    return Track(family, level, seed, d, *FAMILIES[family](d, rng))
+    track = Track(family, level, seed, d, *FAMILIES[family](d, rng))
+    _check_size(track)
+    return track
 
 
 def random_track(
@@ -75,5 +93,19 @@ def random_track(
 
 def check_family(family: str) -> None:
     """Raise a ValueError that names the nearest family where `family` is unknown."""
-    if family not in FAMILIES:
-        raise unknown_name("track family", str(family), FAMILIES)
+    FAMILIES.find(family)
+
+
+def _check_size(track: Track) -> None:
+    gates, corners = track.scene.gates.opening_g.shape[:2]
+    if gates > GATE_COUNT or corners > 4:
+        raise ValueError(
+            f"track family {track.family!r}: {gates} gates of {corners} corners; allowed are at "
+            f"most {GATE_COUNT} of 4 (a track file may have more)"
+        )
+    for kind, there, most in zip(Counts._fields, counts(track.scene), MAX_COUNTS, strict=False):
+        if there > most:
+            raise ValueError(
+                f"track family {track.family!r}: {there} {kind}; allowed are at most {most} "
+                "(a track file may have more)"
+            )

@@ -3,7 +3,7 @@
 Betaflight's body is forward-left-up already: roll right, nose down and a turn to the left are
 positive, in the gyro, the set points and the motor mixer alike. Rates are in deg/s, also where
 the header names no unit (ten times that under `blackbox_high_resolution`: the attitude shows it,
-and `units_check.py` puts it right). Units that `blackbox_decode` was told to use stand in brackets
+and `checks/units.py` puts it right). Units that `blackbox_decode` was told to use stand in brackets
 after a column's name.
 Position and attitude are not logged: --pose brings them.
 """
@@ -18,11 +18,13 @@ import numpy as np
 
 from eval.importers.findings import Finding
 from eval.importers.formats.table import numbers
+from eval.importers.head import first_line
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
 from eval.logs.files import read_columns
 
+SUMMARY = "CSV of blackbox_decode; needs --pose"
 MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 """Motors 1 to 4 (x forward, y left): rear right, front right, rear left, front left."""
 DEG = np.pi / 180.0
@@ -38,6 +40,20 @@ MOST_V = 30.0
 right before Betaflight 4 (a quadrotor of more than seven cells and older firmware is rarer)."""
 _UNIT = re.compile(r"^(?P<name>.*?)(?: \((?P<unit>[^()]*)\))?$")
 _ERPM = re.compile(r"^eRPM(?:\(/100\))?\[(\d)\]$")
+
+
+def detect(head: bytes, options: ImportOptions) -> bool:
+    """Return whether a file with these first bytes is a decoded Blackbox log.
+
+    Raises:
+        ValueError: for one that is not decoded.
+    """
+    if head.startswith(b"H Product:Blackbox"):
+        raise ValueError(
+            "a Blackbox log that is not decoded; run blackbox_decode on it, import the CSV"
+        )
+    line = first_line(head)
+    return b"\0" not in line and (b"loopIteration" in line or b"gyroADC[" in line)
 
 
 class Blackbox:

@@ -21,12 +21,14 @@ from zlib import crc32
 
 import numpy as np
 
-from eval.importers.detect import USD, read_head
 from eval.importers.findings import Finding
+from eval.importers.head import read_head
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
 
+SUMMARY = "log of the Crazyflie's micro SD card deck"
+USD = b"\xbc"
 CODES = {"b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"} | {
     "e": "<f2",
     "f": "<f4",
@@ -88,13 +90,18 @@ class Kind(NamedTuple):
     layout: np.dtype
 
 
+def detect(head: bytes, options: ImportOptions) -> bool:
+    """Return whether a file with these first bytes is a log of the deck."""
+    return head.startswith(USD)
+
+
 def read(path: Path, options: ImportOptions) -> Recording:
     """Return what the log at `path` holds.
 
     Raises:
         FlightLogError: where it is no such log, of an unknown version, or broken in its header.
     """
-    if not read_head(path).startswith(USD):
+    if not detect(read_head(path), options):
         raise FlightLogError(str(path), None, None, "not a uSD deck log (its first byte is not BC)")
     events, findings = decode(path.read_bytes(), str(path))
     parts = {}

@@ -22,14 +22,16 @@ from typing import Any
 
 import numpy as np
 
-from eval.importers.detect import MCAP, read_head
 from eval.importers.findings import Finding
+from eval.importers.head import read_head
 from eval.importers.options import ImportOptions
 from eval.importers.rows import in_world
 from eval.importers.signals import Recording, Signal, collect
 from eval.logs.columns import FlightLogError
 from tracks.common.toml_table import read_toml
 
+SUMMARY = "MCAP with ROS 2 messages (pip install 'diffracing-suite[mcap]')"
+MCAP = b"\x89MCAP0\r\n"
 KINDS: dict[str, tuple[str, ...]] = {
     "odometry": ("nav_msgs/Odometry",),
     "pose": ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"),
@@ -41,6 +43,11 @@ KINDS: dict[str, tuple[str, ...]] = {
 """Kind of message -> types that hold it, `/msg/` left out."""
 
 
+def detect(head: bytes, options: ImportOptions) -> bool:
+    """Return whether a file with these first bytes is MCAP."""
+    return head.startswith(MCAP)
+
+
 def read(path: Path, options: ImportOptions) -> Recording:
     """Return what the MCAP file at `path` holds.
 
@@ -48,7 +55,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         FlightLogError: where it is no MCAP file, damaged, or the extra is not installed.
         ValueError: for a mapping file that cannot be used.
     """
-    if not read_head(path).startswith(MCAP):
+    if not detect(read_head(path), options):
         raise FlightLogError(str(path), None, None, "not an MCAP file (its first bytes differ)")
     told = _topics(options.map)
     found = _messages(path)

@@ -25,13 +25,15 @@ from typing import Any
 
 import numpy as np
 
-from eval.importers.detect import ULOG, read_head
 from eval.importers.findings import Finding
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, turn
+from eval.importers.head import read_head
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
 
+SUMMARY = "PX4 ULog (.ulg)"
+ULOG = b"ULog\x01\x12\x35"
 TOPICS = (
     "vehicle_attitude",
     "vehicle_odometry",
@@ -55,13 +57,18 @@ Topic = Mapping[str, np.ndarray]
 Part = tuple[np.ndarray, np.ndarray]
 
 
+def detect(head: bytes, options: ImportOptions) -> bool:
+    """Return whether a file with these first bytes is ULog."""
+    return head.startswith(ULOG)
+
+
 def read(path: Path, options: ImportOptions) -> Recording:
     """Return what the ULog file at `path` holds.
 
     Raises:
         FlightLogError: where it is no ULog file or is damaged beyond reading.
     """
-    if not read_head(path).startswith(ULOG):
+    if not detect(read_head(path), options):
         raise FlightLogError(str(path), None, None, "not a ULog file (its first bytes differ)")
     log = _load(path)
     topics: dict[str, Topic] = {}

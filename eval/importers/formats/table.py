@@ -24,6 +24,7 @@ from eval.importers.frames import (
     from_euler,
     world_vector,
 )
+from eval.importers.head import first_line
 from eval.importers.options import ImportOptions
 from eval.importers.rows import in_world
 from eval.importers.signals import Recording, collect
@@ -32,6 +33,9 @@ from eval.logs.files import read_columns
 from tracks.common.names import closest
 from tracks.common.toml_table import Table, read_toml
 
+SUMMARY = "CSV or Parquet, described by a mapping file (--map)"
+ASKED_LAST = True
+PARQUET = b"PAR1"
 DEG = float(np.pi / 180.0)
 RPM = float(2.0 * np.pi / 60.0)
 _LENGTH = {"m": 1.0, "cm": 0.01, "mm": 1e-3}
@@ -80,6 +84,13 @@ class TableMap:
     """One of `frames.WORLDS`."""
     body: str = "flu"
     """One of `frames.BODIES`."""
+
+
+def detect(head: bytes, options: ImportOptions) -> bool:
+    """Return whether a file with these first bytes is Parquet, or text that may be a table."""
+    if head.startswith(PARQUET):
+        return True
+    return b"\0" not in head and (options.map is not None or b"," in first_line(head))
 
 
 def read(path: Path, options: ImportOptions) -> Recording:
@@ -148,7 +159,7 @@ def read_map(path: Path) -> TableMap:
             table = top.table(signal)
             columns[signal] = _column(signal, table)
             table.close()
-    top.has("topics")  # of MCAP files; see mcap_format.py
+    top.has("topics")  # of MCAP files; see mcap.py
     top.close()
     return TableMap(columns, world, body)
 

@@ -15,22 +15,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.effects import EFFECTS, all_values
-from eval.effects.interface import at
+from eval.effects.interface import GRAVITY, Parameter, Sample, Values, as_arrays, at, neutral
+from eval.effects.log_faults import lateness, measured
 from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.oracle.stretches import (
     DELAY_STEP_S,
     Channels,
-    Windows,
-    cut,
+    Stretches,
     replay,
     state_columns,
+    stretch_plant,
     whitened,
-    window_plant,
     without_start,
 )
 from suite.blind.sensors import Sensors
-from suite.diagnose.plans.simulate import Recording
+from tracks.geometry.rotation import exp_rot, to_world
 
 THRESHOLD = 12.5
 """Expected log-likelihood ratio at which an effect can just be detected: five sigma."""
@@ -53,6 +53,21 @@ class Column(NamedTuple):
     component: int
     """0 for plain numbers."""
 
+    @property
+    def spec(self) -> Parameter:
+        """The parameter in the catalogue."""
+        found = EFFECTS[self.effect].parameters
+        return next(parameter for parameter in found if parameter.name == self.parameter)
+
+    def value(self, values: Values) -> float:
+        """Return the component in `values` of its effect."""
+        return float(np.ravel(getattr(values, self.parameter))[self.component])
+
+    def room(self, nominal: Vehicle) -> tuple[float, float]:
+        """Return how far down and up it may go from its value in the given vehicle."""
+        given = self.value(all_values(nominal)[self.effect])
+        return at(self.spec.low, nominal) - given, at(self.spec.high, nominal) - given
+
 
 @dataclass(frozen=True)
 class Information:
@@ -66,81 +81,83 @@ class Information:
         """Return the numbers of the columns of `effect`."""
         return [i for i, column in enumerate(self.columns) if column.effect == effect]
 
+    def block(self, effect: str) -> np.ndarray:
+        """Return the part of the matrix that belongs to `effect`."""
+        rows = self.rows_of(effect)
+        return self.matrix[np.ix_(rows, rows)]
 
-def columns_of(has_voltage: bool) -> tuple[Column, ...]:
-    """Return every component that flights can tell, but for the random wind."""
-    found = []
-    for effect in EFFECTS.values():
-        for parameter in effect.parameters:
-            name = parameter.name
-            # The voltage decides by which of its two parameters a battery sags.
-            sags = effect.name == "battery_sag" and (name == "per_volt") != has_voltage
-            if effect.name == "gusts" or not parameter.fitted or sags:
-                continue
-            for component in range(parameter.size or 1):
-                if component not in parameter.unseen:
-                    found.append(Column(effect.name, name, component))
-    return tuple(found)
+
+def columns_of(has_voltage: bool, names: Sequence[str] | None = None) -> tuple[Column, ...]:
+    """Return every component that flights can tell, of `names` or of all, but for random wind."""
+    return tuple(
+        Column(name, parameter.name, component)
+        for name, effect in EFFECTS.items()
+        if not effect.random and (names is None or name in names)
+        for parameter, component in effect.components(has_voltage)
+    )
 
 
 def information(
-    nominal: Vehicle,
-    recordings: Sequence[Recording],
-    sensors: Sensors,
-    windows: Windows | None = None,
+    nominal: Vehicle, stretches: Stretches, sensors: Sensors, names: Sequence[str] | None = None
 ) -> Information:
-    """Return what `recordings` say about the catalogue, measured from the `nominal` vehicle."""
-    windows = windows or cut(recordings)
-    columns, moved = signatures(nominal, windows, sensors)
+    """Return what stretches say about effects (all, or `names`), from the `nominal` vehicle on."""
+    columns, moved = signatures(nominal, stretches, sensors, names)
     flat = moved.reshape(len(columns), -1)
     return Information(columns, flat @ flat.T)
 
 
 def signatures(
-    nominal: Vehicle, windows: Windows, sensors: Sensors
+    nominal: Vehicle, stretches: Stretches, sensors: Sensors, names: Sequence[str] | None = None
 ) -> tuple[tuple[Column, ...], np.ndarray]:
     """Return the columns and (P, W, D) what a unit of each does to the logged channels."""
     has_voltage = bool(sensors.voltage)
-    columns = columns_of(has_voltage)
-    basis, base = start_of(nominal, windows, sensors)
-    flown = [c for c in columns if EFFECTS[c.effect].log is None]
-    steps = np.array([_step_of(column) for column in flown])
-    plant = window_plant(nominal, _changed(nominal, flown, steps))
-    motion = Motion(*(np.broadcast_to(f, (len(flown), *f.shape)) for f in windows.motion))
-    channels = replay(windows, plant, motion, has_voltage=has_voltage)
-    moved = dict(zip(flown, whitened(sensors, channels, base) / steps[:, None, None], strict=True))
+    columns = columns_of(has_voltage, names)
+    basis, base = start_of(nominal, stretches, sensors)
+    moved = {}
+    flown = [c for c in columns if EFFECTS[c.effect].in_flight]
+    if flown:
+        # Times act by whole physics steps.
+        steps = np.array(
+            [DELAY_STEP_S if c.spec.unit == "s" else 0.1 * c.spec.typical[0] for c in flown]
+        )
+        plant = stretch_plant(nominal, _changed(nominal, flown, steps))
+        motion = Motion(*(np.broadcast_to(f, (len(flown), *f.shape)) for f in stretches.motion))
+        apart = whitened(sensors, replay(stretches, plant, motion, has_voltage=has_voltage), base)
+        moved = dict(zip(flown, apart / steps[:, None, None], strict=True))
     for column in columns:
         if column not in moved:
-            moved[column] = whitened(sensors, _faulty(column, base), base) / FAULT_STEP
-    stacked = np.stack([moved[column] for column in columns])
-    return columns, without_start(basis, stacked)
+            moved[column] = whitened(sensors, _faulty(column, base, nominal), base) / FAULT_STEP
+    return columns, without_start(basis, np.stack([moved[column] for column in columns]))
 
 
-def start_of(nominal: Vehicle, windows: Windows, sensors: Sensors) -> tuple[np.ndarray, Channels]:
+def start_of(
+    nominal: Vehicle, stretches: Stretches, sensors: Sensors
+) -> tuple[np.ndarray, Channels]:
     """Return the basis of what an unknown start explains, and the stretches of `nominal`."""
-    plant = window_plant(nominal)
-    base = replay(windows, plant, has_voltage=bool(sensors.voltage))
-    return state_columns(windows, plant, sensors, base), base
+    plant = stretch_plant(nominal)
+    base = replay(stretches, plant, has_voltage=bool(sensors.voltage))
+    return state_columns(stretches, plant, sensors, base), base
 
 
 def gust_strength(
     nominal: Vehicle,
-    windows: Windows,
+    stretches: Stretches,
     sensors: Sensors,
-    length_m: float,
+    name: str,
     rng: np.random.Generator,
 ) -> float:
-    """Return the intensity [m/s] of random wind at which the log-likelihood ratio is `THRESHOLD`.
+    """Return the size of random wind `name` at which the log-likelihood ratio is `THRESHOLD`.
 
-    The wind adds a covariance to the noise; with lambda its whitened eigenvalues for a unit of
-    intensity, a stretch adds (s^2 lambda - log(1 + s^2 lambda)) / 2.
+    The size s is its first parameter, to which the wind is proportional; the others are neutral.
+    It adds a covariance to the noise; with lambda its whitened eigenvalues for s = 1, a stretch
+    adds (s^2 lambda - log(1 + s^2 lambda)) / 2.
     """
-    basis, base = start_of(nominal, windows, sensors)
-    effects = {**nominal.effects, "gusts": EFFECTS["gusts"].values(1.0, length_m)}
-    plant = window_plant(nominal, effects)
-    count = len(windows.start_s)
-    draws = rng.standard_normal((len(windows.command.thrust) + 1, GUST_DRAWS, count, 3))
-    channels = replay(windows, plant, has_voltage=bool(sensors.voltage), draws=draws)
+    basis, base = start_of(nominal, stretches, sensors)
+    wind = EFFECTS[name].values(1.0, *neutral(EFFECTS[name], nominal)[1:])
+    plant = stretch_plant(nominal, {**nominal.effects, name: wind})
+    count = len(stretches.start_s)
+    draws = rng.standard_normal((len(stretches.command.thrust) + 1, GUST_DRAWS, count, 3))
+    channels = replay(stretches, plant, has_voltage=bool(sensors.voltage), draws=draws)
     moved = without_start(basis, whitened(sensors, channels, base))
     gram = np.einsum("kwd,lwd->wkl", moved, moved) / GUST_DRAWS
     eigenvalues = np.maximum(np.linalg.eigvalsh(gram), 0.0)
@@ -158,13 +175,14 @@ def gust_strength(
     return float(high)
 
 
-def detectable(info: Information, effect: str, direction: np.ndarray) -> float:
-    """Return how often `direction` (in the columns of `effect`) can just be detected.
+def log_ratio(matrix: np.ndarray, change: np.ndarray) -> float:
+    """Return the expected log-likelihood ratio of a `change` (P,) under information (P, P)."""
+    return float(0.5 * change @ matrix @ change)
 
-    Infinite where these flights do not show it.
-    """
-    rows = info.rows_of(effect)
-    ratio = 0.5 * direction @ info.matrix[np.ix_(rows, rows)] @ direction
+
+def detectable(matrix: np.ndarray, direction: np.ndarray) -> float:
+    """Return how often `direction` (P,) can just be detected; infinite where it does not show."""
+    ratio = log_ratio(matrix, direction)
     return float(np.sqrt(THRESHOLD / ratio)) if ratio > 1e-12 else float("inf")
 
 
@@ -199,7 +217,7 @@ def left_over(
     values, vectors = np.linalg.eigh(matrix)
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     target = root[:, : len(mine)] @ (truth[instead_of] * scale[: len(mine)])
-    bounds = [_room(info.columns[row], nominal) for row in theirs]
+    bounds = [info.columns[row].room(nominal) for row in theirs]
     free = [(-np.inf, np.inf)] * len(kept)
     low, high = np.array([*bounds, *free]).T
     rest = scale[len(mine) :]
@@ -213,15 +231,16 @@ def alternatives(
     """Return for each true effect the names that may stand for it, with what they leave over."""
     found: dict[str, dict[str, float]] = {}
     for name in truth:
-        rows = info.rows_of(name)
-        whole = 0.5 * truth[name] @ info.matrix[np.ix_(rows, rows)] @ truth[name]
+        whole = log_ratio(info.block(name), truth[name])
         found[name] = {}
-        for other in EFFECTS:
-            silent = other == "accelerometer_bias" and not has_acc
-            if other in truth or other == "gusts" or silent:
+        for other, effect in EFFECTS.items():
+            silent = "acc_b" in effect.needs and not has_acc
+            if other in truth or effect.random or silent:
                 continue
             # All four rotors together imitate a thrust scale; a weak motor is one of them.
-            single = range(4) if other == "weak_motor" else (None,)
+            rows = info.rows_of(other)
+            alone = any(info.columns[row].spec.one_at_a_time for row in rows)
+            single = range(len(rows)) if alone else (None,)
             rest = min(left_over(info, truth, name, other, nominal, one) for one in single)
             if rest < min(ALLOWED, MOSTLY * whole):
                 found[name][other] = rest
@@ -232,19 +251,11 @@ FAULT_STEP = 1e-4
 """By which a fault of the log is changed, in its own unit."""
 
 
-def _step_of(column: Column) -> float:
-    if column.effect in ("command_delay", "motor_lag"):
-        return DELAY_STEP_S
-    effect = EFFECTS[column.effect]
-    parameter = next(p for p in effect.parameters if p.name == column.parameter)
-    return 0.1 * parameter.typical[0]
-
-
 def _changed(nominal: Vehicle, columns: Sequence[Column], steps: np.ndarray) -> dict[str, Any]:
     """Return every effect's values with leading axes (P, 1), each changed in its own columns."""
     changed = {}
     for name, values in all_values(nominal).items():
-        if name == "gusts":
+        if EFFECTS[name].random:
             continue
         fields = {}
         for key, value in values._asdict().items():
@@ -258,30 +269,21 @@ def _changed(nominal: Vehicle, columns: Sequence[Column], steps: np.ndarray) -> 
     return changed
 
 
-def _faulty(column: Column, base: Channels) -> Channels:
+def _faulty(column: Column, base: Channels, nominal: Vehicle) -> Channels:
     """Return `base` with a fault of the log of size `FAULT_STEP`."""
-    unit = FAULT_STEP * np.eye(3)[column.component]
-    if column.effect == "gyro_bias":
-        return base._replace(rate_b=base.rate_b + unit)
-    if column.effect == "accelerometer_bias":
-        return base._replace(acc_b=base.acc_b + unit)
-    # Along the true motion: poses of a moment earlier.
-    from eval.effects.interface import GRAVITY
-    from tracks.geometry.rotation import exp_rot, to_world
-
-    acc_w = to_world(base.rot_w, base.acc_b) - np.array([0.0, 0.0, GRAVITY])
-    acc_w[0] = acc_w[1]
-    return base._replace(
-        pos_w=base.pos_w - FAULT_STEP * base.vel_w,
-        vel_w=base.vel_w - FAULT_STEP * acc_w,
-        rot_w=np.matmul(base.rot_w, exp_rot(-FAULT_STEP * base.rate_b)),
-    )
-
-
-def _room(column: Column, nominal: Vehicle) -> tuple[float, float]:
-    """Return how far down and up a component may go from its value in the given vehicle."""
-    effect = EFFECTS[column.effect]
-    parameter = next(p for p in effect.parameters if p.name == column.parameter)
-    given = getattr(all_values(nominal)[column.effect], column.parameter)
-    value = float(given[column.component]) if given.ndim else float(given)
-    return at(parameter.low, nominal) - value, at(parameter.high, nominal) - value
+    none = as_arrays(neutral(EFFECTS[column.effect], nominal))
+    field = getattr(none, column.parameter)
+    step = FAULT_STEP * np.eye(max(field.size, 1))[column.component].reshape(field.shape)
+    fault = {column.effect: none._replace(**{column.parameter: field + step})}
+    sample = Sample(*base[: len(Sample._fields)])
+    if EFFECTS[column.effect].late:
+        # Along the true motion: poses of a moment earlier.
+        late = lateness(fault)
+        acc_w = to_world(base.rot_w, base.acc_b) - np.array([0.0, 0.0, GRAVITY])
+        acc_w[0] = acc_w[1]
+        sample = sample._replace(
+            pos_w=base.pos_w - late * base.vel_w,
+            vel_w=base.vel_w - late * acc_w,
+            rot_w=np.matmul(base.rot_w, exp_rot(-late * base.rate_b)),
+        )
+    return Channels(*measured(fault, sample), base.rotor_speed)

@@ -35,7 +35,7 @@ STATE_STEP = 1e-5
 """By which the state at the start is changed, in its own units."""
 
 
-class Windows(NamedTuple):
+class Stretches(NamedTuple):
     """W stretches of S steps from all flights of a case."""
 
     dt: float
@@ -72,7 +72,7 @@ class Channels(NamedTuple):
 
 def cut(
     recordings: Sequence[Recording], every_s: float = EVERY_S, horizon_s: float = HORIZON_S
-) -> Windows:
+) -> Stretches:
     """Return the stretches of all `recordings`, which share their physics step and log rate.
 
     Args:
@@ -107,7 +107,7 @@ def cut(
             )
     heads = [np.stack([part[i] for part in parts]) for i in range(7)]
     rows = [np.stack([part[i] for part in parts], axis=1) for i in range(7, 14)]
-    return Windows(
+    return Stretches(
         dt,
         period,
         heads[0],
@@ -122,7 +122,7 @@ def cut(
 
 
 def replay(
-    windows: Windows,
+    stretches: Stretches,
     plant: Plant,
     motion: Motion | None = None,
     outside: bool = False,
@@ -132,14 +132,14 @@ def replay(
     """Fly the stretches again.
 
     Args:
-        windows: W stretches.
+        stretches: W stretches.
         plant: one, or with leading axes (P, 1) that the result then has as (R, P, W, ...).
         motion: (P, W, ...) to start from in place of the true states.
         outside: whether the recorded physics outside the catalogue acts too.
         has_voltage: whether effects see the voltage.
         draws: (S + 1, P, W, 3) normal draws for random wind.
     """
-    start = windows.motion if motion is None else motion
+    start = stretches.motion if motion is None else motion
     lead = np.broadcast_shapes(start.pos_w.shape[:-1], plant.constants.mass.shape)
     if draws is not None:
         lead = np.broadcast_shapes(lead, draws.shape[1:-1])
@@ -152,16 +152,16 @@ def replay(
             if gust is not None:
                 wind[name] = gust(value, draws[0])
     state = PlantState(
-        np.broadcast_to(windows.rotor_speed, (*lead, 4)),
-        np.broadcast_to(windows.history[..., :room], (*lead, 4, room)),
+        np.broadcast_to(stretches.rotor_speed, (*lead, 4)),
+        np.broadcast_to(stretches.history[..., :room], (*lead, 4, room)),
         wind,
     )
     acc_b = np.zeros((*lead, 3))
     kept = []
-    given = windows.acting if outside else windows.command
+    given = stretches.acting if outside else stretches.command
     steps = len(given.thrust)
     for step in range(steps + 1):
-        if step % windows.period == 0:
+        if step % stretches.period == 0:
             # The first row has no step before it: its accelerometer says nothing.
             kept.append((*motion, acc_b, state.rotor_speed))
         if step == steps:
@@ -173,14 +173,14 @@ def replay(
         inputs = Inputs(
             command,
             noise=None if draws is None else draws[step + 1],
-            voltage_drop=windows.voltage_drop[step] if has_voltage else None,
+            voltage_drop=stretches.voltage_drop[step] if has_voltage else None,
         )
-        time_s = windows.start_s + step * windows.dt
+        time_s = stretches.start_s + step * stretches.dt
         state, wrench = plant_step(plant, state, motion, inputs, time_s)
         if outside:
             wrench = Wrench(
-                wrench.force_b + windows.extra.force_b[step],
-                wrench.torque_b + windows.extra.torque_b[step],
+                wrench.force_b + stretches.extra.force_b[step],
+                wrench.torque_b + stretches.extra.torque_b[step],
             )
         acc_b = wrench.force_b / plant.constants.mass[..., None]
         motion = euler_step(plant, motion, wrench)
@@ -222,9 +222,11 @@ def whitened(sensors: Sensors, channels: Channels, base: Channels) -> np.ndarray
     return both.reshape(*both.shape[:-2], -1)
 
 
-def state_columns(windows: Windows, plant: Plant, sensors: Sensors, base: Channels) -> np.ndarray:
+def state_columns(
+    stretches: Stretches, plant: Plant, sensors: Sensors, base: Channels
+) -> np.ndarray:
     """Return (W, D, 12): an orthonormal basis of what an unknown start can explain."""
-    motion = windows.motion
+    motion = stretches.motion
     step = STATE_STEP * np.eye(3)[:, None, :]
     still = np.zeros((3, 1, 3))
 
@@ -237,7 +239,7 @@ def state_columns(windows: Windows, plant: Plant, sensors: Sensors, base: Channe
         motion.vel_w + stacked(2),
         motion.rate_b + stacked(3),
     )
-    columns = whitened(sensors, replay(windows, plant, moved), base) / STATE_STEP
+    columns = whitened(sensors, replay(stretches, plant, moved), base) / STATE_STEP
     return np.linalg.qr(np.moveaxis(columns, 0, -1))[0]
 
 
@@ -247,7 +249,7 @@ def without_start(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return columns - np.einsum("wdk,...wk->...wd", basis, share)
 
 
-def window_plant(vehicle: Vehicle, effects: Mapping[str, Any] | None = None) -> Plant:
+def stretch_plant(vehicle: Vehicle, effects: Mapping[str, Any] | None = None) -> Plant:
     """Return a plant for stretches, `effects` in place of the vehicle's own.
 
     It remembers the commands that the vehicle's delay and `DELAY_STEP_S` more need.

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from eval.effects import EFFECTS
 from eval.effects.interface import Constants
 from eval.quadrotor.plant import Nominal, assemble, nominal_quadrotor
 from eval.quadrotor.stepper import Feedback
@@ -73,7 +74,7 @@ class Model:
         """Numbers F that are free in each window: its start, and the rotor speeds' errors."""
         self.starts = list(range(self.size, self.size + self.free))
         """Places of the free numbers among all directions."""
-        base = {name: value for name, value in space.base.items() if name != "gusts"}
+        base = {name: v for name, v in space.base.items() if not EFFECTS[name].random}
         self.given = Given(*nominal_quadrotor(vehicle), base)
         self.dt = step_s(vehicle)
         """Length of a step [s]."""

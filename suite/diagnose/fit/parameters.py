@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,10 +12,6 @@ from eval.effects import EFFECTS, all_values
 from eval.effects.interface import at
 from eval.vehicles.vehicle import Vehicle
 from tracks.geometry.scene import Array
-
-NOT_FITTED = ("gusts",)
-"""Random wind cannot be flown again, so no rollout can fit it."""
-
 
 Layout = tuple[tuple[str, str, int | None], ...]
 """Effect, parameter and component of each number."""
@@ -44,11 +40,11 @@ class Candidate:
     """A way to explain a gap: numbers that are fitted together."""
 
     name: str
-    """Of the effect; `weak_motor` comes once a rotor."""
+    """Of the effect; one whose components come one at a time comes once each."""
     indices: tuple[int, ...]
     """Places in the vector."""
     label: str
-    """For people: the name, and the rotor where it is one of four."""
+    """For people: the name, and the component (from 1) where it comes once each."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +88,10 @@ def effects_at(layout: Layout, base: Mapping[str, Any], theta: Array) -> dict[st
 
 
 def make_space(vehicle: Vehicle) -> Space:
-    """Return the vector of `vehicle`: all but what no flight can tell."""
+    """Return the vector of `vehicle`: all but what acts by chance or no flight can tell."""
     base, entries = all_values(vehicle), []
     for name, effect in EFFECTS.items():
-        if name in NOT_FITTED:
+        if effect.random:
             continue
         for parameter in effect.parameters:
             if not parameter.fitted:
@@ -119,17 +115,21 @@ def make_space(vehicle: Vehicle) -> Space:
     return Space(tuple(entries), base)
 
 
-def candidates(space: Space, voltage: bool, accelerometer: bool) -> list[Candidate]:
-    """Return what may be named on logs with or without a voltage and an accelerometer."""
+def candidates(space: Space, voltage: bool, has: Collection[str]) -> list[Candidate]:
+    """Return what may be named on logs with or without a voltage.
+
+    Args:
+        space: of the vehicle.
+        voltage: the logs have one.
+        has: what else they have of what effects need (`acc_b`; `command` where commands drive).
+    """
     found = []
-    for name in EFFECTS:
-        at_ = [i for i, e in enumerate(space.entries) if e.effect == name]
-        if not at_ or (name == "accelerometer_bias" and not accelerometer):
+    for name, effect in EFFECTS.items():
+        told = {parameter.name: parameter for parameter in effect.told(voltage)}
+        at_ = [i for i, e in enumerate(space.entries) if e.effect == name and e.parameter in told]
+        if not at_ or not set(effect.needs) <= set(has):
             continue
-        if name == "battery_sag":
-            wanted = "per_volt" if voltage else "rate"
-            at_ = [i for i in at_ if space.entries[i].parameter == wanted]
-        if name == "weak_motor":
+        if any(parameter.one_at_a_time for parameter in told.values()):
             found += [Candidate(name, (i,), f"{name} {k + 1}") for k, i in enumerate(at_)]
         else:
             found.append(Candidate(name, tuple(at_), name))

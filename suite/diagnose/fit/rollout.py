@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from eval.effects.interface import Sample
+from eval.effects.log_faults import lateness, measured, restored
 from eval.quadrotor.delay import delayed_series
 from eval.quadrotor.plant import Motion, Plant, unpacked
 from eval.quadrotor.stepper import Feedback, Inputs, PlantState, rollout, rotor_step, wanted_speed
@@ -55,40 +57,41 @@ def fly_windows(
         feedback: what pushes in place of `push`.
     """
     dt = float(plant.dt)
-    gyro = values["gyro_bias"].bias
     before, warm = round(HISTORY_S / dt) + 1, round(WARM_S / dt)
     steps = windows.command.shape[1] - before - warm
     command = delayed_series(jnp.asarray(windows.command), plant.constants.delay, dt, before)
+    start = restored(values, _sample(windows.rate_b, windows.pos_w, windows.rot_w, windows.vel_w))
     motion = Motion(
-        windows.pos_w + offset[:, :3],
-        jnp.matmul(windows.rot_w, exp_rot(offset[:, 3:6])),
-        windows.vel_w + offset[:, 6:9],
-        windows.rate_b - gyro + offset[:, 9:STATE],
+        start.pos_w + offset[:, :3],
+        jnp.matmul(start.rot_w, exp_rot(offset[:, 3:6])),
+        start.vel_w + offset[:, 6:9],
+        start.rate_b + offset[:, 9:STATE],
     )
     order = jnp.swapaxes(command, 0, 1)
-    warm_rate_b = jnp.swapaxes(jnp.asarray(windows.warm_rate_b), 0, 1)
-    speed = wanted_speed(plant, unpacked(order[0]), warm_rate_b[0] - gyro)
+    # Before the start only rates are known.
+    warm_rate_b = restored(values, _sample(jnp.swapaxes(windows.warm_rate_b, 0, 1))).rate_b
+    speed = wanted_speed(plant, unpacked(order[0]), warm_rate_b[0])
 
     def warm_up(state: PlantState, inputs: Any) -> tuple[PlantState, None]:
         order, rate_b = inputs
-        return rotor_step(plant, state, unpacked(order), rate_b - gyro)[0], None
+        return rotor_step(plant, state, unpacked(order), rate_b)[0], None
 
     # The commands are late already: a plant for whole flights need not remember them.
-    start = PlantState(speed, jnp.zeros((len(speed), 4, 0)), {})
-    start, _ = jax.lax.scan(warm_up, start, (order[:warm], warm_rate_b))
+    state = PlantState(speed, jnp.zeros((len(speed), 4, 0)), {})
+    state, _ = jax.lax.scan(warm_up, state, (order[:warm], warm_rate_b))
 
-    measured = None
+    rotor_speed = None
     if driven_by_rotors:
         error = offset[:, STATE:].reshape(-1, KNOTS, 4)
-        measured = jnp.asarray(windows.rotor_speed) - jnp.matmul(_hats(steps), error)
-        measured = jnp.swapaxes(measured, 0, 1)
+        rotor_speed = jnp.asarray(windows.rotor_speed) - jnp.matmul(_hats(steps), error)
+        rotor_speed = jnp.swapaxes(rotor_speed, 0, 1)
     inputs = Inputs(
         unpacked(order[warm:]),
-        measured,
+        rotor_speed,
         voltage_drop=jnp.swapaxes(jnp.asarray(windows.voltage_drop), 0, 1) if voltage else None,
         push_b=None if push is None else jnp.swapaxes(jnp.matmul(_hats(steps), push), 0, 1),
     )
-    flown = rollout(plant, motion, inputs, start, windows.start_s, feedback)
+    flown = rollout(plant, motion, inputs, state, windows.start_s, feedback)
     force_b = jnp.concatenate([flown.acc_b[:1], flown.acc_b])
     along = (flown.motion, flown.rotor_speed, force_b)
     return Flown(*jax.tree.map(lambda field: jnp.moveaxis(field, 0, 1), along))
@@ -98,12 +101,11 @@ def difference(plant: Plant, values: Mapping[str, Any], flown: Flown, windows: W
     """Return simulated - measured (B, N, 19) of `flown`, zero where nothing was measured."""
     dt, (track, speeds, forces) = float(plant.dt), flown
     steps = speeds.shape[1] - 1
-    gyro, accelerometer = values["gyro_bias"].bias, values["accelerometer_bias"].bias
-    pose = _at(windows.row_s - values["clock_offset"].offset, dt, steps)
+    pose = _at(windows.row_s - lateness(values), dt, steps)
     now = _at(windows.row_s, dt, steps)
-    pos_w, rot_w, vel_w = _pose(track, pose, dt)
-    rate_b = _pick(track.rate_b, now, dt)
-    turn = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), rot_w)
+    rate_b, force_b = _pick(track.rate_b, now, dt), _pick(forces, now, dt)
+    seen = measured(values, Sample(*_pose(track, pose, dt), rate_b, force_b))
+    turn = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), seen.rot_w)
     attitude = 0.5 * jnp.stack(
         [
             turn[..., 2, 1] - turn[..., 1, 2],
@@ -113,16 +115,25 @@ def difference(plant: Plant, values: Mapping[str, Any], flown: Flown, windows: W
         axis=-1,
     )
     parts = [
-        pos_w - windows.row_pos_w,
+        seen.pos_w - windows.row_pos_w,
         attitude,
-        vel_w - windows.row_vel_w,
-        rate_b + gyro - windows.row_rate_b,
-        _pick(forces, now, dt) + accelerometer - windows.row_acc_b,
+        seen.vel_w - windows.row_vel_w,
+        seen.rate_b - windows.row_rate_b,
+        seen.acc_b - windows.row_acc_b,
         _pick(speeds, now, dt) - windows.row_rotor_speed,
     ]
     apart = jnp.concatenate(parts, axis=-1)
     assert apart.shape[-1] == CHANNELS
     return jnp.where(windows.seen, apart, 0.0)
+
+
+def _sample(rate_b: Any, pos_w: Any = None, rot_w: Any = None, vel_w: Any = None) -> Sample:
+    """Return a sample (..., 3) without an accelerometer, and at rest where no pose is given."""
+    rate_b = jnp.asarray(rate_b)
+    still = jnp.zeros_like(rate_b)
+    if pos_w is None:
+        pos_w, rot_w, vel_w = still, jnp.broadcast_to(jnp.eye(3), (*still.shape, 3)), still
+    return Sample(pos_w, rot_w, vel_w, rate_b, still)
 
 
 def _hats(steps: int) -> np.ndarray:

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from eval.effects.constant_wind import ConstantWind
-from eval.effects.gusts import VERTICAL
+from eval.effects import EFFECTS, constant_wind, gusts
 from eval.quadrotor.plant import Motion, assemble
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from suite.diagnose.fit.model import Model
@@ -46,6 +45,16 @@ class Turbulence(NamedTuple):
     length_ci95: tuple[float, float]
     ratio: float
     """Log-likelihood over that of no wind."""
+
+    @property
+    def effect(self) -> str:
+        """Name of the wind in the catalogue."""
+        return gusts.EFFECT.name
+
+    @property
+    def values(self) -> gusts.Gusts:
+        """What a vehicle file holds of it."""
+        return gusts.Gusts(self.intensity, self.length)
 
 
 def find_turbulence(model: Model, theta: np.ndarray, push: Push) -> Turbulence | None:
@@ -83,9 +92,9 @@ def find_turbulence(model: Model, theta: np.ndarray, push: Push) -> Turbulence |
 def _passed_on(model: Model, theta: np.ndarray, knot: Flown) -> np.ndarray:
     """Return (W, 6 KNOTS, 3 KNOTS): the push per m/s of wind in the world at each knot."""
     given = model.given
-    values = dict(model.space.effects(theta))
-    values.pop("gusts", None)
-    plain = np.asarray(values["constant_wind"].velocity)
+    values = {n: v for n, v in model.space.effects(theta).items() if not EFFECTS[n].random}
+    steady_wind = constant_wind.EFFECT.name
+    plain = np.asarray(values[steady_wind].velocity)
     motion = Motion(*(np.asarray(field) for field in knot.track))
     count = len(motion.pos_w)
     state = PlantState(np.zeros(0), np.zeros(0), {})
@@ -93,7 +102,7 @@ def _passed_on(model: Model, theta: np.ndarray, knot: Flown) -> np.ndarray:
     inputs = Inputs(rotor_speed=np.asarray(knot.rotor_speed), voltage_drop=still)
 
     def wrench(wind_w: np.ndarray) -> np.ndarray:
-        values["constant_wind"] = ConstantWind(plain + wind_w)
+        values[steady_wind] = constant_wind.ConstantWind(plain + wind_w)
         plant = assemble(given.nominal, given.constants, values, model.dt, 0.0)
         _, out = plant_step(plant, state, motion, inputs, still)
         mass, inertia = plant.constants.mass, plant.constants.inertia
@@ -113,7 +122,7 @@ def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
     passed = np.concatenate([np.zeros((len(speed), 1)), np.cumsum(step, axis=1)], axis=1)
     colour = np.exp(-np.abs(passed[:, :, None] - passed[:, None, :]))
     root = np.linalg.cholesky(colour + 1e-9 * np.eye(KNOTS))
-    axes = np.diag([1.0, 1.0, VERTICAL])
+    axes = np.diag([1.0, 1.0, gusts.VERTICAL])
     count = len(root)
     whole = np.einsum("wkl,ab->wkalb", root, axes)
     return whole.reshape(count, KNOTS * 3, KNOTS * 3)

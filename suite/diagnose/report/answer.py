@@ -89,7 +89,7 @@ def _gusts(found: Turbulence | None) -> list[dict[str, Any]]:
         return []
     return [
         {
-            "name": "gusts",
+            "name": found.effect,
             "alternatives": [],
             "parameters": {
                 "intensity": {
@@ -115,20 +115,19 @@ def _parameters(diagnosis: Diagnosis, name: str, ones: list[Named]) -> dict[str,
         value, width = float(finding.state.theta[index]), float(diagnosis.widths[place[index]])
         return value, [max(value - width, entry.low), min(value + width, entry.high)]
 
-    if name == "weak_motor":
-        values = [one(i) for i in indices]
-        rotors = [(space.entries[i].component or 0) + 1 for i in indices]
-        lone = len(rotors) == 1
-        return {
-            "index": {"value": rotors[0] if lone else rotors, "unit": "1", "ci95": None},
-            "scale": {
-                "value": values[0][0] if lone else [v for v, _ in values],
-                "unit": "1",
-                "ci95": values[0][1] if lone else [c for _, c in values],
-            },
-        }
     found: dict[str, Any] = {}
     for parameter in EFFECTS[name].parameters:
+        if parameter.one_at_a_time:
+            values = [one(i) for i in indices]
+            which = [(space.entries[i].component or 0) + 1 for i in indices]
+            lone = len(which) == 1
+            found["index"] = {"value": which[0] if lone else which, "unit": "1", "ci95": None}
+            found[parameter.name] = {
+                "value": values[0][0] if lone else [v for v, _ in values],
+                "unit": parameter.unit,
+                "ci95": values[0][1] if lone else [c for _, c in values],
+            }
+            continue
         at = {space.entries[i].component: i for i in indices
               if space.entries[i].parameter == parameter.name}  # fmt: skip
         if not at:

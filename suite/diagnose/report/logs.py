@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from eval.effects import EFFECTS
 from suite.common.report import Cell, Grid, Part, Section
 from suite.diagnose.data.actuators import Apart
 from suite.diagnose.data.kinematics import Kinematics
@@ -11,8 +12,6 @@ from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.verdict.proof import Proof
 
-FAULTS = ("gyro_bias", "clock_offset", "accelerometer_bias", "frame_tilt")
-"""Effects that are faults of a log and imitate physics."""
 RESOLUTION_S = 0.002
 """Offsets below this are left unsaid: sampling and a simulator's steps shift pose and gyro so far
 against each other [s]."""
@@ -80,7 +79,7 @@ def _faults(diagnosis: Diagnosis) -> Grid:
             Cell("named" if s.candidate.name in named else "not named"),
         ]
         for s in diagnosis.finding.first
-        if s.candidate.name in FAULTS
+        if EFFECTS[s.candidate.name].of_log
     ]
     note = (
         "In the search they compete with the physics that they imitate, in one model; the gain "

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from eval.effects.log_faults import lateness
 from suite.diagnose.data.windows import SLICES, Windows
 from suite.diagnose.fit.model import Linear, Model
 from suite.diagnose.fit.normal_equations import make_frame, rotor_spread, sums_of
@@ -115,7 +116,7 @@ def _errors(
 
 def true_starts(model: Model, theta: np.ndarray, windows: Windows) -> np.ndarray:
     """Return where windows start if the log's clock is off by the model's offset."""
-    late = model.space.effects(theta)["clock_offset"].offset
+    late = lateness(model.space.effects(theta))
     offset = np.zeros((len(windows.flight), model.free))
     offset[:, :3] = late * windows.vel_w
     offset[:, 3:6] = late * windows.rate_b

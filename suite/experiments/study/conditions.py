@@ -3,40 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from eval.effects import EFFECTS
-from eval.effects.constant_wind import ConstantWind
+from eval.effects import EFFECTS, constant_wind
 from eval.effects.interface import Effect, neutral
 from eval.judging.sensors import SensorNoise
 from eval.vehicles.vehicle import Vehicle
 
-SIGNS: Mapping[str, tuple[int, ...]] = MappingProxyType(
-    {
-        "thrust_scale": (-1, 1),
-        "mass_offset": (1, -1),
-        "inertia_scale": (1, -1),
-        "rate_gain": (-1, 1),
-        "weak_motor": (-1,),
-    }
-)
-"""Ways in which an effect differs from its neutral values; upwards where nothing is said."""
-DIRECTIONS: Mapping[str, tuple[float, ...]] = MappingProxyType(
-    {
-        "constant_wind": (-0.6, 0.8, 0.0),
-        "com_offset": (0.6, 0.8, 0.0),
-        "torque_trim": (0.6, 0.8, 0.0),
-        "thrust_tilt": (0.6, 0.8),
-        "frame_tilt": (0.6, 0.8),
-        "weak_motor": (1.0, 0.0, 0.0, 0.0),
-    }
-)
-"""Unit vectors along which an effect's components share its size; else each has all of it."""
 STATE_UNIT = SensorNoise(pos_m=0.03, vel=0.1, attitude_rad=math.radians(1.0))
 """What 1 means in the sweep of the state's estimate."""
 
@@ -71,7 +49,7 @@ class Sweep:
 
 def log_faults() -> list[str]:
     """Return the effects that are faults of a log and touch no flight."""
-    return [name for name, effect in EFFECTS.items() if effect.log is not None]
+    return [name for name, effect in EFFECTS.items() if not effect.in_flight]
 
 
 def effect_conditions(vehicle: Vehicle) -> list[Condition]:
@@ -81,8 +59,8 @@ def effect_conditions(vehicle: Vehicle) -> list[Condition]:
     """
     found = []
     for effect in EFFECTS.values():
-        if effect.log is None:
-            found += [_with(vehicle, effect, sign) for sign in SIGNS.get(effect.name, (1,))]
+        if effect.in_flight:
+            found += [_with(vehicle, effect, sign) for sign in effect.parameters[0].signs]
     return found
 
 
@@ -91,13 +69,11 @@ def _with(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     values = neutral(effect, vehicle)
     size = parameter.typical[1]
     none = np.asarray(getattr(values, parameter.name), float)
-    if effect.name == "motor_lag":
-        none = np.zeros_like(none)  # its usual sizes are whole time constants
-    share = np.asarray(DIRECTIONS.get(effect.name, np.ones(none.shape)))
+    none = np.zeros_like(none) if parameter.whole else none
+    share = np.asarray(parameter.direction) if parameter.direction else np.ones(none.shape)
     changed = none + sign * size * share
-    if effect.name in vehicle.effects or effect.name == "motor_lag":
-        own = np.asarray(getattr(_own(vehicle, effect.name), parameter.name), float)
-        changed = np.where(np.abs(own - none) > np.abs(changed - none), own, changed)
+    own = np.asarray(getattr(_own(vehicle, effect.name), parameter.name), float)
+    changed = np.where(np.abs(own - none) > np.abs(changed - none), own, changed)
     value = tuple(changed.tolist()) if changed.ndim else float(changed)
     shown = "(" + ", ".join(f"{v:.3g}" for v in changed) + ")" if changed.ndim else f"{value:.3g}"
     words = f"{parameter.name} {shown} {'' if parameter.unit == '1' else parameter.unit}".strip()
@@ -147,8 +123,9 @@ def _draggier(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorNoise]:
 
 
 def _windy(vehicle: Vehicle, speed: float) -> tuple[Vehicle, SensorNoise]:
-    velocity = tuple(speed * share for share in DIRECTIONS["constant_wind"])
-    return with_effect(vehicle, "constant_wind", ConstantWind(velocity)), SensorNoise()
+    wind = constant_wind.EFFECT
+    velocity = tuple(speed * share for share in wind.parameters[0].direction)
+    return with_effect(vehicle, wind.name, wind.values(velocity)), SensorNoise()
 
 
 def _sensing(field: str) -> Callable[..., tuple[Vehicle, SensorNoise]]:

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS, all_values, apply_log_faults, find_effect
+from eval.effects import EFFECTS, all_values, find_effect
 from eval.effects.interface import neutral
+from eval.effects.log_faults import apply_log_faults
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from tests.support.flights import small_log

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS, apply_log_faults
+from eval.effects import EFFECTS
+from eval.effects.log_faults import apply_log_faults
 from eval.quadrotor.plant import Command, Motion, make_plant, uses_noise
 from eval.quadrotor.rigid_body import accelerations
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from eval.importers import FORMATS, import_log
+from eval.importers import import_log
+from eval.importers.formats import FORMATS
 from eval.importers.formats.crazyflie import unpack_quaternion
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError

@@ -43,6 +43,7 @@ def test_windows_of_unlike_rates_are_cut_to_what_all_have():
     """A log of every other decision has half as many in a window, and in what came before it."""
     plant = nominal_model(PointMassConfig())
     log = fly(plant, 1)[0]
+    assert log.policy_step is not None
     steps = np.cumsum(log.policy_step) - 1
     thin = replace(log, extra={**log.extra, "policy_step": log.policy_step & (steps % 2 == 0)})
     both = cut_windows([log, thin], 0.5, 0.3)

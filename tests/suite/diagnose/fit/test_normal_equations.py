@@ -27,7 +27,7 @@ def test_the_null_gives_small_p_values_as_rarely_as_they_say():
     space = make_space(PLAIN)
     fold = folds_of(np.repeat(np.arange(4), 6), np.tile(np.arange(6.0), 4))
     theta = 0.5 * (space.array("low") + space.array("high"))
-    among = candidates(space, False, False)
+    among = candidates(space, False, {"command"})
     rng = np.random.default_rng(3)
     best = [score(made_sums(rng, space, 0.0), theta, space, [], among, fold)[0].p_value
             for _ in range(60)]  # fmt: skip

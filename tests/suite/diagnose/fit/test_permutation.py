@@ -11,7 +11,7 @@ from tests.support.vehicles import PLAIN
 
 SPACE = make_space(PLAIN)
 NAMES = ("linear_drag", "rotor_drag", "thrust_scale", "gyro_bias", "com_offset", "frame_tilt")
-AMONG = [c for c in candidates(SPACE, False, False) if c.name in NAMES]
+AMONG = [c for c in candidates(SPACE, False, {"command"}) if c.name in NAMES]
 MIDDLE = 0.5 * (SPACE.array("low") + SPACE.array("high"))
 WINDOWS, ROWS = 20, 12
 FOLD = folds_of(np.repeat(np.arange(4), 5), np.tile(np.arange(5.0), 4))

@@ -248,7 +248,7 @@ def test_quadrotors_vary_around_the_vehicle_and_the_tracks_stay_the_same():
     assert np.all((bare["command_delay"].delay >= 0) & (bare["command_delay"].delay <= 0.01))
 
 
-@pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.log is None])
+@pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.in_flight])
 def test_every_effect_of_a_vehicle_file_flies_in_training(name):
     """A typical strength of it changes where the quadrotor is after half a second."""
     changed = {

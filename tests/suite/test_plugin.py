@@ -1,0 +1,103 @@
+"""A package that adds an effect, a track family, a log format and a world, installed and used."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+RUN = """
+import sys
+from suite.cli import main
+for line in sys.stdin.read().splitlines():
+    code = main([*line.split(), "--json"])
+    if code:
+        raise SystemExit(code)
+"""
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory, root):
+    """The environment of a process that finds the example package."""
+    place = tmp_path_factory.mktemp("plugin")
+    shutil.copytree(root / "examples" / "plugin", place / "source")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    pip += ["--no-deps", "--no-index", "--no-build-isolation", "--target", str(place / "site")]
+    subprocess.run([*pip, str(place / "source")], check=True, capture_output=True)
+    return {**os.environ, "PYTHONPATH": f"{place / 'site'}{os.pathsep}{root}"}
+
+
+def suite(commands, env, cwd):
+    """Run commands in one process and return what each printed."""
+    done = subprocess.run(
+        [sys.executable, "-c", RUN], input="\n".join(commands), env=env, cwd=cwd,
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found, text = [], done.stdout.strip()
+    while text:
+        answer, end = json.JSONDecoder().raw_decode(text)
+        found.append(answer)
+        text = text[end:].strip()
+    return found
+
+
+def test_all_four_are_used_by_commands(installed, tmp_path, root):
+    text = (root / "eval" / "vehicles" / "reference.toml").read_text(encoding="utf-8")
+    fins = "\n[effects.fin_drag]\ncoefficient = 0.3\n"
+    (tmp_path / "finned.toml").write_text(text + fins)
+    time_s = np.arange(0.0, 2.0, 0.01)
+    circle = np.stack([np.cos(time_s), np.sin(time_s), 1.0 + 0.0 * time_s], 1)
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_s), 1))
+    rows = np.concatenate(
+        [time_s[:, None], circle, level, 0.0 * circle, 800.0 + 0.0 * level], axis=1
+    )
+    np.savetxt(tmp_path / "flight.simlog", rows, header="simlog")
+    fly = "eval --policy racer --track staircase --trials 1 --procs 1 --world"
+    effects, tracks, drawn, imported, *flown = suite(
+        [
+            "effects",
+            "tracks",
+            "tracks staircase --difficulty 3 --out pictures",
+            "import flight.simlog --no-fix --out flight.parquet",
+            f"{fly} coarse --out coarse",
+            f"{fly} mujoco --vehicle finned.toml --out finned",
+        ],
+        installed,
+        tmp_path,
+    )
+    assert list(effects["effects"])[-1] == "fin_drag"
+    assert tracks["families"]["staircase"] == {
+        "about": "Staircase: eight gates in a line along world x, each higher than the one before.",
+        "judged": False,
+    }
+    assert drawn["tracks"][0]["gates"] == 8
+    assert imported["rows"] == 200
+    run = json.loads((tmp_path / "coarse" / "run.json").read_text())
+    assert "coarse" in json.dumps(run)
+    times = [
+        pq.read_table(tmp_path / name / "trials.parquet")["time_s"][0].as_py()
+        for name in ("coarse", "finned")
+    ]
+    assert times[0] != times[1], "each flies otherwise"
+
+
+def test_a_name_of_the_suite_is_refused(installed, tmp_path):
+    """Whoever takes one of ours is told, by whatever command reads the table."""
+    site = tmp_path / "thief-1.0.dist-info"
+    site.mkdir()
+    (site / "METADATA").write_text("Metadata-Version: 2.1\nName: thief\nVersion: 1.0\n")
+    (site / "entry_points.txt").write_text(
+        "[diffracing_suite.effects]\nlinear_drag = racing_extras:FIN_DRAG\n"
+    )
+    env = {**installed, "PYTHONPATH": f"{tmp_path}{os.pathsep}{installed['PYTHONPATH']}"}
+    done = subprocess.run(
+        [sys.executable, "-c", "from suite.cli import main; raise SystemExit(main(['effects']))"],
+        env=env, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "'linear_drag' of the package 'thief'" in done.stderr and "rename" in done.stderr
