@@ -28,7 +28,7 @@ from suite.common.estimate import Estimate, announce
 from suite.common.report import markdown, rich_table
 from suite.common.stages import Stages, claim
 from suite.delta.run import PLANT_STEPS_S, fit_quadrotor_delta
-from suite.diagnose.run import Wishes, diagnose_files
+from suite.diagnose.run import diagnose_files
 from suite.judging.collect import Collection
 from suite.judging.evaluate import Judgement
 from suite.loop.hidden_config import HiddenConfig
@@ -189,9 +189,10 @@ def _diagnose(config: HiddenConfig, stages: Stages) -> dict[str, Any]:
     def work(folder: Path) -> None:
         listed = json.loads((measured / "diagnosed.json").read_text(encoding="utf-8"))
         paths = [measured / name for name in listed["files"]]
-        wishes = Wishes(drive=DRIVE, seed=config.seed)
         try:
-            diagnose_files(paths, config.vehicle, wishes, folder, stages.console)
+            diagnose_files(
+                paths, config.vehicle, folder, stages.console, drive=DRIVE, seed=config.seed
+            )
         except ValueError as error:
             raise WorkFailed(f"the flights in {measured} cannot be diagnosed: {error}") from error
 

@@ -17,12 +17,12 @@ NOT_FITTED = ("gusts",)
 """Random wind cannot be flown again, so no rollout can fit it."""
 
 
-Layout = tuple[tuple[str, str, int | None], ...]
+ParameterLayout = tuple[tuple[str, str, int | None], ...]
 """Effect, parameter and component of each number."""
 
 
 @dataclass(frozen=True)
-class Entry:
+class FittedNumber:
     """One number of the vector."""
 
     effect: str
@@ -52,10 +52,10 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Space:
+class ParameterSpace:
     """The vector of all numbers that can be fitted on a vehicle."""
 
-    entries: tuple[Entry, ...]
+    entries: tuple[FittedNumber, ...]
     base: Mapping[str, Any]
     """Values of every effect, as the vehicle file has them."""
 
@@ -68,12 +68,12 @@ class Space:
         return effects_at(self.layout, self.base, theta)
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> ParameterLayout:
         """Which number of the vector is what; the same for every vehicle."""
         return tuple((e.effect, e.parameter, e.component) for e in self.entries)
 
 
-def effects_at(layout: Layout, base: Mapping[str, Any], theta: Array) -> dict[str, Any]:
+def effects_at(layout: ParameterLayout, base: Mapping[str, Any], theta: Array) -> dict[str, Any]:
     """Return `base` with the numbers `theta` (P,) in their places; all may be traced."""
     xp = theta.__array_namespace__()
     values = {name: value._asdict() for name, value in base.items()}
@@ -91,7 +91,7 @@ def effects_at(layout: Layout, base: Mapping[str, Any], theta: Array) -> dict[st
     return {name: type(base[name])(**fields) for name, fields in values.items()}
 
 
-def make_space(vehicle: Vehicle) -> Space:
+def make_space(vehicle: Vehicle) -> ParameterSpace:
     """Return the vector of `vehicle`: all but what no flight can tell."""
     base, entries = all_values(vehicle), []
     for name, effect in EFFECTS.items():
@@ -105,7 +105,7 @@ def make_space(vehicle: Vehicle) -> Space:
                 if k in parameter.unseen:
                     continue
                 entries.append(
-                    Entry(
+                    FittedNumber(
                         effect=name,
                         parameter=parameter.name,
                         component=k if parameter.size else None,
@@ -116,10 +116,10 @@ def make_space(vehicle: Vehicle) -> Space:
                         step=parameter.typical[1],
                     )
                 )
-    return Space(tuple(entries), base)
+    return ParameterSpace(tuple(entries), base)
 
 
-def candidates(space: Space, voltage: bool, accelerometer: bool) -> list[Candidate]:
+def candidates(space: ParameterSpace, voltage: bool, accelerometer: bool) -> list[Candidate]:
     """Return what may be named on logs with or without a voltage and an accelerometer."""
     found = []
     for name in EFFECTS:

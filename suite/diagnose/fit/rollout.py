@@ -12,7 +12,7 @@ import numpy as np
 from eval.quadrotor.plant import Command, Memory, Motion, Plant, Wrench, spin_step, wanted_speed
 from eval.quadrotor.rigid_body import euler_step
 from eval.quadrotor.rotors import follow, steady
-from suite.diagnose.data.windows import CHANNELS, HISTORY_S, WARM_S, Windows
+from suite.diagnose.data.windows import BURN_IN_S, CHANNELS, HISTORY_S, FlightWindows
 from tracks.geometry.rotation import exp_rot
 
 STATE = 12
@@ -47,7 +47,7 @@ def fly_windows(
     driven_by_rotors: bool,
     voltage: bool,
     offset: Any,
-    windows: Windows,
+    windows: FlightWindows,
     push: Any = None,
     feedback: Feedback | None = None,
 ) -> Flown:
@@ -66,7 +66,7 @@ def fly_windows(
     """
     dt = float(plant.dt)
     gyro = values["gyro_bias"].bias
-    before, warm = round(HISTORY_S / dt) + 1, round(WARM_S / dt)
+    before, warm = round(HISTORY_S / dt) + 1, round(BURN_IN_S / dt)
     steps = windows.command.shape[1] - before - warm
     command = _late(windows.command, plant.constants.delay, dt, before)
     motion = Motion(
@@ -85,9 +85,9 @@ def fly_windows(
         return follow(speed, wanted, plant.constants.time_constant, plant.dt).end, None
 
     order = jnp.swapaxes(command, 0, 1)
-    warm_rate_b = jnp.swapaxes(jnp.asarray(windows.warm_rate_b), 0, 1)
+    burn_in_rate_b = jnp.swapaxes(jnp.asarray(windows.burn_in_rate_b), 0, 1)
     speed, _ = jax.lax.scan(
-        warm_up, ask(order[0], warm_rate_b[0] - gyro), (order[:warm], warm_rate_b)
+        warm_up, ask(order[0], burn_in_rate_b[0] - gyro), (order[:warm], burn_in_rate_b)
     )
 
     def step(carry: Any, inputs: Any) -> Any:
@@ -136,7 +136,9 @@ def fly_windows(
     return Flown(track, speeds, forces)
 
 
-def difference(plant: Plant, values: Mapping[str, Any], flown: Flown, windows: Windows) -> Any:
+def difference(
+    plant: Plant, values: Mapping[str, Any], flown: Flown, windows: FlightWindows
+) -> Any:
     """Return simulated - measured (B, N, 19) of `flown`, zero where nothing was measured."""
     dt, (track, speeds, forces) = float(plant.dt), flown
     steps = speeds.shape[1] - 1

@@ -43,9 +43,9 @@ def test_enough_stretches_are_left_to_fit():
 
 def test_the_command_copies_all_a_diagnosis_needs(tmp_path, capsys):
     assert cli.main(["example", "--out", str(tmp_path / "x"), "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["files"] == sorted([*(p.name for p in FILES), "vehicle.toml"])
-    for name in answer["files"]:
+    diagnosis_json = json.loads(capsys.readouterr().out)
+    assert diagnosis_json["files"] == sorted([*(p.name for p in FILES), "vehicle.toml"])
+    for name in diagnosis_json["files"]:
         assert (tmp_path / "x" / name).read_bytes() == (FOLDER / name).read_bytes()
 
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from suite.common.report import html
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.report.answer import answer
+from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
-from suite.diagnose.verdict.proof import as_json, gather
+from suite.diagnose.verdict.checks import run_checks
 from tests.support.broken_logs import BREAKAGES
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
@@ -34,11 +34,11 @@ def outcome(logs, drive="commands"):
     except ValueError as error:
         assert len(str(error)) > 20
         return str(error)
-    proof = gather(result, logs, LAGGED)
-    found = {**answer(result), **as_json(proof, 0)}
+    checks = run_checks(result)
+    found = {**diagnosis_json(result), **checks_json(checks, 0)}
     text = to_json(plain(found))
     assert "NaN" not in text and "Infinity" not in text
-    assert "<h2>" in html(page(result, json.loads(text), proof, "", set(), 0))
+    assert "<h2>" in html(page(result, json.loads(text), checks, "", set()))
     assert found["verdict"] in VERDICTS
     assert np.isfinite(found["gap"]["before"]) and np.isfinite(found["gap"]["after"])
     return found

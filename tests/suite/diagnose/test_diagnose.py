@@ -10,7 +10,7 @@ from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.report.answer import answer
+from suite.diagnose.report.diagnosis_json import diagnosis_json
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -37,7 +37,7 @@ def within(entry, truth):
 
 
 def test_flights_of_the_vehicle_itself_have_no_gap():
-    found = answer(diagnose(flights(LAGGED), LAGGED))
+    found = diagnosis_json(diagnose(flights(LAGGED), LAGGED))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
     assert 0.8 < found["gap"]["before"] < 1.2
 
@@ -48,7 +48,7 @@ def test_flights_of_the_vehicle_itself_have_no_gap():
 )
 def test_an_effect_is_named_with_its_value(name):
     parameter, truth = CASES[name]
-    found = answer(diagnose(flights(with_effects(LAGGED, **{name: (truth,)})), LAGGED))
+    found = diagnosis_json(diagnose(flights(with_effects(LAGGED, **{name: (truth,)})), LAGGED))
     assert found["verdict"] == "named"
     (effect,) = found["effects"]
     assert name in (effect["name"], *effect["alternatives"])
@@ -68,7 +68,7 @@ def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
     def swing(motion, t):
         return np.array([0.8 * np.sin(2 * np.pi * 1.3 * t), 0.8 * np.cos(2 * np.pi * 1.1 * t), 0.0])
 
-    found = answer(diagnose(flights(LAGGED, extra=swing), LAGGED))
+    found = diagnosis_json(diagnose(flights(LAGGED, extra=swing), LAGGED))
     assert found["verdict"] in ("unknown", "partly")
 
 

@@ -8,7 +8,7 @@ from suite.blind.sensors import SENSORS, log_of
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import ordinary_flights
-from suite.diagnose.report.answer import answer
+from suite.diagnose.report.diagnosis_json import diagnosis_json
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 DRAG = {"linear_drag": ((0.3, 0.25, 0.15),), "quadratic_drag": ((0.012, 0.016, 0.03),)}
@@ -67,7 +67,7 @@ def test_an_effect_is_named_alone(name, ways):
         log_of(flight, truth, SENSORS["estimator"], rng, f"flight_{k}")
         for k, flight in enumerate(flights)
     ]
-    found = answer(diagnose(logs, GIVEN))
+    found = diagnosis_json(diagnose(logs, GIVEN))
     assert found["verdict"] in ("named", "partly"), found["unexplained"]
     assert [effect["name"] for effect in found["effects"]] == [name]
     (effect,) = found["effects"]

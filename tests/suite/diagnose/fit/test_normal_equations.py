@@ -4,9 +4,9 @@ import numpy as np
 
 from suite.diagnose.data.noise import noise_of
 from suite.diagnose.data.windows import cut
-from suite.diagnose.fit.normal_equations import Sums, solve
+from suite.diagnose.fit.normal_equations import NormalEquations, solve
 from suite.diagnose.fit.parameters import candidates, make_space
-from suite.diagnose.fit.permutation import folds_of, score
+from suite.diagnose.fit.permutation import folds_of, score_candidates
 from tests.support.diagnosis_flights import NOISE, fly
 from tests.support.vehicles import PLAIN
 
@@ -18,7 +18,7 @@ def made_sums(rng, space, true_size, windows=24, rows=40):
     residual = rng.standard_normal((windows, rows))
     residual += true_size * slope[..., 0] * space.array("step")[0]
     turned = np.swapaxes(slope, 1, 2)
-    return Sums(
+    return NormalEquations(
         turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1), np.zeros(0)
     )
 
@@ -29,12 +29,12 @@ def test_the_null_gives_small_p_values_as_rarely_as_they_say():
     theta = 0.5 * (space.array("low") + space.array("high"))
     among = candidates(space, False, False)
     rng = np.random.default_rng(3)
-    best = [score(made_sums(rng, space, 0.0), theta, space, [], among, fold)[0].p_value
+    best = [score_candidates(made_sums(rng, space, 0.0), theta, space, [], among, fold)[0].p_value
             for _ in range(60)]  # fmt: skip
     # Of 60 nulls 6 are expected below 0.1; 14 or more come with a chance of 0.2 %.
     assert np.sum(np.array(best) <= 0.1) < 14
     assert np.median(best) > 0.2
-    strong = score(made_sums(rng, space, 0.5), theta, space, [], among, fold)[0]
+    strong = score_candidates(made_sums(rng, space, 0.5), theta, space, [], among, fold)[0]
     assert strong.candidate.name == space.entries[0].effect
     assert strong.p_value <= 0.01
 
