@@ -179,8 +179,8 @@ def _candidates(diagnosis: Diagnosis) -> Section:
         f"All {len(scores)} candidates, each fitted alone before anything was named. The gain is "
         "the fall of the whitened squared error on stretches that its fit did not see. The null: "
         f"the signs of whole stretches are shuffled {limits.sign_draws} times, and the best gain "
-        "of all candidates is taken each time; p is how often that is as large. One name follows another "
-        f"while p is at most {limits.name_p_value:g}; then all are refitted jointly."
+        "of all candidates is taken each time; p is how often that is as large. One name follows "
+        f"another while p is at most {limits.name_p_value:g}; then all are refitted jointly."
     )
     head = f"{'effect':24}{'gain':>12}{'p':>8}"
     return Section(

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from eval.logs.flight_log import read_flight
+from eval.quadrotor.plant import Motion
 from suite.blind.sensors import SENSORS, log_of
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.plans.files import COLUMNS, read_plan, write_plan
+from suite.diagnose.plans.pilot import Gains, steer
 from suite.diagnose.plans.plan import fly_plan, sets_of, ways_for, write_plan_of
 from suite.diagnose.plans.separating import OTHERWISE, SEPARATIONS, advice
 from suite.diagnose.plans.simulate import fly
-from suite.diagnose.plans.trajectory import Trajectory
+from suite.diagnose.plans.trajectory import Reference, Trajectory
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -107,3 +109,15 @@ def test_flying_the_plan_turns_the_set_into_a_name(tmp_path):
     assert (effect["name"], effect["alternatives"]) == ("rotor_drag", [])
     low, high = effect["parameters"]["coefficient"]["ci95"]
     assert low < 3e-5 < high
+
+
+def test_the_pilot_pushes_towards_where_it_should_be_and_never_turns_over():
+    level = np.eye(3)[None]
+    still = Motion(np.zeros((1, 3)), level, np.zeros((1, 3)), np.zeros((1, 3)))
+    wanted = Reference(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
+    hover = steer(LAGGED, Gains(), wanted, still, np.zeros((1, 3)))
+    assert hover.thrust[0] == pytest.approx(9.81) and np.abs(hover.rate_b).max() < 1e-9
+    ahead = wanted._replace(pos_w=np.array([[1.0, 0.0, 0.0]]))
+    assert steer(LAGGED, Gains(), ahead, still, np.zeros((1, 3))).rate_b[0, 1] > 0.1
+    fall = wanted._replace(acc_w=np.array([[0.0, 0.0, -30.0]]))
+    assert steer(LAGGED, Gains(), fall, still, np.zeros((1, 3))).thrust[0] > 0.0
