@@ -31,11 +31,8 @@ def noise_of(
 ) -> np.ndarray:
     """Return the standard deviation of each channel's noise, (19,) in its unit; NaN where unseen.
 
-    Args:
-        residual: (W, N, 19) measured - simulated.
-        windows: of the same rows.
-        rows_together: rows that a polynomial is taken off; `limits.noise_rows` if not given.
-        limits: rows, degree, and what is rounding.
+    `residual` (W, N, 19) is measured - simulated in `windows`; a polynomial is taken off
+    `rows_together` of them at a time, by default `limits.noise_rows`.
     """
     block, degree = rows_together or limits.noise_rows, limits.noise_degree
     power: list[list[float]] = [[] for _ in range(CHANNELS)]

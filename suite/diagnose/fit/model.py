@@ -107,33 +107,21 @@ class RolloutModel:
         With None the directions are all numbers and then the F free ones, whose places are
         `starts`.
         """
-        with jax.enable_x64(True):
-            return self._linearise(theta, offset, windows, indices)
-
-    def _linearise(
-        self,
-        theta: np.ndarray,
-        offset: np.ndarray,
-        windows: FlightWindows,
-        indices: list[int] | None,
-    ) -> Linearisation:
         everything = np.eye(self.size + self.free)
-        if indices is None:
-            groups = [everything]
-        else:
-            chosen = everything[indices]
-            groups = []
-            for first in range(0, max(len(indices), 1), DIRECTIONS):
-                rows = np.zeros((DIRECTIONS, self.size + self.free))
-                part = chosen[first : first + DIRECTIONS]
+        groups, width = [everything], len(everything)
+        if indices is not None:
+            groups, width = [], len(indices)
+            for first in range(0, max(width, 1), DIRECTIONS):
+                rows = np.zeros((DIRECTIONS, len(everything)))
+                part = everything[indices[first : first + DIRECTIONS]]
                 rows[: len(part)] = part
                 groups.append(rows)
         values, slopes = [], []
-        for x, w, count in batches(offset, windows):
-            answers = [self._linear(self.given, theta, x, w, group) for group in groups]
-            values.append(np.asarray(answers[0][0])[:count])
-            slopes.append(np.concatenate([np.asarray(a[1])[:count] for a in answers], axis=-1))
-        width = self.size + self.free if indices is None else len(indices)
+        with jax.enable_x64(True):
+            for x, w, count in batches(offset, windows):
+                answers = [self._linear(self.given, theta, x, w, group) for group in groups]
+                values.append(np.asarray(answers[0][0])[:count])
+                slopes.append(np.concatenate([np.asarray(a[1])[:count] for a in answers], axis=-1))
         return Linearisation(-np.concatenate(values), np.concatenate(slopes)[..., :width], offset)
 
 

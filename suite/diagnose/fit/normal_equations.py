@@ -138,15 +138,8 @@ def fit(
 ) -> tuple[Estimate, NormalEquations]:
     """Fit the numbers at `indices` and every window's start (Gauss-Newton, halved where it fails).
 
-    Args:
-        model: that flies the windows.
-        windows: W of them.
-        whitening: of these windows.
-        start: where to begin.
-        indices: places in the vector of what is fitted, K of them.
-        rounds: Gauss-Newton steps at most.
-        known: slopes at `start` along all numbers, to save their first calculation.
-        limits: when a fit is done.
+    At most `rounds` steps are taken; `known` are the slopes at `start` along all numbers, to save
+    their first calculation.
 
     Returns:
         The best estimate, and its normal equations along `indices`.

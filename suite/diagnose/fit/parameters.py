@@ -29,9 +29,8 @@ class FittedNumber:
     parameter: str
     component: int | None
     """Which of a vector, or None for a plain number."""
-    neutral: float
-    """Where the effect is absent."""
     low: float
+    """Bounds of the fit, in the parameter's unit."""
     high: float
     start: float
     """As the vehicle file has it."""
@@ -109,7 +108,6 @@ def make_space(vehicle: Vehicle) -> ParameterSpace:
                         effect=name,
                         parameter=parameter.name,
                         component=k if parameter.size else None,
-                        neutral=at(parameter.neutral, vehicle),
                         low=at(parameter.low, vehicle),
                         high=at(parameter.high, vehicle),
                         start=float(now[k]),

@@ -46,17 +46,10 @@ def score_candidates(
     seed: int = 0,
     limits: Thresholds = THRESHOLDS,
 ) -> list[CandidateScore]:
-    """Return the score of each of `among` when joined to the numbers `named`, best first.
+    """Return the score of each of `among` when joined to the numbers at `named`, best first.
 
-    Args:
-        equations: along all numbers at `theta`.
-        theta: (P,) where the equations were taken.
-        space: gives the bounds and the usual sizes of the numbers.
-        named: places of the numbers that are fitted along.
-        among: the candidates.
-        fold: (W,) windows of one number are left out together.
-        seed: of the null's draws.
-        limits: of the permutation test.
+    `equations` are along all numbers, taken at `theta` (P,); windows of one `fold` (W,) are left
+    out together; `seed` is of the null's draws.
     """
     scale = space.array("step")
     low, high = (space.array("low") - theta) / scale, (space.array("high") - theta) / scale

@@ -94,6 +94,13 @@ class _Task(NamedTuple):
             equations, theta, self.model.space, named, left, self.fold, self.seed, self.limits
         )
 
+    def fit(
+        self, look: _Look, start: Estimate, indices: list[int], known: Linearisation | None = None
+    ) -> tuple[Estimate, NormalEquations]:
+        """Fit the numbers at `indices` to what can be trusted."""
+        windows, whitening = look.windows, look.whitening
+        return fit(self.model, windows, whitening, start, indices, known=known, limits=self.limits)
+
 
 class _Look(NamedTuple):
     """The slopes along everything at one estimate, and how to weigh them."""
@@ -115,16 +122,10 @@ def search(
     seed: int = 0,
     limits: Thresholds = THRESHOLDS,
 ) -> SearchResult:
-    """Return what explains the gap between `model` and `windows`.
+    """Return which of `among` explain the gap between `model` and `windows`.
 
-    Args:
-        model: that flies the windows.
-        windows: what is fitted.
-        among: the candidates.
-        say: told of each step in a line for people.
-        known: slopes along everything at the vehicle file's numbers, to save their calculation.
-        seed: of the null's draws.
-        limits: of every step.
+    `say` is told of each step in a line for people; `known` are the slopes along everything at the
+    vehicle file's numbers, to save their calculation; `seed` is of the null's draws.
     """
     fold = folds_of(np.asarray(windows.flight), np.asarray(windows.start_s), limits.folds)
     task = _Task(model, windows, among, fold, say, seed, limits)
@@ -145,13 +146,12 @@ def search(
         named.append(NamedEffect(item.candidate, item.p_value, item.gain))
     named, estimate = _settle(task, look, named, estimate)
     indices = indices_of([n.candidate for n in named])
-    last_rounds = limits.last_rounds if indices else 0
+    rounds = limits.last_rounds if indices else 0
     weighed = look.windows, look.whitening
-    estimate, last = fit(model, *weighed, estimate, indices, last_rounds, limits=limits)
+    estimate, last = fit(model, *weighed, estimate, indices, rounds, limits=limits)
     nothing = last
     if indices:
-        start = start_estimate(model, look.windows)
-        _, nothing = fit(model, *weighed, start, [], limits=limits)
+        _, nothing = task.fit(look, start_estimate(model, look.windows), [])
     explained = float(nothing.chi2.sum() - last.chi2.sum())
     return SearchResult(
         tuple(named), look.windows, estimate, last, look.sigma, look.whitening, first, explained
@@ -215,9 +215,7 @@ def _best_of_short_list(
     near = [s for s in scores if _near(fallen, s.candidate, limits)]
     for item in near[: limits.short_list]:
         at = indices_of([*chosen, item.candidate])
-        after, equations = fit(
-            task.model, look.windows, look.whitening, estimate, at, known=look.linear, limits=limits
-        )
+        after, equations = task.fit(look, estimate, at, look.linear)
         tried.append((float(equations.chi2.sum()) + 2 * len(at), item, after))
         task.say(f"{item.candidate.label}: {chi2 - equations.chi2.sum():.0f}")
     _, item, after = min(tried, key=lambda t: t[0])
@@ -236,14 +234,7 @@ def _settle(
         before = [n.candidate for n in named]
         if not before:
             break
-        estimate, _ = fit(
-            task.model,
-            look.windows,
-            look.whitening,
-            estimate,
-            indices_of(before),
-            limits=task.limits,
-        )
+        estimate, _ = task.fit(look, estimate, indices_of(before))
         for place in range(len(named)):
             named, estimate = _judge_rivals(task, named, place, estimate)
         needed = [n for n in named if n.p_value <= task.limits.name_p_value]
@@ -279,10 +270,7 @@ def _judge_rivals(
     for candidate in left:
         if candidate == one.candidate or _near(fallen, candidate, limits):
             chosen = indices_of([*others, candidate])
-            after, equations = fit(
-                model, look.windows, look.whitening, without, chosen, known=look.linear,
-                limits=limits,
-            )  # fmt: skip
+            after, equations = task.fit(look, without, chosen, look.linear)
             tried.append((float(equations.chi2.sum()) + len(candidate.indices), candidate, after))
             task.say(f"{one.candidate.label} or {candidate.label}: {tried[-1][0]:.1f}")
     least, best, after = min(tried, key=lambda t: t[0])

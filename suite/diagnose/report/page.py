@@ -36,14 +36,9 @@ RIVALS = 6
 def page(
     diagnosis: Diagnosis, found: Mapping[str, Any], checks: Checks, toml: str, files: set[str]
 ) -> Report:
-    """Return the report of a diagnosis.
+    """Return the report of a diagnosis; `found` is its JSON, and the words are taken from there.
 
-    Args:
-        diagnosis: all that is known.
-        found: its JSON, with what else is said in words.
-        checks: what stands beside the names.
-        toml: contents of the vehicle file that was written.
-        files: which of `FILES` there are.
+    `toml` is the vehicle file that was written, `files` which of `FILES` there are.
     """
     gap = found["gap"]
     sections = [

@@ -67,15 +67,9 @@ def find_disagreement(
 ) -> Disagreement:
     """Return the errors of rollouts from `windows`' starts.
 
-    Args:
-        model: that flies the windows.
-        vehicle: whose thrust counts where the rotor speeds are the input.
-        before: (P,) numbers as the vehicle file has them.
-        after: (P,) with what was named; None where nothing was.
-        windows: one a rollout.
-        sigma: (19,) noise of each channel in its unit.
-        start_sigma: (F,) noise of what a rollout starts from.
-        limits: of the bins.
+    The numbers are `before` (P,) as the vehicle file has them, `after` with what was named, None
+    where nothing was. `sigma` (19,) is the noise of each channel in its unit, `start_sigma` (F,)
+    that of what a rollout starts from.
     """
     axes_b = np.swapaxes(np.asarray(windows.rot_w), 1, 2)
     linear = model.linearise(before, true_starts(model, before, windows), windows, model.starts)

@@ -83,13 +83,9 @@ def residual_structure(
     seed: int = 0,
     limits: Thresholds = THRESHOLDS,
 ) -> ResidualStructure:
-    """Return the structure in what is left over.
+    """Return the structure in what is left over; windows of one `fold` (W,) are left out together.
 
-    Args:
-        equations: of the disturbance.
-        fold: (W,) windows of one number are left out together.
-        seed: of the null's draws.
-        limits: of the permutation test and of the score test.
+    `seed` is of the permutation test's draws.
     """
     along, groups = equations.shapes.unit, equations.shapes.groups
     turned = np.swapaxes(along, 1, 2)
