@@ -1,6 +1,5 @@
 """The model that is fitted: its slopes, its whitening, its numbers, and the search on top."""
 
-import jax
 import numpy as np
 import pytest
 
@@ -129,4 +128,3 @@ def test_a_search_names_the_drag_and_leaves_its_result_alone(flown):
     with pytest.raises(AttributeError):
         one.gain = 0.0  # type: ignore[misc]
     assert NamedEffect(one.candidate, 1.0, 0.0).rivals == ()
-    assert jax.config.jax_enable_x64 is False

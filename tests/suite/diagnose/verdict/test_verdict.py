@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def gap(energy):
     return Gap(np.asarray(energy) / 10.0, np.asarray(energy), {})
 
 
-def searched(slow=1.0, named=(), explained=0.0):
+def searched(slow=1.0, named=(), explained=0.0) -> Any:
     """As much of a search's result as a verdict needs: 10 windows of slow errors."""
     whitening = SimpleNamespace(slow_freedom=np.full((10, STATE), 5.0))
     energy = np.full((10, STATE), 5.0)
