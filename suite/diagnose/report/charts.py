@@ -144,11 +144,8 @@ def labelled_gaps(side: BlackBoxComparison) -> list[tuple[str, Gap | None]]:
     ]
 
 
-def _before_after(
-    before: np.ndarray, after: np.ndarray | None
-) -> list[tuple[str, str, np.ndarray]]:
-    series = [("as given", BEFORE, before)]
-    return series if after is None else [*series, ("with what was named", AFTER, after)]
+def _before_after(before: np.ndarray, after: np.ndarray) -> list[tuple[str, str, np.ndarray]]:
+    return [("as given", BEFORE, before), ("with what was named", AFTER, after)]
 
 
 def _legend_above(figure: Figure, axes: Axes) -> None:

@@ -193,9 +193,7 @@ def _kinematics(found: Kinematics) -> dict[str, Any]:
 
 def _by_condition(found: Disagreement, condition: str) -> dict[str, Any]:
     series = {"before": found.before, "after": found.after}
-    tables = {
-        name: binned(found, over, condition) for name, over in series.items() if over is not None
-    }
+    tables = {name: binned(found, over, condition) for name, over in series.items()}
     by_horizon = {
         name: {
             f"{horizon:g} s": {

@@ -43,12 +43,12 @@ class Disagreement(NamedTuple):
     """From one rollout's start to the next [s]; longer ones share rows."""
     before: np.ndarray
     """(H, W, 12) error over its noise floor; NaN where nothing was measured."""
-    after: np.ndarray | None
-    """The same with what was named; None where nothing was."""
+    after: np.ndarray
+    """The same with what was named; where nothing was, as before."""
     drift_before: np.ndarray
     """(W, 6) mean acceleration over 0.5 s that the model lacks [m/s^2], and the attitude's error
     after 0.5 s [rad], body axes."""
-    drift_after: np.ndarray | None
+    drift_after: np.ndarray
     vel_b: np.ndarray
     """(W, 3) at the start, body axes [m/s]."""
     rate_b: np.ndarray
@@ -73,9 +73,9 @@ def find_disagreement(
     """
     axes_b = np.swapaxes(np.asarray(windows.rot_w), 1, 2)
     linear = model.linearise(before, true_starts(model, before, windows), windows, model.starts)
-    errors = [linear.residual]
+    errors = [linear.residual, linear.residual]
     if after is not None:
-        errors.append(model.residual(after, true_starts(model, after, windows), windows))
+        errors[1] = model.residual(after, true_starts(model, after, windows), windows)
     own = np.diag(np.where(np.isfinite(sigma), sigma, 0.0)[:STATE])
     turned = _in_body(axes_b, np.broadcast_to(own, (len(axes_b), STATE, STATE)))
     over: list[list[np.ndarray]] = [[] for _ in errors]
@@ -98,9 +98,9 @@ def find_disagreement(
         edges={name: _edges(values, limits) for name, values in conditions.items()},
         stride_s=float(np.median(gaps[gaps > 1e-3])) if (gaps > 1e-3).any() else 1.0,
         before=stacked[0],
-        after=stacked[1] if after is not None else None,
+        after=stacked[1],
         drift_before=drifts[0],
-        drift_after=drifts[1] if after is not None else None,
+        drift_after=drifts[1],
         vel_b=(axes_b @ np.asarray(windows.vel_w)[..., None])[..., 0],
         rate_b=np.asarray(windows.rate_b),
     )
@@ -148,15 +148,11 @@ def by_group(table: np.ndarray) -> np.ndarray:
     return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
 
 
-def in_words(
-    found: Disagreement, over: np.ndarray | None, limits: Thresholds = THRESHOLDS
-) -> str | None:
+def in_words(found: Disagreement, over: np.ndarray, limits: Thresholds = THRESHOLDS) -> str | None:
     """Return where `over` (H, W, 12) is furthest beyond noise, in words; None where nowhere.
 
     The error that stands out most is taken first, then what it goes with most clearly.
     """
-    if over is None:
-        return None
     energy = over**2
     count = np.isfinite(energy).sum(axis=1)
     own = np.minimum(1.0, found.stride_s / np.array(HORIZONS_S))[:, None]

@@ -95,16 +95,12 @@ def test_sections_show_the_numbers(drag, drag_checks, found):
 
 def test_charts_are_pictures(drag, drag_checks):
     over = drag_checks.disagreement
-    bare = replace_after(over)
+    bare = over._replace(after=over.before, drift_after=over.drift_before)
     for chart in (disagreement_chart, drift_chart):
         assert chart(over).startswith(PNG) and chart(bare) != chart(over)
     scores = drag.search.first
     assert gains_chart(scores, None, set()) != gains_chart(scores, 5.0, {"linear_drag"})
     assert black_box_chart([compared(drag).held_out], 0).startswith(PNG)
-
-
-def replace_after(over):
-    return over._replace(after=None, drift_after=None)
 
 
 def test_the_page_stands_alone(drag, drag_checks, found):
