@@ -16,7 +16,8 @@ from scipy.optimize import minimize_scalar
 
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mixer_matrix
-from eval.quadrotor.plant import Command, Plant, make_plant, wanted_speed
+from eval.quadrotor.plant import Command, Plant, make_plant
+from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.resample import follow_lag, hold, interpolate
 from suite.diagnose.data.windows import step_s
