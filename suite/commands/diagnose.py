@@ -43,10 +43,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
-    from suite.diagnose.report.answer import components
-    from suite.diagnose.run import Wishes, diagnose_files
+    from suite.diagnose.report.diagnosis_json import components
+    from suite.diagnose.run import diagnose_files
 
-    wishes = Wishes(
+    result = diagnose_files(
+        config.flights,
+        config.vehicle,
+        config.out,
+        console,
         drive=config.drive,
         compare_delta=config.compare_delta,
         plan=config.plan,
@@ -54,7 +58,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         recording=config.recording,
         seed=config.seed,
     )
-    result = diagnose_files(config.flights, config.vehicle, wishes, config.out, console)
     console.say(f"verdict: {result['verdict']}")
     for effect in result["effects"]:
         rivals = ", ".join(effect["alternatives"])
@@ -74,13 +77,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     for line in result["separate_with"]:
         console.say(f"would tell {line}")
     for side in ("held_out", "outside"):
-        contest = (result["black_box"] or {}).get(side)
-        if contest:
-            named = contest["named"]
+        compared = (result["black_box"] or {}).get(side)
+        if compared:
+            named = compared["named"]
             beside = f"{named['gap']:.2f} with the names, " if named else ""
             console.say(
-                f"on {contest['judged_on']}: {contest['before']['gap']:.2f} before, {beside}"
-                f"{contest['black_box']['gap']:.2f} with a Delta Action Model"
+                f"on {compared['judged_on']}: {compared['before']['gap']:.2f} before, {beside}"
+                f"{compared['black_box']['gap']:.2f} with a Delta Action Model"
             )
     plan = result.get("plan")
     if plan:

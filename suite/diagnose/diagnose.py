@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -14,56 +14,30 @@ from eval.effects import EFFECTS
 from eval.effects.log_faults import lateness
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.hold_out import split
-from suite.diagnose.data.input_source import another_controller, choose_drive
-from suite.diagnose.data.windows import Windows, cut, take
-from suite.diagnose.fit.intervals import errors_of
-from suite.diagnose.fit.model import Linear, Model
-from suite.diagnose.fit.normal_equations import Frame, State, fit, information
+from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.data.input_source import another_controller, rotors_are_input
+from suite.diagnose.data.windows import FlightWindows, cut, take
+from suite.diagnose.fit.model import Linearisation, RolloutModel
+from suite.diagnose.fit.normal_equations import (
+    Estimate,
+    fit,
+    half_widths95,
+    information,
+    start_estimate,
+)
 from suite.diagnose.fit.parameters import candidates, indices_of, make_space
-from suite.diagnose.fit.permutation import FEW, folds_of
-from suite.diagnose.fit.search import Finding, search, start_state
-from suite.diagnose.fit.turbulence import Turbulence, find_turbulence
-from suite.diagnose.verdict.gap import OVERLAP_S, Gap, measure, worse
-from suite.diagnose.verdict.residual_structure import Rest, push_of, rest_of
-from suite.diagnose.verdict.verdict import COLOURED, SHAPED, Judgement, judge
-
-HALF_STEP = 0.6
-"""Share of a physics step up to which pose and rates may be apart by integration alone."""
-LOST_M = 50.0
-"""A simulated stretch that ends this far from the flight says nothing [m]."""
-LEAST = 2
-"""Stretches to fit without which nothing can be left out."""
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """What was found, before it is written down."""
-
-    verdict: str
-    finding: Finding
-    vehicle: Vehicle
-    """With the named effects."""
-    widths: np.ndarray
-    """Half-widths of the 95 % intervals, in the order of `finding.indices`."""
-    before: Gap
-    after: Gap
-    without: dict[str, Gap]
-    """By a named effect's label: the gap with all others."""
-    control: tuple[str, Gap] | None
-    """A wrong effect fitted in the same way, and its gap."""
-    held_out: list[str]
-    share_left: float
-    """Structured rest over the structured gap before."""
-    where: str | None
-    rest: Rest
-    """Structure in what is left over."""
-    turbulence: Turbulence | None
-    driven_by: str
-    seconds: float
-    warnings: list[str]
-    model: Model
-    held: Windows
+from suite.diagnose.fit.permutation import folds_of
+from suite.diagnose.fit.search import SearchResult, search
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.diagnosis import Diagnosis
+from suite.diagnose.verdict.gap import Gap, measure, worse
+from suite.diagnose.verdict.residual_structure import (
+    ResidualStructure,
+    disturbance_equations,
+    residual_structure,
+)
+from suite.diagnose.verdict.turbulence import Turbulence, find_turbulence
+from suite.diagnose.verdict.verdict import Verdict, verdict_on
 
 
 def diagnose(
@@ -72,6 +46,7 @@ def diagnose(
     drive: str = "auto",
     say: Callable[[str], None] = lambda _: None,
     seed: int = 0,
+    limits: Thresholds = THRESHOLDS,
 ) -> Diagnosis:
     """Find what explains how `logs` differ from `vehicle`.
 
@@ -79,139 +54,141 @@ def diagnose(
         logs: flights; a fifth of them, at least one, is held out (of a lone flight, the last
             30 %).
         vehicle: the one that the simulation used.
-        drive: what drives the model: "commands", "motors", or "auto".
+        drive: what the model's input is: "commands", "motors", or "auto".
         say: told of the search's steps.
         seed: of the null's draws.
+        limits: of every step.
 
     Raises:
         ValueError: where no flight can be used, or not in the way that was asked for.
     """
     began = time.monotonic()
-    by_rotors, warnings = choose_drive(logs, drive), list[str]()
-    if drive == "auto" and not by_rotors and another_controller(logs, vehicle):
+    rotor_input, warnings = rotors_are_input(logs, drive), list[str]()
+    if drive == "auto" and not rotor_input and another_controller(logs, vehicle, limits):
         warnings.append("the nominal rate loop does not give the measured rotor speeds; they drive")
-        by_rotors = True
+        rotor_input = True
     space = make_space(vehicle)
     voltage = all(log.voltage is not None for log in logs)
-    model = Model(vehicle, space, by_rotors, voltage)
-    cut_, notes = cut(logs, vehicle, by_rotors)
-    if cut_ is None:
+    model = RolloutModel(vehicle, space, rotor_input, voltage)
+    whole, notes = cut(logs, vehicle, rotor_input, limits=limits)
+    if whole is None:
         raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
     warnings += notes
-    begin = start_state(model, cut_)
-    linear = model.linearise(begin.theta, begin.offset, cut_, None)
-    good = _sound(linear)
+    begin = start_estimate(model, whole)
+    linear = model.linearise(begin.theta, begin.offset, whole, None)
+    good = _sound(linear, limits)
     if not good.all():
         broken = int((~good).sum())
         warnings.append(f"{broken} stretches left out: the model's flight from there diverges")
-    cut_, linear = take(cut_, good), Linear(*(part[good] for part in linear))
-    inside, names = split(logs, cut_, information(linear, cut_, model.size))
-    if inside.sum() < LEAST:
+    whole, linear = take(whole, good), _take(linear, good)
+    told = information(linear, whole, model.size, limits)
+    inside, names = choose_held_out(logs, whole, told, limits)
+    count = int(inside.sum())
+    if count < limits.least_windows:
         raise ValueError(
-            f"{int(inside.sum())} stretches of 1 s to fit, at least {LEAST} are needed: fly longer"
+            f"{count} stretches of 1 s to fit, at least {limits.least_windows} are needed: fly "
+            "longer"
         )
-    if inside.sum() < FEW:
+    if count < limits.few_windows:
         warnings.append(
-            f"{int(inside.sum())} stretches of 1 s to fit: too few for a null of their own, so "
+            f"{count} stretches of 1 s to fit: too few for a null of their own, so "
             "the null is drawn from the measured noise"
         )
-    windows, apart = take(cut_, inside), take(cut_, ~inside)
+    windows, apart = take(whole, inside), take(whole, ~inside)
     has = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
-    among = candidates(space, voltage, has if by_rotors else has | {"command"})
+    among = candidates(space, voltage, has if rotor_input else has | {"command"})
     say(f"{len(windows.flight)} stretches of 1 s to fit, {len(apart.flight)} held out")
-    known = Linear(*(part[inside] for part in linear))
-    finding = search(model, windows, among, say, known, seed)
+    found = search(model, windows, among, say, _take(linear, inside), seed, limits)
 
-    windows = finding.windows
-    held = _held_out(logs, vehicle, by_rotors, apart)
-    start = start_state(model, windows).theta
-    before = measure(model, start, held, finding.sigma)
-    after = measure(model, finding.state.theta, held, finding.sigma) if finding.named else before
-    if finding.named and worse(before, after):
-        warnings.append("what was found on the fitted flights does not hold on held-out ones")
-        finding, after = _without_names(model, finding), before
-    rest, turbulence = _left_over(model, finding, seed)
-    if turbulence and finding.named and not worse(after, before):
+    held = _held_out(logs, vehicle, rotor_input, apart, limits)
+    before = measure(model, begin.theta, held, found.sigma, limits)
+    after = before
+    if found.named:
+        after = measure(model, found.estimate.theta, held, found.sigma, limits)
+        if worse(before, after, limits=limits):
+            warnings.append("what was found on the fitted flights does not hold on held-out ones")
+            found, after = _without_names(model, found), before
+    residual, turbulence = _left_over(model, found, seed, limits)
+    if turbulence and found.named and not worse(after, before, limits=limits):
         # Wind that lasts from one stretch to the next looks like many a steady number.
-        finding, after = _without_names(model, finding), before
-        rest, turbulence = _left_over(model, finding, seed)
-    judgement = judge(finding, rest, by_rotors)
+        found, after = _without_names(model, found), before
+        residual, turbulence = _left_over(model, found, seed, limits)
+    verdict = verdict_on(found, residual, rotor_input, limits)
     if turbulence:
-        judgement = Judgement("named", 0.0, None)
-    if judgement.verdict == "unknown" and finding.named:
-        labels = ", ".join(n.candidate.label for n in finding.named)
+        verdict = Verdict("named")
+    if verdict.label == "unknown" and found.named:
+        labels = ", ".join(candidate.label for candidate in found.candidates)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
-        finding, after = _without_names(model, finding), before
-    warnings += _of_another_integrator(model, finding)
-    without: dict[str, Gap] = {}
-    for one in finding.named:
-        others = [n.candidate for n in finding.named if n is not one]
-        theta = start
-        if others:
-            theta = finding.state.theta.copy()
-            theta[list(one.candidate.indices)] = start[list(one.candidate.indices)]
-            state = State(theta, finding.state.offset)
-            theta = fit(model, windows, finding.frame, state, indices_of(others))[0].theta
-        without[one.candidate.label] = measure(model, theta, held, finding.sigma)
-    control = _control(model, windows, finding, held) if finding.named else None
+        found, after = _without_names(model, found), before
+    warnings += _of_another_integrator(model, found, limits)
     return Diagnosis(
-        verdict=judgement.verdict,
-        finding=finding,
-        vehicle=_with_effects(vehicle, model, finding, turbulence),
-        widths=errors_of(finding.sums),
+        verdict=verdict,
+        search=found,
+        half_widths=half_widths95(found.equations),
+        vehicle=_with_effects(vehicle, model, found, turbulence),
         before=before,
         after=after,
-        without=without,
-        control=control,
-        held_out=names,
-        share_left=judgement.share_left,
-        where=judgement.where,
-        rest=rest,
+        without=_without_each(model, found, held, limits),
+        control=_control(model, found, held, limits) if found.named else None,
+        residual=residual,
         turbulence=turbulence,
-        driven_by="measured rotor speeds" if by_rotors else "commands",
+        logs=logs,
+        nominal=vehicle,
+        rotor_input=rotor_input,
+        held_out=names,
+        held_windows=held,
+        model=model,
         seconds=time.monotonic() - began,
         warnings=warnings,
-        model=model,
-        held=held,
+        seed=seed,
+        limits=limits,
     )
 
 
-def _left_over(model: Model, finding: Finding, seed: int) -> tuple[Rest, Turbulence | None]:
-    """Return the structure in what `finding` leaves over, and the wind that may have made it."""
-    windows = finding.windows
-    push = push_of(model, windows, finding.frame, finding.state)
-    rest = rest_of(push, folds_of(windows.flight, windows.start_s), seed)
-    if not any(p <= COLOURED for axis, p in rest.coloured.items() if axis.startswith("force")):
-        return rest, None
-    turbulence = find_turbulence(model, finding.state.theta, push)
+def _take(linear: Linearisation, chosen: np.ndarray) -> Linearisation:
+    return Linearisation(*(part[chosen] for part in linear))
+
+
+def _left_over(
+    model: RolloutModel, found: SearchResult, seed: int, limits: Thresholds
+) -> tuple[ResidualStructure, Turbulence | None]:
+    """Return the structure in what `found` leaves over, and the wind that may have made it."""
+    windows = found.windows
+    equations = disturbance_equations(model, windows, found.whitening, found.estimate, limits)
+    fold = folds_of(windows.flight, windows.start_s, limits.folds)
+    residual = residual_structure(equations, fold, seed, limits)
+    forces = [p for axis, p in residual.coloured.items() if axis.startswith("force")]
+    if not any(p <= limits.colour_p_value for p in forces):
+        return residual, None
+    turbulence = find_turbulence(model, found.estimate.theta, equations, limits)
     # Wind is one explanation and a shape over the state another: the better one counts.
-    shape = rest.shapes[0]
-    if turbulence and shape.p_value <= SHAPED and shape.gain > turbulence.ratio:
-        return rest, None
-    return rest, turbulence
+    shape = residual.shapes[0]
+    if turbulence and shape.p_value <= limits.shape_p_value and shape.gain > turbulence.ratio:
+        return residual, None
+    return residual, turbulence
 
 
-def _without_names(model: Model, finding: Finding) -> Finding:
-    """Return `finding` with nothing named, at the numbers of the vehicle file."""
-    return replace(
-        finding, named=[], indices=[], state=start_state(model, finding.windows), explained=0.0
-    )
+def _without_names(model: RolloutModel, found: SearchResult) -> SearchResult:
+    """Return `found` with nothing named, at the numbers of the vehicle file."""
+    return replace(found, named=(), estimate=start_estimate(model, found.windows), explained=0.0)
 
 
-def _of_another_integrator(model: Model, finding: Finding) -> list[str]:
+def _of_another_integrator(
+    model: RolloutModel, found: SearchResult, limits: Thresholds
+) -> list[str]:
     """Return a warning where a clock's offset may be a simulator's way to integrate."""
-    values = model.space.effects(finding.state.theta)
-    named = dict.fromkeys(one.candidate.name for one in finding.named)
+    values = model.space.effects(found.estimate.theta)
+    named = dict.fromkeys(candidate.name for candidate in found.candidates)
     late = {name: float(lateness({name: values[name]})) for name in named if EFFECTS[name].late}
     return [
         f"{name}: {1e3 * offset:.2g} ms is about half a physics step; flights of a simulator "
         "that integrates in another way look like this"
         for name, offset in late.items()
-        if abs(offset) <= HALF_STEP * model.dt
+        if abs(offset) <= limits.integrator_share * model.dt
     ]
 
 
-def _sound(linear: Linear) -> np.ndarray:
+def _sound(linear: Linearisation, limits: Thresholds) -> np.ndarray:
     """Return which windows (W,) the model flies to their end.
 
     Raises:
@@ -220,7 +197,7 @@ def _sound(linear: Linear) -> np.ndarray:
     residual = linear.residual
     good = np.asarray(np.isfinite(residual).all(axis=(1, 2)))
     good &= np.isfinite(linear.slope).all(axis=(1, 2, 3))
-    good &= (np.abs(residual[..., :3]) < LOST_M).all(axis=(1, 2))
+    good &= (np.abs(residual[..., :3]) < limits.diverged_m).all(axis=(1, 2))
     if not good.any():
         raise ValueError(
             "the model diverges on every flight: check the vehicle file and the frames"
@@ -229,43 +206,75 @@ def _sound(linear: Linear) -> np.ndarray:
 
 
 def _held_out(
-    logs: Sequence[FlightLog], vehicle: Vehicle, by_rotors: bool, rest: Windows
-) -> Windows:
-    """Return overlapping windows over what is held out."""
-    if not len(rest.flight):
+    logs: Sequence[FlightLog],
+    vehicle: Vehicle,
+    rotor_input: bool,
+    apart: FlightWindows,
+    limits: Thresholds,
+) -> FlightWindows:
+    """Return overlapping windows over what is held out, of which `apart` do not overlap."""
+    if not len(apart.flight):
         raise ValueError("nothing is left to hold out: fly longer, or log a second flight")
-    many, _ = cut(logs, vehicle, by_rotors, OVERLAP_S)
+    many, _ = cut(logs, vehicle, rotor_input, limits.gap_stride_s, limits)
     assert many is not None
-    inside = np.isin(many.flight, rest.flight) & (many.start_s >= rest.start_s.min() - 1e-6)
+    inside = np.isin(many.flight, apart.flight) & (many.start_s >= apart.start_s.min() - 1e-6)
     return take(many, inside)
 
 
+def _without_each(
+    model: RolloutModel, found: SearchResult, held: FlightWindows, limits: Thresholds
+) -> dict[str, Gap]:
+    """Return by label of each name the gap where all others are fitted without it."""
+    start, gaps = model.space.array("start"), {}
+    for one in found.candidates:
+        others = [candidate for candidate in found.candidates if candidate is not one]
+        theta = start
+        if others:
+            theta = found.estimate.theta.copy()
+            theta[list(one.indices)] = start[list(one.indices)]
+            without = Estimate(theta, found.estimate.offset)
+            theta = _refit(model, found, without, indices_of(others), limits)
+        gaps[one.label] = measure(model, theta, held, found.sigma, limits)
+    return gaps
+
+
 def _control(
-    model: Model, windows: Windows, finding: Finding, held: Windows
+    model: RolloutModel, found: SearchResult, held: FlightWindows, limits: Thresholds
 ) -> tuple[str, Gap] | None:
     """Return the best effect that is neither named nor a rival, fitted alone, and its gap."""
-    taken = {n.candidate.name for n in finding.named}
-    taken |= {rival for n in finding.named for rival in n.rivals}
-    wrong = next((s.candidate for s in finding.first if s.candidate.name not in taken), None)
+    taken = {candidate.name for candidate in found.candidates}
+    taken |= {rival for one in found.named for rival in one.rivals}
+    wrong = next((s.candidate for s in found.first if s.candidate.name not in taken), None)
     if wrong is None:
         return None
-    frame: Frame = finding.frame
-    state = start_state(model, windows)
-    theta = fit(model, windows, frame, state, list(wrong.indices))[0].theta
-    return wrong.label, measure(model, theta, held, finding.sigma)
+    start = start_estimate(model, found.windows)
+    theta = _refit(model, found, start, list(wrong.indices), limits)
+    return wrong.label, measure(model, theta, held, found.sigma, limits)
+
+
+def _refit(
+    model: RolloutModel,
+    found: SearchResult,
+    start: Estimate,
+    indices: list[int],
+    limits: Thresholds,
+) -> np.ndarray:
+    """Return the numbers (P,) where those at `indices` are fitted to what was searched."""
+    best, _ = fit(model, found.windows, found.whitening, start, indices, limits=limits)
+    return best.theta
 
 
 def _with_effects(
-    vehicle: Vehicle, model: Model, finding: Finding, turbulence: Turbulence | None
+    vehicle: Vehicle, model: RolloutModel, found: SearchResult, turbulence: Turbulence | None
 ) -> Vehicle:
     """Return `vehicle` with the named effects in place of what it has of them."""
-    fitted: dict[str, Any] = model.space.effects(finding.state.theta)
+    fitted: dict[str, Any] = model.space.effects(found.estimate.theta)
     effects = dict(vehicle.effects)
-    for name in {n.candidate.name for n in finding.named}:
+    for name in {candidate.name for candidate in found.candidates}:
         values = []
         for value in fitted[name]:
-            plain = np.asarray(value, dtype=float)
-            values.append(tuple(plain.tolist()) if plain.ndim else float(plain))
+            array = np.asarray(value, dtype=float)
+            values.append(tuple(array.tolist()) if array.ndim else float(array))
         effects[name] = type(fitted[name])(*values)
     if turbulence:
         effects[turbulence.effect] = turbulence.values

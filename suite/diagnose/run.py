@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from eval.logs.flight_log import FlightLog, read_flights
+from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
-from eval.vehicles.vehicle import Vehicle
 from suite.common.console import Console
 from suite.common.report import write_report
 from suite.delta.run import flight_files
-from suite.diagnose.diagnose import Diagnosis, diagnose
+from suite.diagnose.diagnose import diagnose
 from suite.diagnose.plans.plan import fly_plan, write_plan_of
-from suite.diagnose.report.answer import answer
+from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.report.recording import write_rollouts
-from suite.diagnose.verdict.black_box import Contests, compare_black_box
+from suite.diagnose.verdict.black_box import compare_black_box
+from suite.diagnose.verdict.checks import run_checks
 from suite.diagnose.verdict.delta_model import BlackBoxConfig
-from suite.diagnose.verdict.proof import as_json, gather
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
 
@@ -28,82 +27,70 @@ SCHEMA = 1
 """Version of diagnosis.json."""
 
 
-@dataclass(frozen=True)
-class Wishes:
-    """What a diagnosis is asked for besides the names."""
-
-    drive: str = "auto"
-    """"auto", "commands" or "motors"."""
-    compare_delta: bool = False
-    """Fit a Delta Action Model on the same split and show it beside the names."""
-    plan: bool = False
-    """Write flights that tell apart what these could not."""
-    fly: str | None = None
-    """Fly the plan in simulation with this vehicle."""
-    recording: bool = True
-    """Write a recording for rerun."""
-    seed: int = 0
-    """Of all draws."""
-
-
 def diagnose_files(
-    paths: Sequence[Path], vehicle_name: str, wishes: Wishes, out: Path, console: Console
+    paths: Sequence[Path],
+    vehicle_name: str,
+    out: Path,
+    console: Console,
+    *,
+    drive: str = "auto",
+    compare_delta: bool = False,
+    plan: bool = False,
+    fly: str | None = None,
+    recording: bool = True,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """Diagnose flights in files; write what was found and return what diagnosis.json holds.
 
     Args:
         paths: flight logs, or folders of them.
         vehicle_name: a vehicle file or a shipped name.
-        wishes: what is asked for.
         out: folder for the files.
         console: told of the work as it goes.
+        drive: what the model's input is: "auto", "commands" or "motors".
+        compare_delta: fit a Delta Action Model to the same flights and show it beside the names.
+        plan: write flights that tell apart what these could not.
+        fly: fly the plan in simulation with this vehicle.
+        recording: write a recording for rerun.
+        seed: of all draws.
 
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
     vehicle = load_vehicle(vehicle_name)
-    truth = None if wishes.fly is None else load_vehicle(wishes.fly)
+    truth = None if fly is None else load_vehicle(fly)
     logs, warnings = read_flights(flight_files(paths))
     for warning in warnings:
         console.note(f"warning: {warning}")
-    result = diagnose(logs, vehicle, wishes.drive, console.note, wishes.seed)
-    proof = gather(result, logs, vehicle)
-    if wishes.compare_delta:
-        contests = _contests(result, logs, vehicle, wishes.seed, console)
-        proof = replace(proof, contests=contests)
-    found: dict[str, Any] = {**answer(result, wishes.seed), **as_json(proof, wishes.seed)}
+    result = diagnose(logs, vehicle, drive, console.note, seed)
+    checks = run_checks(result)
+    if compare_delta:
+        with console.progress("fitting the Delta Action Model", 1.0) as show:
+            compared = compare_black_box(result, BlackBoxConfig(seed=seed), show)
+        checks = replace(checks, black_box=compared)
+    found: dict[str, Any] = {**diagnosis_json(result), **checks_json(checks, seed)}
     found["warnings"] = [*warnings, *found["warnings"]]
-    told = found["disagreement"]["after" if result.finding.named else "before"]
+    told = found["disagreement"]["after" if result.search.named else "before"]
     if found["unexplained"]["where"] and told:
         found["unexplained"]["where"] += f"; most in {told}"
     out.mkdir(parents=True, exist_ok=True)
-    if wishes.plan or truth is not None:
-        found["plan"] = write_plan_of(found, out / "plan")
+    if plan or truth is not None:
+        folder, sigma = out / "plan", result.search.sigma
+        found["plan"] = write_plan_of(found, folder)
         if truth is not None:
-            found["plan"] = fly_plan(
-                found["plan"], result, vehicle, truth, out / "plan", wishes.seed
-            )
+            found["plan"] = fly_plan(found["plan"], sigma, vehicle, truth, folder, seed)
         found["warnings"] += found["plan"].pop("warnings", [])
-    found = {**plain(found), **stamp(SCHEMA, wishes.seed)}
+    found = {**plain(found), **stamp(SCHEMA, seed)}
     names = ", ".join(effect["name"] for effect in found["effects"]) or "nothing"
     comment = f"{vehicle.name} with what suite diagnose named: {names}"
     save_vehicle(result.vehicle, out / "vehicle.toml", comment)
     files = {"vehicle.toml", "diagnosis.json"}
-    if wishes.recording:
-        write_rollouts(out / "recording.rrd", result, logs, vehicle)
+    if recording:
+        write_rollouts(out / "recording.rrd", result)
         files.add("recording.rrd")
     if found.get("plan", {}).get("flights"):
         files.add("plan/plan.json")
     toml = (out / "vehicle.toml").read_text(encoding="utf-8")
-    report = page(result, found, proof, toml, files, wishes.seed)
-    write_report(out / "report.html", report)
+    write_report(out / "report.html", page(result, found, checks, toml, files))
     write_json(out / "diagnosis.json", found)
     return found
-
-
-def _contests(
-    result: Diagnosis, logs: Sequence[FlightLog], vehicle: Vehicle, seed: int, console: Console
-) -> Contests:
-    config = BlackBoxConfig(seed=seed)
-    with console.progress("fitting the Delta Action Model", 1.0) as show:
-        return compare_black_box(result, logs, vehicle, config, show)

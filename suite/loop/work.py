@@ -201,13 +201,19 @@ def _measure(run: LoopRun) -> Stage:
 
 def _diagnose(run: LoopRun) -> Stage:
     def work(folder: Path) -> None:
-        from suite.diagnose.run import Wishes, diagnose_files
+        from suite.diagnose.run import diagnose_files
 
         listed = json.loads((run.logs / "diagnosed.json").read_text(encoding="utf-8"))
         paths = [run.logs / name for name in listed["files"]]
-        wishes = Wishes(drive=INPUT_SOURCE, seed=run.config.seed)
         try:
-            diagnose_files(paths, run.config.vehicle, wishes, folder, run.console)
+            diagnose_files(
+                paths,
+                run.config.vehicle,
+                folder,
+                run.console,
+                drive=INPUT_SOURCE,
+                seed=run.config.seed,
+            )
         except ValueError as error:
             raise WorkFailed(f"the flights in {run.logs} cannot be diagnosed: {error}") from error
 

@@ -1,4 +1,4 @@
-"""Which flights are kept back to measure the gap on."""
+"""Which flights are held out to measure the gap on."""
 
 from __future__ import annotations
 
@@ -7,37 +7,31 @@ from collections.abc import Sequence
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.data.windows import Windows
-
-SHARE = 0.2
-"""Share of the flights that is kept back, at least one."""
-ONE_FLIGHT = 0.7
-"""Share of a lone flight that is fitted; the rest is held out."""
+from suite.diagnose.data.windows import LENGTH_S, FlightWindows
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
-def split(
-    logs: Sequence[FlightLog], windows: Windows, told: np.ndarray
+def choose_held_out(
+    logs: Sequence[FlightLog],
+    windows: FlightWindows,
+    information: np.ndarray,
+    limits: Thresholds = THRESHOLDS,
 ) -> tuple[np.ndarray, list[str]]:
     """Return which windows are fitted, (W,) bool, and the names of what is held out.
 
-    Held out are the flights that can best be spared: those of whose information on any number of
-    the catalogue the others have most. What was measured has no say in it, only what was flown; a
-    lone chirp or the only pass near the ground is fitted.
-
-    Args:
-        logs: flights.
-        windows: W stretches of them.
-        told: (W, K) information of each stretch on each of the catalogue's numbers.
+    Held out are the flights that can best be spared: those of whose `information` (W, K), of each
+    window on each number of the catalogue, the others have most. What was measured has no say in
+    it, only what was flown; a lone chirp or the only pass near the ground is fitted.
     """
     flight = np.asarray(windows.flight)
     there = list(np.unique(flight))
     if len(there) == 1:
         log = logs[int(there[0])]
-        cut_s = ONE_FLIGHT * log.duration_s
-        return np.asarray(windows.start_s) + 1.0 <= cut_s, [f"{log.name} from {cut_s:.1f} s"]
-    by_flight = {k: told[flight == k].sum(axis=0) for k in there}
+        cut_s = limits.lone_fitted_share * log.duration_s
+        return np.asarray(windows.start_s) + LENGTH_S <= cut_s, [f"{log.name} from {cut_s:.1f} s"]
+    by_flight = {k: information[flight == k].sum(axis=0) for k in there}
     held: list[int] = []
-    for _ in range(max(1, round(SHARE * len(there)))):
+    for _ in range(max(1, round(limits.held_out_share * len(there)))):
         kept = [k for k in there if k not in held]
         whole = np.sum([by_flight[k] for k in kept], axis=0)
         seen = whole > 0.0

@@ -14,15 +14,9 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.logs.velocity import velocity_from_position
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.rotation import quat_to_rot
 
-SPAN_S = 0.06
-"""The attitude is compared over about this time [s]."""
-BLOCK_S = 0.5
-"""Neighbouring comparisons this near are not independent [s]."""
-CALM = 2.0
-"""Rates whose change is below this tell no time offset: the gyro's noise changes as much (mean
-square over the axes together [rad^2/s^4])."""
 Z95 = 1.96
 
 
@@ -84,9 +78,11 @@ def facts_of(log: FlightLog) -> LogFacts:
     )
 
 
-def check_kinematics(logs: Sequence[FlightLog]) -> Kinematics | None:
+def check_kinematics(
+    logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
+) -> Kinematics | None:
     """Return what pose and gyro of `logs` say about each other; None where too little is there."""
-    parts = [part for log in logs if (part := _comparisons(log)) is not None]
+    parts = [part for log in logs if (part := _comparisons(log, limits)) is not None]
     if not parts:
         return None
     # Columns: the bias of each axis, then the offset, which acts on all three.
@@ -105,7 +101,7 @@ def check_kinematics(logs: Sequence[FlightLog]) -> Kinematics | None:
         scatter += np.outer(pull, pull)
     freedom = max(len(pulls) - 4, 1)
     error = np.sqrt(np.diag(inverse @ scatter @ inverse) * len(pulls) / freedom)
-    calm = square[3, 3] < CALM * sum(len(part[0]) for part in parts)
+    calm = square[3, 3] < limits.calm * sum(len(part[0]) for part in parts)
     return Kinematics(
         flights=len(parts),
         bias=best[:3],
@@ -121,10 +117,12 @@ def _design(change: np.ndarray) -> np.ndarray:
     return np.concatenate([np.tile(np.eye(3), (len(change), 1)), change.reshape(-1, 1)], axis=1)
 
 
-def _comparisons(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _comparisons(
+    log: FlightLog, limits: Thresholds
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return gyro less turn (K, 3), change of the rates (K, 3) [rad/s^2] and blocks (K,)."""
     time, rate = log.time_s, log.rate_b
-    count = max(1, round(SPAN_S / float(np.median(np.diff(time)))))
+    count = max(1, round(limits.turn_span_s / float(np.median(np.diff(time)))))
     if len(time) < 4 * count:
         return None
     first = np.arange(0, len(time) - count)
@@ -150,7 +148,7 @@ def _comparisons(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray] | 
     by_gyro = (full[last] - full[first]) / span
     change = (rate[last] - rate[first]) / span
     good = (
-        (span[:, 0] < 1.5 * SPAN_S)
+        (span[:, 0] < 1.5 * limits.turn_span_s)
         & (hole[last] == hole[first])
         & np.isfinite(by_attitude).all(axis=1)
         & np.isfinite(change).all(axis=1)
@@ -158,7 +156,7 @@ def _comparisons(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray] | 
     )
     if good.sum() < 20:
         return None
-    block = ((time[first] - time[0]) / BLOCK_S).astype(int)
+    block = ((time[first] - time[0]) / limits.turn_block_s).astype(int)
     return (by_gyro - by_attitude)[good], change[good], block[good]
 
 

@@ -14,24 +14,24 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.resample import hold, interpolate
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.scene import Array
 
 LENGTH_S = 1.0
 """A window's length [s]."""
 HISTORY_S = 0.1
 """Commands before a window that a delay may reach [s]."""
-WARM_S = 0.2
+BURN_IN_S = 0.2
 """Before a window: the rotors follow the commands at the measured rates [s]."""
 SHORTEST_STEP_S = 0.002
 """The model's step is the rate loop's period, or this where that is shorter [s]."""
-STRIDE_S = LENGTH_S
-"""From the start of one window to the next [s]: no row counts twice."""
 ROWS = 101
 """Measured rows in a window; a log that has more of them is thinned."""
-HOLE_S = 0.1
-"""A window with a hole longer than this is left out [s]."""
 CHANNELS = 19
 """pos_w 3, attitude 3, vel_w 3, rate_b 3, acc_b 3, rotor speeds 4."""
+STATE_GROUPS = ("position", "attitude", "velocity", "rates")
+"""What a state is made of, three channels each, in their order."""
 SLICES = {
     "position": slice(0, 3),
     "attitude": slice(3, 6),
@@ -46,7 +46,7 @@ UNITS = {
 }  # fmt: skip
 
 
-class Windows(NamedTuple):
+class FlightWindows(NamedTuple):
     """W windows of S steps with N measured rows each."""
 
     flight: Array
@@ -55,8 +55,8 @@ class Windows(NamedTuple):
     """(W,) since the first row of the flight [s]."""
     command: Array
     """(W, H + S, 4) thrust and rates held during each step, H of them before the window."""
-    warm_rate_b: Array
-    """(W, warm steps, 3) measured [rad/s]."""
+    burn_in_rate_b: Array
+    """(W, steps of `BURN_IN_S`, 3) measured [rad/s]."""
     rotor_speed: Array
     """(W, S, 4) measured [rad/s]; zeros where there is none."""
     voltage_drop: Array
@@ -84,56 +84,56 @@ def step_s(vehicle: Vehicle) -> float:
     return max(1.0 / vehicle.controller.frequency, SHORTEST_STEP_S)
 
 
+def steps_before(dt: float) -> tuple[int, int]:
+    """Return how many steps of `dt` [s] of history, and then of burn-in, precede a window."""
+    return round(HISTORY_S / dt) + 1, round(BURN_IN_S / dt)
+
+
 def cut(
     logs: Sequence[FlightLog],
     vehicle: Vehicle,
-    driven_by_rotors: bool,
-    stride_s: float = STRIDE_S,
-) -> tuple[Windows | None, list[str]]:
-    """Return the windows of `logs`, one after another, and warnings.
+    rotor_input: bool,
+    stride_s: float = LENGTH_S,
+    limits: Thresholds = THRESHOLDS,
+) -> tuple[FlightWindows | None, list[str]]:
+    """Return the windows of `logs` and warnings; None where no flight has one.
 
     Args:
-        logs: flights.
-        vehicle: whose steps and lag count.
-        driven_by_rotors: the measured rotor speeds are the input; they are no measurement then.
-        stride_s: from the start of one window to that of the next [s].
-
-    Returns:
-        None in place of windows where no flight has one.
+        logs: flights, known by their place.
+        vehicle: whose physics step and motor lag are used.
+        rotor_input: the measured rotor speeds are the input; they are no measurement then.
+        stride_s: from the start of one window to that of the next [s]; by default no row counts
+            twice.
+        limits: the longest hole in a window.
     """
-    parts: list[Windows] = []
+    parts: list[FlightWindows] = []
     warnings: list[str] = []
+    shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
     for number, log in enumerate(logs):
-        rows = [
-            _window(log, number, first, vehicle, driven_by_rotors)
-            for first in _starts(log, stride_s)
-        ]
-        rows = [row for row in rows if row is not None]
-        if not rows:
-            warnings.append(
-                f"{log.name}: no stretch of {LENGTH_S + WARM_S + HISTORY_S:g} s without a hole"
-            )
-        parts += rows
+        starts = _starts(log, stride_s, limits.longest_hole_s)
+        if not starts:
+            warnings.append(f"{log.name}: no stretch of {shortest_s:g} s without a hole")
+        parts += [_window(log, number, first, vehicle, rotor_input) for first in starts]
     if not parts:
         return None, warnings
-    return Windows(*(np.stack(field) for field in zip(*parts, strict=True))), warnings
+    return FlightWindows(*(np.stack(field) for field in zip(*parts, strict=True))), warnings
 
 
-def take(windows: Windows, chosen: Array) -> Windows:
+def take(windows: FlightWindows, chosen: Array) -> FlightWindows:
     """Return the windows at `chosen` (indices or bool)."""
-    return Windows(*(np.asarray(field)[chosen] for field in windows))
+    return FlightWindows(*(np.asarray(field)[chosen] for field in windows))
 
 
-def _starts(log: FlightLog, stride_s: float) -> list[int]:
+def _starts(log: FlightLog, stride_s: float, hole_s: float) -> list[int]:
     time, whole = log.time_s, log.whole
-    next_s, found = time[0] + WARM_S + HISTORY_S, []
+    next_s, found = time[0] + BURN_IN_S + HISTORY_S, []
     while True:
         later = np.flatnonzero((time >= next_s - 1e-9) & whole)
         if not len(later) or time[later[0]] + LENGTH_S > time[-1] + 1e-6:
             return found
         first = int(later[0])
         inside = time[(time >= time[first] - 1e-9) & (time <= time[first] + LENGTH_S + 1e-9)]
-        if len(inside) < 12 or np.diff(inside).max() > HOLE_S:
+        if len(inside) < 12 or np.diff(inside).max() > hole_s:
             next_s = time[first] + 0.1
             continue
         found.append(first)
@@ -141,28 +141,27 @@ def _starts(log: FlightLog, stride_s: float) -> list[int]:
 
 
 def _window(
-    log: FlightLog, number: int, first: int, vehicle: Vehicle, driven_by_rotors: bool
-) -> Windows | None:
+    log: FlightLog, number: int, first: int, vehicle: Vehicle, rotor_input: bool
+) -> FlightWindows:
     dt, time = step_s(vehicle), log.time_s
-    steps, warm, before = round(LENGTH_S / dt), round(WARM_S / dt), round(HISTORY_S / dt) + 1
+    before, burn_in = steps_before(dt)
+    steps = round(LENGTH_S / dt)
     begin = time[first]
-    at = begin + dt * np.arange(-(before + warm), steps)
+    at = begin + dt * np.arange(-(before + burn_in), steps)
     command = np.concatenate([np.full((len(at), 1), GRAVITY), np.zeros((len(at), 3))], axis=1)
     if log.thrust_cmd is not None and log.rate_cmd_b is not None:
         given = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-        good = np.flatnonzero(np.isfinite(given).all(axis=1))
-        if len(good):
-            held = np.searchsorted(time[good], at + 1e-7, side="right") - 1
-            command = given[good[np.maximum(held, 0)]]
-    rates = _linear(at[before : before + warm], time, log.rate_b)
+        if np.isfinite(given).all(axis=1).any():
+            command = hold(at, time, given)
+    rates = interpolate(at[before : before + burn_in], time, log.rate_b)
     speed = np.zeros((steps, 4))
-    if log.rotor_speed is not None and driven_by_rotors:
+    if log.rotor_speed is not None and rotor_input:
         middle = begin + dt * (np.arange(steps) + 0.5)
         speed = _rotors(middle, time, log.rotor_speed, vehicle.rotors.time_constant)
     drop = np.zeros(steps)
     if log.voltage is not None and np.isfinite(log.voltage).any():
         first_volt = log.voltage[np.flatnonzero(np.isfinite(log.voltage))[0]]
-        drop = first_volt - _linear(at[-steps:], time, log.voltage[:, None])[:, 0]
+        drop = first_volt - interpolate(at[-steps:], time, log.voltage[:, None])[:, 0]
     rot_w = log.rot_w
     rows = np.flatnonzero((time >= begin - 1e-9) & (time <= begin + LENGTH_S + 1e-9))
     rows = rows[:: -(-len(rows) // ROWS)]
@@ -175,7 +174,7 @@ def _window(
     turned = np.isfinite(rot_rows.reshape(len(rows), 9).sum(axis=1, keepdims=True))
     attitude_seen = np.repeat(turned, 3, axis=1)
     seen = [attitude_seen if m.ndim == 3 else np.isfinite(m) for m in measured]
-    if driven_by_rotors:
+    if rotor_input:
         seen[5] = np.zeros_like(seen[5])  # an input is no measurement
     seen[4][0] = False  # the force before the window is not simulated
     missing = ROWS - len(rows)
@@ -184,7 +183,7 @@ def _window(
         return np.concatenate([np.nan_to_num(values), np.zeros((missing, *values.shape[1:]))])
 
     mask = np.concatenate([np.concatenate(seen, axis=1), np.zeros((missing, CHANNELS), bool)])
-    return Windows(
+    return FlightWindows(
         np.asarray(number),
         np.asarray(begin - time[0]),
         command,
@@ -199,15 +198,6 @@ def _window(
         *(padded(values) for values in measured),
         seen=mask,
     )
-
-
-def _linear(at: np.ndarray, time: np.ndarray, series: np.ndarray) -> np.ndarray:
-    """Return `series` (T, K) at `at`, linear between its values that are there."""
-    columns = []
-    for column in series.T:
-        good = np.isfinite(column)
-        columns.append(np.interp(at, time[good], column[good]) if good.any() else 0.0 * at)
-    return np.stack(columns, axis=-1)
 
 
 def _rotors(

@@ -1,70 +1,49 @@
-"""Whitened residuals of windows, freed from the unknown state in which each window starts.
+"""The normal equations of whitened windows, and the Gauss-Newton fit that solves them.
 
-A window's start is measured with the same noise as its other rows. It is left free: what 12 small
-changes of it can explain is projected out of residuals and slopes, and what stays has the
-measurement's own white noise. Where measured rotor speeds are the input, their errors are free as
-well, but for rows that say how large they may be. All that the search needs is then a few sums a
-window.
+All that the search needs of a window is then a few sums: J'J, J'r and r'r of what is left when its
+start is projected out.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
-from scipy.special import eval_legendre
+from scipy.stats import t as student
 
-from suite.diagnose.data.noise import noise_of, rotor_noise
-from suite.diagnose.data.windows import Windows
-from suite.diagnose.fit.model import Linear, Model
-from suite.diagnose.fit.rollout import KNOTS, STATE
-
-SLOW = 5
-"""Degree of the polynomials in which a model's error of a window would show."""
-DONE = 0.05
-"""A fit has converged where another round would lower its squared error by less than this."""
-SINGULAR = 1e-5
-"""A column with less than this of its own beside the others needs Householder's way [1]."""
-ROOM = 1.5
-"""Errors of rotor speeds may be this much larger, for what happens between the knots."""
-
-
-class Frame(NamedTuple):
-    """How windows are whitened and freed from their starts."""
-
-    weight: np.ndarray
-    """(W, N, 19) 1 / noise; 0 where nothing was measured."""
-    prior: np.ndarray
-    """(F - 12,) 1 / size of each error of the rotor speeds; they are M's last rows."""
-    start: np.ndarray
-    """(W, M, F) orthonormal, what the start explains of the whitened rows."""
-    upper: np.ndarray
-    """(W, F, F) from the start to `start`'s coordinates."""
-    slow: np.ndarray
-    """(W, 12, N, L) unit slow errors of pose, velocity and rates, channel by channel."""
-    slow_freedom: np.ndarray
-    """(W, 12) expected energy along them where there is noise only, by channel."""
-    freedom: np.ndarray
-    """(W,) measured numbers less the start's."""
+from suite.diagnose.data.noise import noise_of
+from suite.diagnose.data.windows import FlightWindows
+from suite.diagnose.fit.model import Linearisation, RolloutModel
+from suite.diagnose.fit.parameters import ParameterSpace
+from suite.diagnose.fit.rollout import STATE
+from suite.diagnose.fit.whitening import (
+    Whitening,
+    make_whitening,
+    project_out_start,
+    whiten,
+    whitened_residual,
+)
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
-class Sums(NamedTuple):
-    """Normal equations of each of W windows along K directions."""
+class NormalEquations(NamedTuple):
+    """Gauss-Newton's sums of each of W windows along K numbers, J and r whitened."""
 
-    square: np.ndarray
-    """(W, K, K) slope' slope."""
-    cross: np.ndarray
-    """(W, K) slope' residual."""
-    error: np.ndarray
-    """(W,) residual' residual."""
-    slow: np.ndarray
+    hessian: np.ndarray
+    """(W, K, K) J'J."""
+    gradient: np.ndarray
+    """(W, K) J'r."""
+    chi2: np.ndarray
+    """(W,) r'r."""
+    slow_energy: np.ndarray
     """(W, 12) energy of slow errors, by channel of pose, velocity and rates."""
 
 
 @dataclass(frozen=True)
-class State:
+class Estimate:
     """Where a fit stands."""
 
     theta: np.ndarray
@@ -73,185 +52,155 @@ class State:
     """(W, F) of what is free in each window, from what was measured."""
 
 
-def make_frame(linear: Linear, sigma: np.ndarray, windows: Windows) -> Frame:
-    """Return the frame of `windows` at the slopes of `linear` along what is free (its last)."""
-    weight = np.where(windows.seen, 1.0 / np.where(np.isfinite(sigma), sigma, 1.0), 0.0)
-    count, rows, channels = weight.shape
-    size = linear.offset.shape[1]
-    prior = np.full(size - STATE, 1.0 / rotor_spread(windows) if size > STATE else 1.0)
-    slope = (linear.slope[..., -size:] * weight[..., None]).reshape(count, -1, size)
-    held = np.zeros((count, size - STATE, size))
-    held[:, :, STATE:] = np.diag(prior)
-    start, upper = orthonormal(np.concatenate([slope, held], axis=1))
-    upper = upper + 1e-9 * np.eye(size)
-    time = 2.0 * np.asarray(windows.row_s)[..., None] - 1.0
-    power = np.concatenate([eval_legendre(degree, time) for degree in range(SLOW + 1)], axis=-1)
-    slow = np.moveaxis((weight[..., :12] > 0)[..., None] * power[:, :, None], 1, 2)
-    slow = slow / np.maximum(np.linalg.norm(slow, axis=2, keepdims=True), 1e-9)
-    inside = start[:, : rows * channels].reshape(count, rows, channels, size)[:, :, :12]
-    taken = np.moveaxis(inside, 1, 3) @ slow
-    slow_freedom = (slow**2).sum(axis=(2, 3)) - (taken**2).sum(axis=(2, 3))
-    freedom = (weight > 0).sum(axis=(1, 2)) - STATE
-    return Frame(weight, prior, start, upper, slow, slow_freedom, freedom)
+def start_estimate(model: RolloutModel, windows: FlightWindows) -> Estimate:
+    """Return the vehicle file's numbers and the measured starts."""
+    return Estimate(model.space.array("start"), np.zeros((len(windows.flight), model.free)))
 
 
-def orthonormal(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return Q and upper triangular R of `matrix` (..., M, F), M much larger than F.
-
-    Cholesky's factor of the Gram matrix, twice (CholeskyQR2; Yamamoto et al. 2015): products of
-    whole matrices, where Householder's way through so tall a matrix is many small steps. Columns
-    that depend on each other to single precision are left to Householder.
-    """
-    size = np.maximum(np.linalg.norm(matrix, axis=-2, keepdims=True), 1e-300)
-    base, upper = matrix / size, np.swapaxes(size, -1, -2) * np.eye(matrix.shape[-1])
-    for _ in range(2):
-        try:
-            lower = np.linalg.cholesky(np.swapaxes(base, -1, -2) @ base)
-        except np.linalg.LinAlgError:
-            return np.linalg.qr(matrix)
-        factor = np.swapaxes(lower, -1, -2)
-        if np.einsum("...kk->...k", factor).min() < SINGULAR:
-            return np.linalg.qr(matrix)
-        base, upper = base @ np.linalg.inv(factor), factor @ upper
-    return base, upper
-
-
-def rotor_spread(windows: Windows) -> float:
-    """Return how far the rotor speeds' error may be off at a knot [rad/s].
-
-    White noise of rows adds up like errors that run straight between knots a tenth of a second
-    apart and are smaller by the root of the rows that each stands for.
-    """
-    rows = np.asarray(windows.seen)[..., 9].sum(axis=1).mean()
-    return ROOM * rotor_noise(windows) * float(np.sqrt((KNOTS - 1) / rows))
-
-
-def whiten(frame: Frame, values: np.ndarray) -> np.ndarray:
-    """Return `values` (W, N, 19, K) over their noise, (W, M, K), with zeros in the last rows."""
-    flat = (
-        (values * frame.weight[..., None]).reshape(len(values), -1, values.shape[3])
-        if values.shape[3]
-        else np.zeros((len(values), frame.weight[0].size, 0))
-    )
-    last = np.zeros((len(values), len(frame.prior), values.shape[3]))
-    return np.concatenate([flat, last], axis=1)
-
-
-def free(frame: Frame, white: np.ndarray) -> np.ndarray:
-    """Return `white` (W, M, K) without what the start explains."""
-    return white - frame.start @ (np.swapaxes(frame.start, 1, 2) @ white)
-
-
-def white_residual(frame: Frame, linear: Linear) -> np.ndarray:
-    """Return the residuals of `linear` over their noise, (W, M)."""
-    white = whiten(frame, linear.residual[..., None])
-    if len(frame.prior):
-        white[:, -len(frame.prior) :, 0] = -linear.offset[:, STATE:] * frame.prior
-    return white
-
-
-def sums_of(frame: Frame, linear: Linear, directions: int) -> Sums:
+def normal_equations_of(
+    whitening: Whitening, linear: Linearisation, directions: int
+) -> NormalEquations:
     """Return the normal equations of `linear` along its first `directions`."""
-    residual = free(frame, white_residual(frame, linear))[..., 0]
-    slope = free(frame, whiten(frame, linear.slope[..., :directions]))
-    turned = np.swapaxes(slope, 1, 2)
+    residual = project_out_start(whitening, whitened_residual(whitening, linear))
+    slope = project_out_start(whitening, whiten(whitening, linear.slope[..., :directions]))
+    hessian, gradient = products(slope, residual)
+    residual = residual[..., 0]
     # What the start explains is out of the residual, so the slow errors need not be freed of it.
-    rows = residual[:, : frame.weight[0].size].reshape(frame.weight.shape)[..., :12]
-    slow = ((np.swapaxes(rows, 1, 2)[:, :, None] @ frame.slow)[:, :, 0] ** 2).sum(axis=2)
-    return Sums(
-        turned @ slope,
-        (turned @ residual[..., None])[..., 0],
-        (residual**2).sum(axis=1),
-        slow,
-    )
+    rows = residual[:, : whitening.weight[0].size].reshape(whitening.weight.shape)[..., :STATE]
+    slow = ((np.swapaxes(rows, 1, 2)[:, :, None] @ whitening.slow)[:, :, 0] ** 2).sum(axis=2)
+    return NormalEquations(hessian, gradient, (residual**2).sum(axis=1), slow)
 
 
-def information(linear: Linear, windows: Windows, directions: int) -> np.ndarray:
+def products(slope: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return J'J (W, K, K) and J'r (W, K) of `slope` (W, M, K) and `residual` (W, M, 1)."""
+    turned = np.swapaxes(slope, 1, 2)
+    return turned @ slope, (turned @ residual)[..., 0]
+
+
+def information(
+    linear: Linearisation,
+    windows: FlightWindows,
+    directions: int,
+    limits: Thresholds = THRESHOLDS,
+) -> np.ndarray:
     """Return what each window tells of each of the first `directions`, (W, K)."""
-    frame = make_frame(linear, noise_of(linear.residual, windows), windows)
-    sums = sums_of(frame, linear, directions)
-    return np.einsum("wkk->wk", sums.square)
+    sigma = noise_of(linear.residual, windows, limits=limits)
+    whitening = make_whitening(linear, sigma, windows, limits)
+    return np.einsum("wkk->wk", normal_equations_of(whitening, linear, directions).hessian)
 
 
 def solve(
-    square: np.ndarray, cross: np.ndarray, low: np.ndarray, high: np.ndarray, scale: np.ndarray
+    hessian: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
-    """Return the change within [low, high] that lowers the error most, for one set of sums."""
-    if not len(cross):
+    """Return the change (K,) within [low, high] that lowers chi-square most.
+
+    `scale` (K,), the usual size of each number, conditions the equations.
+    """
+    if not len(gradient):
         return np.zeros(0)
-    matrix = square * np.outer(scale, scale)
+    matrix = hessian * np.outer(scale, scale)
     ridge = 1e-9 * max(float(np.trace(matrix)) / len(matrix), 1e-12)
     factor = np.linalg.cholesky(matrix + ridge * np.eye(len(matrix)))
-    right = np.linalg.solve(factor, cross * scale)
-    plain = np.linalg.solve(factor.T, right)
+    right = np.linalg.solve(factor, gradient * scale)
+    free = np.linalg.solve(factor.T, right)
     low, high = np.minimum(low / scale, -1e-12), np.maximum(high / scale, 1e-12)
-    if np.all((plain >= low) & (plain <= high)):
-        return plain * scale
+    if np.all((free >= low) & (free <= high)):
+        return free * scale
     return lsq_linear(factor.T, right, (low, high)).x * scale
 
 
-def fit(
-    model: Model,
-    windows: Windows,
-    frame: Frame,
-    state: State,
-    indices: list[int],
-    rounds: int = 3,
-    known: Linear | None = None,
-) -> tuple[State, Sums]:
-    """Fit the numbers at `indices` and every window's start (Gauss-Newton, halved where it fails).
+def gauss_newton_step(
+    hessian: np.ndarray,
+    gradient: np.ndarray,
+    theta: np.ndarray,
+    space: ParameterSpace,
+    indices: Sequence[int],
+) -> tuple[np.ndarray, float]:
+    """Return the best change of the numbers at `indices` and the fall of chi-square it promises.
 
-    Args:
-        model: of the windows.
-        windows: W of them.
-        frame: their noise.
-        state: where to begin.
-        indices: places of the numbers to fit.
-        rounds: Gauss-Newton steps at most.
-        known: slopes at `state` along all directions, where they are known already.
-
-    Returns:
-        The best state, and its sums along `indices`.
+    `hessian` (K, K) and `gradient` (K,) are along them alone, taken at `theta` (P,).
     """
     at = np.array(indices, dtype=int)
-    low, high, scale = (model.space.array(name)[at] for name in ("low", "high", "step"))
+    low, high, scale = (space.array(name)[at] for name in ("low", "high", "step"))
+    change = solve(hessian, gradient, low - theta[at], high - theta[at], scale)
+    return change, float(2 * gradient @ change - change @ hessian @ change)
 
-    def look(state: State) -> tuple[Linear, Sums]:
-        linear = model.linearise(state.theta, state.offset, windows, indices)
-        return linear, sums_of(frame, linear, len(indices))
 
-    def step(state: State, sums: Sums) -> tuple[np.ndarray, float]:
-        """Return the change of the numbers and the fall of the error that the slopes promise."""
-        square, cross = sums.square.sum(0), sums.cross.sum(0)
-        change = solve(square, cross, low - state.theta[at], high - state.theta[at], scale)
-        return change, float(2 * cross @ change - change @ square @ change)
+def fit(
+    model: RolloutModel,
+    windows: FlightWindows,
+    whitening: Whitening,
+    start: Estimate,
+    indices: list[int],
+    rounds: int = 3,
+    known: Linearisation | None = None,
+    limits: Thresholds = THRESHOLDS,
+) -> tuple[Estimate, NormalEquations]:
+    """Fit the numbers at `indices` and every window's start (Gauss-Newton, halved where it fails).
+
+    At most `rounds` steps are taken; `known` are the slopes at `start` along all numbers, to save
+    their first calculation.
+
+    Returns:
+        The best estimate, and its normal equations along `indices`.
+    """
+    at = np.array(indices, dtype=int)
+    low, high = model.space.array("low")[at], model.space.array("high")[at]
+
+    def look(estimate: Estimate) -> tuple[Linearisation, NormalEquations]:
+        linear = model.linearise(estimate.theta, estimate.offset, windows, indices)
+        return linear, normal_equations_of(whitening, linear, len(indices))
+
+    def step(estimate: Estimate, equations: NormalEquations) -> tuple[np.ndarray, float]:
+        hessian, gradient = equations.hessian.sum(0), equations.gradient.sum(0)
+        return gauss_newton_step(hessian, gradient, estimate.theta, model.space, indices)
 
     if known is None:
-        linear, sums = look(state)
+        linear, equations = look(start)
     else:
         linear = known._replace(slope=known.slope[..., at])
-        sums = sums_of(frame, linear, len(indices))
-    change, promised = step(state, sums)
+        equations = normal_equations_of(whitening, linear, len(indices))
+    best, (change, promised) = start, step(start, equations)
     for _ in range(rounds):
-        total = float(sums.error.sum())
-        white = white_residual(frame, linear)
+        total = float(equations.chi2.sum())
+        white = whitened_residual(whitening, linear)
         if len(at):
-            white = white - whiten(frame, (linear.slope @ change)[..., None])
-        begin = np.linalg.solve(frame.upper, np.swapaxes(frame.start, 1, 2) @ white)[..., 0]
+            white = white - whiten(whitening, (linear.slope @ change)[..., None])
+        moved = np.linalg.solve(whitening.upper, np.swapaxes(whitening.start, 1, 2) @ white)[..., 0]
         share = 1.0
         while share > 0.1:
-            theta = state.theta.copy()
+            theta = best.theta.copy()
             theta[at] = np.clip(theta[at] + share * change, low, high)
-            trial = State(theta, state.offset + share * begin)
-            new_linear, new_sums = look(trial)
-            error = float(new_sums.error.sum())
-            if np.isfinite(error) and error <= total + 1e-6:
+            trial = Estimate(theta, best.offset + share * moved)
+            new_linear, new_equations = look(trial)
+            chi2 = float(new_equations.chi2.sum())
+            if np.isfinite(chi2) and chi2 <= total + 1e-6:
                 break
             share /= 2.0
         else:
             break
-        state, linear, sums = trial, new_linear, new_sums
-        change, promised = step(state, sums)
-        if promised < DONE:
+        best, linear, equations = trial, new_linear, new_equations
+        change, promised = step(best, equations)
+        if promised < limits.converged:
             break
-    return state, sums
+    return best, equations
+
+
+def half_widths95(equations: NormalEquations) -> np.ndarray:
+    """Return half-widths (K,) of 95 % intervals at the fit whose normal equations these are.
+
+    The larger of two covariances counts: that of the measurement noise (Gauss-Newton), and the
+    one in which each window's slope is one draw (the block sandwich; Liang and Zeger 1986), which
+    holds where errors within a window are not independent.
+    """
+    count, size = equations.gradient.shape
+    if not size:
+        return np.zeros(0)
+    hessian = equations.hessian.sum(axis=0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    inverse = np.linalg.pinv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
+    centred = equations.gradient - equations.gradient.mean(axis=0)
+    freedom = max(count - size, 2)
+    blocks = inverse @ (centred.T @ centred * count / freedom) @ inverse
+    variance = np.maximum(np.diag(inverse), np.diag(blocks))
+    return np.sqrt(np.maximum(variance, 0.0)) * float(student.ppf(0.975, freedom))

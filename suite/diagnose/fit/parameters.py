@@ -13,21 +13,20 @@ from eval.effects.interface import at
 from eval.vehicles.vehicle import Vehicle
 from tracks.geometry.scene import Array
 
-Layout = tuple[tuple[str, str, int | None], ...]
+ParameterLayout = tuple[tuple[str, str, int | None], ...]
 """Effect, parameter and component of each number."""
 
 
 @dataclass(frozen=True)
-class Entry:
+class FittedNumber:
     """One number of the vector."""
 
     effect: str
     parameter: str
     component: int | None
     """Which of a vector, or None for a plain number."""
-    neutral: float
-    """Where the effect is absent."""
     low: float
+    """Bounds of the fit, in the parameter's unit."""
     high: float
     start: float
     """As the vehicle file has it."""
@@ -48,10 +47,10 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Space:
+class ParameterSpace:
     """The vector of all numbers that can be fitted on a vehicle."""
 
-    entries: tuple[Entry, ...]
+    entries: tuple[FittedNumber, ...]
     base: Mapping[str, Any]
     """Values of every effect, as the vehicle file has them."""
 
@@ -64,12 +63,12 @@ class Space:
         return effects_at(self.layout, self.base, theta)
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> ParameterLayout:
         """Which number of the vector is what; the same for every vehicle."""
         return tuple((e.effect, e.parameter, e.component) for e in self.entries)
 
 
-def effects_at(layout: Layout, base: Mapping[str, Any], theta: Array) -> dict[str, Any]:
+def effects_at(layout: ParameterLayout, base: Mapping[str, Any], theta: Array) -> dict[str, Any]:
     """Return `base` with the numbers `theta` (P,) in their places; all may be traced."""
     xp = theta.__array_namespace__()
     values = {name: value._asdict() for name, value in base.items()}
@@ -87,7 +86,7 @@ def effects_at(layout: Layout, base: Mapping[str, Any], theta: Array) -> dict[st
     return {name: type(base[name])(**fields) for name, fields in values.items()}
 
 
-def make_space(vehicle: Vehicle) -> Space:
+def make_space(vehicle: Vehicle) -> ParameterSpace:
     """Return the vector of `vehicle`: all but what acts by chance or no flight can tell."""
     base, entries = all_values(vehicle), []
     for name, effect in EFFECTS.items():
@@ -101,21 +100,20 @@ def make_space(vehicle: Vehicle) -> Space:
                 if k in parameter.unseen:
                     continue
                 entries.append(
-                    Entry(
+                    FittedNumber(
                         effect=name,
                         parameter=parameter.name,
                         component=k if parameter.size else None,
-                        neutral=at(parameter.neutral, vehicle),
                         low=at(parameter.low, vehicle),
                         high=at(parameter.high, vehicle),
                         start=float(now[k]),
                         step=parameter.typical[1],
                     )
                 )
-    return Space(tuple(entries), base)
+    return ParameterSpace(tuple(entries), base)
 
 
-def candidates(space: Space, voltage: bool, has: Collection[str]) -> list[Candidate]:
+def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> list[Candidate]:
     """Return what may be named on logs with or without a voltage.
 
     Args:

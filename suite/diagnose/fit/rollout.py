@@ -1,4 +1,4 @@
-"""Windows flown through the model, and how that differs from what was measured in them."""
+"""FlightWindows flown through the model, and how that differs from what was measured in them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from eval.effects.log_faults import lateness, measured, restored
 from eval.quadrotor.delay import delayed_series
 from eval.quadrotor.plant import Motion, Plant, unpacked
 from eval.quadrotor.stepper import Feedback, Inputs, PlantState, rollout, rotor_step, wanted_speed
-from suite.diagnose.data.windows import CHANNELS, HISTORY_S, WARM_S, Windows
+from suite.diagnose.data.windows import CHANNELS, FlightWindows, steps_before
 from tracks.geometry.rotation import exp_rot
 
 STATE = 12
@@ -37,10 +37,10 @@ class Flown(NamedTuple):
 def fly_windows(
     plant: Plant,
     values: Mapping[str, Any],
-    driven_by_rotors: bool,
+    rotor_input: bool,
     voltage: bool,
     offset: Any,
-    windows: Windows,
+    windows: FlightWindows,
     push: Any = None,
     feedback: Feedback | None = None,
 ) -> Flown:
@@ -49,7 +49,7 @@ def fly_windows(
     Args:
         plant: with the effects `values`, for steps of the windows.
         values: of all effects; the log's own faults are read from them.
-        driven_by_rotors: measured rotor speeds are the input, not the commands.
+        rotor_input: measured rotor speeds are the input, not the commands.
         voltage: the windows have a voltage.
         offset: (B, F) of the start and of the rotor speeds' errors from what was measured.
         windows: B of them.
@@ -57,8 +57,8 @@ def fly_windows(
         feedback: what pushes in place of `push`.
     """
     dt = float(plant.dt)
-    before, warm = round(HISTORY_S / dt) + 1, round(WARM_S / dt)
-    steps = windows.command.shape[1] - before - warm
+    before, burn_in = steps_before(dt)
+    steps = windows.command.shape[1] - before - burn_in
     command = delayed_series(jnp.asarray(windows.command), plant.constants.delay, dt, before)
     start = restored(values, _sample(windows.rate_b, windows.pos_w, windows.rot_w, windows.vel_w))
     motion = Motion(
@@ -69,24 +69,24 @@ def fly_windows(
     )
     order = jnp.swapaxes(command, 0, 1)
     # Before the start only rates are known.
-    warm_rate_b = restored(values, _sample(jnp.swapaxes(windows.warm_rate_b, 0, 1))).rate_b
-    speed = wanted_speed(plant, unpacked(order[0]), warm_rate_b[0])
+    burn_in_rate_b = restored(values, _sample(jnp.swapaxes(windows.burn_in_rate_b, 0, 1))).rate_b
+    speed = wanted_speed(plant, unpacked(order[0]), burn_in_rate_b[0])
 
-    def warm_up(state: PlantState, inputs: Any) -> tuple[PlantState, None]:
+    def burn_in_step(state: PlantState, inputs: Any) -> tuple[PlantState, None]:
         order, rate_b = inputs
         return rotor_step(plant, state, unpacked(order), rate_b)[0], None
 
     # The commands are late already: a plant for whole flights need not remember them.
     state = PlantState(speed, jnp.zeros((len(speed), 4, 0)), {})
-    state, _ = jax.lax.scan(warm_up, state, (order[:warm], warm_rate_b))
+    state, _ = jax.lax.scan(burn_in_step, state, (order[:burn_in], burn_in_rate_b))
 
     rotor_speed = None
-    if driven_by_rotors:
+    if rotor_input:
         error = offset[:, STATE:].reshape(-1, KNOTS, 4)
         rotor_speed = jnp.asarray(windows.rotor_speed) - jnp.matmul(_hats(steps), error)
         rotor_speed = jnp.swapaxes(rotor_speed, 0, 1)
     inputs = Inputs(
-        unpacked(order[warm:]),
+        unpacked(order[burn_in:]),
         rotor_speed,
         voltage_drop=jnp.swapaxes(jnp.asarray(windows.voltage_drop), 0, 1) if voltage else None,
         push_b=None if push is None else jnp.swapaxes(jnp.matmul(_hats(steps), push), 0, 1),
@@ -97,7 +97,9 @@ def fly_windows(
     return Flown(*jax.tree.map(lambda field: jnp.moveaxis(field, 0, 1), along))
 
 
-def difference(plant: Plant, values: Mapping[str, Any], flown: Flown, windows: Windows) -> Any:
+def difference(
+    plant: Plant, values: Mapping[str, Any], flown: Flown, windows: FlightWindows
+) -> Any:
     """Return simulated - measured (B, N, 19) of `flown`, zero where nothing was measured."""
     dt, (track, speeds, forces) = float(plant.dt), flown
     steps = speeds.shape[1] - 1

@@ -7,293 +7,302 @@ on data with shuffled signs. A rival that explains the same windows as well is a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from suite.diagnose.data.noise import noise_of
-from suite.diagnose.data.windows import SLICES, Windows
-from suite.diagnose.fit.model import Linear, Model
-from suite.diagnose.fit.normal_equations import Frame, State, Sums, fit, make_frame, solve, sums_of
-from suite.diagnose.fit.parameters import Candidate, Space, indices_of
-from suite.diagnose.fit.permutation import Score, folds_of, score
-
-P_VALUE = 0.001
-"""Chance of a false name at each step of the search."""
-MOST = 4
-"""Effects that are named at most."""
-LEAST_SHARE = 0.003
-"""An effect that explains less than this share of what the first one did is not named: the fit of
-the first, which is not exact, leaves so much."""
-SHORT = 5
-"""Candidates that are fitted through the whole model at a step."""
-NEAR = 0.5
-"""Candidates whose linear gain is less than this share of the best are not fitted so."""
-APART = 9.0
-"""A rival whose squared error, in units of the noise, is less than this above that of the name
-(three sigma) cannot be told from it."""
-MOSTLY = 0.25
-"""Nor can one that leaves less than this share of what the name explains, where that is little."""
-ROUNDS = 3
-"""Times that names and rivals are weighed anew."""
-HORIZONS_S = (1.0, 0.5, 0.25)
-"""Lengths of a window, of which the longest is taken that it can be trusted for [s]."""
-LOST_M = 0.15
-"""Error of position from which slopes are not trusted [m]."""
-LOST_HEIGHT = 0.25
-"""The same for height, as a share of it: near the ground the air changes with it [1]."""
-LOST_RAD = 0.25
-"""The same for attitude [rad]."""
-LAST_ROUNDS = 10
-"""Steps of the last fit of all names: some effects saturate."""
-LOOK = 25.0
-"""A candidate that is worse than the best by more than this to first order is not fitted."""
-BENT = 0.1
-"""Nor one that is worse by more than this share besides: large effects are not of first order."""
+from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.fit.model import Linearisation, RolloutModel
+from suite.diagnose.fit.normal_equations import (
+    Estimate,
+    NormalEquations,
+    fit,
+    gauss_newton_step,
+    normal_equations_of,
+    start_estimate,
+)
+from suite.diagnose.fit.parameters import Candidate, ParameterSpace, indices_of
+from suite.diagnose.fit.permutation import CandidateScore, folds_of, score_candidates
+from suite.diagnose.fit.whitening import Whitening, make_whitening
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
-@dataclass
-class Named:
+@dataclass(frozen=True)
+class NamedEffect:
     """One effect that was named."""
 
     candidate: Candidate
-    p_value: float = 1.0
-    gain: float = 0.0
-    """Fall of the error when it is added last."""
-    rivals: list[str] = field(default_factory=list)
+    p_value: float
+    gain: float
+    """Fall of chi-square on windows left out when it is added last."""
+    rivals: tuple[str, ...] = ()
     """Names that explain the same."""
-    apart: dict[str, float] = field(default_factory=dict)
-    """By label of what was fitted in its place: by how much it is worse, in units of the noise and
-    with a unit for each number."""
+    worse_by: Mapping[str, float] = field(default_factory=dict)
+    """By label of what was fitted in its place: rise of chi-square, with one for each number."""
 
 
-@dataclass
-class Finding:
+@dataclass(frozen=True)
+class SearchResult:
     """What a search found."""
 
-    named: list[Named]
-    windows: Windows
+    named: tuple[NamedEffect, ...]
+    windows: FlightWindows
     """What was fitted, as long as the model could be trusted."""
-    state: State
-    sums: Sums
-    """Along the named numbers, at the end."""
-    indices: list[int]
+    estimate: Estimate
+    equations: NormalEquations
+    """Along the named numbers, at the end of the search."""
     sigma: np.ndarray
-    frame: Frame
-    first: list[Score]
-    """Scores of all candidates before anything was named."""
-    slow_after: np.ndarray
-    """(W, 12) energy of slow errors that are left; `frame.slow_freedom` is what noise gives."""
+    """(19,) measurement noise of each channel in its unit; NaN where nothing was measured."""
+    whitening: Whitening
+    first: list[CandidateScore]
+    """Scores of all candidates before anything was named, best first."""
     explained: float
-    """Fall of the squared error, in units of the noise, that the named effects bring."""
+    """Fall of chi-square that the named effects bring."""
+
+    @property
+    def candidates(self) -> list[Candidate]:
+        """What was named, without the reasons."""
+        return [one.candidate for one in self.named]
+
+    @property
+    def indices(self) -> list[int]:
+        """Places in the vector of the named numbers."""
+        return indices_of(self.candidates)
 
 
-def start_state(model: Model, windows: Windows) -> State:
-    """Return the vehicle file's numbers and the measured starts."""
-    return State(model.space.array("start"), np.zeros((len(windows.flight), model.free)))
+class _Task(NamedTuple):
+    """What a search is given."""
+
+    model: RolloutModel
+    windows: FlightWindows
+    """At full length."""
+    among: Sequence[Candidate]
+    fold: np.ndarray
+    """(W,) windows of one number are left out together."""
+    say: Callable[[str], None]
+    seed: int
+    limits: Thresholds
+
+    def score(
+        self, equations: NormalEquations, theta: np.ndarray, named: Sequence[int]
+    ) -> list[CandidateScore]:
+        """Return the scores of what is not among the numbers `named`, best first."""
+        left = [c for c in self.among if not set(c.indices) & set(named)]
+        return score_candidates(
+            equations, theta, self.model.space, named, left, self.fold, self.seed, self.limits
+        )
+
+    def fit(
+        self, look: _Look, start: Estimate, indices: list[int], known: Linearisation | None = None
+    ) -> tuple[Estimate, NormalEquations]:
+        """Fit the numbers at `indices` to what can be trusted."""
+        windows, whitening = look.windows, look.whitening
+        return fit(self.model, windows, whitening, start, indices, known=known, limits=self.limits)
+
+
+class _Look(NamedTuple):
+    """The slopes along everything at one estimate, and how to weigh them."""
+
+    linear: Linearisation
+    windows: FlightWindows
+    """As long as these slopes can be trusted."""
+    whitening: Whitening
+    equations: NormalEquations
+    sigma: np.ndarray
 
 
 def search(
-    model: Model,
-    windows: Windows,
+    model: RolloutModel,
+    windows: FlightWindows,
     among: Sequence[Candidate],
     say: Callable[[str], None],
-    known: Linear | None = None,
+    known: Linearisation | None = None,
     seed: int = 0,
-) -> Finding:
-    """Return what explains the gap between `model` and `windows`.
+    limits: Thresholds = THRESHOLDS,
+) -> SearchResult:
+    """Return which of `among` explain the gap between `model` and `windows`.
 
-    Args:
-        model: of the windows.
-        windows: what is fitted.
-        among: the candidates.
-        say: told of the steps.
-        known: slopes along everything at the vehicle file's numbers, where they are known.
-        seed: of the null's draws.
+    `say` is told of each step in a line for people; `known` are the slopes along everything at the
+    vehicle file's numbers, to save their calculation; `seed` is of the null's draws.
     """
-    whole, fold = windows, folds_of(np.asarray(windows.flight), np.asarray(windows.start_s))
-    state = start_state(model, windows)
-    named: list[Named] = []
-    first: list[Score] = []
+    fold = folds_of(np.asarray(windows.flight), np.asarray(windows.start_s), limits.folds)
+    task = _Task(model, windows, among, fold, say, seed, limits)
+    estimate = start_estimate(model, windows)
+    named: list[NamedEffect] = []
+    first: list[CandidateScore] = []
     while True:
-        linear, windows, frame, sums, sigma = _look(model, whole, state, None if named else known)
-        indices = indices_of([n.candidate for n in named])
-        left = [c for c in among if not set(c.indices) & set(indices)]
-        scores = score(sums, state.theta, model.space, indices, left, fold, seed)
-        if not first:
-            first = scores
+        look = _look(task, estimate, None if named else known)
+        chosen = [n.candidate for n in named]
+        scores = task.score(look.equations, estimate.theta, indices_of(chosen))
+        first = first or scores
         best = scores[0] if scores else None
-        enough = best and best.p_value <= P_VALUE and best.gain > LEAST_SHARE * first[0].gain
-        if best is None or not enough or len(named) >= MOST:
+        if best is None or len(named) >= limits.most_names or best.p_value > limits.name_p_value:
             break
-        tried = []
-        fallen = {
-            s.candidate: _fallen(sums, state.theta, model.space, [*indices, *s.candidate.indices])
-            for s in scores
-            if s.gain >= NEAR * best.gain
-        }
-        short = [s for s in scores if _near(fallen, s.candidate)][:SHORT]
-        for item in short:
-            at = indices_of([*(n.candidate for n in named), item.candidate])
-            after, fitted = fit(model, windows, frame, state, at, known=linear)
-            tried.append((float(fitted.error.sum()) + 2 * len(at), item, after))
-            say(f"{item.candidate.label}: {float(sums.error.sum() - fitted.error.sum()):.0f}")
-        _, item, state = min(tried, key=lambda t: t[0])
-        named.append(Named(item.candidate, item.p_value, item.gain))
-    named, state = _settle(model, whole, windows, frame, named, state, among, fold, say, seed)
+        if best.gain <= limits.least_name_share * first[0].gain:
+            break
+        item, estimate = _best_of_short_list(task, look, estimate, chosen, scores)
+        named.append(NamedEffect(item.candidate, item.p_value, item.gain))
+    named, estimate = _settle(task, look, named, estimate)
     indices = indices_of([n.candidate for n in named])
-    state, last = fit(model, windows, frame, state, indices, LAST_ROUNDS if indices else 0)
-    begin = fit(model, windows, frame, start_state(model, windows), [])[1] if indices else last
-    explained = float(begin.error.sum() - last.error.sum())
-    return Finding(named, windows, state, last, indices, sigma, frame, first, last.slow, explained)
+    rounds = limits.last_rounds if indices else 0
+    weighed = look.windows, look.whitening
+    estimate, last = fit(model, *weighed, estimate, indices, rounds, limits=limits)
+    nothing = last
+    if indices:
+        _, nothing = task.fit(look, start_estimate(model, look.windows), [])
+    explained = float(nothing.chi2.sum() - last.chi2.sum())
+    return SearchResult(
+        tuple(named), look.windows, estimate, last, look.sigma, look.whitening, first, explained
+    )
 
 
-def _settle(
-    model: Model,
-    whole: Windows,
-    windows: Windows,
-    frame: Frame,
-    named: list[Named],
-    state: State,
-    among: Sequence[Candidate],
-    fold: np.ndarray,
-    say: Callable[[str], None],
-    seed: int,
-) -> tuple[list[Named], State]:
-    """Refit all names jointly and judge each against its rivals, until no name changes.
-
-    Args:
-        model: of the windows.
-        whole: windows at full length.
-        windows: as long as the model with all names can be trusted.
-        frame: of these.
-        named: what was named.
-        state: with it.
-        among: the candidates.
-        fold: (W,) windows of one number are left out together.
-        say: told of the steps.
-        seed: of the null's draws.
-    """
-    for _ in range(ROUNDS):
-        indices = indices_of([n.candidate for n in named])
-        if not indices:
-            break
-        state, _ = fit(model, windows, frame, state, indices)
-        before = [n.candidate for n in named]
-        state = _judge_rivals(model, whole, named, state, among, fold, say, seed)
-        needed = [n for n in named if n.p_value <= P_VALUE]
-        if [n.candidate for n in needed] == before:
-            break
-        # A name that was taken on the way may be needed no more beside better ones.
-        theta, begin = state.theta.copy(), model.space.array("start")
-        for one in named:
-            if one not in needed:
-                theta[list(one.candidate.indices)] = begin[list(one.candidate.indices)]
-        named, state = needed, State(theta, state.offset)
-    return named, state
-
-
-def _look(
-    model: Model, windows: Windows, state: State, known: Linear | None
-) -> tuple[Linear, Windows, Frame, Sums, np.ndarray]:
-    """Return the slopes along everything at `state`, and how to weigh them.
-
-    With them come the windows, as long as slopes can be trusted, their frame and sums, and the
-    noise.
-    """
-    linear = known
-    if linear is None:
-        linear = model.linearise(state.theta, state.offset, windows, None)
-    sigma = noise_of(linear.residual, windows)
-    view = trusted(windows, linear.residual)
-    frame = make_frame(linear, sigma, view)
-    return linear, view, frame, sums_of(frame, linear, model.size), sigma
-
-
-def trusted(windows: Windows, residual: np.ndarray) -> Windows:
+def trusted(
+    windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
+) -> FlightWindows:
     """Return `windows`, each up to where the model has not left the flight by too much.
 
     Beyond, slopes taken where the model is say nothing of where the flight was: it may have turned
     over, or sunk below the ground. What is named brings the model back, and the next look is
-    longer.
+    longer. `residual` is (W, N, 19).
     """
-    apart = np.abs(residual)
+    error = np.abs(residual)
     height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
-    lost = (apart[..., SLICES["position"]].max(axis=-1) > LOST_M) | (
-        apart[..., SLICES["attitude"]].max(axis=-1) > LOST_RAD
+    lost = (error[..., SLICES["position"]].max(axis=-1) > limits.trusted_m) | (
+        error[..., SLICES["attitude"]].max(axis=-1) > limits.trusted_rad
     )
-    lost |= (apart[..., 2] > LOST_HEIGHT * height) & (height > 0.0)
+    lost |= (error[..., 2] > limits.trusted_height_share * height) & (height > 0.0)
     row_s = np.asarray(windows.row_s)
-    trusted = np.full(len(row_s), HORIZONS_S[-1])
-    for horizon in reversed(HORIZONS_S):
+    until_s = np.full(len(row_s), limits.trusted_horizons_s[-1])
+    for horizon in reversed(limits.trusted_horizons_s):
         there = ~(lost & (row_s <= horizon)).any(axis=1)
-        trusted = np.where(there, horizon, trusted)
-    seen = np.asarray(windows.seen) & (row_s <= trusted[:, None] + 1e-9)[..., None]
+        until_s = np.where(there, horizon, until_s)
+    seen = np.asarray(windows.seen) & (row_s <= until_s[:, None] + 1e-9)[..., None]
     return windows._replace(seen=seen)
 
 
-def _near(fallen: Mapping[Candidate, float], candidate: Candidate) -> bool:
-    """Return whether `candidate` could be the best: slopes alone say too little of large effects.
+def _look(task: _Task, estimate: Estimate, known: Linearisation | None = None) -> _Look:
+    """Return the slopes of all windows at `estimate`, which `known` saves."""
+    model, limits = task.model, task.limits
+    linear = known
+    if linear is None:
+        linear = model.linearise(estimate.theta, estimate.offset, task.windows, None)
+    sigma = noise_of(linear.residual, task.windows, limits=limits)
+    view = trusted(task.windows, linear.residual, limits)
+    whitening = make_whitening(linear, sigma, view, limits)
+    equations = normal_equations_of(whitening, linear, model.size)
+    return _Look(linear, view, whitening, equations, sigma)
 
-    Args:
-        fallen: fall of the error to first order, by candidate.
-        candidate: one of them, or any other.
+
+def _best_of_short_list(
+    task: _Task,
+    look: _Look,
+    estimate: Estimate,
+    chosen: list[Candidate],
+    scores: list[CandidateScore],
+) -> tuple[CandidateScore, Estimate]:
+    """Return which of the best `scores` fits best through the whole model beside `chosen`."""
+    limits, space, tried = task.limits, task.model.space, []
+    indices, chi2 = indices_of(chosen), float(look.equations.chi2.sum())
+    fallen = {
+        s.candidate: _fallen(
+            look.equations, estimate.theta, space, [*indices, *s.candidate.indices]
+        )
+        for s in scores
+        if s.gain >= limits.near_share * scores[0].gain
+    }
+    near = [s for s in scores if _near(fallen, s.candidate, limits)]
+    for item in near[: limits.short_list]:
+        at = indices_of([*chosen, item.candidate])
+        after, equations = task.fit(look, estimate, at, look.linear)
+        tried.append((float(equations.chi2.sum()) + 2 * len(at), item, after))
+        task.say(f"{item.candidate.label}: {chi2 - equations.chi2.sum():.0f}")
+    _, item, after = min(tried, key=lambda t: t[0])
+    return item, after
+
+
+def _settle(
+    task: _Task, look: _Look, named: list[NamedEffect], estimate: Estimate
+) -> tuple[list[NamedEffect], Estimate]:
+    """Refit all names jointly and judge each against its rivals, until no name changes.
+
+    `look` was taken with all of them.
     """
-    most = max(fallen.values())
-    return fallen.get(candidate, -np.inf) >= most - LOOK - BENT * abs(most)
+    begin = task.model.space.array("start")
+    for _ in range(task.limits.settle_rounds):
+        before = [n.candidate for n in named]
+        if not before:
+            break
+        estimate, _ = task.fit(look, estimate, indices_of(before))
+        for place in range(len(named)):
+            named, estimate = _judge_rivals(task, named, place, estimate)
+        needed = [n for n in named if n.p_value <= task.limits.name_p_value]
+        if [n.candidate for n in needed] == before:
+            break
+        # A name that was taken on the way may be needed no more beside better ones.
+        theta = estimate.theta.copy()
+        for one in named:
+            if one not in needed:
+                theta[list(one.candidate.indices)] = begin[list(one.candidate.indices)]
+        named, estimate = needed, Estimate(theta, estimate.offset)
+    return named, estimate
 
 
 def _judge_rivals(
-    model: Model,
-    windows: Windows,
-    named: list[Named],
-    state: State,
-    among: Sequence[Candidate],
-    fold: np.ndarray,
-    say: Callable[[str], None],
-    seed: int,
-) -> State:
-    """Set each name's evidence when added last, and its rivals; a better rival takes its place."""
-    begin = model.space.array("start")
-    for one in list(named):
-        others = [n.candidate for n in named if n is not one]
-        theta = state.theta.copy()
-        theta[list(one.candidate.indices)] = begin[list(one.candidate.indices)]
-        without = State(theta, state.offset)
-        linear, view, frame, sums, _ = _look(model, windows, without, None)
-        at = indices_of(others)
-        left = [c for c in among if not set(c.indices) & set(at)]
-        scores = score(sums, theta, model.space, at, left, fold, seed)
-        own = next((s for s in scores if s.candidate == one.candidate), None)
-        if own is not None:
-            one.p_value, one.gain = own.p_value, own.gain
-        fallen = {c: _fallen(sums, theta, model.space, [*at, *c.indices]) for c in left}
-        tried = []
-        for candidate in left:
-            if candidate == one.candidate or _near(fallen, candidate):
-                chosen = indices_of([*others, candidate])
-                after, fitted = fit(model, view, frame, without, chosen, known=linear)
-                tried.append((float(fitted.error.sum()) + len(candidate.indices), candidate, after))
-                say(f"{one.candidate.label} or {candidate.label}: {tried[-1][0]:.1f}")
-        least, best, state = min(tried, key=lambda t: t[0])
-        if best != one.candidate:
-            one.p_value = next(s.p_value for s in scores if s.candidate == best)
-        explained = float(sums.error.sum()) - _fallen(sums, theta, model.space, at) - least
-        limit = min(APART, MOSTLY * explained)
-        one.candidate = best
-        one.apart = {c.label: cost - least for cost, c, _ in tried if c != best}
-        names = [c.name for cost, c, _ in tried if cost - least <= limit]
-        one.rivals = [name for name in dict.fromkeys(names) if name != best.name]
-    return state
+    task: _Task, named: list[NamedEffect], place: int, estimate: Estimate
+) -> tuple[list[NamedEffect], Estimate]:
+    """Weigh the name at `place` when added last; a better rival takes its place."""
+    model, limits, one = task.model, task.limits, named[place]
+    others = [n.candidate for k, n in enumerate(named) if k != place]
+    theta, own = estimate.theta.copy(), list(one.candidate.indices)
+    theta[own] = model.space.array("start")[own]
+    without = Estimate(theta, estimate.offset)
+    look = _look(task, without)
+    at = indices_of(others)
+    scores = {s.candidate: s for s in task.score(look.equations, theta, at)}
+    if one.candidate in scores:
+        score = scores[one.candidate]
+        one = replace(one, p_value=score.p_value, gain=score.gain)
+    left = [c for c in task.among if not set(c.indices) & set(at)]
+    fallen = {c: _fallen(look.equations, theta, model.space, [*at, *c.indices]) for c in left}
+    tried = []
+    for candidate in left:
+        if candidate == one.candidate or _near(fallen, candidate, limits):
+            chosen = indices_of([*others, candidate])
+            after, equations = task.fit(look, without, chosen, look.linear)
+            tried.append((float(equations.chi2.sum()) + len(candidate.indices), candidate, after))
+            task.say(f"{one.candidate.label} or {candidate.label}: {tried[-1][0]:.1f}")
+    least, best, after = min(tried, key=lambda t: t[0])
+    if best != one.candidate:
+        one = replace(one, candidate=best, p_value=scores[best].p_value)
+    total = float(look.equations.chi2.sum())
+    explained = total - _fallen(look.equations, theta, model.space, at) - least
+    alike = min(limits.rival_chi2, limits.rival_share * explained)
+    names = dict.fromkeys(c.name for chi2, c, _ in tried if chi2 - least <= alike)
+    rivals = tuple(name for name in names if name != best.name)
+    worse_by = {c.label: chi2 - least for chi2, c, _ in tried if c != best}
+    one = replace(one, rivals=rivals, worse_by=worse_by)
+    return [*named[:place], one, *named[place + 1 :]], after
 
 
-def _fallen(sums: Sums, theta: np.ndarray, space: Space, columns: Sequence[int]) -> float:
-    """Return the fall of the error, to first order, where the numbers at `columns` are fitted."""
+def _near(fallen: Mapping[Candidate, float], candidate: Candidate, limits: Thresholds) -> bool:
+    """Return whether `candidate` could be the best: slopes alone say too little of large effects.
+
+    `fallen` holds the fall of chi-square to first order, by candidate.
+    """
+    most = max(fallen.values())
+    slack = limits.first_order_chi2 + limits.first_order_share * abs(most)
+    return fallen.get(candidate, -np.inf) >= most - slack
+
+
+def _fallen(
+    equations: NormalEquations, theta: np.ndarray, space: ParameterSpace, columns: Sequence[int]
+) -> float:
+    """Return the fall of chi-square to first order where the numbers at `columns` are fitted."""
     columns = sorted(set(columns))
-    square = sums.square[:, columns][:, :, columns].sum(0)
-    cross = sums.cross[:, columns].sum(0)
-    low, high, scale = (space.array(name)[columns] for name in ("low", "high", "step"))
-    if not columns or np.trace(square) < 1e-12:
+    hessian = equations.hessian[:, columns][:, :, columns].sum(0)
+    if not columns or np.trace(hessian) < 1e-12:
         return 0.0
-    change = solve(square, cross, low - theta[columns], high - theta[columns], scale)
-    return float(2 * cross @ change - change @ square @ change)
+    gradient = equations.gradient[:, columns].sum(0)
+    return gauss_newton_step(hessian, gradient, theta, space, columns)[1]

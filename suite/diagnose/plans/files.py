@@ -7,9 +7,8 @@ points.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +32,9 @@ NAME = "plan.json"
 
 
 def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
-    """Write `ways` in `folder`; return what plan.json holds.
+    """Write `ways`, one a flight, in `folder`; return what plan.json holds.
 
-    Args:
-        folder: made where it is missing.
-        ways: one a flight.
-        words: what the flights are for, for people.
+    `words` say to people what the flights are for.
     """
     folder.mkdir(parents=True, exist_ok=True)
     flights = []
@@ -62,27 +58,3 @@ def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -
     plan = {"flights": flights, "words": list(words)}
     write_json(folder / NAME, {**plan, **stamp(SCHEMA, None)})
     return plan
-
-
-def read_plan(folder: Path) -> list[Trajectory]:
-    """Return the trajectories of the plan in `folder`.
-
-    Raises:
-        ValueError: where there is none, or one that cannot be read, naming file and key.
-    """
-    path = folder / NAME
-    try:
-        plan = json.loads(path.read_text(encoding="utf-8"))
-        return [_trajectory(flight["trajectory"], path) for flight in plan["flights"]]
-    except (OSError, KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: no plan: {error}; suite diagnose --plan writes one") from error
-
-
-def _trajectory(values: Mapping[str, Any], path: Path) -> Trajectory:
-    known = {field.name for field in fields(Trajectory)}
-    strange = sorted(set(values) - known)
-    if strange:
-        raise ValueError(
-            f"{path}: trajectory: unknown key {strange[0]!r}; allowed: {sorted(known)}"
-        )
-    return Trajectory(**values)

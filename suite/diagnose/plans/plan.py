@@ -13,7 +13,6 @@ from eval.logs.flight_log import write_flight
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.sensors import Sensors, log_of
 from suite.diagnose.data.windows import SLICES
-from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.plans.files import NAME, SCHEMA, write_plan
 from suite.diagnose.plans.separating import plan_for, separations_of
 from suite.diagnose.plans.simulate import FlightFailed, fly
@@ -67,7 +66,7 @@ def write_plan_of(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 def fly_plan(
     plan: dict[str, Any],
-    result: Diagnosis,
+    sigma: np.ndarray,
     nominal: Vehicle,
     truth: Vehicle,
     folder: Path,
@@ -77,7 +76,7 @@ def fly_plan(
 
     Args:
         plan: from `write_plan_of`.
-        result: whose measurement noise the logs get.
+        sigma: (19,) noise of each channel in its unit that the logs get; NaN: not logged.
         nominal: what the pilot believes.
         truth: what is flown.
         folder: of the plan.
@@ -87,7 +86,7 @@ def fly_plan(
         The plan, each flight with its log's name in `flown`; `warnings` names those that failed.
     """
     rate_hz = _rate(truth)
-    sensors = _sensors(result, rate_hz, plan["words"])
+    sensors = _sensors(sigma, rate_hz, plan["words"])
     flights, warnings = [], []
     for number, flight in enumerate(plan["flights"], 1):
         way = Trajectory(**flight["trajectory"])
@@ -126,9 +125,8 @@ def _rate(vehicle: Vehicle) -> float:
     return frequency / max(1, round(frequency / RATE_HZ))
 
 
-def _sensors(result: Diagnosis, rate_hz: float, words: list[str]) -> Sensors:
+def _sensors(sigma: np.ndarray, rate_hz: float, words: list[str]) -> Sensors:
     """Return sensors as noisy as the diagnosed logs; rotor speeds and voltage where asked for."""
-    sigma = result.finding.sigma
 
     def noise(group: str) -> float:
         values = sigma[SLICES[group]]

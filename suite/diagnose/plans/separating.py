@@ -16,6 +16,8 @@ _CIRCLE = Trajectory("circle", speed=3.0, size=3.0)
 _SLOW_EIGHT = Trajectory("figure_eight", speed=2.0, size=3.0)
 _HOVER = Trajectory("hover")
 _UP_DOWN = Trajectory("vertical", speed=1.5, size=1.0)
+OTHERWISE = "fly faster, with changes of thrust, speed, heading and height"
+"""What to do about a pair that is not known."""
 
 
 @dataclass(frozen=True)
@@ -128,3 +130,9 @@ def plan_for(names: Iterable[str]) -> list[Trajectory]:
     """
     found = [way for entry in separations_of(names) for way in entry.separating]
     return list(dict.fromkeys(found or [_RANGE, _SWEEP, _CHIRP, _FAST_WOBBLE]))
+
+
+def advice(name: str, rival: str) -> str:
+    """Return a line that says which flight would tell `name` from `rival`."""
+    known = separations_of((name, rival))
+    return f"{name} from {rival}: {known[0].words if known else OTHERWISE}"

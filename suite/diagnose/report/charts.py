@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from suite.common.charts import plain_axes, png, titled
-from suite.diagnose.fit.permutation import Score
-from suite.diagnose.verdict.black_box import Contests
-from suite.diagnose.verdict.gap import HORIZONS_S, Gap, interval
-from suite.diagnose.verdict.proof import by_group
-from suite.diagnose.verdict.where import GROUPS, UNITS, Where, binned
+from suite.diagnose.data.windows import STATE_GROUPS
+from suite.diagnose.fit.permutation import CandidateScore
+from suite.diagnose.verdict.black_box import BlackBoxComparison
+from suite.diagnose.verdict.disagreement import UNITS, Disagreement, binned, by_group
+from suite.diagnose.verdict.gap import Gap
 
 BEFORE, AFTER, WRONG, BOX = "#8b93a1", "#2463c9", "#e0892b", "#7a5cb8"
+"""Colours of the vehicle as given, with what was named, with a wrong name, with a black box."""
 FLOOR = "#1d2430"
 SHOWN = 14
 """Candidates in the chart."""
@@ -25,7 +26,9 @@ CELLS = 7
 """Places at which the drift is averaged."""
 
 
-def gains_chart(scores: Sequence[Score], threshold: float | None, named: set[str]) -> bytes:
+def gains_chart(
+    scores: Sequence[CandidateScore], threshold: float | None, named: set[str]
+) -> bytes:
     """Return the gains of the best candidates, and what chance reaches.
 
     Args:
@@ -52,60 +55,47 @@ def gains_chart(scores: Sequence[Score], threshold: float | None, named: set[str
     return png(figure)
 
 
-def where_chart(where: Where) -> bytes:
+def disagreement_chart(found: Disagreement) -> bytes:
     """Return errors of 0.5 s rollouts over their noise floor, against what was flown."""
     figure = Figure(figsize=(11.0, 7.4), layout="constrained")
-    grid = figure.subplots(len(GROUPS), len(UNITS), sharey="row", squeeze=False)
-    series = [("as given", where.before, BEFORE)]
-    if where.after is not where.before:
-        series.append(("with what was named", where.after, AFTER))
+    grid = figure.subplots(len(STATE_GROUPS), len(UNITS), sharey="row", squeeze=False)
     for column, (condition, unit) in enumerate(UNITS.items()):
-        edges = where.edges[condition]
+        edges = found.edges[condition]
         middle = 0.5 * (edges[1:] + edges[:-1])
-        for label, over, colour in series:
-            table, _ = binned(where, over, condition)
-            rows = by_group(table[HORIZON])
-            for row in range(len(GROUPS)):
-                grid[row][column].plot(
-                    middle, rows[:, row], "o-", ms=3.5, lw=1.5, color=colour, label=label
-                )
+        for label, colour, over in _before_after(found.before, found.after):
+            rows = by_group(binned(found, over, condition)[0][HORIZON])
+            for axes, line in zip(grid[:, column], rows.T, strict=True):
+                axes.plot(middle, line, "o-", ms=3.5, lw=1.5, color=colour, label=label)
         grid[-1][column].set_xlabel(f"{condition} [{unit}]", fontsize=9)
-    for row, group in enumerate(GROUPS):
+    for row, group in enumerate(STATE_GROUPS):
         for axes in grid[row]:
             axes.axhline(1.0, color=FLOOR, lw=0.8, ls=":")
             axes.set_yscale("log")
             _few_ticks(axes)
             plain_axes(axes)
         grid[row][0].set_ylabel(f"{group}\nerror / noise floor", fontsize=9)
-    handles, labels = grid[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False, fontsize=9)
+    _legend_above(figure, grid[0][0])
     return png(figure)
 
 
-def drift_chart(where: Where) -> bytes:
+def drift_chart(found: Disagreement) -> bytes:
     """Return what acceleration the model lacks against velocity, and its turn against rates."""
     figure = Figure(figsize=(11.0, 5.2), layout="constrained")
     grid = figure.subplots(2, 3)
-    series = [(where.drift_before, BEFORE, "as given")]
-    if where.after is not where.before:
-        series.append((where.drift_after, AFTER, "with what was named"))
-    for axis in range(3):
-        name = "xyz"[axis]
-        for row, (state, scale) in enumerate(((where.vel_b, 1.0), (where.rate_b, 180.0 / np.pi))):
+    series = _before_after(found.drift_before, found.drift_after)
+    small = {"loc": "left", "fontsize": 9}
+    for axis, name in enumerate("xyz"):
+        for row, (state, scale) in enumerate(((found.vel_b, 1.0), (found.rate_b, 180.0 / np.pi))):
             axes = grid[row][axis]
-            for drift, colour, label in series:
+            for label, colour, drift in series:
                 _binned_means(axes, state[:, axis], scale * drift[:, 3 * row + axis], colour, label)
             axes.axhline(0.0, color=FLOOR, lw=0.8, ls=":")
             plain_axes(axes)
-        grid[0][axis].set_title(
-            f"lacking acceleration along body {name} [m/s²]", loc="left", fontsize=9
-        )
+        grid[0][axis].set_title(f"lacking acceleration along body {name} [m/s²]", **small)
         grid[0][axis].set_xlabel(f"velocity along body {name} [m/s]", fontsize=8)
-        grid[1][axis].set_title(f"lacking turn about body {name} in 0.5 s [deg]", loc="left",
-                                fontsize=9)  # fmt: skip
+        grid[1][axis].set_title(f"lacking turn about body {name} in 0.5 s [deg]", **small)
         grid[1][axis].set_xlabel(f"rate about body {name} [rad/s]", fontsize=8)
-    handles, labels = grid[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False, fontsize=9)
+    _legend_above(figure, grid[0][0])
     return png(figure)
 
 
@@ -119,14 +109,7 @@ def gap_chart(rows: Sequence[tuple[str, Gap, str]], speed: np.ndarray, seed: int
     """
     figure = Figure(figsize=(11.0, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    for place, (_, gap, colour) in enumerate(rows[::-1]):
-        low, high = interval(gap.score, seed)
-        left.plot([low, high], [place, place], color=colour, lw=2.5, solid_capstyle="butt")
-        left.plot(gap.rms, place, "o", ms=7, color=colour)
-    left.set_yticks(range(len(rows)), [label for label, _, _ in rows[::-1]])
-    left.set_ylim(-0.6, len(rows) - 0.4)
-    left.axvline(1.0, color=FLOOR, lw=0.8, ls=":")
-    _from_one(left, [interval(gap.score, seed)[1] for _, gap, _ in rows])
+    _gap_bars(left, rows, seed)
     titled(left, "Gap on held-out flights, 1 is the noise floor")
     for label, gap, colour in rows:
         if len(gap.score) == len(speed):
@@ -139,27 +122,49 @@ def gap_chart(rows: Sequence[tuple[str, Gap, str]], speed: np.ndarray, seed: int
     return png(figure)
 
 
-def contest_chart(found: Contests, seed: int) -> bytes:
-    """Return the gaps of the named effect and of the black box, inside and outside."""
-    sides = [found.held_out] + ([found.outside] if found.outside else [])
+def black_box_chart(sides: Sequence[BlackBoxComparison], seed: int) -> bytes:
+    """Return the gaps of the named effect and of the black box, for one or two comparisons."""
     figure = Figure(figsize=(11.0, 2.4), layout="constrained")
     for axes, side in zip(figure.subplots(1, 2), sides, strict=False):
-        rows = [("as given", side.before, BEFORE)]
-        if side.named is not None:
-            rows.append(("named effect", side.named, AFTER))
-        rows.append(("Delta Action Model", side.black_box, BOX))
-        for place, (_, gap, colour) in enumerate(rows[::-1]):
-            low, high = interval(gap.score, seed)
-            axes.plot([low, high], [place, place], color=colour, lw=2.5, solid_capstyle="butt")
-            axes.plot(gap.rms, place, "o", ms=7, color=colour)
-        axes.set_yticks(range(len(rows)), [label for label, _, _ in rows[::-1]])
-        axes.set_ylim(-0.6, len(rows) - 0.4)
-        axes.axvline(1.0, color=FLOOR, lw=0.8, ls=":")
-        _from_one(axes, [interval(gap.score, seed)[1] for _, gap, _ in rows])
+        colours = (BEFORE, AFTER, BOX)
+        rows = [(*row, colour) for row, colour in zip(labelled_gaps(side), colours, strict=True)]
+        _gap_bars(axes, [(label, gap, colour) for label, gap, colour in rows if gap], seed)
         titled(axes, f"Gap on {side.judged_on}")
     for axes in figure.axes[len(sides) :]:
         axes.set_axis_off()
     return png(figure)
+
+
+def labelled_gaps(side: BlackBoxComparison) -> list[tuple[str, Gap | None]]:
+    """Return what is compared, from top to bottom."""
+    return [
+        ("as given", side.before),
+        ("named effect", side.named),
+        ("Delta Action Model", side.black_box),
+    ]
+
+
+def _before_after(before: np.ndarray, after: np.ndarray) -> list[tuple[str, str, np.ndarray]]:
+    return [("as given", BEFORE, before), ("with what was named", AFTER, after)]
+
+
+def _legend_above(figure: Figure, axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False, fontsize=9)
+
+
+def _gap_bars(axes: Axes, rows: Sequence[tuple[str, Gap, str]], seed: int) -> None:
+    """Draw gaps (label, gap, colour) with their 95 % intervals, from top to bottom."""
+    for place, (_, gap, colour) in enumerate(rows[::-1]):
+        low, high = gap.ci95(seed)
+        axes.plot([low, high], [place, place], color=colour, lw=2.5, solid_capstyle="butt")
+        axes.plot(gap.rms, place, "o", ms=7, color=colour)
+    axes.set_yticks(range(len(rows)), [label for label, _, _ in rows[::-1]])
+    axes.set_ylim(-0.6, len(rows) - 0.4)
+    axes.axvline(1.0, color=FLOOR, lw=0.8, ls=":")
+    axes.set_xscale("log")
+    axes.set_xlim(0.8, 1.25 * max(1.5, *(gap.ci95(seed)[1] for _, gap, _ in rows)))
+    _few_ticks(axes, "x")
 
 
 def _binned_means(
@@ -179,12 +184,6 @@ def _binned_means(
     axes.errorbar(middle, mean, error, fmt="o-", ms=4, lw=1.5, color=colour, label=label)
 
 
-def _from_one(axes: Axes, highest: Sequence[float]) -> None:
-    axes.set_xscale("log")
-    axes.set_xlim(0.8, 1.25 * max(*highest, 1.5))
-    _few_ticks(axes, "x")
-
-
 def _few_ticks(axes: Axes, which: str = "y") -> None:
     """Write numbers as people do on a logarithmic axis."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
@@ -196,8 +195,3 @@ def _few_ticks(axes: Axes, which: str = "y") -> None:
     low, high = axis.get_view_interval()
     if high / max(low, 1e-9) > 300.0:
         axis.set_major_locator(LogLocator())
-
-
-COLOURS: Mapping[str, str] = {"before": BEFORE, "after": AFTER, "wrong": WRONG, "box": BOX}
-"""Of what is compared."""
-HORIZON_S = HORIZONS_S[HORIZON]

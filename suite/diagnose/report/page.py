@@ -8,14 +8,13 @@ from typing import Any
 from eval.effects import EFFECTS
 from suite.common.report import Cell, Details, Grid, Links, Part, Picture, Report, Section
 from suite.diagnose.data.windows import UNITS
-from suite.diagnose.diagnose import Diagnosis
-from suite.diagnose.fit.permutation import FLIPS
-from suite.diagnose.fit.search import P_VALUE
-from suite.diagnose.report.answer import components
-from suite.diagnose.report.charts import drift_chart, gains_chart, where_chart
-from suite.diagnose.report.logs import actuators_section, logs_section, noise_section
-from suite.diagnose.report.proof import evidence_section, rest_section
-from suite.diagnose.verdict.proof import Proof
+from suite.diagnose.report.cells import cells, grid, short_name
+from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
+from suite.diagnose.report.diagnosis_json import components
+from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
+from suite.diagnose.report.result_sections import held_out_section, residual_section
+from suite.diagnose.verdict.checks import Checks
+from suite.diagnose.verdict.diagnosis import Diagnosis
 
 VERDICTS = {
     "no_gap": "Simulation and flights agree within the measurement noise.",
@@ -35,30 +34,23 @@ RIVALS = 6
 
 
 def page(
-    diagnosis: Diagnosis, found: Mapping[str, Any], proof: Proof, toml: str, files: set[str],
-    seed: int,
-) -> Report:  # fmt: skip
-    """Return the report of a diagnosis.
+    diagnosis: Diagnosis, found: Mapping[str, Any], checks: Checks, toml: str, files: set[str]
+) -> Report:
+    """Return the report of a diagnosis; `found` is its JSON, and the words are taken from there.
 
-    Args:
-        diagnosis: the diagnosis.
-        found: its JSON.
-        proof: what stands beside the names.
-        toml: the vehicle file that was written.
-        files: which of `FILES` there are.
-        seed: of the intervals' draws.
+    `toml` is the vehicle file that was written, `files` which of `FILES` there are.
     """
     gap = found["gap"]
     sections = [
         Section("The answer", _answer(found)),
-        logs_section(diagnosis, proof),
+        logs_section(diagnosis, checks),
         noise_section(diagnosis),
-        _where(found, proof),
-        *actuators_section(proof, diagnosis.driven_by),
+        _disagreement(found, checks),
+        *actuators_section(checks, diagnosis.input_source),
         _candidates(diagnosis),
         _identity(diagnosis, found),
-        rest_section(diagnosis, found),
-        evidence_section(diagnosis, found, proof, seed),
+        residual_section(diagnosis, found),
+        held_out_section(diagnosis, found, checks),
         _written(found, toml, files),
     ]
     if found["warnings"]:
@@ -93,28 +85,26 @@ def _lead(found: Mapping[str, Any]) -> str:
 
 
 def _few(names: list[str]) -> str:
-    short = [name.replace("\\", "/").rsplit("/", 1)[-1] for name in names]
+    short = [short_name(name) for name in names]
     return ", ".join(short[:3]) + (f" and {len(short) - 3} more" if len(short) > 3 else "")
 
 
 def _answer(found: Mapping[str, Any]) -> list[Part]:
     if not found["effects"]:
         return [VERDICTS[found["verdict"]]]
-    rows = []
-    for effect in found["effects"]:
-        removed, chance = effect["gap_removed"], effect["p_value"]
-        for label, value, span in components(effect["parameters"]):
-            rows.append(
-                [
-                    Cell(effect["name"]),
-                    Cell(", ".join(effect["alternatives"]) or "none"),
-                    Cell(label),
-                    Cell("not seen" if value is None else _number(value)),
-                    Cell("" if span is None else f"{_number(span[0])} to {_number(span[1])}"),
-                    Cell("exempt" if removed is None else f"{100 * removed:.0f} %"),
-                    Cell(f"{chance:.2g}"),
-                ]
-            )
+    rows = [
+        (
+            effect["name"],
+            ", ".join(effect["alternatives"]) or "none",
+            label,
+            "not seen" if value is None else f"{value:.4g}",
+            "" if span is None else f"{span[0]:.4g} to {span[1]:.4g}",
+            "exempt" if effect["gap_removed"] is None else f"{100 * effect['gap_removed']:.0f} %",
+            f"{effect['p_value']:.2g}",
+        )
+        for effect in found["effects"]
+        for label, value, span in components(effect["parameters"])
+    ]
     headers = ["effect", "cannot be told from", "parameter", "total", "95 %", "of the gap", "p"]
     words = [
         f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
@@ -124,19 +114,19 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
         "Values are totals: what the vehicle file had of an effect is replaced. Of the gap: the "
         "share that this effect takes away when it is added last."
     )
-    return [*words, Grid("", headers, rows, note=note)]
+    return [*words, grid("", headers, rows, note)]
 
 
-def _where(found: Mapping[str, Any], proof: Proof) -> Section:
+def _disagreement(found: Mapping[str, Any], checks: Checks) -> Section:
     rows = []
     for horizon, groups in found["gap"]["channels"].items():
         for group, values in groups.items():
             floor = values["noise_floor"]
-            cells = [Cell(horizon), Cell(f"{group} [{UNITS[group]}]")]
+            row = cells(horizon, f"{group} [{UNITS[group]}]")
             for key in ("before", "after"):
                 tone = "good" if key == "after" and values[key] < 1.2 * floor else ""
-                cells.append(Cell(f"{values[key]:.4g}", tone))
-            rows.append([*cells, Cell(f"{floor:.4g}")])
+                row.append(Cell(f"{values[key]:.4g}", tone))
+            rows.append([*row, *cells(f"{floor:.4g}")])
     headers = ["rollout of", "RMS error", "as given", "with what was named", "noise floor"]
     told = found["disagreement"]
     words = [
@@ -153,14 +143,14 @@ def _where(found: Mapping[str, Any], proof: Proof) -> Section:
         "3. Where they disagree",
         [
             *words,
-            Picture(where_chart(proof.where), WHERE),
-            Picture(drift_chart(proof.where), DRIFT),
+            Picture(disagreement_chart(checks.disagreement), ERRORS),
+            Picture(drift_chart(checks.disagreement), DRIFT),
             Grid("On held-out flights", headers, rows),
         ],
     )
 
 
-WHERE = (
+ERRORS = (
     "Errors of rollouts of 0.5 s over their noise floor, all flights, against what was flown at "
     "their starts. A line that stays at the dotted one is noise; one that rises says with what the "
     "disagreement grows."
@@ -172,51 +162,47 @@ DRIFT = (
 
 
 def _candidates(diagnosis: Diagnosis) -> Section:
-    scores = diagnosis.finding.first
-    named = {n.candidate.label for n in diagnosis.finding.named}
+    scores, limits = diagnosis.search.first, diagnosis.limits
+    named = {candidate.label for candidate in diagnosis.search.candidates}
     chance = scores[0].chance if scores else None
     rows = [
-        [
-            Cell(s.candidate.label),
-            Cell(f"{s.gain:.1f}"),
-            Cell(f"{s.p_value:.3f}"),
-            Cell("named" if s.candidate.label in named else ""),
-        ]
+        f"{s.candidate.label:24}{s.gain:>12.1f}{s.p_value:>8.3f}  "
+        + ("named" if s.candidate.label in named else "")
         for s in scores
     ]
     words = (
         f"All {len(scores)} candidates, each fitted alone before anything was named. The gain is "
         "the fall of the whitened squared error on stretches that its fit did not see. The null: "
-        f"the signs of whole stretches are shuffled {FLIPS} times, and the best gain of all "
-        "candidates is taken each time; p is how often that is as large. One name follows another "
-        f"while p is at most {P_VALUE:g}; then all are refitted jointly."
+        f"the signs of whole stretches are shuffled {limits.sign_draws} times, and the best gain "
+        "of all candidates is taken each time; p is how often that is as large. One name follows "
+        f"another while p is at most {limits.name_p_value:g}; then all are refitted jointly."
     )
-    table = "\n".join(f"{c[0].text:24}{c[1].text:>12}{c[2].text:>8}  {c[3].text}" for c in rows)
+    head = f"{'effect':24}{'gain':>12}{'p':>8}"
     return Section(
         "4. The candidates",
         [
             words,
             Picture(gains_chart(scores, chance, named), "The best fourteen; blue were named."),
-            Details("all candidates", f"{'effect':24}{'gain':>12}{'p':>8}\n{table}"),
+            Details("all candidates", "\n".join([head, *rows])),
         ],
     )
 
 
 def _identity(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
     rows = []
-    for one in diagnosis.finding.named:
-        ordered = sorted(one.apart.items(), key=lambda item: item[1])
-        for label, apart in ordered[:RIVALS]:
+    for one in diagnosis.search.named:
+        ordered = sorted(one.worse_by.items(), key=lambda item: item[1])
+        for label, worse_by in ordered[:RIVALS]:
             same = label.split()[0] in one.rivals
             verdict = Cell("cannot be told apart", "bad") if same else Cell("ruled out")
-            rows.append([Cell(one.candidate.label), Cell(label), Cell(f"{apart:.1f}"), verdict])
+            rows.append([*cells(one.candidate.label, label, f"{worse_by:.1f}"), verdict])
     headers = ["named", "in its place", "worse by", ""]
     note = (
         "Worse by: squared error in units of the noise, with one for each number that is fitted; "
         "9 is three standard errors. What was not fitted in a name's place was too far off."
     )
     parts: list[Part] = [Grid("", headers, rows, note=note)] if rows else []
-    if not diagnosis.finding.named:
+    if not diagnosis.search.named:
         parts.append("Nothing was named, so that there is nothing to tell apart.")
     elif not found["separate_with"]:
         parts.append("No other name explains the same flights as well.")
@@ -238,22 +224,17 @@ def _written(found: Mapping[str, Any], toml: str, files: set[str]) -> Section:
     plan = found.get("plan")
     if plan:
         rows = [
-            [
-                Cell(way["file"]),
-                Cell(way["trajectory"]["kind"]),
-                Cell(f"{way['trajectory']['duration_s']:g} s"),
-                Cell(f"{way['top_speed']:.1f} m/s"),
-                Cell(f"{way['top_acceleration']:.1f} m/s²"),
-                Cell(" x ".join(f"{size:.1f}" for size in way["room"]) + " m"),
-                Cell(way["flown"] or ""),
-            ]
+            (
+                way["file"],
+                way["trajectory"]["kind"],
+                f"{way['trajectory']['duration_s']:g} s",
+                f"{way['top_speed']:.1f} m/s",
+                f"{way['top_acceleration']:.1f} m/s²",
+                " x ".join(f"{size:.1f}" for size in way["room"]) + " m",
+                way["flown"] or "",
+            )
             for way in plan["flights"]
         ]
         headers = ["flight", "kind", "lasts", "speed", "acceleration", "needs", "flown as"]
-        note = " ".join(plan["words"])
-        parts.append(Grid("Flights to fly next", headers, rows, note=note))
+        parts.append(grid("Flights to fly next", headers, rows, " ".join(plan["words"])))
     return Section("8. What was written", parts)
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}"

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from eval.vehicles.vehicle import Vehicle
 from eval.view.comparison import Compared, Simulation, Track, write_comparison
-from suite.diagnose.data.windows import LENGTH_S, Windows, cut, take
-from suite.diagnose.diagnose import Diagnosis
+from suite.diagnose.data.windows import LENGTH_S, FlightWindows, take
+from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import true_starts
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 
@@ -19,47 +17,36 @@ MOST = 4
 """Held-out flights in a recording."""
 
 
-def write_rollouts(
-    path: Path, result: Diagnosis, logs: Sequence[FlightLog], vehicle: Vehicle
-) -> Path:
-    """Write rollouts of 1 s over what was held out, as given and with what was named.
-
-    Args:
-        path: file to write, ending in `.rrd`.
-        result: the diagnosis of `logs`.
-        logs: the flights.
-        vehicle: the one that the simulation used.
+def write_rollouts(path: Path, diagnosis: Diagnosis) -> Path:
+    """Write rollouts of 1 s over what was held out, as given and with what was named, as `.rrd`.
 
     Raises:
         OSError: where the file cannot be written; nothing is left under its name.
     """
-    windows, _ = cut(logs, vehicle, result.driven_by != "commands", LENGTH_S)
-    assert windows is not None  # the diagnosis has cut them before
-    held = result.held
+    model, windows, held = diagnosis.model, diagnosis.cut(LENGTH_S), diagnosis.held_windows
     first_s = float(np.min(held.start_s)) if len(np.unique(windows.flight)) == 1 else 0.0
     chosen = np.isin(windows.flight, np.unique(held.flight)[:MOST])
     chosen &= np.asarray(windows.start_s) >= first_s - 1e-6
     windows = take(windows, chosen)
-    start = result.model.space.array("start")
-    series = [("simulated as given", start)]
-    if result.finding.named:
-        series.append(("simulated with what was named", result.finding.state.theta))
-    simulated = {}
-    for label, theta in series:
-        offset = true_starts(result.model, theta, windows)
-        simulated[label] = result.model.residual(theta, offset, windows)
+    series = [("simulated as given", diagnosis.start)]
+    if diagnosis.fitted is not None:
+        series.append(("simulated with what was named", diagnosis.fitted))
+    simulated = {
+        label: model.residual(theta, true_starts(model, theta, windows), windows)
+        for label, theta in series
+    }
     flights = []
     for number in np.unique(windows.flight):
         rows = np.flatnonzero(windows.flight == number)
         simulations = []
         for label, residual in simulated.items():
             found = [_rollout(take(windows, row), residual[row]) for row in rows]
-            found = [one for one in found if one is not None]
-            tracks, errors = [one[0] for one in found], [one[1] for one in found]
+            whole = [one for one in found if one is not None]
+            tracks, errors = [one[0] for one in whole], [one[1] for one in whole]
             simulations.append(Simulation(label, tracks, errors))
-        log = logs[int(number)]
+        log = diagnosis.logs[int(number)]
         flights.append(Compared(log.name, _measured(log, first_s), simulations))
-    return write_comparison(path, flights, vehicle.body.half_size)
+    return write_comparison(path, flights, diagnosis.nominal.body.half_size)
 
 
 def _measured(log: FlightLog, first_s: float) -> Track:
@@ -69,7 +56,7 @@ def _measured(log: FlightLog, first_s: float) -> Track:
     return Track(*(field[rows] for field in fields))
 
 
-def _rollout(window: Windows, residual: np.ndarray) -> tuple[Track, np.ndarray] | None:
+def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[Track, np.ndarray] | None:
     """Return one rollout and its errors (T, 4) at the rows with a pose; None where it diverged."""
     seen = np.asarray(window.seen)
     rows = seen[:, 0] & seen[:, 3]

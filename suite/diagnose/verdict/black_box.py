@@ -10,44 +10,37 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.windows import LENGTH_S, Windows, cut, take
-from suite.diagnose.diagnose import Diagnosis
-from suite.diagnose.fit.normal_equations import fit, make_frame
-from suite.diagnose.fit.search import start_state
+from suite.diagnose.data.windows import LENGTH_S, FlightWindows, take
+from suite.diagnose.fit.normal_equations import fit, start_estimate
+from suite.diagnose.fit.whitening import make_whitening
 from suite.diagnose.verdict.delta_model import BlackBoxConfig, black_box_gap, fit_black_box
+from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap, measure
 
-SLOW = 0.6
-"""Share of the stretches, the slowest, that are fitted where the fast ones judge."""
-LEAST = 6
-"""Stretches to fit and to judge, at least."""
-STRIDE_S = 0.5
-"""From one fitted stretch to the next where flights are left out [s]."""
 
-
-class Contest(NamedTuple):
-    """The gap on stretches that took no part in any fit."""
+class BlackBoxComparison(NamedTuple):
+    """The gap on windows that took no part in any fit."""
 
     judged_on: str
     """For people."""
     fitted: int
-    """Stretches."""
+    """How many windows were fitted."""
     judged: int
+    """How many the gap is of."""
     before: Gap
     named: Gap | None
-    """With the named effects, fitted to the same stretches as the black box; None without any."""
+    """With the named effects, fitted to the same windows as the black box; None without any."""
     black_box: Gap
 
 
 @dataclass(frozen=True)
-class Contests:
+class BlackBoxComparisons:
     """Both comparisons."""
 
-    held_out: Contest
-    """The split of the diagnosis."""
-    outside: Contest | None
-    """Fitted to slow stretches, judged on fast ones; None where there are too few."""
+    held_out: BlackBoxComparison
+    """On what the diagnosis held out."""
+    outside: BlackBoxComparison | None
+    """Fitted to slow windows, judged on fast ones; None where there are too few."""
     split_m_s: float
     """Speed between slow and fast [m/s]."""
     seconds: float
@@ -55,82 +48,65 @@ class Contests:
 
 
 def compare_black_box(
-    result: Diagnosis,
-    logs: Sequence[FlightLog],
-    vehicle: Vehicle,
+    diagnosis: Diagnosis,
     config: BlackBoxConfig,
     progress: Callable[[float, str], None] = lambda *_: None,
-) -> Contests:
+) -> BlackBoxComparisons:
     """Fit the black box twice and hold it against what was named.
 
-    Args:
-        result: the diagnosis of `logs`.
-        logs: the flights.
-        vehicle: the one that the simulation used.
-        config: of the black box's fits.
-        progress: called with (share done, words).
+    `progress` is called with (share done, words).
     """
     began = time.monotonic()
-    model, sigma = result.model, result.finding.sigma
-    by_rotors = result.driven_by != "commands"
-    begin = model.space.array("start")
+    limits, search = diagnosis.limits, diagnosis.search
+    model, sigma, held = diagnosis.model, search.sigma, diagnosis.held_windows
 
     def show(part: int) -> Callable[[int, str], None]:
         return lambda step, words: progress(0.5 * (part + step / config.iterations), words)
 
-    known = _known(result, _windows(logs, vehicle, by_rotors, STRIDE_S))
+    known = _not_held_out(diagnosis.cut(limits.check_stride_s), held)
     params = fit_black_box(model, known, sigma, config, show(0))
-    held_out = Contest(
+    held_out = BlackBoxComparison(
         judged_on="flights left out",
         fitted=len(known.flight),
-        judged=len(result.held.flight),
-        before=result.before,
-        named=result.after if result.finding.named else None,
-        black_box=black_box_gap(model, params, result.held, sigma),
+        judged=len(held.flight),
+        before=diagnosis.before,
+        named=diagnosis.after if search.named else None,
+        black_box=black_box_gap(model, params, held, sigma, limits),
     )
-    every = _windows(logs, vehicle, by_rotors, LENGTH_S)
-    top, mean = _speeds(logs, every)
-    split = float(np.quantile(top, SLOW))
+    every = diagnosis.cut(LENGTH_S)
+    top, mean = _speeds(diagnosis.logs, every)
+    split = float(np.quantile(top, limits.slow_share))
     slow, fast = take(every, top <= split), take(every, mean > split)
     outside = None
-    if min(len(slow.flight), len(fast.flight)) >= LEAST:
+    if min(len(slow.flight), len(fast.flight)) >= limits.least_judged:
         params = fit_black_box(model, slow, sigma, replace(config, seed=config.seed + 1), show(1))
         named = None
-        if result.finding.named:
-            state = start_state(model, slow)
-            linear = model.linearise(state.theta, state.offset, slow, model.starts)
-            frame = make_frame(linear, sigma, slow)
-            theta = fit(model, slow, frame, state, result.finding.indices)[0].theta
-            named = measure(model, theta, fast, sigma)
-        outside = Contest(
+        if search.named:
+            start = start_estimate(model, slow)
+            linear = model.linearise(start.theta, start.offset, slow, model.starts)
+            whitening = make_whitening(linear, sigma, slow, limits)
+            best, _ = fit(model, slow, whitening, start, search.indices, limits=limits)
+            named = measure(model, best.theta, fast, sigma, limits)
+        outside = BlackBoxComparison(
             judged_on=f"speeds above {split:.1f} m/s, fitted below",
             fitted=len(slow.flight),
             judged=len(fast.flight),
-            before=measure(model, begin, fast, sigma),
+            before=measure(model, diagnosis.start, fast, sigma, limits),
             named=named,
-            black_box=black_box_gap(model, params, fast, sigma),
+            black_box=black_box_gap(model, params, fast, sigma, limits),
         )
-    return Contests(held_out, outside, split, time.monotonic() - began)
+    return BlackBoxComparisons(held_out, outside, split, time.monotonic() - began)
 
 
-def _windows(
-    logs: Sequence[FlightLog], vehicle: Vehicle, by_rotors: bool, stride_s: float
-) -> Windows:
-    windows, _ = cut(logs, vehicle, by_rotors, stride_s)
-    assert windows is not None  # the diagnosis has cut them before
-    return windows
-
-
-def _known(result: Diagnosis, windows: Windows) -> Windows:
-    """Return those of `windows` that do not touch what the diagnosis left out."""
-    held = result.held
+def _not_held_out(windows: FlightWindows, held: FlightWindows) -> FlightWindows:
+    """Return those of `windows` that do not touch what the diagnosis held out."""
     apart = ~np.isin(windows.flight, held.flight)
     if not apart.any():  # of a lone flight the end is left out
         apart = np.asarray(windows.start_s) + LENGTH_S <= float(np.min(held.start_s)) + 1e-6
     return take(windows, apart)
 
 
-def _speeds(logs: Sequence[FlightLog], windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+def _speeds(logs: Sequence[FlightLog], windows: FlightWindows) -> tuple[np.ndarray, np.ndarray]:
     """Return the top and the mean speed in each window (W,) [m/s]."""
     found = []
     for flight, start_s in zip(windows.flight, windows.start_s, strict=True):

@@ -22,10 +22,11 @@ from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Motion
 from eval.quadrotor.stepper import Feedback, Inputs
 from policies.networks import delta_network
-from suite.diagnose.data.windows import Windows
-from suite.diagnose.fit.model import BATCH, Model
+from suite.diagnose.data.windows import FlightWindows, take
+from suite.diagnose.fit.model import BATCH, RolloutModel, batches
 from suite.diagnose.fit.rollout import STATE
-from suite.diagnose.verdict.gap import Gap, gap_of, true_starts
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.gap import Gap, gap_of, noise_floor, start_noise, true_starts
 from tracks.geometry.rotation import to_local
 
 PERIOD_S = 0.02
@@ -47,27 +48,26 @@ class BlackBoxConfig:
 
 
 def fit_black_box(
-    model: Model,
-    windows: Windows,
+    model: RolloutModel,
+    windows: FlightWindows,
     sigma: np.ndarray,
     config: BlackBoxConfig,
     show: Callable[[int, str], None] = lambda *_: None,
 ) -> dict[str, np.ndarray]:
-    """Return the network fitted to `windows`.
+    """Return the network fitted to `windows`, of noise `sigma` (19,), at the start numbers.
 
-    Args:
-        model: with the numbers of the vehicle file.
-        windows: of the flights that are fitted.
-        sigma: (19,) noise of each channel.
-        config: of the fit.
-        show: called with (iteration, words) as it goes.
+    `show` is called with (iteration, words) as it goes.
+
+    Raises:
+        FloatingPointError: where the fit diverges.
     """
     theta = model.space.array("start")
     offset = true_starts(model, theta, windows)
-    weight = 1.0 / _floors(model, theta, offset, windows, sigma)
+    slope = model.linearise(theta, offset, windows, model.starts).slope[..., :STATE, :STATE]
+    weight = 1.0 / (noise_floor(slope, start_noise(sigma, windows, STATE)) + 1e-9)
     optimizer = optax.adam(optax.cosine_decay_schedule(config.rate, config.iterations))
 
-    def loss(params: Any, offset: Any, windows: Windows, weight: Any) -> Any:
+    def loss(params: Any, offset: Any, windows: FlightWindows, weight: Any) -> Any:
         over = _apart(model, theta, params, offset, windows)[..., :STATE] * weight
         # Far from the record a square would let one window decide.
         return (jnp.sqrt(1.0 + over**2) - 1.0).mean()
@@ -84,7 +84,7 @@ def fit_black_box(
         state = optimizer.init(params)
         for iteration in range(config.iterations):
             rows = rng.choice(len(offset), BATCH, replace=len(offset) < BATCH)
-            batch = (offset[rows], Windows(*(f[rows] for f in windows)), weight[rows])
+            batch = (offset[rows], take(windows, rows), weight[rows])
             params, state, value = update(params, state, *batch)
             if not np.isfinite(value):
                 raise FloatingPointError(f"the black box's fit diverged at step {iteration + 1}")
@@ -93,20 +93,20 @@ def fit_black_box(
 
 
 def black_box_gap(
-    model: Model, params: dict[str, np.ndarray], windows: Windows, sigma: np.ndarray
+    model: RolloutModel,
+    params: dict[str, np.ndarray],
+    windows: FlightWindows,
+    sigma: np.ndarray,
+    limits: Thresholds = THRESHOLDS,
 ) -> Gap:
     """Return the gap on `windows` that is left with the fitted network."""
     theta = model.space.array("start")
     offset = true_starts(model, theta, windows)
     linear = model.linearise(theta, offset, windows, model.starts)
     fly = jax.jit(lambda x, w: _apart(model, theta, params, x, w))
-    parts = []
     with jax.enable_x64(True):
-        for first in range(0, len(offset), BATCH):
-            rows = np.minimum(np.arange(first, first + BATCH), len(offset) - 1)
-            parts.append(np.asarray(fly(offset[rows], Windows(*(f[rows] for f in windows)))))
-    residual = -np.concatenate(parts)[: len(offset)]
-    return gap_of(linear._replace(residual=residual), windows, sigma)
+        parts = [np.asarray(fly(x, w))[:count] for x, w, count in batches(offset, windows)]
+    return gap_of(linear._replace(residual=-np.concatenate(parts)), windows, sigma, limits)
 
 
 def _start(seed: int) -> dict[str, Any]:
@@ -116,7 +116,9 @@ def _start(seed: int) -> dict[str, Any]:
     return params
 
 
-def _apart(model: Model, theta: Any, params: Any, offset: Any, windows: Windows) -> Any:
+def _apart(
+    model: RolloutModel, theta: Any, params: Any, offset: Any, windows: FlightWindows
+) -> Any:
     """Return simulated - measured (B, N, 19) under the network."""
     count, every = len(offset), max(1, round(PERIOD_S / model.dt))
     scale, up = jnp.asarray(OUTPUT_SCALE), jnp.array([0.0, 0.0, 1.0])
@@ -137,13 +139,3 @@ def _apart(model: Model, theta: Any, params: Any, offset: Any, windows: Windows)
 
     start = (jnp.zeros((count, delta_network.HIDDEN)), jnp.zeros((count, len(OUTPUT_SCALE))))
     return model.fly(theta, offset, windows, None, Feedback(start, act))[0]
-
-
-def _floors(
-    model: Model, theta: np.ndarray, offset: np.ndarray, windows: Windows, sigma: np.ndarray
-) -> np.ndarray:
-    """Return what noise makes of a perfect model's errors, (W, N, 12)."""
-    own = np.where(np.isfinite(sigma), sigma, 0.0)[:STATE]
-    linear = model.linearise(theta, offset, windows, model.starts)
-    slope = linear.slope[..., :STATE, :STATE]
-    return np.sqrt(own**2 + ((slope * own) ** 2).sum(axis=-1)) + 1e-9

@@ -13,21 +13,17 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.effects.log_faults import lateness
-from suite.diagnose.data.windows import SLICES, Windows
-from suite.diagnose.fit.model import Linear, Model
-from suite.diagnose.fit.normal_equations import make_frame, rotor_spread, sums_of
+from suite.diagnose.data.windows import SLICES, STATE_GROUPS, FlightWindows
+from suite.diagnose.fit.model import Linearisation, RolloutModel
+from suite.diagnose.fit.normal_equations import normal_equations_of
 from suite.diagnose.fit.rollout import STATE
+from suite.diagnose.fit.whitening import make_whitening, rotor_spread
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 HORIZONS_S = (0.1, 0.5, 1.0)
+"""Lengths of the plain rollouts [s]."""
 HEADLINE_S = 1.0
-STATES = ("position", "attitude", "velocity", "rates")
-DRAWS = 1000
-BLOCK = 4
-"""Neighbouring windows that are drawn together: they start 0.25 s apart."""
-OVERLAP_S = 0.25
-"""From one start to the next of the rollouts that measure the gap [s]."""
-DOUBT = 25.0
-"""A rise of squared errors, in units of the noise, from which a name is doubted."""
+"""Length of the rollouts that make the headline [s]."""
 MEASURE = (
     "RMS of slow errors of 1 s rollouts on held-out data, start free within its noise, over "
     "position, attitude, velocity and rates, in units of what measurement noise gives"
@@ -49,73 +45,64 @@ class Gap(NamedTuple):
         """Root of the mean score; 1 is the noise floor."""
         return float(np.sqrt(self.score.mean()))
 
+    def ci95(self, seed: int, limits: Thresholds = THRESHOLDS) -> tuple[float, float]:
+        """Return the 95 % interval of `rms`, windows drawn in blocks."""
+        drawn = np.sqrt(self.score[_blocks(len(self.score), seed, limits)].mean(axis=1))
+        low, high = np.quantile(drawn, [0.025, 0.975])
+        return float(low), float(high)
 
-def measure(model: Model, theta: np.ndarray, windows: Windows, sigma: np.ndarray) -> Gap:
-    """Return the gap of `model` with the numbers `theta` on `windows`."""
+
+def measure(
+    model: RolloutModel,
+    theta: np.ndarray,
+    windows: FlightWindows,
+    sigma: np.ndarray,
+    limits: Thresholds = THRESHOLDS,
+) -> Gap:
+    """Return the gap of `model` at `theta` (P,) on `windows` with noise `sigma` (19,)."""
     offset = true_starts(model, theta, windows)
     linear = model.linearise(theta, offset, windows, model.starts)
-    return gap_of(linear, windows, sigma)
+    return gap_of(linear, windows, sigma, limits)
 
 
-def gap_of(linear: Linear, windows: Windows, sigma: np.ndarray) -> Gap:
-    """Return the gap of residuals; `linear` has the slopes along what is free, last."""
-    frame = make_frame(linear, sigma, windows)
-    slow = sums_of(frame, linear, 0).slow
-    score = slow.sum(axis=1) / frame.slow_freedom.sum(axis=1)
+def gap_of(
+    linear: Linearisation,
+    windows: FlightWindows,
+    sigma: np.ndarray,
+    limits: Thresholds = THRESHOLDS,
+) -> Gap:
+    """Return the gap of residuals; the slopes in `linear` are those along what is free."""
+    whitening = make_whitening(linear, sigma, windows, limits)
+    slow = normal_equations_of(whitening, linear, 0).slow_energy
+    score = slow.sum(axis=1) / whitening.slow_freedom.sum(axis=1)
+    noise = start_noise(sigma, windows, linear.offset.shape[1], limits)
     table = {}
     for horizon in HORIZONS_S:
-        error, floor = _errors(linear, windows, sigma, horizon)
+        at = at_horizon(windows, horizon)
+        error = linear.residual[at][:, :STATE]
+        floor = np.maximum(noise_floor(linear.slope[at][:, :STATE], noise), 1e-12)
         table[horizon] = {
-            name: (_rms(error[:, SLICES[name]]), _rms(floor[:, SLICES[name]])) for name in STATES
+            name: (_rms(error[:, SLICES[name]]), _rms(floor[:, SLICES[name]]))
+            for name in STATE_GROUPS
         }
     return Gap(score, slow.sum(axis=1), table)
 
 
-def worse(before: Gap, after: Gap, seed: int = 0) -> bool:
+def worse(before: Gap, after: Gap, seed: int = 0, limits: Thresholds = THRESHOLDS) -> bool:
     """Return whether `after` is above `before` on the same windows by more than chance.
 
     Numbers that were fitted elsewhere raise the error of any other flight by about one each, which
     is no reason to doubt them.
     """
     grown = after.energy - before.energy
-    drawn = grown[_blocks(len(grown), seed)].mean(axis=1)
+    drawn = grown[_blocks(len(grown), seed, limits)].mean(axis=1)
     # Windows overlap: each row of the log counts this often.
-    total = grown.sum() * OVERLAP_S / HEADLINE_S
-    return bool(np.quantile(drawn, 0.025) > 0.0 and total > DOUBT)
+    total = grown.sum() * limits.gap_stride_s / HEADLINE_S
+    return bool(np.quantile(drawn, 0.025) > 0.0 and total > limits.doubt_chi2)
 
 
-def interval(score: np.ndarray, seed: int = 0) -> tuple[float, float]:
-    """Return the 95 % interval of the root mean score, windows drawn in blocks."""
-    drawn = np.sqrt(score[_blocks(len(score), seed)].mean(axis=1))
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    return float(low), float(high)
-
-
-def _blocks(count: int, seed: int) -> np.ndarray:
-    """Return draws (DRAWS, ...) of `count` windows in blocks of neighbours."""
-    rng = np.random.default_rng(seed)
-    first = rng.integers(0, max(count - BLOCK + 1, 1), (DRAWS, max(1, -(-count // BLOCK))))
-    rows = np.minimum(first[..., None] + np.arange(BLOCK), count - 1)
-    return rows.reshape(DRAWS, -1)
-
-
-def _errors(
-    linear: Linear, windows: Windows, sigma: np.ndarray, horizon: float
-) -> tuple[np.ndarray, np.ndarray]:
-    row = np.abs(np.asarray(windows.row_s) - horizon).argmin(axis=1)
-    at = np.arange(len(row))
-    error = linear.residual[at, row][:, :12]
-    size = linear.offset.shape[1]
-    slope = linear.slope[at, row][:, :12, -size:]
-    own = np.where(np.isfinite(sigma), sigma, 0.0)[:12]
-    rotors = np.full(size - STATE, rotor_spread(windows) if size > STATE else 0.0)
-    known = np.concatenate([own, rotors])
-    floor = np.sqrt(own**2 + ((slope * known) ** 2).sum(axis=-1))
-    return error, np.maximum(floor, 1e-12)
-
-
-def true_starts(model: Model, theta: np.ndarray, windows: Windows) -> np.ndarray:
-    """Return where windows start if the log's clock is off by the model's offset."""
+def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:
+    """Return where windows start (W, F), off what was measured, by the model's clock offset."""
     late = lateness(model.space.effects(theta))
     offset = np.zeros((len(windows.flight), model.free))
     offset[:, :3] = late * windows.vel_w
@@ -126,6 +113,40 @@ def true_starts(model: Model, theta: np.ndarray, windows: Windows) -> np.ndarray
     acc_w = (np.asarray(windows.row_vel_w)[at, rows] - windows.vel_w) / np.maximum(span, 1e-3)
     offset[:, 6:9] = late * acc_w
     return offset
+
+
+def at_horizon(windows: FlightWindows, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return each window's number and its row nearest to `horizon_s` [s], (W,) each."""
+    row = np.abs(np.asarray(windows.row_s) - horizon_s).argmin(axis=1)
+    return np.arange(len(row)), row
+
+
+def start_noise(
+    sigma: np.ndarray, windows: FlightWindows, free: int, limits: Thresholds = THRESHOLDS
+) -> np.ndarray:
+    """Return the noise (F,) of the numbers that are free in a window, from the channels' (19,)."""
+    noise = np.zeros(free)
+    noise[:STATE] = np.where(np.isfinite(sigma), sigma, 0.0)[:STATE]
+    if free > STATE:
+        noise[STATE:] = rotor_spread(windows, limits)
+    return noise
+
+
+def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return what the noise of start and row makes of a perfect model's errors, (..., 12).
+
+    `slope` is (..., 12, F) along what is free, `noise` (F,) of it; its first 12 are a row's too.
+    """
+    return np.sqrt(noise[:STATE] ** 2 + ((slope * noise) ** 2).sum(axis=-1))
+
+
+def _blocks(count: int, seed: int, limits: Thresholds) -> np.ndarray:
+    """Return draws (D, ...) of `count` windows in blocks of neighbours."""
+    rng, block = np.random.default_rng(seed), limits.bootstrap_block
+    size = (limits.bootstrap_draws, max(1, -(-count // block)))
+    first = rng.integers(0, max(count - block + 1, 1), size)
+    rows = np.minimum(first[..., None] + np.arange(block), count - 1)
+    return rows.reshape(limits.bootstrap_draws, -1)
 
 
 def _rms(values: np.ndarray) -> float:

@@ -14,10 +14,15 @@ import numpy as np
 
 from suite.common.errors import WorkFailed
 from suite.diagnose.data.noise import noise_of
-from suite.diagnose.fit.intervals import errors_of
-from suite.diagnose.fit.model import Model
-from suite.diagnose.fit.normal_equations import Sums, fit, make_frame
-from suite.diagnose.fit.search import start_state, trusted
+from suite.diagnose.fit.model import RolloutModel
+from suite.diagnose.fit.normal_equations import (
+    NormalEquations,
+    fit,
+    half_widths95,
+    start_estimate,
+)
+from suite.diagnose.fit.search import trusted
+from suite.diagnose.fit.whitening import make_whitening
 from suite.experiments.bench.compare import Comparison, Figure, in_turn
 from suite.experiments.bench.rigid_body import Task, make_task
 
@@ -42,9 +47,9 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
     if not sysid_baseline.is_installed():
         raise WorkFailed("mujoco.sysid lacks some of its packages: pip install 'mujoco[sysid]'")
     task = make_task(seed, duration_s)
-    model = Model(task.nominal, task.space, driven_by_rotors=True, voltage=False)
+    model = RolloutModel(task.nominal, task.space, rotor_input=True, voltage=False)
     problem = sysid_baseline.prepare(task, _noise(model, task))
-    answers: dict[str, tuple[np.ndarray, Sums]] = {}
+    answers: dict[str, tuple[np.ndarray, NormalEquations]] = {}
 
     def ours() -> None:
         answers["ours"] = refit(model, task)
@@ -63,37 +68,39 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
     return Comparison("diagnose", first, second, details=details)
 
 
-def refit(model: Model, task: Task) -> tuple[np.ndarray, Sums]:
+def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]:
     """Return the fitted numbers (K,) and their normal equations, as the diagnosis does it.
 
     Noise, slopes along what is free in every stretch, and the Gauss-Newton rounds on stretches as
     long as the model can be trusted, which get longer as the numbers get better.
     """
-    indices, state = list(task.indices), start_state(model, task.windows)
+    indices, state = list(task.indices), start_estimate(model, task.windows)
     seen = 0
     while True:
         linear = model.linearise(state.theta, state.offset, task.windows, [*indices, *model.starts])
         view = trusted(task.windows, linear.residual)
-        frame = make_frame(linear, noise_of(linear.residual, task.windows), view)
-        state, sums = fit(model, view, frame, state, indices)
+        whitening = make_whitening(linear, noise_of(linear.residual, task.windows), view)
+        state, equations = fit(model, view, whitening, state, indices)
         if view.seen.sum() <= seen:
-            return state.theta[indices], sums
+            return state.theta[indices], equations
         seen = view.seen.sum()
 
 
-def _noise(model: Model, task: Task) -> np.ndarray:
-    begin = start_state(model, task.windows)
+def _noise(model: RolloutModel, task: Task) -> np.ndarray:
+    begin = start_estimate(model, task.windows)
     residual = model.residual(begin.theta, begin.offset, task.windows)
     return noise_of(residual, task.windows)
 
 
-def _agreement(task: Task, answers: Mapping[str, tuple[np.ndarray, Sums]]) -> dict[str, Any]:
+def _agreement(
+    task: Task, answers: Mapping[str, tuple[np.ndarray, NormalEquations]]
+) -> dict[str, Any]:
     """Return each side's numbers, and how far they are apart over the joint 95 % half-width.
 
     The half-widths are worked out in the same way for both, from how stretches disagree; the joint
     one is their root sum of squares.
     """
-    widths = {side: errors_of(sums) for side, (_, sums) in answers.items()}
+    widths = {side: half_widths95(equations) for side, (_, equations) in answers.items()}
     first, second = (values for values, _ in answers.values())
     apart = np.abs(first - second) / np.hypot(*widths.values())
     rows = {}

@@ -15,8 +15,8 @@ import numpy as np
 
 from eval.effects import EFFECTS, all_values
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.windows import Windows, cut
-from suite.diagnose.fit.parameters import Space, make_space
+from suite.diagnose.data.windows import FlightWindows, cut
+from suite.diagnose.fit.parameters import ParameterSpace, make_space
 
 REFITTED = ("mass_offset", "com_offset", "inertia_scale")
 """Effects whose numbers are fitted; between them six that a flight can tell."""
@@ -32,13 +32,13 @@ class Task:
 
     nominal: Vehicle
     """What both sides start from."""
-    space: Space
+    space: ParameterSpace
     """The catalogue's numbers on that vehicle."""
     indices: tuple[int, ...]
     """Places of the numbers that are fitted, K of them."""
     truth: np.ndarray
     """(K,) what was flown."""
-    windows: Windows
+    windows: FlightWindows
     """Stretches of 1 s, driven by measured rotor speeds."""
 
     @property
@@ -72,7 +72,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
         logs = [
             log_of(flight, truth, sensors, rng, f"flight {i}") for i, flight in enumerate(flights)
         ]
-        windows, _ = cut(logs, nominal, driven_by_rotors=True)
+        windows, _ = cut(logs, nominal, rotor_input=True)
         assert windows is not None
         return Task(
             nominal, space, indices, make_space(truth).array("start")[list(indices)], windows

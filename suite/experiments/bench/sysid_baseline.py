@@ -19,7 +19,7 @@ import numpy as np
 from eval.quadrotor.model import BODY, add_quadrotor, rotor_name
 from eval.quadrotor.plant import make_plant
 from suite.diagnose.data.windows import SLICES, step_s
-from suite.diagnose.fit.normal_equations import Sums
+from suite.diagnose.fit.normal_equations import NormalEquations
 from suite.experiments.bench.rigid_body import Task
 
 POSE = 13
@@ -100,7 +100,7 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
     return Problem(task, params, residual)
 
 
-def refit(problem: Problem) -> tuple[np.ndarray, Sums]:
+def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
     """Return the fitted numbers (K,) and their normal equations, stretch by stretch."""
     import mujoco.sysid as sysid
 
@@ -120,7 +120,7 @@ def refit(problem: Problem) -> tuple[np.ndarray, Sums]:
     apart = residual.reshape(count, -1)
     turned = np.swapaxes(slope, 1, 2)
     error = (apart**2).sum(1)
-    return values, Sums(
+    return values, NormalEquations(
         turned @ slope, -(turned @ apart[..., None])[..., 0], error, np.zeros((count, 12))
     )
 

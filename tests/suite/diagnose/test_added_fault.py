@@ -7,11 +7,11 @@ import pytest
 from suite.blind.sensors import SENSORS, log_of
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.fit.model import Model
+from suite.diagnose.fit.model import RolloutModel
 from suite.diagnose.fit.parameters import candidates, make_space
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import Trajectory, ordinary_flights
-from suite.diagnose.report.answer import answer
+from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.gap import true_starts
 from tests.support.faults import ImuFault, with_imu_fault
 from tests.support.vehicles import PLAIN, with_effects, with_lag
@@ -37,7 +37,7 @@ def test_the_simulated_log_has_it():
     windows, _ = cut(logs_of(ways, None), GIVEN, False)
     assert windows is not None
     space = make_space(GIVEN)
-    model, start = Model(GIVEN, space, False, False), space.array("start")
+    model, start = RolloutModel(GIVEN, space, False, False), space.array("start")
     true = start.copy()
     names = [(e.effect, e.parameter, e.component) for e in space.entries]
     for (parameter, component), value in {
@@ -69,7 +69,7 @@ def test_the_search_may_name_it():
 def test_the_diagnosis_finds_it():
     rng = np.random.default_rng(4)
     logs = logs_of(ordinary_flights(rng, duration_s=5.5), rng)
-    found = answer(diagnose(logs, GIVEN))
+    found = diagnosis_json(diagnose(logs, GIVEN))
     assert [effect["name"] for effect in found["effects"]] == ["imu_fault"]
     (effect,) = found["effects"]
     assert effect["parameters"]["scale"]["value"] == pytest.approx(1.04, abs=0.004)

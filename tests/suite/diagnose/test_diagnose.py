@@ -1,18 +1,34 @@
-"""The diagnosis on flights made by MuJoCo: nulls stay null, effects are named, wrong ones lose."""
+"""The diagnosis on flights made by MuJoCo: nulls stay null, effects are named, wrong ones lose.
+
+Every effect of the catalogue, hidden at a usual size, is named alone; broken logs end in a verdict
+with warnings or in an error that says what is wrong.
+"""
 
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from eval.effects import EFFECTS
 from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from suite.blind.sensors import SENSORS, log_of
 from suite.cli import main
+from suite.common.report import html
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.report.answer import answer
+from suite.diagnose.plans.simulate import fly as fly_ways
+from suite.diagnose.plans.trajectory import ordinary_flights
+from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
+from suite.diagnose.report.page import page
+from suite.diagnose.thresholds import Thresholds
+from suite.diagnose.verdict.checks import run_checks
+from tests.support.broken_logs import BREAKAGES
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tracks.common.files import plain, to_json
 
 LAGGED = with_lag(PLAIN, 0.03)
 CASES = {
@@ -37,7 +53,7 @@ def within(entry, truth):
 
 
 def test_flights_of_the_vehicle_itself_have_no_gap():
-    found = answer(diagnose(flights(LAGGED), LAGGED))
+    found = diagnosis_json(diagnose(flights(LAGGED), LAGGED))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
     assert 0.8 < found["gap"]["before"] < 1.2
 
@@ -48,7 +64,7 @@ def test_flights_of_the_vehicle_itself_have_no_gap():
 )
 def test_an_effect_is_named_with_its_value(name):
     parameter, truth = CASES[name]
-    found = answer(diagnose(flights(with_effects(LAGGED, **{name: (truth,)})), LAGGED))
+    found = diagnosis_json(diagnose(flights(with_effects(LAGGED, **{name: (truth,)})), LAGGED))
     assert found["verdict"] == "named"
     (effect,) = found["effects"]
     assert name in (effect["name"], *effect["alternatives"])
@@ -68,7 +84,7 @@ def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
     def swing(motion, t):
         return np.array([0.8 * np.sin(2 * np.pi * 1.3 * t), 0.8 * np.cos(2 * np.pi * 1.1 * t), 0.0])
 
-    found = answer(diagnose(flights(LAGGED, extra=swing), LAGGED))
+    found = diagnosis_json(diagnose(flights(LAGGED, extra=swing), LAGGED))
     assert found["verdict"] in ("unknown", "partly")
 
 
@@ -103,3 +119,153 @@ def test_what_drives_the_model_must_be_in_every_log():
     log = replace(fly(LAGGED, 0, duration_s=2.0), thrust_cmd=None, rate_cmd_b=None)
     with pytest.raises(ValueError, match="sort"):
         diagnose([log, fly(LAGGED, 1, duration_s=2.0)], LAGGED)
+
+
+def test_thresholds_are_those_that_are_given():
+    logs = flights(with_effects(LAGGED, linear_drag=((0.1, 0.1, 0.05),)))
+    strict = diagnose(logs, LAGGED, limits=Thresholds(most_names=0))
+    assert not strict.search.named and strict.verdict.label == "unknown"
+    assert strict.limits.most_names == 0
+
+
+TRUTH = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
+VERDICTS = ("no_gap", "named", "partly", "unknown")
+
+
+@pytest.fixture(scope="module")
+def sound():
+    return [fly(TRUTH, seed, duration_s=5.0, motors=True) for seed in range(3)]
+
+
+def outcome(logs, drive="commands"):
+    """The JSON of a diagnosis that went through all its steps, or the message of its refusal."""
+    try:
+        result = diagnose(logs, LAGGED, drive)
+    except ValueError as error:
+        assert len(str(error)) > 20
+        return str(error)
+    checks = run_checks(result)
+    found = {**diagnosis_json(result), **checks_json(checks, 0)}
+    text = to_json(plain(found))
+    assert "NaN" not in text and "Infinity" not in text
+    assert "<h2>" in html(page(result, json.loads(text), checks, "", set()))
+    assert found["verdict"] in VERDICTS
+    assert np.isfinite(found["gap"]["before"]) and np.isfinite(found["gap"]["after"])
+    return found
+
+
+@pytest.mark.parametrize(
+    "breakages",
+    [BREAKAGES[first : first + 3] for first in range(0, len(BREAKAGES), 3)],
+    ids=lambda group: "-".join(breakage.__name__ for breakage in group),
+)
+def test_broken_flights_among_sound_ones(sound, breakages):
+    rng = np.random.default_rng(0)
+    broken = [breakage(log, rng) for breakage, log in zip(breakages, sound, strict=False)]
+    found = outcome([*broken, *sound[1:]])
+    assert isinstance(found, dict), found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("breakage", BREAKAGES, ids=lambda f: f.__name__)
+def test_one_broken_flight_among_sound_ones(sound, breakage):
+    rng = np.random.default_rng(0)
+    found = outcome([breakage(sound[0], rng), *sound[1:]])
+    assert isinstance(found, dict), found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("breakage", BREAKAGES, ids=lambda f: f.__name__)
+@pytest.mark.parametrize("drive", ["commands", "motors", "auto"])
+def test_every_flight_broken_alike(sound, breakage, drive):
+    rng = np.random.default_rng(1)
+    outcome([breakage(log, rng) for log in sound], drive)
+
+
+@pytest.mark.slow
+@settings(max_examples=40)
+@given(st.lists(st.sampled_from(BREAKAGES), min_size=1, max_size=4), st.integers(0, 2**16))
+def test_flights_broken_in_several_ways(sound, breakages, seed):
+    rng = np.random.default_rng(seed)
+    logs = list(sound)
+    for breakage in breakages:
+        k = int(rng.integers(len(logs)))
+        if len(logs[k].time_s) > 30:
+            logs[k] = breakage(logs[k], rng)
+    outcome(logs)
+
+
+DRAG = {"linear_drag": ((0.3, 0.25, 0.15),), "quadratic_drag": ((0.012, 0.016, 0.03),)}
+GIVEN = with_effects(with_lag(PLAIN, 0.02), **DRAG)
+HIDDEN = {
+    "linear_drag": ((0.4, 0.3, 0.2),),
+    "quadratic_drag": ((0.02, 0.02, 0.03),),
+    "rotor_drag": (2e-5,),
+    "inflow": (5e-5,),
+    "translational_lift": (0.01,),
+    "blade_flapping": (5e-7,),
+    "ground_effect": (4.0, 0.0635),
+    "constant_wind": ((1.5, -1.0, 0.5),),
+    "gusts": (0.8, 5.0),
+    "motor_lag": (0.035,),
+    "command_delay": (0.01,),
+    "thrust_scale": (0.95,),
+    "battery_sag": (0.005, 0.0),
+    "mass_offset": (0.05,),
+    "com_offset": ((0.004, -0.003, 0.0),),
+    "torque_trim": ((0.003, -0.002, 0.001),),
+    "inertia_scale": ((1.15, 0.9, 1.1),),
+    "rotor_gyroscopic": (2e-5,),
+    "rate_gain": ((0.85, 0.9, 1.1),),
+    "angular_damping": ((0.6, 0.6, 0.4),),
+    "weak_motor": ((1.0, 0.94, 1.0, 1.0),),
+    "thrust_tilt": ((0.01, -0.008),),
+    "gyro_bias": ((0.02, -0.01, 0.015),),
+    "accelerometer_bias": ((0.15, -0.1, 0.1),),
+    "frame_tilt": ((0.01, 0.008),),
+    "clock_offset": (0.008,),
+}
+ALIKE = {
+    "mass_offset": {"thrust_scale"},
+    "thrust_scale": {"mass_offset"},
+    "rotor_drag": {"linear_drag"},
+}
+"""What half a minute of flight may leave open."""
+
+
+@pytest.fixture(scope="module")
+def ways():
+    return ordinary_flights(np.random.default_rng(5), duration_s=5.5)
+
+
+def test_no_effect_is_forgotten():
+    assert set(HIDDEN) == set(EFFECTS)
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_an_effect_is_named_alone(name, ways):
+    truth = with_effects(GIVEN, **{**DRAG, name: HIDDEN[name]})
+    rng = np.random.default_rng(list(EFFECTS).index(name))
+    flights = fly_ways(GIVEN, truth, ways, SENSORS["estimator"].rate_hz, rng=rng)
+    logs = [
+        log_of(flight, truth, SENSORS["estimator"], rng, f"flight_{k}")
+        for k, flight in enumerate(flights)
+    ]
+    found = diagnosis_json(diagnose(logs, GIVEN))
+    assert found["verdict"] in ("named", "partly"), found["unexplained"]
+    assert [effect["name"] for effect in found["effects"]] == [name]
+    (effect,) = found["effects"]
+    assert set(effect["alternatives"]) <= ALIKE.get(name, set())
+    if name != "gusts":
+        assert found["gap"]["after"] < 1.2
+    parameter = EFFECTS[name].parameters[0].name
+    if name == "weak_motor":
+        assert effect["parameters"]["index"]["value"] == 2
+        assert effect["parameters"]["scale"]["value"] == pytest.approx(0.94, abs=0.005)
+        return
+    value = np.array(effect["parameters"][parameter]["value"], dtype=float)
+    true = np.array(HIDDEN[name][0])
+    neutral = np.array(getattr(GIVEN.effects.get(name), parameter, 0.0))
+    scale = np.abs(true - neutral).max()
+    seen = np.isfinite(value)
+    assert np.abs(value - true)[seen].max() < (0.5 if name == "gusts" else 0.15) * scale

@@ -62,7 +62,7 @@ class Stub(Small):
         monkeypatch.setattr("suite.diagnose.run.diagnose_files", self.diagnose)
         monkeypatch.setattr(work, "fit_delta", self.fit)
 
-    def diagnose(self, paths, vehicle, drive, out, console):
+    def diagnose(self, paths, vehicle, out, console, *, drive, seed):
         logs, _ = read_flights(paths)
         self.diagnosed.append((vehicle, drive, [log.name for log in logs]))
         base = load_vehicle(vehicle)
@@ -145,7 +145,7 @@ def test_measured_flights_are_others_than_the_judged_and_noisy(whole):
     exact, _ = read_flights(sorted((out / "flights").glob("*.parquet")))
     logs, _ = read_flights(sorted((out / "measured").glob("*.parquet")))
     assert {log.about["seed"] for log in logs} <= {100_004, 100_005, 100_006}
-    assert stub.diagnosed[0][1].drive == "commands"
+    assert stub.diagnosed[0][1] == "commands"
     one = next(log for log in exact if log.about["seed"] == logs[0].about["seed"])
     count = len(logs[0].time_s)
     assert one.time_s[-1] - logs[0].time_s[-1] <= CONTACT_MARGIN_S + 0.011

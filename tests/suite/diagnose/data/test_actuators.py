@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.data.actuators import actuators_apart
+from suite.diagnose.data.actuators import actuator_mismatches
 from tests.support.diagnosis_flights import NOISE, fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -14,7 +14,7 @@ LAGGED = with_lag(PLAIN, 0.03)
 
 def apart(truth, given=LAGGED):
     logs = [fly(truth, seed, duration_s=4.0, motors=True) for seed in range(2)]
-    (found,) = actuators_apart(logs, given)
+    (found,) = actuator_mismatches(logs, given)
     return found
 
 
@@ -44,7 +44,7 @@ def test_a_rotor_that_does_not_reach_its_speed_is_seen():
         if speed is not None
     ]
     assert len(slow) == len(logs)
-    (found,) = actuators_apart(slow, LAGGED)
+    (found,) = actuator_mismatches(slow, LAGGED)
     np.testing.assert_allclose(found.scale, [1.0, 0.97, 1.0, 1.0], atol=2e-3)
     # A quarter of the thrust falls by 6 %.
     mean = np.mean([thrust.mean() for *_, thrust in pairs if thrust is not None])
@@ -55,17 +55,17 @@ def test_logged_motor_commands_are_held_against_the_speeds_too():
     log = fly(LAGGED, 0, duration_s=4.0, motors=True)
     assert log.rotor_speed is not None
     asked = replace(log, rotor_speed_cmd=log.rotor_speed / 0.9)
-    loop, logged = actuators_apart([asked], with_lag(PLAIN, 0.0))
+    loop, logged = actuator_mismatches([asked], with_lag(PLAIN, 0.0))
     assert (loop.asked_by, logged.asked_by) == ("nominal rate loop", "logged motor commands")
     np.testing.assert_allclose(logged.scale, 0.9, atol=5e-3)
 
 
 def test_logs_without_speeds_or_with_holes_say_nothing():
     log = fly(LAGGED, 0, duration_s=2.0, motors=True)
-    assert actuators_apart([replace(log, rotor_speed=None)], LAGGED) == []
+    assert actuator_mismatches([replace(log, rotor_speed=None)], LAGGED) == []
     assert log.rotor_speed is not None
     log.rotor_speed[::20] = np.nan
     log.rotor_speed[5:60] = np.nan
-    assert len(actuators_apart([log], LAGGED)) <= 1
+    assert len(actuator_mismatches([log], LAGGED)) <= 1
     log.rotor_speed[:] = np.nan
-    assert actuators_apart([log], LAGGED) == []
+    assert actuator_mismatches([log], LAGGED) == []

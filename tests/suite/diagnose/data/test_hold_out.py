@@ -1,15 +1,14 @@
-"""Held out is what can be spared; rotor speeds drive where the loop does not ask for them."""
+"""Held out is what can be spared."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from suite.diagnose.data.hold_out import split
-from suite.diagnose.data.input_source import another_controller
+from suite.diagnose.data.hold_out import choose_held_out
 from suite.diagnose.data.windows import cut
 from tests.support.diagnosis_flights import fly
-from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tests.support.vehicles import PLAIN, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)
 
@@ -25,7 +24,7 @@ def test_a_flight_that_alone_tells_of_something_is_fitted(three):
     logs, windows = three
     told = np.ones((len(windows.flight), 2))
     told[windows.flight != 2, 1] = 1e-3
-    inside, names = split(logs, windows, told)
+    inside, names = choose_held_out(logs, windows, told)
     assert names == ["flight_1"]
     assert set(windows.flight[inside]) == {0, 2}
 
@@ -34,19 +33,6 @@ def test_of_a_lone_flight_the_end_is_held_out(three):
     logs, _ = three
     windows, _ = cut(logs[:1], LAGGED, False)
     assert windows is not None
-    inside, names = split(logs[:1], windows, np.ones((len(windows.flight), 1)))
+    inside, names = choose_held_out(logs[:1], windows, np.ones((len(windows.flight), 1)))
     assert names == ["flight_0 from 2.8 s"]
     assert inside.any() and not inside[-1]
-
-
-def test_a_moved_centre_of_mass_is_no_other_controller():
-    moved = with_effects(LAGGED, com_offset=((0.006, -0.004, 0.0),))
-    assert not another_controller([fly(moved, 0, duration_s=4.0, motors=True)], LAGGED)
-
-
-def test_speeds_that_the_loop_does_not_ask_for_are_another_controllers(three):
-    log = fly(LAGGED, 0, duration_s=4.0, motors=True)
-    assert log.rotor_speed is not None
-    other = replace(log, rotor_speed=np.roll(log.rotor_speed, 1, axis=1))
-    assert another_controller([other], LAGGED)
-    assert not another_controller(three[0], LAGGED)

@@ -1,24 +1,21 @@
-"""The null of the search and the noise estimate, against numbers known beforehand."""
+"""Normal equations and their solution, against numbers known beforehand."""
 
 import numpy as np
 
-from suite.diagnose.data.noise import noise_of
-from suite.diagnose.data.windows import cut
-from suite.diagnose.fit.normal_equations import Sums, solve
+from suite.diagnose.fit.normal_equations import NormalEquations, half_widths95, products, solve
 from suite.diagnose.fit.parameters import candidates, make_space
-from suite.diagnose.fit.permutation import folds_of, score
-from tests.support.diagnosis_flights import NOISE, fly
+from suite.diagnose.fit.permutation import folds_of, score_candidates
 from tests.support.vehicles import PLAIN
 
 
-def made_sums(rng, space, true_size, windows=24, rows=40):
+def made_equations(rng, space, true_size, windows=24, rows=40):
     """Windows whose residual is white noise plus `true_size` of the first candidate's slope."""
     slope = rng.standard_normal((windows, rows, len(space.entries)))
     slope /= space.array("step")
     residual = rng.standard_normal((windows, rows))
     residual += true_size * slope[..., 0] * space.array("step")[0]
     turned = np.swapaxes(slope, 1, 2)
-    return Sums(
+    return NormalEquations(
         turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1), np.zeros(0)
     )
 
@@ -29,12 +26,14 @@ def test_the_null_gives_small_p_values_as_rarely_as_they_say():
     theta = 0.5 * (space.array("low") + space.array("high"))
     among = candidates(space, False, {"command"})
     rng = np.random.default_rng(3)
-    best = [score(made_sums(rng, space, 0.0), theta, space, [], among, fold)[0].p_value
-            for _ in range(60)]  # fmt: skip
+    best = []
+    for _ in range(60):
+        made = made_equations(rng, space, 0.0)
+        best.append(score_candidates(made, theta, space, [], among, fold)[0].p_value)
     # Of 60 nulls 6 are expected below 0.1; 14 or more come with a chance of 0.2 %.
     assert np.sum(np.array(best) <= 0.1) < 14
     assert np.median(best) > 0.2
-    strong = score(made_sums(rng, space, 0.5), theta, space, [], among, fold)[0]
+    strong = score_candidates(made_equations(rng, space, 0.5), theta, space, [], among, fold)[0]
     assert strong.candidate.name == space.entries[0].effect
     assert strong.p_value <= 0.01
 
@@ -49,14 +48,16 @@ def test_bounds_hold_and_the_free_solution_is_exact():
     np.testing.assert_allclose(bound, [0.25, 0.0], atol=1e-6)
 
 
-def test_the_noise_is_seen_under_a_models_error():
-    log = fly(PLAIN, 0, duration_s=4.0)
-    windows, _ = cut([log], PLAIN, False)
-    assert windows is not None
-    rng = np.random.default_rng(0)
-    time = np.asarray(windows.row_s)[..., None]
-    residual = 0.3 * time**2 + 0.002 * rng.standard_normal(windows.seen.shape)
-    sigma = noise_of(residual, windows)
-    np.testing.assert_allclose(sigma[:12], 0.002, rtol=0.15)
-    assert np.isnan(sigma[12:]).all()
-    assert NOISE["pos"] == 0.002
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    rng = np.random.default_rng(1)
+    inside = []
+    for _ in range(100):
+        slope = rng.standard_normal((30, 20, 2))
+        residual = (slope @ [0.3, -0.2])[..., None] + rng.standard_normal((30, 20, 1))
+        hessian, gradient = products(slope, residual)
+        best = np.linalg.solve(hessian.sum(0), gradient.sum(0))
+        left = gradient - hessian @ best
+        half = half_widths95(NormalEquations(hessian, left, np.zeros(30), np.zeros(0)))
+        inside.extend(np.abs(best - [0.3, -0.2]) < half)
+    # Of 200, 190 are expected inside; fewer than 180 come with a chance of 0.1 %.
+    assert sum(inside) >= 180

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from suite.diagnose.fit.normal_equations import Sums
+from suite.diagnose.fit.normal_equations import NormalEquations
 from suite.diagnose.fit.parameters import candidates, make_space
-from suite.diagnose.fit.permutation import folds_of, score
+from suite.diagnose.fit.permutation import folds_of, score_candidates
 from tests.support.vehicles import PLAIN
 
 SPACE = make_space(PLAIN)
@@ -18,7 +18,7 @@ FOLD = folds_of(np.repeat(np.arange(4), 5), np.tile(np.arange(5.0), 4))
 DRAWS = 200
 
 
-def sums(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
+def equations(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
     """Sums of windows of noise, plus `size` of what `truth` does in each of them.
 
     Args:
@@ -40,12 +40,15 @@ def sums(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
     slope = slope / SPACE.array("step")
     turned = np.swapaxes(slope, 1, 2)
     cross = (turned @ noise[..., None])[..., 0]
-    return Sums(turned @ slope, cross, (noise**2).sum(axis=1), np.zeros(0))
+    return NormalEquations(turned @ slope, cross, (noise**2).sum(axis=1), np.zeros(0))
 
 
 def best_of(draws, **options):
-    return [score(sums(np.random.default_rng([7, k]), **options), MIDDLE, SPACE, [], AMONG, FOLD,
-                  seed=k)[0] for k in range(draws)]  # fmt: skip
+    found = []
+    for k in range(draws):
+        made = equations(np.random.default_rng([7, k]), **options)
+        found.append(score_candidates(made, MIDDLE, SPACE, [], AMONG, FOLD, seed=k)[0])
+    return found
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.9])
@@ -74,17 +77,17 @@ def test_a_wrong_effect_adds_nothing_beside_the_true_one():
     p_values = []
     for k in range(60):
         rng = np.random.default_rng([9, k])
-        made = sums(rng, truth="rotor_drag", size=0.6, alike=1.0)
-        scores = score(made, MIDDLE, SPACE, list(true.indices), others, FOLD, seed=k)
+        made = equations(rng, truth="rotor_drag", size=0.6, alike=1.0)
+        scores = score_candidates(made, MIDDLE, SPACE, list(true.indices), others, FOLD, seed=k)
         p_values.append(scores[0].p_value)
     # The null shuffles the named effect's own part as well, which makes it the more careful.
     assert np.sum(np.array(p_values) <= 0.01) < 5
 
 
 def test_other_seeds_draw_another_null_and_one_seed_the_same():
-    made = sums(np.random.default_rng(1))
+    made = equations(np.random.default_rng(1))
     first, again, other = (
-        score(made, MIDDLE, SPACE, [], AMONG, FOLD, seed=seed) for seed in (1, 1, 2)
+        score_candidates(made, MIDDLE, SPACE, [], AMONG, FOLD, seed=seed) for seed in (1, 1, 2)
     )
     assert first == again
     assert [s.gain for s in first] == [s.gain for s in other]

@@ -6,7 +6,7 @@ import pytest
 
 from suite.diagnose.data.windows import CHANNELS, cut, take
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.fit.model import BATCH, Model
+from suite.diagnose.fit.model import BATCH, RolloutModel
 from suite.diagnose.fit.parameters import make_space
 from suite.diagnose.fit.rollout import KNOTS
 from suite.diagnose.verdict.black_box import compare_black_box
@@ -28,7 +28,7 @@ def few():
     log = fly(TRUTH, 0, duration_s=7.0)
     windows, _ = cut([log], LAGGED, False, 0.5)
     assert windows is not None and len(windows.flight) >= BATCH
-    return Model(LAGGED, make_space(LAGGED), False, False), take(windows, np.arange(BATCH))
+    return RolloutModel(LAGGED, make_space(LAGGED), False, False), take(windows, np.arange(BATCH))
 
 
 def test_a_network_that_was_not_fitted_changes_nothing(few):
@@ -61,7 +61,7 @@ def test_its_output_pushes_the_body(few):
 def test_it_learns_and_the_named_effect_holds_up_better_outside():
     logs = [fly(TRUTH, k, duration_s=8.0, speed=3.0 + k) for k in range(5)]
     result = diagnose(logs, LAGGED)
-    found = compare_black_box(result, logs, LAGGED, BlackBoxConfig(iterations=200))
+    found = compare_black_box(result, BlackBoxConfig(iterations=200))
     inside, outside = found.held_out, found.outside
     assert outside is not None and inside.named is not None and outside.named is not None
     assert inside.black_box.rms < 0.5 * inside.before.rms

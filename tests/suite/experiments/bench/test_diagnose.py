@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.noise import noise_of
-from suite.diagnose.fit.intervals import errors_of
-from suite.diagnose.fit.model import Model
-from suite.diagnose.fit.search import start_state
+from suite.diagnose.fit.model import RolloutModel
+from suite.diagnose.fit.normal_equations import half_widths95, start_estimate
 from suite.experiments.bench import diagnose, sysid_baseline
 from suite.experiments.bench.rigid_body import make_task
 
@@ -15,8 +14,8 @@ from suite.experiments.bench.rigid_body import make_task
 def both():
     """Return (task, model, the baseline's problem) of short flights."""
     task = make_task(20_000, 2.5)
-    model = Model(task.nominal, task.space, driven_by_rotors=True, voltage=False)
-    begin = start_state(model, task.windows)
+    model = RolloutModel(task.nominal, task.space, rotor_input=True, voltage=False)
+    begin = start_estimate(model, task.windows)
     residual = model.residual(begin.theta, begin.offset, task.windows)
     return task, model, sysid_baseline.prepare(task, noise_of(residual, task.windows)), residual
 
@@ -39,7 +38,7 @@ def test_both_sides_have_the_same_residuals(both):
 def test_both_sides_find_what_was_flown(both):
     task, model, problem, _ = both
     answers = [diagnose.refit(model, task), sysid_baseline.refit(problem)]
-    widths = [errors_of(sums) for _, sums in answers]
+    widths = [half_widths95(equations) for _, equations in answers]
     for (values, _), width in zip(answers, widths, strict=True):
         assert np.all(np.abs(values - task.truth) < 2.0 * width)
         assert np.all(width < task.array("step"))

@@ -3,7 +3,14 @@
 import numpy as np
 
 from suite.diagnose.data.windows import cut
-from suite.diagnose.verdict.where import CHANNELS, UNITS, Where, binned, conditions_of, in_words
+from suite.diagnose.verdict.disagreement import (
+    CHANNELS,
+    UNITS,
+    Disagreement,
+    binned,
+    conditions_of,
+    in_words,
+)
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
 
@@ -18,7 +25,7 @@ def made(growth, stride_s=0.5, seed=0):
     over[1, :, CHANNELS.index("velocity x")] *= growth(conditions)
     edges = {name: np.linspace(0.0, 10.0, 6) for name in UNITS}
     blank = np.zeros((COUNT, 6))
-    return Where(conditions, edges, stride_s, over, over, blank, blank, blank, blank)
+    return Disagreement(conditions, edges, stride_s, over, over, blank, blank, blank, blank)
 
 
 def test_the_bin_with_the_strongest_structure_is_told():

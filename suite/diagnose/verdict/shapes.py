@@ -12,37 +12,31 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from suite.diagnose.fit.rollout import KNOTS, Flown
-
-CELLS = 4
-"""Places along x and y between which a force that hangs on the place is drawn."""
-PIECES = 5
-"""Straight pieces of a curve over one number."""
-REVERSAL = 10.0
-"""Change of thrust beyond which its direction is all that counts [m/s^3]."""
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
-class Group(NamedTuple):
-    """One shape, as columns of `Shapes.push`."""
+class ShapeGroup(NamedTuple):
+    """One shape, as columns of `ShapeLibrary.unit`."""
 
     label: str
     """For people: "force that goes with ..."."""
     columns: tuple[int, ...]
 
 
-class Shapes(NamedTuple):
+class ShapeLibrary(NamedTuple):
     """All shapes on the knots of W windows."""
 
-    push: np.ndarray
+    unit: np.ndarray
     """(W, KNOTS * 6, J) acceleration and angular acceleration in body axes, for 1 of each."""
-    groups: tuple[Group, ...]
+    groups: tuple[ShapeGroup, ...]
 
 
-def shapes_of(knot: Flown, start_s: np.ndarray) -> Shapes:
-    """Return the library on windows whose states at the knots are `knot`.
+def shape_library(
+    knot: Flown, start_s: np.ndarray, limits: Thresholds = THRESHOLDS
+) -> ShapeLibrary:
+    """Return all shapes on windows with the states `knot` (W, KNOTS, ...) at their knots.
 
-    Args:
-        knot: (W, KNOTS, ...).
-        start_s: (W,) since the start of the flight [s].
+    `start_s` (W,) is since the start of the flight [s].
     """
     pos_w, rot_w, vel_w, rate_b = (np.asarray(field) for field in knot.track)
     axes_b = np.swapaxes(rot_w, -1, -2)
@@ -67,7 +61,7 @@ def shapes_of(knot: Flown, start_s: np.ndarray) -> Shapes:
         "the thrust": thrust,
         "the thrust's square": thrust**2,
         "the thrust's change": change,
-        "the thrust's direction of change": np.tanh(change / REVERSAL),
+        "the thrust's direction of change": np.tanh(change / limits.thrust_reversal),
         "thrust times velocity along x": thrust * vel_b[..., 0],
         "thrust times velocity along y": thrust * vel_b[..., 1],
         "the heading": np.cos(yaw),
@@ -76,49 +70,52 @@ def shapes_of(knot: Flown, start_s: np.ndarray) -> Shapes:
         "twice the heading ": np.sin(2.0 * yaw),
     }
     columns: list[np.ndarray] = []
-    groups: list[Group] = []
+    groups: list[ShapeGroup] = []
 
-    def add(label: str, pushes: list[np.ndarray]) -> None:
-        groups.append(Group(label, tuple(range(len(columns), len(columns) + len(pushes)))))
-        columns.extend(pushes)
+    def add(label: str, shapes: list[np.ndarray]) -> None:
+        groups.append(ShapeGroup(label, tuple(range(len(columns), len(columns) + len(shapes)))))
+        columns.extend(shapes)
 
     six = np.eye(6)
     for label, scalar in scalars.items():
         along = scalar[..., None, None] * six
         add(f"force with {label.rstrip()}", [along[..., i, :] for i in range(3)])
         add(f"torque with {label.rstrip()}", [along[..., i, :] for i in range(3, 6)])
-    motion = [hat[..., None] * vel_b for hat in _hats(speed)]
+    motion = [hat[..., None] * vel_b for hat in _hats(speed, limits.pieces)]
     add("force with the motion, by its speed", [
         along_b[..., i, None] * six[i] for along_b in motion for i in range(3)
     ])  # fmt: skip
     for label, scalar in (("thrust", thrust), ("climb", vel_w[..., 2]), ("height", pos_w[..., 2])):
-        add(f"force along body z, by the {label}", [h[..., None] * six[2] for h in _hats(scalar)])
+        add(
+            f"force along body z, by the {label}",
+            [h[..., None] * six[2] for h in _hats(scalar, limits.pieces)],
+        )
     world = np.concatenate([axes_b, np.zeros_like(axes_b)], axis=-2)
     add("force along fixed directions", [world[..., i] for i in range(3)])
     add("force with the place", [
-        world[..., i] * bump[..., None] for bump in _bumps(pos_w) for i in range(3)
+        world[..., i] * bump[..., None] for bump in _bumps(pos_w, limits.cells) for i in range(3)
     ])  # fmt: skip
     middle = pos_w.mean(axis=(0, 1))
     away = np.einsum("wkij,wkj->wki", axes_b, pos_w - middle)
     add("force towards a place", [np.concatenate([away, np.zeros_like(away)], axis=-1)])
     stacked = np.stack(columns, axis=-1)
-    return Shapes(stacked.reshape(len(stacked), KNOTS * 6, -1), tuple(groups))
+    return ShapeLibrary(stacked.reshape(len(stacked), KNOTS * 6, -1), tuple(groups))
 
 
-def _hats(scalar: np.ndarray) -> list[np.ndarray]:
+def _hats(scalar: np.ndarray, pieces: int) -> list[np.ndarray]:
     """Return hats over what values `scalar` (W, KNOTS) takes, as many between any two."""
-    places = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, PIECES + 1)))
+    places = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, pieces + 1)))
     if len(places) < 2:
         return [np.ones_like(scalar)]
     return [np.interp(scalar, places, one) for one in np.eye(len(places))]
 
 
-def _bumps(pos_w: np.ndarray) -> list[np.ndarray]:
+def _bumps(pos_w: np.ndarray, cells: int) -> list[np.ndarray]:
     """Return hats over the horizontal places that were flown, each (W, KNOTS)."""
     low, high = pos_w[..., :2].min(axis=(0, 1)), pos_w[..., :2].max(axis=(0, 1))
-    width = np.maximum(high - low, 0.5) / (CELLS - 1)
+    width = np.maximum(high - low, 0.5) / (cells - 1)
     found = []
-    for cell in np.ndindex(CELLS, CELLS):
+    for cell in np.ndindex(cells, cells):
         apart = (pos_w[..., :2] - low) / width - cell
         found.append(np.exp(-0.5 * (apart**2).sum(axis=-1) / 0.5**2))
     return found

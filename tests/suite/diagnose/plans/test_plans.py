@@ -7,32 +7,31 @@ import numpy as np
 import pytest
 
 from eval.logs.flight_log import read_flight
+from eval.quadrotor.plant import Motion
 from suite.blind.sensors import SENSORS, log_of
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.plans.files import COLUMNS, read_plan, write_plan
+from suite.diagnose.plans.files import COLUMNS, write_plan
+from suite.diagnose.plans.pilot import Gains, steer
 from suite.diagnose.plans.plan import fly_plan, sets_of, ways_for, write_plan_of
-from suite.diagnose.plans.separating import SEPARATIONS
+from suite.diagnose.plans.separating import OTHERWISE, SEPARATIONS, advice
 from suite.diagnose.plans.simulate import fly
-from suite.diagnose.plans.trajectory import Trajectory
-from suite.diagnose.report.answer import answer
-from suite.diagnose.verdict.separate import OTHERWISE, advice
+from suite.diagnose.plans.trajectory import Reference, Trajectory
+from suite.diagnose.report.diagnosis_json import diagnosis_json
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)
 SET = {"effects": [{"name": "rotor_drag", "alternatives": ["linear_drag"]}]}
 
 
-class Found:
-    """As much of a diagnosis as a plan needs."""
-
-    class finding:  # noqa: N801
-        sigma = np.repeat([0.002, 0.004, np.nan, 0.02, np.nan, np.nan], [3, 3, 3, 3, 3, 4])
+SIGMA = np.repeat([0.002, 0.004, np.nan, 0.02, np.nan, np.nan], [3, 3, 3, 3, 3, 4])
+"""Noise of position, attitude and rates; nothing else was logged."""
 
 
 def test_a_plan_comes_back_from_its_file(tmp_path):
     ways = [Trajectory("punches", 3.0, speed=2.0), Trajectory("hover", 2.0, turn="sweep")]
     plan = write_plan(tmp_path / "plan", ways, ["fly them"])
-    assert read_plan(tmp_path / "plan") == ways
+    written = json.loads((tmp_path / "plan" / "plan.json").read_text())
+    assert [Trajectory(**flight["trajectory"]) for flight in written["flights"]] == ways
     table = np.loadtxt(tmp_path / "plan" / plan["flights"][0]["file"], delimiter=",", skiprows=1)
     assert table.shape == (301, len(COLUMNS))
     wanted = ways[0].reference(table[:, 0])
@@ -41,15 +40,6 @@ def test_a_plan_comes_back_from_its_file(tmp_path):
     assert plan["flights"][0]["top_speed"] == pytest.approx(
         np.linalg.norm(wanted.vel_w, axis=1).max()
     )
-
-
-@pytest.mark.parametrize(
-    "text", ["", "{", '{"flights": [{}]}', '{"flights": [{"trajectory": {"sort": "hover"}}]}']
-)
-def test_a_bad_plan_is_refused_by_name(tmp_path, text):
-    (tmp_path / "plan.json").write_text(text, encoding="utf-8")
-    with pytest.raises(ValueError, match="plan.json"):
-        read_plan(tmp_path)
 
 
 def test_the_plan_is_for_the_sets_and_only_for_them():
@@ -78,7 +68,7 @@ def test_a_plan_is_flown_with_the_noise_of_the_logs(tmp_path):
     wild = dict(plan["flights"][1])
     wild["trajectory"] = {**wild["trajectory"], "kind": "circle", "speed": 60.0, "duration_s": 4.0}
     plan["flights"].append(wild)
-    flown = fly_plan(plan, Found, LAGGED, LAGGED, tmp_path / "plan", 3)  # type: ignore[arg-type]
+    flown = fly_plan(plan, SIGMA, LAGGED, LAGGED, tmp_path / "plan", 3)
     names = [flight["flown"] for flight in flown["flights"]]
     assert names[0] and names[1] and names[2] is None
     assert len(flown["warnings"]) == 1 and "could not be flown" in flown["warnings"][0]
@@ -100,14 +90,26 @@ def test_flying_the_plan_turns_the_set_into_a_name(tmp_path):
         for k, recording in enumerate(fly(LAGGED, truth, ways))
     ]
     first = diagnose(logs, LAGGED)
-    found = answer(first)
+    found = diagnosis_json(first)
     (effect,) = found["effects"]
     assert {effect["name"], *effect["alternatives"]} >= {"rotor_drag", "linear_drag"}
     plan = write_plan_of(found, tmp_path / "plan")
-    plan = fly_plan(plan, first, LAGGED, truth, tmp_path / "plan", 1)
+    plan = fly_plan(plan, first.search.sigma, LAGGED, truth, tmp_path / "plan", 1)
     new = [read_flight(tmp_path / "plan" / flight["flown"]) for flight in plan["flights"]]
-    again = answer(diagnose([*logs, *(replace(log, about={}) for log in new)], LAGGED))
+    again = diagnosis_json(diagnose([*logs, *(replace(log, about={}) for log in new)], LAGGED))
     (effect,) = again["effects"]
     assert (effect["name"], effect["alternatives"]) == ("rotor_drag", [])
     low, high = effect["parameters"]["coefficient"]["ci95"]
     assert low < 3e-5 < high
+
+
+def test_the_pilot_pushes_towards_where_it_should_be_and_never_turns_over():
+    level = np.eye(3)[None]
+    still = Motion(np.zeros((1, 3)), level, np.zeros((1, 3)), np.zeros((1, 3)))
+    wanted = Reference(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
+    hover = steer(LAGGED, Gains(), wanted, still, np.zeros((1, 3)))
+    assert hover.thrust[0] == pytest.approx(9.81) and np.abs(hover.rate_b).max() < 1e-9
+    ahead = wanted._replace(pos_w=np.array([[1.0, 0.0, 0.0]]))
+    assert steer(LAGGED, Gains(), ahead, still, np.zeros((1, 3))).rate_b[0, 1] > 0.1
+    fall = wanted._replace(acc_w=np.array([[0.0, 0.0, -30.0]]))
+    assert steer(LAGGED, Gains(), fall, still, np.zeros((1, 3))).thrust[0] > 0.0

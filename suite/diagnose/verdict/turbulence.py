@@ -1,4 +1,4 @@
-"""Random wind: a push that no rollout repeats, known by its colour and by how drag passes it on.
+"""Random wind: no rollout repeats it; known by its colour and by how drag passes it on.
 
 The wind at the knots of a window is a normal variable with the covariance of `gusts`; through the
 drag of the vehicle it adds a covariance to the residuals. Intensity and length are where the
@@ -16,22 +16,10 @@ from scipy.optimize import minimize
 from eval.effects import EFFECTS, constant_wind, gusts
 from eval.quadrotor.plant import Motion, assemble
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
-from suite.diagnose.fit.model import Model
+from suite.diagnose.fit.model import RolloutModel
 from suite.diagnose.fit.rollout import KNOTS, Flown
-from suite.diagnose.verdict.residual_structure import Push
-
-LENGTHS_M = np.geomspace(0.5, 40.0, 25)
-"""Lengths that are tried [m]."""
-INTENSITIES = np.geomspace(0.02, 8.0, 121)
-"""Intensities that are tried [m/s]."""
-SURE = 10.0
-"""Log-likelihood ratio to no wind from which there is wind."""
-RIVAL = 8.0
-"""A push along the body axes that is better by this log-likelihood is no wind."""
-TAIL = 4.0
-"""Standard errors by which the tails of the pulls may be above those of a normal variable."""
-WITHIN = 1.92
-"""Fall of the log-likelihood at the ends of a 95 % interval (Wilks 1938)."""
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.residual_structure import DisturbanceEquations
 
 
 class Turbulence(NamedTuple):
@@ -57,39 +45,37 @@ class Turbulence(NamedTuple):
         return gusts.Gusts(self.intensity, self.length)
 
 
-def find_turbulence(model: Model, theta: np.ndarray, push: Push) -> Turbulence | None:
-    """Return the random wind that explains what `push` leaves over, or None.
-
-    Args:
-        model: of the windows.
-        theta: (P,) its numbers.
-        push: what a further push does to the windows of `model` at `theta`.
-    """
-    passed = _passed_on(model, theta, push.knot)
+def find_turbulence(
+    model: RolloutModel,
+    theta: np.ndarray,
+    disturbance: DisturbanceEquations,
+    limits: Thresholds = THRESHOLDS,
+) -> Turbulence | None:
+    """Return the random wind that explains what `model` leaves over at `theta` (P,), or None."""
+    passed = _passed_on(model, theta, disturbance.knot)
     if np.abs(passed).max() < 1e-6:
         return None
-    table = np.full((len(LENGTHS_M), len(INTENSITIES)), -np.inf)
-    for i, length in enumerate(LENGTHS_M):
-        root = passed @ _wind_root(push.knot, length)
-        table[i] = _likelihood(push, root, INTENSITIES)
+    tried_m, tried = np.geomspace(*limits.wind_lengths_m), np.geomspace(*limits.wind_intensities)
+    roots = [passed @ _wind_root(disturbance.knot, length) for length in tried_m]
+    table = np.stack([_likelihood(disturbance, root, tried) for root in roots])
     i, j = np.unravel_index(int(table.argmax()), table.shape)
     ratio = float(table[i, j])
-    if ratio < SURE or _free_push(push) > ratio + RIVAL:
+    if ratio < limits.wind_ratio or _free_likelihood(disturbance) > ratio + limits.wind_rival_ratio:
         return None
-    if _outliers(push, passed @ _wind_root(push.knot, float(LENGTHS_M[i])), INTENSITIES[j]):
+    if _has_outliers(disturbance, roots[i], tried[j], limits.wind_tail):
         return None
-    near = table >= ratio - WITHIN
-    lengths, intensities = LENGTHS_M[near.any(axis=1)], INTENSITIES[near.any(axis=0)]
+    near = table >= ratio - limits.profile_fall
+    lengths, intensities = tried_m[near.any(axis=1)], tried[near.any(axis=0)]
     return Turbulence(
-        float(INTENSITIES[j]),
+        float(tried[j]),
         (float(intensities[0]), float(intensities[-1])),
-        float(LENGTHS_M[i]),
+        float(tried_m[i]),
         (float(lengths[0]), float(lengths[-1])),
         ratio,
     )
 
 
-def _passed_on(model: Model, theta: np.ndarray, knot: Flown) -> np.ndarray:
+def _passed_on(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarray:
     """Return (W, 6 KNOTS, 3 KNOTS): the push per m/s of wind in the world at each knot."""
     given = model.given
     values = {n: v for n, v in model.space.effects(theta).items() if not EFFECTS[n].random}
@@ -128,46 +114,53 @@ def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
     return whole.reshape(count, KNOTS * 3, KNOTS * 3)
 
 
-def _likelihood(push: Push, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the log-likelihood over that of none of pushes root @ normal draws, for `sizes`."""
+def _pulls(equations: DisturbanceEquations, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return information (W, J) and pull (W, J) along what disturbances root @ normal do apart."""
     turned = np.swapaxes(root, 1, 2)
-    values, vectors = np.linalg.eigh(turned @ push.square @ root)
+    values, vectors = np.linalg.eigh(turned @ equations.hessian @ root)
+    pulls = np.swapaxes(vectors, 1, 2) @ (turned @ equations.gradient[..., None])
+    return values, pulls[..., 0]
+
+
+def _likelihood(equations: DisturbanceEquations, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return the log-likelihood over that of none of disturbances root @ normal, for `sizes`."""
+    values, pulls = _pulls(equations, root)
     values = np.maximum(values, 0.0)
-    pulls = (np.swapaxes(vectors, 1, 2) @ (turned @ push.cross[..., None]))[..., 0]
     raised = sizes[:, None, None] ** 2
     terms = raised * pulls**2 / (1.0 + raised * values) - np.log1p(raised * values)
     return 0.5 * terms.sum(axis=(1, 2))
 
 
-def _outliers(push: Push, root: np.ndarray, size: float) -> bool:
+def _has_outliers(
+    equations: DisturbanceEquations, root: np.ndarray, size: float, tail: float
+) -> bool:
     """Return whether the pulls are larger now and then than those of a normal wind.
 
-    Their fourth power has mean 3 and variance 96 over their variance. What comes only in some
-    places, or at some speeds, has more of it than wind has.
+    Their fourth power has mean 3 and variance 96 over their variance; `tail` is how many standard
+    errors it may be above. What comes only in some places, or at some speeds, has more of it than
+    wind has.
     """
-    turned = np.swapaxes(root, 1, 2)
-    values, vectors = np.linalg.eigh(turned @ push.square @ root)
-    pulls = (np.swapaxes(vectors, 1, 2) @ (turned @ push.cross[..., None]))[..., 0]
+    values, pulls = _pulls(equations, root)
     heard = size**2 * values > 1.0
     if heard.sum() < 8:
         return False
     power = pulls[heard] ** 2 / values[heard] / (1.0 + size**2 * values[heard])
     fourth = float((power**2).mean() / power.mean() ** 2)
-    return fourth > 3.0 + TAIL * np.sqrt(96.0 / heard.sum())
+    return fourth > 3.0 + tail * np.sqrt(96.0 / heard.sum())
 
 
-def _free_push(push: Push) -> float:
-    """Return the largest log-likelihood of a random push with a size for each body axis."""
+def _free_likelihood(equations: DisturbanceEquations) -> float:
+    """Return the largest log-likelihood of a random disturbance with a size for each body axis."""
     time = np.linspace(0.0, 1.0, KNOTS)
 
-    def worse(logs: np.ndarray) -> float:
+    def loss(logs: np.ndarray) -> float:
         sizes, tau = np.exp(logs[:6]), np.exp(logs[6])
         colour = np.exp(-np.abs(time[:, None] - time) / tau) + 1e-9 * np.eye(KNOTS)
         root = np.einsum("kl,ab->kalb", np.linalg.cholesky(colour), np.diag(sizes))
-        root = root.reshape(1, KNOTS * 6, KNOTS * 6).repeat(len(push.cross), axis=0)
-        return -float(_likelihood(push, root, np.ones(1))[0])
+        root = root.reshape(1, KNOTS * 6, KNOTS * 6).repeat(len(equations.gradient), axis=0)
+        return -float(_likelihood(equations, root, np.ones(1))[0])
 
     begin = np.log([0.05, 0.05, 0.05, 0.01, 0.01, 0.01, 0.5])
     bounds = [(-9.0, 3.0)] * 6 + [(np.log(0.05), np.log(5.0))]
-    found = minimize(worse, begin, method="Powell", bounds=bounds, options={"maxiter": 4})
+    found = minimize(loss, begin, method="Powell", bounds=bounds, options={"maxiter": 4})
     return -float(found.fun)

@@ -1,0 +1,231 @@
+"""A diagnosis as the JSON that others read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from suite.diagnose.data.kinematics import Kinematics
+from suite.diagnose.data.windows import STATE_GROUPS
+from suite.diagnose.fit.search import NamedEffect
+from suite.diagnose.plans.separating import advice
+from suite.diagnose.verdict.black_box import BlackBoxComparison
+from suite.diagnose.verdict.checks import Checks
+from suite.diagnose.verdict.diagnosis import Diagnosis
+from suite.diagnose.verdict.disagreement import UNITS, Disagreement, binned, by_group, in_words
+from suite.diagnose.verdict.gap import HEADLINE_S, HORIZONS_S, MEASURE, Gap
+from suite.diagnose.verdict.turbulence import Turbulence
+
+SHOWN = 5
+"""Shapes of the residual that are listed."""
+DIGITS = 4
+"""Of the errors by condition, which are many."""
+
+
+def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return what diagnosis.json says of the names and of the gap."""
+    named, seed = diagnosis.search.named, diagnosis.seed
+    before, after, control = diagnosis.before, diagnosis.after, diagnosis.control
+    names = dict.fromkeys(one.candidate.name for one in named)
+    effects = [_effect(diagnosis, name) for name in names]
+    return {
+        "verdict": diagnosis.verdict.label,
+        "effects": effects + _gusts(diagnosis.turbulence),
+        "gap": {
+            "measure": MEASURE,
+            "before": before.rms,
+            "after": after.rms,
+            "noise_floor": 1.0,
+            "before_ci95": before.ci95(seed, diagnosis.limits),
+            "after_ci95": after.ci95(seed, diagnosis.limits),
+            "horizon_s": HEADLINE_S,
+            "held_out": diagnosis.held_out,
+            "channels": {
+                f"{horizon:g} s": {
+                    group: {
+                        "before": error,
+                        "after": after.table[horizon][group][0],
+                        "noise_floor": floor,
+                    }
+                    for group, (error, floor) in table.items()
+                }
+                for horizon, table in before.table.items()
+            },
+        },
+        "control": control
+        and {
+            "effect": control[0],
+            "after": control[1].rms,
+            "after_ci95": control[1].ci95(seed, diagnosis.limits),
+        },
+        "unexplained": {
+            "share": diagnosis.verdict.share_left,
+            "where": diagnosis.verdict.where,
+            "shapes": [shape._asdict() for shape in diagnosis.residual.shapes[:SHOWN]],
+            "coloured": diagnosis.residual.coloured,
+        },
+        "separate_with": [advice(n.candidate.name, rival) for n in named for rival in n.rivals],
+        "driven_by": diagnosis.input_source,
+        "seconds": diagnosis.seconds,
+        "warnings": diagnosis.warnings,
+    }
+
+
+def checks_json(checks: Checks, seed: int) -> dict[str, Any]:
+    """Return the entries that `checks` add to diagnosis.json; `seed` is of the intervals' draws."""
+    found, black_box = checks.disagreement, checks.black_box
+    return {
+        "kinematics": checks.kinematics and _kinematics(checks.kinematics),
+        "disagreement": {
+            "before": in_words(found, found.before),
+            "after": in_words(found, found.after),
+            "unit": "RMS error over its noise floor",
+            "by": {name: _by_condition(found, name) for name in UNITS},
+        },
+        "actuators": [{**one._asdict(), "followed": one.followed} for one in checks.actuators],
+        "black_box": black_box
+        and {
+            "held_out": _comparison(black_box.held_out, seed),
+            "outside": black_box.outside and _comparison(black_box.outside, seed),
+            "split_m_s": black_box.split_m_s,
+            "seconds": black_box.seconds,
+        },
+    }
+
+
+def components(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield label, value and interval of every component, None where there is none."""
+    for name, entry in parameters.items():
+        value, span, unit = entry["value"], entry["ci95"], entry["unit"]
+        if not isinstance(value, list):
+            yield f"{name} [{unit}]", value, span
+            continue
+        for k, one in enumerate(value):
+            yield f"{name} {k + 1} [{unit}]", one, span[k] if span else None
+
+
+def _effect(diagnosis: Diagnosis, name: str) -> dict[str, Any]:
+    ones = [n for n in diagnosis.search.named if n.candidate.name == name]
+    before, after = diagnosis.before.rms, diagnosis.after.rms
+    without = [diagnosis.without[n.candidate.label].rms for n in ones]
+    removed = (max(without) - after) / max(before - 1.0, 1e-9)
+    return {
+        "name": name,
+        "alternatives": sorted({rival for n in ones for rival in n.rivals} - {name}),
+        "parameters": _parameters(diagnosis, name, ones),
+        "gap_removed": min(max(removed, 0.0), 1.0),
+        "p_value": max(n.p_value for n in ones),
+    }
+
+
+def _gusts(found: Turbulence | None) -> list[dict[str, Any]]:
+    """Return the entry of random wind; no rollout repeats it, so that it takes no gap away."""
+    if found is None:
+        return []
+    intensity, length = list(found.intensity_ci95), list(found.length_ci95)
+    return [
+        {
+            "name": found.effect,
+            "alternatives": [],
+            "parameters": {
+                "intensity": {"value": found.intensity, "unit": "m/s", "ci95": intensity},
+                "length": {"value": found.length, "unit": "m", "ci95": length},
+            },
+            "gap_removed": None,
+            "p_value": float(np.exp(-found.ratio)),
+        }
+    ]
+
+
+def _parameters(diagnosis: Diagnosis, name: str, ones: list[NamedEffect]) -> dict[str, Any]:
+    space, search = diagnosis.model.space, diagnosis.search
+    place = {index: k for k, index in enumerate(search.indices)}
+    indices = sorted(i for n in ones for i in n.candidate.indices)
+
+    def one(index: int) -> tuple[float, list[float]]:
+        entry = space.entries[index]
+        value = float(search.estimate.theta[index])
+        width = float(diagnosis.half_widths[place[index]])
+        return value, [max(value - width, entry.low), min(value + width, entry.high)]
+
+    found: dict[str, Any] = {}
+    for parameter in EFFECTS[name].parameters:
+        if parameter.one_at_a_time:
+            values = [one(i) for i in indices]
+            which = [(space.entries[i].component or 0) + 1 for i in indices]
+            lone = len(which) == 1
+            found["index"] = {"value": which[0] if lone else which, "unit": "1", "ci95": None}
+            found[parameter.name] = {
+                "value": values[0][0] if lone else [v for v, _ in values],
+                "unit": parameter.unit,
+                "ci95": values[0][1] if lone else [c for _, c in values],
+            }
+            continue
+        at = {space.entries[i].component: i for i in indices
+              if space.entries[i].parameter == parameter.name}  # fmt: skip
+        if not at:
+            continue
+        if parameter.size:
+            parts = [one(at[k]) if k in at else (None, None) for k in range(parameter.size)]
+            value, ci = [v for v, _ in parts], [c for _, c in parts]
+        else:
+            value, ci = one(at[None])
+        found[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci}
+    return found
+
+
+def _kinematics(found: Kinematics) -> dict[str, Any]:
+    known = np.isfinite(found.offset_ci)
+    return {
+        "gyro_bias": {"value": found.bias, "half_width95": found.bias_ci, "unit": "rad/s"},
+        "clock_offset": {
+            "value": found.offset if known else None,
+            "half_width95": found.offset_ci if known else None,
+            "unit": "s",
+        },
+        "velocity_over_path": found.velocity_scale,
+    }
+
+
+def _by_condition(found: Disagreement, condition: str) -> dict[str, Any]:
+    series = {"before": found.before, "after": found.after}
+    tables = {name: binned(found, over, condition) for name, over in series.items()}
+    by_horizon = {
+        name: {
+            f"{horizon:g} s": {
+                group: _short(by_group(table[h])[:, g]) for g, group in enumerate(STATE_GROUPS)
+            }
+            for h, horizon in enumerate(HORIZONS_S)
+        }
+        for name, (table, _) in tables.items()
+    }
+    edges = _short(found.edges[condition])
+    return {"edges": edges, "rollouts": tables["before"][1], **by_horizon}
+
+
+def _short(values: np.ndarray) -> list[float | None]:
+    return [float(f"{v:.{DIGITS}g}") if np.isfinite(v) else None for v in values]
+
+
+def _comparison(found: BlackBoxComparison, seed: int) -> dict[str, Any]:
+    return {
+        "judged_on": found.judged_on,
+        "stretches": {"fitted": found.fitted, "judged": found.judged},
+        "before": _gap(found.before, seed),
+        "named": None if found.named is None else _gap(found.named, seed),
+        "black_box": _gap(found.black_box, seed),
+    }
+
+
+def _gap(gap: Gap, seed: int) -> dict[str, Any]:
+    return {
+        "gap": gap.rms,
+        "ci95": gap.ci95(seed),
+        "rollouts": {
+            f"{horizon:g} s": {group: values[0] for group, values in groups.items()}
+            for horizon, groups in gap.table.items()
+        },
+    }

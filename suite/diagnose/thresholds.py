@@ -1,0 +1,177 @@
+"""Every number that the diagnosis judges by, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """What counts as enough, near, sure or beyond noise, in the order of the diagnosis's steps."""
+
+    longest_hole_s: float = 0.1
+    """Rows further apart are a hole: no window or rotor lag reaches across it [s]."""
+    fitted_loop_share: float = 0.5
+    """Rotor speeds that the nominal rate loop misses by more than this share of how they change
+    are another controller's: they are the input then [1]."""
+    speed_mean_s: float = 0.1
+    """Rotor speeds are compared with the loop's as means over this time, to be rid of noise [s]."""
+    still_speed: float = 10.0
+    """Rotor speeds that change by less, or are off by less, say nothing [rad/s]."""
+    loop_settled_s: float = 0.3
+    """After the first row, until the rotors' lag has forgotten how they began [s]."""
+    lag_settled_s: float = 0.2
+    """Left out after each hole where lags are fitted, for the same reason [s]."""
+    longest_lag_s: float = 0.15
+    """Slowest motors that are thought of [s]."""
+    longest_delay_s: float = 0.06
+    """Latest commands that are thought of [s]."""
+    delays_tried: int = 9
+    """Delays up to the longest that are tried before the best is refined."""
+    actuator_flight_s: float = 60.0
+    """Flight that is enough to compare rotor speeds; what is logged beyond does not count [s]."""
+    held_out_share: float = 0.2
+    """Share of the flights that is held out, at least one [1]."""
+    lone_fitted_share: float = 0.7
+    """Share of a lone flight that is fitted; the end is held out [1]."""
+    turn_span_s: float = 0.06
+    """The attitude's turn is held against the gyro over about this time [s]."""
+    turn_block_s: float = 0.5
+    """Comparisons of turns this near to each other are not independent [s]."""
+    calm: float = 2.0
+    """Rates that change by less tell no clock offset: the gyro's noise changes as much (mean square
+    over the axes together [rad^2/s^4])."""
+    clock_resolution_s: float = 0.002
+    """Offsets below are left unsaid: sampling and a simulator's steps shift pose and gyro so far
+    against each other [s]."""
+    noise_rows: int = 20
+    """Rows that a polynomial is taken off: what is left of a model's error in 0.2 s is none."""
+    rotor_noise_rows: int = 8
+    """The same for rotor speeds that are an input, which change faster."""
+    noise_degree: int = 3
+    """Degree of that polynomial."""
+    least_noise: tuple[float, ...] = (1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2)
+    """Noise below is rounding and the model's steps; pose [m, rad], velocity [m/s], rates [rad/s],
+    accelerometer [m/s^2], rotor speed [rad/s]."""
+
+    slow_degree: int = 5
+    """Degree of the polynomials in which a model's error of a window would show."""
+    rotor_knot_excess: float = 1.5
+    """Errors of rotor speeds may be this much larger, for what happens between the knots [1]."""
+    singular: float = 1e-5
+    """A column with less than this of its own beside the others needs Householder's way [1]."""
+    converged: float = 0.05
+    """A fit is done where another round would lower chi-square by less than this [1]."""
+    sign_draws: int = 1999
+    """Draws of the null: p-values down to 1/2000."""
+    folds: int = 5
+    """Parts into which windows are dealt; each is left out once."""
+    loud_gain: float = 50.0
+    """A gain that noise never has: what else explains as much as the best is no chance either."""
+    alike_share: float = 0.5
+    """Share of the best gain from which a group of columns explains about as much [1]."""
+    few_windows: int = 10
+    """Signs of fewer windows can be shuffled in too few ways for a p-value of 1 %."""
+    name_p_value: float = 0.001
+    """Chance of a false name at each step of the search."""
+    most_names: int = 4
+    """Effects that are named at most."""
+    least_name_share: float = 0.003
+    """An effect with less than this share of the first one's gain is not named: the fit of the
+    first, which is not exact, leaves so much [1]."""
+    short_list: int = 5
+    """Candidates that are fitted through the whole model at a step."""
+    near_share: float = 0.5
+    """Candidates whose linear gain is less than this share of the best are not fitted so [1]."""
+    rival_chi2: float = 9.0
+    """A rival less than this above a name's chi-square (three sigma) cannot be told from it."""
+    rival_share: float = 0.25
+    """Nor can one that leaves less than this share of what the name explains, where that is
+    little [1]."""
+    settle_rounds: int = 3
+    """Times that names and rivals are weighed anew."""
+    trusted_horizons_s: tuple[float, ...] = (1.0, 0.5, 0.25)
+    """Lengths of a window, of which the longest is taken whose slopes can be trusted [s]."""
+    trusted_m: float = 0.15
+    """Error of position up to which slopes are trusted [m]."""
+    trusted_height_share: float = 0.25
+    """The same for height, as a share of it: near the ground the air changes with it [1]."""
+    trusted_rad: float = 0.25
+    """The same for attitude [rad]."""
+    last_rounds: int = 10
+    """Gauss-Newton steps of the last fit of all names: some effects saturate."""
+    first_order_chi2: float = 25.0
+    """A candidate that is worse than the best by more to first order is not fitted."""
+    first_order_share: float = 0.1
+    """Nor one that is worse by more than this share besides: large effects are not linear [1]."""
+    diverged_m: float = 50.0
+    """A simulated window that ends this far from the flight says nothing [m]."""
+    least_windows: int = 2
+    """Windows to fit without which nothing can be left out."""
+    integrator_share: float = 0.6
+    """Share of a physics step up to which pose and rates may be apart by integration alone [1]."""
+
+    bootstrap_draws: int = 1000
+    """Draws of the 95 % intervals of a gap."""
+    bootstrap_block: int = 4
+    """Neighbouring windows that are drawn together: they start 0.25 s apart and last 1 s."""
+    gap_stride_s: float = 0.25
+    """From one start to the next of the rollouts that measure the gap [s]."""
+    doubt_chi2: float = 25.0
+    """Rise of chi-square on held-out flights from which a name is doubted (five sigma)."""
+    cells: int = 4
+    """Places along x and y between which a force that hangs on the place is drawn."""
+    pieces: int = 5
+    """Straight pieces of a curve over one number."""
+    thrust_reversal: float = 10.0
+    """Change of thrust beyond which its direction is all that counts [m/s^3]."""
+    colours_s: tuple[float, ...] = (0.3, 0.03)
+    """Times for which a random disturbance keeps its direction: a gust's and a rotor's [s]."""
+    disturbance_quantiles: tuple[float, ...] = (0.9, 0.5, 0.1)
+    """Quantiles of the information along all directions at which a disturbance is seen."""
+    informed_share: float = 1e-9
+    """Directions with less than this share of the largest information are not looked at [1]."""
+    noise_doubt: float = 0.02
+    """Share by which the measured noise power may be wrong [1]."""
+    shape_p_value: float = 0.001
+    """A shape over the state that chance equals more rarely than this is structure."""
+    colour_p_value: float = 1e-4
+    """So is energy of a smooth disturbance along an axis that noise gives more rarely."""
+    structure: float = 1.15
+    """Slow errors above their expectation by this factor are no noise [1]."""
+    structure_rotor_input: float = 1.3
+    """The same where measured rotor speeds are the input: their noise is known less well [1]."""
+    unexplained_share: float = 0.5
+    """Where more of the gap is left, what was named does not explain it [1]."""
+    wind_lengths_m: tuple[float, float, int] = (0.5, 40.0, 25)
+    """Shortest and longest length of turbulence that is tried [m], and how many."""
+    wind_intensities: tuple[float, float, int] = (0.02, 8.0, 121)
+    """Least and largest intensity that is tried [m/s], and how many."""
+    wind_ratio: float = 10.0
+    """Log-likelihood ratio to no wind from which there is wind."""
+    wind_rival_ratio: float = 8.0
+    """A disturbance along the body axes that is better by this log-likelihood is no wind."""
+    wind_tail: float = 4.0
+    """Standard errors by which the tails of wind's pulls may be above a normal variable's."""
+    profile_fall: float = 1.92
+    """Fall of the log-likelihood at the ends of a 95 % interval (Wilks 1938)."""
+    check_stride_s: float = 0.5
+    """From one window to the next where more of them are wanted than the search has [s]."""
+    most_bins: int = 6
+    """Bins of a condition at most, as many as a chart can show."""
+    least_in_bin: int = 8
+    """Rollouts in a bin at least."""
+    thrust_mean_s: float = 0.5
+    """A rollout's thrust is the mean over this time [s]."""
+    beyond_noise: float = 4.0
+    """Standard errors by which the energy of errors is off where they are beyond noise."""
+    condition_p_value: float = 1e-3
+    """Chance below which errors are said to go with a condition."""
+    slow_share: float = 0.6
+    """Share of the windows, the slowest, that are fitted where the fast ones judge [1]."""
+    least_judged: int = 6
+    """Windows to fit and to judge there, at least."""
+
+
+THRESHOLDS = Thresholds()
+"""As `suite diagnose` uses them; tuned on flights of MuJoCo that no blind case contains."""

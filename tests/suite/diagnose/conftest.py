@@ -1,0 +1,23 @@
+"""One diagnosis of a hidden drag, for the tests of what is said of it."""
+
+import pytest
+
+from suite.diagnose.diagnose import diagnose
+from suite.diagnose.verdict.checks import run_checks
+from tests.support.diagnosis_flights import fly
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+
+
+@pytest.fixture(scope="session")
+def drag():
+    """Return the diagnosis of three flights with a drag that the vehicle file lacks."""
+    given = with_lag(PLAIN, 0.03)
+    truth = with_effects(given, linear_drag=((0.15, 0.15, 0.05),))
+    logs = [fly(truth, seed, duration_s=5.0, motors=True) for seed in range(3)]
+    return diagnose(logs, given, "commands")
+
+
+@pytest.fixture(scope="session")
+def drag_checks(drag):
+    """Return what stands beside its names."""
+    return run_checks(drag)

@@ -1,0 +1,37 @@
+"""Rotor speeds are the input where the nominal loop does not ask for them, or it is asked for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from suite.diagnose.data.input_source import another_controller, rotors_are_input
+from tests.support.diagnosis_flights import fly
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+
+LAGGED = with_lag(PLAIN, 0.03)
+
+
+def test_a_moved_centre_of_mass_is_no_other_controller():
+    moved = with_effects(LAGGED, com_offset=((0.006, -0.004, 0.0),))
+    assert not another_controller([fly(moved, 0, duration_s=4.0, motors=True)], LAGGED)
+
+
+def test_speeds_that_the_loop_does_not_ask_for_are_another_controllers():
+    log = fly(LAGGED, 0, duration_s=4.0, motors=True)
+    assert log.rotor_speed is not None
+    other = replace(log, rotor_speed=np.roll(log.rotor_speed, 1, axis=1))
+    assert another_controller([other], LAGGED)
+    assert not another_controller([fly(LAGGED, 0, duration_s=2.0)], LAGGED)
+
+
+def test_the_columns_decide_what_can_be_the_input():
+    log = fly(LAGGED, 0, duration_s=2.0, motors=True)
+    no_motors = replace(log, rotor_speed=None)
+    no_commands = replace(log, thrust_cmd=None, rate_cmd_b=None)
+    assert not rotors_are_input([log], "auto") and rotors_are_input([log], "motors")
+    assert rotors_are_input([log, no_commands], "auto")
+    with pytest.raises(ValueError, match="not every flight"):
+        rotors_are_input([log, no_motors], "motors")
+    with pytest.raises(ValueError, match="auto, commands, motors"):
+        rotors_are_input([log], "wheels")

@@ -1,0 +1,49 @@
+"""Logs cut into windows: what is held, what is seen, and what a hole does."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from suite.diagnose.data.windows import LENGTH_S, SLICES, cut, step_s, steps_before, take
+from suite.diagnose.thresholds import Thresholds
+from tests.support.diagnosis_flights import fly
+from tests.support.vehicles import PLAIN
+
+
+def test_windows_hold_the_rows_and_commands_of_their_time():
+    log = fly(PLAIN, 0, duration_s=4.0)
+    windows, warnings = cut([log], PLAIN, False)
+    assert windows is not None and not warnings
+    assert len(windows.flight) == 3 and np.diff(windows.start_s).min() >= LENGTH_S - 1e-9
+    dt, first = step_s(PLAIN), sum(steps_before(step_s(PLAIN)))
+    assert windows.command.shape[1] == first + round(LENGTH_S / dt)
+    row = int(np.searchsorted(log.time_s, windows.start_s[1] - 1e-9))
+    np.testing.assert_array_equal(windows.pos_w[1], log.pos_w[row])
+    np.testing.assert_array_equal(windows.row_pos_w[1][7], log.pos_w[row + 7])
+    assert log.thrust_cmd is not None
+    assert windows.command[1, first, 0] == log.thrust_cmd[row]
+    chosen = take(windows, windows.start_s > 1.0)
+    np.testing.assert_array_equal(chosen.pos_w, windows.pos_w[1:])
+
+
+def test_what_is_an_input_or_derived_is_no_measurement():
+    log = replace(fly(PLAIN, 0, duration_s=2.0, motors=True), velocity_derived=True)
+    for rotor_input in (False, True):
+        windows, _ = cut([log], PLAIN, rotor_input)
+        assert windows is not None
+        seen = windows.seen.any(axis=(0, 1))
+        assert seen[SLICES["rotor speed"]].all() != rotor_input
+        assert bool(windows.rotor_speed.any()) == rotor_input
+        assert not seen[SLICES["velocity"]].any() and seen[SLICES["position"]].all()
+
+
+def test_a_hole_is_stepped_over_and_a_log_of_holes_is_named():
+    log = fly(PLAIN, 0, duration_s=4.0)
+    kept = (log.time_s < 0.8) | (log.time_s > 1.15)
+    arrays = {name: value[kept] for name, value in vars(log).items()
+              if isinstance(value, np.ndarray) and len(value) == len(kept)}  # fmt: skip
+    holed = replace(log, **arrays)
+    windows, _ = cut([holed], PLAIN, False)
+    assert windows is not None and windows.start_s.min() > 1.1
+    none, warnings = cut([holed], PLAIN, False, limits=Thresholds(longest_hole_s=1e-3))
+    assert none is None and warnings == [f"{log.name}: no stretch of 1.3 s without a hole"]

@@ -1,0 +1,136 @@
+"""The model that is fitted: its slopes, its whitening, its numbers, and the search on top."""
+
+import numpy as np
+import pytest
+
+from eval.effects import EFFECTS
+from suite.diagnose.data.windows import cut
+from suite.diagnose.fit.model import BATCH, DIRECTIONS, RolloutModel, batches
+from suite.diagnose.fit.normal_equations import normal_equations_of, start_estimate
+from suite.diagnose.fit.parameters import candidates, effects_at, indices_of, make_space
+from suite.diagnose.fit.rollout import KNOTS, STATE
+from suite.diagnose.fit.search import NamedEffect, search, trusted
+from suite.diagnose.fit.whitening import (
+    make_whitening,
+    orthonormal,
+    project_out_start,
+    whiten,
+    whitened_residual,
+)
+from tests.support.diagnosis_flights import fly
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+
+LAGGED = with_lag(PLAIN, 0.03)
+SPACE = make_space(LAGGED)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """Return a model, windows with a drag that it lacks, and their slopes along everything."""
+    truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
+    windows, _ = cut([fly(truth, seed, duration_s=4.0) for seed in range(3)], LAGGED, False)
+    assert windows is not None
+    model = RolloutModel(LAGGED, SPACE, rotor_input=False, voltage=False)
+    begin = start_estimate(model, windows)
+    return model, windows, model.linearise(begin.theta, begin.offset, windows, None)
+
+
+def test_a_vector_of_numbers_is_the_vehicles_effects_and_back():
+    theta = SPACE.array("start")
+    place = {(e.effect, e.parameter, e.component): i for i, e in enumerate(SPACE.entries)}
+    theta[place["linear_drag", "coefficient", 1]] = 0.4
+    drag = effects_at(SPACE.layout, SPACE.base, theta)["linear_drag"].coefficient
+    np.testing.assert_allclose(drag, [0.0, 0.4, 0.0])
+    assert len(
+        {candidate.label for candidate in candidates(SPACE, True, {"acc_b", "command"})}
+    ) >= len(EFFECTS)
+    wind = next(
+        c for c in candidates(SPACE, True, {"acc_b", "command"}) if c.name == "constant_wind"
+    )
+    assert indices_of([wind, wind]) == sorted(wind.indices)
+
+
+def test_slopes_are_those_of_small_changes(flown):
+    model, windows, linear = flown
+    begin = start_estimate(model, windows)
+    name = ("linear_drag", "coefficient", 0)
+    index = SPACE.layout.index(name)
+    step = np.zeros(model.size)
+    step[index] = 1e-4
+    ends = [model.residual(begin.theta + s * step, begin.offset, windows) for s in (-1, 1)]
+    slope = (ends[0] - ends[1]) / 2e-4
+    np.testing.assert_allclose(linear.slope[..., index], slope, atol=1e-4)
+    few = model.linearise(begin.theta, begin.offset, windows, [index])
+    np.testing.assert_allclose(few.slope[..., 0], linear.slope[..., index], atol=1e-9)
+
+
+def test_a_disturbance_pushes_the_windows(flown):
+    model, windows, _ = flown
+    begin = start_estimate(model, windows)
+    response = model.respond(begin.theta, begin.offset, windows)
+    assert response.slope.shape[-1] == KNOTS * 6
+    assert response.knot.rotor_speed.shape == (len(windows.flight), KNOTS, 4)
+    up = response.slope[..., 2::6].sum(axis=-1)[:, :, 2]
+    at = np.abs(np.asarray(windows.row_s) - 0.5).argmin(axis=1)
+    # 1 m/s^2 along body z for half a second, less what tilt takes of it.
+    np.testing.assert_allclose(up[np.arange(len(at)), at], 0.125, rtol=0.5)
+
+
+def test_batches_are_of_one_size_and_whole(flown):
+    model, windows, _ = flown
+    offset = start_estimate(model, windows).offset
+    parts = list(batches(offset, windows))
+    assert all(len(x) == len(w.flight) == BATCH for x, w, _ in parts)
+    assert sum(count for *_, count in parts) == len(windows.flight) and DIRECTIONS <= model.size
+
+
+def test_what_the_start_explains_is_projected_out(flown):
+    model, windows, linear = flown
+    sigma = np.where(windows.seen.any(axis=(0, 1)), 0.01, np.nan)
+    whitening = make_whitening(linear, sigma, windows)
+    moved = np.random.default_rng(0).standard_normal((len(windows.flight), STATE))
+    slope = linear.slope[..., -STATE:]
+    by_start = np.einsum("wnck,wk->wnc", slope, moved)[..., None]
+    left = project_out_start(whitening, whiten(whitening, by_start))
+    assert np.abs(left).max() < 1e-6 * np.abs(whiten(whitening, by_start)).max()
+    equations = normal_equations_of(whitening, linear, 3)
+    residual = project_out_start(whitening, whitened_residual(whitening, linear))
+    np.testing.assert_allclose(equations.chi2, (residual**2).sum(axis=(1, 2)))
+    assert (whitening.slow_freedom >= -1e-9).all()
+
+
+def test_columns_that_depend_on_each_other_are_made_orthonormal_too():
+    rng = np.random.default_rng(0)
+    matrix = rng.standard_normal((3, 40, 4))
+    for tall in (matrix, matrix[..., [0, 1, 2, 2]] + 1e-9 * matrix):
+        base, upper = orthonormal(tall, 1e-5)
+        np.testing.assert_allclose(base @ upper, tall, atol=1e-9)
+        np.testing.assert_allclose(
+            np.swapaxes(base, 1, 2) @ base, np.broadcast_to(np.eye(4), (3, 4, 4)), atol=1e-6
+        )
+
+
+def test_windows_are_trusted_until_the_model_leaves_the_flight(flown):
+    _, windows, linear = flown
+    residual = np.zeros_like(linear.residual)
+    residual[0, np.asarray(windows.row_s)[0] > 0.4, 0] = 1.0
+    view = trusted(windows, residual)
+    last = [np.asarray(windows.row_s)[w][view.seen[w].any(axis=1)].max() for w in (0, 1)]
+    assert last == pytest.approx([0.25, 1.0], abs=0.011)
+
+
+def test_a_search_names_the_drag_and_leaves_its_result_alone(flown):
+    model, windows, linear = flown
+    among = [
+        c for c in candidates(SPACE, False, {"command"}) if c.name in ("linear_drag", "gyro_bias")
+    ]
+    said = []
+    found = search(model, windows, among, said.append, linear)
+    assert [candidate.name for candidate in found.candidates] == ["linear_drag"]
+    one = found.named[0]
+    assert one.p_value <= 1e-3 and one.gain > 0.0 and found.explained > 100.0 and said
+    assert found.indices == sorted(one.candidate.indices)
+    np.testing.assert_allclose(found.estimate.theta[found.indices], [0.15, 0.15, 0.05], atol=0.03)
+    with pytest.raises(AttributeError):
+        one.gain = 0.0  # type: ignore[misc]
+    assert NamedEffect(one.candidate, 1.0, 0.0).rivals == ()

@@ -1,0 +1,114 @@
+"""A diagnosis as JSON, report and recording: what is said is what was found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from suite.common.report import Grid, html
+from suite.diagnose.report.cells import cells, grid, short_name
+from suite.diagnose.report.charts import (
+    black_box_chart,
+    disagreement_chart,
+    drift_chart,
+    gains_chart,
+)
+from suite.diagnose.report.diagnosis_json import checks_json, components, diagnosis_json
+from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
+from suite.diagnose.report.page import page
+from suite.diagnose.report.recording import write_rollouts
+from suite.diagnose.report.result_sections import held_out_section, residual_section
+from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
+from suite.diagnose.verdict.disagreement import by_group
+from tracks.common.files import plain
+
+PNG = b"\x89PNG"
+
+
+@pytest.fixture(scope="module")
+def found(drag, drag_checks):
+    return plain({**diagnosis_json(drag), **checks_json(drag_checks, 0)})
+
+
+def texts(table):
+    return [[cell.text for cell in row] for row in table.rows]
+
+
+def compared(drag):
+    side = BlackBoxComparison("flights left out", 9, 5, drag.before, drag.after, drag.before)
+    return BlackBoxComparisons(side, None, 4.0, 1.0)
+
+
+def test_rows_are_cells_without_a_tone():
+    assert [cell.text for cell in cells("a", "b")] == ["a", "b"] and not cells("a")[0].tone
+    assert texts(grid("t", ["x"], [("1",), ("2",)], "n")) == [["1"], ["2"]]
+    assert short_name("a\\b/c.parquet") == "c.parquet"
+
+
+def test_the_json_says_what_was_found(drag, found):
+    assert found["verdict"] == drag.verdict.label and found["driven_by"] == "commands"
+    (effect,) = found["effects"]
+    assert effect["name"] == "linear_drag" and effect["gap_removed"] > 0.9
+    value = np.array(effect["parameters"]["coefficient"]["value"])
+    np.testing.assert_allclose(value, drag.fitted[drag.search.indices])
+    assert found["gap"]["channels"]["1 s"]["velocity"]["noise_floor"] > 0.0
+    assert found["black_box"] is None and found["kinematics"]["velocity_over_path"]
+
+
+def test_a_comparison_with_a_black_box_is_in_the_json(drag, drag_checks):
+    box = checks_json(replace(drag_checks, black_box=compared(drag)), 0)["black_box"]
+    assert box["outside"] is None and box["held_out"]["stretches"] == {"fitted": 9, "judged": 5}
+    assert box["held_out"]["named"]["gap"] == drag.after.rms
+
+
+def test_components_of_a_vector_are_numbered():
+    entry = {"value": [1.0, None], "ci95": [[0.5, 1.5], None], "unit": "m"}
+    one = {"value": 2.0, "ci95": None, "unit": "1"}
+    assert list(components({"offset": entry, "scale": one})) == [
+        ("offset 1 [m]", 1.0, [0.5, 1.5]), ("offset 2 [m]", None, None), ("scale [1]", 2.0, None)
+    ]  # fmt: skip
+
+
+def test_groups_leave_out_what_was_not_measured():
+    table = np.ones((2, 12))
+    table[0, :3] = [3.0, np.nan, 1.0]
+    table[1, 9:] = np.nan
+    rms = by_group(table)
+    assert rms[0, 0] == pytest.approx(np.sqrt(5.0)) and np.isnan(rms[1, 3])
+
+
+def test_sections_show_the_numbers(drag, drag_checks, found):
+    logs = logs_section(drag, drag_checks)
+    assert isinstance(logs.parts[0], Grid) and len(logs.parts[0].rows) == 3
+    noise = noise_section(drag).parts[1]
+    assert isinstance(noise, Grid) and [row[0] for row in texts(noise)][0] == "position [m]"
+    assert len(actuators_section(drag_checks, "commands")) == 1
+    assert actuators_section(replace(drag_checks, actuators=[]), "commands") == []
+    rest = {**found, "unexplained": {"where": "a shape", "share": 0.25}}
+    assert residual_section(drag, rest).parts[0] == "25 % of the gap is left: a shape."
+    with_box = replace(drag_checks, black_box=compared(drag))
+    held = held_out_section(drag, found, with_box).parts
+    assert "too few stretches" in str(held[-1])
+    tables = [part for part in held if isinstance(part, Grid)]
+    assert texts(tables[0])[-1][0] == "with what was named" and len(tables) == 2
+
+
+def test_charts_are_pictures(drag, drag_checks):
+    over = drag_checks.disagreement
+    bare = over._replace(after=over.before, drift_after=over.drift_before)
+    for chart in (disagreement_chart, drift_chart):
+        assert chart(over).startswith(PNG) and chart(bare) != chart(over)
+    scores = drag.search.first
+    assert gains_chart(scores, None, set()) != gains_chart(scores, 5.0, {"linear_drag"})
+    assert black_box_chart([compared(drag).held_out], 0).startswith(PNG)
+
+
+def test_the_page_stands_alone(drag, drag_checks, found):
+    text = html(page(drag, found, drag_checks, "name = 'x'", {"vehicle.toml"}))
+    assert text.count("<h2>") >= 9 and "linear_drag" in text and "vehicle.toml" in text
+    assert "recording.rrd" not in text
+
+
+def test_the_recording_is_written(drag, tmp_path):
+    path = write_rollouts(tmp_path / "x.rrd", drag)
+    assert path.stat().st_size > 10_000

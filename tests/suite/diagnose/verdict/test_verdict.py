@@ -1,0 +1,157 @@
+"""What the numbers allow to be said: gaps, structure in what is left, wind, and the verdict."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from suite.diagnose.fit.rollout import KNOTS, STATE
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict import black_box, checks, diagnosis
+from suite.diagnose.verdict.gap import Gap, measure, noise_floor, start_noise, worse
+from suite.diagnose.verdict.residual_structure import (
+    AXES,
+    DisturbanceEquations,
+    ResidualStructure,
+    ShapeScore,
+    disturbance_equations,
+    residual_structure,
+)
+from suite.diagnose.verdict.shapes import shape_library
+from suite.diagnose.verdict.turbulence import _likelihood, find_turbulence
+from suite.diagnose.verdict.verdict import Verdict, verdict_on
+
+
+def gap(energy):
+    return Gap(np.asarray(energy) / 10.0, np.asarray(energy), {})
+
+
+def searched(slow=1.0, named=(), explained=0.0) -> Any:
+    """As much of a search's result as a verdict needs: 10 windows of slow errors."""
+    whitening = SimpleNamespace(slow_freedom=np.full((10, STATE), 5.0))
+    energy = np.full((10, STATE), 5.0)
+    energy[:, 6] *= slow
+    equations = SimpleNamespace(slow_energy=energy)
+    return SimpleNamespace(
+        named=named, whitening=whitening, equations=equations, explained=explained
+    )
+
+
+def left(p_value=0.5, coloured=0.5, gain=1.0):
+    shapes = [ShapeScore("force with the speed", gain, p_value)]
+    return ResidualStructure(shapes, dict.fromkeys(AXES, coloured))
+
+
+def test_noise_alone_is_no_gap_and_a_name_without_structure_is_named():
+    assert verdict_on(searched(), left(), False) == Verdict("no_gap")
+    assert verdict_on(searched(named=("drag",)), left(), False) == Verdict("named")
+
+
+def test_structure_is_told_by_what_it_goes_with():
+    shaped = verdict_on(searched(), left(p_value=1e-4), False)
+    assert shaped == Verdict("unknown", 1.0, "force with the speed")
+    coloured = verdict_on(searched(), left(coloured=1e-6), False)
+    assert coloured.where == "a changing " + ", ".join(AXES)
+    loud = verdict_on(searched(slow=10.0), left(), False)
+    assert loud.label == "unknown" and loud.where == "errors of velocity x"
+
+
+def test_what_explains_most_is_named_in_part():
+    found = searched(named=("drag",), explained=1000.0)
+    verdict = verdict_on(found, left(p_value=1e-4, gain=100.0), False)
+    assert verdict.label == "partly" and verdict.share_left == pytest.approx(1 / 11)
+    assert verdict_on(found, left(p_value=1e-4, gain=2000.0), False).label == "unknown"
+
+
+def test_rotor_speeds_as_input_may_be_noisier():
+    quiet = searched(slow=3.0)
+    assert verdict_on(quiet, left(coloured=1e-6), True) == Verdict("no_gap")
+    assert verdict_on(quiet, left(), False).label == "unknown"
+    strict = replace(THRESHOLDS, structure_rotor_input=1.1)
+    assert verdict_on(quiet, left(), True, strict).label == "unknown"
+
+
+def test_a_gaps_interval_holds_it_and_a_rise_is_seen():
+    rng = np.random.default_rng(0)
+    before, after = gap(rng.chisquare(10, 80)), gap(rng.chisquare(10, 80) + 8.0)
+    low, high = before.ci95(0)
+    assert low < before.rms < high and high - low < 0.3
+    assert before.ci95(0) == before.ci95(0) != before.ci95(1)
+    assert worse(before, after) and not worse(after, before) and not worse(before, before)
+    assert not worse(before, after, limits=Thresholds(doubt_chi2=1e6))
+
+
+def test_the_noise_floor_is_what_start_and_row_make():
+    slope = np.zeros((1, STATE, STATE))
+    slope[0, 0, 6] = 0.5
+    noise = np.zeros(STATE)
+    noise[[0, 6]] = 0.3, 0.8
+    floor = noise_floor(slope, noise)
+    assert floor[0, 0] == pytest.approx(0.5) and floor[0, 6] == pytest.approx(0.8)
+
+
+def test_a_diagnosis_is_measured_on_what_was_held_out(drag):
+    assert isinstance(drag, diagnosis.Diagnosis) and drag.verdict.label == "named"
+    assert drag.input_source == "commands" and drag.fitted is not None
+    sigma, held = drag.search.sigma, drag.held_windows
+    again = measure(drag.model, drag.fitted, held, sigma)
+    np.testing.assert_array_equal(again.score, drag.after.score)
+    assert drag.after.rms < 1.3 < drag.before.rms
+    noise = start_noise(sigma, held, drag.model.free)
+    np.testing.assert_array_equal(noise, np.where(np.isfinite(sigma), sigma, 0.0)[:STATE])
+
+
+def test_without_the_name_its_shape_is_left(drag):
+    found = drag.search
+    bare = replace(found.estimate, theta=drag.start)
+    equations = disturbance_equations(drag.model, found.windows, found.whitening, bare)
+    fold = np.arange(len(found.windows.flight)) % 5
+    with_gap = residual_structure(equations, fold)
+    assert with_gap.shapes[0].gain > 10.0 * max(drag.residual.shapes[0].gain, 1.0)
+    assert min(with_gap.coloured.values()) < 1e-6 <= min(drag.residual.coloured.values())
+
+
+def test_shapes_are_columns_that_their_groups_share_out(drag):
+    found = drag.search
+    response = drag.model.respond(found.estimate.theta, found.estimate.offset, found.windows)
+    library = shape_library(response.knot, np.asarray(found.windows.start_s))
+    columns = [column for group in library.groups for column in group.columns]
+    assert columns == list(range(library.unit.shape[-1]))
+    assert library.unit.shape[1] == KNOTS * 6 and np.isfinite(library.unit).all()
+    fewer = shape_library(response.knot, np.asarray(found.windows.start_s), Thresholds(cells=2))
+    assert fewer.unit.shape[-1] < library.unit.shape[-1]
+
+
+def test_the_likelihood_of_a_random_disturbance_peaks_at_its_size():
+    rng = np.random.default_rng(2)
+    count, size = 200, 2.0
+    hessian = np.broadcast_to(4.0 * np.eye(6), (count, 6, 6))
+    noise = 2.0 * rng.standard_normal((count, 6))
+    gradient = 4.0 * size * rng.standard_normal((count, 6)) + noise
+    equations = DisturbanceEquations(hessian, gradient, None, None)  # type: ignore[arg-type]
+    sizes = np.array([0.5, 1.0, 2.0, 4.0, 8.0])
+    found = _likelihood(equations, np.broadcast_to(np.eye(6), (count, 6, 6)), sizes)
+    assert sizes[found.argmax()] == size
+
+
+def test_a_drag_is_not_taken_for_wind(drag):
+    found = drag.search
+    equations = disturbance_equations(drag.model, found.windows, found.whitening, found.estimate)
+    assert find_turbulence(drag.model, found.estimate.theta, equations) is None
+
+
+def test_what_was_held_out_is_not_fitted_by_the_black_box(drag):
+    known = black_box._not_held_out(drag.cut(0.5), drag.held_windows)
+    assert len(known.flight) and not set(known.flight) & set(drag.held_windows.flight)
+    top, mean = black_box._speeds(drag.logs, known)
+    assert (top >= mean).all() and (mean > 0.0).all()
+
+
+def test_checks_know_the_logs_and_their_motors(drag, drag_checks):
+    assert isinstance(drag_checks, checks.Checks) and drag_checks.black_box is None
+    assert [fact.name for fact in drag_checks.facts] == [log.name for log in drag.logs]
+    assert drag_checks.actuators[0].followed > 0.9
+    over = drag_checks.disagreement
+    assert np.nanmean(over.after**2) < np.nanmean(over.before**2)
