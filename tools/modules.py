@@ -20,8 +20,8 @@ ROOMS = {
 }
 HEAD = """# Modules
 
-Every file of the four rooms in one sentence, from its docstring (`python tools/modules.py` writes this
-page). [architecture.md](architecture.md) says how they belong together.
+Every file of the four rooms in one sentence, from its docstring (`python tools/modules.py` writes
+this page). [architecture.md](architecture.md) says how they belong together.
 """
 
 
