@@ -1,47 +1,80 @@
-"""The observation: the paper's 12 numbers (Su et al. 2026, Eq. 1) or more, and a depth image."""
+"""What a policy sees: the paper's 12 numbers (Su et al. 2026, Eq. 1) or more, and a depth image.
+
+`observe` is the one place that assembles it, for trainer, judge, worlds and environments. A number
+more is a key in `policies.spec.EXTRAS` and a line in `EXTRA_VECTORS`.
+"""
 
 from __future__ import annotations
 
-from policies.spec import DepthEncoding
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from policies.spec import EXTRAS, DepthEncoding, PolicySpec
 from tracks.geometry.rotation import to_local
-from tracks.geometry.scene import Array
+from tracks.geometry.scene import Array, Gates
 
 
-def state_vector(
-    pos_w: Array,
-    vel_w: Array,
-    rot_w: Array,
-    gate_w: Array,
-    last_action_b: Array,
-    second_w: Array | None = None,
-    axis_w: Array | None = None,
-) -> Array:
-    """Return the numbers that a policy sees besides the image, (..., 12), (..., 15) or (..., 18).
+class View(NamedTuple):
+    """What can be observed of drones and their gates; arrays (..., ) of NumPy or JAX."""
+
+    pos_w: Any
+    """(..., 3) [m]."""
+    rot_w: Any
+    """(..., 3, 3) body to world."""
+    vel_w: Any
+    """(..., 3) [m/s]."""
+    gate_w: Any
+    """(..., 3) centre of the next gate [m]."""
+    second_w: Any
+    """(..., 3) centre of the gate after it, or of the last gate where there is none [m]."""
+    axis_w: Any
+    """(..., 3) unit vector along which the next gate is flown through."""
+    depth_m: Any = None
+    """(..., H, W) planar depth, clipped to the camera's range [m]; None without a camera."""
+
+
+class Observation(NamedTuple):
+    """What a policy is given."""
+
+    state: Any
+    """(..., spec.state_size): velocity in body axes [m/s], the third row of R (world z in body
+    axes, free of yaw), the next gate's centre in body axes [m], the last action [m/s^2] and then
+    the spec's extras."""
+    image: Any
+    """(..., H, W) inverse depth as the spec encodes it [1]; None where the view has none."""
+
+
+def view_of(
+    pos_w: Array, rot_w: Array, vel_w: Array, gate: Gates, after: Gates, depth_m: Array | None
+) -> View:
+    """Return the view (N, ...) of drones that fly to `gate` and then `after`, one gate a row."""
+    axis_w = gate.rot_w[..., 0]
+    return View(pos_w, rot_w, vel_w, gate.center_w, after.center_w, axis_w, depth_m)
+
+
+EXTRA_VECTORS: dict[str, Callable[[View], Array]] = {
+    "second_gate": lambda view: to_local(view.rot_w, view.second_w - view.pos_w),
+    "gate_axis": lambda view: to_local(view.rot_w, view.axis_w),
+}
+"""Key of a spec -> the three numbers, (..., 3) in body axes, that it adds to the state."""
+
+
+def observe(spec: PolicySpec, view: View, last_action_b: Array) -> Observation:
+    """Return what a policy of `spec` is given.
 
     Args:
-        pos_w: (..., 3) position [m].
-        vel_w: (..., 3) velocity [m/s].
-        rot_w: (..., 3, 3) body to world.
-        gate_w: (..., 3) centre of the next gate [m].
+        spec: the policy's; its extras and its depth encoding count.
+        view: what there is to see.
         last_action_b: (..., 3) the previous action, in the body axes of its own time [m/s^2].
-        second_w: (..., 3) centre of the gate after the next, or of the last gate where there is
-            none after it [m]; for policies with `PolicySpec.second_gate`.
-        axis_w: (..., 3) unit vector along which the next gate is flown through; for policies with
-            `PolicySpec.gate_axis`.
-
-    Returns:
-        Velocity in body axes [m/s], the third row of R (world z in body axes, free of yaw), the
-        next gate's centre in body axes [m], the last action [m/s^2] and, where they are given, the
-        second gate's centre [m] and the next gate's direction, both in body axes.
     """
-    xp = rot_w.__array_namespace__()
-    vel_b, gate_b = to_local(rot_w, vel_w), to_local(rot_w, gate_w - pos_w)
+    rot_w = view.rot_w
+    vel_b, gate_b = to_local(rot_w, view.vel_w), to_local(rot_w, view.gate_w - view.pos_w)
     numbers = [vel_b, rot_w[..., 2, :], gate_b, last_action_b]
-    if second_w is not None:
-        numbers.append(to_local(rot_w, second_w - pos_w))
-    if axis_w is not None:
-        numbers.append(to_local(rot_w, axis_w))
-    return xp.concatenate(numbers, axis=-1)
+    numbers += [EXTRA_VECTORS[key](view) for key in EXTRAS if getattr(spec, key)]
+    state = rot_w.__array_namespace__().concatenate(numbers, axis=-1)
+    if view.depth_m is None:
+        return Observation(state, None)
+    return Observation(state, encode_depth(spec.depth, view.depth_m, spec.camera.range_m))
 
 
 def encode_depth(encoding: DepthEncoding, depth_m: Array, range_m: float) -> Array:

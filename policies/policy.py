@@ -47,8 +47,8 @@ class Policy(Protocol):
 
         Args:
             hidden: from `start` or the last `act`.
-            state: (n, spec.state_size) float32 from `observation.state_vector`.
-            image: (n, height, width) float32 from `observation.encode_depth`.
+            state: (n, spec.state_size) float32, the state of `observation.observe`.
+            image: (n, height, width) float32, its image.
             fresh: (n,) bool, rows whose memory is cleared first since a new trial starts there.
 
         Returns:

@@ -24,7 +24,7 @@ from eval.worlds.trial import (
     next_gate,
     start_progress,
 )
-from policies.observation import encode_depth, state_vector
+from policies.observation import observe, view_of
 from policies.spec import PolicySpec
 from tracks.geometry.rotation import to_world
 from tracks.geometry.scene import Gates
@@ -137,13 +137,10 @@ class Race:
         gate = next_gate(self._course, self.progress.gates)
         if self.ended_by == "diverged":
             pos_w, rot_w, vel_w = self.progress.pos_w, np.eye(3)[None], np.zeros((1, 3))
-        second_w = None
-        if self.spec.second_gate:
-            second_w = next_gate(self._course, self.progress.gates + 1).center_w
-        axis_w = gate.rot_w[..., 0] if self.spec.gate_axis else None
-        state = state_vector(pos_w, vel_w, rot_w, gate.center_w, self.action_b, second_w, axis_w)[0]
-        depth = self._eye.image(self.model, data, pos_w[0], rot_w[0])
-        image = encode_depth(self.spec.depth, depth, self.spec.camera.range_m)
+        after = next_gate(self._course, self.progress.gates + 1)
+        depth = self._eye.image(self.model, data, pos_w[0], rot_w[0])[None]
+        view = view_of(pos_w, rot_w, vel_w, gate, after, depth)
+        state, image = (part[0] for part in observe(self.spec, view, self.action_b))
         return {
             "state": np.clip(state, -STATE_LIMIT, STATE_LIMIT).astype(np.float32),
             "image": image.astype(np.float32),

@@ -32,7 +32,7 @@ from eval.worlds.trial import (
     TrialSpec,
     track_of,
 )
-from policies.observation import encode_depth, state_vector
+from policies.observation import observe
 from policies.policy import Policy
 from tracks.families import check_family
 from tracks.track import Track
@@ -247,13 +247,9 @@ class _Slots:
         seen = self._world.view(flying)
         if self._sensors:
             seen = self._sensors.see(seen, self._world.progress.gates, flying)
-        second_w = seen.second_w if spec.second_gate else None
-        axis_w = seen.axis_w if spec.gate_axis else None
-        state = state_vector(
-            seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, self._action_b, second_w, axis_w
-        )
+        state, image = observe(spec, seen, self._action_b)
         state = np.where(flying[:, None], state, 0).astype(np.float32)
-        image = encode_depth(spec.depth, seen.depth_m, spec.camera.range_m).astype(np.float32)
+        image = image.astype(np.float32)
         asked = time.perf_counter()
         answer, self._hidden = self._policy.act(self._hidden, state, image, self._fresh | ~flying)
         took_s = time.perf_counter() - asked

@@ -13,9 +13,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from eval.worlds import View
 from eval.worlds.slots import GATES, PIXELS, STATE, generator_of
 from eval.worlds.trial import TrialSpec
+from policies.observation import View
 from tracks.geometry.rotation import exp_rot, to_world
 
 NEAREST_M = 1e-3

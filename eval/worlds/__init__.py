@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from eval.worlds.trial import Progress, TrialSpec
+from policies.observation import View
 from tracks.common.registry import Registry
 from tracks.track import Track
 
@@ -30,25 +31,6 @@ WORLDS: Registry[Any] = Registry(
     lambda name, world: None if callable(world) else f"{world!r}; must be a class (`World`)",
 )
 """Name to class (`World`), called with (vehicle, camera, layout, rules, slots=, threads=)."""
-
-
-class View(NamedTuple):
-    """What can be observed in each slot, (N, ...); rows of empty slots hold anything finite."""
-
-    pos_w: np.ndarray
-    """(N, 3) [m]."""
-    rot_w: np.ndarray
-    """(N, 3, 3) body to world."""
-    vel_w: np.ndarray
-    """(N, 3) [m/s]."""
-    gate_w: np.ndarray
-    """(N, 3) centre of the next gate [m]."""
-    second_w: np.ndarray
-    """(N, 3) centre of the gate after it, or of the last gate where there is none [m]."""
-    axis_w: np.ndarray
-    """(N, 3) unit vector along which the next gate is flown through."""
-    depth_m: np.ndarray
-    """(N, H, W) planar depth, clipped to the camera's range [m]."""
 
 
 class Rows(NamedTuple):

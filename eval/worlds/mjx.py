@@ -23,7 +23,7 @@ from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopi
 from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import Rows, View
+from eval.worlds import Rows
 from eval.worlds.collision import CONTACT_M, NEAR, box_distances
 from eval.worlds.engine import start_state
 from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
@@ -40,6 +40,7 @@ from eval.worlds.trial import (
     next_gate,
     start_progress,
 )
+from policies.observation import View, view_of
 from tracks.common.tree_rows import select
 from tracks.formats.mujoco_scene import GROUND
 from tracks.geometry.camera import Camera, pixel_rays_b
@@ -202,9 +203,8 @@ class MjxWorld:
         pos_w, rot_w, vel_w, _ = _motion(state.qpos, state.qvel)
         depth = depth_image(scene, pos_w, rot_w, self._rays_b, self._camera.range_m)
         depth = depth.reshape(self.slots, self._camera.height, self._camera.width)
-        gate, second = (next_gate(course, state.progress.gates + ahead) for ahead in (0, 1))
-        axis_w = gate.rot_w[..., 0]
-        return View(pos_w, rot_w, vel_w, gate.center_w, second.center_w, axis_w, depth)
+        gate, after = (next_gate(course, state.progress.gates + ahead) for ahead in (0, 1))
+        return view_of(pos_w, rot_w, vel_w, gate, after, depth)
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
         """Fly each slot's action (N, 3) for its number of physics steps (N,)."""

@@ -16,7 +16,7 @@ from mujoco.batch import Batch
 from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import Rows, View
+from eval.worlds import Rows
 from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
 from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
 from eval.worlds.trial import (
@@ -31,6 +31,7 @@ from eval.worlds.trial import (
     next_gate,
     start_progress,
 )
+from policies.observation import View, view_of
 from tracks.common.tree_rows import packed, select
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import to_world
@@ -166,16 +167,8 @@ class MujocoWorld:
         else:
             list(self._pool.map(look, slots, chunksize=8))
         gate = next_gate(self._course, self._progress.gates)
-        second_w = next_gate(self._course, self._progress.gates + 1).center_w
-        return View(
-            motion.pos_w,
-            motion.rot_w,
-            motion.vel_w,
-            gate.center_w,
-            second_w,
-            gate.rot_w[..., 0],
-            depth,
-        )
+        after = next_gate(self._course, self._progress.gates + 1)
+        return view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, after, depth)
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
         """Fly each slot's action (N, 3) for its number of physics steps (N,)."""

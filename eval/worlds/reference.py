@@ -14,11 +14,11 @@ from eval.judging.sensors import SensorNoise, Sensors
 from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import REFERENCE, View
+from eval.worlds import REFERENCE
 from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import layout_of, noise_of
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
-from policies.observation import encode_depth, state_vector
+from policies.observation import View, observe
 from policies.policy import Policy
 from tracks.geometry.crossing import crossing, is_near
 from tracks.geometry.rotation import to_world
@@ -110,12 +110,7 @@ def fly_trial(
             )
             if sensors:
                 seen = sensors.see(seen, np.array([passed]), np.array([True]))
-            state = state_vector(
-                seen.pos_w, seen.vel_w, seen.rot_w, seen.gate_w, action_b,
-                seen.second_w if spec.second_gate else None,
-                seen.axis_w if spec.gate_axis else None,
-            )  # fmt: skip
-            image = encode_depth(spec.depth, seen.depth_m, spec.camera.range_m)
+            state, image = observe(spec, seen, action_b)
             fresh = np.full(rows, decisions == 0)
             answer, hidden = policy.act(hidden, _padded(state, rows), _padded(image, rows), fresh)
             guarded = guard_action(limits, np.asarray(answer)[:1], action_b, 0.0, policy.name)

@@ -129,7 +129,7 @@ def step(
     Args:
         params: from `init` or a checkpoint.
         hidden: (N, hidden) recurrent state, zero at the start of a trial.
-        state: (N, spec.state_size) from `observation.state_vector`.
-        image: (N, height, width) from `observation.encode_depth`.
+        state: (N, spec.state_size) the state of `observation.observe`.
+        image: (N, height, width) its image.
     """
     return recur(params, hidden, encode(params, image), state)

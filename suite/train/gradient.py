@@ -79,10 +79,10 @@ def make_gradient(
         key: jax.Array,
         delta: delta_network.Params | None,
     ) -> tuple[network.Params, jax.Array, StepRecord]:
-        nudge = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], width))
+        embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], width))
         (loss, records), (direct, cotangents) = jax.value_and_grad(
             rollout, argnums=(0, 1), has_aux=True
-        )(params, nudge, worlds, key, frozen_encode, delta)
+        )(params, embedding_shift, worlds, key, frozen_encode, delta)
         first = jax.random.randint(jax.random.fold_in(key, stride), (), 0, stride)
         images, cotangents = (
             every(stride, first, array).reshape(-1, *array.shape[2:])

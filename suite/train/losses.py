@@ -1,7 +1,12 @@
-"""The loss of one step, per world (Su et al. 2026, Sec. III-C)."""
+"""The loss of one step, per world (Su et al. 2026, Sec. III-C): a table of terms.
+
+A new term is a function of a `Step`, a line in `LOSSES` and its weight in `LossConfig`.
+"""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -10,57 +15,126 @@ import jax.numpy as jnp
 from suite.train.config import LossConfig
 from tracks.geometry.field import CURRENT, attractive_field, magnetic_field
 from tracks.geometry.gates import rectangle
-from tracks.geometry.scene import Gates
+from tracks.geometry.scene import Array, Gates
 
 UNIT_FIELD = 11.313708498984761
 """|B| / C_I at the centre of a square gate of 1 m: 8 sqrt(2) [1/m]."""
-
 MAX_PULL = 5.0
 """Largest field pull relative to that at the centre of a 1 m gate [1]."""
-
-
-class Terms(NamedTuple):
-    """Weighted terms, (B,) each; their sum is the loss of the step."""
-
-    clearance: jax.Array
-    collide: jax.Array
-    acceleration: jax.Array
-    jerk: jax.Array
-    progress: jax.Array
-    guidance: jax.Array
-    """-u_A . p with u_A held: zero in value, its gradient is the field's."""
-
-
-def _norm(vector: jax.Array) -> jax.Array:
-    """Return the length over the last axis, with a finite gradient at zero."""
-    return jnp.sqrt((vector * vector).sum(-1) + 1e-12)
-
-
-def obstacle_terms(
-    config: LossConfig, distance: jax.Array, away_w: jax.Array, path_w: jax.Array, vel_w: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Return L_clearance and L_collide (B,) over the points of a step's path.
-
-    The nearest obstacle comes from outside the differentiated graph; the distance's gradient with
-    respect to the path is the direction away from it, which is exact.
-
-    Args:
-        config: barrier and radius.
-        distance: (B, S) signed distance at path_w, no gradient [m].
-        away_w: (B, S, 3) unit vectors along which it grows.
-        path_w: (B, S, 3) points with gradient [m].
-        vel_w: (B, 3) [m/s].
-    """
-    moved = ((path_w - jax.lax.stop_gradient(path_w)) * away_w).sum(-1)
-    gap = distance + moved - config.safety_radius_m
-    barrier = config.barrier_height * jax.nn.softplus(config.barrier_slope * gap)
-    closing = jnp.maximum(-(away_w * jax.lax.stop_gradient(vel_w)[:, None]).sum(-1), 0.0)
-    collide = closing * jnp.maximum(1.0 - gap, 0.0) ** 2
-    return barrier.mean(-1), collide.mean(-1)
-
-
 APPROACH_FREE_M = 0.3
 """So far off its axis a gate is still flown at straight [m]."""
+
+
+class Step(NamedTuple):
+    """What a term may look at: one step of B worlds."""
+
+    pos_w: jax.Array
+    """(B, 3) at the step's end [m]."""
+    vel_w: jax.Array
+    """(B, 3) [m/s]."""
+    acc_w: jax.Array
+    """(B, 3) net acceleration [m/s^2]."""
+    acc_before_w: jax.Array
+    """(B, 3) that of the step before [m/s^2]."""
+    time_step: Array
+    """(B,) length of the step [s]."""
+    path_w: jax.Array
+    """(B, S, 3) points of the step's path, with gradient [m]."""
+    distance: jax.Array
+    """(B, S) signed distance of the nearest obstacle at `path_w`, no gradient [m]."""
+    away_w: jax.Array
+    """(B, S, 3) unit vectors along which it grows."""
+    goal_w: jax.Array
+    """(B, 3) the point that progress is measured to [m]."""
+    place_g: jax.Array
+    """(B, 3) position in the frame of the gate flown to, wherever before it the goal is [m]."""
+    gate: Gates
+    """(B, ...) whose field pulls: the one to pass when the step began."""
+
+
+Term = Callable[[LossConfig, Step], jax.Array]
+"""(shape of the term, step) -> the loss (B,), not weighted."""
+
+
+def clearance(config: LossConfig, step: Step) -> jax.Array:
+    """Return L_clearance, the mean over the path [1]."""
+    barrier = config.barrier_height * jax.nn.softplus(config.barrier_slope * _gap(config, step))
+    return barrier.mean(-1)
+
+
+def collide(config: LossConfig, step: Step) -> jax.Array:
+    """Return L_collide, the mean over the path [m^3/s]."""
+    held_vel = jax.lax.stop_gradient(step.vel_w)
+    closing = jnp.maximum(-(step.away_w * held_vel[:, None]).sum(-1), 0.0)
+    return (closing * jnp.maximum(1.0 - _gap(config, step), 0.0) ** 2).mean(-1)
+
+
+def acceleration(_: LossConfig, step: Step) -> jax.Array:
+    """Return L_a [m^2/s^4]."""
+    return (step.acc_w * step.acc_w).sum(-1)
+
+
+def jerk(_: LossConfig, step: Step) -> jax.Array:
+    """Return L_j [m^2/s^6]."""
+    change = (step.acc_w - step.acc_before_w) / step.time_step[:, None]
+    return (change * change).sum(-1)
+
+
+def progress(_: LossConfig, step: Step) -> jax.Array:
+    """Return L_p, minus the speed towards the goal [m/s]."""
+    to_goal = step.goal_w - step.pos_w
+    return -(step.vel_w * to_goal).sum(-1) / _norm(to_goal)
+
+
+def progress_norm(config: LossConfig, step: Step) -> jax.Array:
+    """Return L_p^norm, the ablation's progress by direction alone [1]."""
+    return progress(config, step) / (_norm(step.vel_w) + 1e-3)
+
+
+def projection(config: LossConfig, step: Step) -> jax.Array:
+    """Return L_proj, the scalar substitute for the field: how far off the gate's axis [m^2]."""
+    near = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(_norm(step.place_g)))
+    return (step.place_g[:, 1:] ** 2).sum(-1) * near
+
+
+def guidance(config: LossConfig, step: Step) -> jax.Array:
+    """Return the term whose position gradient is -u_A / u_A(centre of a 1 m gate); 0 in value.
+
+    At the wires the field has no bound, so its pull is held to MAX_PULL.
+    """
+    held_pos, held_vel = jax.lax.stop_gradient(step.pos_w), jax.lax.stop_gradient(step.vel_w)
+    gate = step.gate
+    wires_g = _square_around(gate.opening_g) if config.field_square else gate.opening_g
+    field = magnetic_field(gate.center_w, gate.rot_w, wires_g, held_pos)
+    pull = attractive_field(field, held_vel, config.field_decay)
+    pull = pull / (CURRENT * UNIT_FIELD) ** (1 - config.field_decay)
+    pull = pull * jnp.minimum(1.0, MAX_PULL / _norm(pull))[:, None]
+    return -(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos)).sum(-1)
+
+
+LOSSES: dict[str, tuple[tuple[Term, str], ...]] = {
+    "clearance": ((clearance, "clearance"),),
+    "collide": ((collide, "collide"),),
+    "acceleration": ((acceleration, "acceleration"),),
+    "jerk": ((jerk, "jerk"),),
+    "progress": (
+        (progress, "progress"),
+        (progress_norm, "progress_norm"),
+        (projection, "projection"),
+    ),
+    "guidance": ((guidance, "field_gain"),),
+}
+"""Name in the curve -> its terms, each with the field of `LossConfig` that is its weight."""
+
+
+def weighted(config: LossConfig, step: Step) -> dict[str, jax.Array]:
+    """Return the weighted terms (B,) by name; their sum is the loss of the step."""
+
+    def total(terms: tuple[tuple[Term, str], ...]) -> jax.Array:
+        parts = (getattr(config, weight) * term(config, step) for term, weight in terms)
+        return functools.reduce(jnp.add, parts)
+
+    return {name: total(terms) for name, terms in LOSSES.items()}
 
 
 def approach_shift(config: LossConfig, local_g: jax.Array) -> jax.Array:
@@ -75,71 +149,22 @@ def approach_shift(config: LossConfig, local_g: jax.Array) -> jax.Array:
     return jnp.clip(off - APPROACH_FREE_M, 0.0, config.approach_m)
 
 
-def progress_term(
-    config: LossConfig,
-    pos_w: jax.Array,
-    vel_w: jax.Array,
-    target_w: jax.Array,
-    place_g: jax.Array,
-) -> jax.Array:
-    """Return L_p with the ablation's variants L_p^norm and L_proj, weighted, (B,).
+def _norm(vector: jax.Array) -> jax.Array:
+    """Return the length over the last axis, with a finite gradient at zero."""
+    return jnp.sqrt((vector * vector).sum(-1) + 1e-12)
 
-    Args:
-        config: weights and decay.
-        pos_w: (B, 3) [m].
-        vel_w: (B, 3) [m/s].
-        target_w: (B, 3) the point to fly to [m].
-        place_g: (B, 3) the position in the target gate's frame [m]; L_proj counts the distance to
-            the gate, whatever point before it `target_w` is.
+
+def _gap(config: LossConfig, step: Step) -> jax.Array:
+    """Return the distance to the nearest obstacle beyond the safety radius, (B, S) [m].
+
+    The nearest obstacle comes from outside the differentiated graph; the distance's gradient with
+    respect to the path is the direction away from it, which is exact.
     """
-    to_gate = target_w - pos_w
-    distance = _norm(to_gate)
-    towards = (vel_w * to_gate).sum(-1) / distance
-    total = -config.progress * towards - config.progress_norm * towards / (_norm(vel_w) + 1e-3)
-    near = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(_norm(place_g)))
-    return total + config.projection * (place_g[:, 1:] ** 2).sum(-1) * near
-
-
-def guidance_term(
-    config: LossConfig, gates: Gates, pos_w: jax.Array, vel_w: jax.Array
-) -> jax.Array:
-    """Return the term whose position gradient is -field_gain u_A / u_A(centre of a 1 m gate).
-
-    At the wires the field has no bound, so its pull is held to MAX_PULL times field_gain.
-
-    Args:
-        config: gain and decay of the field.
-        gates: each world's target gate, (B, ...).
-        pos_w: (B, 3) the only input that the gradient goes to [m].
-        vel_w: (B, 3) [m/s].
-    """
-    held_pos, held_vel = jax.lax.stop_gradient(pos_w), jax.lax.stop_gradient(vel_w)
-    wires_g = _square_around(gates.opening_g) if config.field_square else gates.opening_g
-    field = magnetic_field(gates.center_w, gates.rot_w, wires_g, held_pos)
-    pull = attractive_field(field, held_vel, config.field_decay)
-    unit = (CURRENT * UNIT_FIELD) ** (1 - config.field_decay)
-    pull = pull / unit
-    pull = pull * jnp.minimum(1.0, MAX_PULL / _norm(pull))[:, None]
-    return -config.field_gain * (jax.lax.stop_gradient(pull) * (pos_w - held_pos)).sum(-1)
+    moved = ((step.path_w - jax.lax.stop_gradient(step.path_w)) * step.away_w).sum(-1)
+    return step.distance + moved - config.safety_radius_m
 
 
 def _square_around(opening_g: jax.Array) -> jax.Array:
     """Return the square (B, 4, 2) around a regular opening (B, V, 2) whose first side is level."""
     side = -2.0 * opening_g[..., :1, 1:]
     return side * rectangle(1.0, 1.0)
-
-
-def smoothness_terms(
-    config: LossConfig, acc_w: jax.Array, acc_before_w: jax.Array, time_step: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Return the weighted L_a and L_j (B,).
-
-    Args:
-        config: their weights.
-        acc_w: (B, 3) net acceleration [m/s^2].
-        acc_before_w: (B, 3) that of the step before [m/s^2].
-        time_step: (B,) [s].
-    """
-    jerk = (acc_w - acc_before_w) / time_step[:, None]
-    size, change = (acc_w * acc_w).sum(-1), (jerk * jerk).sum(-1)
-    return config.acceleration * size, config.jerk * change

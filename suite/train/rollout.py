@@ -1,9 +1,9 @@
 """One rollout of the policy in its dynamics, with the loss of every step.
 
 The image carries no gradient to the state (Zhang et al. 2025), so the encoder can leave the
-differentiated loop: the embeddings enter as constants plus `nudge`, a zero whose gradient is the
-loss's gradient with respect to the embeddings. Obstacles, field and gates are looked up on values
-without gradient for the same reason.
+differentiated loop: the embeddings enter as constants plus `embedding_shift`, a zero whose gradient
+is their cotangent. Obstacles, field and gates are looked up on values without gradient for the same
+reason.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from policies.networks import delta_network, network
-from policies.observation import encode_depth, state_vector
+from policies.observation import View, encode_depth, observe
 from suite.train import losses
 from suite.train.config import LossConfig, TrainConfig
 from suite.train.dynamics.interface import Body, make_dynamics
@@ -65,8 +65,8 @@ class StepRecord(NamedTuple):
 
     image: jax.Array
     """(B, height, width) encoded, with its noise."""
-    terms: losses.Terms
-    """Weighted, zero for worlds that have left the loss."""
+    terms: dict[str, jax.Array]
+    """Weighted losses by name, zero for worlds that have left the loss."""
     speed: jax.Array
     """[m/s]."""
     clearance: jax.Array
@@ -101,6 +101,14 @@ def target_gate(gates: Gates, target: jax.Array, ahead: int = 0) -> tuple[Gates,
     return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
 
 
+def view_in(worlds: Worlds, body: Body, target: jax.Array) -> View:
+    """Return what drones at `body` that have passed `target` (B,) gates can observe, but images."""
+    gates = worlds.scene.gates
+    gate, target_w = target_gate(gates, target)
+    _, second_w = target_gate(gates, target, ahead=1)
+    return View(body.pos_w, body.rot_w, body.vel_w, target_w, second_w, gate.rot_w[:, :, 0])
+
+
 def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return (the oldest entry, the queue after it left and `new` joined)."""
     line = jnp.concatenate([waiting, new[:, None]], axis=1)
@@ -129,7 +137,7 @@ def make_look(
 
 def make_judge(
     weights: LossConfig,
-) -> Callable[..., tuple[losses.Terms, jax.Array, jax.Array]]:
+) -> Callable[..., tuple[dict[str, jax.Array], jax.Array, jax.Array]]:
     """Return judge(worlds, before, body, target) -> (terms, clearance, passed), (B,) each.
 
     It scores the step from `before` to `body` of worlds that have passed `target` gates: the
@@ -138,7 +146,7 @@ def make_judge(
 
     def judge(
         worlds: Worlds, before: Body, body: Body, target: jax.Array
-    ) -> tuple[losses.Terms, jax.Array, jax.Array]:
+    ) -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
         gate, _ = target_gate(worlds.scene.gates, target)
         count = worlds.scene.gates.center_w.shape[1]
         held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
@@ -152,19 +160,20 @@ def make_judge(
         share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
         distance, away = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path), NEAR)
-        barrier, collide = losses.obstacle_terms(weights, distance, away, path, body.vel_w)
-        size, change = losses.smoothness_terms(
-            weights, body.acc_w, before.acc_w, worlds.constants.time_step
+        step = losses.Step(
+            pos_w=body.pos_w,
+            vel_w=body.vel_w,
+            acc_w=body.acc_w,
+            acc_before_w=before.acc_w,
+            time_step=worlds.constants.time_step,
+            path_w=path,
+            distance=distance,
+            away_w=away,
+            goal_w=goal_w,
+            place_g=local,
+            gate=gate,
         )
-        terms = losses.Terms(
-            clearance=weights.clearance * barrier,
-            collide=weights.collide * collide,
-            acceleration=size,
-            jerk=change,
-            progress=losses.progress_term(weights, body.pos_w, body.vel_w, goal_w, local),
-            guidance=losses.guidance_term(weights, gate, body.pos_w, body.vel_w),
-        )
-        return terms, distance.min(-1), passed
+        return losses.weighted(weights, step), distance.min(-1), passed
 
     return judge
 
@@ -178,11 +187,11 @@ def states_at_start(batch: int, config: TrainConfig) -> jax.Array:
 def make_rollout(
     config: TrainConfig, note: Note | None = None
 ) -> Callable[..., tuple[jax.Array, StepRecord]]:
-    """Return rollout(params, nudge, worlds, key, encode, delta) -> (loss, records).
+    """Return rollout(params, embedding_shift, worlds, key, encode, delta) -> (loss, records).
 
-    `encode(params, image)` gives the embeddings; `nudge` is (T, B, hidden); `delta` is the frozen
-    Delta Action network's parameters or None. The loss is the mean over steps and worlds; records
-    are (T, B, ...).
+    `encode(params, image)` gives the embeddings; `embedding_shift` is (T, B, hidden); `delta` is
+    the frozen Delta Action network's parameters or None. The loss is the mean over steps and
+    worlds; records are (T, B, ...).
     """
     spec, physics, weights = config.spec, config.physics, config.loss
     look, judge, dynamics = make_look(config), make_judge(weights), make_dynamics(config)
@@ -191,15 +200,9 @@ def make_rollout(
         params: network.Params,
         memory: Memory,
         embedding: jax.Array,
-        target_w: jax.Array,
-        second_w: jax.Array | None,
-        axis_w: jax.Array | None,
+        seen: View,
     ) -> tuple[jax.Array, Memory]:
-        body = memory.body
-        state = state_vector(
-            body.pos_w, body.vel_w, body.rot_w, target_w, memory.action_b, second_w, axis_w
-        )
-        state, states = queue(memory.states, state)
+        state, states = queue(memory.states, observe(spec, seen, memory.action_b).state)
         embedding, embeddings = queue(memory.embeddings, embedding)
         action, hidden = network.recur(params, memory.hidden, embedding, state)
         memory = memory._replace(
@@ -209,13 +212,13 @@ def make_rollout(
 
     def rollout(
         params: network.Params,
-        nudge: jax.Array,
+        embedding_shift: jax.Array,
         worlds: Worlds,
         key: jax.Array,
         encode: Callable[[network.Params, jax.Array], jax.Array],
         delta: delta_network.Params | None = None,
     ) -> tuple[jax.Array, StepRecord]:
-        steps, batch, width = nudge.shape
+        steps, batch, width = embedding_shift.shape
         body = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
         memory = Memory(
             body=body,
@@ -231,16 +234,12 @@ def make_rollout(
         def step(
             memory: Memory, inputs: tuple[jax.Array, jax.Array, jax.Array]
         ) -> tuple[Memory, StepRecord]:
-            nudge_now, key_now, number = inputs
+            shift_now, key_now, number = inputs
             before = memory.body
             image = look(worlds, jax.lax.stop_gradient(before), key_now)
-            gate, target_w = target_gate(worlds.scene.gates, memory.target)
-            embedding = encode(params, image) + nudge_now
-            second_w = None
-            if spec.second_gate:
-                _, second_w = target_gate(worlds.scene.gates, memory.target, ahead=1)
-            axis_w = gate.rot_w[:, :, 0] if spec.gate_axis else None
-            action, memory = act(params, memory, embedding, target_w, second_w, axis_w)
+            seen = view_in(worlds, before, memory.target)
+            embedding = encode(params, image) + shift_now
+            action, memory = act(params, memory, embedding, seen)
             if delta is not None:
                 vel_b = to_local(jax.lax.stop_gradient(before.rot_w), before.vel_w)
                 correction, delta_hidden = delta_network.step(
@@ -248,9 +247,9 @@ def make_rollout(
                 )
                 action = action + correction
                 memory = memory._replace(delta_hidden=delta_hidden)
-            body = dynamics.step(before, worlds.constants, action, target_w, key_now)
+            body = dynamics.step(before, worlds.constants, action, seen.gate_w, key_now)
             terms, clearance, passed = judge(worlds, before, body, memory.target)
-            terms = losses.Terms(*(term * memory.alive for term in terms))
+            terms = {name: term * memory.alive for name, term in terms.items()}
             alive = memory.alive * (clearance > -weights.crash_depth_m)
             alive = alive * (number + 1 < worlds.stop)
             target = memory.target + passed
@@ -270,8 +269,8 @@ def make_rollout(
             return memory._replace(body=body, target=target, alive=alive), record
 
         keys = jax.random.split(key, steps)
-        _, records = jax.lax.scan(step, memory, (nudge, keys, jnp.arange(steps)))
-        loss = functools.reduce(jnp.add, (term.mean() for term in records.terms))
+        _, records = jax.lax.scan(step, memory, (embedding_shift, keys, jnp.arange(steps)))
+        loss = functools.reduce(jnp.add, (records.terms[name].mean() for name in losses.LOSSES))
         return loss, jax.lax.stop_gradient(records)
 
     return rollout

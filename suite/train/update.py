@@ -87,7 +87,7 @@ def curve_numbers(
         "speed_max": speed.max(0).mean(),
         "memory": jnp.abs(records.hidden).mean(),
     }
-    return numbers | {f"loss_{k}": v.mean() for k, v in records.terms._asdict().items()}
+    return numbers | {f"loss_{k}": v.mean() for k, v in records.terms.items()}
 
 
 def sample_hidden(key: jax.Array, records: StepRecord, before: jax.Array) -> jax.Array:

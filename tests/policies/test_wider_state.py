@@ -14,7 +14,7 @@ from policies.formats.export import export_policy
 from policies.formats.policy_file import save_policy
 from policies.formats.spec_json import spec_from_json, spec_to_json
 from policies.networks import network
-from policies.observation import state_vector
+from policies.observation import View, observe
 from policies.policy import load_policy
 from policies.spec import PolicySpec
 from tests.policies.conftest import SPEC, lively
@@ -39,6 +39,10 @@ def both(tmp_path_factory):
     return save_policy(tmp_path_factory.mktemp("both") / "both", lively(BOTH, 4), BOTH, seed=1)
 
 
+def state_of(spec, pos_w, vel_w, rot_w, gate_w, last_b, second_w, axis_w):
+    return observe(spec, View(pos_w, rot_w, vel_w, gate_w, second_w, axis_w), last_b).state
+
+
 def actions(policy, width, n=70, steps=5):
     rng = np.random.default_rng(7)
     hidden, found = policy.start(n), []
@@ -61,8 +65,8 @@ def test_the_last_three_numbers_are_the_second_gate_in_body_axes():
     turn = Rotation.from_euler("ZYX", [0.7, -0.3, 0.2])
     rng = np.random.default_rng(0)
     pos, vel, gate, last, second = rng.normal(size=(5, 3))
-    without = state_vector(pos, vel, turn.as_matrix(), gate, last)
-    seen = state_vector(pos, vel, turn.as_matrix(), gate, last, second)
+    known = pos, vel, turn.as_matrix(), gate, last, second, np.array([1.0, 0.0, 0.0])
+    without, seen = state_of(PolicySpec(), *known), state_of(SECOND, *known)
     assert without.shape == (12,)
     np.testing.assert_array_equal(seen[:12], without)
     np.testing.assert_allclose(seen[12:], turn.inv().apply(second - pos), atol=1e-12)
@@ -75,10 +79,11 @@ def test_the_gates_direction_comes_last_and_turns_with_the_body():
     pos, vel, gate, last, second = rng.normal(size=(5, 3))
     axis = np.array([0.6, -0.8, 0.0])
     body = turn.as_matrix()
-    with_both = state_vector(pos, vel, body, gate, last, second, axis)
-    np.testing.assert_array_equal(with_both[:15], state_vector(pos, vel, body, gate, last, second))
+    known = vel, body, gate, last, second, axis
+    with_both = state_of(BOTH, pos, *known)
+    np.testing.assert_array_equal(with_both[:15], state_of(SECOND, pos, *known))
     np.testing.assert_allclose(with_both[15:], turn.inv().apply(axis), atol=1e-12)
-    alone = state_vector(pos + 5, vel, body, gate, last, axis_w=axis)
+    alone = state_of(AXIS, pos + 5, *known)
     np.testing.assert_array_equal(alone[12:], with_both[15:])
 
 

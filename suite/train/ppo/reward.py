@@ -15,9 +15,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from suite.train import losses
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import Body
-from suite.train.losses import obstacle_terms, progress_term, smoothness_terms
 from suite.train.rollout import NEAR, target_gate
 from suite.train.worlds import Worlds
 from tracks.geometry.clearance import nearest_obstacle
@@ -66,15 +66,7 @@ def make_reward(
     Args:
         config: beta_2, r_q and the points of a step's path are those of its `loss`.
     """
-    weights = replace(
-        config.loss,
-        barrier_height=1.0,
-        acceleration=-ACCELERATION,
-        jerk=-JERK,
-        progress=PROGRESS,
-        progress_norm=0.0,
-        projection=0.0,
-    )
+    weights = replace(config.loss, barrier_height=1.0)
 
     def reward(
         worlds: Worlds, before: Body, body: Body, target: jax.Array
@@ -88,17 +80,27 @@ def make_reward(
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
         distance, away = nearest_obstacle(worlds.scene, path, NEAR)
         clearance = distance.min(-1)
-        barrier, closing = obstacle_terms(weights, distance, away, path, body.vel_w)
-        size, change = smoothness_terms(
-            weights, body.acc_w, before.acc_w, worlds.constants.time_step
+        step = losses.Step(
+            pos_w=body.pos_w,
+            vel_w=body.vel_w,
+            acc_w=body.acc_w,
+            acc_before_w=before.acc_w,
+            time_step=worlds.constants.time_step,
+            path_w=path,
+            distance=distance,
+            away_w=away,
+            goal_w=goal_w,
+            place_g=jnp.zeros((1, 3)),
+            gate=gate,
         )
-        behind = progress_term(weights, body.pos_w, body.vel_w, goal_w, jnp.zeros((1, 3)))
+        avoid = BARRIER * losses.clearance(weights, step)
+        smooth = ACCELERATION * losses.acceleration(weights, step)
         terms = RewardTerms(
             collision=COLLISION * (clearance < weights.safety_radius_m),
-            avoid=BARRIER * barrier + CLOSING * closing,
-            smooth=-size - change,
+            avoid=avoid + CLOSING * losses.collide(weights, step),
+            smooth=smooth + JERK * losses.jerk(weights, step),
             passing=PASS * passed,
-            progress=-behind,
+            progress=-PROGRESS * losses.progress(weights, step),
         )
         return terms, clearance, passed
 

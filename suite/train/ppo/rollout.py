@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 
 from policies.networks import network
-from policies.observation import state_vector
+from policies.observation import observe
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import make_dynamics
 from suite.train.ppo import critic
 from suite.train.ppo.reward import RewardTerms, make_reward
-from suite.train.rollout import BODY_RADIUS_M, make_look, queue, states_at_start, target_gate
+from suite.train.rollout import BODY_RADIUS_M, make_look, queue, states_at_start, view_in
 from suite.train.worlds import Worlds
 
 
@@ -107,26 +107,13 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
         def step(memory: Memory, key: jax.Array) -> tuple[Memory, Record]:
             before = memory.body
             seen = critic.features(worlds, before, memory.target)
-            gate, target_w = target_gate(worlds.scene.gates, memory.target)
-            second_w = None
-            if spec.second_gate:
-                _, second_w = target_gate(worlds.scene.gates, memory.target, ahead=1)
-            axis_w = gate.rot_w[:, :, 0] if spec.gate_axis else None
-            state = state_vector(
-                before.pos_w,
-                before.vel_w,
-                before.rot_w,
-                target_w,
-                memory.action_b,
-                second_w,
-                axis_w,
-            )
-            state, states = queue(memory.states, state)
+            view = view_in(worlds, before, memory.target)
+            state, states = queue(memory.states, observe(spec, view, memory.action_b).state)
             image, images = queue(memory.images, look(worlds, before, key))
             mean, hidden = network.step(params, memory.hidden, state, image)
             noise = jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
             action = mean + jnp.exp(log_deviation) * noise
-            body = dynamics.step(before, worlds.constants, action, target_w, key)
+            body = dynamics.step(before, worlds.constants, action, view.gate_w, key)
             terms, clearance, passed = reward(worlds, before, body, memory.target)
             done = clearance < BODY_RADIUS_M
             record = Record(

@@ -21,8 +21,8 @@ from eval.quadrotor.rigid_body import accelerations, euler_step
 from eval.quadrotor.rotors import follow, speed_command
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from eval.quadrotor.vehicle_file import load_vehicle
-from policies.observation import encode_depth, state_vector
-from policies.spec import DepthEncoding
+from policies.observation import View, encode_depth, observe
+from policies.spec import DepthEncoding, PolicySpec
 from suite.train.dynamics.point_mass import attitude
 from tracks.geometry.crossing import crossing, is_inside, is_near
 from tracks.geometry.field import attractive_field, magnetic_field
@@ -64,13 +64,16 @@ FUNCTIONS = {
     ),
     magnetic_field: ("*batch 3, *batch 3 3, *batch corners 2, *batch 3", "*batch 3"),
     attractive_field: ("*batch 3, *batch 3", "*batch 3"),
-    state_vector: ("*batch 3, *batch 3, *batch 3 3, *batch 3, *batch 3", "*batch 12"),
-    lambda pos_w, vel_w, rot_w, gate_w, last_b, second_w: state_vector(
-        pos_w, vel_w, rot_w, gate_w, last_b, second_w
-    ): ("*batch 3, *batch 3, *batch 3 3, *batch 3, *batch 3, *batch 3", "*batch 15"),
-    lambda pos_w, vel_w, rot_w, gate_w, last_b, second_w, axis_w: state_vector(
-        pos_w, vel_w, rot_w, gate_w, last_b, second_w, axis_w
-    ): ("*batch 3, *batch 3, *batch 3 3, *batch 3, *batch 3, *batch 3, *batch 3", "*batch 18"),
+    lambda pos_w, rot_w, vel_w, gate_w, second_w, axis_w, last_b: (
+        observe(
+            PolicySpec(second_gate=True, gate_axis=True),
+            View(pos_w, rot_w, vel_w, gate_w, second_w, axis_w),
+            last_b,
+        ).state
+    ): (
+        "*batch 3, *batch 3 3, *batch 3, *batch 3, *batch 3, *batch 3, *batch 3",
+        "*batch 18",
+    ),
     lambda depth_m: encode_depth(DepthEncoding(), depth_m, 10.0): (
         "*batch height width",
         "*batch height width",

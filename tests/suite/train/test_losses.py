@@ -1,5 +1,6 @@
 """Every loss term against its equation and finite differences; the field; what is cut."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -9,14 +10,9 @@ import pytest
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
+from suite.train import losses
 from suite.train.config import LossConfig
-from suite.train.losses import (
-    MAX_PULL,
-    guidance_term,
-    obstacle_terms,
-    progress_term,
-    smoothness_terms,
-)
+from suite.train.losses import MAX_PULL, Step, weighted
 from tracks.geometry.clearance import nearest_obstacle
 from tracks.geometry.field import attractive_field, magnetic_field
 from tracks.geometry.gates import round_gates, square_gates
@@ -43,6 +39,51 @@ def one_of_each() -> Scene:
         np.zeros((0, 3, 3)),
     )
     return jax.tree.map(lambda x: jnp.asarray(x)[None], scene)
+
+
+def a_step(batch, **known):
+    """Return a step of `batch` worlds at rest before a gate, but for what is `known`."""
+    zero = jnp.zeros((batch, 3))
+    rest = {name: zero for name in ("pos_w", "vel_w", "acc_w", "acc_before_w", "goal_w", "place_g")}
+    path = {"path_w": zero[:, None], "distance": jnp.ones((batch, 1)), "away_w": zero[:, None]}
+    whole = {**rest, **path, "time_step": jnp.ones(batch), "gate": unit_gate(batch), **known}
+    return Step(**whole)
+
+
+def obstacle_terms(config, distance, away_w, path_w, vel_w):
+    step = a_step(
+        len(vel_w), distance=distance, away_w=away_w, path_w=path_w, vel_w=jnp.asarray(vel_w)
+    )
+    return losses.clearance(config, step), losses.collide(config, step)
+
+
+def progress_term(config, pos_w, vel_w, goal_w, place_g):
+    step = a_step(len(pos_w), pos_w=pos_w, vel_w=vel_w, goal_w=goal_w, place_g=place_g)
+    return weighted(config, step)["progress"]
+
+
+def smoothness_terms(config, acc_w, acc_before_w, time_step):
+    step = a_step(len(acc_w), acc_w=acc_w, acc_before_w=acc_before_w, time_step=time_step)
+    terms = weighted(config, step)
+    return terms["acceleration"], terms["jerk"]
+
+
+def guidance_term(config, gates, pos_w, vel_w):
+    return weighted(config, a_step(len(pos_w), gate=gates, pos_w=pos_w, vel_w=vel_w))["guidance"]
+
+
+def test_every_weight_of_the_table_scales_its_term_alone():
+    rng = np.random.default_rng(9)
+    step = a_step(4, **{
+        name: jnp.asarray(rng.normal(0, 2, (4, 3)))
+        for name in ("pos_w", "vel_w", "acc_w", "goal_w", "place_g")
+    })  # fmt: skip
+    nothing = {weight: 0.0 for terms in losses.LOSSES.values() for _, weight in terms}
+    for name, terms in losses.LOSSES.items():
+        for term, weight in terms:
+            found = weighted(replace(LossConfig(), **{**nothing, weight: 3.0}), step)
+            np.testing.assert_allclose(found[name], 3.0 * term(LossConfig(), step), rtol=1e-6)
+            assert not any(np.any(value) for key, value in found.items() if key != name)
 
 
 nearest = jax.jit(nearest_obstacle)

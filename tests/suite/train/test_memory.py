@@ -30,7 +30,7 @@ def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
     run = jax.jit(make_gradient(config))
     _, _, records = run(params, worlds._replace(stop=np.array([4, 2, 1, 4])), KEY, None)
     assert np.array_equal(records.alive.T, [[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 0, 0], [1] * 4])
-    for term in records.terms:
+    for term in records.terms.values():
         assert (np.asarray(term)[np.asarray(records.alive) == 0] == 0).all()
     remembered = worlds._replace(hidden=np.full_like(worlds.hidden, 0.5))
     first = run(params, remembered, KEY, None)[2].hidden[0]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from policies.observation import state_vector
+from policies.observation import View, observe
 from suite.delta.replay import nominal_model
 from suite.train import losses, rollout
 from suite.train.config import LossConfig, PointMassConfig
@@ -37,9 +37,9 @@ def blind(params, image):
 
 
 def flown(config, worlds):
-    nudge = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
+    embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
     run = jax.jit(make_rollout(config), static_argnums=4)
-    return run(fresh_params(config.spec), nudge, worlds, KEY, blind)[1]
+    return run(fresh_params(config.spec), embedding_shift, worlds, KEY, blind)[1]
 
 
 def at_first_gate(config, ahead_m):
@@ -62,32 +62,32 @@ def test_the_step_that_passes_a_gate_is_progress_to_the_next_where_asked(pass_fi
     config = small_config(1, 1, physics=STILL, loss=loss)
     records = flown(config, at_first_gate(config, 0.02))
     assert bool(records.passed[0, 0])
-    assert float(records.terms.progress[0, 0]) == pytest.approx(progress, abs=0.2)
+    assert float(records.terms["progress"][0, 0]) == pytest.approx(progress, abs=0.2)
 
 
 def test_the_step_before_is_progress_to_the_gate():
     config = small_config(1, 1, physics=STILL, loss={"progress": 1.0})
     records = flown(config, at_first_gate(config, 1.0))
     assert not bool(records.passed[0, 0])
-    assert float(records.terms.progress[0, 0]) == pytest.approx(-3.0, abs=0.2)
+    assert float(records.terms["progress"][0, 0]) == pytest.approx(-3.0, abs=0.2)
 
 
 def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
     """The second gate's centre, the last one's where none comes after, and the next's direction."""
     seen = []
 
-    def spy(pos_w, vel_w, rot_w, gate_w, action_b, second_w=None, axis_w=None):
-        jax.debug.callback(lambda *shown: seen.append(shown), second_w, axis_w)
-        return state_vector(pos_w, vel_w, rot_w, gate_w, action_b, second_w, axis_w)
+    def spy(spec, view, action_b):
+        jax.debug.callback(lambda *shown: seen.append(shown), view.second_w, view.axis_w)
+        return observe(spec, view, action_b)
 
-    monkeypatch.setattr(rollout, "state_vector", spy)
+    monkeypatch.setattr(rollout, "observe", spy)
     config = replace(small_config(3, 1), spec=replace(SPEC, second_gate=True, gate_axis=True))
     worlds = boxes_worlds(config)._replace(target=np.array([0, 3, 7], np.int32))
 
     @jax.jit
     def fly(params):
-        nudge = jnp.zeros((1, 3, SPEC.hidden_size))
-        make_rollout(config)(params, nudge, worlds, KEY, blind)
+        embedding_shift = jnp.zeros((1, 3, SPEC.hidden_size))
+        make_rollout(config)(params, embedding_shift, worlds, KEY, blind)
 
     fly(fresh_params(config.spec))  # nothing is returned, so little is compiled
     jax.effects_barrier()
@@ -129,7 +129,8 @@ def test_a_state_on_its_way_at_the_start_is_that_of_a_level_drone_at_rest():
     """The judge's own words for it: the third row of the rotation is (0, 0, 1)."""
     config = replace(small_config(2), physics=PointMassConfig(state_delay=1))
     zero = np.zeros(3)
-    expected = state_vector(zero, zero, np.eye(3), zero, zero)
+    seen = View(zero, np.eye(3), zero, zero, zero, zero)
+    expected = observe(config.spec, seen, zero).state
     np.testing.assert_array_equal(rollout.states_at_start(2, config), np.tile(expected, (2, 1, 1)))
 
 
@@ -159,7 +160,7 @@ def test_hovering_above_the_frame_there_is_progress_to_be_made_backwards():
         worlds = at_first_gate(config, 0.0)
         turn = worlds.scene.gates.rot_w[:, 0]
         worlds = worlds._replace(pos_w=worlds.pos_w + 1.2 * turn[:, :, 2], vel_w=-2 * turn[:, :, 0])
-        terms[approach] = np.asarray(flown(config, worlds).terms.progress[0])
+        terms[approach] = np.asarray(flown(config, worlds).terms["progress"][0])
     assert np.all(terms[0.0] > -0.3) and np.all(terms[1.5] < -0.8)
 
 
@@ -176,7 +177,7 @@ def test_beyond_the_last_gate_progress_goes_straight_on():
     worlds = worlds._replace(
         scene=worlds.scene._replace(gates=gates), target=np.full(1, center.shape[1], np.int32)
     )
-    term = flown(config, worlds).terms.progress
+    term = flown(config, worlds).terms["progress"]
     assert float(term[0, 0]) == pytest.approx(-3.0, abs=0.2)
 
 

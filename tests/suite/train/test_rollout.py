@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from policies.networks import delta_network, network
-from policies.observation import state_vector
+from policies.observation import observe
 from suite.train.dynamics import point_mass
 from suite.train.gradient import encoder_gradient, make_gradient
 from suite.train.losses import UNIT_FIELD
-from suite.train.rollout import make_rollout, target_gate
+from suite.train.rollout import make_rollout, target_gate, view_in
 from tests.support.training import (
     SPEC,
     boxes_worlds,
@@ -38,8 +38,8 @@ def loss_of(config, encode=blind):
 
     def loss(params, worlds, delta=None, field_gain=0.0):
         weighted = replace(config, loss=replace(config.loss, field_gain=field_gain))
-        nudge = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
-        return make_rollout(weighted)(params, nudge, worlds, KEY, encode, delta)[0]
+        embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
+        return make_rollout(weighted)(params, embedding_shift, worlds, KEY, encode, delta)[0]
 
     return loss
 
@@ -80,7 +80,9 @@ def test_the_encoders_gradient_does_not_depend_on_its_chunks(two_pass, monkeypat
 def test_records_are_those_of_the_flight(two_pass):
     config, worlds, _, _, loss, records = two_pass
     assert records.image.shape == (6, 4, 20, 20) and records.pos_w.shape == (6, 4, 3)
-    assert float(sum(term.mean() for term in records.terms)) == pytest.approx(float(loss), rel=1e-5)
+    assert float(sum(term.mean() for term in records.terms.values())) == pytest.approx(
+        float(loss), rel=1e-5
+    )
     first = np.linalg.norm(np.array(records.pos_w[0]) - worlds.pos_w, axis=-1)
     assert np.all(first < 8 * 0.05)
     assert np.ptp(np.array(records.image)) > 1
@@ -130,7 +132,7 @@ def fly(params, worlds):
     positions, velocities = [], []
     _, target_w = target_gate(worlds.scene.gates, worlds.target)
     for _ in range(CONFIG.episode.steps):
-        state = state_vector(body.pos_w, body.vel_w, body.rot_w, target_w, action)
+        state = observe(CONFIG.spec, view_in(worlds, body, worlds.target), action).state
         action, hidden = network.recur(params, hidden, blind(params, state), state)
         body = point_mass.step(body, worlds.constants, action, target_w, 6.0, 0.916)
         positions.append(body.pos_w)
@@ -236,8 +238,10 @@ def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
         pos_w=np.array(inside), vel_w=0 * worlds.vel_w,
         scene=worlds.scene._replace(boxes=boxes._replace(center_w=center, half_size=wall)),
     )  # fmt: skip
-    nudge = jnp.zeros((6, 4, SPEC.hidden_size))
-    _, records = jax.jit(make_rollout(config), static_argnums=4)(params, nudge, moved, KEY, blind)
-    total = np.abs(sum(np.array(term) for term in records.terms))
+    embedding_shift = jnp.zeros((6, 4, SPEC.hidden_size))
+    _, records = jax.jit(make_rollout(config), static_argnums=4)(
+        params, embedding_shift, moved, KEY, blind
+    )
+    total = np.abs(sum(np.array(term) for term in records.terms.values()))
     assert np.all(total[0] > 0)
     assert not np.any(total[1:, :2]) and np.all(total[1:, 2:] > 0)

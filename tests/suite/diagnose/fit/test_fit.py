@@ -22,6 +22,7 @@ from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)
 SPACE = make_space(LAGGED)
+NEEDED = ("acc_b", "command")
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +42,8 @@ def test_a_vector_of_numbers_is_the_vehicles_effects_and_back():
     theta[place["linear_drag", "coefficient", 1]] = 0.4
     drag = effects_at(SPACE.layout, SPACE.base, theta)["linear_drag"].coefficient
     np.testing.assert_allclose(drag, [0.0, 0.4, 0.0])
-    assert len(
-        {candidate.label for candidate in candidates(SPACE, True, {"acc_b", "command"})}
-    ) >= len(EFFECTS)
-    wind = next(
-        c for c in candidates(SPACE, True, {"acc_b", "command"}) if c.name == "constant_wind"
-    )
+    assert len({candidate.label for candidate in candidates(SPACE, True, NEEDED)}) >= len(EFFECTS)
+    wind = next(c for c in candidates(SPACE, True, NEEDED) if c.name == "constant_wind")
     assert indices_of([wind, wind]) == sorted(wind.indices)
 
 
@@ -122,7 +119,7 @@ def test_windows_are_trusted_until_the_model_leaves_the_flight(flown):
 def test_a_search_names_the_drag_and_leaves_its_result_alone(flown):
     model, windows, linear = flown
     among = [
-        c for c in candidates(SPACE, False, {"command"}) if c.name in ("linear_drag", "gyro_bias")
+        c for c in candidates(SPACE, False, NEEDED[1:]) if c.name in ("linear_drag", "gyro_bias")
     ]
     said = []
     found = search(model, windows, among, said.append, linear)

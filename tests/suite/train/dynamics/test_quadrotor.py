@@ -190,9 +190,9 @@ def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatc
     @jax.jit
     @jax.value_and_grad
     def loss(params):
-        nudge = jnp.zeros((5, 2, SPEC.hidden_size))
+        embedding_shift = jnp.zeros((5, 2, SPEC.hidden_size))
         blind = lambda p, image: jnp.zeros((2, SPEC.hidden_size))  # noqa: E731
-        return rollout(params, nudge, worlds, jax.random.key(5), blind, None)[0]
+        return rollout(params, embedding_shift, worlds, jax.random.key(5), blind, None)[0]
 
     gradient = loss(params)[1]
     rng = np.random.default_rng(0)
