@@ -98,7 +98,7 @@ def test_the_wheel_works_from_an_empty_folder(wheel, tmp_path):
     (site,) = home.glob("lib/python*/site-packages")
     # The requirements come from this environment; the suite itself must come from the wheel.
     zipfile.ZipFile(wheel).extractall(site)
-    baked = site / "tracks" / "built_from.txt"
+    baked = site / "tracks" / "common" / "built_from.txt"
     assert baked.is_file(), "the build writes the commit into the wheel"
     baked.write_text("0123abc\n")
     installed = [path for path in sys.path if path.endswith("site-packages")]

@@ -1,17 +1,14 @@
 """A trial's outcome is set by (track, difficulty, seed) alone, to the bit."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import eval.judging.judge as judge
 from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
 from tests.support.pilots import Pursuit, RandomNetwork
 
-VEHICLE = load_vehicle(Path(judge.__file__).parent / "vehicles" / "reference.toml")
+VEHICLE = load_vehicle("reference")
 TRIALS = [
     TrialSpec(track, level, seed)
     for track in ("zigzag", "circular", "ellipse")

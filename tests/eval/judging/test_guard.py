@@ -1,13 +1,10 @@
 """A policy's output checked and limited."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import eval.judging.judge as judge
 from eval.judging.guard import ActionLimits, guard_action
 from eval.judging.judge import JudgeOptions, fly
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -15,7 +12,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from tests.support.courses import straight
 from tests.support.pilots import Pursuit
 
-VEHICLE = load_vehicle(Path(judge.__file__).parent / "vehicles" / "reference.toml")
+VEHICLE = load_vehicle("reference")
 LIMITS = ActionLimits(size=10.0)
 
 

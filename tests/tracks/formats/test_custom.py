@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tracks.families import FAMILIES, make_track
 from tracks.formats.custom import load_track
-from tracks.formats.custom_save import save_track
 
 GATE = """
 [[gates]]
@@ -20,10 +18,6 @@ def write(folder, text):
     path = folder / "track.toml"
     path.write_text(text)
     return path
-
-
-def leaves(scene):
-    return [a for part in scene for a in (part if isinstance(part, tuple) else (part,))]
 
 
 def test_the_example_is_read_as_it_says(root):
@@ -70,44 +64,6 @@ def test_clockwise_polygons_are_turned_round(tmp_path):
     opening = load_track(write(tmp_path, gate)).scene.gates.opening_g[0]
     after = np.roll(opening, -1, axis=0)
     assert np.all(opening[:, 0] * after[:, 1] - opening[:, 1] * after[:, 0] > 0)
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_a_saved_track_comes_back(tmp_path, family):
-    track = make_track(family, 8, 2)
-    save_track(track, tmp_path / "copy.toml")
-    again = load_track(tmp_path / "copy.toml")
-    assert again.names == track.names and again.family == family
-    assert again.start_yaw == pytest.approx(track.start_yaw)
-    assert np.array_equal(again.start_pos_w, track.start_pos_w)
-    for mine, theirs in zip(leaves(track.scene), leaves(again.scene), strict=True):
-        assert np.allclose(mine, theirs, rtol=0, atol=1e-9)
-    assert [path.name for path in tmp_path.iterdir()] == ["copy.toml"]
-
-
-def test_meshes_and_polygons_come_back(tmp_path, root):
-    track = load_track(root / "tracks" / "examples" / "yard.toml")
-    save_track(track, tmp_path / "yard.toml")
-    again = load_track(tmp_path / "yard.toml")
-    assert again.names == track.names and again.mesh_sizes == track.mesh_sizes
-    for mine, theirs in zip(leaves(track.scene)[:-1], leaves(again.scene)[:-1], strict=True):
-        assert np.allclose(mine, theirs, rtol=0, atol=1e-9)
-
-    middles = [np.sort(t.scene.triangles.mean(1), axis=0) for t in (track, again)]
-    assert np.allclose(*middles, rtol=0, atol=1e-7)
-
-
-@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
-def test_meshes_come_from_any_common_file(tmp_path, suffix):
-    two = [trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere(2, 0.5)]
-    two[1].apply_translation([3, 0, 0])
-    trimesh.util.concatenate(two).export(tmp_path / f"two.{suffix}")
-    text = GATE + f'[[meshes]]\nfile = "two.{suffix}"\nposition = [0, 0, 1]\nscale = 0.5\n'
-    track = load_track(write(tmp_path, text))
-    assert sorted(track.mesh_sizes) == [12, 320]
-    assert np.allclose(
-        np.ptp(track.scene.triangles.reshape(-1, 3), axis=0), [1.75 + 0.25, 0.5, 0.5], atol=0.02
-    )
 
 
 BAD = {
@@ -207,21 +163,3 @@ def test_a_start_inside_a_mesh_is_refused_however_it_is_wound(tmp_path):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ValueError, match="none.toml: cannot be read"):
         load_track(tmp_path / "none.toml")
-
-
-def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
-    path = write(tmp_path, GATE + '[[meshes]]\nfile = "part.stl"\n')
-    good = trimesh.creation.box((1, 1, 1))
-    dented = good.subdivide()
-    top = np.argmax(dented.vertices @ [0, 0, 1] - np.linalg.norm(dented.vertices[:, :2], axis=-1))
-    dented.vertices[top, 2] -= 0.8
-    dented.apply_translation([4, 0, 0])
-    trimesh.util.concatenate([good, dented]).export(tmp_path / "part.stl")
-    with pytest.raises(ValueError, match=r"part.stl: part \d of 2 .*not convex.*split it"):
-        load_track(path)
-    trimesh.Trimesh(good.vertices, good.faces[:-1]).export(tmp_path / "part.stl")
-    with pytest.raises(ValueError, match=r"part 0 of 1 .11 triangles. is not closed"):
-        load_track(path)
-    (tmp_path / "part.stl").write_bytes(b"nothing of the kind")
-    with pytest.raises(ValueError, match="part.stl"):
-        load_track(path)

@@ -1,0 +1,144 @@
+"""Columns come back from Parquet and CSV as they were written; damaged files are named."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from eval.logs.columns import GROUPS
+from eval.logs.flight_log import (
+    FlightLog,
+    FlightLogError,
+    columns_from_log,
+    log_from_columns,
+    read_flight,
+    write_flight,
+)
+
+KINDS = ("parquet", "csv")
+STATE = ("time", "pos", "quat", "rate")
+
+
+def columns(rows=150, groups=(*STATE, "vel", "cmd_thrust", "cmd_rate")):
+    """The columns of a well-formed log."""
+    rng = np.random.default_rng(0)
+    made: dict[str, np.ndarray] = {
+        name: rng.normal(size=rows) for group in groups for name in GROUPS[group]
+    }
+    made["time"] = np.arange(rows) / 100
+    quat = rng.normal(size=(rows, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    return made | dict(zip(GROUPS["quat"], quat.T, strict=True))
+
+
+def write_table(path, table, metadata=None):
+    arrow = pa.table({name: pa.array(values) for name, values in table.items()})
+    if path.suffix == ".parquet":
+        pyarrow.parquet.write_table(arrow.replace_schema_metadata(metadata), path)
+    else:
+        pyarrow.csv.write_csv(arrow, path)
+    return path
+
+
+def assert_same(one: FlightLog, other: FlightLog):
+    a, b = columns_from_log(one), columns_from_log(other)
+    assert list(a) == list(b)
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data(), kind=st.sampled_from(KINDS))
+def test_any_values_round_trip_to_the_last_bit(tmp_path, data, kind):
+    rows = data.draw(st.integers(2, 12))
+    number = st.one_of(st.floats(-190, 190), st.just(float("nan")))
+    values = npst.arrays(np.float64, (rows, 18), elements=number)
+    many = data.draw(values)
+    many[0] = np.nan_to_num(many[0])  # a group without any value reads as one that is not there
+    step = npst.arrays(np.float64, rows, elements=st.floats(1.0 / 3, 1e3))
+    quat = np.tile([0.6, 0.0, -0.8, 0.0], (rows, 1))
+    log = FlightLog(
+        "any",
+        time_s=np.cumsum(data.draw(step)) + 1.7e9 * data.draw(st.booleans()) + rows,
+        pos_w=many[:, :3],
+        quat_wxyz=quat,
+        vel_w=many[:, 3:6],
+        rate_b=many[:, 6:9],
+        rotor_speed=many[:, 9:13],
+        rotor_speed_cmd=many[:, 13:17],
+        voltage=many[:, 17],
+    )
+    if log.duration_s < 1:
+        log = replace(log, time_s=log.time_s + np.arange(rows))
+    back = read_flight(write_flight(tmp_path / f"any.{kind}", log))
+    assert_same(log, back)
+    a, b = columns_from_log(log), columns_from_log(back)
+    assert all(a[name].tobytes() == b[name].tobytes() for name in a if not np.isnan(a[name]).any())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_unknown_columns_of_any_type_and_metadata_are_kept(tmp_path, kind):
+    table = columns() | {"mode": np.array(["rate"] * 150), "count": np.arange(150)}
+    metadata = {"flight": json.dumps({"vehicle": "x", "notes": "windy"})}
+    log = read_flight(write_table(tmp_path / f"in.{kind}", table, metadata))
+    assert list(log.extra) == ["mode", "count"] and set(log.extra["mode"]) == {"rate"}
+    if kind == "parquet":
+        assert log.about == {"vehicle": "x", "notes": "windy"}
+    again = read_flight(write_flight(tmp_path / f"out.{kind}", log))
+    assert_same(log, again)
+    assert again.action_b is None and again.policy_step is None and again.gate is None
+    foreign = replace(log, extra={"gate": np.array(["north"] * 150)})
+    assert foreign.gate is None
+
+
+def test_files_that_are_no_logs_are_refused(tmp_path):
+    good = write_table(tmp_path / "good.parquet", columns()).read_bytes()
+    text = write_table(tmp_path / "good.csv", columns()).read_text()
+    lines = text.splitlines()
+    cases = {
+        "empty.csv": (b"", "empty"),
+        "cut.parquet": (good[: len(good) // 2], "corrupt Parquet"),
+        "text.parquet": (b"hello", "not a Parquet"),
+        "binary.csv": (bytes(range(256)), "neither a Parquet file nor CSV"),
+        "semicolons.csv": (text.replace(",", ";").encode(), "commas"),
+        "header.csv": (lines[0].encode() + b"\n", "no rows"),
+        "word.csv": (text.replace(lines[5].split(",")[0], "oops", 1).encode(), "oops"),
+        "short.csv": ("\n".join([*lines[:3], "1,2", *lines[3:]]).encode(), "row 3: 2 values"),
+        "twice.csv": (text.replace('"pos_y"', '"pos_x"').encode(), "twice"),
+    }
+    for name, (content, reason) in cases.items():
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(FlightLogError) as caught:
+            read_flight(path)
+        assert reason in str(caught.value), (name, str(caught.value))
+        assert str(path) in str(caught.value)
+    for path in (tmp_path / "nowhere.csv", tmp_path):
+        with pytest.raises(FlightLogError, match="cannot be read"):
+            read_flight(path)
+
+
+def test_a_last_line_that_was_cut_is_left_out_with_a_warning(tmp_path):
+    path = write_table(tmp_path / "cut.csv", columns())
+    path.write_text(path.read_text().rstrip("\n").rsplit(",", 3)[0])
+    log = read_flight(path)
+    assert len(log.time_s) == 149
+    assert "row 150" in log.warnings[0] and str(path) in log.warnings[0]
+
+
+def test_nothing_is_written_that_could_not_be_read(tmp_path):
+    log = log_from_columns(columns(), {}, "a")
+    with pytest.raises(FlightLogError, match="infinite"):
+        write_flight(tmp_path / "a.csv", replace(log, pos_w=log.pos_w + np.inf))
+    with pytest.raises(FlightLogError, match="149 values"):
+        write_flight(tmp_path / "a.csv", replace(log, thrust_cmd=np.zeros(149)))
+    with pytest.raises(FlightLogError, match="ending"):
+        write_flight(tmp_path / "a.txt", log)
+    assert not list(tmp_path.iterdir())

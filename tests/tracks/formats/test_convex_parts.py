@@ -1,0 +1,51 @@
+"""Mesh files come in as convex closed parts, or are refused by name."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from tracks.formats.custom import load_track
+
+GATE = """
+[[gates]]
+center = [0, 0, 1.5]
+width = 1.0
+height = 1.0
+"""
+
+
+def write(folder, text):
+    path = folder / "track.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+def test_meshes_come_from_any_common_file(tmp_path, suffix):
+    two = [trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere(2, 0.5)]
+    two[1].apply_translation([3, 0, 0])
+    trimesh.util.concatenate(two).export(tmp_path / f"two.{suffix}")
+    text = GATE + f'[[meshes]]\nfile = "two.{suffix}"\nposition = [0, 0, 1]\nscale = 0.5\n'
+    track = load_track(write(tmp_path, text))
+    assert sorted(track.mesh_sizes) == [12, 320]
+    assert np.allclose(
+        np.ptp(track.scene.triangles.reshape(-1, 3), axis=0), [1.75 + 0.25, 0.5, 0.5], atol=0.02
+    )
+
+
+def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
+    path = write(tmp_path, GATE + '[[meshes]]\nfile = "part.stl"\n')
+    good = trimesh.creation.box((1, 1, 1))
+    dented = good.subdivide()
+    top = np.argmax(dented.vertices @ [0, 0, 1] - np.linalg.norm(dented.vertices[:, :2], axis=-1))
+    dented.vertices[top, 2] -= 0.8
+    dented.apply_translation([4, 0, 0])
+    trimesh.util.concatenate([good, dented]).export(tmp_path / "part.stl")
+    with pytest.raises(ValueError, match=r"part.stl: part \d of 2 .*not convex.*split it"):
+        load_track(path)
+    trimesh.Trimesh(good.vertices, good.faces[:-1]).export(tmp_path / "part.stl")
+    with pytest.raises(ValueError, match=r"part 0 of 1 .11 triangles. is not closed"):
+        load_track(path)
+    (tmp_path / "part.stl").write_bytes(b"nothing of the kind")
+    with pytest.raises(ValueError, match="part.stl"):
+        load_track(path)
