@@ -77,7 +77,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     import functools
 
     from suite.common.estimate import Estimate, announce
-    from suite.common.side_by_side import all_done, check_jobs
+    from suite.common.work import all_done, check_jobs
     from suite.experiments.ablation_tables import ablation_report, summaries
     from suite.experiments.document import write_document
     from suite.train.run import estimate

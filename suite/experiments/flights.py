@@ -6,17 +6,17 @@ cache, and each trial goes there as it ends; documents that share flights share 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
-from eval.judging.judge import JudgeOptions, fly
+from eval.judging.judge import JudgeOptions, Task, fly_share
 from eval.judging.results import Journal
 from eval.judging.sensors import SensorNoise
-from eval.judging.sharding import fly_in_processes, usable_cores
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy, load_policy
@@ -30,6 +30,7 @@ from suite.judging.flying import (
     TRIALS_A_PROCESS,
     policy_digest,
 )
+from tracks.common.work import usable_cores, work_off
 
 
 @dataclass(frozen=True)
@@ -102,11 +103,14 @@ def flown(
             numbers = count(total - left + 1)
             with console.progress(what, total) as update:
 
-                def keep(number: int, result: TrialResult) -> None:
+                def keep(piece: int, ended: tuple[int, TrialResult]) -> None:
+                    number, result = ended
                     open_journals[number].append(result)
                     update(next(numbers))
 
-                _fly(fliers, _shares(missing, processes), processes, keep)
+                shares = _shares(missing, processes)
+                pieces = [shares[k::processes] for k in range(processes)]
+                work_off(partial(_fly_shares, fliers), pieces, processes, keep)
     return [
         [journals[key].done[trial] for trial in order.trials]
         for key, order in zip(keys, orders, strict=True)
@@ -137,35 +141,16 @@ def _shares(missing: Sequence[list[TrialSpec]], processes: int) -> list[Share]:
     return shares
 
 
-def _fly(
-    fliers: list[Flier],
-    shares: list[Share],
-    processes: int,
-    keep: Callable[[int, TrialResult], None],
-) -> None:
-    if processes > 1:
-        fly_in_processes(_fly_shares, fliers, shares, processes, keep)
-    else:
-        _fly_shares(fliers, shares, keep)
-
-
 def _fly_shares(
-    fliers: list[Flier], shares: list[Share], emit: Callable[[int, TrialResult], None]
-) -> None:
-    """Fly in this process; each policy is loaded and compiled once."""
+    fliers: Sequence[Flier], shares: Sequence[Share]
+) -> Iterator[tuple[int, TrialResult]]:
+    """Yield (number of the flier, result) of trials flown here; each policy is loaded once."""
     loaded: dict[str, Policy] = {}
     for number, trials in shares:
         flier = fliers[number]
         if flier.policy not in loaded:
             loaded[flier.policy] = load_policy(flier.policy)
-
-        def emit_one(result: TrialResult, flight: object, number: int = number) -> None:
-            emit(number, result)
-
-        fly(
-            loaded[flier.policy],
-            trials,
-            flier.vehicle,
-            options=JudgeOptions(processes=1, noise=flier.noise),
-            on_result=emit_one,
-        )
+        options = JudgeOptions(processes=1, noise=flier.noise)
+        task = Task(loaded[flier.policy], flier.vehicle, options=options)
+        for _, result, _ in fly_share(task, list(enumerate(trials))):
+            yield number, result

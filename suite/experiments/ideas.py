@@ -98,7 +98,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     import functools
 
     from eval.quadrotor.vehicle_file import load_vehicle
-    from suite.common.side_by_side import all_done, check_jobs
+    from suite.common.work import all_done, check_jobs
     from suite.experiments.document import write_document
     from suite.experiments.flights import Flier, Order, flown
     from suite.experiments.ideas_tables import ideas_report

@@ -57,7 +57,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     import functools
 
     from eval.quadrotor.vehicle_file import load_vehicle
-    from suite.common.side_by_side import all_done, check_jobs
+    from suite.common.work import all_done, check_jobs
     from suite.experiments.conditions import sweep_conditions, sweeps
     from suite.experiments.document import write_document
     from suite.experiments.randomisation_tables import randomisation_report

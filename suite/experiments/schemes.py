@@ -93,7 +93,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     """
     import functools
 
-    from suite.common.side_by_side import all_done, check_jobs
+    from suite.common.work import all_done, check_jobs
     from suite.experiments.document import write_document
     from suite.experiments.scheme_curves import summaries
     from suite.experiments.scheme_tables import scheme_report

@@ -52,7 +52,7 @@ def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
     """
     from eval.judging.tables import summarise
     from eval.quadrotor.vehicle_file import load_vehicle
-    from suite.common.side_by_side import check_jobs
+    from suite.common.work import check_jobs
     from suite.experiments.document import write_document
     from suite.experiments.flights import Flier, Order, flown
     from suite.experiments.seed_tables import seed_report, spread
@@ -101,7 +101,7 @@ def _trained(config: Config, place: Place, console: Console) -> dict[str, str]:
     import functools
     from dataclasses import replace
 
-    from suite.common.side_by_side import all_done
+    from suite.common.work import all_done
     from suite.experiments.recipes import asked_recipe, check_seeds
     from suite.experiments.trainings import trained_policy
 
