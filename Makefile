@@ -2,6 +2,7 @@
 # make race   the whole loop at a small size: train, fly, record, fit, fine-tune, fly again
 # make test   lint, types and tests
 # make lint   ruff and pyright
+# make docs   the pages of docs/ as a site in site/, links checked
 # make lock   requirements.lock from what is installed in .venv
 # make clean  remove caches and build products (runs/ and .venv stay)
 
@@ -14,7 +15,7 @@ USABLE := import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3,
 
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: env race test lint lock clean
+.PHONY: env race test lint docs lock clean
 
 env: $(STAMP)
 
@@ -43,10 +44,14 @@ lint: $(STAMP)
 test: lint
 	$(PY) -m pytest -n $(JOBS) --dist worksteal
 
+docs: $(STAMP)
+	$(PY) -m mkdocs build --quiet --clean --strict
+	@echo "open site/index.html"
+
 lock:
 	$(PY) tools/lock.py > requirements.lock.new
 	mv requirements.lock.new requirements.lock
 
 clean:
-	rm -rf build dist .cache .pytest_cache .hypothesis .ruff_cache *.egg-info
+	rm -rf build dist site .cache .pytest_cache .hypothesis .ruff_cache *.egg-info
 	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +

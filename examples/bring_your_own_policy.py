@@ -38,7 +38,7 @@ def main(folder: Path) -> None:
     path = folder / "to_the_gate.pt2"
     torch.export.save(program, path, extra_files={"policy.json": label})
 
-    policy = load_policy(path, trust=True)  # a .pt2 can run code; this one is our own
+    policy = load_policy(path, trust=True)  # a .pt2 holds code; this one is ours
     state = np.zeros((1, 12), np.float32)
     state[0, 5] = 1.0  # level: world z is body z
     state[0, 6:9] = [4.0, 3.0, 0.0]  # the gate is 5 m away, ahead and to the left

@@ -72,6 +72,8 @@ def json_digest(path: Path) -> str:
     def bare(value: Any) -> Any:
         if isinstance(value, dict):
             return {k: bare(v) for k, v in value.items() if k not in STAMPS}
+        if isinstance(value, str) and "/" in value:  # a path in the folder of the run
+            return value.rsplit("/", 1)[1]
         return [bare(v) for v in value] if isinstance(value, list) else value
 
     text = json.dumps(bare(json.loads(path.read_text())), sort_keys=True)

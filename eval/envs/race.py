@@ -1,4 +1,4 @@
-"""One race on MuJoCo's plain C engine, driven action by action: what both environments wrap."""
+"""One race on MuJoCo's C engine, driven action by action: what both environments wrap."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from eval.judging.guard import ActionLimits, guard_action
-from eval.quadrotor.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
+from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.engine import Eye, compile_model, motion_of, start_state
@@ -46,20 +46,20 @@ class Race:
     def __init__(self, track: Track, vehicle: Vehicle, spec: PolicySpec, rules: Rules) -> None:
         """Compile the model of `vehicle` on `track`."""
         self.spec, self.rules = spec, rules
-        self.cockpit = make_cockpit(vehicle)
+        self.autopilot = make_autopilot(vehicle)
         layout = layout_of([track])
-        self.model = compile_model(track, vehicle, self.cockpit.dt, layout.solids)
-        self.steps_a_decision = max(1, round(1 / (spec.rate_hz * self.cockpit.dt)))
+        self.model = compile_model(track, vehicle, self.autopilot.dt, layout.solids)
+        self.steps_a_decision = max(1, round(1 / (spec.rate_hz * self.autopilot.dt)))
         self._start = start_state(track)
         gates = Gates(*(np.asarray(field)[None] for field in track.scene.gates))
         self._course = Course(gates, np.array([gates.center_w.shape[1]], np.int32))
         self._draws: np.ndarray | None = None
-        if uses_noise(self.cockpit.plant):
+        if uses_noise(self.autopilot.plant):
             trial = TrialSpec(track.family, track.level, track.seed)
-            steps = round(rules.time_limit_s / self.cockpit.dt)
+            steps = round(rules.time_limit_s / self.autopilot.dt)
             self._draws = noise_of(trial, steps + self.steps_a_decision + 2)
         self._eye = Eye(spec.camera)
-        self._pilot: Autopilot
+        self._loops: AutopilotState
         self.progress: Progress
         self.action_b = np.zeros((1, 3))
 
@@ -75,7 +75,7 @@ class Race:
         mujoco.mj_step1(self.model, data)
         motion = motion_of(data)
         noise = None if self._draws is None else self._draws[:1]
-        self._pilot = start_autopilot(self.cockpit, motion, noise)
+        self._loops = start_autopilot(self.autopilot, motion, noise)
         self.progress = start_progress(motion.pos_w)
         self.action_b = np.zeros((1, 3))
         self._judge(data, bad_wrench=False)
@@ -97,16 +97,16 @@ class Race:
             motion, step = motion_of(data), before.step
             gate_w = next_gate(self._course, before.gates).center_w
             noise = None if self._draws is None else self._draws[step + 1]
-            self._pilot, (force_b, torque_b) = fly_step(
-                self.cockpit, self._pilot, motion, self.action_b, gate_w, step, noise
+            self._loops, wrench = autopilot_step(
+                self.autopilot, self._loops, motion, self.action_b, gate_w, step, noise
             )
-            good = bool(is_wrench(self.rules, force_b, torque_b)[0])
+            good = bool(is_wrench(self.rules, wrench)[0])
             if good:
-                data.qfrc_applied[:3] = to_world(motion.rot_w, force_b)[0]
-                data.qfrc_applied[3:] = torque_b[0]
+                data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
+                data.qfrc_applied[3:] = wrench.torque_b[0]
                 mujoco.mj_step2(self.model, data)
             self.progress = before._replace(step=step + np.int32(1))
-            if good and not has_diverged(self.rules, *_state(data))[0]:
+            if good and not has_diverged(self.rules, motion_of(data))[0]:
                 mujoco.mj_step1(self.model, data)
                 self._judge(data, bad_wrench=False)
             else:
@@ -125,10 +125,8 @@ class Race:
                 self.rules,
                 self.progress,
                 self._course,
-                self.cockpit.dt,
-                motion.pos_w,
-                motion.rot_w,
-                motion.vel_w,
+                self.autopilot.dt,
+                motion,
                 np.array([data.ncon > 0]),
                 np.array([bad_wrench]),
             )
@@ -150,10 +148,6 @@ class Race:
             "state": np.clip(state, -STATE_LIMIT, STATE_LIMIT).astype(np.float32),
             "image": image.astype(np.float32),
         }
-
-
-def _state(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return data.qpos[None, :3], data.qvel[None, :3], data.qvel[None, 3:]
 
 
 def _distance(a_w: np.ndarray, b_w: np.ndarray) -> float:

@@ -20,7 +20,7 @@ from eval.judging.recorder import Recorder
 from eval.judging.sensors import SensorNoise, Sensors, check_noise
 from eval.logs.flight import Flight
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import PLAIN, World, world_class
+from eval.worlds import REFERENCE, World, world_class
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import (
     DIVERGED,
@@ -120,8 +120,10 @@ def fly(
     for trial in trials:
         if trial.track not in (tracks or {}):
             check_family(trial.track)
-    if world == PLAIN and record:
-        raise ValueError("world 'plain' records no flights; record in 'mujoco', which flies alike")
+    if world == REFERENCE and record:
+        raise ValueError(
+            "world 'reference' records no flights; record in 'mujoco', which flies alike"
+        )
     task = Task(policy, vehicle, world, options, record, tracks or {})
     results: dict[int, TrialResult] = {}
 
@@ -157,9 +159,9 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     """Fly numbered trials in this process and yield each as it ends."""
     policy = task.policy if _is_policy(task.policy) else task.policy()
     options = task.options
-    if task.world == PLAIN:
+    if task.world == REFERENCE:
         for index, trial in share:
-            result = world_class(PLAIN)(
+            result = world_class(REFERENCE)(
                 policy, trial, track_of(task.tracks, trial), task.vehicle, options.rules,
                 options.limits, options.slots, options.noise,
             )  # fmt: skip
@@ -276,7 +278,7 @@ class _Slots:
             success=ended == FINISHED,
             gates_passed=int(progress.gates[slot]),
             ended_by=how,
-            collided_with=self._world.touched(slot) if how == "collision" else None,
+            collided_with=self._world.collided_with(slot) if how == "collision" else None,
             pos_x=float(progress.pos_w[slot, 0]),
             pos_y=float(progress.pos_w[slot, 1]),
             pos_z=float(progress.pos_w[slot, 2]),

@@ -7,19 +7,12 @@ rotors, effects) runs at every one. Pure, for numpy and JAX, over N vehicles at 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
-from eval.quadrotor.plant import (
-    Command,
-    Motion,
-    Plant,
-    Wrench,
-    make_plant,
-    plant_step,
-    start_memory,
-)
+from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant
+from eval.quadrotor.stepper import Inputs, PlantState, hover_state, plant_step
 from eval.vehicles.vehicle import Controller, Vehicle
 from tracks.common.tree_rows import packed, select
 from tracks.geometry.scene import Array
@@ -29,8 +22,8 @@ ATTITUDE_HZ = 100.0
 
 
 @dataclass(frozen=True)
-class Cockpit:
-    """Everything that stays the same while a vehicle flies."""
+class Autopilot:
+    """The loops and the plant that they fly: what stays the same during a flight."""
 
     plant: Plant
     controller: Controller
@@ -40,67 +33,68 @@ class Cockpit:
     """Physics steps a command of the attitude loop holds."""
 
 
-class Autopilot(NamedTuple):
-    """What the loops of N vehicles remember."""
+class AutopilotState(NamedTuple):
+    """What the loops of N vehicles carry from step to step."""
 
-    memory: Any
-    """The plant's (N, ...)."""
+    plant: PlantState
+    """(N, ...)."""
     command: Command
     """Held between steps of the attitude loop."""
     heading_w: Array
     """(N, 3) wanted heading, horizontal unit vectors."""
 
 
-def make_cockpit(vehicle: Vehicle) -> Cockpit:
+def make_autopilot(vehicle: Vehicle) -> Autopilot:
     """Return what flies `vehicle`, at its rate loop's frequency."""
     dt = 1.0 / vehicle.controller.frequency
     every = max(1, round(vehicle.controller.frequency / ATTITUDE_HZ))
-    return Cockpit(make_plant(vehicle, dt), vehicle.controller, dt, every)
+    return Autopilot(make_plant(vehicle, dt), vehicle.controller, dt, every)
 
 
-def start_autopilot(cockpit: Cockpit, motion: Motion, noise: Array | None = None) -> Autopilot:
+def start_autopilot(
+    autopilot: Autopilot, motion: Motion, noise: Array | None = None
+) -> AutopilotState:
     """Return the loops of N vehicles that hovered until now, heading as their body x does.
 
     Args:
-        cockpit: from `make_cockpit`.
+        autopilot: from `make_autopilot`.
         motion: (N, ...) at the start.
         noise: (N, 3) normal draws for the wind at the start, or None.
     """
     xp = motion.pos_w.__array_namespace__()
     n = motion.pos_w.shape[0]
-    memory = start_memory(cockpit.plant, (n,), xp, noise)
+    plant = hover_state(autopilot.plant, (n,), xp, noise)
     hover = Command(xp.full((n,), GRAVITY), xp.zeros((n, 3)))
-    return packed(Autopilot(memory, hover, level_heading(motion.rot_w)))
+    return packed(AutopilotState(plant, hover, level_heading(motion.rot_w)))
 
 
-def fly_step(
-    cockpit: Cockpit,
-    pilot: Autopilot,
+def autopilot_step(
+    autopilot: Autopilot,
+    state: AutopilotState,
     motion: Motion,
     action_b: Array,
     gate_w: Array,
     step: Array,
     noise: Array | None = None,
-) -> tuple[Autopilot, Wrench]:
+) -> tuple[AutopilotState, Wrench]:
     """Return the loops after a physics step and the wrench to hold during it.
 
     Args:
-        cockpit: from `make_cockpit`.
-        pilot: from `start_autopilot` or the step before.
+        autopilot: from `make_autopilot`.
+        state: from `start_autopilot` or the step before.
         motion: (N, ...) at the start of the step.
         action_b: (N, 3) the policy's [m/s^2].
         gate_w: (N, 3) centre of the next gate, which the heading follows [m].
         step: (N,) physics steps flown; the attitude loop runs at multiples of `attitude_every`.
         noise: (N, 3) normal draws for random wind, or None.
     """
-    due = step % cockpit.attitude_every == 0
-    period = cockpit.attitude_every * cockpit.dt
-    heading_w = blend_heading(pilot.heading_w, gate_w - motion.pos_w, period)
+    due = step % autopilot.attitude_every == 0
+    period = autopilot.attitude_every * autopilot.dt
+    heading_w = blend_heading(state.heading_w, gate_w - motion.pos_w, period)
     force_w = action_to_force(action_b, motion.rot_w)
-    command = attitude_command(cockpit.controller, force_w, motion.rot_w, heading_w)
-    command = select(due, command, pilot.command)
-    heading_w = select(due, heading_w, pilot.heading_w)
-    memory, wrench = plant_step(
-        cockpit.plant, pilot.memory, motion, command, step * cockpit.dt, noise
-    )
-    return packed(Autopilot(memory, command, heading_w)), wrench
+    command = attitude_command(autopilot.controller, force_w, motion.rot_w, heading_w)
+    command = select(due, command, state.command)
+    heading_w = select(due, heading_w, state.heading_w)
+    inputs = Inputs(command, noise=noise)
+    plant, wrench = plant_step(autopilot.plant, state.plant, motion, inputs, step * autopilot.dt)
+    return packed(AutopilotState(plant, command, heading_w)), wrench

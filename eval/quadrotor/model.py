@@ -33,7 +33,7 @@ def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
     """Add `vehicle` to the world body of `spec`, with its effects on mass, inertia and gravity.
 
     The body's origin is the true centre of mass. Gravity of the whole model is set, for a tilted
-    frame. After compiling, call `set_true_inertia`.
+    frame. `compile_quadrotor` is what makes a model of it.
 
     Args:
         spec: to be added to; its integrator must stay Euler for parity with the JAX quadrotor.
@@ -76,17 +76,20 @@ def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
     _add_camera(body, vehicle, origin)
 
 
-def set_true_inertia(model: mujoco.MjModel, vehicle: Vehicle) -> None:
-    """Set the true inertia in a compiled `model`.
+def compile_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle, dt: float) -> mujoco.MjModel:
+    """Return the model of `spec` with `vehicle` in it, for steps of `dt` [s].
 
     MuJoCo's compiler refuses moments of inertia that break the triangle inequality, which a
     fitted or assumed `inertia_scale` of a flat quadrotor easily does by a few percent; its
-    dynamics do not mind.
+    dynamics do not mind. The true ones are set in the compiled model.
     """
-    constants = make_plant(vehicle, 1.0 / vehicle.controller.frequency).constants
-    model.body(BODY).inertia[:] = constants.inertia
+    spec.option.timestep = dt
+    add_quadrotor(spec, vehicle)
+    model = spec.compile()
+    model.body(BODY).inertia[:] = make_plant(vehicle, dt).constants.inertia
     # For a lone free body MuJoCo steps with constants that it derived from the inertia.
     mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
 
 
 def _possible(inertia: np.ndarray) -> np.ndarray:

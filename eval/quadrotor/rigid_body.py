@@ -11,8 +11,8 @@ def accelerations(plant: Plant, motion: Motion, wrench: Wrench) -> tuple[Array, 
     """Return dv/dt in the world (..., 3) [m/s^2] and dw/dt in body axes (..., 3) [rad/s^2]."""
     constants = plant.constants
     force_w = to_world(motion.rot_w, wrench.force_b)
-    spin_b = constants.inertia * motion.rate_b
-    torque_b = wrench.torque_b - cross(motion.rate_b, spin_b)
+    momentum_b = constants.inertia * motion.rate_b
+    torque_b = wrench.torque_b - cross(motion.rate_b, momentum_b)
     return force_w / constants.mass[..., None] + constants.gravity_w, torque_b / constants.inertia
 
 

@@ -10,7 +10,7 @@ NEGLIGIBLE = 1e-6
 """Thrusts below this are none [N]."""
 
 
-class Spin(NamedTuple):
+class RotorStep(NamedTuple):
     """What the rotors do during one physics step; means are exact for a constant command."""
 
     end: Array
@@ -30,7 +30,7 @@ def speed_command(thrust: Array, thrust_coefficient: float) -> Array:
     return xp.where(pushes, xp.sqrt(xp.where(pushes, thrust, 1.0) / thrust_coefficient), 0.0)
 
 
-def follow(speed: Array, command: Array, time_constant: Array, dt: Array) -> Spin:
+def follow(speed: Array, command: Array, time_constant: Array, dt: Array) -> RotorStep:
     """Return the rotors' step under dOmega/dt = (command - Omega) / time_constant.
 
     The thrust of a step is that of the mean square and not of the speed at one of its ends, so
@@ -56,9 +56,9 @@ def follow(speed: Array, command: Array, time_constant: Array, dt: Array) -> Spi
         + 2.0 * command * behind * steps * (1.0 - left)
         + behind**2 * 0.5 * steps * (1.0 - left**2)
     )
-    return Spin(command + behind * left, mean, mean_square)
+    return RotorStep(command + behind * left, mean, mean_square)
 
 
-def steady(speed: Array) -> Spin:
+def steady(speed: Array) -> RotorStep:
     """Return the step of rotors that hold `speed` (..., 4) [rad/s], as when it was measured."""
-    return Spin(speed, speed, speed**2)
+    return RotorStep(speed, speed, speed**2)

@@ -17,8 +17,8 @@ from typing import Any
 
 from eval.effects import EFFECTS, find_effect
 from eval.effects.interface import Effect, at
-from eval.quadrotor.vehicle_check import check_vehicle
-from eval.vehicles.vehicle import Body, Controller, Rotors, Vehicle
+from eval.vehicles.vehicle import CollisionBox, Controller, Rotors, Vehicle
+from eval.vehicles.vehicle_check import check_vehicle
 from tracks.common.files import write_text
 from tracks.common.names import closest, unknown_name
 from tracks.common.toml_text import to_toml
@@ -114,8 +114,7 @@ def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = 
 
 def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
     """Return `vehicle` as the nested table of its file: strings, numbers, lists and dicts."""
-    rotors, controller, camera = vehicle.rotors, vehicle.controller, vehicle.camera
-    effects = {}
+    camera, effects = vehicle.camera, {}
     for name in EFFECTS:
         if name in vehicle.effects:
             values = vehicle.effects[name]
@@ -126,21 +125,9 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
         "schema": SCHEMA,
         "mass": vehicle.mass,
         "inertia": list(vehicle.inertia),
-        "rotors": {
-            "position": [list(hub) for hub in rotors.position],
-            "spin": list(rotors.spin),
-            "thrust_coefficient": rotors.thrust_coefficient,
-            "torque_coefficient": rotors.torque_coefficient,
-            "time_constant": rotors.time_constant,
-            "speed_max": rotors.speed_max,
-        },
-        "controller": {
-            "rate_gain": list(controller.rate_gain),
-            "frequency": controller.frequency,
-            "attitude_gain": list(controller.attitude_gain),
-            "rate_max": list(controller.rate_max),
-        },
-        "body": {"half_size": list(vehicle.body.half_size)},
+        "rotors": {**_plain(vars(vehicle.rotors)), "spin": list(vehicle.rotors.spin)},
+        "controller": _plain(vars(vehicle.controller)),
+        "body": _plain(vars(vehicle.body)),
         "camera": {
             "pitch_deg": camera.pitch_deg,
             "fov_deg": list(camera.fov_deg),
@@ -238,11 +225,9 @@ def _controller(table: Mapping[str, Any]) -> Controller:
     )
 
 
-def _body(table: Mapping[str, Any]) -> Body:
+def _body(table: Mapping[str, Any]) -> CollisionBox:
     _known_keys("body.", table, ["half_size"])
-    return Body(
-        **{key: _numbers(f"body.{key}", value, 3) for key, value in table.items()},
-    )
+    return CollisionBox(**{key: _numbers(f"body.{key}", table[key], 3) for key in table})
 
 
 def _camera(table: Mapping[str, Any]) -> Camera:

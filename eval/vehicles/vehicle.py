@@ -53,8 +53,8 @@ class Controller:
 
 
 @dataclass(frozen=True)
-class Body:
-    """What collides."""
+class CollisionBox:
+    """What collides: the vehicle file's `[body]`."""
 
     half_size: Vector = (0.064, 0.064, 0.025)
     """Half of the edges of a box around the origin [m]."""
@@ -71,7 +71,7 @@ class Vehicle:
     """Nominal, principal, body axes [kg m^2]."""
     rotors: Rotors
     controller: Controller
-    body: Body = field(default_factory=Body)
+    body: CollisionBox = field(default_factory=CollisionBox)
     camera: Camera = field(default_factory=Camera)
     effects: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     """Values (the effect's NamedTuple) by the effect's name, see `eval.effects.EFFECTS`."""

@@ -25,12 +25,28 @@ class Tab(NamedTuple):
     """(3,) upper corner [m]."""
 
 
-def layout(tabs: Sequence[Tab]) -> rrb.Blueprint:
-    """Return the blueprint of a recording with these trials."""
-    parts = [_tab(tab) for tab in tabs]
+def layout(tabs: Sequence[Tab], shown_s: tuple[float, float]) -> rrb.Blueprint:
+    """Return the blueprint of a recording with these trials, which plays `shown_s` [s]."""
+    return tabbed([_tab(tab) for tab in tabs], shown_s)
+
+
+def tabbed(parts: Sequence[rrb.Container], shown_s: tuple[float, float]) -> rrb.Blueprint:
+    """Return a blueprint with a tab for each of `parts`, which plays between two times [s].
+
+    The viewer has no setting for where the time stands, but a loop over a selection begins at the
+    selection's first moment. A file without it opens at its last moment, when all is over. (A
+    viewer that is slow to load plays from the start to the end and stops there: 0.41.)
+    """
+    begin, end = (round(1e9 * time) for time in shown_s)
     return rrb.Blueprint(
         parts[0] if len(parts) == 1 else rrb.Tabs(*parts, active_tab=0),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+        rrb.TimePanel(
+            state="expanded",
+            timeline=TIMELINE,
+            play_state="playing",
+            loop_mode="selection",
+            time_selection=rrb.components.AbsoluteTimeRange(begin, max(end, begin + 1)),
+        ),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         auto_views=False,
@@ -67,19 +83,25 @@ def _tab(tab: Tab) -> rrb.Vertical:
     if tab.has_depth:
         camera = f"{world}/drone/camera"
         beside.append(rrb.Spatial2DView(origin=camera, name="depth image it saw"))
-    plots = [
-        ("speed", "speed [m/s]"),
-        ("thrust", "thrust command [m/s²]"),
-        ("rates", "body rates [rad/s]"),
-        ("action", "policy's action, body [m/s²]"),
-        ("rotors", "rotor speeds [rad/s]"),
-    ]
-    series = [rrb.TimeSeriesView(origin=f"{tab.root}/{name}", name=title) for name, title in plots]
+    plots = {
+        "speed": "speed [m/s]",
+        "rates": "body rates [rad/s]",
+        "action": "policy's action, body [m/s²]",
+        "thrust": "thrust command [m/s²]",
+        "rotors": "rotor speeds [rad/s]",
+    }
+    speed, rates, *others = (
+        rrb.TimeSeriesView(origin=f"{tab.root}/{name}", name=title) for name, title in plots.items()
+    )
+    events = rrb.TextLogView(
+        origin=f"{tab.root}/events",
+        name="events",
+        columns=rrb.archetypes.TextLogColumns(text_log_columns=["body"]),
+    )
     return rrb.Vertical(
         rrb.Horizontal(overview, rrb.Vertical(*beside), column_shares=[2.2, 1.0]),
-        rrb.Horizontal(*series[:3]),
-        rrb.Horizontal(*series[3:], rrb.TextLogView(origin=f"{tab.root}/events", name="events")),
-        row_shares=[3.0, 1.0, 1.0],
+        rrb.Horizontal(speed, rates, rrb.Tabs(*others), events, column_shares=[2, 2, 2, 1]),
+        row_shares=[3.0, 1.0],
         name=tab.title,
     )
 

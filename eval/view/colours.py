@@ -14,6 +14,8 @@ DRONE = (40, 44, 52)
 AXES = ((220, 60, 60), (60, 160, 70), (60, 100, 220))
 """x, y and z."""
 
+LIGHT_W = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82])
+"""Unit vector towards the light."""
 SPEED_MAP = ListedColormap(colormaps["plasma"](np.linspace(0, 0.9, 256)))
 """Colours of the speed, without the yellow that is hard to see on white."""
 DEPTH_MAP = colormaps["turbo"]
@@ -32,6 +34,11 @@ def speed_colours(speed: np.ndarray, top: float) -> np.ndarray:
 def top_speed(speed: np.ndarray) -> float:
     """Return the speed that the colours end at, at least 1 [m/s]."""
     return max(1.0, float(np.nanmax(speed, initial=1.0)))
+
+
+def brightness(normals_w: np.ndarray) -> np.ndarray:
+    """Return what share of its colour a face of unit normal (..., 3) shows, 0.44 to 1."""
+    return 0.72 + 0.28 * (normals_w @ LIGHT_W)
 
 
 def depth_colours(depth_m: np.ndarray, range_m: float) -> np.ndarray:

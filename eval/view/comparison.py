@@ -17,7 +17,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from eval.view.blueprint import TIMELINE
+from eval.view.blueprint import tabbed
 from eval.view.recording import APPLICATION, DRONE_HALF_SIZE, time_columns
 from tracks.common.files import replacing_file
 from tracks.common.provenance import stamp
@@ -187,14 +187,10 @@ def _broken(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _layout(flights: Sequence[Compared]) -> rrb.Blueprint:
-    tabs = [_tab(f"/flight_{number}", flight) for number, flight in enumerate(flights)]
-    return rrb.Blueprint(
-        tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        auto_views=False,
-    )
+    times = [flight.measured.time_s for flight in flights]
+    # The start is skipped, where the simulations still lie on what was measured.
+    shown = (0.1 * float(times[0][-1]), max(float(time[-1]) for time in times))
+    return tabbed([_tab(f"/flight_{number}", f) for number, f in enumerate(flights)], shown)
 
 
 def _tab(root: str, flight: Compared) -> rrb.Vertical:

@@ -34,6 +34,8 @@ SCHEMA = 1
 """Version of the recording's entities, in its properties."""
 GROUND = (226, 228, 224)
 GROUND_MARGIN_M = 3.0
+BEFORE_GATE_S = 0.6
+"""How long before its first gate a trial is shown first [s]."""
 DRONE_HALF_SIZE = (0.064, 0.064, 0.025)
 """The body that is drawn unless told otherwise [m]."""
 ROTOR_RADIUS_M = 0.0635
@@ -76,7 +78,7 @@ def write_recording(
     # Nothing goes out until the file is named, so that it holds the blueprint first.
     recording = rr.RecordingStream(APPLICATION)
     with replacing_file(path) as beside:
-        recording.save(beside, default_blueprint=layout(tabs))
+        recording.save(beside, default_blueprint=layout(tabs, _shown(rollouts)))
         try:
             about = stamp(SCHEMA, rollouts[0][2].seed)
             texts = {key: str(value) for key, value in about.items() if value is not None}
@@ -107,6 +109,14 @@ def _tab(number: int, track: Track, flight: Flight, result: TrialResult, several
     return Tab(f"/trial_{number}", title, _has_depth(flight), low_w, high_w)
 
 
+def _shown(rollouts: Sequence[Rollout]) -> tuple[float, float]:
+    """Return what a recording plays: from just before the first trial's first gate to the end."""
+    flight = rollouts[0][1]
+    passed = flight.time_s[flight.gate > 0]
+    begin = max(0.0, float(passed[0]) - BEFORE_GATE_S) if len(passed) else 0.0
+    return begin, max(result.time_s for _, _, result in rollouts)
+
+
 def _has_depth(flight: Flight) -> bool:
     return flight.depth_m is not None and len(flight.depth_m) > 0
 
@@ -124,12 +134,14 @@ def time_columns(time_s: np.ndarray) -> list[rr.TimeColumn]:
 def _mesh(
     vertices: np.ndarray, faces: np.ndarray, colour: tuple[int, int, int] | None
 ) -> rr.Mesh3D:
-    """Return a mesh with flat faces: every triangle has its own corners and normals."""
+    """Return a mesh with flat faces: every triangle has its own corners and shade."""
     corners = vertices[faces]
+    grey = np.round(255 * colours.brightness(flat_normals(corners))).astype(np.uint8)
     return rr.Mesh3D(
         vertex_positions=corners.reshape(-1, 3),
         triangle_indices=np.arange(len(faces) * 3).reshape(-1, 3),
-        vertex_normals=np.repeat(flat_normals(corners), 3, axis=0),
+        # The viewer's own light would make green of a gate in the shade black.
+        vertex_colors=np.repeat(grey, 3)[:, None].repeat(3, axis=1),
         albedo_factor=colour,
     )
 

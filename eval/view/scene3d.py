@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw
 
+from eval.view.colours import brightness
 from eval.view.solids import flat_normals
 
 NEAR_M = 0.05
@@ -19,7 +20,6 @@ FOG_M = 45.0
 """Distance at which a colour has faded all the way it does [m]."""
 FOG_SHARE = 0.65
 SKY, GROUND, GRID = (232, 238, 245), (214, 217, 212), (200, 204, 200)
-LIGHT_W = np.array([0.35, -0.45, 0.82])
 GRID_REACH_M = 24
 
 
@@ -83,9 +83,7 @@ def paint(view: View, faces: Faces, lines: Lines) -> Image.Image:
     normals = flat_normals(faces.corners_w)
     front = np.einsum("fi,fi->f", faces.corners_w[:, 0] - view.eye_w, normals) < 0
     corners = to_camera(view, faces.corners_w[front])
-    light = LIGHT_W / np.linalg.norm(LIGHT_W)
-    shade = 0.72 + 0.28 * (normals[front] @ light)
-    colour = faces.colour[front] * shade[:, None]
+    colour = faces.colour[front] * brightness(normals[front])[:, None]
     ends = to_camera(view, lines.ends_w)
     shapes = [*corners, *ends]
     distance = np.concatenate([_distance(corners), _distance(ends)])

@@ -1,4 +1,4 @@
-"""A short video of a trial from behind the drone, with the depth image it saw.
+"""A short video of a trial from behind the drone, beside the depth image it saw.
 
 The frames are painted by `scene3d.py` and encoded by `video_file.py`, so neither a display nor a
 GPU is needed.
@@ -34,6 +34,10 @@ TRAIL_S = 1.6
 """How long the path is shown behind the drone [s]."""
 
 
+SIDE_SHARE = 1 / 3
+"""Share of a frame's width that the depth image takes, where the flight has any."""
+
+
 @dataclass(frozen=True)
 class VideoOptions:
     """How a video looks."""
@@ -52,6 +56,10 @@ class VideoOptions:
     """Height of the eye above the drone [m]."""
     hold_s: float = 1.0
     """How long the last frame stays [s]."""
+
+
+SMALL = VideoOptions(size=(720, 360), fps=12)
+"""For a page: what a GIF of a race takes stays below some 3 MB."""
 
 
 def frame_times(flight: Flight, options: VideoOptions) -> np.ndarray:
@@ -95,7 +103,7 @@ def write_video(
     frames = video_frames(track, flight, result, options)
     with replacing_file(path) as beside:
         if kind == ".gif":
-            write_gif(beside, frames, options.fps, on_frame)
+            write_gif(beside, frames, options.fps, _swatches(), on_frame)
         else:
             write_mp4(beside, frames, options.size, options.fps, on_frame)
     return path
@@ -119,26 +127,38 @@ def video_frames(
     rot_w = quat_to_rot(flight.quat_wxyz)
     eye_w, target_w = _chase(flight, rot_w, options)
     decided = np.flatnonzero(flight.policy_step)
-    big = (options.size[0] * OVERSAMPLING, options.size[1] * OVERSAMPLING)
+    seen = flight.depth_m if flight.depth_m is not None and len(flight.depth_m) else None
+    beside = 0 if seen is None else round(options.size[0] * SIDE_SHARE)
+    big = ((options.size[0] - beside) * OVERSAMPLING, options.size[1] * OVERSAMPLING)
     for time in times:
         k = int(np.searchsorted(flight.time_s, time, side="right")) - 1
         pos, eye, target = (_at(flight, values, time) for values in (flight.pos_w, eye_w, target_w))
         next_gate = int(flight.gate[k])
         body = _drone_faces(pos, rot_w[k])
+        seen_past = _beyond(corners, eye, pos)
         faces = Faces(
-            np.concatenate([corners, body.corners_w]),
-            np.concatenate([_track_colour(gate, next_gate), body.colour]),
+            np.concatenate([corners[seen_past], body.corners_w]),
+            np.concatenate([_track_colour(gate[seen_past], next_gate), body.colour]),
         )
         shown = (flight.time_s[:-1] > time - TRAIL_S) & (flight.time_s[1:] <= time)
         lines = Lines(pieces[shown], path_colour[shown], 0.03)
         image = paint(look_at(eye, target, options.fov_deg, big), faces, lines)
-        image = image.reduce(OVERSAMPLING)
-        image_number = int(np.searchsorted(decided, k, side="right")) - 1
-        if flight.depth_m is not None and 0 <= image_number < len(flight.depth_m):
-            _inset(image, flight.depth_m[image_number])
+        frame = Image.new("RGB", options.size, SKY)
+        frame.paste(image.reduce(OVERSAMPLING))
+        if seen is not None:
+            number = int(np.searchsorted(decided, k, side="right")) - 1
+            _paint_depth(frame, beside, seen[min(max(number, 0), len(seen) - 1)])
         ended = time >= flight.time_s[-1]
-        _write_on(image, track, result, float(time), float(speed[k]), next_gate, ended)
-        yield image
+        _write_on(frame, beside, track, result, float(time), float(speed[k]), next_gate, ended)
+        yield frame
+
+
+def _swatches() -> np.ndarray:
+    """Return the colours (n, 3) that come in a video but hardly in its first frame."""
+    gates = np.array([colours.AHEAD, colours.PASSED, colours.CRASH, colours.START])
+    shades = [gates * shade for shade in (0.5, 0.65, 0.8, 0.95)]
+    depths = colours.depth_colours(np.linspace(0, DEPTH_RANGE_M, 40), DEPTH_RANGE_M)
+    return np.concatenate([*shades, depths, colours.speed_colours(np.linspace(0, 1, 12), 1.0)])
 
 
 def _finite_part(flight: Flight) -> Flight:
@@ -172,6 +192,12 @@ def _chase(
     return eye, smooth + 1.2 * ahead + 0.15 * up
 
 
+def _beyond(corners_w: np.ndarray, eye_w: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
+    """Return which faces (F, 3, 3) are not before the drone, where they would hide it, (F,)."""
+    way = pos_w - eye_w
+    return ((corners_w - eye_w) @ way).max(axis=1) > way @ way
+
+
 def _track_colour(gate: np.ndarray, next_gate: int) -> np.ndarray:
     colour = np.tile(np.array(colours.SOLID, dtype=float), (len(gate), 1))
     colour[gate >= 0] = 0.55 * np.array(colours.AHEAD) + 0.45 * 255
@@ -198,18 +224,27 @@ def _drone_faces(pos_w: np.ndarray, rot_w: np.ndarray) -> Faces:
     return Faces(pos_w + np.array(parts) @ rot_w.T, np.array(colour, dtype=float))
 
 
-def _inset(image: Image.Image, depth_m: np.ndarray) -> None:
-    width = image.width // 5
-    height = width * depth_m.shape[0] // depth_m.shape[1]
+def _paint_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:
+    """Paint what the policy saw at the right, below a line that says what it is."""
+    size = (width, width * depth_m.shape[0] // depth_m.shape[1])
     small = Image.fromarray(colours.depth_colours(depth_m, DEPTH_RANGE_M))
-    at = (image.width - width - 12, 12)
-    image.paste(small.resize((width, height), Image.Resampling.NEAREST), at)
-    corner = (at[0] + width, at[1] + height)
-    ImageDraw.Draw(image).rectangle([at[0] - 1, at[1] - 1, *corner], outline=colours.DRONE)
+    corner = (frame.width - width, (frame.height - size[1]) // 2)
+    frame.paste(small.resize(size, Image.Resampling.NEAREST), corner)
+    draw = ImageDraw.Draw(frame)
+    font = ImageFont.load_default(size=_font_size(frame))
+    draw.line([corner[0] - 1, 0, corner[0] - 1, frame.height], fill=colours.DRONE)
+    text = f"depth it saw, {depth_m.shape[1]} x {depth_m.shape[0]}, to {DEPTH_RANGE_M:g} m"
+    middle = corner[0] + width / 2
+    draw.text((middle, corner[1] - 6), text, fill=colours.DRONE, font=font, anchor="mb")
+
+
+def _font_size(frame: Image.Image) -> int:
+    return max(frame.height // 27, 11)
 
 
 def _write_on(
     image: Image.Image,
+    beside: int,
     track: Track,
     result: TrialResult,
     time: float,
@@ -218,7 +253,7 @@ def _write_on(
     ended: bool,
 ) -> None:
     draw = ImageDraw.Draw(image)
-    font = ImageFont.load_default(size=image.height // 27)
+    font = ImageFont.load_default(size=_font_size(image))
     gates = len(track.scene.gates.center_w)
     title = f"{track.family}  level {track.level}  seed {track.seed}"
     # A pale edge keeps words readable on a dark gate.
@@ -229,5 +264,5 @@ def _write_on(
     if ended:
         colour = colours.PASSED if result.ended_by == "finished" else colours.CRASH
         large = ImageFont.load_default(size=image.height // 14)
-        where = (image.width / 2, image.height * 0.2)
+        where = ((image.width - beside) / 2, image.height * 0.2)
         draw.text(where, result.ending, fill=colour, font=large, anchor="mm", **edge)

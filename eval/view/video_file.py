@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import imageio_ffmpeg
+import numpy as np
 from PIL import Image
 
 COLOURS = 128
@@ -63,15 +64,33 @@ def write_gif(
     path: Path,
     frames: Iterable[Image.Image],
     fps: int,
+    swatches: np.ndarray | None = None,
     on_frame: Callable[[int], None] | None = None,
 ) -> None:
-    """Write frames as GIF, all with the colours of the first; the arguments are `write_mp4`'s."""
+    """Write frames as GIF, all with one palette; the arguments are `write_mp4`'s.
+
+    Args:
+        path: file to write, ending in `.gif`.
+        frames: one after the other.
+        fps: frames a second.
+        swatches: (n, 3) colours 0-255 that the palette needs besides the first frame's.
+        on_frame: called with the number of frames that are done.
+    """
     indexed: list[Image.Image] = []
     for number, frame in enumerate(frames, start=1):
-        palette = indexed[0] if indexed else None
-        image = frame.quantize(COLOURS) if palette is None else frame.quantize(palette=palette)
-        indexed.append(image)
+        palette = indexed[0] if indexed else _palette(frame, swatches)
+        # Without dithering areas stay of one colour, which a GIF holds in few bytes.
+        indexed.append(frame.quantize(palette=palette, dither=Image.Dither.NONE))
         if on_frame is not None:
             on_frame(number)
     duration = round(1000 / fps)
     indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
+
+
+def _palette(frame: Image.Image, swatches: np.ndarray | None) -> Image.Image:
+    """Return an image with the palette of `frame` and of `swatches`, which fill as many pixels."""
+    source = np.asarray(frame, dtype=np.uint8).reshape(-1, 3)
+    if swatches is not None:
+        more = np.repeat(swatches.astype(np.uint8), max(1, len(source) // len(swatches)), axis=0)
+        source = np.concatenate([source, more])
+    return Image.fromarray(source[None]).quantize(COLOURS)

@@ -15,12 +15,12 @@ from eval.worlds.trial import Progress, TrialSpec
 from tracks.common.names import unknown_name
 from tracks.track import Track
 
-PLAIN = "plain"
+REFERENCE = "reference"
 """The world without slots: `eval.worlds.reference.fly_trial`, one trial after the other."""
 WORLDS = {
     "mujoco": "eval.worlds.mujoco:MujocoWorld",
     "mjx": "eval.worlds.mjx:MjxWorld",
-    PLAIN: "eval.worlds.reference:fly_trial",
+    REFERENCE: "eval.worlds.reference:fly_trial",
 }
 """Name to module and class (`World`)."""
 
@@ -98,13 +98,13 @@ class World(Protocol):
         """
         ...
 
-    def touched(self, slot: int) -> str:
+    def collided_with(self, slot: int) -> str:
         """Return the name of the solid that the trial in `slot` collided with."""
         ...
 
 
 def world_class(name: str) -> Any:
-    """Return the class of the world `name` (for `PLAIN` the function).
+    """Return the class of the world `name` (for `REFERENCE` the function).
 
     Raises:
         ValueError: where there is no such world.

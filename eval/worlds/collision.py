@@ -2,7 +2,7 @@
 
 For every solid near by, a point of the box is moved to the solid and back into the box in turn.
 Both are convex, so that the point ends where the two are nearest to one another (alternating
-projections, Cheney and Goldstein 1959); they touch where that distance is nought.
+projections, Cheney and Goldstein 1959); they are in contact where that distance is nought.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ ROUNDS = 12
 REACH = 1.5
 """Length of a projection over the way to the surface: beyond 1 the rounds converge faster, from 2
 on they may not."""
-TOUCH_M = 1e-3
-"""Nearer than this is touching: as near as the rounds come, and half a step's way at 1 m/s [m]."""
+CONTACT_M = 1e-3
+"""Nearer than this is a contact: as near as the rounds come, and half a step's way at 1 m/s [m]."""
 _KINDS = ("boxes", "cylinders", "capsules", "spheres", "triangles")
 
 
-def gaps(scene: Scene, pos_w: Array, rot_w: Array, half_size: Array, middle_b: Array) -> Array:
+def box_distances(
+    scene: Scene, pos_w: Array, rot_w: Array, half_size: Array, middle_b: Array
+) -> Array:
     """Return the distances (N, S + 1) [m] between boxes and solids; 0 or less where they meet.
 
     Args:
@@ -41,10 +43,10 @@ def gaps(scene: Scene, pos_w: Array, rot_w: Array, half_size: Array, middle_b: A
         one another is not measured.
     """
     middle_w = pos_w + to_world(rot_w, middle_b)
-    found = [_gap(_only(scene, kind), kind, middle_w, rot_w, half_size) for kind in _KINDS]
+    found = [_distance(_only(scene, kind), kind, middle_w, rot_w, half_size) for kind in _KINDS]
     reach = (jnp.abs(rot_w[:, 2]) * half_size).sum(-1)
     ground = (middle_w[:, 2] - reach)[:, None]
-    return jnp.concatenate([*(gap for gap in found if gap is not None), ground], axis=-1)
+    return jnp.concatenate([*(each for each in found if each is not None), ground], axis=-1)
 
 
 def _only(scene: Scene, kind: str) -> Scene:
@@ -62,7 +64,9 @@ def _only(scene: Scene, kind: str) -> Scene:
     return scene._replace(**parts)
 
 
-def _gap(alone: Scene, kind: str, middle_w: Array, rot_w: Array, half_size: Array) -> Array | None:
+def _distance(
+    alone: Scene, kind: str, middle_w: Array, rot_w: Array, half_size: Array
+) -> Array | None:
     solids = getattr(alone, kind)
     places = solids if kind == "triangles" else solids[0]
     if places.shape[1] == 0:

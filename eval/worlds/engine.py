@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from eval.quadrotor.model import add_quadrotor, set_true_inertia
+from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Vehicle
 from tracks.formats.mujoco_scene import add_scene, solid_name
@@ -29,13 +29,9 @@ def compile_model(track: Track, vehicle: Vehicle, dt: float, to: Counts) -> mujo
         to: how many solids of each kind the model holds.
     """
     spec = mujoco.MjSpec()
-    spec.option.timestep = dt
     spec.option.disableflags |= NO_AUTORESET
     add_scene(spec, track.scene, track.names, track.mesh_sizes, to)
-    add_quadrotor(spec, vehicle)
-    model = spec.compile()
-    set_true_inertia(model, vehicle)
-    return model
+    return compile_quadrotor(spec, vehicle, dt)
 
 
 class Eye:

@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from eval.quadrotor.autopilot import Autopilot, fly_step, make_cockpit, start_autopilot
-from eval.quadrotor.model import add_quadrotor, set_true_inertia
+from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopilot, start_autopilot
+from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows, View
-from eval.worlds.collision import NEAR, TOUCH_M, gaps
+from eval.worlds.collision import CONTACT_M, NEAR, box_distances
 from eval.worlds.engine import start_state
 from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
 from eval.worlds.trial import (
@@ -60,7 +60,7 @@ class Flying(NamedTuple):
     """(N, 7)."""
     qvel: Array
     """(N, 6)."""
-    pilot: Autopilot
+    loops: AutopilotState
     progress: Progress
 
 
@@ -81,14 +81,16 @@ class MjxWorld:
         """Make the world; the arguments are those of `MujocoWorld`, `threads` is left to JAX."""
         self.slots = slots
         self._layout, self._rules, self._camera = layout, rules, camera
-        self._cockpit = make_cockpit(vehicle)
-        self.dt = self._cockpit.dt
-        self._model = mjx.put_model(_free_body(vehicle, self.dt))
+        self._autopilot = make_autopilot(vehicle)
+        self.dt = self._autopilot.dt
+        free = mujoco.MjSpec()
+        free.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self._model = mjx.put_model(compile_quadrotor(free, vehicle, self.dt))
         self._half_size = np.asarray(vehicle.body.half_size)
-        self._middle_b = -np.asarray(self._cockpit.plant.constants.com_offset_b)
+        self._middle_b = -np.asarray(self._autopilot.plant.constants.com_offset_b)
         self._rays_b = jnp.asarray(pixel_rays_b(camera), jnp.float32)
         self._most = 0
-        self._has_noise = uses_noise(self._cockpit.plant)
+        self._has_noise = uses_noise(self._autopilot.plant)
         self._noise = [np.zeros((1, 3), np.float32)] * slots
         self._course = empty_course(slots, layout)
         self._tracks: list[Track | None] = [None] * slots
@@ -101,8 +103,8 @@ class MjxWorld:
         progress = start_progress(nothing.pos_w)
         progress = progress._replace(ended=jnp.full(slots, -1, jnp.int32))
         qpos = jnp.tile(jnp.asarray([0.0, 0, 0, 1, 0, 0, 0]), (slots, 1))
-        pilot = start_autopilot(self._cockpit, nothing, self._start_noise())
-        self._state = Flying(qpos, jnp.zeros((slots, 6)), pilot, progress)
+        loops = start_autopilot(self._autopilot, nothing, self._start_noise())
+        self._state = Flying(qpos, jnp.zeros((slots, 6)), loops, progress)
 
     @property
     def progress(self) -> Progress:
@@ -149,8 +151,8 @@ class MjxWorld:
         scene: Scene,
     ) -> Flying:
         motion = _motion(qpos, jnp.zeros_like(state.qvel))
-        pilot = start_autopilot(self._cockpit, motion, noise)
-        fresh = Flying(qpos, jnp.zeros_like(state.qvel), pilot, start_progress(motion.pos_w))
+        loops = start_autopilot(self._autopilot, motion, noise)
+        fresh = Flying(qpos, jnp.zeros_like(state.qvel), loops, start_progress(motion.pos_w))
         state = select(started, fresh, state)
         near = nearest_solids(scene, motion.pos_w, NEAR)
         return self._judge(state, started, jnp.zeros_like(started), course, near)
@@ -159,25 +161,25 @@ class MjxWorld:
         self, state: Flying, which: Array, bad: Array, course: Course, near: Scene
     ) -> Flying:
         """Judge the current states of the slots in `which`; lost ones come back at rest."""
-        pos_w, rot_w, vel_w, rate_b = _motion(state.qpos, state.qvel)
-        diverged = bad | has_diverged(self._rules, pos_w, vel_w, rate_b)
-        gap = gaps(near, pos_w, rot_w, self._half_size, self._middle_b)
-        contact = (gap <= jnp.where(jnp.arange(gap.shape[1]) < gap.shape[1] - 1, TOUCH_M, 0)).any(
-            -1
-        )
+        motion = _motion(state.qpos, state.qvel)
+        diverged = bad | has_diverged(self._rules, motion)
+        pos_w, rot_w, _, _ = motion
+        distance = box_distances(near, pos_w, rot_w, self._half_size, self._middle_b)
+        is_ground = jnp.arange(distance.shape[1]) == distance.shape[1] - 1
+        contact = (distance <= jnp.where(is_ground, 0, CONTACT_M)).any(-1)
         verdict = judge_state(
-            self._rules, state.progress, course, self.dt, pos_w, rot_w, vel_w, contact, diverged
+            self._rules, state.progress, course, self.dt, motion, contact, diverged
         )
         progress = select(which, verdict, state.progress)
         lost = progress.ended == DIVERGED
         rest = jnp.asarray([0.0, 0, 0, 1, 0, 0, 0])
         qpos = jnp.where(lost[:, None], rest, state.qpos)
         qvel = jnp.where(lost[:, None], 0.0, state.qvel)
-        judged = Flying(qpos, qvel, state.pilot, progress)
+        judged = Flying(qpos, qvel, state.loops, progress)
         # Types of their own: one that Python's numbers gave would compile everything twice.
         return jax.tree.map(lambda a: a.astype(a.dtype), judged)
 
-    def touched(self, slot: int) -> str:
+    def collided_with(self, slot: int) -> str:
         """Return the name of the solid that the trial in `slot` collided with."""
         track = self._tracks[slot]
         assert track is not None
@@ -185,8 +187,8 @@ class MjxWorld:
         scene = pad(track.scene._replace(gates=gates), self._layout.solids)
         scene = jax.tree.map(lambda a: jnp.asarray(a[None], jnp.float32), scene)
         pos_w, rot_w, _, _ = _motion(self._state.qpos[slot][None], self._state.qvel[slot][None])
-        gap = np.asarray(_gaps(scene, pos_w, rot_w, self._half_size, self._middle_b))[0]
-        return _solid_names(track, self._layout)[int(gap.argmin())]
+        distance = _box_distances(scene, pos_w, rot_w, self._half_size, self._middle_b)
+        return _solid_names(track, self._layout)[int(np.asarray(distance)[0].argmin())]
 
     def view(self, wanted: np.ndarray) -> View:
         """Return what can be observed now."""
@@ -248,30 +250,30 @@ class MjxWorld:
             flying = (steps > done) & (state.progress.ended == FLYING)
             motion, step = _motion(state.qpos, state.qvel), state.progress.step
             gate_w = next_gate(course, state.progress.gates).center_w
-            pilot, (force_b, torque_b) = fly_step(
-                self._cockpit, state.pilot, motion, action_b, gate_w, step, draws
+            loops, wrench = autopilot_step(
+                self._autopilot, state.loops, motion, action_b, gate_w, step, draws
             )
-            pilot = select(flying, pilot, state.pilot)
-            bad = ~is_wrench(self._rules, force_b, torque_b)
-            force_w = to_world(motion.rot_w, force_b)
-            applied = jnp.concatenate([force_w, torque_b], axis=-1)
+            loops = select(flying, loops, state.loops)
+            bad = ~is_wrench(self._rules, wrench)
+            force_w = to_world(motion.rot_w, wrench.force_b)
+            applied = jnp.concatenate([force_w, wrench.torque_b], axis=-1)
             qpos, qvel = self._integrate(state.qpos, state.qvel, applied)
             go = flying & ~bad
             moved = Flying(
                 jnp.where(go[:, None], qpos, state.qpos),
                 jnp.where(go[:, None], qvel, state.qvel),
-                pilot,
+                loops,
                 state.progress._replace(step=step + flying.astype(jnp.int32)),
             )
             after = self._judge(moved, flying, bad, course, near)
             if not record:
                 return after, None
-            before = state._replace(pilot=pilot)
-            due = flying & (step % self._cockpit.attitude_every == 0)
+            before = state._replace(loops=loops)
+            due = flying & (step % self._autopilot.attitude_every == 0)
             ended = flying & (after.progress.ended != FLYING) & (after.progress.ended != DIVERGED)
             return after, (
-                self._rows(due, before, state.pilot.memory.rotor_speed),
-                self._rows(ended, after, pilot.memory.rotor_speed),
+                self._rows(due, before, state.loops.plant.rotor_speed),
+                self._rows(ended, after, loops.plant.rotor_speed),
             )
 
         return jax.lax.scan(one, state, (jnp.arange(most), noise))
@@ -288,7 +290,7 @@ class MjxWorld:
         return jax.vmap(one)(qpos, qvel, applied)
 
     def _rows(self, due: Array, state: Flying, rotor_speed: Array) -> Rows:
-        command = state.pilot.command
+        command = state.loops.command
         return Rows(
             due, state.progress.step * self.dt, state.qpos[:, :3], state.qpos[:, 3:],
             state.qvel[:, :3], state.qvel[:, 3:], command.thrust, command.rate_b, rotor_speed,
@@ -296,17 +298,7 @@ class MjxWorld:
         )  # fmt: skip
 
 
-_gaps = jax.jit(gaps)
-
-
-def _free_body(vehicle: Vehicle, dt: float) -> mujoco.MjModel:
-    spec = mujoco.MjSpec()
-    spec.option.timestep = dt
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    add_quadrotor(spec, vehicle)
-    model = spec.compile()
-    set_true_inertia(model, vehicle)
-    return model
+_box_distances = jax.jit(box_distances)
 
 
 def _motion(qpos: Array, qvel: Array) -> Motion:
@@ -317,7 +309,7 @@ def _motion(qpos: Array, qvel: Array) -> Motion:
 
 
 def _solid_names(track: Track, layout: Layout) -> list[str]:
-    """Return a name for every column of `gaps` on the padded scene."""
+    """Return a name for every column of `box_distances` on the padded scene."""
     names, left = [], list(track.names)
     scene = track.scene
     kinds = (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)

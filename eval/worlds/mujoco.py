@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from eval.quadrotor.autopilot import fly_step, make_cockpit, start_autopilot
+from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows, View
@@ -66,8 +66,8 @@ class MujocoWorld:
         """
         self.slots = slots
         self._vehicle, self._layout, self._rules = vehicle, layout, rules
-        self._cockpit = make_cockpit(vehicle)
-        self.dt = self._cockpit.dt
+        self._autopilot = make_autopilot(vehicle)
+        self.dt = self._autopilot.dt
         self._eye = Eye(camera)
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self._threads = threads
@@ -76,9 +76,8 @@ class MujocoWorld:
         self._progress = self._progress._replace(ended=np.full(slots, -1, np.int32))
         self._models: list[mujoco.MjModel] = []
         self._noise: list[np.ndarray] | None = None
-        if uses_noise(self._cockpit.plant):
+        if uses_noise(self._autopilot.plant):
             self._noise = [np.zeros((1, 3))] * slots
-        self._contact_names = [""] * slots
 
     @property
     def progress(self) -> Progress:
@@ -91,7 +90,7 @@ class MujocoWorld:
         # Live views: state in, contacts and orientation of the current state out.
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._applied = self._batch.bind("qfrc_applied")
-        self._touching = self._batch.bind("ncon")
+        self._contacts = self._batch.bind("ncon")
         self._xmat = self._batch.bind("xmat")
         # Rays want the solids' places only, and those do not move: one MjData a slot serves all.
         self._seen = [mujoco.MjData(model)] * self.slots
@@ -123,10 +122,10 @@ class MujocoWorld:
         noise = None
         if self._noise is not None:
             noise = np.stack([draws[0] for draws in self._noise])
-        fresh = start_autopilot(self._cockpit, motion, noise)
+        fresh = start_autopilot(self._autopilot, motion, noise)
         started = np.zeros(self.slots, bool)
         started[ids] = True
-        self._pilot = packed(select(started, fresh, getattr(self, "_pilot", fresh)))
+        self._loops = packed(select(started, fresh, getattr(self, "_loops", fresh)))
         self._progress = select(started, start_progress(motion.pos_w), self._progress)
         self._judge(started, np.zeros(self.slots, bool))
 
@@ -137,24 +136,15 @@ class MujocoWorld:
 
     def _judge(self, which: np.ndarray, bad_wrench: np.ndarray) -> None:
         """Judge the current states of the slots in `which`."""
-        pos_w, rot_w, vel_w, rate_b = self._motion()
-        diverged = bad_wrench | has_diverged(self._rules, pos_w, vel_w, rate_b)
-        contact = self._touching > 0
+        motion, contact = self._motion(), self._contacts > 0
+        diverged = bad_wrench | has_diverged(self._rules, motion)
         with np.errstate(invalid="ignore", over="ignore"):  # of rows that have diverged
             judged = judge_state(
-                self._rules,
-                self._progress,
-                self._course,
-                self.dt,
-                pos_w,
-                rot_w,
-                vel_w,
-                contact,
-                diverged,
+                self._rules, self._progress, self._course, self.dt, motion, contact, diverged
             )
         self._progress = select(which, judged, self._progress)
 
-    def touched(self, slot: int) -> str:
+    def collided_with(self, slot: int) -> str:
         """Return the name of the solid that the trial in `slot` collided with."""
         return contact_name(self._models[slot], self._batch.get_data(slot))
 
@@ -196,24 +186,24 @@ class MujocoWorld:
                 break
             step, motion = self._progress.step, self._motion()
             gate_w = next_gate(self._course, self._progress.gates).center_w
-            speed_before = self._pilot.memory.rotor_speed
-            pilot, (force_b, torque_b) = fly_step(
-                self._cockpit, self._pilot, motion, action_b, gate_w, step, self._draws(step)
+            speed_before = self._loops.plant.rotor_speed
+            loops, wrench = autopilot_step(
+                self._autopilot, self._loops, motion, action_b, gate_w, step, self._draws(step)
             )
-            self._pilot = packed(select(flying, pilot, self._pilot))
+            self._loops = packed(select(flying, loops, self._loops))
             if record:
-                due = flying & (step % self._cockpit.attitude_every == 0)
+                due = flying & (step % self._autopilot.attitude_every == 0)
                 rows += self._rows(due, speed_before)
-            bad = ~is_wrench(self._rules, force_b, torque_b)
+            bad = ~is_wrench(self._rules, wrench)
             go = flying & ~bad
-            self._applied[:, :3] = to_world(motion.rot_w, force_b)
-            self._applied[:, 3:] = torque_b
+            self._applied[:, :3] = to_world(motion.rot_w, wrench.force_b)
+            self._applied[:, 3:] = wrench.torque_b
             self._batch.step(np.flatnonzero(go).astype(np.int32), stage=_TO_CONTACTS)
             self._progress = self._progress._replace(step=step + flying)
             self._judge(flying, bad)
             if record:
                 ended = ~np.isin(self._progress.ended, (FLYING, DIVERGED))
-                rows += self._rows(flying & ended, self._pilot.memory.rotor_speed)
+                rows += self._rows(flying & ended, self._loops.plant.rotor_speed)
             lost = np.flatnonzero(flying & (self._progress.ended == DIVERGED))
             if len(lost):  # the other slots' arithmetic shall not meet its numbers again
                 self._batch.reset(lost.astype(np.int32), stage=_TO_CONTACTS)
@@ -228,7 +218,7 @@ class MujocoWorld:
     def _rows(self, due: np.ndarray, rotor_speed: np.ndarray) -> list[Rows]:
         if not due.any():
             return []
-        pilot = self._pilot
+        loops = self._loops
         qpos, qvel = self._qpos.copy(), self._qvel.copy()
         return [
             Rows(
@@ -238,8 +228,8 @@ class MujocoWorld:
                 qpos[:, 3:],
                 qvel[:, :3],
                 qvel[:, 3:],
-                pilot.command.thrust,
-                pilot.command.rate_b,
+                loops.command.thrust,
+                loops.command.rate_b,
                 rotor_speed,
                 self._progress.gates,
             )

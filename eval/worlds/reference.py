@@ -1,6 +1,6 @@
-"""The world `plain`: one trial as a loop of MuJoCo steps, to be read from top to bottom.
+"""The world `reference`: one trial as a loop of MuJoCo steps, to be read from top to bottom.
 
-It is the reference that the batched worlds are held against, so it shares the vehicle with them
+The batched worlds are held against it, so it shares the vehicle with them
 and nothing else: it keeps its own count of gates and decides on its own when a trial ends.
 """
 
@@ -11,10 +11,10 @@ import numpy as np
 
 from eval.judging.guard import ActionLimits, guard_action
 from eval.judging.sensors import SensorNoise, Sensors
-from eval.quadrotor.autopilot import fly_step, make_cockpit, start_autopilot
+from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import View
+from eval.worlds import REFERENCE, View
 from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import layout_of, noise_of
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
@@ -49,18 +49,18 @@ def fly_trial(
         noise: what is wrong with the policy's observation.
     """
     rules, limits = rules or Rules(), limits or ActionLimits()
-    cockpit = make_cockpit(vehicle)
-    dt, spec = cockpit.dt, policy.spec
+    autopilot = make_autopilot(vehicle)
+    dt, spec = autopilot.dt, policy.spec
     model = compile_model(track, vehicle, dt, layout_of([track]).solids)
     data = mujoco.MjData(model)
     data.qpos[:] = start_state(track)
     mujoco.mj_step1(model, data)  # contacts of the first state
     gates, count = track.scene.gates, len(track.scene.gates.center_w)
     draws = np.zeros((1, 3))
-    if uses_noise(cockpit.plant):
+    if uses_noise(autopilot.plant):
         draws = noise_of(trial, round(rules.time_limit_s / dt) + 2)
     eye, hidden = Eye(spec.camera), policy.start(rows)
-    pilot = start_autopilot(cockpit, motion_of(data), draws[:1] if len(draws) > 1 else None)
+    loops = start_autopilot(autopilot, motion_of(data), draws[:1] if len(draws) > 1 else None)
     sensors = None
     if noise and not noise.is_none:
         sensors = Sensors(noise, 1, spec.rate_hz, spec.camera.range_m)
@@ -125,7 +125,9 @@ def fly_trial(
 
         # Fly one step.
         blow = draws[None, step + 1] if len(draws) > 1 else None
-        pilot, wrench = fly_step(cockpit, pilot, motion, action_b, gate_w, np.array([step]), blow)
+        loops, wrench = autopilot_step(
+            autopilot, loops, motion, action_b, gate_w, np.array([step]), blow
+        )
         step += 1
         if not (np.abs([wrench.force_b, wrench.torque_b]) <= rules.wrench_limit).all():
             ended_by = "diverged"
@@ -141,7 +143,7 @@ def fly_trial(
         *trial,
         policy=policy.name,
         vehicle=vehicle.name,
-        world="plain",
+        world=REFERENCE,
         success=ended_by == "finished",
         gates_passed=passed,
         ended_by=ended_by,

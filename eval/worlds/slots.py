@@ -37,7 +37,7 @@ def layout_of(tracks: Iterable[Track]) -> Layout:
 
 
 def empty_course(slots: int, layout: Layout) -> Course:
-    """Return the course of slots without a trial: gates that nothing crosses."""
+    """Return the course of slots without a trial, where nothing is judged: room for gates."""
     n, g = slots, layout.gates
     gates = Gates(
         np.zeros((n, g, 3)),

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from eval.quadrotor.plant import Motion, Wrench
 from tracks.families import make_track
 from tracks.geometry.crossing import NEAR_RADIUS_M, crossing, is_near
 from tracks.geometry.scene import Array, Gates
@@ -149,18 +150,19 @@ def next_gate(course: Course, number: Array) -> Gates:
     return Gates(*(field[rows, xp.minimum(number, course.count - 1)] for field in course.gates))
 
 
-def has_diverged(rules: Rules, pos_w: Array, vel_w: Array, rate_b: Array) -> Array:
-    """Return which states (N, 3) are not finite or beyond any flight, (N,) bool."""
-    xp = pos_w.__array_namespace__()
-    speed_fits = (xp.abs(vel_w) <= rules.speed_limit).all(-1)  # a comparison with NaN is false
-    rate_fits = (xp.abs(rate_b) <= rules.rate_limit).all(-1)
-    return ~(xp.isfinite(pos_w).all(-1) & speed_fits & rate_fits)
+def has_diverged(rules: Rules, motion: Motion) -> Array:
+    """Return which states are not finite or beyond any flight, (N,) bool."""
+    xp = motion.pos_w.__array_namespace__()
+    # A comparison with NaN is false.
+    speed_fits = (xp.abs(motion.vel_w) <= rules.speed_limit).all(-1)
+    rate_fits = (xp.abs(motion.rate_b) <= rules.rate_limit).all(-1)
+    return ~(xp.isfinite(motion.pos_w).all(-1) & speed_fits & rate_fits)
 
 
-def is_wrench(rules: Rules, force_b: Array, torque_b: Array) -> Array:
-    """Return which forces and torques (N, 3) are finite and within any flight's, (N,) bool."""
-    xp = force_b.__array_namespace__()
-    both = xp.concatenate([force_b, torque_b], axis=-1)
+def is_wrench(rules: Rules, wrench: Wrench) -> Array:
+    """Return which forces and torques are finite and within any flight's, (N,) bool."""
+    xp = wrench.force_b.__array_namespace__()
+    both = xp.concatenate(wrench, axis=-1)
     return (xp.abs(both) <= rules.wrench_limit).all(-1)  # a comparison with NaN is false
 
 
@@ -169,9 +171,7 @@ def judge_state(
     progress: Progress,
     course: Course,
     dt: float,
-    pos_w: Array,
-    rot_w: Array,
-    vel_w: Array,
+    motion: Motion,
     contact: Array,
     diverged: Array,
 ) -> Progress:
@@ -185,12 +185,11 @@ def judge_state(
         progress: of N trials; rows that have ended are returned as they are.
         course: the gates of each trial's track.
         dt: length of a physics step [s].
-        pos_w: (N, 3) [m].
-        rot_w: (N, 3, 3) body to world.
-        vel_w: (N, 3) [m/s].
+        motion: (N, ...) the states.
         contact: (N,) bool, the body touches something.
         diverged: (N,) bool, the state is none; its numbers are not looked at.
     """
+    pos_w, rot_w, vel_w, _ = motion
     xp = pos_w.__array_namespace__()
     flying = progress.ended == FLYING
     live = flying & ~diverged

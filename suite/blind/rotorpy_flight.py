@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from eval.effects import all_values
-from eval.quadrotor.plant import Command, Motion, Wrench, make_plant, wanted_speed
+from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
+from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.cases import ROTORPY_EFFECTS
 from suite.diagnose.plans.pilot import Gains, steer

@@ -42,7 +42,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for an unknown preset or logs that cannot be used.
     """
     from suite.delta.fit import FitConfig
-    from suite.delta.run import fit_delta, fit_quadrotor_delta, quadrotor_table, table
+    from suite.delta.run import errors, fit_delta, table
     from suite.train.presets import chosen_model, preset
     from tracks.common.files import plain
 
@@ -53,19 +53,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         seed=config.seed,
     )
     recipe = chosen_model(preset(config.preset), config.model, config.vehicle)
-    if recipe.quadrotor is None:
-        result = fit_delta(fitting, recipe.physics, config.flights, config.out, console)
-        words = table(result, fitting.horizon_s)
-        errors = {
-            "point_mass": result.point_mass,
-            "fitted_point_mass": result.fitted_point_mass,
-            "delta_action": result.delta_action,
-        }
-    else:
-        quad = recipe.quadrotor
-        fitted = fit_quadrotor_delta(fitting, quad, config.flights, config.out, console)
-        words = quadrotor_table(fitted, fitting.horizon_s)
-        errors = {"without": fitted.without, "delta_action": fitted.with_delta}
-    console.say(words)
+    dynamics = recipe.quadrotor or recipe.physics
+    result = fit_delta(fitting, dynamics, config.flights, config.out, console)
+    console.say(table(result, fitting.horizon_s))
     console.say(f"delta: {config.out / 'delta'}")
-    return {"delta": str(config.out / "delta"), **plain(errors)}
+    return {"delta": str(config.out / "delta"), **plain(errors(result))}

@@ -27,7 +27,7 @@ class Config:
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str = "mujoco"
-    """mujoco (fast on CPUs), mjx (for GPUs) or plain (slow and simple)."""
+    """mujoco (fast on CPUs), mjx (for GPUs) or reference (slow and simple)."""
     seed: int = 0
     """Seed of the first trial; the others follow by one."""
     out: Path = Path("runs/eval")

@@ -55,13 +55,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for anything that cannot be used, before the first stage.
     """
-    if config.world is not None:
-        return _run_hidden(config, config.world, console)
     from suite.loop.config import resolve
     from suite.loop.run import run_loop
 
     resolved = resolve(
         recipe=config.preset,
+        world=config.world,
         policy=config.policy,
         track=config.track,
         difficulty=config.difficulty,
@@ -75,29 +74,3 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         changes=config.set,
     )
     return run_loop(resolved, config.out, console)
-
-
-def _run_hidden(config: Config, world: str, console: Console) -> dict[str, Any]:
-    from suite.loop.hidden import run_hidden_loop
-    from suite.loop.hidden_config import resolve_hidden
-
-    if config.iterations is not None:
-        raise ValueError(
-            f"--iterations is {config.iterations}, but with --world nothing is trained from "
-            "scratch; say how long to fine-tune with --finetune-iterations"
-        )
-    resolved = resolve_hidden(
-        world=world,
-        recipe=config.preset,
-        policy=config.policy,
-        track=config.track,
-        difficulty=config.difficulty,
-        trials=config.trials,
-        flights=config.flights,
-        vehicle=config.vehicle,
-        seed=config.seed,
-        finetune_iterations=config.finetune_iterations,
-        fit_iterations=config.fit_iterations,
-        changes=config.set,
-    )
-    return run_hidden_loop(resolved, config.out, console)

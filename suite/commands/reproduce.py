@@ -50,7 +50,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
     """
-    from suite.experiments.document import Place
+    from suite.experiments.pages.document import Place, write_document
+    from suite.experiments.study.options import check
 
-    experiment = importlib.import_module(type(config.experiment).__module__)
-    return experiment.run(config.experiment, Place(config.out, config.cache), console)
+    check(config.experiment)
+    place, module = Place(config.out, config.cache), type(config.experiment).__module__
+    name, document = module.rpartition(".")[2], importlib.import_module(module).document
+    report, numbers = document(config.experiment, place, console)
+    return write_document(place, name, config.experiment, report, numbers, console)

@@ -37,11 +37,13 @@ class Config:
     seed: int = 0
     """For a policy: the trials' seed."""
     out: Path = Path("runs/view")
-    """Folder for the pictures (PNG) and the video."""
+    """Folder for the pictures (PNG), the video and the GIF."""
     rerun: Path | None = None
     """The recording (.rrd); by default trials.rrd in the folder."""
     video: bool = False
     """Also write a video (MP4) of the first trial; takes about its length."""
+    gif: bool = False
+    """Also write a small GIF of the first trial, for a page."""
     trust: bool = False
     """Also load policy files that can run code on this machine."""
     json: bool = False
@@ -77,8 +79,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             f"{_name(rollout)}: {result.gates_passed} gates, {result.ended_by}{hit} after "
             f"{result.time_s:.1f} s"
         )
-    if config.video:
-        written.append(_video(config.out / f"{_name(rollouts[0])}.mp4", rollouts[0], console))
+    for ending, wanted in ((".mp4", config.video), (".gif", config.gif)):
+        if wanted:
+            name = f"{_name(rollouts[0])}{ending}"
+            written.append(_video(config.out / name, rollouts[0], console))
     for path in written:
         console.say(f"written: {path}")
     console.say(f"open the recording with: rerun {recording}")
@@ -86,9 +90,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 
 def _video(path: Path, rollout: Rollout, console: Console) -> Path:
-    from eval.view.video import VideoOptions, frame_times, write_video
+    from eval.view.video import SMALL, VideoOptions, frame_times, write_video
 
-    options, flight = VideoOptions(), rollout[1]
+    options, flight = SMALL if path.suffix == ".gif" else VideoOptions(), rollout[1]
     frames = len(frame_times(flight, options)) if len(flight.time_s) else 0
     with console.progress("video", frames) as show:
         return write_video(path, *rollout, options, show)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from suite.common.console import Console, duration
+from suite.common.estimate import Estimate, announce
 from suite.common.provenance import write_run_record
 from tracks.common.files import plain, write_json
 
@@ -50,39 +52,60 @@ def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
     return [] if theirs == ours else [f"{name} is {theirs!r} there, {ours!r} here"]
 
 
-class Stages:
-    """The stages of a run, one after the other."""
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a run."""
 
-    def __init__(self, out: Path, console: Console, total: int) -> None:
-        """Begin with none done; `total` is how many there will be."""
-        self.out, self.console, self.total = out, console, total
-        self.seconds: dict[str, float] = {}
-        """How long each stage took when it was done, by its folder's name [s]."""
+    name: str
+    """Of its folder below the run's."""
+    words: str
+    """What it does, for people."""
+    needs: Estimate
+    """Time and memory."""
+    work: Callable[[Path], Any]
+    """Called with the folder; it must go on where an earlier call was cut off."""
+    tell: Callable[[Path], None] = lambda folder: None
+    """Called with the folder of the finished stage, also of one found again, to say what came."""
 
-    def is_done(self, name: str) -> bool:
-        """Say whether a stage is finished already."""
-        return (self.out / name / MARK).is_file()
 
-    def do(self, name: str, words: str, work: Callable[[Path], Any]) -> Path:
-        """Do a stage in its folder unless it is finished, and return the folder.
+def do_stages(out: Path, stages: Sequence[Stage], console: Console, what: str) -> dict[str, float]:
+    """Do the stages that are not finished, each in its folder, one after the other.
 
-        Args:
-            name: of the folder below the run's.
-            words: what the stage does, for people.
-            work: called with the folder; it must go on where an earlier call was cut off.
-        """
-        folder = self.out / name
-        number = f"[{len(self.seconds) + 1}/{self.total}]"
-        if self.is_done(name):
-            found = json.loads((folder / MARK).read_text(encoding="utf-8"))
-            self.seconds[name] = float(found["seconds"])
-            self.console.note(f"{number} {words}: done before, in {folder}")
-            return folder
-        self.console.note(f"{number} {words}")
-        started = time.monotonic()
-        work(folder)
-        self.seconds[name] = time.monotonic() - started
-        # Written last: what it vouches for is on the disk.
-        write_json(folder / MARK, {"stage": words, "seconds": self.seconds[name]})
-        self.console.note(f"{number} took {duration(self.seconds[name])}")
-        return folder
+    Args:
+        out: the run's folder.
+        stages: all of the run's, in order.
+        console: told what is done, after about how long all that is left will take.
+        what: the run is, in a few words.
+
+    Returns:
+        How long each stage took when it was done, by its name [s].
+    """
+    left = [stage.needs for stage in stages if not is_done(out / stage.name)]
+    seconds = sum(need.seconds for need in left)
+    if seconds:
+        announce(console, what, Estimate(seconds, max(need.memory_bytes for need in left)))
+    took = {}
+    for number, stage in enumerate(stages, 1):
+        took[stage.name] = _do(stage, out / stage.name, f"[{number}/{len(stages)}]", console)
+        stage.tell(out / stage.name)
+    return took
+
+
+def is_done(folder: Path) -> bool:
+    """Say whether the stage in `folder` is finished already."""
+    return (folder / MARK).is_file()
+
+
+def _do(stage: Stage, folder: Path, number: str, console: Console) -> float:
+    """Do a stage unless it is finished, and return how long it took [s]."""
+    if is_done(folder):
+        console.note(f"{number} {stage.words}: done before, in {folder}")
+        return float(json.loads((folder / MARK).read_text(encoding="utf-8"))["seconds"])
+    console.note(f"{number} {stage.words}")
+    started = time.monotonic()
+    stage.work(folder)
+    seconds = time.monotonic() - started
+    # Written last: what it vouches for is on the disk.
+    write_json(folder / MARK, {"stage": stage.words, "seconds": seconds})
+    console.note(f"{number} took {duration(seconds)}")
+    return seconds

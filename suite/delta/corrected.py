@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from suite.delta.replay import nominal_plant
+from suite.delta.replay import nominal_model
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain
 
@@ -20,7 +20,7 @@ def corrected(dynamics: PointMassConfig | QuadrotorConfig) -> dict[str, Any]:
     The point mass's are the middle of its ranges; of a vehicle file everything but its name counts.
     """
     if isinstance(dynamics, PointMassConfig):
-        return {"model": POINT, "plant": plain(nominal_plant(dynamics))}
+        return {"model": POINT, "plant": plain(nominal_model(dynamics))}
     return {"model": QUAD, "plant": {**plain(dynamics.vehicle), "name": ""}}
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from dataclasses import replace as changed
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import jax
@@ -19,8 +20,8 @@ import numpy as np
 import optax
 
 from policies.networks import delta_network
-from suite.delta.replay import Plant, nominal_plant, replay
-from suite.delta.windows import Windows
+from suite.delta.replay import PointMassModel, nominal_model, replay
+from suite.delta.windows import PointMassWindows
 from suite.train.config import PointMassConfig
 
 IDENTIFY_RATE = 3e-2
@@ -42,7 +43,7 @@ class FitConfig:
     iterations: int = 1500
     """Gradient steps."""
     batch: int = 256
-    """Windows per gradient step."""
+    """PointMassWindows per gradient step."""
     rate: float = 5e-3
     """Peak learning rate; it falls to zero as a cosine."""
     velocity_weight: float = 0.3
@@ -53,7 +54,7 @@ class FitConfig:
     """Seed of the network, the split and the batches."""
 
 
-class Errors(NamedTuple):
+class ReplayErrors(NamedTuple):
     """Mean distance between replay and record at the end of a window, over windows."""
 
     position_m: float
@@ -63,21 +64,27 @@ class Errors(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fit:
-    """The fitted model and how it compares on held-out flights."""
+class DeltaFit:
+    """A fitted network and what it brings on held-out flights."""
 
     params: dict[str, np.ndarray]
     """Of the Delta Action network."""
-    identified: Plant
-    """The point mass whose lag, drag and delay were fitted."""
-    point_mass: Errors
-    """Held-out errors of the point mass as the trainer has it."""
-    fitted_point_mass: Errors
-    """Held-out errors with fitted lag, drag and delay."""
-    delta_action: Errors
-    """Held-out errors with the Delta Action Model."""
+    without: ReplayErrors
+    """Held-out errors of the dynamics alone."""
+    with_delta: ReplayErrors
+    """Held-out errors with the network."""
     curve: list[dict[str, float]]
     """Rows of iteration, fit error and held-out error [m]."""
+
+
+@dataclass(frozen=True)
+class PointMassFit(DeltaFit):
+    """A network fitted through the point mass, beside its rival."""
+
+    identified: PointMassModel
+    """The point mass whose lag, drag and delay were fitted."""
+    rival: ReplayErrors
+    """Its held-out errors."""
 
 
 Replay = Callable[[Any, Any], tuple[jax.Array, jax.Array, jax.Array]]
@@ -125,42 +132,30 @@ def _descend(
     variables, state = start, optimizer.init(start)
     for iteration in range(iterations):
         chosen = rng.choice(count, min(config.batch, count), replace=False)
-        batch = type(windows)(*(array[chosen] for array in windows))
+        batch = jax.tree.map(itemgetter(chosen), windows)
         variables, state = update(variables, state, batch)
         watch(iteration, variables)
     return variables
 
 
-def identify(config: FitConfig, physics: PointMassConfig, windows: Windows) -> Plant:
+def identify(
+    config: FitConfig, physics: PointMassConfig, windows: PointMassWindows
+) -> PointMassModel:
     """Return the point mass whose lag, drag and delay replay `windows` best."""
-    plant = nominal_plant(physics)
-    start = (jnp.log(plant.lag), plant.drag, plant.delay)
+    middle = nominal_model(physics)
+    start = (jnp.log(middle.lag), middle.drag, middle.delay)
 
-    def as_plant(variables: Any) -> Plant:
+    def as_model(variables: Any) -> PointMassModel:
         lag, drag, delay = variables
-        return Plant(jnp.exp(lag), drag, jnp.clip(delay, 0.0, 2.0))
+        return PointMassModel(jnp.exp(lag), drag, jnp.clip(delay, 0.0, 2.0))
 
-    def loss(variables: Any, batch: Windows) -> jax.Array:
-        return _loss(config, partial(replay, as_plant(variables)), batch, None)
+    def loss(variables: Any, batch: PointMassWindows) -> jax.Array:
+        return _loss(config, partial(replay, as_model(variables)), batch, None)
 
     iterations = max(1, config.iterations // 3)
     faster = changed(config, rate=max(config.rate, IDENTIFY_RATE))
     best = _descend(faster, loss, start, windows, iterations, lambda *_: None)
-    return as_plant(best)
-
-
-@dataclass(frozen=True)
-class Network:
-    """A fitted network and what it brings on held-out flights."""
-
-    params: dict[str, np.ndarray]
-    """Of the Delta Action network."""
-    without: Errors
-    """Held-out errors of the dynamics alone."""
-    with_delta: Errors
-    """Held-out errors with the network."""
-    curve: list[dict[str, float]]
-    """Rows of iteration, fit error and held-out error [m]."""
+    return as_model(best)
 
 
 def fit_network(
@@ -169,7 +164,7 @@ def fit_network(
     known: Any,
     held_out: Any,
     show: Callable[[int, str], None] = lambda *_: None,
-) -> Network:
+) -> DeltaFit:
     """Fit a network by gradients through `replay` on `known` and judge it on `held_out`.
 
     Args:
@@ -180,7 +175,8 @@ def fit_network(
         show: called with (iteration, words) as it goes.
     """
     errors = jax.jit(partial(window_errors, replay))
-    watched = type(known)(*(array[:: -(-len(array) // WATCHED)] for array in known))
+    stride = -(-len(known.pos_w) // WATCHED)
+    watched = jax.tree.map(itemgetter(slice(None, None, stride)), known)
     curve: list[dict[str, float]] = []
     every = max(1, config.iterations // 50)
 
@@ -196,9 +192,12 @@ def fit_network(
         show(iteration + 1, f"1 s error {row['fit_m']:.3f} m, held out {row['held_out_m']:.3f} m")
 
     start = delta_network.init(jax.random.key(config.seed))
-    loss = partial(_network_loss, config, replay)
+
+    def loss(params: delta_network.Params, batch: Any) -> jax.Array:
+        return _loss(config, replay, batch, params)
+
     params = _descend(config, loss, start, known, config.iterations, watch)
-    return Network(
+    return DeltaFit(
         params={name: np.asarray(value) for name, value in params.items()},
         without=_means(errors(held_out, None)),
         with_delta=_means(errors(held_out, params)),
@@ -206,23 +205,17 @@ def fit_network(
     )
 
 
-def _network_loss(
-    config: FitConfig, replay: Replay, params: delta_network.Params, batch: Any
-) -> jax.Array:
-    return _loss(config, replay, batch, params)
-
-
-def _means(errors: tuple[jax.Array, jax.Array]) -> Errors:
-    return Errors(*(float(error.mean()) for error in errors))
+def _means(errors: tuple[jax.Array, jax.Array]) -> ReplayErrors:
+    return ReplayErrors(*(float(error.mean()) for error in errors))
 
 
 def fit(
     config: FitConfig,
     physics: PointMassConfig,
-    known: Windows,
-    held_out: Windows,
+    known: PointMassWindows,
+    held_out: PointMassWindows,
     show: Callable[[int, str], None] = lambda *_: None,
-) -> Fit:
+) -> PointMassFit:
     """Fit the Delta Action Model of the point mass to `known` and judge it on `held_out`.
 
     Args:
@@ -232,15 +225,8 @@ def fit(
         held_out: windows of flights that take no part.
         show: called with (iteration, words) as it goes.
     """
-    nominal = partial(replay, nominal_plant(physics))
+    nominal = partial(replay, nominal_model(physics))
     network = fit_network(config, nominal, known, held_out, show)
     identified = identify(config, physics, known)
     rival = jax.jit(partial(window_errors, partial(replay, identified)))
-    return Fit(
-        params=network.params,
-        identified=identified,
-        point_mass=network.without,
-        fitted_point_mass=_means(rival(held_out, None)),
-        delta_action=network.with_delta,
-        curve=network.curve,
-    )
+    return PointMassFit(**vars(network), identified=identified, rival=_means(rival(held_out, None)))

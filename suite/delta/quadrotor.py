@@ -15,15 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from eval.quadrotor.plant import Memory, start_memory
+from eval.quadrotor.stepper import PlantState, hover_state
 from policies.networks import delta_network
-from suite.delta.warm import WARM_S, Warm, gather, remembered
+from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before, state_after
+from suite.delta.windows import refuse_none, stacked
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics.quadrotor import Body, Grid, fly_period, plant_of, whole_steps
 from tracks.geometry.rotation import to_local
 
 
-class QuadWindows(NamedTuple):
+class QuadrotorWindows(NamedTuple):
     """N windows of T rows; row 0 is where the replay starts, at a decision."""
 
     pos_w: np.ndarray
@@ -46,15 +47,8 @@ class QuadWindows(NamedTuple):
     """(N, T) 1 where a new action begins."""
     yaw_rate: np.ndarray
     """(N, T) commanded about body z [rad/s]."""
-    warm_inputs: np.ndarray
-    """(N, W, 9) as in `suite.delta.warm.Warm`."""
-    warm_seen: np.ndarray
-    """(N, W)."""
-
-    @property
-    def warm(self) -> Warm:
-        """What the network saw before each window."""
-        return Warm(self.warm_inputs, self.warm_seen)
+    burn_in: BurnIn
+    """What the network saw before each window."""
 
 
 def row_grid(config: QuadrotorConfig, row_s: float) -> Grid:
@@ -65,7 +59,7 @@ def row_grid(config: QuadrotorConfig, row_s: float) -> Grid:
 
 def cut_quadrotor_windows(
     logs: Sequence[FlightLog], config: QuadrotorConfig, duration_s: float, stride_s: float
-) -> tuple[QuadWindows, Grid]:
+) -> tuple[QuadrotorWindows, Grid]:
     """Return windows of `duration_s`, about one every `stride_s` of every flight, and their grid.
 
     A window with a missing value or an uneven row is left out.
@@ -88,19 +82,13 @@ def cut_quadrotor_windows(
         for log in logs
         for window in _flight_windows(log, cut, length, row_s, duration_s, stride_s)
     ]
-    if not found:
-        names = ", ".join(log.name for log in logs[:3])
-        raise ValueError(
-            f"no window of {duration_s} s in {len(logs)} flights ({names}, ...); record longer "
-            "flights with suite collect"
-        )
-    columns = zip(*found, strict=True)
-    return QuadWindows(*(np.stack(column).astype(np.float32) for column in columns)), cut
+    refuse_none(found, logs, duration_s)
+    return stacked(found), cut
 
 
 def _flight_windows(
     log: FlightLog, cut: Grid, length: int, row_s: float, duration_s: float, stride_s: float
-) -> list[QuadWindows]:
+) -> list[QuadrotorWindows]:
     action, decides = log.action_b, log.policy_step
     assert action is not None and decides is not None and log.rate_cmd_b is not None
     assert log.thrust_cmd is not None
@@ -112,7 +100,7 @@ def _flight_windows(
     at = np.flatnonzero(decides & log.whole)
     if len(at) < 2:
         return []
-    warm = round(WARM_S / float(np.median(np.diff(time[at]))))
+    before = round(BURN_IN_S / float(np.median(np.diff(time[at]))))
     back = int(np.ceil(length * cut.dt / row_s - 1e-9))
     found, next_s = [], time[0]
     for number, first in enumerate(at.tolist()):
@@ -125,7 +113,7 @@ def _flight_windows(
         next_s = time[first] + stride_s
         held = np.searchsorted(time, time[first] - ages_s, side="right") - 1
         found.append(
-            QuadWindows(
+            QuadrotorWindows(
                 log.pos_w[span],
                 log.vel_w[span],
                 rot_w[first],
@@ -136,7 +124,7 @@ def _flight_windows(
                 action[span][:-1],
                 decides[span][:-1],
                 log.rate_cmd_b[span][:-1, 2],
-                *gather(rot_w[at], log.vel_w[at], action[at], number, warm),
+                burn_in_before(rot_w[at], log.vel_w[at], action[at], number, before),
             )
         )
     return found
@@ -145,7 +133,7 @@ def _flight_windows(
 def replay_quadrotor(
     config: QuadrotorConfig,
     cut: Grid,
-    windows: QuadWindows,
+    windows: QuadrotorWindows,
     delta: delta_network.Params | None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return pos_w, vel_w (N, T, 3) after every row, and the corrections (N, T, 3).
@@ -158,9 +146,9 @@ def replay_quadrotor(
     """
     plant = plant_of(config, {}, cut.dt, varies=False)
     count = windows.pos_w.shape[0]
-    hover = start_memory(plant, (count,), jnp)
+    hover = hover_state(plant, (count,), jnp)
     speed = jnp.asarray(windows.rotor_speed)
-    memory = Memory(
+    state = PlantState(
         jnp.where(jnp.isfinite(speed), speed, hover.rotor_speed),
         jnp.swapaxes(jnp.asarray(windows.past), 1, 2),
         hover.wind,
@@ -173,7 +161,7 @@ def replay_quadrotor(
         rot_w=jnp.asarray(windows.rot_w),
         rate_b=jnp.asarray(windows.rate_b),
         heading_w=zero.at[:, 0].set(1.0),
-        memory=memory,
+        plant=state,
         time_s=jnp.asarray(windows.start_s),
     )
 
@@ -198,7 +186,7 @@ def replay_quadrotor(
         )
         return (body, hidden, correction), (body.pos_w, body.vel_w, correction)
 
-    hidden = delta_network.start(count) if delta is None else remembered(delta, windows.warm)
+    hidden = state_after(delta, windows.burn_in)
     by_row = (windows.action_b, windows.decides, windows.yaw_rate)
     by_row = tuple(jnp.swapaxes(jnp.asarray(x), 0, 1) for x in by_row)
     _, flown = jax.lax.scan(step, (body, hidden, zero), by_row)

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 
 from policies.networks import delta_network
-from suite.delta.warm import remembered
-from suite.delta.windows import Windows
+from suite.delta.burn_in import state_after
+from suite.delta.windows import PointMassWindows
 from suite.train.config import PointMassConfig
 from suite.train.dynamics import point_mass
 from tracks.geometry.rotation import to_local, to_world
 from tracks.geometry.scene import Array
 
 
-class Plant(NamedTuple):
+class PointMassModel(NamedTuple):
     """Constants of the replayed point mass, scalars and one vector."""
 
     lag: Array
@@ -27,10 +27,10 @@ class Plant(NamedTuple):
     """Delay of a command in decisions."""
 
 
-def nominal_plant(config: PointMassConfig) -> Plant:
+def nominal_model(config: PointMassConfig) -> PointMassModel:
     """Return the middle of the trainer's ranges."""
     along = (config.drag, config.drag, config.drag_up)
-    return Plant(
+    return PointMassModel(
         jnp.asarray(config.lag_mean),
         jnp.asarray([(low + high) / 2 for low, high in along]),
         jnp.asarray(sum(config.action_delay) / 2),
@@ -38,7 +38,7 @@ def nominal_plant(config: PointMassConfig) -> Plant:
 
 
 def replay(
-    plant: Plant, windows: Windows, delta: delta_network.Params | None
+    model: PointMassModel, windows: PointMassWindows, delta: delta_network.Params | None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return pos_w, vel_w (N, T, 3) after every decision, and the corrections (N, T, 3).
 
@@ -46,14 +46,14 @@ def replay(
     which the point mass does not decide, follows the record.
 
     Args:
-        plant: constants of the point mass.
+        model: constants of the point mass.
         windows: the record, N windows of T decisions.
         delta: parameters of the Delta Action network; None leaves the actions as they are.
     """
     count = windows.action_b.shape[0]
     rot_w = jnp.asarray(windows.rot_w)
     air_b = to_local(rot_w, windows.vel_w[:, 0])
-    thrust_w = windows.acc_w + to_world(rot_w, plant.drag * air_b)
+    thrust_w = windows.acc_w + to_world(rot_w, model.drag * air_b)
     body = point_mass.Body(
         pos_w=jnp.asarray(windows.pos_w[:, 0]),
         vel_w=jnp.asarray(windows.vel_w[:, 0]),
@@ -74,11 +74,11 @@ def replay(
             vel_b = to_local(body.rot_w, body.vel_w)
             correction, hidden = delta_network.step(delta, hidden, vel_b, body.rot_w[:, 2], action)
         constants = point_mass.Constants(
-            lag=jnp.broadcast_to(plant.lag, count),
-            drag=jnp.broadcast_to(plant.drag, (count, 3)),
+            lag=jnp.broadcast_to(model.lag, count),
+            drag=jnp.broadcast_to(model.drag, (count, 3)),
             wind_w=jnp.zeros((count, 3)),
             time_step=time_step,
-            delay=jnp.broadcast_to(plant.delay, count),
+            delay=jnp.broadcast_to(model.delay, count),
         )
         body = point_mass.step(body, constants, action + correction, body.pos_w, 0.0, 0.0)
         body = body._replace(
@@ -92,8 +92,7 @@ def replay(
         jnp.swapaxes(windows.heading_w, 0, 1)[1:],
         jnp.swapaxes(windows.time_step, 0, 1),
     )
-    hidden = delta_network.start(count) if delta is None else remembered(delta, windows.warm)
-    start = (body, hidden)
-    _, (pos_w, vel_w, correction_b) = jax.lax.scan(step, start, by_step)
-    pos_w, vel_w = jnp.swapaxes(pos_w, 0, 1), jnp.swapaxes(vel_w, 0, 1)
-    return pos_w, vel_w, jnp.swapaxes(correction_b, 0, 1)
+    start = (body, state_after(delta, windows.burn_in))
+    _, flown = jax.lax.scan(step, start, by_step)
+    pos_w, vel_w, correction_b = (jnp.swapaxes(x, 0, 1) for x in flown)
+    return pos_w, vel_w, correction_b

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,22 @@ from policies.formats.delta_file import save_delta
 from suite.common.console import Console
 from suite.common.estimate import Estimate, announce
 from suite.common.provenance import write_run_record
-from suite.delta.corrected import corrected
-from suite.delta.fit import Errors, Fit, FitConfig, Network, fit, fit_network
+from suite.delta.corrected import QUAD, corrected
+from suite.delta.fit import DeltaFit, FitConfig, PointMassFit, ReplayErrors, fit, fit_network
 from suite.delta.windows import cut_windows
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain, write_json, write_text
 
-PLANT_STEPS_S = 4e5
-"""Steps of the quadrotor a second that a fit makes, for the estimate."""
+PLANT_STEPS_S, POINT_STEPS_S = 4e5, 1.5e5
+"""Steps of the quadrotor and of the point mass a second that a fit makes, for the estimate."""
+
+
+def fitting_estimate(config: FitConfig, steps: float, through_quadrotor: bool) -> Estimate:
+    """Return about how long a fit takes with windows of `steps`, and what memory it needs."""
+    work = config.iterations * config.batch * steps
+    if through_quadrotor:
+        return Estimate(40 + work / PLANT_STEPS_S, 1.5e9)
+    return Estimate(20 + work / POINT_STEPS_S, 8e8)
 
 
 def flight_files(paths: Sequence[Path]) -> list[Path]:
@@ -62,119 +70,93 @@ def split(
 
 
 def fit_delta(
-    config: FitConfig, physics: PointMassConfig, paths: Sequence[Path], out: Path, console: Console
-) -> Fit:
+    config: FitConfig,
+    dynamics: PointMassConfig | QuadrotorConfig,
+    paths: Sequence[Path],
+    out: Path,
+    console: Console,
+) -> DeltaFit:
     """Fit the Delta Action Model to flight logs; write the checkpoint, the curve and the table.
 
-    Raises:
-        ValueError: where the logs cannot be used.
-    """
-    known, held = _read(config, paths, console)
-    windows = cut_windows(known, config.horizon_s, config.stride_s)
-    held_windows = cut_windows(held, config.horizon_s, config.stride_s)
-    work = config.iterations * config.batch * windows.action_b.shape[1]
-    announce(console, "fitting the Delta Action Model", Estimate(20 + work / 1.5e5, 8e8))
-    with console.progress("fitting", config.iterations) as show:
-        result = fit(config, physics, windows, held_windows, show)
-    summary = {
-        "windows": {"fit": len(windows.acc_w), "held_out": len(held_windows.acc_w)},
-        "point_mass": result.point_mass,
-        "fitted_point_mass": result.fitted_point_mass,
-        "delta_action": result.delta_action,
-        "identified": result.identified,
-        "curve": result.curve,
-    }
-    words = table(result, config.horizon_s)
-    _write(config, corrected(physics), held, result.params, summary, words, out)
-    return result
-
-
-def fit_quadrotor_delta(
-    config: FitConfig, quad: QuadrotorConfig, paths: Sequence[Path], out: Path, console: Console
-) -> Network:
-    """Fit a Delta Action Model of the trainer's quadrotor; write the same files.
+    Args:
+        config: the fit.
+        dynamics: the trainer's point mass or quadrotor, which is corrected.
+        paths: flight logs, and folders of them.
+        out: folder for delta/, delta.json and table.md.
+        console: told how it goes.
 
     Raises:
         ValueError: where the logs cannot be used.
     """
-    from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor
-
-    known, held = _read(config, paths, console)
-    windows, cut = cut_quadrotor_windows(known, quad, config.horizon_s, config.stride_s)
-    held_windows, _ = cut_quadrotor_windows(held, quad, config.horizon_s, config.stride_s)
-    work = config.iterations * config.batch * windows.action_b.shape[1] * cut.physics
-    words = "fitting the Delta Action Model through the quadrotor"
-    announce(console, words, Estimate(40 + work / PLANT_STEPS_S, 1.5e9))
-    with console.progress("fitting", config.iterations) as show:
-        replay = partial(replay_quadrotor, quad, cut)
-        result = fit_network(config, replay, windows, held_windows, show)
-    summary = {
-        "vehicle": quad.vehicle,
-        "windows": {"fit": len(windows.start_s), "held_out": len(held_windows.start_s)},
-        "without": result.without,
-        "delta_action": result.with_delta,
-        "curve": result.curve,
-    }
-    words = quadrotor_table(result, config.horizon_s)
-    _write(config, corrected(quad), held, result.params, summary, words, out)
-    return result
-
-
-def _read(
-    config: FitConfig, paths: Sequence[Path], console: Console
-) -> tuple[list[FlightLog], list[FlightLog]]:
     logs, warnings = read_flights(flight_files(paths))
     for warning in warnings:
         console.note(f"warning: {warning}")
-    return split(logs, config.held_out, config.seed)
+    parts, about = split(logs, config.held_out, config.seed), corrected(dynamics)
+    work: Callable[[Any, Any, Callable[[int, str], None]], DeltaFit]
+    known: Any
+    held_out: Any
+    if isinstance(dynamics, QuadrotorConfig):
+        from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor
 
-
-def _write(
-    config: FitConfig,
-    of: Mapping[str, Any],
-    held: Sequence[FlightLog],
-    params: Mapping[str, Any],
-    summary: Mapping[str, Any],
-    words: str,
-    out: Path,
-) -> None:
+        cuts = [
+            cut_quadrotor_windows(part, dynamics, config.horizon_s, config.stride_s)
+            for part in parts
+        ]
+        known, held_out = (windows for windows, _ in cuts)
+        grid = cuts[0][1]
+        words, steps = "fitting the Delta Action Model through the quadrotor", grid.physics
+        work = partial(fit_network, config, partial(replay_quadrotor, dynamics, grid))
+    else:
+        known, held_out = (cut_windows(part, config.horizon_s, config.stride_s) for part in parts)
+        words, steps = "fitting the Delta Action Model", 1
+        work = partial(fit, config, dynamics)
+    steps *= known.action_b.shape[1]
+    announce(console, words, fitting_estimate(config, steps, about["model"] == QUAD))
+    with console.progress("fitting", config.iterations) as show:
+        result = work(known, held_out, show)
+    summary = {
+        "model": about["model"],
+        "horizon_s": config.horizon_s,
+        "held_out": [log.name for log in parts[1]],
+        **({"vehicle": dynamics.vehicle} if isinstance(dynamics, QuadrotorConfig) else {}),
+        "windows": {"fit": len(known.pos_w), "held_out": len(held_out.pos_w)},
+        **errors(result),
+        **({"identified": result.identified} if isinstance(result, PointMassFit) else {}),
+        "curve": result.curve,
+    }
     write_run_record(out, config, config.seed)
-    names = [log.name for log in held]
-    about = {"model": of["model"], "horizon_s": config.horizon_s, "held_out": names, **summary}
-    save_delta(out / "delta", params, seed=config.seed, fit={**plain(config), **of})
-    write_json(out / "delta.json", plain(about))
-    write_text(out / "table.md", words)
+    save_delta(out / "delta", result.params, seed=config.seed, fit={**plain(config), **about})
+    write_json(out / "delta.json", plain(summary))
+    write_text(out / "table.md", table(result, config.horizon_s))
+    return result
 
 
-def quadrotor_table(result: Network, horizon_s: float) -> str:
-    """Return the held-out errors through the quadrotor as a Markdown table."""
-    rows = (
-        ("quadrotor of the vehicle file", result.without),
-        ("quadrotor with Delta Action Model", result.with_delta),
-    )
-    return _markdown(rows, horizon_s, "the quadrotor's")
+def errors(result: DeltaFit) -> dict[str, ReplayErrors]:
+    """Return the held-out errors by what flew, as delta.json has them."""
+    if isinstance(result, PointMassFit):
+        return {
+            "point_mass": result.without,
+            "fitted_point_mass": result.rival,
+            "delta_action": result.with_delta,
+        }
+    return {"without": result.without, "delta_action": result.with_delta}
 
 
-def table(result: Fit, horizon_s: float) -> str:
+def table(result: DeltaFit, horizon_s: float) -> str:
     """Return the held-out errors as a Markdown table."""
-    rows = (
-        ("point mass as trained in", result.point_mass),
-        ("point mass, lag, drag and delay fitted", result.fitted_point_mass),
-        ("point mass with Delta Action Model", result.delta_action),
-    )
-    return _markdown(rows, horizon_s, "the point mass's")
-
-
-def _markdown(rows: Sequence[tuple[str, Errors]], horizon_s: float, whose: str) -> str:
-    base = rows[0][1].position_m
+    whose = "point mass" if isinstance(result, PointMassFit) else "quadrotor"
+    names = {
+        "without": "quadrotor of the vehicle file",
+        "point_mass": "point mass as trained in",
+        "fitted_point_mass": "point mass, lag, drag and delay fitted",
+        "delta_action": f"{whose} with Delta Action Model",
+    }
     lines = [
         f"| held-out flights, after {horizon_s:g} s | position error [m] "
-        f"| velocity error [m/s] | of {whose} |",
+        f"| velocity error [m/s] | of the {whose}'s |",
         "|---|---|---|---|",
     ]
-    for name, errors in rows:
-        share = errors.position_m / base
-        lines.append(
-            f"| {name} | {errors.position_m:.3f} | {errors.velocity_m_s:.3f} | {share:.2f} |"
-        )
+    for key, (position_m, velocity_m_s) in errors(result).items():
+        share = position_m / result.without.position_m
+        lines.append(f"| {names[key]} | {position_m:.3f} | {velocity_m_s:.3f} | {share:.2f} |")
     return "\n".join([*lines, ""])

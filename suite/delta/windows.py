@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from suite.delta.warm import WARM_S, Warm, gather
+from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before
 from tracks.geometry.rotation import quat_to_rot
 
+T = TypeVar("T")
 HISTORY = 2
 """Decisions before a window whose commands may still be on their way into it."""
 
 
-class Windows(NamedTuple):
+class PointMassWindows(NamedTuple):
     """N windows of T decisions; row 0 is where the replay starts."""
 
     pos_w: np.ndarray
@@ -34,15 +36,8 @@ class Windows(NamedTuple):
     """(N, HISTORY, 3) commands before the window in world axes, latest first [m/s^2]."""
     time_step: np.ndarray
     """(N, T) time between decisions [s]."""
-    warm_inputs: np.ndarray
-    """(N, W, 9) as in `suite.delta.warm.Warm`."""
-    warm_seen: np.ndarray
-    """(N, W)."""
-
-    @property
-    def warm(self) -> Warm:
-        """What the network saw before each window."""
-        return Warm(self.warm_inputs, self.warm_seen)
+    burn_in: BurnIn
+    """What the network saw before each window."""
 
 
 def _heading(rot_w: np.ndarray) -> np.ndarray:
@@ -57,7 +52,7 @@ def _heading(rot_w: np.ndarray) -> np.ndarray:
     return np.where(size > 1e-3, ahead / np.maximum(size, 1e-3), [1.0, 0.0, 0.0])
 
 
-def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -> Windows:
+def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -> PointMassWindows:
     """Return windows of `duration_s`, one starting every `stride_s` of every flight.
 
     A window with a missing value is left out. The acceleration at the start is the mean over the
@@ -67,27 +62,44 @@ def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -
         ValueError: where a log has no actions, or no flight is as long as a window.
     """
     parts = [window for log in logs for window in _flight_windows(log, duration_s, stride_s)]
-    if not parts:
+    refuse_none(parts, logs, duration_s)
+    steps = min(len(part.action_b) for part in parts)
+    back = min(len(part.burn_in.seen) for part in parts)
+
+    def alike(part: PointMassWindows) -> PointMassWindows:
+        """Cut a window to as many decisions, and its burn-in to the latest, as all have."""
+        return part._replace(
+            pos_w=part.pos_w[: steps + 1],
+            vel_w=part.vel_w[: steps + 1],
+            heading_w=part.heading_w[: steps + 1],
+            action_b=part.action_b[:steps],
+            time_step=part.time_step[:steps],
+            burn_in=BurnIn(*(array[len(array) - back :] for array in part.burn_in)),
+        )
+
+    return stacked([alike(part) for part in parts])
+
+
+def refuse_none(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: float) -> None:
+    """Refuse flights without a window.
+
+    Raises:
+        ValueError: naming some of them, and what to do.
+    """
+    if not windows:
         names = ", ".join(log.name for log in logs[:3])
         raise ValueError(
             f"no window of {duration_s} s in {len(logs)} flights ({names}, ...); record longer "
             "flights with suite collect"
         )
-    shortest = min(part.action_b.shape[0] for part in parts)
-    rows = {"pos_w": shortest + 1, "vel_w": shortest + 1, "heading_w": shortest + 1}
-    rows |= {"action_b": shortest, "time_step": shortest}
-    looks_back = min(part.warm_seen.shape[0] for part in parts)
-
-    def stacked(name: str) -> np.ndarray:
-        arrays = [getattr(part, name) for part in parts]
-        if name.startswith("warm"):
-            return np.stack([a[len(a) - looks_back :] for a in arrays])
-        return np.stack([a[: rows[name]] if name in rows else a for a in arrays])
-
-    return Windows(*(stacked(name).astype(np.float32) for name in Windows._fields))
 
 
-def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[Windows]:
+def stacked(windows: Sequence[T]) -> T:
+    """Return windows of one shape along a new first axis, as 32-bit numbers."""
+    return jax.tree.map(lambda *arrays: np.stack(arrays).astype(np.float32), *windows)
+
+
+def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[PointMassWindows]:
     action, decides = log.action_b, log.policy_step
     if action is None or decides is None:
         raise ValueError(
@@ -112,7 +124,7 @@ def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[
         if (steady > 1.5 * period).any() or not np.isfinite(acc[first]).all():
             continue
         found.append(
-            Windows(
+            PointMassWindows(
                 log.pos_w[at[span]],
                 log.vel_w[at[span]],
                 acc[first],
@@ -121,7 +133,7 @@ def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[
                 action[at[span]][:-1],
                 command[first - HISTORY : first][::-1],
                 np.diff(time[span]),
-                *gather(rot, log.vel_w[at], action[at], first, round(WARM_S / period)),
+                burn_in_before(rot, log.vel_w[at], action[at], first, round(BURN_IN_S / period)),
             )
         )
     return found

@@ -2,24 +2,46 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
-from suite.common.choices import at_least, parse_levels
-from suite.common.console import Console
+import numpy as np
+
+from eval.judging.statistics import Interval
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import TrialResult
+from suite.common.console import Console, duration
+from suite.common.errors import WorkFailed
+from suite.common.report import Grid, Picture, Report, Section, ranged
+from suite.experiments.pages.document import Place
+from suite.experiments.pages.tables import points_cell, table
 from suite.experiments.schemes import PROJECTION, PROJECTION_DECAY
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from suite.experiments.document import Place
-    from suite.train.config import TrainConfig
+from suite.experiments.study import judging, options, training
+from suite.experiments.study.intervals import Gap, crossed, spread
+from suite.experiments.study.summary import Summary, summaries
+from suite.train.overrides import override
 
 RECIPE = "recipe"
 """The key of the row that all others are compared with."""
 ROUND_CORNERS = 8
 """Of the gates in the comparison of fields."""
+MEANING = (
+    "Success: over the trials of all training seeds, with the least and the most of a seed. "
+    "Difference: to the recipe on the same trials and training seeds, in points, with a 95 % "
+    "bootstrap interval that draws training seeds and trials anew. A gain or a loss is where it "
+    "leaves zero out and every seed agrees. Seeds are few, and all rows are compared with the same "
+    "trainings of the recipe: where a change does nothing, three seeds agree in sign one time in "
+    "four, and of many rows one may stand out by chance.",
+    "v_max: the median over trials of each one's largest speed before any contact. Training: the "
+    "median time of a row's trainings, without compilation.",
+)
+ROUND = (
+    "In the training's own dynamics, from standing start. Success cross: all gates without a "
+    "collision; success rate: no collision, whatever gates were passed. Mean over training seeds, "
+    "least and most. Images show the nearest 24 bars and plates, and collisions are looked for "
+    "among the nearest 8: three gates and one, with eight bars each. It is the same for both."
+)
 
 
 @dataclass(frozen=True)
@@ -57,94 +79,102 @@ class Config:
     """Trainings at once, each in a process with its own share of the cores."""
 
 
-class Idea(NamedTuple):
-    """A row: the recipe, or one change of it."""
+class Compared(NamedTuple):
+    """A row against the recipe."""
 
     key: str
-    """Its name."""
-    words: str
-    """What it is for."""
-    changes: tuple[str, ...]
-    """Of the recipe, as `suite train --set` takes them."""
-    recipe: TrainConfig
-    """With the changes made, and the seed left as it is."""
+    success: list[float]
+    """Of each training seed."""
+    difference: Interval
+    """In success, over all seeds' trials."""
+    of_seeds: list[float]
+    """The difference of each training seed."""
+    v_max: float
+    """Median over trials [m/s]."""
+    collisions: float
+    """Share of trials."""
+    timeouts: float
+    """Share of trials."""
+    seconds: float
+    """Median training time [s]."""
 
     @property
-    def round(self) -> bool:
-        """Whether it is about round gates, which the judge does not have."""
-        return self.recipe.episode.gate_corners != 4
+    def gap(self) -> Gap:
+        """The difference, and what it tells."""
+        return Gap(self.difference, self.of_seeds)
 
 
-class Made(NamedTuple):
-    """A training of a row."""
-
-    policy: str
-    """Its checkpoint's folder."""
-    seconds: float
-    """Spent on gradient steps after those that compile [s]."""
-    commit: str
-    """That trained it."""
-    diverged: str = ""
-    """What was said where it diverged, and there is no policy to fly."""
-
-
-def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
-    """Train and fly what is missing and write ideas.md.
+def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
+    """Return the page and its numbers; train and fly what is missing.
 
     Raises:
-        ValueError: for anything that cannot be used, before the first training.
         WorkFailed: where a training of the recipe itself diverges; any other leaves its row out.
     """
-    import functools
+    from suite.experiments.pages.charts import gaps_chart
 
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from suite.common.work import all_done, check_jobs
-    from suite.experiments.document import write_document
-    from suite.experiments.flights import Flier, Order, flown
-    from suite.experiments.ideas_tables import ideas_report
-    from suite.experiments.recipes import check_seeds, check_unseen
-    from suite.judging.flying import trial_list
-    from tracks.families import JUDGED
-
-    seeds = config.training_seeds
-    check_seeds(seeds)
-    check_unseen("--round-seed", config.round_seed, seeds)
-    check_jobs(config.jobs)
-    at_least("--trials", config.trials, 1)
-    at_least("--round-trials", config.round_trials, 1)
-    at_least("--round-seconds", config.round_seconds, 0.5)
-    at_least("--seed", config.seed, 0)
-    vehicle, chosen = load_vehicle(config.vehicle), ideas(config)
-    trials = trial_list(JUDGED, parse_levels(config.difficulty), config.trials, config.seed)
-    runs = {(idea.key, s): replace(idea.recipe, seed=s) for s in seeds for idea in chosen}
-    console.note(f"{len(runs)} trainings, less those that are there")
-    do = functools.partial(_make, cache=place.cache)
-    found = all_done(do, list(runs.values()), config.jobs, console, "training")
-    made = dict(zip(runs, found, strict=True))
-    chosen, failures = _whole_rows(chosen, made)
-    wanted = [(idea.key, seed) for idea in chosen if not idea.round for seed in seeds]
-    orders = [Order(Flier(made[which].policy, vehicle), trials) for which in wanted]
-    flights = flown(orders, place.cache, console, f"judging {len(orders)} trainings")
-    judged = dict(zip(wanted, flights, strict=True))
-    measured = {
-        idea.key: _flown_round(idea, [made[idea.key, seed].policy for seed in seeds], config)
-        for idea in chosen
-        if idea.round
+    seeds, vehicle = config.training_seeds, load_vehicle(config.vehicle)
+    asked, trials = ideas(config), judging.trials_of(config)
+    looks = training.Looks(0, config.round_trials, config.round_seed, config.round_seconds)
+    plain, turned = ([row for row in asked if is_round(row) is wanted] for wanted in (False, True))
+    studies = [
+        training.Study(plain, seeds, config.jobs, by_seed=True),
+        training.Study(turned, seeds, config.jobs, looks),
+    ]
+    runs = [run for study in studies for run in training.trained(study, place.cache, console)]
+    failures = _failures(runs)
+    judged, rounds = ([r for r in study.rows if r.key not in failures] for study in studies)
+    made = {(run.row, run.seed): run for run in runs}
+    orders = {
+        (row.key, seed): judging.Order(judging.Flier(made[row.key, seed].policy, vehicle), trials)
+        for row in judged
+        for seed in seeds
     }
-    report, numbers = ideas_report(config, chosen, made, judged, measured, failures)
-    return write_document(place, "ideas", report, numbers, config.seed, console)
+    flights = judging.flown(orders, place.cache, console, f"judging {len(orders)} trainings")
+    base = _won([flights[RECIPE, seed] for seed in seeds])
+    rows = [
+        compared(
+            row.key,
+            [flights[row.key, seed] for seed in seeds],
+            base,
+            float(np.median([made[row.key, seed].seconds for seed in seeds])),
+        )
+        for row in judged
+    ]
+    measured, recipe = summaries(rounds, runs), asked[0].recipe
+    caption = "Difference in success to the recipe; dots: training seeds."
+    picture = Picture(gaps_chart({row.key: row.gap for row in rows[1:]}), caption)
+    sections = [Section("One change at a time", [_grid(judged, rows), *MEANING, picture])]
+    if rounds:
+        sections.append(Section("Round gates", [_round_grid(measured), ROUND]))
+    report = Report(
+        title="What could be better than the recipe",
+        lead=" ".join([lead(rows), *map(_round_words, measured)]),
+        facts={
+            "recipe": f"{options.recipe_words(config)}, {recipe.optimizer.iterations} gradient "
+            f"steps of {recipe.episode.batch} worlds x {recipe.episode.steps} steps",
+            "training seeds": " ".join(map(str, seeds)),
+            "trained at commit": training.commits(runs),
+            "trials": f"three tracks, levels {config.difficulty}, seeds "
+            f"{options.judged_seeds(config)}: {len(trials)} a training",
+            "worlds with round gates": f"{config.round_trials}, seed {config.round_seed}, "
+            f"{config.round_seconds:g} s each",
+            "trainings at once": f"{config.jobs}, each on its own share of the cores",
+            "vehicle": config.vehicle,
+            **{f"left out, {key}": said for key, said in failures.items()},
+        },
+        sections=sections,
+    )
+    worlds = {row.key: [points[-1] for points in row.whole] for row in measured}
+    return report, {"rows": rows, "round": worlds, "diverged": failures}
 
 
-def ideas(config: Config) -> list[Idea]:
+def ideas(config: Config) -> list[training.Row]:
     """Return the recipe and the changes of it that are asked for; what changes nothing is left out.
 
     Raises:
         ValueError: for a preset, a change or a row that does not exist.
     """
-    from suite.experiments.recipes import asked_recipe, asked_rows
-    from suite.train.overrides import override
-
-    base = asked_recipe(config.preset, config.set, config.iterations)
+    base = options.asked_recipe(config)
     if base.episode.gate_corners != 4:
         raise ValueError(
             f"--set episode.gate_corners={base.episode.gate_corners}: the judge's gates have 4; "
@@ -176,51 +206,118 @@ def ideas(config: Config) -> list[Idea]:
         ),
     }
     made = [
-        Idea(k, words, changes, override(base, changes)) for k, (words, changes) in rows.items()
+        training.Row(key, words, override(base, changes), changes)
+        for key, (words, changes) in rows.items()
     ]
-    kept = asked_rows(made, config.only, "row")
-    return [
-        Idea(RECIPE, "nothing changed", (), base),
-        *(idea for idea in kept if idea.recipe != base),
-    ]
+    kept = training.asked_rows(made, config.only, "row")
+    recipe = training.Row(RECIPE, "nothing changed", base)
+    return [recipe, *(row for row in kept if row.recipe != base)]
 
 
-def _make(config: TrainConfig, console: Console, cache: Path) -> Made:
-    from suite.experiments.trainings import commit_of, divergence, folder_of, warm_seconds
-
-    diverged = divergence(config, cache, console)
-    if diverged:
-        console.note(diverged)
-    folder = folder_of(config, cache)
-    policy = folder / "policy"
-    return Made(str(policy), warm_seconds(folder), commit_of(policy), diverged)
+def is_round(row: training.Row) -> bool:
+    """Return whether a row is about round gates, which the judge does not have."""
+    return row.recipe.episode.gate_corners != 4
 
 
-def _whole_rows(
-    chosen: list[Idea], made: Mapping[tuple[str, int], Made]
-) -> tuple[list[Idea], dict[str, str]]:
-    """Return the rows whose trainings all came to an end, and what the others' seeds said.
+def _failures(runs: Sequence[training.Trained]) -> dict[str, str]:
+    """Return what the seeds of rows said of which a training diverged.
 
     Raises:
         WorkFailed: where the recipe's own training diverged, with which all are compared.
     """
-    from suite.common.errors import WorkFailed
-
     failures: dict[str, str] = {}
-    for (key, seed), run in made.items():
+    for run in runs:
         if run.diverged:
-            before = f"{failures[key]}; " if key in failures else ""
-            failures[key] = f"{before}seed {seed}: {run.diverged}"
+            before = f"{failures[run.row]}; " if run.row in failures else ""
+            failures[run.row] = f"{before}seed {run.seed}: {run.diverged}"
     if RECIPE in failures:
         raise WorkFailed(f"the recipe itself, {failures[RECIPE]}")
-    return [idea for idea in chosen if idea.key not in failures], failures
+    return failures
 
 
-def _flown_round(idea: Idea, policies: list[str], config: Config) -> list[dict[str, float]]:
-    """Return what each policy does in unseen worlds with round gates, the same for all."""
-    from suite.experiments.validation import make_validation, stored_params
+def compared(
+    key: str, mine: Sequence[Sequence[TrialResult]], base: np.ndarray, seconds: float
+) -> Compared:
+    """Return a row.
 
-    measure = make_validation(
-        idea.recipe, config.round_trials, config.round_seed, config.round_seconds
+    Args:
+        key: its name.
+        mine: results of each training seed, the same trials in the same order.
+        base: which of them the recipe's trainings won, (seeds, trials) bool.
+        seconds: median training time.
+    """
+    won = _won(mine)
+    gap, every = crossed(won.astype(float) - base), [row for rows in mine for row in rows]
+    return Compared(
+        key=key,
+        success=won.mean(axis=1).tolist(),
+        difference=gap.difference,
+        of_seeds=gap.of_seeds,
+        v_max=float(np.median([row.v_max for row in every])),
+        collisions=float(np.mean([row.ended_by == "collision" for row in every])),
+        timeouts=float(np.mean([row.ended_by == "timeout" for row in every])),
+        seconds=seconds,
     )
-    return [measure(stored_params(path)) for path in policies]
+
+
+def _won(results: Sequence[Sequence[TrialResult]]) -> np.ndarray:
+    return np.array([[row.success for row in rows] for rows in results])
+
+
+def lead(rows: Sequence[Compared]) -> str:
+    """Return in sentences which changes are gains and which losses."""
+    said = [f"Of the recipe's trials {100 * float(np.mean(rows[0].success)):.0f} % succeed."]
+    for verdict, words in (("gain", "More succeed with"), ("loss", "Fewer succeed with")):
+        named = [
+            f"{row.key} ({points_cell(row.difference).text})"
+            for row in rows[1:]
+            if row.gap.verdict == verdict
+        ]
+        if named:
+            said.append(f"{words} {', '.join(named)}.")
+    unclear = [row.key for row in rows[1:] if row.gap.verdict == "unclear"]
+    if unclear:
+        said.append(f"These trainings do not tell for {', '.join(unclear)}.")
+    return " ".join(said)
+
+
+def _round_words(row: Summary) -> str:
+    cross, words = row.text("success_cross"), row.words[0].upper() + row.words[1:]
+    return f"{words}: {cross} % of the tracks are crossed."
+
+
+def _grid(judged: Sequence[training.Row], rows: Sequence[Compared]) -> Grid:
+    headers = ["row", "what", "changes", "success [%]", "difference [points]", "by seed",
+               "v_max [m/s]", "collisions [%]", "timeouts [%]", "training", ""]  # fmt: skip
+    lines = []
+    for (_, words, _, changes), row in zip(judged, rows, strict=True):
+        seeds = " ".join(f"{round(100 * gap) + 0:+d}" for gap in row.of_seeds)
+        success = ranged(*spread([100 * rate for rate in row.success]), 0)
+        told = ("-", "-", "") if row.key == RECIPE else (
+            points_cell(row.difference), seeds, row.gap.verdict
+        )  # fmt: skip
+        lines.append(
+            [
+                row.key,
+                words,
+                " ".join(f"`{change}`" for change in changes) or "-",
+                success,
+                *told[:2],
+                f"{row.v_max:.2f}",
+                f"{100 * row.collisions:.0f}",
+                f"{100 * row.timeouts:.0f}",
+                duration(row.seconds),
+                told[2],
+            ]
+        )
+    return table(headers, lines)
+
+
+def _round_grid(rounds: Sequence[Summary]) -> Grid:
+    headers = ["row", "what", "success cross [%]", "success rate [%]", "v_max [m/s]", "gates"]
+    digits = {"success_cross": 0, "success_rate": 0, "v_max": 2, "gates": 2}
+    lines = [
+        [row.key, row.words, *(row.text(name, digits=d) for name, d in digits.items())]
+        for row in rounds
+    ]
+    return table(headers, lines)

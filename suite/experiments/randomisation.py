@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
-from suite.common.choices import at_least, parse_levels
+import numpy as np
+
+from eval.judging.statistics import Interval, wilson
+from eval.quadrotor.vehicle_file import load_vehicle
 from suite.common.console import Console
-
-if TYPE_CHECKING:
-    from eval.worlds.trial import TrialSpec
-    from suite.experiments.conditions import Condition
-    from suite.experiments.document import Place
-    from suite.experiments.robust_tables import Tested
-    from suite.train.config import PointMassConfig, TrainConfig
+from suite.common.report import Grid, Picture, Report, Section
+from suite.experiments.pages.document import Place
+from suite.experiments.pages.tables import condition_grid, points_cell, table
+from suite.experiments.study import disturbed, judging, options, training
+from suite.experiments.study.disturbed import Tested
+from suite.experiments.study.intervals import Gap, nested
+from suite.train.config import PointMassConfig, TrainConfig
 
 FIXED, RANDOMISED = "fixed", "randomised"
+ALL = "all disturbances"
+MEANING = (
+    "Success: over all trials under all sizes of the disturbance but the undisturbed one. "
+    "Difference: randomised - fixed, in points, with a 95 % bootstrap interval that draws training "
+    "seeds anew and the trials of each, a trial with all its conditions. A gain or a loss is where "
+    "it leaves zero out and every seed agrees; with few seeds one of several rows may stand out by "
+    "chance."
+)
 
 
 @dataclass(frozen=True)
@@ -47,50 +59,75 @@ class Config:
     """Trainings at once, each in a process with its own share of the cores."""
 
 
-def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
-    """Train and fly what is missing and write randomisation.md.
+class Compared(NamedTuple):
+    """Two settings of the recipe under some conditions, all of them together."""
 
-    Raises:
-        ValueError: for anything that cannot be used, before the first training.
-        WorkFailed: where a training diverges.
-    """
-    import functools
+    rates: dict[str, Interval]
+    """Each setting's success, with Wilson intervals."""
+    gap: Gap
+    """In success, the second - the first."""
 
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from suite.common.work import all_done, check_jobs
-    from suite.experiments.conditions import sweep_conditions, sweeps
-    from suite.experiments.document import write_document
-    from suite.experiments.randomisation_tables import randomisation_report
-    from suite.experiments.recipes import asked_recipe, check_seeds
-    from suite.experiments.trainings import trained_policy
-    from suite.judging.flying import trial_list
-    from tracks.common.names import unknown_name
-    from tracks.families import JUDGED
 
-    seeds = config.training_seeds
-    check_seeds(seeds)
-    at_least("--trials", config.trials, 1)
-    at_least("--seed", config.seed, 0)
-    check_jobs(config.jobs)
-    vehicle = load_vehicle(config.vehicle)
-    known = {sweep.name: sweep for sweep in sweeps(vehicle)}
-    for name in config.only:
-        if name not in known:
-            raise unknown_name("sweep", name, known)
-    grown = {s: sweep_conditions(vehicle, s) for s in known.values()
-             if not config.only or s.name in config.only}  # fmt: skip
-    trials = trial_list(JUDGED, parse_levels(config.difficulty), config.trials, config.seed)
-    recipe = asked_recipe(config.preset, config.set, config.iterations)
-    runs = [replace(r, seed=seed) for r in (fixed(recipe), recipe) for seed in seeds]
-    do = functools.partial(trained_policy, cache=place.cache)
-    found = all_done(do, runs, config.jobs, console, "training")
-    policies = {FIXED: found[: len(seeds)], RANDOMISED: found[len(seeds) :]}
-    shares = [trials[number :: len(seeds)] for number in range(len(seeds))]
-    tested = _flown(policies, shares, [c for cs in grown.values() for c in cs], place, console)
-    rest = iter(tested)
-    of_sweeps = {sweep: [next(rest) for _ in points] for sweep, points in grown.items()}
-    report, numbers = randomisation_report(config, recipe, policies, shares, of_sweeps)
-    return write_document(place, "randomisation", report, numbers, config.seed, console)
+def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
+    """Return the page and its numbers; what is missing is trained and flown first."""
+    from suite.experiments.pages.charts import sweeps_chart
+
+    seeds, recipe = config.training_seeds, options.asked_recipe(config)
+    _, sweeps = disturbed.asked_conditions(load_vehicle(config.vehicle), config.only, effects=False)
+    trials = judging.trials_of(config)
+    rows = [
+        training.Row(FIXED, "fixed dynamics", fixed(recipe)),
+        training.Row(RANDOMISED, "the recipe's dynamics", recipe),
+    ]
+    runs = training.trained(
+        training.Study(rows, seeds, config.jobs, may_diverge=False), place.cache, console
+    )
+    shares = {seed: trials[part :: len(seeds)] for part, seed in enumerate(seeds)}
+    fliers = {
+        row.key: [(run.policy, shares[run.seed]) for run in runs if run.row == row.key]
+        for row in rows
+    }
+    _, grown = disturbed.flown_under([], sweeps, fliers, place.cache, console)
+    base = next(iter(grown.values()))[0]
+    worse = {sweep.name: points[1:] for sweep, points in grown.items()}
+    worse[ALL] = [point for points in worse.values() for point in points]
+    sizes = {seed: len(share) for seed, share in shares.items()}
+    compared = {
+        what: compare(
+            {row.key: np.array([p.won(row.key) for p in points]) for row in rows},
+            list(sizes.values()),
+        )
+        for what, points in {"undisturbed": [base], **worse}.items()
+    }
+    grids = [condition_grid(points, base, (s.axis,), s.name) for s, points in grown.items()]
+    picture = Picture(sweeps_chart(grown), "Success with 95 % Wilson intervals.")
+    report = Report(
+        title="What randomised dynamics in training buy",
+        lead=lead(compared),
+        facts={
+            "recipe": f"{options.recipe_words(config)}, {recipe.optimizer.iterations} gradient "
+            "steps",
+            "randomised": _ranges(recipe),
+            "fixed": "the middle of those ranges; no wind, no noise",
+            "training seeds": " ".join(map(str, seeds)),
+            "trained at commit": training.commits(runs),
+            "trials": f"three tracks, level {config.difficulty}, seeds "
+            f"{options.judged_seeds(config)}: {len(trials)} trials a condition, shared out to the "
+            "training seeds",
+            "vehicle": config.vehicle,
+        },
+        sections=[
+            Section("By disturbance", [_summary(compared), MEANING, picture]),
+            Section("Every training", [_by_seed(sizes, base, worse[ALL])]),
+            Section("Every condition", grids),
+        ],
+    )
+    return report, {
+        "compared": {what: {"rates": e.rates, **e.gap._asdict()} for what, e in compared.items()},
+        "conditions": [
+            disturbed.tested_numbers(p, base) for points in grown.values() for p in points
+        ],
+    }
 
 
 def fixed(recipe: TrainConfig) -> TrainConfig:
@@ -117,28 +154,78 @@ def fixed(recipe: TrainConfig) -> TrainConfig:
     )
 
 
-def _flown(
-    policies: dict[str, list[str]],
-    shares: list[list[TrialSpec]],
-    conditions: list[Condition],
-    place: Place,
-    console: Console,
-) -> list[Tested]:
-    """Return every condition with both settings' trials, each seed's share after the other's."""
-    from suite.experiments.flights import Flier, Order, flown
-    from suite.experiments.robust_tables import Tested
+def compare(won: Mapping[str, np.ndarray], sizes: Sequence[int]) -> Compared:
+    """Return two settings' success over all conditions together, and how they differ.
 
-    orders = [
-        Order(Flier(policy, condition.vehicle, condition.noise), share)
-        for condition in conditions
-        for paths in policies.values()
-        for policy, share in zip(paths, shares, strict=True)
-    ]
-    rows = iter(flown(orders, place.cache, console, "flying under disturbances"))
-    return [
-        Tested(
-            condition,
-            {name: [row for _ in paths for row in next(rows)] for name, paths in policies.items()},
+    Args:
+        won: which trials succeeded, (conditions, trials) bool of each setting.
+        sizes: trials of each training seed, in their order.
+    """
+    rates = {name: wilson(int(each.sum()), each.size) for name, each in won.items()}
+    first, second = (each.mean(axis=0) for each in won.values())
+    return Compared(rates, nested(np.split(second - first, np.cumsum(sizes)[:-1])))
+
+
+def lead(compared: Mapping[str, Compared]) -> str:
+    """Return in sentences what randomisation gains and loses."""
+
+    def said(name: str) -> str:
+        fixed, randomised = (100 * rate.value for rate in compared[name].rates.values())
+        points = points_cell(compared[name].gap.difference).text
+        return (
+            f"{randomised:.0f} % succeed where dynamics were randomised in training and "
+            f"{fixed:.0f} % where they were not ({points} points)"
         )
-        for condition in conditions
+
+    words = [f"Over all disturbances {said(ALL)}; undisturbed {said('undisturbed')}."]
+    for verdict, meant in (
+        ("gain", "Randomisation gains in"),
+        ("loss", "It loses in"),
+        ("unclear", "These trainings do not tell for"),
+    ):
+        named = [what for what, entry in compared.items() if entry.gap.verdict == verdict]
+        if named:
+            words.append(f"{meant}: {', '.join(named)}.")
+    return " ".join(words)
+
+
+def _summary(compared: Mapping[str, Compared]) -> Grid:
+    lines = [
+        [
+            what,
+            *(f"{100 * rate.value:.0f}" for rate in rates.values()),
+            points_cell(gap.difference),
+            " ".join(f"{100 * each:+.0f}" for each in gap.of_seeds),
+            "" if gap.verdict == "unclear" else gap.verdict,
+        ]
+        for what, (rates, gap) in compared.items()
     ]
+    headers = ["disturbance", f"{FIXED} [%]", f"{RANDOMISED} [%]", "difference [points]"]
+    return table([*headers, "by seed", ""], lines)
+
+
+def _by_seed(sizes: Mapping[int, int], base: Tested, worse: Sequence[Tested]) -> Grid:
+    lines, start, names = [], 0, list(base.results)
+    for seed, size in sizes.items():
+        mine = slice(start, start + size)
+        start += size
+        rates = [
+            100 * np.mean([point.won(name)[mine] for point in points])
+            for points in ([base], worse)
+            for name in names
+        ]
+        lines.append([str(seed), str(size), *(f"{rate:.0f}" for rate in rates)])
+    headers = ["training seed", "trials"]
+    headers += [f"{name}, {how} [%]" for how in ("undisturbed", "disturbed") for name in names]
+    return table(headers, lines)
+
+
+def _ranges(recipe: TrainConfig) -> str:
+    physics = recipe.physics
+    low, high = physics.drag
+    first, last = physics.action_delay
+    return (
+        f"lag {physics.lag_mean:g} +- {physics.lag_std:g} 1/s, drag {low:g} to {high:g} 1/s, delay "
+        f"{first:g} to {last:g} decisions, wind {physics.wind_std[0]:g} m/s, time step "
+        f"{100 * physics.time_step_std:g} %, field of view, noise of the image"
+    )

@@ -2,18 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import tyro
 
-from suite.common.choices import at_least, parse_levels
+from eval.judging.tables import percent
+from eval.quadrotor.vehicle_file import load_vehicle
+from policies.policy import load_policy
 from suite.common.console import Console
-
-if TYPE_CHECKING:
-    from suite.experiments.document import Place
+from suite.common.report import Picture, Report, Section
+from suite.experiments.pages.document import Place
+from suite.experiments.pages.tables import condition_grid
+from suite.experiments.study import disturbed, judging, options
+from suite.experiments.study.conditions import STATE_UNIT, Condition, log_faults
+from suite.experiments.study.disturbed import Grown, Tested
+from suite.judging.flying import default_policy, labels, policy_digest
 
 UNDISTURBED = "undisturbed"
+MEANINGS = (
+    "Success: rate over all tracks with its 95 % Wilson interval. Change: against the same policy "
+    "undisturbed on the same trials, in points, with Newcombe's paired 95 % interval; the "
+    "intervals are not corrected for there being many conditions."
+)
+OF_EFFECTS = (
+    "Each effect alone, added to the vehicle at the upper end of its usual size (`suite effects "
+    "NAME`); where the vehicle has more of it already, it keeps that. The autopilot and the policy "
+    "do not know."
+)
+OF_SWEEPS = (
+    "The sensors' noise is in the policy's observation only; the autopilot below it sees "
+    "the truth. Depth: white noise on every pixel's inverse depth. Gate-pose error: each "
+    "gate is shown elsewhere, the same for the whole trial. State estimate: position "
+    f"{STATE_UNIT.pos_m:g} m, velocity {STATE_UNIT.vel:g} m/s, attitude 1 deg, each axis, times "
+    f"the factor, changing over {STATE_UNIT.correlation_s:g} s. The wind blows along "
+    "(-0.6, 0.8, 0)."
+)
 
 
 @dataclass(frozen=True)
@@ -39,52 +64,79 @@ class Config:
     """Only these effects and sweeps, by name; by default all."""
 
 
-def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
-    """Fly what is missing and write robustness.md.
-
-    Raises:
-        ValueError: for anything that cannot be used, before the first flight.
-    """
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from policies.policy import load_policy
-    from suite.experiments.conditions import Condition, effect_conditions, sweep_conditions, sweeps
-    from suite.experiments.document import write_document
-    from suite.experiments.flights import Flier, Order, flown
-    from suite.experiments.robust_tables import Tested, robust_report
-    from suite.judging.flying import default_policy, labels, trial_list
-    from tracks.common.names import unknown_name
-    from tracks.families import JUDGED
-
-    at_least("--trials", config.trials, 1)
-    at_least("--seed", config.seed, 0)
-    vehicle = load_vehicle(config.vehicle)
-    asked = config.policy or (default_policy(),)
+def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
+    """Return the page and its numbers; what is missing is flown first."""
+    vehicle, asked = load_vehicle(config.vehicle), config.policy or (default_policy(),)
     names = labels(asked, [load_policy(policy).name for policy in asked])
-    all_sweeps = sweeps(vehicle)
-    effects = effect_conditions(vehicle)
-    known = dict.fromkeys([*(s.name for s in all_sweeps), *(c.name for c in effects)])
-    for name in config.only:
-        if name not in known:
-            raise unknown_name("effect or sweep", name, known)
-    chosen = config.only or tuple(known)
-    base = Condition(UNDISTURBED, 0.0, "", vehicle)
-    effects = [base, *(c for c in effects if c.name in chosen)]
-    grown = {s: sweep_conditions(vehicle, s) for s in all_sweeps if s.name in chosen}
-    conditions = [*effects, *(point for points in grown.values() for point in points)]
-    trials = trial_list(JUDGED, parse_levels(config.difficulty), config.trials, config.seed)
-    orders = [
-        Order(Flier(policy, condition.vehicle, condition.noise), trials)
-        for policy in asked
-        for condition in conditions
+    alone, sweeps = disturbed.asked_conditions(vehicle, config.only)
+    base, trials = Condition(UNDISTURBED, 0.0, "", vehicle), judging.trials_of(config)
+    fliers = {name: [(policy, trials)] for name, policy in zip(names, asked, strict=True)}
+    effects, grown = disturbed.flown_under([base, *alone], sweeps, fliers, place.cache, console)
+    report = Report(
+        title="Robustness: what the policy survives",
+        lead=_lead(names[0], effects, grown),
+        facts={
+            **{
+                name: f"{path}, SHA-256 {policy_digest(path)[:16]}"
+                for name, path in zip(names, asked, strict=True)
+            },
+            "trials": f"three tracks, level {config.difficulty}, seeds "
+            f"{options.judged_seeds(config)}: {len(trials)} trials a condition, the same in all",
+            "vehicle": config.vehicle,
+        },
+        sections=[*_of_effects(effects), *_of_sweeps(grown, effects[0])],
+    )
+    tested = [*effects, *(point for points in grown.values() for point in points)]
+    return report, {"conditions": [disturbed.tested_numbers(entry, effects[0]) for entry in tested]}
+
+
+def _of_effects(effects: Sequence[Tested]) -> list[Section]:
+    from suite.experiments.pages.charts import effects_chart
+
+    if len(effects) == 1:
+        return []
+    caption = "Success under each effect, 95 % Wilson intervals; dashed: undisturbed."
+    *some, last = log_faults()
+    parts = [
+        OF_EFFECTS,
+        Picture(effects_chart(effects), caption),
+        condition_grid(effects, effects[0], ("effect", "total")),
+        MEANINGS,
+        f"{', '.join(some)} and {last} are faults of a log, not of the flight, and change nothing "
+        "here; errors of what the policy senses are below.",
     ]
-    rows = iter(flown(orders, place.cache, console, "flying under disturbances"))
-    flown_by = {name: [next(rows) for _ in conditions] for name in names}
-    tested = [
-        Tested(condition, {name: flown_by[name][number] for name in names})
-        for number, condition in enumerate(conditions)
-    ]
-    of_effects, rest = tested[: len(effects)], iter(tested[len(effects) :])
-    of_sweeps = {sweep: [next(rest) for _ in points] for sweep, points in grown.items()}
-    report, numbers = robust_report(config, dict(zip(names, asked, strict=True)), of_effects,
-                                    of_sweeps)  # fmt: skip
-    return write_document(place, "robustness", report, numbers, config.seed, console)
+    return [Section("Every effect at its usual size", parts)]
+
+
+def _of_sweeps(grown: Grown, base: Tested) -> list[Section]:
+    from suite.experiments.pages.charts import sweeps_chart
+
+    if not grown:
+        return []
+    caption = (
+        "Success against growing disturbances, 95 % Wilson intervals; the leftmost point is the "
+        "vehicle as it is."
+    )
+    grids = [condition_grid(points, base, (s.axis,), s.name) for s, points in grown.items()]
+    parts = [Picture(sweeps_chart(grown), caption), *grids, OF_SWEEPS]
+    return [Section("Growing disturbances", parts)]
+
+
+def _lead(policy: str, effects: Sequence[Tested], grown: Grown) -> str:
+    base = effects[0].success(policy)
+    text = f"Undisturbed, {policy} succeeds in {percent(base)} of the trials."
+    if len(effects) > 1:
+        worst = sorted(effects[1:], key=lambda entry: entry.success(policy).value)[:3]
+        each = (
+            f"{e.condition.name} ({e.condition.words}) {100 * e.success(policy).value:.0f} %"
+            for e in worst
+        )
+        text += f" The effects that cost most: {', '.join(each)}."
+    halves = []
+    for sweep, points in grown.items():
+        lost = [p for p in points if p.success(policy).value < base.value / 2]
+        reached = f"at {lost[0].condition.words}" if lost else "nowhere in the sweep"
+        halves.append(f"{sweep.name} {reached}")
+    if halves:
+        text += f" Success falls below half of that: {', '.join(halves)}."
+    return text

@@ -2,32 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
-from suite.common.choices import at_least
-from suite.common.console import Console
-from suite.experiments.recipes import (
-    FourGates,
-    asked_rows,
-    check_owned,
-    check_sizes,
-    four_gate_recipe,
-)
+import numpy as np
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from suite.experiments.document import Place
-    from suite.train.config import TrainConfig
-    from suite.train.ppo.config import PpoConfig
+from suite.common.console import Console, duration
+from suite.common.report import Grid, Picture, Report, Section
+from suite.experiments.pages.document import Place
+from suite.experiments.pages.tables import every_training, table
+from suite.experiments.study import options, training
+from suite.experiments.study.intervals import Spread
+from suite.experiments.study.summary import METRICS, Summary, summaries
+from suite.train.ppo.config import ppo_like
 
 PROJECTION, PROJECTION_DECAY = 3.0, 0.5
 """lambda_proj and beta_3 of the paper's scheme without the field."""
+DIGITS = {name: metric.digits + 1 for name, metric in METRICS.items()}
+"""Of every training's numbers."""
+FIGURE = ("reward", "v_max", "success_rate", "gates")
+"""What the paper's figure shows."""
+WANTED = (1, 2, 3)
+"""Mean gates a trial, of four, whose first time the table gives."""
+CAPTION = (
+    "Over environment steps (above) and over seconds of training (below): mean over training "
+    "seeds, with a band from the least to the most."
+)
+MEANING = (
+    "Reward: the paper's, summed over a trial until its end. Success rate: no collision, whatever "
+    "gates were passed. Success cross: all gates passed without a collision before. v_max: the "
+    "median over trials of each one's largest speed. Trials end at a collision, at the last gate "
+    "or at their time, and fly the training's dynamics on worlds that no training has seen, the "
+    "same for all; a collision is what the trainer takes for one, by its own code.",
+    "Policy, dynamics, worlds and environment steps of an iteration are the same for all schemes. "
+    "PPO learns from the reward that is measured; the other two from their losses, with the "
+    "recipe's weights but for lambda_p. Without the field, L_proj stands in with the paper's "
+    "lambda_proj and beta_3.",
+    "Seconds are those of iterations alone: measurements are left out, and iterations that compile "
+    "count as long as the median of the others; what they took longer stands in the table. Each "
+    "training is held to its share of the cores, the same for all; what else the machine did "
+    "meanwhile is in the seconds.",
+    "A time of reaching so many gates is that of the first measurement which has them: the median "
+    "over the seeds that do, and of how many.",
+)
 
 
 @dataclass(frozen=True)
-class Config(FourGates):
+class Config(options.FourGates):
     """Train by PPO, by our method, and by it without the field, and measure them as they learn.
 
     All three share policy, dynamics, worlds and the number of environment steps. Trainings are
@@ -49,98 +71,90 @@ class Config(FourGates):
     are those of such a share."""
 
 
-class Scheme(NamedTuple):
-    """How a policy is trained."""
-
-    key: str
-    """Its name."""
-    words: str
-    """What tables call it."""
-    recipe: TrainConfig | PpoConfig
-    """With the seed left as it is."""
-
-
-class Looks(NamedTuple):
-    """What is measured during a training."""
-
-    measurements: int
-    trials: int
-    seed: int
-    seconds: float
-
-
-class Learnt(NamedTuple):
-    """One training and its curve."""
-
-    scheme: str
-    seed: int
-    points: list[dict[str, float]]
-    """Measurements with `steps`, the environment steps until then, and `time`, the seconds of
-    training until then, without measurements and compilation."""
-    compile_s: float
-    """What the first iteration took longer than the others [s]."""
-    commit: str
-    """That trained it."""
-    diverged: str = ""
-    """What was said where the training diverged."""
-
-
-def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
-    """Train what is missing and write schemes.md.
-
-    Raises:
-        ValueError: for anything that cannot be used, before the first training.
-    """
-    import functools
-
-    from suite.common.work import all_done, check_jobs
-    from suite.experiments.document import write_document
-    from suite.experiments.scheme_curves import summaries
-    from suite.experiments.scheme_tables import scheme_report
-
-    check_sizes(config)
-    check_jobs(config.jobs)
-    at_least("--measurements", config.measurements, 1)
+def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
+    """Return the page and its numbers; train what is missing."""
     chosen = schemes(config)
-    # Seed by seed, so that the schemes meet the same load where the machine has another.
-    runs = [
-        (scheme.key, replace(scheme.recipe, seed=seed))
-        for seed in config.training_seeds
-        for scheme in chosen
-    ]
-    looks = Looks(config.measurements, config.trials, config.seed, config.seconds)
-    do = functools.partial(learn, cache=place.cache, looks=looks)
-    console.note(f"{len(runs)} trainings, less those that are there")
-    results = all_done(do, runs, config.jobs, console, "training")
-    rows = summaries(chosen, results)
-    report = scheme_report(config, chosen, rows, results)
-    numbers = {"config": config, "rows": rows, "runs": results}
-    return write_document(place, "schemes", report, numbers, config.seed, console)
+    looks = training.Looks(config.measurements, config.trials, config.seed, config.seconds)
+    study = training.Study(chosen, config.training_seeds, config.jobs, looks, by_seed=True)
+    runs = training.trained(study, place.cache, console)
+    rows, episode = summaries(chosen, runs), chosen[0].recipe.episode
+    compiling = {
+        row.key: float(np.mean([run.compile_s for run in runs if run.row == row.key]))
+        for row in rows
+    }
+    report = Report(
+        title="Training schemes compared: PPO, ours, ours without the field",
+        lead=verdict(rows),
+        facts={
+            "recipe": f"{options.recipe_words(config)} episode.gates={episode.gates} "
+            f"lambda_p={config.progress:g}",
+            "an iteration": f"{episode.batch} worlds x {episode.steps} steps",
+            "training seeds": " ".join(map(str, config.training_seeds)),
+            "trained at commit": training.commits(runs),
+            "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
+            "trainings at once": f"{config.jobs}, each on its own share of the cores",
+        },
+        sections=[
+            Section("Learning curves", _curves([row for row in rows if row.at], compiling)),
+            every_training("scheme", runs, DIGITS, _trained_for),
+            Section("What was measured", MEANING),
+        ],
+    )
+    return report, {
+        "rows": [
+            {
+                "scheme": row.key,
+                "words": row.words,
+                "seeds": row.seeds,
+                "diverged": row.diverged,
+                "steps": [int(point["steps"].mean) for point in row.at],
+                "time": [point["time"].mean for point in row.at],
+                "curves": {n: [point[n] for point in row.at] for n in METRICS if row.at},
+                "reached": {gates: first_times(row, gates) for gates in WANTED},
+                "compile_s": compiling[row.key],
+            }
+            for row in rows
+        ],
+        "runs": [
+            {
+                "scheme": run.row,
+                "seed": run.seed,
+                "points": run.points,
+                "compile_s": run.compile_s,
+                "commit": run.commit,
+                "diverged": run.diverged,
+            }
+            for run in runs
+        ],
+    }
 
 
-def schemes(config: Config) -> list[Scheme]:
+def _trained_for(run: training.Trained) -> str:
+    return "-" if run.diverged else duration(run.points[-1]["time"])
+
+
+def schemes(config: Config) -> list[training.Row]:
     """Return the schemes that are asked for, in the paper's order.
 
     Raises:
         ValueError: for a preset, a change or a scheme that does not exist, and for worlds that PPO
             cannot share among its minibatches.
     """
-    from suite.train.ppo.config import ppo_like
-
     compared = ("progress_norm", "projection", "projection_decay")
     owned = {f"loss.{name}": "it is compared" for name in compared}
-    check_owned(config.set, {"loss.progress": "give --progress", **owned})
-    base = four_gate_recipe(config)
+    options.check_owned(config.set, {"loss.progress": "give --progress", **owned})
+    base = options.four_gate_recipe(config)
     loss = replace(base.loss, progress=config.progress, progress_norm=0.0, projection=0.0)
     ours = replace(base, loss=loss)
     scalar = replace(loss, field_gain=0.0, projection=PROJECTION, projection_decay=PROJECTION_DECAY)
+    bare = replace(base, loss=scalar)
     ppo = ppo_like(ours, config.ppo_iterations or ours.optimizer.iterations)
     rows = [
-        Scheme("ppo", "PPO", ppo),
-        Scheme("ours", "ours", ours),
-        Scheme("projection", "ours without the field, with L_proj", replace(base, loss=scalar)),
+        training.Row("ppo", "PPO", ppo),
+        training.Row("ours", "ours", ours),
+        training.Row("projection", "ours without the field, with L_proj", bare),
     ]
-    rows = asked_rows(rows, config.only, "scheme")
+    rows = training.asked_rows(rows, config.only, "scheme")
     if ppo.episode.batch % ppo.minibatches and "ppo" in [row.key for row in rows]:
         raise ValueError(
             f"--worlds is {ppo.episode.batch}, allowed with PPO are multiples of its "
@@ -149,76 +163,99 @@ def schemes(config: Config) -> list[Scheme]:
     return rows
 
 
-def learn(
-    run: tuple[str, TrainConfig | PpoConfig], console: Console, cache: Path, looks: Looks
-) -> Learnt:
-    """Train one run, or find it, and return its curve.
-
-    Args:
-        run: the scheme's key and the whole configuration.
-        console: where progress goes.
-        cache: folder of all runs.
-        looks: what is measured on the way.
-    """
-    from suite.common.errors import WorkFailed
-    from suite.experiments.cache import digest
-    from suite.experiments.trainings import commit_of
-    from suite.experiments.validation import make_validation
-    from suite.train.ppo.config import PpoConfig
-    from suite.train.ppo.run import train_ppo
-    from suite.train.repeat import Watch
-    from suite.train.run import train
-
-    key, config = run
-    is_ppo = isinstance(config, PpoConfig)
-    shared = config.shared if is_ppo else config
-    iterations = config.iterations if is_ppo else config.optimizer.iterations
-    measure = make_validation(shared, looks.trials, looks.seed, looks.seconds, rewarded(shared))
-    watch = Watch(max(1, iterations // looks.measurements), measure)
-    folder = cache / "schemes" / digest([key, config, looks])
-    diverged = ""
-    try:
-        if is_ppo:
-            train_ppo(config, folder, console, watch)
-        else:
-            train(config, folder, console, watch=watch)
-    except WorkFailed as failure:
-        diverged = str(failure)
-        console.note(f"{key}, seed {config.seed}: {diverged}")
-    frames = config.episode.batch * config.episode.steps
-    points, compile_s = curve_of(folder, frames)
-    return Learnt(key, config.seed, points, compile_s, commit_of(folder / "policy"), diverged)
+def first_times(row: Summary, gates: float) -> list[tuple[float, float]]:
+    """Return steps and seconds of the first measurement with `gates`, of the seeds that have it."""
+    firsts = [next((p for p in points if p["gates"] >= gates), None) for points in row.whole]
+    return [(point["steps"], point["time"]) for point in firsts if point is not None]
 
 
-def rewarded(config: TrainConfig) -> Any:
-    """Return the paper's reward as a `Note` of the rollout."""
-    from suite.train.ppo.reward import make_reward
-
-    reward = make_reward(config)
-    return lambda worlds, before, body, target: reward(worlds, before, body, target)[0].total()
+def number_at(row: Summary, time: float) -> int:
+    """Return which measurement was the last within `time` seconds of training."""
+    return max(k for k, point in enumerate(row.at) if point["time"].mean <= time + 1e-9)
 
 
-def curve_of(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
-    """Return a run's measurements with their steps and time, and what compilation took [s].
+def verdict(rows: Sequence[Summary]) -> str:
+    """Return what came out in sentences, and whether it is what the paper says."""
+    measured = {row.key: row for row in rows if row.at}
+    said = [f"Every training of {row.words} diverged." for row in rows if not row.at]
+    for row in measured.values():
+        end = row.at[-1]
+        said.append(
+            f"{row.words[0].upper()}{row.words[1:]}: {end['gates'].mean:.2f} gates, "
+            f"success cross {100 * end['success_cross'].mean:.0f} %, success rate "
+            f"{100 * end['success_rate'].mean:.0f} % after {end['steps'].mean:,.0f} environment "
+            f"steps ({duration(end['time'].mean)} of training)."
+        )
+    if {"ours", "ppo"} <= set(measured):
+        ours, ppo = measured["ours"], measured["ppo"]
+        limit = min(row.at[-1]["time"].mean for row in (ours, ppo))
+        clock = _ahead(*(row.at[number_at(row, limit)] for row in (ours, ppo)))
+        said.append(
+            f"The paper has ours ahead of PPO in {_listed(FIGURE)}; here it is ahead at the end "
+            f"in {_ahead(ours.at[-1], ppo.at[-1])}, and after {duration(limit)} of training each "
+            f"in {clock}."
+        )
+    if {"ours", "projection"} <= set(measured):
+        ours, bare = (measured[name].at[-1]["gates"] for name in ("ours", "projection"))
+        said.append(
+            "The paper's scheme without the field fails to learn to cross gates; here it passes "
+            f"{bare.mean:.2f} ({bare.least:.2f} to {bare.most:.2f} over seeds), with the field "
+            f"{ours.mean:.2f} ({ours.least:.2f} to {ours.most:.2f})."
+        )
+    return " ".join(said)
 
-    Iterations that compile, the first and those after a stop, count as long as the median of the
-    others.
 
-    Args:
-        folder: of the run.
-        frames: environment steps in an iteration.
-    """
-    import numpy as np
+def _ahead(ours: Mapping[str, Spread], other: Mapping[str, Spread]) -> str:
+    """Return in which of the figure's numbers ours has more, and where seeds part."""
+    ahead = [name for name in FIGURE if ours[name].mean > other[name].mean]
+    apart = [name for name in FIGURE if ours[name].least > other[name].most]
+    return f"{_listed(ahead)} (with every seed above every one of PPO's: {_listed(apart)})"
 
-    from suite.train import curve
 
-    rows = curve.read(folder)
-    warm = [row["seconds"] for row in rows if not row["cold"]]
-    usual = float(np.median(warm)) if warm else 0.0
-    spent = np.cumsum([0.0, *(usual if row["cold"] else row["seconds"] for row in rows)])
-    compiling = sum(max(0.0, row["seconds"] - usual) for row in rows if row["cold"])
-    points = []
-    for point in curve.read(folder, curve.WATCHED):
-        done = point.pop("iteration")
-        points.append({"steps": done * frames, "time": float(spent[done]), **point})
-    return points, compiling
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(METRICS[name].title.split(" [")[0] for name in names) or "none of them"
+
+
+def _curves(rows: Sequence[Summary], compiling: Mapping[str, float]) -> list[Picture | Grid]:
+    from suite.experiments.pages.charts import curves_chart
+
+    if not rows:
+        return []
+    limit = min(row.at[-1]["time"].mean for row in rows)
+    same = f"After {duration(limit)} of training, the shortest of the budgets"
+    return [
+        Picture(curves_chart(rows, FIGURE), CAPTION),
+        _numbers("At the end of each budget", rows, lambda row: -1),
+        _numbers(same, rows, lambda row: number_at(row, limit)),
+        _reached(rows, compiling),
+    ]
+
+
+def _numbers(title: str, rows: Sequence[Summary], at: Callable[[Summary], int]) -> Grid:
+    headers = ["scheme", *(metric.title for metric in METRICS.values()), "diverged"]
+    lines = [
+        [
+            row.words,
+            *(row.text(name, at(row)) for name in METRICS),
+            f"{row.diverged} of {row.seeds}",
+        ]
+        for row in rows
+    ]
+    return table(headers, lines, f"{title}: mean over seeds [least, most]")
+
+
+def _reached(rows: Sequence[Summary], compiling: Mapping[str, float]) -> Grid:
+    headers = ["scheme", *(f"{gates} gates" if gates > 1 else "1 gate" for gates in WANTED),
+               "whole budget", "compilation"]  # fmt: skip
+    lines = []
+    for row in rows:
+        line = [row.words]
+        for gates in WANTED:
+            found = np.array(first_times(row, gates)).reshape(-1, 2)
+            steps, time = np.median(found, axis=0) if len(found) else (0, 0)
+            times = f"{steps:,.0f} steps, {duration(time)} ({len(found)} of {row.seeds})"
+            line.append(times if len(found) else "not reached")
+        end = row.at[-1]
+        budget = f"{end['steps'].mean:,.0f} steps, {duration(end['time'].mean)}"
+        lines.append([*line, budget, duration(compiling[row.key])])
+    return table(headers, lines, "Steps and time of training to so many gates a trial")

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from suite.common.choices import at_least
+import numpy as np
+
+from eval.judging.tables import Cell
+from eval.quadrotor.vehicle_file import load_vehicle
+from policies.policy import load_policy
 from suite.common.console import Console
-
-if TYPE_CHECKING:
-    from suite.experiments.document import Place
+from suite.common.report import Grid, Picture, Report, Section
+from suite.experiments.pages.document import Place
+from suite.experiments.pages.tables import every_cell, table
+from suite.experiments.study import judging, options, training
+from suite.judging.flying import labels, policy_digest
 
 LEVELS = (0, 3, 6, 9)
 """The levels of the paper's table."""
+MEANING = (
+    "Every policy flew the same trials. The standard deviation is over training seeds (n - 1); "
+    "each cell's own sampling error is part of it, as the intervals further down show."
+)
 
 
 @dataclass(frozen=True)
@@ -43,73 +55,109 @@ class Config:
     """Without --policies: trainings at once, each in a process with its own share of the cores."""
 
 
-def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
-    """Train and fly what is missing and write seeds.md.
+class Repeats(NamedTuple):
+    """How the training seeds of one recipe differ."""
 
-    Raises:
-        ValueError: for anything that cannot be used, before the first flight.
-        WorkFailed: where a training diverges.
-    """
-    from eval.judging.tables import summarise
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from suite.common.work import check_jobs
-    from suite.experiments.document import write_document
-    from suite.experiments.flights import Flier, Order, flown
-    from suite.experiments.seed_tables import seed_report, spread
-    from suite.judging.flying import trial_list
-    from tracks.families import JUDGED
+    mean_success: dict[str, float]
+    """Of each policy: mean success over its cells."""
+    median: str
+    """The policy whose mean success is the median; of an even number, the lower middle one."""
+    mean: float
+    """Over policies."""
+    standard_deviation: float
+    """Over policies; NaN of one."""
 
-    at_least("--trials", config.trials, 1)
-    at_least("--seed", config.seed, 0)
-    check_jobs(config.jobs)
-    vehicle = load_vehicle(config.vehicle)
-    policies = _policies(config, place, console)
-    trials = trial_list(JUDGED, LEVELS, config.trials, config.seed)
-    orders = [Order(Flier(policy, vehicle), trials) for policy in policies.values()]
-    results = flown(orders, place.cache, console, f"judging {len(policies)} training seeds")
-    cells = {
-        name: summarise([row._replace(policy=name) for row in rows])["cells"]
-        for name, rows in zip(policies, results, strict=True)
-    }
-    found = spread(cells)
-    report = seed_report(config, policies, cells, found)
-    numbers = {"config": config, "spread": found, "cells": [c for s in cells.values() for c in s]}
-    return write_document(place, "seeds", report, numbers, config.seed, console)
+
+def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
+    """Return the page and its numbers; what is missing is trained and flown first."""
+    from suite.experiments.pages.charts import cells_chart
+
+    vehicle, policies = load_vehicle(config.vehicle), _policies(config, place, console)
+    trials = judging.trials_of(config, LEVELS)
+    orders = {n: judging.Order(judging.Flier(p, vehicle), trials) for n, p in policies.items()}
+    what = f"judging {len(policies)} training seeds"
+    _, cells = judging.judged_cells(orders, place.cache, console, what)
+    found = repeats(cells)
+    everything = [cell for some in cells.values() for cell in some]
+    low, high = min(found.mean_success.values()), max(found.mean_success.values())
+    parts = [
+        _grid("Success [%]", cells, lambda c: c.success.value, 100, 0),
+        _grid("v_max, median over trials [m/s]", cells, lambda c: c.v_max.value, 1, 2),
+        MEANING,
+        Picture(cells_chart(cells), "Success of each training seed, cell by cell."),
+    ]
+    report = Report(
+        title="The same recipe from several training seeds",
+        lead=(
+            f"Mean success over the {len(everything) // len(cells)} cells: "
+            f"{100 * found.mean:.1f} % over {len(cells)} training seeds, from {100 * low:.1f} to "
+            f"{100 * high:.1f} (standard deviation {100 * found.standard_deviation:.1f} points). "
+            f"The median is {found.median}."
+        ),
+        facts={
+            "recipe": "given policies" if config.policies else options.recipe_words(config),
+            **{
+                name: f"SHA-256 {policy_digest(path)[:16]}, trained at commit "
+                f"{training.commit_of(Path(path))}"
+                for name, path in policies.items()
+            },
+            "vehicle": config.vehicle,
+            "judged seeds": f"{options.judged_seeds(config)}, the same for all",
+        },
+        sections=[Section("Success and speed by training seed", parts), every_cell(everything)],
+    )
+    return report, {"spread": found, "cells": everything}
 
 
 def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:
     """Return the policies by what the tables call them; missing ones are trained."""
-    from pathlib import Path
-
-    from policies.policy import load_policy
-    from suite.judging.flying import labels
-
-    if config.policies:
-        inside = [Path(path, "policy") for path in config.policies]
-        chosen = [
-            str(within) if within.is_dir() else path
-            for path, within in zip(config.policies, inside, strict=True)
-        ]
-        for path in chosen:
-            load_policy(path)
-        names = labels(config.policies, [Path(path).name for path in config.policies])
-        return dict(zip(names, chosen, strict=True))
-    return _trained(config, place, console)
+    if not config.policies:
+        row = training.Row("recipe", "the recipe", options.asked_recipe(config))
+        study = training.Study([row], config.training_seeds, config.jobs, may_diverge=False)
+        runs = training.trained(study, place.cache, console)
+        return {f"seed {run.seed}": run.policy for run in runs}
+    inside = [Path(path, "policy") for path in config.policies]
+    chosen = [
+        str(within) if within.is_dir() else path
+        for path, within in zip(config.policies, inside, strict=True)
+    ]
+    for path in chosen:
+        load_policy(path)
+    names = labels(config.policies, [Path(path).name for path in config.policies])
+    return dict(zip(names, chosen, strict=True))
 
 
-def _trained(config: Config, place: Place, console: Console) -> dict[str, str]:
-    import functools
-    from dataclasses import replace
+def repeats(cells: Mapping[str, Sequence[Cell]]) -> Repeats:
+    """Return how the policies differ in mean success over their cells."""
+    means = {name: float(np.mean([c.success.value for c in some])) for name, some in cells.items()}
+    ordered, values = sorted(means, key=lambda name: means[name]), list(means.values())
+    return Repeats(means, ordered[(len(ordered) - 1) // 2], float(np.mean(values)), _std(values))
 
-    from suite.common.work import all_done
-    from suite.experiments.recipes import asked_recipe, check_seeds
-    from suite.experiments.trainings import trained_policy
 
-    check_seeds(config.training_seeds)
-    recipe = asked_recipe(config.preset, config.set, config.iterations)
-    runs = [replace(recipe, seed=seed) for seed in config.training_seeds]
-    do = functools.partial(trained_policy, cache=place.cache)
-    policies = all_done(do, runs, config.jobs, console, "training")
-    return {
-        f"seed {seed}": policy for seed, policy in zip(config.training_seeds, policies, strict=True)
-    }
+def _std(values: Sequence[float]) -> float:
+    return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+
+
+def _grid(
+    title: str,
+    cells: Mapping[str, Sequence[Cell]],
+    pick: Callable[[Cell], float],
+    scale: float,
+    digits: int,
+) -> Grid:
+    """Return one number of every policy and cell, with its spread over policies below."""
+    first = next(iter(cells.values()))
+    headers = ["policy", "mean", *(f"{cell.track} {cell.difficulty}" for cell in first)]
+    numbers = scale * np.array([[pick(cell) for cell in some] for some in cells.values()])
+    numbers = np.column_stack([numbers.mean(axis=1), numbers])
+    columns = numbers.T.tolist()
+    over = {"mean": lambda c: float(np.mean(c)), "standard deviation": _std, "least": min,
+            "most": max}  # fmt: skip
+    lines = [*zip(cells, numbers.tolist(), strict=True)]
+    lines += [(name, [of(column) for column in columns]) for name, of in over.items()]
+    finer = ("mean", "standard deviation")
+    texts = [
+        (name, *(f"{v:.{digits + (k == 0 or name in finer)}f}" for k, v in enumerate(values)))
+        for name, values in lines
+    ]
+    return table(headers, texts, title)

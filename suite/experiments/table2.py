@@ -2,20 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from suite.common.choices import LEVELS, at_least
+from eval.judging.tables import Cell, percent
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import TrialResult
+from policies.policy import load_policy
+from suite.common.choices import LEVELS
 from suite.common.console import Console
+from suite.common.report import Grid, Picture, Report, Section
+from suite.experiments.pages.document import Place
+from suite.experiments.pages.goals import goal_grid, goals, verdict
+from suite.experiments.pages.paper import sim_to_sim
+from suite.experiments.pages.tables import every_cell, table
+from suite.experiments.study import judging, options
+from suite.experiments.study.cache import code_digest, digest
+from suite.judging.flying import default_policy, policy_digest
+from suite.loop import compare
+from tracks.families import JUDGED
 
 if TYPE_CHECKING:
-    from eval.judging.tables import Cell
-    from eval.worlds.trial import TrialResult
-    from suite.common.report import Report
-    from suite.experiments.document import Place
-    from suite.experiments.variants import Variant
-    from suite.loop.compare import Line
+    from suite.loop.config import LoopConfig
+
+OURS, WITH, CONTROL = "ours", "ours, with Delta Action Model", "ours, tuned as long without it"
+LOOP_TRIALS = 10
+"""Judged trials a cell in the loop's own tables, which are not shown here."""
+LOOP_ROOMS = ("tracks", "policies", "eval", "suite/train", "suite/delta", "suite/loop")
+"""Code that flies, fits and fine-tunes: a loop that older code ran is not taken for this one's."""
+COLUMNS = [
+    header
+    for track in JUDGED
+    for header in (f"{track} SR", "v_max [m/s]", "v_mean [m/s]", "lap [s]")
+]
+"""Of every track."""
+MEANINGS = (
+    "Success (SR): all 8 gates in order, no contact, within 20 s; ours with its 95 % Wilson "
+    "interval, the others as printed, out of 10 trials. v_max: ours is the median over a cell's "
+    "trials of each trial's largest speed before any contact; the paper and the baseline do not "
+    "say over what theirs is the maximum. Simulator, vehicle and tracks are ours: the tracks "
+    "follow the baseline's rules, the numbers of the others were measured in theirs."
+)
+NO_DELTA = (
+    "There is no row of ours with the Delta Action Model: neither --delta-policy nor "
+    "--delta-iterations was given."
+)
+CHART = (
+    "Success with 95 % Wilson intervals and median v_max at every level; hollow: printed by the "
+    "paper (with Delta Action Model)."
+)
 
 
 @dataclass(frozen=True)
@@ -44,137 +82,170 @@ class Config:
     """A shipped vehicle's name or a vehicle file (.toml)."""
 
 
-def run(config: Config, place: Place, console: Console) -> dict[str, Any]:
-    """Fly what is missing and write table2.md.
+class Variant(NamedTuple):
+    """A policy of the table."""
 
-    Raises:
-        ValueError: for anything that cannot be used, before the first flight.
-    """
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from suite.experiments.document import write_document
-    from suite.experiments.flights import Flier, Order, flown
-    from suite.experiments.paper import sim_to_sim
-    from suite.experiments.variants import OURS, variants_of
-    from suite.judging.flying import trial_list
-    from tracks.families import JUDGED
+    name: str
+    """What the table calls it."""
+    policy: str
+    """Name, folder or file."""
+    about: str
+    """Where it comes from."""
 
-    at_least("--trials", config.trials, 1)
-    at_least("--seed", config.seed, 0)
-    vehicle = load_vehicle(config.vehicle)
+
+def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
+    """Return the page and its numbers; what is missing is flown first."""
+    vehicle, printed = load_vehicle(config.vehicle), sim_to_sim()
     variants = variants_of(config, place, console)
-    flying = {True: LEVELS, False: sim_to_sim().levels}
-    orders = [
-        Order(
-            Flier(variant.policy, vehicle),
-            trial_list(JUDGED, flying[variant.name == OURS], config.trials, config.seed),
+    orders = {
+        v.name: judging.Order(
+            judging.Flier(v.policy, vehicle),
+            judging.trials_of(config, LEVELS if v.name == OURS else printed.levels),
         )
-        for variant in variants
-    ]
-    results = dict(
-        zip(variants, flown(orders, place.cache, console, "judging all levels"), strict=True)
-    )
-    cells = {variant: _cells(variant, rows) for variant, rows in results.items()}
+        for v in variants
+    }
+    results, cells = judging.judged_cells(orders, place.cache, console, "judging all levels")
     lines = _merit(results)
-    report = _report(config, cells, lines)
-    numbers = {
-        "config": config,
-        "cells": [cell for some in cells.values() for cell in some],
-        "goals": _goals(cells),
+    everything = [cell for some in cells.values() for cell in some]
+    report = Report(
+        title="Sim-to-sim: the paper's table and all ten levels",
+        lead=" ".join(
+            f"{name}: {verdict(goals(cells[name]))}" for name in cells if name != CONTROL
+        ),
+        facts={
+            **{variant.name: variant.about for variant in variants},
+            "vehicle": config.vehicle,
+            "seeds": f"{options.judged_seeds(config)}, {config.trials} trials a cell, the same "
+            "for all",
+        },
+        sections=list(_sections(cells, lines)),
+    )
+    return report, {
+        "cells": everything,
+        "goals": {name: goals(some) for name, some in cells.items()},
         "with_against_without": lines,
         "policies": variants,
     }
-    return write_document(place, "table2", report, numbers, config.seed, console)
 
 
-def _cells(variant: Variant, rows: Sequence[TrialResult]) -> list[Cell]:
-    from eval.judging.tables import summarise
+def variants_of(config: Config, place: Place, console: Console) -> list[Variant]:
+    """Return the policies to be judged; the loop that makes the fine-tuned ones is run if asked.
 
-    return summarise([row._replace(policy=variant.name) for row in rows])["cells"]
+    Raises:
+        ValueError: for a policy that cannot be loaded, or options that exclude each other.
+    """
+    given = {WITH: config.delta_policy, CONTROL: config.control_policy}
+    if config.delta_iterations and any(given.values()):
+        raise ValueError(
+            "--delta-iterations makes the fine-tuned policies and --delta-policy and "
+            "--control-policy name them; give the one or the other"
+        )
+    policy = config.policy or default_policy()
+    chosen = {OURS: policy, **{name: path for name, path in given.items() if path}}
+    if config.delta_iterations:
+        from suite.loop.run import run_loop
+        from suite.loop.work import Quiet
+
+        loop = loop_config(config, policy)
+        folder = place.cache / "loops" / digest([loop, code_digest(*LOOP_ROOMS)])
+        run_loop(loop, folder, Quiet())
+        chosen[WITH] = str(folder / "tuned-with" / "policy")
+        chosen[CONTROL] = str(folder / "tuned-without" / "policy")
+    made = f"{policy}, fine-tuned by suite loop in {config.delta_iterations} gradient steps"
+    variants = []
+    for name, path in chosen.items():
+        load_policy(path)
+        label = made if config.delta_iterations and name != OURS else path
+        variants.append(Variant(name, path, f"{label}, SHA-256 {policy_digest(path)[:16]}"))
+    return variants
 
 
-def _merit(results: Mapping[Variant, Sequence[TrialResult]]) -> list[Line]:
+def loop_config(config: Config, policy: str) -> LoopConfig:
+    """Return the loop that fine-tunes `policy`, on flights of seeds that no table judges."""
+    from suite.loop.config import resolve
+
+    loop = resolve(
+        recipe="swift",
+        policy=policy,
+        difficulty="0,3,6,9",
+        trials=LOOP_TRIALS,
+        vehicle=config.vehicle,
+        finetune_iterations=config.delta_iterations,
+        changes=config.delta_set,
+    )
+    return replace(loop, seed=config.seed)
+
+
+def _merit(results: Mapping[str, Sequence[TrialResult]]) -> list[compare.Line]:
     """Return what the Delta Action Model changes, trial by trial; nothing without its control."""
-    from suite.experiments import variants
-    from suite.experiments.paper import sim_to_sim
-    from suite.loop.compare import BEFORE, WITH, WITHOUT, compare
-
-    names = {BEFORE: variants.OURS, WITHOUT: variants.CONTROL, WITH: variants.WITH}
-    flown = {variant.name: rows for variant, rows in results.items()}
-    if set(flown) != set(names.values()):
+    names = {compare.BEFORE: OURS, compare.WITHOUT: CONTROL, compare.WITH: WITH}
+    if set(results) != set(names.values()):
         return []
     levels = sim_to_sim().levels
-    return compare(
+    return compare.compare(
         {
-            role: [row for row in flown[name] if row.difficulty in levels]
+            role: [row for row in results[name] if row.difficulty in levels]
             for role, name in names.items()
         }
     )
 
 
-def _goals(cells: Mapping[Variant, Sequence[Cell]]) -> dict[str, Any]:
-    from suite.experiments.goals import goals
+def _sections(
+    cells: Mapping[str, Sequence[Cell]], lines: Sequence[compare.Line]
+) -> Iterator[Section]:
+    from suite.experiments.pages.charts import level_chart
 
-    return {variant.name: goals(some) for variant, some in cells.items()}
-
-
-def _report(
-    config: Config, cells: Mapping[Variant, Sequence[Cell]], lines: Sequence[Line]
-) -> Report:
-    from eval.judging.tables import markdown_table
-    from suite.common.report import Picture, Report, Section
-    from suite.experiments import sim_tables
-    from suite.experiments.goals import goals, verdict
-    from suite.experiments.level_chart import level_chart
-    from suite.experiments.paper import sim_to_sim
-    from suite.experiments.variants import OURS, WITH
-    from suite.loop.compare import CAVEAT, grids
-    from suite.loop.compare import verdict as merit
-
-    printed = sim_to_sim()
     everything = [cell for some in cells.values() for cell in some]
-    chosen = [cell for cell in everything if cell.difficulty in printed.levels]
-    last = config.seed + config.trials - 1
-    whole = {variant: some for variant, some in cells.items() if variant.name == OURS}
-    led = [variant for variant in cells if variant.name in (OURS, WITH)]
-    asides = [] if len(cells) > 1 else [sim_tables.NO_DELTA]
-    return Report(
-        title="Sim-to-sim: the paper's table and all ten levels",
-        lead=" ".join(f"{variant.name}: {verdict(goals(cells[variant]))}" for variant in led),
-        facts={
-            **{variant.name: variant.about for variant in cells},
-            "vehicle": config.vehicle,
-            "seeds": f"{config.seed} to {last}, {config.trials} trials a cell, the same for all",
-        },
-        sections=[
-            Section(
-                "Beside the paper",
-                [*asides, sim_tables.beside_the_paper(chosen), sim_tables.MEANINGS],
-            ),
-            *(
-                [
-                    Section(
-                        "What the Delta Action Model changes",
-                        [merit(lines[-1]), *grids(lines)[:1], CAVEAT],
-                    )
-                ]
-                if lines
-                else []
-            ),
-            *(
-                Section(f"The goal, cell by cell: {variant.name}", [sim_tables.goal_grid(some)])
-                for variant, some in cells.items()
-            ),
-            Section(
-                "All ten levels",
-                [
-                    *(sim_tables.where_it_breaks(v.name, some) for v, some in whole.items()),
-                    Picture(level_chart(everything), sim_tables.CHART),
-                    *(sim_tables.all_levels(v.name, some) for v, some in whole.items()),
-                ],
-            ),
-            Section(
-                "Every cell with its intervals",
-                [markdown_table({"cells": everything, "paired": []}).strip("\n")],
-            ),
-        ],
-    )
+    asides = [] if len(cells) > 1 else [NO_DELTA]
+    yield Section("Beside the paper", [*asides, beside_the_paper(cells), MEANINGS])
+    if lines:
+        parts = [compare.verdict(lines[-1]), *compare.grids(lines)[:1], compare.CAVEAT]
+        yield Section("What the Delta Action Model changes", parts)
+    for name, some in cells.items():
+        yield Section(f"The goal, cell by cell: {name}", [goal_grid(some)])
+    picture = Picture(level_chart(everything), CHART)
+    levels = [(str(level), *_ours(cells[OURS], level)) for level in LEVELS]
+    whole = table(["level", *COLUMNS], levels, OURS)
+    yield Section("All ten levels", [where_it_breaks(OURS, cells[OURS]), picture, whole])
+    yield every_cell(everything)
+
+
+def beside_the_paper(cells: Mapping[str, Sequence[Cell]]) -> Grid:
+    """Return our rows and the printed ones, a method and level each, tracks as columns."""
+    printed = sim_to_sim()
+    lines = [
+        [name, str(level), *_ours(some, level)]
+        for name, some in cells.items()
+        for level in printed.levels
+    ]
+    for method, name in printed.methods.items():
+        for level in printed.levels:
+            line = [name, str(level)]
+            for track in JUDGED:
+                (cell,) = (c for c in printed.at(track, level) if c.method == method)
+                line += [f"{cell.won}/{cell.trials}", f"{cell.v_max:.1f}", "-", "-"]
+            lines.append(line)
+    return table(["method", "level", *COLUMNS], lines, note=f"Printed rows: {printed.source}.")
+
+
+def _ours(cells: Sequence[Cell], level: int) -> list[str]:
+    """Return one policy's numbers at a level, track by track."""
+    by_track, texts = {cell.track: cell for cell in cells if cell.difficulty == level}, []
+    for cell in (by_track[track] for track in JUDGED):
+        lap = "-" if math.isnan(cell.lap_s.value) else f"{cell.lap_s.value:.1f}"
+        texts += [percent(cell.success), f"{cell.v_max.value:.1f}", f"{cell.v_mean.value:.1f}", lap]
+    return texts
+
+
+def where_it_breaks(policy: str, cells: Sequence[Cell]) -> str:
+    """Return up to which level a policy flies each track well, and by half."""
+    parts = []
+    for track in JUDGED:
+        rates = {c.difficulty: c.success.value for c in cells if c.track == track}
+        parts.append(f"{track} {_up_to(rates, 0.9)} (half: {_up_to(rates, 0.5)})")
+    return f"Levels up to which at least 90 % of trials succeed, {policy}: {', '.join(parts)}."
+
+
+def _up_to(rates: dict[int, float], least: float) -> str:
+    good = [str(level) for level in itertools.takewhile(lambda k: rates[k] >= least, sorted(rates))]
+    return good[-1] if good else "none"

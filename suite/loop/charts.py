@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,12 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eval.judging.statistics import Interval
-from suite.common.charts import plain_axes, png, titled
+from suite.common.charts import png, titled
 from suite.loop.compare import BEFORE, WITH, WITHOUT, Line
-from suite.loop.variants import Standing
+from suite.loop.standings import Standing
 
 COLOURS = {BEFORE: "#8b93a1", WITHOUT: "#e0892b", WITH: "#2463c9"}
 LABELS = {BEFORE: "before", WITHOUT: "tuned without delta", WITH: "tuned with delta"}
+SEVERAL = ("#8b93a1", "#c0504d", "#e0892b", "#7a5fb5", "#2463c9", "#2e9e6b")
+"""Colours of up to six policies."""
 PANELS = (
     ("gates", "Gates a rollout", 1),
     ("collided", "Worlds that collided [%]", 100),
@@ -27,34 +29,59 @@ PANELS = (
 def comparison_chart(lines: Sequence[Line]) -> bytes:
     """Return success rates and mean speeds of the three policies by track and level."""
     figure = Figure(figsize=(10.4, 3.9), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    names = [line.track if line.difficulty is None else f"{line.track}\nlevel {line.difficulty}"
+    cells = [line.track if line.difficulty is None else f"{line.track}\nlevel {line.difficulty}"
              for line in lines]  # fmt: skip
-    for axes, title, scale, pick in (
-        (left, "Success [%]", 100, lambda line: line.success),
-        (right, "Mean speed, median over trials [m/s]", 1, lambda line: line.v_mean),
-    ):
-        _dots(axes, lines, scale, pick)
-        titled(axes, title)
-        axes.set_xticks(range(len(lines)), names, fontsize=8)
-        if lines[-1].difficulty is None and len(lines) > 1:
-            axes.axvline(len(lines) - 1.5, color="#b8bec8", lw=0.8)
-    left.set_ylim(-3, 103)
-    right.set_ylim(bottom=0)
-    handles, labels = left.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    return png(figure)
+    titles = {"success": "Success [%]", "v_mean": "Mean speed, median over trials [m/s]"}
+    for axes, (field, title) in zip(figure.subplots(1, 2), titles.items(), strict=True):
+        dots = [
+            (LABELS[variant], colour, [getattr(line, field)[number] for line in lines])
+            for number, (variant, colour) in enumerate(COLOURS.items())
+        ]
+        _dots(axes, title, cells, dots, apart=0.2, ms=5.5, lw=1.8)
+    return _with_legend(figure, 3)
+
+
+def success_chart(stand: Sequence[Standing], labels: Mapping[str, str]) -> bytes:
+    """Return the success rates of any policies by track and level, and over all."""
+    figure = Figure(figsize=(10.4, 4.2), layout="constrained")
+    cells = [cell.replace(" ", "\nlevel ") for cell in (*stand[0].by_cell, "all")]
+    dots = [
+        (labels[one.name], colour, [*one.by_cell.values(), one.success])
+        for one, colour in zip(stand, SEVERAL, strict=False)
+    ]
+    _dots(figure.subplots(), "Success [%]", cells, dots, apart=0.13, ms=5, lw=1.6)
+    return _with_legend(figure, 3)
 
 
 def _dots(
-    axes: Axes, lines: Sequence[Line], scale: float, pick: Callable[[Line], Sequence[Interval]]
+    axes: Axes,
+    title: str,
+    cells: Sequence[str],
+    dots: Sequence[tuple[str, str, Sequence[Interval]]],
+    *,
+    apart: float,
+    ms: float,
+    lw: float,
 ) -> None:
-    for number, variant in enumerate(COLOURS):
-        value, low, high = scale * np.array([pick(line)[number] for line in lines]).T
-        at = np.arange(len(lines)) + 0.2 * (number - 1)
+    """Draw label, colour and intervals of all policies, `apart` of a cell; the last cell is all."""
+    percent = title.endswith("[%]")
+    for number, (label, colour, intervals) in enumerate(dots):
+        value, low, high = (100 if percent else 1) * np.array(intervals).T
+        at = np.arange(len(cells)) + apart * (number - 0.5 * (len(dots) - 1))
         reach = np.maximum([value - low, high - value], 0)
-        style = {"fmt": "o", "ms": 5.5, "lw": 1.8, "capsize": 0}
-        axes.errorbar(at, value, reach, color=COLOURS[variant], label=LABELS[variant], **style)
+        axes.errorbar(at, value, reach, color=colour, label=label, fmt="o", ms=ms, lw=lw)
+    titled(axes, title)
+    axes.set_xticks(range(len(cells)), cells, fontsize=8)
+    if len(cells) > 1:
+        axes.axvline(len(cells) - 1.5, color="#b8bec8", lw=0.8)
+    axes.set_ylim(*((-3, 103) if percent else (0, None)))
+
+
+def _with_legend(figure: Figure, columns: int, size: float = 9) -> bytes:
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    place = "outside lower center"
+    figure.legend(handles, labels, loc=place, ncols=columns, frameon=False, fontsize=size)
+    return png(figure)
 
 
 def training_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
@@ -63,71 +90,39 @@ def training_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
     Args:
         curves: rows of metrics.jsonl by variant; an absent or empty one is left out.
     """
+    labels = {**LABELS, BEFORE: "training"}
+    return _curves({labels[name]: rows for name, rows in curves.items()}, COLOURS.values(), 3, True)
+
+
+def tuning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
+    """Return gates, collisions and speed over several fine-tunings (rows of metrics.jsonl)."""
+    return _curves(curves, SEVERAL[2:], 4, False)
+
+
+def _curves(
+    curves: Mapping[str, Sequence[Mapping[str, Any]]],
+    colours: Iterable[str],
+    columns: int,
+    follow: bool,
+) -> bytes:
+    """Draw curves by label, all of a training's steps and those that follow it if `follow`."""
     figure = Figure(figsize=(10.4, 3.1), layout="constrained")
-    before = len(curves.get(BEFORE, ()))
+    before = len(next(iter(curves.values()))) if follow else 0
     for axes, (key, title, scale) in zip(figure.subplots(1, 3), PANELS, strict=True):
-        for variant, rows in curves.items():
+        start = 0
+        for (label, rows), colour in zip(curves.items(), colours, strict=False):
             if not rows:
                 continue
             values = scale * np.array([row[key] for row in rows], float)
-            at = np.array([row["iteration"] for row in rows])
-            at = at + (0 if variant == BEFORE else before)
-            axes.plot(at, values, color=COLOURS[variant], lw=0.7, alpha=0.25)
-            label = "training" if variant == BEFORE else LABELS[variant]
-            axes.plot(at, _smooth(values), color=COLOURS[variant], lw=1.8, label=label)
+            at = start + np.array([row["iteration"] for row in rows])
+            if follow:
+                axes.plot(at, values, color=colour, lw=0.7, alpha=0.25)
+            axes.plot(at, _smooth(values), color=colour, lw=1.8, label=label)
+            start = before
         titled(axes, title)
         axes.set_xlabel("iteration", fontsize=9)
         axes.set_ylim(bottom=0)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    return png(figure)
-
-
-SEVERAL = ("#8b93a1", "#c0504d", "#e0892b", "#7a5fb5", "#2463c9", "#2e9e6b")
-"""Colours of up to six policies."""
-
-
-def success_chart(stand: Sequence[Standing], labels: Mapping[str, str]) -> bytes:
-    """Return the success rates of any policies by track and level, and over all."""
-    figure = Figure(figsize=(10.4, 4.2), layout="constrained")
-    axes = figure.subplots()
-    cells = [*stand[0].by_cell, "all"]
-    for number, (one, colour) in enumerate(zip(stand, SEVERAL, strict=False)):
-        rates = [*one.by_cell.values(), one.success]
-        value, low, high = 100 * np.array(rates).T
-        at = np.arange(len(cells)) + 0.13 * (number - 0.5 * (len(stand) - 1))
-        reach = np.maximum([value - low, high - value], 0)
-        style = {"fmt": "o", "ms": 5, "lw": 1.6, "capsize": 0}
-        axes.errorbar(at, value, reach, color=colour, label=labels[one.name], **style)
-    axes.axvline(len(cells) - 1.5, color="#b8bec8", lw=0.8)
-    axes.set_xticks(range(len(cells)), [cell.replace(" ", "\nlevel ") for cell in cells])
-    axes.set_ylim(-3, 103)
-    axes.set_title("Success [%]", loc="left", fontsize=11, fontweight="bold")
-    plain_axes(axes)
-    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    return png(figure)
-
-
-def tuning_chart(
-    curves: Mapping[str, Sequence[Mapping[str, Any]]], labels: Mapping[str, str]
-) -> bytes:
-    """Return gates, collisions and speed over several fine-tunings (rows of metrics.jsonl)."""
-    figure = Figure(figsize=(10.4, 3.1), layout="constrained")
-    colours = dict(zip(curves, SEVERAL[2:], strict=False))
-    for axes, (key, title, scale) in zip(figure.subplots(1, 3), PANELS, strict=True):
-        for variant, rows in curves.items():
-            if not rows:
-                continue
-            values = scale * np.array([row[key] for row in rows], float)
-            at = np.array([row["iteration"] for row in rows])
-            axes.plot(at, _smooth(values), color=colours[variant], lw=1.8, label=labels[variant])
-        axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
-        axes.set_xlabel("iteration", fontsize=9)
-        axes.set_ylim(bottom=0)
-        plain_axes(axes)
-    handles, names = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
-    return png(figure)
+    return _with_legend(figure, columns)
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
@@ -158,7 +153,5 @@ def delta_chart(fitted: Mapping[str, Any]) -> bytes:
         axes.axhline(level, color=colour, lw=1.8, label=f"{label}, held-out flights")
     axes.set_ylim(bottom=0)
     axes.set_xlabel("iteration of the fit", fontsize=9)
-    title = f"Position error after {fitted['horizon_s']:g} s [m]"
-    titled(axes, title)
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    return png(figure)
+    titled(axes, f"Position error after {fitted['horizon_s']:g} s [m]")
+    return _with_legend(figure, 2, 8)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from eval.judging.statistics import (
     paired_success,
     wilson,
 )
-from eval.worlds.trial import TrialResult
+from eval.worlds.trial import TrialResult, TrialSpec
 from suite.common.report import Cell, Grid
 
 BEFORE, WITHOUT, WITH = "before", "without", "with"
@@ -76,62 +77,63 @@ def compare(results: Mapping[str, Sequence[TrialResult]]) -> list[Line]:
     Raises:
         ValueError: where the trials are not the same.
     """
-    trials = [row.trial for row in results[BEFORE]]
-    for variant in VARIANTS:
-        if [row.trial for row in results[variant]] != trials:
-            raise ValueError(f"{variant!r} and {BEFORE!r} were not flown on the same trials")
-    cells = list(dict.fromkeys((trial.track, trial.difficulty) for trial in trials))
+    trials = same_trials({name: results[name] for name in VARIANTS})
     lines = []
-    for track, level in cells:
+    for track, level in dict.fromkeys(trial[:2] for trial in trials):
         chosen = [k for k, trial in enumerate(trials) if trial[:2] == (track, level)]
         rows = {name: [results[name][k] for k in chosen] for name in VARIANTS}
         lines.append(_line(track, level, rows))
     return [*lines, _line(OVERALL, None, results)]
 
 
+def same_trials(results: Mapping[str, Sequence[TrialResult]]) -> list[TrialSpec]:
+    """Return the trials that all policies flew, in order.
+
+    Raises:
+        ValueError: where the trials are not the same.
+    """
+    first, *others = results
+    trials = [row.trial for row in results[first]]
+    for name in others:
+        if [row.trial for row in results[name]] != trials:
+            raise ValueError(f"{name!r} and {first!r} were not flown on the same trials")
+    return trials
+
+
+def rate(won: np.ndarray) -> Interval:
+    """Return the share of true values with Wilson's interval."""
+    return wilson(int(won.sum()), len(won))
+
+
 def _line(track: str, level: int | None, rows: Mapping[str, Sequence[TrialResult]]) -> Line:
     seed = zlib.crc32(repr((track, level)).encode())
+    mean, median = partial(bootstrap_mean, seed=seed), partial(bootstrap_median, seed=seed)
 
-    def column(field: str) -> dict[str, np.ndarray]:
-        return {name: np.array([getattr(row, field) for row in rows[name]]) for name in VARIANTS}
+    def columns(field: str) -> list[np.ndarray]:
+        return [np.array([getattr(row, field) for row in rows[name]]) for name in VARIANTS]
 
     def measure(
         field: str,
         alone: Callable[[np.ndarray], Interval],
         apart: Callable[[np.ndarray, np.ndarray], Interval],
     ) -> Measure:
-        of = column(field)
-        before, without, with_delta = (of[name] for name in VARIANTS)
+        before, without, with_delta = columns(field)
         return Measure(
-            alone(before),
-            alone(without),
-            alone(with_delta),
-            apart(with_delta, without),
-            apart(with_delta, before),
+            before=alone(before),
+            without=alone(without),
+            with_delta=alone(with_delta),
+            with_minus_without=apart(with_delta, without),
+            with_minus_before=apart(with_delta, before),
         )
 
-    def rate(won: np.ndarray) -> Interval:
-        return wilson(int(won.sum()), len(won))
-
-    def rates_apart(one: np.ndarray, two: np.ndarray) -> Interval:
-        return Interval(*paired_success(one, two)[:3])
-
-    def mean(values: np.ndarray) -> Interval:
-        return bootstrap_mean(values, seed)
-
-    def median(values: np.ndarray) -> Interval:
-        return bootstrap_median(values, seed)
-
-    def medians_apart(one: np.ndarray, two: np.ndarray) -> Interval:
-        return paired_bootstrap(one, two, seed)
-
-    won = column("success")
+    medians_apart = partial(paired_bootstrap, seed=seed)
+    _, without, with_delta = columns("success")
     return Line(
         track,
         level,
         trials=len(rows[BEFORE]),
-        success=measure("success", rate, rates_apart),
-        p_value=paired_success(won[WITH], won[WITHOUT]).p_value,
+        success=measure("success", rate, lambda *pair: Interval(*paired_success(*pair)[:3])),
+        p_value=paired_success(with_delta, without).p_value,
         gates=measure("gates_passed", mean, lambda one, two: mean(one - two)),
         v_mean=measure("v_mean", median, medians_apart),
         v_max=measure("v_max", median, medians_apart),
@@ -183,19 +185,26 @@ def difference_cell(interval: Interval, scale: float, digits: int) -> Cell:
     return Cell(f"{value} [{low}, {high}]", tone)
 
 
+def told_apart(difference: Interval) -> str:
+    """Return how one policy's successes stand to another's, in words."""
+    if difference.low > 0:
+        return "more than"
+    return "fewer than" if difference.high < 0 else "not to be told from"
+
+
+def points(difference: Interval) -> str:
+    """Return a difference of success rates with its interval, in percentage points."""
+    value, interval = difference_cell(difference, 100, 0).text.split(" ", 1)
+    return f"{value} points {interval}"
+
+
 def verdict(overall: Line) -> str:
     """Return in one sentence what fine-tuning under the Delta Action Model changed."""
     success = overall.success
-    value, low, high = (100 * x for x in success.with_minus_without)
-    if low > 0:
-        words = "more than the same fine-tuning without it"
-    elif high < 0:
-        words = "fewer than the same fine-tuning without it"
-    else:
-        words = "not to be told from the same fine-tuning without it"
     return (
         f"Fine-tuned with the Delta Action Model, {100 * success.with_delta.value:.0f} % of "
-        f"{overall.trials} trials succeed: {words} ({100 * success.without.value:.0f} %; "
-        f"difference {value:+.0f} points [{low:+.0f}, {high:+.0f}]); before, "
+        f"{overall.trials} trials succeed: {told_apart(success.with_minus_without)} the same "
+        f"fine-tuning without it ({100 * success.without.value:.0f} %; "
+        f"difference {points(success.with_minus_without)}); before, "
         f"{100 * success.before.value:.0f} %."
     )

@@ -10,7 +10,7 @@ from suite.common.choices import at_least, is_track_file, parse_levels, parse_tr
 from suite.delta.fit import FitConfig
 from suite.train.config import TrainConfig
 from suite.train.overrides import override
-from suite.train.presets import finetune, preset, with_iterations
+from suite.train.presets import finetune, preset, with_iterations, with_quadrotor
 from tracks.common.files import to_json
 
 RECORDED_FROM = 100_000
@@ -18,33 +18,35 @@ RECORDED_FROM = 100_000
 
 
 @dataclass(frozen=True)
-class Size:
+class LoopSize:
     """How much a loop flies and fits."""
 
-    trials: int = 50
+    trials: int
     """Judged trials of each policy on every track at every level."""
-    flights: int = 20
+    flights: int
     """Recorded flights on every track at every level."""
-    fit_iterations: int = 1500
-    """Gradient steps of the Delta Action Model's fit."""
+    fit_iterations: int
+    """Gradient steps of the fit of a Delta Action Model."""
+    finetune_iterations: int | None = None
+    """Gradient steps of each fine-tuning; None: a share of the training's."""
 
 
-SIZES = {"small": Size(trials=20, flights=8, fit_iterations=500)}
-"""Sizes that go with a recipe; the others have the defaults."""
+SIZES = {"small": LoopSize(20, 8, 500), "": LoopSize(50, 20, 1500)}
+"""Sizes by recipe; "" is that of the others."""
+HIDDEN_SIZES = {"small": LoopSize(20, 3, 200, 100), "": LoopSize(50, 5, 400, 200)}
+"""The same of a loop in a world with a hidden effect."""
 
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """A whole loop."""
+    """What every loop has."""
 
-    training: TrainConfig
-    """The first training; its physics is what the Delta Action Model corrects."""
     tuning: TrainConfig
-    """The fine-tuning, alike with and without the Delta Action Model."""
+    """The fine-tunings, alike but for what flies in them."""
     fit: FitConfig
-    """The fit of the Delta Action Model."""
+    """The fit of a Delta Action Model."""
     policy: str | None
-    """The policy to start from instead of training one: a shipped name or a checkpoint's folder."""
+    """The policy to start from: a shipped name or a checkpoint's folder; None trains one."""
     track: str
     """As in `suite.common.choices.parse_tracks`, families only."""
     difficulty: str
@@ -54,11 +56,11 @@ class LoopConfig:
     flights: int
     """Recorded flights on every track at every level."""
     vehicle: str
-    """A shipped vehicle's name or a vehicle file."""
+    """What the simulation knows: a shipped vehicle's name or a vehicle file."""
     seed: int
-    """Seed of the training and of the first judged trial."""
+    """Seed of what is trained and of the first judged trial."""
     digests: dict[str, str]
-    """SHA-256 of what comes from files: the vehicle and, where one is given, the policy."""
+    """SHA-256 of what comes from files: vehicles and, where one is given, the policy."""
 
     @property
     def recorded_from(self) -> int:
@@ -70,10 +72,37 @@ class LoopConfig:
         """Number of pairs of track and level."""
         return len(parse_tracks(self.track)) * len(parse_levels(self.difficulty))
 
+    @property
+    def true_vehicle(self) -> str:
+        """What is judged and recorded: a shipped vehicle's name or a vehicle file."""
+        return self.vehicle
+
+
+@dataclass(frozen=True)
+class DeltaLoopConfig(LoopConfig):
+    """A loop through the point mass."""
+
+    training: TrainConfig
+    """The first training; its physics is what the Delta Action Model corrects."""
+
+
+@dataclass(frozen=True)
+class HiddenLoopConfig(LoopConfig):
+    """A loop in a world that the simulation's vehicle file does not describe."""
+
+    world: str
+    """What is true: a vehicle file; nothing but the flights in it is looked at."""
+
+    @property
+    def true_vehicle(self) -> str:
+        """What is judged and recorded: the hidden world's vehicle file."""
+        return self.world
+
 
 def resolve(
     *,
     recipe: str,
+    world: str | None = None,
     policy: str | None = None,
     track: str = "all",
     difficulty: str = "0,3",
@@ -88,33 +117,53 @@ def resolve(
 ) -> LoopConfig:
     """Return the loop that a recipe and options ask for; None takes the recipe's size.
 
+    With a world nothing is trained from scratch: without a policy the shipped default flies.
+
     Raises:
         ValueError: for an option that cannot be used, naming it and what is allowed.
     """
     from eval.quadrotor.vehicle_file import load_vehicle
+    from policies.formats.policy_file import load_policy_checkpoint
+    from suite.judging.flying import checkpoint_folder, default_policy, policy_digest
 
-    size = SIZES.get(recipe, Size())
     training = replace(preset(recipe), seed=seed)
+    sizes = SIZES if world is None else HIDDEN_SIZES
+    size = sizes.get(recipe, sizes[""])
     if iterations is not None:
         at_least("--iterations", iterations, 1)
         training = with_iterations(training, iterations)
-    training = override(training, changes)
-    digests = {"vehicle": hashlib.sha256(to_json(load_vehicle(vehicle)).encode()).hexdigest()}
+    simulated = load_vehicle(vehicle)
+    digests = {"vehicle": _digest(simulated)}
+    if world is None:
+        training = override(training, changes)
+    else:
+        if iterations is not None:
+            raise ValueError(
+                f"--iterations is {iterations}, but with --world nothing is trained from "
+                "scratch; say how long to fine-tune with --finetune-iterations"
+            )
+        true = load_vehicle(world)
+        if simulated == true:
+            raise ValueError(
+                f"--world {world} is the simulation's vehicle {vehicle}: nothing is hidden; give a "
+                "vehicle file with an effect more, such as examples/hidden.toml"
+            )
+        digests["world"] = _digest(true)
+        policy = default_policy() if policy is None else policy
     if policy is not None:
-        from policies.formats.policy_file import load_policy_checkpoint
-        from suite.judging.flying import checkpoint_folder, policy_digest
-
         given = load_policy_checkpoint(checkpoint_folder(policy))
         training = replace(training, spec=given.spec)
         digests["policy"] = policy_digest(policy)
     tuning = finetune(training)
-    if finetune_iterations is not None:
-        at_least("--finetune-iterations", finetune_iterations, 1)
-        tuning = with_iterations(tuning, finetune_iterations)
+    longer = size.finetune_iterations if finetune_iterations is None else finetune_iterations
+    if longer is not None:
+        at_least("--finetune-iterations", longer, 1)
+        tuning = with_iterations(tuning, longer)
+    if world is not None:
+        tuning = override(with_quadrotor(tuning, simulated), changes)
     fitted = size.fit_iterations if fit_iterations is None else fit_iterations
     at_least("--fit-iterations", fitted, 1)
     config = LoopConfig(
-        training=training,
         tuning=tuning,
         fit=FitConfig(iterations=fitted, seed=seed),
         policy=policy,
@@ -126,41 +175,38 @@ def resolve(
         seed=seed,
         digests=digests,
     )
-    check_seeds(config.track, config.difficulty, config.seed, config.trials, config.flights)
-    return config
+    _check_seeds(config)
+    if world is None:
+        return DeltaLoopConfig(training=training, **vars(config))
+    return HiddenLoopConfig(world=world, **vars(config))
 
 
-def check_seeds(track: str, difficulty: str, seed: int, trials: int, flights: int) -> None:
+def _digest(value: object) -> str:
+    return hashlib.sha256(to_json(value).encode()).hexdigest()
+
+
+def _check_seeds(config: LoopConfig) -> None:
     """Check that recorded flights and judged trials can be kept apart.
-
-    Args:
-        track: as people write it, and so on.
-        difficulty: levels.
-        seed: of the first judged trial.
-        trials: judged, on every track at every level.
-        flights: recorded, on every track at every level.
 
     Raises:
         ValueError: naming the option and what is allowed.
     """
-    names, levels = parse_tracks(track), parse_levels(difficulty)
-    files = [name for name in names if is_track_file(name)]
+    files = [name for name in parse_tracks(config.track) if is_track_file(name)]
     if files:
         raise ValueError(
             f"--track {files[0]}: a track from a file is the same at every seed, so flights on it "
             "cannot be held apart from trials; give families (zigzag, circular, ellipse)"
         )
-    at_least("--seed", seed, 0)
-    at_least("--trials", trials, 1)
-    at_least("--flights", flights, 1)
-    if trials > RECORDED_FROM:
+    at_least("--seed", config.seed, 0)
+    at_least("--trials", config.trials, 1)
+    at_least("--flights", config.flights, 1)
+    if config.trials > RECORDED_FROM:
         raise ValueError(
-            f"--trials is {trials}; it must be {RECORDED_FROM} or less, since recorded "
+            f"--trials is {config.trials}; it must be {RECORDED_FROM} or less, since recorded "
             "flights have the seeds above"
         )
-    cells = len(names) * len(levels)
-    if flights * cells < 2:
+    if config.flights * config.cells < 2:
         raise ValueError(
-            f"--flights is {flights} on {cells} track and level; at least 2 flights "
+            f"--flights is {config.flights} on {config.cells} track and level; at least 2 flights "
             "are needed, one of which is held out"
         )

@@ -1,129 +1,104 @@
-"""Any number of policies on the same trials, each against those that it is to be told from."""
+"""A loop as data: the policies that it compares, what each is tuned through and judged in.
+
+A loop's folder holds train/ (or given/), eval-X/ of the first policy, flights/, in a hidden world
+measured/ and diagnosis/, a folder for each Delta Action Model, tuned-X/ and eval-X/ of each
+fine-tuned policy X, and replays/; then table.md, loop.json, report.html and recording.rrd.
+"""
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from eval.judging.statistics import (
-    Interval,
-    bootstrap_mean,
-    bootstrap_median,
-    paired_success,
-    wilson,
-)
 from eval.worlds.trial import TrialResult
-from suite.common.report import Cell, Grid
-from suite.loop.compare import difference_cell, value_text
+from suite.common.report import Grid, Picture, Section
+from suite.loop.config import LoopConfig
 
 
-class Difference(NamedTuple):
-    """One policy's success minus another's on the same trials."""
-
-    against: str
-    """The other's name."""
-    success: Interval
-    """Newcombe's paired interval."""
-    p_value: float
-    """Exact McNemar test, two-sided."""
-
-
-class Standing(NamedTuple):
-    """What one policy's trials come to."""
+@dataclass(frozen=True)
+class Variant:
+    """A policy of the loop, judged in eval-NAME/."""
 
     name: str
-    success: Interval
-    """Rate, Wilson."""
-    by_cell: dict[str, Interval]
-    """The same on every track and level, as "zigzag 3"."""
-    gates: Interval
-    """Mean number of gates passed, bootstrap."""
-    v_mean: Interval
-    """Median over trials [m/s], bootstrap."""
-    differences: list[Difference]
-    """Against each reference but itself."""
+    """Of its folders."""
+    judged: str
+    """The judging, in words."""
+    tuned: str | None = None
+    """The fine-tuning in tuned-NAME/, in words; None: it is the first policy."""
+    delta: str | None = None
+    """Folder of the Delta Action Model that corrects what it is fine-tuned through."""
+    diagnosed: bool = False
+    """Whether it is fine-tuned through the vehicle that the diagnosis corrected."""
+    simulated: bool = False
+    """Whether the simulation's vehicle flies when it is judged, not the true one."""
 
 
-def standings(
-    results: Mapping[str, Sequence[TrialResult]], references: Sequence[str]
-) -> list[Standing]:
-    """Return a standing for every policy, in the order of `results`.
+@dataclass(frozen=True)
+class DeltaModel:
+    """A Delta Action Model that is fitted."""
 
-    Args:
-        results: by policy, of the same trials in the same order.
-        references: policies against which the others are held.
-
-    Raises:
-        ValueError: where the trials are not the same.
-    """
-    names = list(results)
-    trials = [row.trial for row in results[names[0]]]
-    for name in names:
-        if [row.trial for row in results[name]] != trials:
-            raise ValueError(f"{name!r} and {names[0]!r} were not flown on the same trials")
-    won = {name: np.array([row.success for row in rows]) for name, rows in results.items()}
-    cells = list(dict.fromkeys((trial.track, trial.difficulty) for trial in trials))
-    found = []
-    for name, rows in results.items():
-        seed = zlib.crc32(name.encode())
-        inside = {
-            f"{track} {level}": won[name][[trial[:2] == (track, level) for trial in trials]]
-            for track, level in cells
-        }
-        apart = {other: paired_success(won[name], won[other]) for other in references}
-        found.append(
-            Standing(
-                name=name,
-                success=_rate(won[name]),
-                by_cell={cell: _rate(wins) for cell, wins in inside.items()},
-                gates=bootstrap_mean(np.array([row.gates_passed for row in rows]), seed),
-                v_mean=bootstrap_median(np.array([row.v_mean for row in rows]), seed),
-                differences=[
-                    Difference(other, Interval(*pair[:3]), pair.p_value)
-                    for other, pair in apart.items()
-                    if other != name
-                ],
-            )
-        )
-    return found
+    folder: str
+    """Where."""
+    words: str
+    """The fitting, in words."""
+    diagnosed: bool = False
+    """Whether it corrects the vehicle that the diagnosis corrected."""
 
 
-def _rate(won: np.ndarray) -> Interval:
-    return wilson(int(won.sum()), len(won))
+class Shown(NamedTuple):
+    """A policy that is in the recording and the pictures."""
+
+    variant: str
+    """Its name."""
+    label: str
+    """What the recording calls it."""
+    heading: str
+    """Over its picture."""
 
 
-def overall_grid(
-    found: Sequence[Standing], references: Sequence[str], labels: Mapping[str, str], trials: int
-) -> Grid:
-    """Return a row a policy: success, its differences, gates and speed."""
-    headers = ["policy", "success [%]"]
-    for other in references:
-        headers += [f"minus {labels[other]}", "p"]
-    rows = []
-    for one in found:
-        row = [Cell(labels[one.name]), Cell(value_text(one.success, 100, 0))]
-        apart = {difference.against: difference for difference in one.differences}
-        for other in references:
-            if other in apart:
-                row.append(difference_cell(apart[other].success, 100, 0))
-                row.append(Cell(f"{apart[other].p_value:.2g}"))
-            else:
-                row += [Cell(""), Cell("")]
-        row.append(Cell(value_text(one.gates, 1, 2)))
-        row.append(Cell(value_text(one.v_mean, 1, 2)))
-        rows.append(row)
-    headers += ["gates passed, mean", "mean speed, median [m/s]"]
-    return Grid(f"Over {trials} trials of each policy", headers, rows)
+@dataclass(frozen=True)
+class Findings:
+    """What a loop came to."""
+
+    verdict: str
+    """In a few sentences."""
+    tables: Sequence[Grid]
+    """Of the policies."""
+    errors: Sequence[str]
+    """Of the Delta Action Models, as Markdown."""
+    numbers: Mapping[str, Any]
+    """What loop.json holds of them."""
+    facts: Mapping[str, str]
+    """What flew, by name, for the report."""
+    chart: Picture
+    """Of the policies."""
+    sections: Sequence[Section]
+    """The report's, between the policies and the flights."""
 
 
-def cell_grid(found: Sequence[Standing], labels: Mapping[str, str]) -> Grid:
-    """Return a row a track and level, a column a policy: success."""
-    headers = ["track and level", *(labels[one.name] for one in found)]
-    rows = [
-        [Cell(cell), *(Cell(value_text(one.by_cell[cell], 100, 0)) for one in found)]
-        for cell in found[0].by_cell
-    ]
-    return Grid("Success by track and level [%]", headers, rows)
+@dataclass(frozen=True)
+class Loop:
+    """A declaration."""
+
+    title: str
+    """Of the report."""
+    hidden: bool
+    """Whether the flights are measured and diagnosed before anything is fitted to them."""
+    variants: Sequence[Variant]
+    """In the order of tables and stages."""
+    models: Sequence[DeltaModel]
+    """In the order of stages."""
+    shown: Sequence[Shown]
+    """First the one before, then the one after."""
+    find: Callable[[LoopConfig, Path, Mapping[str, Sequence[TrialResult]]], Findings]
+    """Makes the findings from the configuration, the folder and the results by variant."""
+    reading: str
+    """How to read the tables."""
+    caveat: str
+    """What their intervals do not say."""
+    advice: str
+    """What to do where the flights are too short to be fitted."""
+    files: Sequence[tuple[str, str]]
+    """Paths that the report links to, with what is there."""

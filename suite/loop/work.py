@@ -1,17 +1,29 @@
-"""What stages of a loop do: take a policy, judge it, record its flights."""
+"""What the stages of a loop do, and the list of them that a declaration asks for."""
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 from rich.console import RenderableType
 
 from eval.judging.results import read_trials
+from eval.quadrotor.vehicle_file import load_vehicle
+from policies.formats.delta_file import load_delta
+from policies.formats.policy_file import load_policy_checkpoint
+from policies.networks.network import fitted
+from suite.common.choices import parse_levels
 from suite.common.console import Console
+from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate
-from suite.common.stages import Stages
+from suite.common.stages import Stage
+from suite.delta.run import fit_delta, fitting_estimate
 from suite.judging.collect import Collection, collect
 from suite.judging.evaluate import Judgement, evaluate
 from suite.judging.flying import (
@@ -21,7 +33,26 @@ from suite.judging.flying import (
     checkpoint_folder,
     options_for,
 )
-from tracks.common.files import replacing_folder
+from suite.judging.replay import drone_of, first_trials, fly_again
+from suite.loop.compare import BEFORE
+from suite.loop.config import DeltaLoopConfig, LoopConfig
+from suite.loop.measured import enough, measure
+from suite.loop.variants import DeltaModel, Loop, Variant
+from suite.train import run as training
+from suite.train.config import TrainConfig
+from tracks.common.files import replacing_folder, write_json
+
+DIAGNOSED_S = 80.0
+"""The diagnosis gets about this much flight, of all tracks and levels in turn [s]."""
+INPUT_SOURCE = "commands"
+"""The judge's rate loop is the vehicle file's, so the diagnosis need not ask whose it is; driven by
+rotor speeds a wrong torque runs away within a second."""
+DIAGNOSIS = Estimate(90.0, 1.5e9)
+"""What a diagnosis needs."""
+PHYSICS_HZ = 200.0
+"""Steps of the quadrotor in which a Delta Action Model is fitted, for the estimate [Hz]."""
+QUADROTOR_COST = 3.0
+"""A gradient step through the quadrotor over one through the point mass, for the estimate."""
 
 
 class Quiet(Console):
@@ -34,43 +65,244 @@ class Quiet(Console):
         """Print nothing."""
 
 
-def take_policy(stages: Stages, given: str) -> Path:
-    """Copy a shipped policy or a checkpoint into the loop's folder and return the copy."""
+@dataclass(frozen=True)
+class LoopRun:
+    """A loop in its folder."""
+
+    loop: Loop
+    """The declaration."""
+    config: LoopConfig
+    """What it is run with."""
+    out: Path
+    """The folder."""
+    console: Console
+    """Where progress goes."""
+
+    @property
+    def logs(self) -> Path:
+        """The folder of the flights to which Delta Action Models are fitted."""
+        return self.out / ("measured" if self.loop.hidden else "flights")
+
+    def policy(self, variant: Variant) -> Path:
+        """Return the folder of a variant's policy."""
+        first = "train" if self.config.policy is None else "given"
+        return self.out / (f"tuned-{variant.name}" if variant.tuned else first) / "policy"
+
+    def tuning(self, diagnosed: bool) -> TrainConfig:
+        """Return the fine-tuning, through the vehicle that the diagnosis corrected if asked."""
+        tuning = self.config.tuning
+        if not diagnosed or tuning.quadrotor is None:
+            return tuning
+        vehicle = load_vehicle(self.out / "diagnosis" / "vehicle.toml")
+        return replace(tuning, quadrotor=replace(tuning.quadrotor, vehicle=vehicle))
+
+
+def plan(run: LoopRun) -> list[Stage]:
+    """Return the stages of a loop in order."""
+    first = [variant for variant in run.loop.variants if variant.tuned is None]
+    later = [variant for variant in run.loop.variants if variant.tuned is not None]
+    return [
+        _begin(run),
+        *(_judge(run, variant) for variant in first),
+        _record(run),
+        *([_measure(run), _diagnose(run)] if run.loop.hidden else []),
+        *(_fit(run, model) for model in run.loop.models),
+        *(_tune(run, variant) for variant in later),
+        *(_judge(run, variant) for variant in later),
+        _replay(run),
+    ]
+
+
+def _begin(run: LoopRun) -> Stage:
+    """Train the first policy, or copy a shipped one or a checkpoint."""
+    config, given = run.config, run.config.policy
+    if given is None:
+        assert isinstance(config, DeltaLoopConfig)
+
+        def train(folder: Path) -> None:
+            training.train(config.training, folder, run.console)
+
+        needs = training.estimate(config.training)
+        return Stage("train", "training in the point mass", needs, train)
 
     def copy(folder: Path) -> None:
         with replacing_folder(folder / "policy") as beside:
             shutil.copytree(checkpoint_folder(given), beside, dirs_exist_ok=True)
 
-    return stages.do("given", f"taking {given} instead of training", copy) / "policy"
+    return Stage("given", f"taking {given} instead of training", Estimate(0, 0), copy)
 
 
-def judge(stages: Stages, name: str, words: str, judgement: Judgement) -> Path:
-    """Judge a policy in the folder `name`, say how it went, and return the folder."""
-    folder = stages.do(name, words, lambda out: evaluate(judgement, out, Quiet()))
-    rows = read_trials(folder / "trials.parquet")
-    won = sum(row.success for row in rows) / len(rows)
-    gates = sum(row.gates_passed for row in rows) / len(rows)
-    stages.console.note(
-        f"    {won:.0%} of {len(rows)} trials succeed, {gates:.1f} gates on average"
-    )
-    return folder
-
-
-def record(stages: Stages, collection: Collection) -> Path:
-    """Record flights in the folder `flights` and return it."""
-    words = "recording flights on other seeds"
-    return stages.do("flights", words, lambda out: collect(collection, out, Quiet()))
-
-
-def flying(trials: int) -> Estimate:
+def _flying(trials: int) -> Estimate:
     """Return about how long `trials` take in MuJoCo, and their memory."""
     processes = options_for(trials, None, "mujoco").processes or 1
     seconds = START_SECONDS + trials * SECONDS_A_TRIAL / processes
     return Estimate(seconds, processes * PROCESS_BYTES)
 
 
-def what_is_left(stages: Stages, needs: Mapping[str, Estimate]) -> Estimate:
-    """Return the time of the stages in `needs` that are not done, and the largest memory."""
-    left = [need for name, need in needs.items() if not stages.is_done(name)]
-    most = max((need.memory_bytes for need in left), default=0.0)
-    return Estimate(sum(need.seconds for need in left), most)
+def _judgement(run: LoopRun, variant: Variant) -> Judgement:
+    config = run.config
+    return Judgement(
+        policies=(str(run.policy(variant)),),
+        track=config.track,
+        difficulty=config.difficulty,
+        trials=config.trials,
+        seed=config.seed,
+        vehicle=config.vehicle if variant.simulated else config.true_vehicle,
+    )
+
+
+def _judge(run: LoopRun, variant: Variant) -> Stage:
+    def work(folder: Path) -> None:
+        evaluate(_judgement(run, variant), folder, Quiet())
+
+    def tell(folder: Path) -> None:
+        rows = read_trials(folder / "trials.parquet")
+        won = sum(row.success for row in rows) / len(rows)
+        gates = sum(row.gates_passed for row in rows) / len(rows)
+        words = f"{won:.0%} of {len(rows)} trials succeed, {gates:.1f} gates on average"
+        run.console.note(f"    {words}")
+
+    needs = _flying(run.config.trials * run.config.cells)
+    return Stage(f"eval-{variant.name}", variant.judged, needs, work, tell)
+
+
+def _record(run: LoopRun) -> Stage:
+    config = run.config
+    first = next(variant for variant in run.loop.variants if variant.name == BEFORE)
+    collection = Collection(
+        policy=str(run.policy(first)),
+        track=config.track,
+        difficulty=config.difficulty,
+        trials=config.flights,
+        vehicle=config.true_vehicle,
+        seed=config.recorded_from,
+    )
+    return Stage(
+        "flights",
+        "recording flights on other seeds",
+        _flying(config.flights * config.cells),
+        lambda folder: collect(collection, folder, Quiet()),
+    )
+
+
+def _measure(run: LoopRun) -> Stage:
+    def work(folder: Path) -> None:
+        try:
+            files = measure(run.out / "flights", folder, run.config.seed)
+        except ValueError as error:
+            raise WorkFailed(f"{error}; record more flights (--flights)") from error
+        chosen = [file.name for file in enough(files, DIAGNOSED_S)]
+        write_json(folder / "diagnosed.json", {"files": chosen})
+
+    words = "cutting the flights before contact, with a log's noise"
+    needs = Estimate(1 + 0.05 * run.config.flights * run.config.cells, 0)
+    return Stage("measured", words, needs, work)
+
+
+def _diagnose(run: LoopRun) -> Stage:
+    def work(folder: Path) -> None:
+        from suite.diagnose.run import Wishes, diagnose_files
+
+        listed = json.loads((run.logs / "diagnosed.json").read_text(encoding="utf-8"))
+        paths = [run.logs / name for name in listed["files"]]
+        wishes = Wishes(drive=INPUT_SOURCE, seed=run.config.seed)
+        try:
+            diagnose_files(paths, run.config.vehicle, wishes, folder, run.console)
+        except ValueError as error:
+            raise WorkFailed(f"the flights in {run.logs} cannot be diagnosed: {error}") from error
+
+    def tell(folder: Path) -> None:
+        found = read_diagnosis(run.out)
+        run.console.note(f"    {found['verdict']}: {named_effects(found) or 'nothing named'}")
+        if not found["effects"]:
+            raise WorkFailed(
+                f"the diagnosis says {found['verdict']} and names nothing to correct, see "
+                f"{folder / 'report.html'}; record more flights (--flights) with another --out"
+            )
+
+    words = "asking the diagnosis what the vehicle file lacks"
+    return Stage("diagnosis", words, DIAGNOSIS, work, tell)
+
+
+def read_diagnosis(out: Path) -> dict[str, Any]:
+    """Return what the diagnosis.json of the loop in `out` holds."""
+    return json.loads((out / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
+
+
+def named_effects(found: Mapping[str, Any]) -> str:
+    """Return the effects that diagnosis.json names, with their rivals, in words."""
+    parts = []
+    for effect in found["effects"]:
+        rivals = ", ".join(effect["alternatives"])
+        parts.append(effect["name"] + (f" (or {rivals})" if rivals else ""))
+    return ", ".join(parts)
+
+
+def _fit(run: LoopRun, model: DeltaModel) -> Stage:
+    fit = run.config.fit
+
+    def work(folder: Path) -> None:
+        tuning = run.tuning(model.diagnosed)
+        try:
+            fit_delta(fit, tuning.quadrotor or tuning.physics, [run.logs], folder, run.console)
+        except ValueError as error:
+            raise WorkFailed(
+                f"the Delta Action Model cannot be fitted to the flights in {run.logs}: {error}; "
+                + run.loop.advice
+            ) from error
+
+    def tell(folder: Path) -> None:
+        for line in (folder / "table.md").read_text(encoding="utf-8").splitlines():
+            run.console.note(f"    {line}")
+
+    tuning = run.config.tuning
+    through_quadrotor = tuning.quadrotor is not None
+    steps = fit.horizon_s * (PHYSICS_HZ if through_quadrotor else tuning.spec.rate_hz)
+    needs = fitting_estimate(fit, steps, through_quadrotor)
+    return Stage(model.folder, model.words, needs, work, tell)
+
+
+def _tune(run: LoopRun, variant: Variant) -> Stage:
+    def work(folder: Path) -> None:
+        tuning, first = run.tuning(variant.diagnosed), replace(variant, tuned=None)
+        stored = load_policy_checkpoint(run.policy(first))
+        start = fitted(jax.tree.map(jnp.asarray, stored.params), stored.spec, tuning.spec)
+        delta = None
+        if variant.delta is not None:
+            model = load_delta(run.out / variant.delta / "delta").params
+            delta = jax.tree.map(jnp.asarray, model)
+        training.train(tuning, folder, run.console, start, delta)
+
+    point = training.estimate(replace(run.config.tuning, quadrotor=None))
+    cost = 1.0 if run.config.tuning.quadrotor is None else QUADROTOR_COST
+    needs = Estimate(cost * point.seconds, point.memory_bytes)
+    return Stage(f"tuned-{variant.name}", f"fine-tuning {variant.tuned}", needs, work)
+
+
+def _replay(run: LoopRun) -> Stage:
+    """Fly the first seed on every track, at the easiest and the hardest level, again.
+
+    Trials are chosen by their seed, not by how they went; in the recording each is followed by the
+    same one flown by the other policy.
+    """
+    by_name = {variant.name: variant for variant in run.loop.variants}
+    judgement = _judgement(run, by_name[BEFORE])
+    levels = parse_levels(run.config.difficulty)
+    ends = replace(judgement, difficulty=f"{min(levels)},{max(levels)}")
+
+    def work(folder: Path) -> None:
+        from eval.view.picture import write_grid
+        from eval.view.recording import write_recording
+
+        trials, flown = first_trials(ends), []
+        columns = len(set(trial.difficulty for trial in trials))
+        for variant, label, _ in run.loop.shown:
+            rollouts = fly_again(judgement, trials, str(run.policy(by_name[variant])))
+            flown.append([(*pair, result._replace(policy=label)) for *pair, result in rollouts])
+            write_grid(folder / f"{variant}.png", flown[-1], columns)
+        pairs = [rollout for pair in zip(*flown, strict=True) for rollout in pair]
+        drone = drone_of(load_vehicle(judgement.vehicle))
+        write_recording(folder.parent / "recording.rrd", pairs, drone)
+
+    words = "flying a few trials again for the recording and the pictures"
+    return Stage("replays", words, _flying(12), work)

@@ -5,8 +5,9 @@ import numpy as np
 
 from eval.effects import apply_log_faults
 from eval.logs.flight_log import FlightLog
-from eval.quadrotor.model import add_quadrotor, set_true_inertia
-from eval.quadrotor.plant import Command, Motion, make_plant, plant_step, start_memory, uses_noise
+from eval.quadrotor.model import compile_quadrotor
+from eval.quadrotor.plant import Command, Motion, make_plant, uses_noise
+from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from tracks.geometry.rotation import quat_to_rot
 
 NOISE = {"pos": 0.002, "att": 0.004, "vel": 0.02, "rate": 0.02, "motor": 4.0, "acc": 0.15}
@@ -56,17 +57,13 @@ def fly(vehicle, seed, duration_s=10.0, speed=5.0, noise=1.0, motors=False, acc=
     `extra(motion, t)` gives a force in the world that no effect of the catalogue makes.
     """
     rng = np.random.default_rng(seed)
-    spec = mujoco.MjSpec()
     dt = 1.0 / vehicle.controller.frequency
-    spec.option.timestep = dt
-    add_quadrotor(spec, vehicle)
-    model = spec.compile()
-    set_true_inertia(model, vehicle)
+    model = compile_quadrotor(mujoco.MjSpec(), vehicle, dt)
     data = mujoco.MjData(model)
     at, yaw_rate = reference(rng, speed), rng.uniform(-0.8, 0.8)
     plant = make_plant(vehicle, dt)
     draw = uses_noise(plant)
-    memory = start_memory(plant, (), noise=rng.standard_normal(3) if draw else None)
+    state = hover_state(plant, (), noise=rng.standard_normal(3) if draw else None)
     data.qpos[:3], data.qvel[:3] = at(0.0)[:2]
     rows, command, force = [], Command(np.zeros(()), np.zeros(3)), np.zeros(3)
     for k in range(round(duration_s / dt) + 1):
@@ -75,9 +72,9 @@ def fly(vehicle, seed, duration_s=10.0, speed=5.0, noise=1.0, motors=False, acc=
         if k % EVERY == 0:
             command = track(at, yaw_rate, k * dt, motion)
             rows.append(np.concatenate([[k * dt], data.qpos, data.qvel, [command.thrust],
-                                        command.rate_b, memory.rotor_speed, force]))  # fmt: skip
-        draws = rng.standard_normal(3) if draw else None
-        memory, wrench = plant_step(plant, memory, motion, command, k * dt, draws)
+                                        command.rate_b, state.rotor_speed, force]))  # fmt: skip
+        inputs = Inputs(command, noise=rng.standard_normal(3) if draw else None)
+        state, wrench = plant_step(plant, state, motion, inputs, k * dt)
         push = np.zeros(3) if extra is None else extra(motion, k * dt)
         force = wrench.force_b / plant.constants.mass + rot.T @ push
         data.qfrc_applied[:3] = rot @ wrench.force_b + push * plant.constants.mass

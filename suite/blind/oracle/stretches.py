@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.quadrotor.plant import Command, Memory, Motion, Plant, Wrench, make_plant, plant_step
+from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant
 from eval.quadrotor.rigid_body import euler_step
+from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.sensors import Sensors
 from suite.diagnose.plans.simulate import FULL_V, Recording
@@ -150,7 +151,7 @@ def replay(
             gust = EFFECTS[name].gust
             if gust is not None:
                 wind[name] = gust(value, draws[0])
-    memory = Memory(
+    state = PlantState(
         np.broadcast_to(windows.rotor_speed, (*lead, 4)),
         np.broadcast_to(windows.history[..., :room], (*lead, 4, room)),
         wind,
@@ -162,22 +163,20 @@ def replay(
     for step in range(steps + 1):
         if step % windows.period == 0:
             # The first row has no step before it: its accelerometer says nothing.
-            kept.append((*motion, acc_b, memory.rotor_speed))
+            kept.append((*motion, acc_b, state.rotor_speed))
         if step == steps:
             break
         command = Command(
             np.broadcast_to(given.thrust[step], lead),
             np.broadcast_to(given.rate_b[step], (*lead, 3)),
         )
-        memory, wrench = plant_step(
-            plant,
-            memory,
-            motion,
+        inputs = Inputs(
             command,
-            windows.start_s + step * windows.dt,
-            None if draws is None else draws[step + 1],
-            windows.voltage_drop[step] if has_voltage else None,
+            noise=None if draws is None else draws[step + 1],
+            voltage_drop=windows.voltage_drop[step] if has_voltage else None,
         )
+        time_s = windows.start_s + step * windows.dt
+        state, wrench = plant_step(plant, state, motion, inputs, time_s)
         if outside:
             wrench = Wrench(
                 wrench.force_b + windows.extra.force_b[step],

@@ -17,7 +17,8 @@ from scipy.signal import lfilter
 
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mixer_matrix
-from eval.quadrotor.plant import Command, make_plant, wanted_speed
+from eval.quadrotor.plant import Command, make_plant
+from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.windows import step_s
 

@@ -12,10 +12,11 @@ import numpy as np
 
 from eval.effects.interface import Constants
 from eval.quadrotor.plant import Nominal, assemble, nominal_quadrotor
+from eval.quadrotor.stepper import Feedback
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.windows import Windows, step_s
 from suite.diagnose.fit.parameters import Layout, Space, effects_at
-from suite.diagnose.fit.rollout import KNOTS, STATE, Feedback, Flown, difference, fly_windows
+from suite.diagnose.fit.rollout import KNOTS, STATE, Flown, difference, fly_windows
 
 BATCH = 12
 """Windows a call: one shape, compiled once."""

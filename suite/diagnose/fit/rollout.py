@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eval.quadrotor.plant import Command, Memory, Motion, Plant, Wrench, spin_step, wanted_speed
-from eval.quadrotor.rigid_body import euler_step
-from eval.quadrotor.rotors import follow, steady
+from eval.quadrotor.delay import delayed_series
+from eval.quadrotor.plant import Motion, Plant, unpacked
+from eval.quadrotor.stepper import Feedback, Inputs, PlantState, rollout, rotor_step, wanted_speed
 from suite.diagnose.data.windows import CHANNELS, HISTORY_S, WARM_S, Windows
 from tracks.geometry.rotation import exp_rot
 
@@ -30,15 +30,6 @@ class Flown(NamedTuple):
     """(B, S + 1, 4) [rad/s]."""
     force_b: Any
     """(B, S + 1, 3) specific force in the step before [m/s^2]."""
-
-
-class Feedback(NamedTuple):
-    """A push that follows from the simulated state, such as a network's."""
-
-    start: Any
-    """What it remembers, at the start of B windows."""
-    act: Callable[[Any, Motion, Any, Any], tuple[Any, Any]]
-    """(memory, motion, commands (B, 4), number of the step) -> (memory, push (B, 6) as below)."""
 
 
 def fly_windows(
@@ -60,80 +51,47 @@ def fly_windows(
         voltage: the windows have a voltage.
         offset: (B, F) of the start and of the rotor speeds' errors from what was measured.
         windows: B of them.
-        push: (B, KNOTS, 6) further acceleration [m/s^2] and angular acceleration [rad/s^2] in
-            body axes; none if not given.
-        feedback: the same from the simulated state, in place of `push`.
+        push: (B, KNOTS, 6) what pushes, as `Inputs.push_b` has it; none if not given.
+        feedback: what pushes in place of `push`.
     """
     dt = float(plant.dt)
     gyro = values["gyro_bias"].bias
     before, warm = round(HISTORY_S / dt) + 1, round(WARM_S / dt)
     steps = windows.command.shape[1] - before - warm
-    command = _late(windows.command, plant.constants.delay, dt, before)
+    command = delayed_series(jnp.asarray(windows.command), plant.constants.delay, dt, before)
     motion = Motion(
         windows.pos_w + offset[:, :3],
         jnp.matmul(windows.rot_w, exp_rot(offset[:, 3:6])),
         windows.vel_w + offset[:, 6:9],
         windows.rate_b - gyro + offset[:, 9:STATE],
     )
-
-    def ask(order: Any, rate_b: Any) -> Any:
-        return wanted_speed(plant, Command(order[:, 0], order[:, 1:]), rate_b)
-
-    def warm_up(speed: Any, inputs: Any) -> Any:
-        order, rate_b = inputs
-        wanted = ask(order, rate_b - gyro)
-        return follow(speed, wanted, plant.constants.time_constant, plant.dt).end, None
-
     order = jnp.swapaxes(command, 0, 1)
     warm_rate_b = jnp.swapaxes(jnp.asarray(windows.warm_rate_b), 0, 1)
-    speed, _ = jax.lax.scan(
-        warm_up, ask(order[0], warm_rate_b[0] - gyro), (order[:warm], warm_rate_b)
-    )
+    speed = wanted_speed(plant, unpacked(order[0]), warm_rate_b[0] - gyro)
 
-    def step(carry: Any, inputs: Any) -> Any:
-        speed, motion, remembered = carry
-        order, measured, drop, index, pushed = inputs
-        if feedback is not None:
-            remembered, pushed = feedback.act(remembered, motion, order, index)
-        if driven_by_rotors:
-            spin = steady(measured)
-        else:
-            wanted = ask(order, motion.rate_b)
-            spin = follow(speed, wanted, plant.constants.time_constant, plant.dt)
-        memory = Memory(spin.end, jnp.zeros((len(speed), 4, 0)), {})
-        time_s = windows.start_s + index * dt
-        _, wrench = spin_step(plant, memory, motion, spin, time_s, None, drop if voltage else None)
-        if pushed is not None:
-            wrench = Wrench(
-                wrench.force_b + plant.constants.mass * pushed[:, :3],
-                wrench.torque_b + plant.constants.inertia * pushed[:, 3:],
-            )
-        after = euler_step(plant, motion, wrench)
-        force_b = wrench.force_b / plant.constants.mass
-        return (spin.end, after, remembered), (after, spin.end, force_b)
+    def warm_up(state: PlantState, inputs: Any) -> tuple[PlantState, None]:
+        order, rate_b = inputs
+        return rotor_step(plant, state, unpacked(order), rate_b - gyro)[0], None
 
-    measured_speed = jnp.asarray(windows.rotor_speed)
+    # The commands are late already: a plant for whole flights need not remember them.
+    start = PlantState(speed, jnp.zeros((len(speed), 4, 0)), {})
+    start, _ = jax.lax.scan(warm_up, start, (order[:warm], warm_rate_b))
+
+    measured = None
     if driven_by_rotors:
         error = offset[:, STATE:].reshape(-1, KNOTS, 4)
-        measured_speed = measured_speed - jnp.matmul(_hats(steps), error)
-    inputs = (
-        order[warm:],
-        jnp.swapaxes(measured_speed, 0, 1),
-        jnp.swapaxes(jnp.asarray(windows.voltage_drop), 0, 1),
-        jnp.arange(steps),
-        None if push is None else jnp.swapaxes(jnp.matmul(_hats(steps), push), 0, 1),
+        measured = jnp.asarray(windows.rotor_speed) - jnp.matmul(_hats(steps), error)
+        measured = jnp.swapaxes(measured, 0, 1)
+    inputs = Inputs(
+        unpacked(order[warm:]),
+        measured,
+        voltage_drop=jnp.swapaxes(jnp.asarray(windows.voltage_drop), 0, 1) if voltage else None,
+        push_b=None if push is None else jnp.swapaxes(jnp.matmul(_hats(steps), push), 0, 1),
     )
-    begin = (speed, motion, None if feedback is None else feedback.start)
-    _, (flown, speeds, forces) = jax.lax.scan(step, begin, inputs)
-    track = Motion(
-        *(
-            jnp.moveaxis(jnp.concatenate([a[None], b]), 0, 1)
-            for a, b in zip(motion, flown, strict=True)
-        )
-    )
-    speeds = jnp.moveaxis(jnp.concatenate([speed[None], speeds]), 0, 1)
-    forces = jnp.moveaxis(jnp.concatenate([forces[:1], forces]), 0, 1)
-    return Flown(track, speeds, forces)
+    flown = rollout(plant, motion, inputs, start, windows.start_s, feedback)
+    force_b = jnp.concatenate([flown.acc_b[:1], flown.acc_b])
+    along = (flown.motion, flown.rotor_speed, force_b)
+    return Flown(*jax.tree.map(lambda field: jnp.moveaxis(field, 0, 1), along))
 
 
 def difference(plant: Plant, values: Mapping[str, Any], flown: Flown, windows: Windows) -> Any:
@@ -171,16 +129,6 @@ def _hats(steps: int) -> np.ndarray:
     """Return the share (S, KNOTS) of each knot in each step, linear between knots."""
     place = (np.arange(steps) + 0.5) / steps * (KNOTS - 1)
     return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(KNOTS)))
-
-
-def _late(command: Any, delay: Any, dt: float, before: int) -> Any:
-    """Return the command that acts in each step from `before` on, linear between two steps."""
-    command = jnp.asarray(command)
-    steps = delay / dt
-    whole = jnp.floor(steps + 1e-9)
-    part = steps - whole
-    index = jnp.arange(before, command.shape[1]) - whole.astype(int)
-    return (1.0 - part) * command[:, index] + part * command[:, jnp.maximum(index - 1, 0)]
 
 
 def _at(time_s: Any, dt: float, steps: int) -> Any:

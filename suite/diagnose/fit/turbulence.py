@@ -15,8 +15,8 @@ from scipy.optimize import minimize
 
 from eval.effects.constant_wind import ConstantWind
 from eval.effects.gusts import VERTICAL
-from eval.quadrotor.plant import Memory, Motion, assemble, spin_step
-from eval.quadrotor.rotors import steady
+from eval.quadrotor.plant import Motion, assemble
+from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from suite.diagnose.fit.model import Model
 from suite.diagnose.fit.rollout import KNOTS, Flown
 from suite.diagnose.verdict.residual_structure import Push
@@ -88,14 +88,14 @@ def _passed_on(model: Model, theta: np.ndarray, knot: Flown) -> np.ndarray:
     plain = np.asarray(values["constant_wind"].velocity)
     motion = Motion(*(np.asarray(field) for field in knot.track))
     count = len(motion.pos_w)
-    memory = Memory(np.zeros(0), np.zeros(0), {})
+    state = PlantState(np.zeros(0), np.zeros(0), {})
     still = np.zeros(motion.pos_w.shape[:2])
-    spin = steady(np.asarray(knot.rotor_speed))
+    inputs = Inputs(rotor_speed=np.asarray(knot.rotor_speed), voltage_drop=still)
 
     def wrench(wind_w: np.ndarray) -> np.ndarray:
         values["constant_wind"] = ConstantWind(plain + wind_w)
         plant = assemble(given.nominal, given.constants, values, model.dt, 0.0)
-        _, out = spin_step(plant, memory, motion, spin, still, None, still)
+        _, out = plant_step(plant, state, motion, inputs, still)
         mass, inertia = plant.constants.mass, plant.constants.inertia
         return np.concatenate([out.force_b / mass, out.torque_b / inertia], axis=-1)
 

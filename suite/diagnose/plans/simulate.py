@@ -7,15 +7,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from eval.quadrotor.plant import (
-    Command,
-    Motion,
-    Wrench,
-    make_plant,
-    plant_step,
-    start_memory,
-    uses_noise,
-)
+from eval.quadrotor.plant import Command, Motion, Wrench, make_plant, uses_noise
+from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.plans.pilot import Gains, steer
 from suite.diagnose.plans.trajectory import Reference, Trajectory
@@ -100,6 +93,8 @@ def fly(
     """
     import mujoco
 
+    from eval.quadrotor.model import compile_quadrotor
+
     frequency = truth.controller.frequency
     period = round(frequency / rate_hz)
     if period < 1 or abs(period * rate_hz - frequency) > 1e-6 * frequency:
@@ -115,7 +110,7 @@ def fly(
     draws = None
     if rng is not None and uses_noise(plant):
         draws = rng.standard_normal((steps + 1, count, 3))
-    model = _model(truth, dt)
+    model = compile_quadrotor(mujoco.MjSpec(), truth, dt)
     datas = [mujoco.MjData(model) for _ in trajectories]
     for index, data in enumerate(datas):
         half = wanted.yaw[0, index] / 2
@@ -123,8 +118,8 @@ def fly(
         data.qpos[3:] = [np.cos(half), 0.0, 0.0, np.sin(half)]
         data.qvel[:3] = wanted.vel_w[0, index]
         mujoco.mj_step1(model, data)
-    memory = start_memory(plant, (count,), noise=None if draws is None else draws[0])
-    hover = (memory.rotor_speed**2).sum(-1)
+    state = hover_state(plant, (count,), noise=None if draws is None else draws[0])
+    hover = (state.rotor_speed**2).sum(-1)
     gains, summed_w = gains or Gains(), np.zeros((count, 3))
     command = Command(np.zeros(count), np.zeros((count, 3)))
     still = np.zeros((count, 3))
@@ -138,19 +133,16 @@ def fly(
             _check(motion, now, time_s)
             summed_w = np.clip(summed_w + period * dt * (now.pos_w - motion.pos_w), -1.0, 1.0)
             command = steer(nominal, gains, now, motion, summed_w)
-        power = (memory.rotor_speed**2).sum(-1) / hover - 1.0
+        power = (state.rotor_speed**2).sum(-1) / hover - 1.0
         drop = FALL_V_PER_S * time_s + SAG_V * power
         acting = command if extra is None else extra.command(command, time_s)
-        speed = memory.rotor_speed
-        memory, wrench = plant_step(
-            plant,
-            memory,
-            motion,
+        speed = state.rotor_speed
+        inputs = Inputs(
             acting,
-            np.full(count, time_s),
-            None if draws is None else draws[step + 1],
-            drop if has_voltage else None,
+            noise=None if draws is None else draws[step + 1],
+            voltage_drop=drop if has_voltage else None,
         )
+        state, wrench = plant_step(plant, state, motion, inputs, np.full(count, time_s))
         added = Wrench(still, still)
         if extra is not None:
             added = extra.wrench(motion, wrench, time_s, dt)
@@ -167,19 +159,6 @@ def fly(
         _recording(kept, index, round(way.duration_s * frequency), dt, period)
         for index, way in enumerate(trajectories)
     ]
-
-
-def _model(truth: Vehicle, dt: float) -> Any:
-    import mujoco
-
-    from eval.quadrotor.model import add_quadrotor, set_true_inertia
-
-    spec = mujoco.MjSpec()
-    spec.option.timestep = dt
-    add_quadrotor(spec, truth)
-    model = spec.compile()
-    set_true_inertia(model, truth)
-    return model
 
 
 def _motion(datas: Sequence[Any]) -> tuple[Motion, np.ndarray]:

@@ -20,10 +20,11 @@ import optax
 
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Motion
+from eval.quadrotor.stepper import Feedback, Inputs
 from policies.networks import delta_network
 from suite.diagnose.data.windows import Windows
 from suite.diagnose.fit.model import BATCH, Model
-from suite.diagnose.fit.rollout import STATE, Feedback
+from suite.diagnose.fit.rollout import STATE
 from suite.diagnose.verdict.gap import Gap, gap_of, true_starts
 from tracks.geometry.rotation import to_local
 
@@ -120,16 +121,19 @@ def _apart(model: Model, theta: Any, params: Any, offset: Any, windows: Windows)
     count, every = len(offset), max(1, round(PERIOD_S / model.dt))
     scale, up = jnp.asarray(OUTPUT_SCALE), jnp.array([0.0, 0.0, 1.0])
 
-    def act(memory: Any, motion: Motion, order: Any, index: Any) -> tuple[Any, Any]:
+    def act(carry: Any, motion: Motion, inputs: Inputs, index: Any) -> tuple[Any, Any]:
+        assert inputs.command is not None
+        thrust = inputs.command.thrust
+
         def decide(_: Any) -> Any:
             row3 = motion.rot_w[:, 2]
-            action_b = order[:, :1] * up - GRAVITY * row3
+            action_b = thrust[:, None] * up - GRAVITY * row3
             vel_b = to_local(motion.rot_w, motion.vel_w)
-            push, hidden = delta_network.step(params, memory[0], vel_b, row3, action_b)
+            push, hidden = delta_network.step(params, carry[0], vel_b, row3, action_b)
             return hidden, scale * push
 
-        memory = jax.lax.cond(index % every == 0, decide, lambda _: memory, None)
-        return memory, memory[1]
+        carry = jax.lax.cond(index % every == 0, decide, lambda _: carry, None)
+        return carry, carry[1]
 
     start = (jnp.zeros((count, delta_network.HIDDEN)), jnp.zeros((count, len(OUTPUT_SCALE))))
     return model.fly(theta, offset, windows, None, Feedback(start, act))[0]

@@ -130,9 +130,9 @@ def conditions_of(windows: Windows, vehicle: Vehicle) -> dict[str, np.ndarray]:
     first = round(HISTORY_S / dt) + 1 + round(WARM_S / dt)
     steps = round(THRUST_S / dt)
     thrust = np.asarray(windows.command)[:, first : first + steps, 0].mean(axis=1)
-    spin = np.asarray(windows.rotor_speed)[:, :steps]
-    if spin.any():
-        force = vehicle.rotors.thrust_coefficient * (spin**2).sum(axis=-1)
+    speed = np.asarray(windows.rotor_speed)[:, :steps]
+    if speed.any():
+        force = vehicle.rotors.thrust_coefficient * (speed**2).sum(axis=-1)
         thrust = force.mean(axis=1) / vehicle.mass
     return {
         "speed": np.linalg.norm(windows.vel_w, axis=-1),

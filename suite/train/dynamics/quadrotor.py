@@ -1,6 +1,6 @@
 """The judge's quadrotor as the trainer's dynamics: one policy period with gradients.
 
-The equations are those of the judge (`eval.quadrotor`: autopilot, plant, rigid body): the
+The equations are those of the judge (`eval.quadrotor`: attitude, stepper, rigid body): the
 action becomes collective thrust and body rates in the attitude loop, again at each of its steps
 with the attitude of that moment; rate loop, mixer, rotors and effects turn those into motion. A
 period holds a whole number of attitude steps and physics steps, so the steps are a little shorter
@@ -19,17 +19,8 @@ import numpy as np
 from eval.effects import EFFECTS, as_arrays, neutral
 from eval.effects.interface import Values, at
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading
-from eval.quadrotor.plant import (
-    Command,
-    Memory,
-    Motion,
-    Plant,
-    make_plant,
-    plant_step,
-    start_memory,
-    uses_noise,
-)
-from eval.quadrotor.rigid_body import euler_step
+from eval.quadrotor.plant import Command, Motion, Plant, make_plant, uses_noise
+from eval.quadrotor.stepper import Inputs, PlantState, hover_state, step
 from eval.vehicles.vehicle import Vehicle
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics.point_mass import attitude, faded
@@ -60,8 +51,8 @@ class Body(NamedTuple):
     """(B, 3) [rad/s]."""
     heading_w: jax.Array
     """(B, 3) wanted heading, horizontal unit vectors."""
-    memory: Memory
-    """The plant's (B, ...): rotor speeds and the commands on their way."""
+    plant: PlantState
+    """(B, ...): rotor speeds and the commands on their way."""
     time_s: jax.Array
     """(B,) since the start [s]."""
 
@@ -154,7 +145,7 @@ def start_body(plant: Plant, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.
         rot_w=attitude(zero, heading_w),
         rate_b=zero,
         heading_w=heading_w,
-        memory=start_memory(plant, batch, jnp),
+        plant=hover_state(plant, batch, jnp),
         time_s=jnp.zeros(batch, pos_w.dtype),
     )
 
@@ -184,14 +175,14 @@ def fly_period(
     controller, dt = vehicle.controller, cut.dt
 
     def physics(
-        carry: tuple[Memory, Motion, jax.Array], draws: jax.Array | None, command: Command
-    ) -> tuple[tuple[Memory, Motion, jax.Array], None]:
-        memory, motion, time_s = carry
-        memory, wrench = plant_step(plant, memory, motion, command, time_s, draws)
-        return (memory, euler_step(plant, motion, wrench), time_s + dt), None
+        carry: tuple[PlantState, Motion, jax.Array], draws: jax.Array | None, command: Command
+    ) -> tuple[tuple[PlantState, Motion, jax.Array], None]:
+        state, motion, time_s = carry
+        state, motion, _ = step(plant, state, motion, Inputs(command, noise=draws), time_s)
+        return (state, motion, time_s + dt), None
 
     def loop(carry: Any, draws: jax.Array | None) -> tuple[Any, None]:
-        heading_w, memory, motion, time_s = carry
+        heading_w, state, motion, time_s = carry
         heading_w = jax.lax.stop_gradient(heading(heading_w, motion.pos_w))
         force_w = action_to_force(action_b, motion.rot_w)
         command = attitude_command(controller, force_w, motion.rot_w, heading_w)
@@ -199,7 +190,7 @@ def fly_period(
             command = command._replace(rate_b=command.rate_b.at[:, 2].set(yaw_rate))
         inner, _ = jax.lax.scan(
             lambda c, d: physics(c, d, command),
-            (memory, motion, time_s),
+            (state, motion, time_s),
             draws,
             length=cut.physics,
             unroll=min(cut.physics, 2),
@@ -207,8 +198,8 @@ def fly_period(
         return (heading_w, *inner), None
 
     motion = Motion(body.pos_w, body.rot_w, body.vel_w, body.rate_b)
-    start = (body.heading_w, body.memory, motion, body.time_s)
-    (heading_w, memory, motion, time_s), _ = jax.lax.scan(loop, start, noise, length=cut.attitude)
+    start = (body.heading_w, body.plant, motion, body.time_s)
+    (heading_w, state, motion, time_s), _ = jax.lax.scan(loop, start, noise, length=cut.attitude)
     return Body(
         pos_w=motion.pos_w,
         vel_w=motion.vel_w,
@@ -216,7 +207,7 @@ def fly_period(
         rot_w=motion.rot_w,
         rate_b=motion.rate_b,
         heading_w=heading_w,
-        memory=memory,
+        plant=state,
         time_s=time_s,
     )
 

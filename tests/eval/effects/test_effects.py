@@ -11,16 +11,8 @@ import pytest
 
 from eval.effects import EFFECTS, all_values, apply_log_faults, find_effect
 from eval.effects.interface import neutral
-from eval.quadrotor.plant import (
-    Command,
-    Motion,
-    Wrench,
-    make_plant,
-    plant_step,
-    spin_step,
-    start_memory,
-)
-from eval.quadrotor.rotors import steady
+from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
+from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from tests.support.flights import small_log
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects
 
@@ -32,12 +24,12 @@ MOVING = Motion(np.zeros(3), np.eye(3), np.array([3.0, -2.0, 1.0]), np.array([1.
 def test_neutral_values_change_nothing():
     vehicle = replace(PLAIN, rotors=replace(PLAIN.rotors, time_constant=0.02))
     plain, full = make_plant(vehicle, 0.002), make_plant(vehicle, 0.002, all_values(vehicle), 0.02)
-    memories = [start_memory(plant, ()) for plant in (plain, full)]
+    states = [hover_state(plant, ()) for plant in (plain, full)]
     for k in range(10):
         command = Command(np.array(9.0 + k), np.array([1.0, 0.1 * k, -1.0]))
         acting = []
         for i, plant in enumerate((plain, full)):
-            memories[i], one = plant_step(plant, memories[i], MOVING, command, 3.0)
+            states[i], one = plant_step(plant, states[i], MOVING, Inputs(command), 3.0)
             acting.append(np.concatenate(one))
         np.testing.assert_allclose(acting[1], acting[0], rtol=1e-12, atol=1e-15)
 
@@ -52,12 +44,9 @@ def test_effect_acts(name):
     changed = any(np.any(log[key] != value) for key, value in small_log().items())
     drag = with_effects(linear_drag=((0.3, 0.2, 0.1),)).effects
     plants = [make_plant(PLAIN, 0.002, {**drag, name: values}) for values in (base, drawn)]
-    noise = np.ones(3)
     low = MOVING._replace(pos_w=np.array([0.0, 0.0, 0.1]))
-    speed = steady(SPEED + [100.0, 0.0, 100.0, 0.0])
-    wrenches = [
-        spin_step(plant, start_memory(plant, ()), low, speed, 20.0, noise)[1] for plant in plants
-    ]
+    inputs = Inputs(rotor_speed=SPEED + [100.0, 0.0, 100.0, 0.0], noise=np.ones(3))
+    wrenches = [plant_step(p, hover_state(p, ()), low, inputs, 20.0)[1] for p in plants]
     pairs = [*zip(*wrenches, strict=True)]
     pairs += zip(plants[0].constants, plants[1].constants, strict=True)
     assert changed or any(np.any(np.asarray(a) != np.asarray(b)) for a, b in pairs)
@@ -78,14 +67,13 @@ def test_numpy_and_jax_agree_on_the_whole_catalogue():
     noise = rng.standard_normal((12, n, 3))
 
     def fly(xp):
-        state = Motion(*(xp.asarray(field) for field in motion))
-        memory, acting = start_memory(plant, (n,), xp, xp.asarray(noise[0])), Wrench(state, state)
+        now = Motion(*(xp.asarray(field) for field in motion))
+        state, acting = hover_state(plant, (n,), xp, xp.asarray(noise[0])), Wrench(now, now)
         for k in range(12):
             command = Command(xp.asarray(commands[0][k]), xp.asarray(commands[1][k]))
-            memory, acting = plant_step(
-                plant, memory, state, command, 0.5 + 0.002 * k, xp.asarray(noise[k])
-            )
-        return acting, memory
+            inputs = Inputs(command, noise=xp.asarray(noise[k]))
+            state, acting = plant_step(plant, state, now, inputs, 0.5 + 0.002 * k)
+        return acting, state
 
     with jax.enable_x64(True):
         ours, theirs = fly(np), jax.jit(lambda: fly(jnp))()
@@ -102,17 +90,16 @@ def test_parameters_with_a_batch_axis_are_one_vehicle_each():
     )
     together = make_plant(PLAIN, 0.002, stacked, max_delay=0.04)
     motion = Motion(*(np.stack([field] * 3) for field in MOVING))
-    command = Command(np.full(3, 12.0), np.tile([1.0, -1.0, 0.2], (3, 1)))
-    memory, acting = start_memory(together, (3,)), Wrench(None, None)
+    inputs = Inputs(Command(np.full(3, 12.0), np.tile([1.0, -1.0, 0.2], (3, 1))))
+    state, acting = hover_state(together, (3,)), Wrench(None, None)
     for k in range(25):
-        memory, acting = plant_step(together, memory, motion, command, np.full(3, 0.1 * k))
+        state, acting = plant_step(together, state, motion, inputs, np.full(3, 0.1 * k))
     for i, vehicle in enumerate(drawn):
         alone = make_plant(vehicle, 0.002, max_delay=0.04)
-        own, one = start_memory(alone, ()), Wrench(None, None)
+        own, one = hover_state(alone, ()), Wrench(None, None)
         for k in range(25):
-            own, one = plant_step(
-                alone, own, MOVING, Command(command.thrust[i], command.rate_b[i]), 0.1 * k
-            )
+            row = jax.tree.map(lambda x, i=i: x[i], inputs)
+            own, one = plant_step(alone, own, MOVING, row, 0.1 * k)
         np.testing.assert_allclose(acting.force_b[i], one.force_b, rtol=1e-10)
         np.testing.assert_allclose(acting.torque_b[i], one.torque_b, rtol=1e-9, atol=1e-12)
 
@@ -123,7 +110,7 @@ def test_unknown_effect_names_the_nearest():
 
 
 def test_effects_import_neither_mujoco_nor_jax():
-    code = "import sys, eval.quadrotor.plant; print(sorted({'mujoco', 'jax'} & set(sys.modules)))"
+    code = "import sys, eval.quadrotor.stepper; print(sorted({'mujoco', 'jax'} & set(sys.modules)))"
     output = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )

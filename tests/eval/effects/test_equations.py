@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS, apply_log_faults
-from eval.quadrotor.plant import (
-    Command,
-    Motion,
-    make_plant,
-    plant_step,
-    spin_step,
-    start_memory,
-    uses_noise,
-)
+from eval.quadrotor.plant import Command, Motion, make_plant, uses_noise
 from eval.quadrotor.rigid_body import accelerations
-from eval.quadrotor.rotors import steady
+from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from tests.support.flights import small_log
 from tests.support.vehicles import PLAIN, at_rest, with_effects
 
@@ -30,7 +22,8 @@ YAWED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 def wrench(vehicle, motion=MOVING, speed=SPEED, time_s=0.0, **more):
     plant = make_plant(vehicle, 0.002)
-    _, acting = spin_step(plant, start_memory(plant, ()), motion, steady(speed), time_s, **more)
+    inputs = Inputs(rotor_speed=speed, **more)
+    _, acting = plant_step(plant, hover_state(plant, ()), motion, inputs, time_s)
     return acting
 
 
@@ -137,12 +130,13 @@ def test_gusts_have_their_intensity_colour_and_mean():
         np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)), np.tile([8.0, 0, 0], (n, 1)),
         np.zeros((n, 3)),
     )  # fmt: skip
-    memory = start_memory(plant, (n,), noise=rng.standard_normal((n, 3)))
+    state = hover_state(plant, (n,), noise=rng.standard_normal((n, 3)))
     winds = []
     for _ in range(steps):
         noise = rng.standard_normal((n, 3))
-        memory, _ = spin_step(plant, memory, motion, steady(np.tile(SPEED, (n, 1))), 0.0, noise)
-        winds.append(memory.wind["gusts"])
+        inputs = Inputs(rotor_speed=np.tile(SPEED, (n, 1)), noise=noise)
+        state, _ = plant_step(plant, state, motion, inputs, 0.0)
+        winds.append(state.wind["gusts"])
     winds = np.array(winds)
     np.testing.assert_allclose(winds.std(axis=(0, 1)), [1.5, 1.5, 0.75], rtol=0.05)
     np.testing.assert_allclose(winds.mean(axis=(0, 1)), 0.0, atol=0.08)
@@ -157,22 +151,22 @@ def test_gusts_without_noise_are_absent():
 
 def test_motor_lag_replaces_the_time_constant():
     plant = make_plant(with_effects(motor_lag=(0.05,)), 0.05)
-    memory = start_memory(plant, ())._replace(rotor_speed=SPEED)
+    state = hover_state(plant, ())._replace(rotor_speed=SPEED)
     # 6.25 N over four rotors of k_T asks for the speed that gives it.
     wanted = 2000.0
     command = Command(np.array(4 * 1.6e-6 * wanted**2 / 0.75), np.zeros(3))
-    memory, _ = plant_step(plant, memory, at_rest(), command, 0.0)
-    near(memory.rotor_speed, 1000.0 + 1000.0 * (1.0 - np.exp(-1.0)))
+    state, _ = plant_step(plant, state, at_rest(), Inputs(command), 0.0)
+    near(state.rotor_speed, 1000.0 + 1000.0 * (1.0 - np.exp(-1.0)))
 
 
 @pytest.mark.parametrize(("delay", "acts_at"), [(0.0, 0), (0.004, 2), (0.03, 15)])
 def test_command_delay(delay, acts_at):
     plant = make_plant(with_effects(command_delay=(delay,)), 0.002)
-    memory = start_memory(plant, ())
+    state = hover_state(plant, ())
     pushes = []
     for _ in range(20):
         command = Command(np.array(15.0), np.zeros(3))
-        memory, acting = plant_step(plant, memory, at_rest(), command, 0.0)
+        state, acting = plant_step(plant, state, at_rest(), Inputs(command), 0.0)
         pushes.append(acting.force_b[2])
     expected = np.where(np.arange(20) < acts_at, 9.81 * 0.75, 15.0 * 0.75)
     near(pushes, expected)
@@ -180,13 +174,12 @@ def test_command_delay(delay, acts_at):
 
 def test_command_delay_between_steps_gives_the_mean_of_the_step():
     plant = make_plant(with_effects(command_delay=(0.005,)), 0.002)
-    memory = start_memory(plant, ())
+    state = hover_state(plant, ())
     thrusts = [10.0, 20.0, 12.0, 12.0, 12.0]
     pushes = []
     for thrust in thrusts:
-        memory, acting = plant_step(
-            plant, memory, at_rest(), Command(np.array(thrust), np.zeros(3)), 0.0
-        )
+        command = Command(np.array(thrust), np.zeros(3))
+        state, acting = plant_step(plant, state, at_rest(), Inputs(command), 0.0)
         pushes.append(acting.force_b[2] / 0.75)
     near(pushes, [9.81, 9.81, (9.81 + 10.0) / 2, 15.0, 16.0])
 
@@ -208,7 +201,7 @@ def test_battery_sag():
 def test_mass_offset():
     plant = make_plant(with_effects(mass_offset=(0.1,)), 0.002)
     hover = Command(np.array(9.81), np.zeros(3))
-    _, acting = plant_step(plant, start_memory(plant, ()), at_rest(), hover, 0.0)
+    _, acting = plant_step(plant, hover_state(plant, ()), at_rest(), Inputs(hover), 0.0)
     acc, _ = accelerations(plant, at_rest(), acting)
     near(acc, [0.0, 0.0, 9.81 * 0.75 / 0.85 - 9.81])
 
@@ -235,7 +228,7 @@ def test_inertia_scale_and_rate_gain():
     ]
     for effects, expected in cases:
         plant = make_plant(with_effects(**effects), 0.002)
-        _, acting = plant_step(plant, start_memory(plant, ()), start, command, 0.0)
+        _, acting = plant_step(plant, hover_state(plant, ()), start, Inputs(command), 0.0)
         near(accelerations(plant, start, acting)[1], expected)
 
 

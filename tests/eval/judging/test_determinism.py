@@ -109,8 +109,8 @@ def test_pursuit_by_a_scripted_policy_is_deterministic_too():
     assert first == results(TRIALS[:4], slots=64, policy=Pursuit())
 
 
-def test_plain_world_flies_the_same(expected):
+def test_reference_world_flies_the_same(expected):
     trials = TRIALS[3::4]
     options = JudgeOptions(rules=RULES)
-    found = fly(network(), trials, VEHICLE, "plain", options)
+    found = fly(network(), trials, VEHICLE, "reference", options)
     assert [r._replace(world="mujoco") for r in found] == [expected[t] for t in trials]

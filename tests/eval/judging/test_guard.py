@@ -62,7 +62,7 @@ class Faulty(Pursuit):
         return action, count[:, None]
 
 
-@pytest.mark.parametrize("world", ["mujoco", "plain"])
+@pytest.mark.parametrize("world", ["mujoco", "reference"])
 def test_the_trial_says_so(world):
     options = JudgeOptions(slots=3, rules=Rules(time_limit_s=0.99))
     trials = [TrialSpec("straight", 0, seed) for seed in range(4)]

@@ -30,9 +30,9 @@ def test_a_policy_that_cannot_keep_time_is_refused(rate_hz):
         fly(policy, [TrialSpec("zigzag", 0, 0)], VEHICLE)
 
 
-def test_the_plain_world_records_nothing():
+def test_the_reference_world_records_nothing():
     with pytest.raises(ValueError, match="records no flights"):
-        fly(Pursuit(), [TrialSpec("zigzag", 0, 0)], VEHICLE, "plain", record=Record())
+        fly(Pursuit(), [TrialSpec("zigzag", 0, 0)], VEHICLE, "reference", record=Record())
 
 
 def test_no_trials():

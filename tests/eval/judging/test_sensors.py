@@ -173,5 +173,5 @@ def test_a_noisy_trials_outcome_is_set_by_the_trial_alone(noisy):
     order = [TRIALS[k] for k in (4, 0, 5, 2)]
     for found in (results(order, slots=3), results(order, processes=2), results(order[::-1])[::-1]):
         assert found == [noisy[trial] for trial in order]
-    plain = results(TRIALS[:2], world="plain")
-    assert [row._replace(world="mujoco") for row in plain] == [noisy[t] for t in TRIALS[:2]]
+    flown = results(TRIALS[:2], world="reference")
+    assert [row._replace(world="mujoco") for row in flown] == [noisy[t] for t in TRIALS[:2]]

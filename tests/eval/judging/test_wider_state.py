@@ -39,7 +39,7 @@ def shown(world, **more):
     return np.array(policy.seen)
 
 
-@pytest.mark.parametrize("world", ["mujoco", "plain", "mjx"])
+@pytest.mark.parametrize("world", ["mujoco", "reference", "mjx"])
 def test_the_second_gate_and_the_direction_are_those_of_a_line_of_gates(world):
     """Level gates on a line: centres differ by the stretch, and the direction is along the line."""
     states = shown(world, second_gate=True, gate_axis=True)
@@ -62,13 +62,13 @@ def test_the_second_gate_and_the_direction_are_those_of_a_line_of_gates(world):
 
 @pytest.mark.parametrize("more", [{"second_gate": True}, {"gate_axis": True}])
 def test_each_comes_alone_as_well(more):
-    states = shown("plain", **more)
+    states = shown("reference", **more)
     assert states.shape[1] == 15
     length = np.linalg.norm(states[0, 12:])
     assert length == pytest.approx(DISTANCES[1] if "second_gate" in more else 1.0, abs=0.6)
 
 
-@pytest.mark.parametrize("world", ["mujoco", "plain"])
+@pytest.mark.parametrize("world", ["mujoco", "reference"])
 def test_others_are_shown_the_papers_twelve_numbers(world):
     assert shown(world).shape[1] == 12
 

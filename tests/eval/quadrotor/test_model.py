@@ -8,9 +8,8 @@ from eval.quadrotor.model import (
     BODY,
     CAMERA,
     COLLIDES,
-    add_quadrotor,
+    compile_quadrotor,
     rotor_name,
-    set_true_inertia,
 )
 from eval.quadrotor.vehicle_file import load_vehicle
 from tests.support.vehicles import PLAIN, with_effects
@@ -21,10 +20,7 @@ def compiled(vehicle, ground=False):
     spec = mujoco.MjSpec()
     if ground:
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
-    add_quadrotor(spec, vehicle)
-    model = spec.compile()
-    set_true_inertia(model, vehicle)
-    return model
+    return compile_quadrotor(spec, vehicle, 0.002)
 
 
 def push(model, control):

@@ -19,7 +19,14 @@ from eval.view.picture import write_grid, write_picture
 from eval.view.recording import Drone, write_recording
 from eval.view.scene3d import Faces, Lines, look_at, paint, to_camera, to_pixels
 from eval.view.solids import flat_normals, joined, outline, track_solids
-from eval.view.video import VideoOptions, frame_times, video_frames, write_video
+from eval.view.video import (
+    DEPTH_RANGE_M,
+    VideoOptions,
+    _beyond,
+    frame_times,
+    video_frames,
+    write_video,
+)
 from tests.support.flights import result_of, small_track, smooth_flight
 from tests.support.recordings import columns
 from tracks.geometry.camera import Camera, pixel_rays_b
@@ -160,6 +167,13 @@ def test_a_recording_opens_laid_out(recorded):
     assert {"/trial_0/world", "/trial_0/world/drone/camera", "/trial_1/speed"} <= origins
     shown = {entity for entity, _ in columns(path)}
     assert all(any(entity.startswith(origin) for entity in shown) for origin in origins)
+    # It plays from just before the first gate, with the time in sight.
+    flight = rollout()[1]
+    gate_s = flight.time_s[flight.gate > 0][0]
+    (shown,) = by_name["TimePanelBlueprint:time_selection"]
+    begin, end = shown["min"] / 1e9, shown["max"] / 1e9
+    assert max(0.0, gate_s - 1.0) <= begin < gate_s < end
+    assert by_name["PanelBlueprint:state"] or by_name["TimePanelBlueprint:state"]
     titles = by_name["ContainerBlueprint:display_name"]
     assert "zigzag level 3 seed 5: collision" in titles
 
@@ -299,14 +313,25 @@ def test_the_video_shows_drone_depth_and_gates():
     assert share(frames[-1], colours.PASSED, 2) > 5e-4  # the word at the end
     greens = []
     for frame in frames[:-1]:
-        red, green, blue = np.moveaxis(np.asarray(frame, dtype=int)[100:, :], -1, 0)
+        red, green, blue = np.moveaxis(np.asarray(frame, dtype=int)[100:, :320], -1, 0)
         greens.append(((green > 1.5 * red) & (green > 1.2 * blue)).mean())
     # No gate is green before it was passed; just behind it the eye sees it green.
     assert greens[0] == 0 < max(greens[2:])
+    # Beside it, in the right third and at its middle: what it saw, pixel for pixel.
+    seen = np.asarray(frames[0])[75:195, 320:480]
+    assert flight.depth_m is not None
+    want = colours.depth_colours(flight.depth_m[0], DEPTH_RANGE_M)
+    np.testing.assert_array_equal(seen[2::5, 2::5], want)
     without = next(video_frames(*rollout("finished", None, False), VideoOptions((480, 270), 5)))
-    differs = np.abs(np.asarray(frames[0], dtype=int) - np.asarray(without)).max(axis=-1) > 3
-    rows, cols = np.nonzero(differs)
-    assert rows.max() < 100 and cols.min() > 360  # the depth image alone, top right
+    assert share(without.crop((320, 0, 480, 270)), colours.DRONE, 2) < 0.01  # the scene goes on
+
+
+def test_what_stands_before_the_drone_is_not_painted():
+    eye, drone = np.zeros(3), np.array([2.0, 0.0, 0.0])
+    before = np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 0.0, 1.0]])
+    faces = np.stack([before, before + [2.0, 0.0, 0.0], before * [3.0, 1.0, 1.0] - [1.5, 0, 0]])
+    faces[2, 0, 0] = 2.5  # one corner beyond is enough
+    assert _beyond(faces, eye, drone).tolist() == [False, True, True]
 
 
 def test_bad_video_requests_are_refused(tmp_path):

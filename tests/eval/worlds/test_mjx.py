@@ -2,21 +2,13 @@
 
 from collections import Counter
 
-import jax
-import mujoco
 import numpy as np
 import pytest
 
 from eval.judging.judge import JudgeOptions, Record, fly
-from eval.quadrotor.model import add_quadrotor
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds.collision import TOUCH_M, gaps
-from eval.worlds.engine import compile_model
-from eval.worlds.slots import layout_of
 from eval.worlds.trial import Rules, TrialSpec
 from tests.support.pilots import Pursuit
-from tracks.families import MAX_COUNTS, make_track
-from tracks.geometry.scene import stack
 
 VEHICLE = load_vehicle("reference")
 POSITION_TOLERANCE_M = 2e-4
@@ -82,48 +74,3 @@ def test_ends_agree_on_many():
     (ours, _), (theirs, _) = both(trials)
     agree = np.mean([a.ended_by == b.ended_by for a, b in zip(ours, theirs, strict=True)])
     assert agree >= 0.99
-
-
-def test_touching_is_what_mujoco_says():
-    """Random poses close to solids of every kind: contact there, a gap of nought here."""
-    rng = np.random.default_rng(0)
-    track = make_track("circular", 9, 3)
-    model = compile_model(track, VEHICLE, 0.002, layout_of([track]).solids)
-    data = mujoco.MjData(model)
-    scene = track.scene
-    places = np.concatenate(
-        [scene.boxes.center_w, scene.cylinders.center_w, scene.capsules.center_w,
-         scene.spheres.center_w]
-    )  # fmt: skip
-    size = np.concatenate(
-        [np.linalg.norm(scene.boxes.half_size, axis=1),
-         np.hypot(scene.cylinders.radius, scene.cylinders.half_length),
-         scene.capsules.radius + scene.capsules.half_length, scene.spheres.radius]
-    )  # fmt: skip
-    n = 600
-    index = rng.integers(len(places), size=n)
-    away = rng.normal(size=(n, 3))
-    away *= (size[index] * rng.uniform(0, 1.1, n) / np.linalg.norm(away, axis=1))[:, None]
-    quat = rng.normal(size=(n, 4))
-    hits, rot = np.zeros(n, bool), np.zeros((n, 3, 3))
-    pos = places[index] + away
-    for i in range(n):
-        data.qpos[:3], data.qpos[3:] = pos[i], quat[i] / np.linalg.norm(quat[i])
-        mujoco.mj_step1(model, data)
-        hits[i], rot[i] = data.ncon > 0, data.xmat[1].reshape(3, 3)
-    gates = scene.gates
-    assert gates is not None
-    batch = jax.tree.map(lambda a: np.repeat(a, n, 0), stack([scene], MAX_COUNTS))
-    half = np.asarray(VEHICLE.body.half_size, np.float32)
-    found = jax.jit(gaps)(
-        batch, pos.astype(np.float32), rot.astype(np.float32), half, np.zeros(3, np.float32)
-    )
-    found = (np.asarray(found) <= TOUCH_M).any(-1)
-    assert 0.2 < hits.mean() < 0.8
-    assert (hits == found).mean() > 0.98
-
-
-def test_quadrotor_model_is_the_first_body():
-    spec = mujoco.MjSpec()
-    add_quadrotor(spec, VEHICLE)
-    assert spec.compile().body(1).name == "quadrotor"

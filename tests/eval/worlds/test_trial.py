@@ -1,133 +1,73 @@
-"""Every way in which a trial ends, provoked."""
-
-import math
-from pathlib import Path
+"""The rules of a trial, state by state."""
 
 import numpy as np
-import pytest
 
-import eval.worlds.mujoco as mujoco_world
-import eval.worlds.reference as plain_world
-from eval.judging.judge import JudgeOptions, fly
-from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds.trial import Rules, TrialSpec
+from eval.quadrotor.plant import Motion, Wrench
+from eval.worlds.trial import (
+    COLLISION,
+    DIVERGED,
+    FINISHED,
+    FLYING,
+    TIMEOUT,
+    TIPPED,
+    Course,
+    Rules,
+    has_diverged,
+    is_wrench,
+    judge_state,
+    next_gate,
+    start_progress,
+)
 from tests.support.courses import straight
-from tests.support.pilots import Pursuit, Steady
+from tracks.geometry.scene import Gates
 
-VEHICLE = load_vehicle(Path(mujoco_world.__file__).parent.parent / "vehicles" / "reference.toml")
-WORLDS = ["mujoco", "plain"]
-RULES = Rules()
-
-
-def one(policy, track, world, rules=RULES, seed=0):
-    options = JudgeOptions(slots=4, rules=rules)
-    trial = TrialSpec(track.family, 0, seed)
-    (result,) = fly(policy, [trial], VEHICLE, world, options, tracks={track.family: track})
-    return result
+DT = 0.002
+GATES = straight((1.0, 2.0)).scene.gates
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_finished(world):
-    result = one(Pursuit(3.0), straight(), world)
-    assert (result.ended_by, result.success, result.gates_passed) == ("finished", True, 2)
-    assert (result.gates_8s, result.gates_035, result.collided_with) == (2, 2, None)
-    # The centre has just crossed the last gate's plane, at the speed it has then.
-    assert 0 <= result.pos_x - 4.0 < result.v_max * 0.002 + 1e-9
-    assert 1.0 < result.v_mean < result.v_max < 3.5
-    assert result.v_mean == pytest.approx(4.0 / result.time_s, rel=0.02)
+def judged(pos_w, before_w=None, passed=0, step=1, contact=False, diverged=False, rot_w=None):
+    """Return the progress of one trial that came from `before_w` to `pos_w`, `passed` behind it."""
+    pos_w = np.array([pos_w], float)
+    course = Course(Gates(*(field[None] for field in GATES)), np.array([2]))
+    progress = start_progress(pos_w if before_w is None else np.array([before_w], float))
+    progress = progress._replace(gates=np.array([passed]), step=np.array([step]))
+    rot_w = np.eye(3)[None] if rot_w is None else rot_w
+    motion = Motion(pos_w, rot_w, np.array([[3.0, 4.0, 0.0]]), np.zeros((1, 3)))
+    flags = np.array([contact]), np.array([diverged])
+    return judge_state(Rules(), progress, course, DT, motion, *flags)
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_collision_with_the_wall(world):
-    result = one(Pursuit(3.0), straight(wall_at=3.0), world)
-    assert (result.ended_by, result.collided_with) == ("collision", "the wall")
-    assert (result.success, result.gates_passed) == (False, 1)
-    # The body's front reaches 0.064 m ahead, lower when pitched; the wall's face is at 2.95 m.
-    assert 2.95 - 0.08 < result.pos_x < 2.95 - 0.03
+BEFORE, AFTER = (1.9, 0.0, 1.5), (2.1, 0.0, 1.5)
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_collision_with_the_ground(world):
-    result = one(Steady((0.0, 0.0, -2.0)), straight(), world)
-    assert (result.ended_by, result.collided_with) == ("collision", "ground")
-    assert result.pos_z == pytest.approx(0.025, abs=0.01)
-    # Fell 1.475 m at 2 m/s^2 less the file's vertical drag of 4 x 0.18 1/s (and a little of
-    # 4 x 0.01 1/m), after a delay and a lag of 30 ms each.
-    t = np.linspace(0, 3, 30001)
-    fallen = 2 / 0.72 * (t - (1 - np.exp(-0.72 * t)) / 0.72)
-    assert result.time_s == pytest.approx(t[np.searchsorted(fallen, 1.475)] + 0.06, rel=0.03)
+def test_the_last_gate_finishes_unless_something_is_hit_in_the_same_step():
+    through = judged(AFTER, BEFORE, passed=1)
+    assert (through.ended[0], through.gates[0], through.v_max[0]) == (FINISHED, 2, 5.0)
+    hit = judged(AFTER, BEFORE, passed=1, contact=True)
+    assert (hit.ended[0], hit.gates[0], hit.v_max[0]) == (COLLISION, 1, 0.0)
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_tipped(world):
-    result = one(Steady((0.0, 20.0, -15.0)), straight(height=30.0), world)
-    assert (result.ended_by, result.success) == ("tipped", False)
+def test_a_gate_out_of_its_turn_does_not_count():
+    assert judged(AFTER, BEFORE).gates[0] == 0
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_timeout(world):
-    result = one(Steady(), straight(), world, Rules(time_limit_s=1.0))
-    assert (result.ended_by, result.time_s) == ("timeout", pytest.approx(1.0, abs=1e-12))
-    # Hovering: nothing moves but for what the delay of the loops lets through.
-    assert abs(result.pos_z - 1.5) < 0.02 and result.v_max < 0.1
+def test_upside_down_late_and_lost():
+    assert judged((0, 0, 1), rot_w=np.diag([1.0, -1.0, -1.0])[None]).ended[0] == TIPPED
+    assert judged((0, 0, 1), step=9999).ended[0] == FLYING
+    assert judged((0, 0, 1), step=10000).ended[0] == TIMEOUT
+    lost = judged((np.nan, 0, 1), (0, 0, 1), diverged=True)
+    assert lost.ended[0] == DIVERGED and np.isfinite(lost.pos_w).all()
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_gates_in_the_short_window(world):
-    result = one(Pursuit(3.0), straight((1.0, 3.5)), world, Rules(short_window_s=1.1))
-    assert (result.gates_passed, result.gates_8s) == (2, 1)
+def test_what_is_no_state_and_no_wrench():
+    fine = np.zeros((3, 3))
+    vel_w = np.array([[0.0, 0.0, 0.0], [1001.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
+    motion = Motion(fine, np.tile(np.eye(3), (3, 1, 1)), vel_w, fine)
+    np.testing.assert_array_equal(has_diverged(Rules(), motion), [False, True, True])
+    torque_b = np.array([[0.0, 0.0, 0.0], [2e6, 0.0, 0.0], [np.inf, 0.0, 0.0]])
+    np.testing.assert_array_equal(is_wrench(Rules(), Wrench(fine, torque_b)), [True, False, False])
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_crossing_outside_the_opening_does_not_count(world):
-    track = straight((1.0,))
-    track.scene.gates.opening_g[:] *= 0.01  # 1 cm: the pursuit is not that exact
-    result = one(Pursuit(3.0), track, world, Rules(time_limit_s=2.0))
-    assert result.gates_passed == 0 and result.gates_035 == 1
-
-
-@pytest.mark.parametrize("world", WORLDS)
-def test_diverged_ends_that_trial_only(world, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)  # MuJoCo would leave its log here
-    module = {"mujoco": mujoco_world, "plain": plain_world}[world]
-    original = module.fly_step
-
-    def broken(cockpit, pilot, motion, action_b, gate_w, step, noise=None):
-        pilot, wrench = original(cockpit, pilot, motion, action_b, gate_w, step, noise)
-        ill = (motion.pos_w[:, 0] > 0.5) & (gate_w[:, 0] > 2.0)
-        wrench.force_b[ill] = np.nan
-        return pilot, wrench
-
-    well, ill = straight((0.8, 1.6), name="well"), straight((2.4, 3.2), name="ill")
-    trials = [TrialSpec("well", 0, 0), TrialSpec("ill", 0, 0), TrialSpec("well", 0, 1)]
-    tracks, options = {"well": well, "ill": ill}, JudgeOptions(slots=4)
-    before = fly(Pursuit(3.0), trials, VEHICLE, world, options, tracks=tracks)
-    monkeypatch.setattr(module, "fly_step", broken)
-    after = fly(Pursuit(3.0), trials, VEHICLE, world, options, tracks=tracks)
-    assert (after[0], after[2]) == (before[0], before[2])
-    assert before[1].ended_by == "finished"
-    assert (after[1].ended_by, after[1].success) == ("diverged", False)
-    assert 0.5 < after[1].pos_x < 0.6 and all(map(math.isfinite, after[1][10:16]))
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("world", WORLDS)
-def test_state_beyond_any_flight_is_diverged(world, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    module = {"mujoco": mujoco_world, "plain": plain_world}[world]
-    original = module.fly_step
-
-    def kicked(cockpit, pilot, motion, action_b, gate_w, step, noise=None):
-        pilot, wrench = original(cockpit, pilot, motion, action_b, gate_w, step, noise)
-        return pilot, wrench._replace(force_b=np.where(step[:, None] == 7, 1e5, wrench.force_b))
-
-    monkeypatch.setattr(module, "fly_step", kicked)
-    result = one(Steady(), straight(), world, Rules(speed_limit=100.0))
-    assert (result.ended_by, result.time_s) == ("diverged", pytest.approx(8 * 0.002))
-    assert all(map(math.isfinite, result[10:16])) and list(tmp_path.iterdir()) == []
-
-
-def test_collision_at_the_start():
-    result = one(Pursuit(), straight(wall_at=0.0), "mujoco")
-    assert (result.ended_by, result.time_s, result.collided_with) == ("collision", 0.0, "the wall")
-    assert result.v_max == 0.0
+def test_past_the_last_gate_the_last_is_next():
+    course = Course(Gates(*(np.stack([field] * 3) for field in GATES)), np.full(3, 2))
+    assert next_gate(course, np.array([0, 1, 5])).center_w[:, 0].tolist() == [1.0, 2.0, 2.0]

@@ -108,7 +108,7 @@ def test_a_run_record_holds_what_is_needed_to_repeat_it(tmp_path):
 
 
 def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch):
-    from suite.experiments.trainings import commit_of
+    from suite.experiments.study.training import commit_of
 
     for commit in ("aaa", "aaa", "bbb"):
         monkeypatch.setattr(

@@ -1,10 +1,13 @@
 """README and docs: commands are read by the program, marked ones run, links and imports hold.
 
 A fenced sh block below the comment ``<!-- run -->`` is run, in an empty folder. Every other
-`suite` line must be one that the command line accepts, and every `make` line a target.
+`suite` line must be one that the command line accepts, and every `make` line a target; what stands
+`suite so` within a sentence must be a command, with options that it has. The site is made of the
+same pages.
 """
 
 import ast
+import dataclasses
 import importlib
 import os
 import re
@@ -18,8 +21,12 @@ import pytest
 from suite import cli
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"(<!-- run -->\n+)?```sh\n(.*?)```", re.DOTALL)
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+SENTENCE = re.compile(r"`suite ([^`]+)`")
+MADE_UP = {"hello", "COMMAND"}
+"""Commands that a page speaks of and that are none."""
 PYTHON = [
     pytest.param(body, id=f"{page.name}-{number}")
     for page in PAGES
@@ -62,6 +69,39 @@ def test_every_command_is_one_that_exists(marked, body):
         _check(words)
 
 
+def _options(name):
+    config = importlib.import_module(f"suite.commands.{name}").Config
+    return {f"--{field.name.rstrip('_').replace('_', '-')}" for field in dataclasses.fields(config)}
+
+
+def _check_sentence(text):
+    name, *words = text.split()
+    if name in MADE_UP or name.startswith("-"):
+        return
+    assert name in cli.COMMANDS, f"no command {name!r}"
+    if name == "reproduce" and words[1:]:  # its options are its experiment's
+        _check(["suite", name, *words])
+        return
+    for word in words:
+        if re.fullmatch(r"--[a-z][a-z-]*", word) and word != "--help":
+            assert word in _options(name), f"suite {name} has no option {word}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_within_a_sentence_exist_and_none_hides_in_another_fence(page):
+    text = page.read_text(encoding="utf-8")
+    for kind, body in FENCE.findall(text):
+        assert kind == "sh" or not re.match(r"(suite|make|pip) ", body), "fence it with ```sh"
+    for words in SENTENCE.findall(FENCE.sub("", text)):
+        _check_sentence(words)
+
+
+@pytest.mark.parametrize("text", ["nothing", "eval --trails 3", "view runs/x --giff"])
+def test_an_option_that_does_not_exist_is_found_within_a_sentence(text):
+    with pytest.raises(AssertionError):
+        _check_sentence(text)
+
+
 @pytest.mark.parametrize("words", [["suite", "nothing"], ["suite", "info", "--x"], ["make", "tea"]])
 def test_a_command_that_does_not_exist_is_found(words):
     with pytest.raises((AssertionError, SystemExit)):
@@ -96,3 +136,26 @@ def test_links_within_the_repository_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)", page.read_text(encoding="utf-8")):
         if "://" not in target:
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_the_readme_is_short_and_its_picture_small():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 160
+    picture = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)[0]
+    assert (ROOT / picture).stat().st_size < 3e6
+
+
+def test_the_site_is_whole_and_loads_nothing_from_elsewhere(tmp_path):
+    # The tool says that its own next version may never come; nothing of ours hangs on that.
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, env=quiet, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for page in PAGES[1:]:
+        assert (tmp_path / page.relative_to(ROOT / "docs").with_suffix(".html")).is_file()
+    tag = r"""<(?:script|img|link|iframe)[^>]*(?:src|href)=["']?(?:https?:)?//"""
+    loads = tag + r"""|url\(["']?https?:|@import"""
+    for path in tmp_path.rglob("*"):
+        if path.suffix in (".html", ".css"):
+            found = re.search(loads, path.read_text(encoding="utf-8"))
+            assert found is None, f"{path.name}: {found}"

@@ -1,16 +1,11 @@
 """Lag, drag and delay found again, and a residual learned, on flights whose truth is known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from eval.logs.flight_log import write_flight
-from policies.formats.delta_file import load_delta
-from suite.common.console import Console
 from suite.delta.fit import FitConfig, fit, identify
-from suite.delta.replay import Plant, nominal_plant
-from suite.delta.run import fit_delta, table
+from suite.delta.replay import PointMassModel, nominal_model
+from suite.delta.run import table
 from suite.delta.windows import cut_windows
 from suite.train.config import PointMassConfig
 from tests.support.point_mass_flights import fly
@@ -21,7 +16,7 @@ CONFIG = FitConfig(horizon_s=0.6, iterations=240, batch=64, rate=1e-2)
 
 def test_lag_drag_and_delay_of_a_point_mass_are_identified():
     """Far from the middle: a rival that is fitted by half would flatter the network."""
-    truth = Plant(np.float32(6.0), np.array([0.1, 0.6, 0.25], np.float32), np.float32(1.6))
+    truth = PointMassModel(np.float32(6.0), np.array([0.1, 0.6, 0.25], np.float32), np.float32(1.6))
     windows = cut_windows(fly(truth, 6), 0.6, 0.15)
     config = FitConfig(horizon_s=0.6, iterations=900, batch=64)
     found = identify(config, PHYSICS, windows)
@@ -37,35 +32,18 @@ def push(vel_b, action_b):
 
 @pytest.fixture(scope="module")
 def logs():
-    return fly(nominal_plant(PHYSICS), 8, extra_b=push)
+    return fly(nominal_model(PHYSICS), 8, extra_b=push)
 
 
 def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(logs):
     known, held_out = (cut_windows(part, 0.6, 0.15) for part in (logs[:6], logs[6:]))
     shown = []
     result = fit(CONFIG, PHYSICS, known, held_out, lambda *words: shown.append(words))
-    assert result.point_mass.position_m > 0.1
-    assert result.delta_action.position_m < 0.3 * result.point_mass.position_m
-    assert result.delta_action.velocity_m_s < 0.4 * result.point_mass.velocity_m_s
-    assert result.delta_action.position_m < result.fitted_point_mass.position_m
+    assert result.without.position_m > 0.1
+    assert result.with_delta.position_m < 0.3 * result.without.position_m
+    assert result.with_delta.velocity_m_s < 0.4 * result.without.velocity_m_s
+    assert result.with_delta.position_m < result.rival.position_m
     held_out = [row["held_out_m"] for row in result.curve]
-    assert held_out[-1] == pytest.approx(result.delta_action.position_m, rel=1e-5)
+    assert held_out[-1] == pytest.approx(result.with_delta.position_m, rel=1e-5)
     assert held_out[-1] < 0.5 * held_out[0] and len(shown) == len(held_out)
     assert "| point mass with Delta Action Model |" in table(result, 0.6)
-
-
-def test_logs_become_a_checkpoint_with_its_report(logs, tmp_path):
-    (tmp_path / "logs").mkdir()
-    for i, log in enumerate(logs[:3]):
-        thrust = np.full_like(log.time_s, 9.81)
-        commanded = replace(log, thrust_cmd=thrust, rate_cmd_b=log.rate_b)
-        write_flight(tmp_path / "logs" / f"{i}.parquet", commanded)
-    config = FitConfig(horizon_s=0.6, iterations=3, batch=8, held_out=0.4)
-    result = fit_delta(config, PHYSICS, [tmp_path / "logs"], tmp_path / "out", Console())
-    stored = load_delta(tmp_path / "out" / "delta").params
-    for name, value in result.params.items():
-        np.testing.assert_array_equal(stored[name], value)
-    assert (tmp_path / "out" / "table.md").read_text() == table(result, 0.6)
-    with pytest.raises(ValueError, match="no flight logs in"):
-        fit_delta(config, PHYSICS, [tmp_path / "out"], tmp_path / "again", Console())
-    assert not (tmp_path / "again").exists()

@@ -16,10 +16,10 @@ from policies.formats.delta_file import load_delta
 from policies.networks import delta_network
 from policies.spec import PolicySpec
 from suite.common.console import Console
+from suite.delta.burn_in import state_after
 from suite.delta.fit import FitConfig, window_errors
 from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor
-from suite.delta.run import fit_quadrotor_delta
-from suite.delta.warm import Warm, remembered
+from suite.delta.run import fit_delta
 from suite.train.config import QuadrotorConfig
 from tests.support.courses import straight
 from tests.support.pilots import Pursuit
@@ -114,7 +114,7 @@ def test_the_network_remembers_the_flight_before_a_window(logs):
     """The state before a window is that of the network run over the flight's decisions."""
     params = delta_network.init(jax.random.key(1))
     windows = cut_quadrotor_windows(logs[:1], QuadrotorConfig(TRUE), 0.5, 0.3)[0]
-    hidden = np.asarray(remembered(params, windows.warm))
+    hidden = np.asarray(state_after(params, windows.burn_in))
     log, number = logs[0], 3
     at = np.flatnonzero(log.policy_step)
     at = at[log.time_s[at] < windows.start_s[number] - 1e-4]
@@ -125,8 +125,6 @@ def test_the_network_remembers_the_flight_before_a_window(logs):
         state = delta_network.step(params, state, *(jnp.asarray(x[None]) for x in inputs))[1]
     np.testing.assert_allclose(hidden[number], state[0], atol=1e-5)
     assert np.abs(hidden[number]).max() > 1e-2
-    blank = Warm(np.ones((2, 4, 9)), np.zeros((2, 4)))
-    assert not np.any(remembered(params, blank))
 
 
 def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path):
@@ -134,7 +132,7 @@ def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path):
         write_flight(tmp_path / "logs" / log.name.replace(" ", "-"), log)
     config = FitConfig(horizon_s=0.5, iterations=60, batch=32, rate=1e-2, held_out=0.3)
     quad = QuadrotorConfig(BARE)
-    result = fit_quadrotor_delta(config, quad, [tmp_path / "logs"], tmp_path / "out", Console())
+    result = fit_delta(config, quad, [tmp_path / "logs"], tmp_path / "out", Console())
     assert result.without.position_m > 0.05
     assert result.with_delta.position_m < 0.6 * result.without.position_m
     stored = load_delta(tmp_path / "out" / "delta")

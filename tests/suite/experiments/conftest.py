@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from eval.worlds.trial import Rules
-from suite.experiments import flights
+from suite.experiments.study import judging
 from suite.train.repeat import Outcome
 from tests.support.documents import another_racer
 
@@ -16,9 +16,9 @@ class Sky:
     def __init__(self, monkeypatch):
         self.flown = []
         self.stop_after = None
-        self._fly = flights.fly_share
-        monkeypatch.setattr(flights, "fly_share", self.fly)
-        monkeypatch.setattr(flights, "usable_cores", lambda: 1)
+        self._fly = judging.fly_share
+        monkeypatch.setattr(judging, "fly_share", self.fly)
+        monkeypatch.setattr(judging, "usable_cores", lambda: 1)
 
     def fly(self, task, share):
         options = replace(task.options, slots=8, rules=Rules(time_limit_s=1.0))
@@ -40,11 +40,11 @@ def made(monkeypatch):
     """Return the configurations that were trained; each gives racer, with another digest."""
     configs = []
 
-    def stand_in(config, folder, console):
+    def stand_in(config, folder, console, watch=None):
         if not (folder / "policy").is_dir():
             configs.append(config)
             another_racer(folder / "policy", 1000 + len(configs))
         return Outcome(folder / "policy", 1, {})
 
-    monkeypatch.setattr("suite.experiments.trainings.train", stand_in)
+    monkeypatch.setattr("suite.train.run.train", stand_in)
     return configs

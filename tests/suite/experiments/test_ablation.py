@@ -4,24 +4,17 @@ import pytest
 
 from eval.judging.statistics import wilson
 from suite.common.errors import WorkFailed
-from suite.experiments import trainings
-from suite.experiments.ablation import Config, Trained, settings
-from suite.experiments.ablation_tables import beside_paper, summaries, verdict
-from suite.experiments.paper import ablation as printed
-from suite.experiments.seed_intervals import Spread
+from suite.experiments.ablation import Config, beside_paper, pooled, settings, verdict
+from suite.experiments.pages.paper import ablation as printed
+from suite.experiments.study.intervals import Spread
+from suite.experiments.study.summary import summaries
+from suite.experiments.study.training import Trained
+from suite.train import run as training_run
 from tests.support.documents import page, reproduce
 from tests.support.training import boxes_worlds
 
 SMALL = ("spec.hidden_size=8", "spec.camera.width=20", "spec.camera.height=20", "episode.steps=6")
 TINY = ["--set", *SMALL, "--iterations", "2", "--worlds", "2", "--trials", "3", "--seconds", "0.5"]
-
-
-def test_the_papers_rows_are_as_printed():
-    source, rows = printed()
-    assert "with and without AVF" in source and len(rows) == 8
-    assert [row.success_cross for row in rows.values()] == [0.95, 0, 0, 0, 0.28, 0, 0, 0.58]
-    assert sum(row.success_rate for row in rows.values()) == pytest.approx(6.25)
-    assert sum(row.v_max for row in rows.values()) == pytest.approx(51.6)
 
 
 def test_settings_differ_in_field_and_progress_alone():
@@ -45,17 +38,17 @@ def test_settings_differ_in_field_and_progress_alone():
 
 def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, capfd):
     args = [*TINY, "--only", "field 0.4", "normalised 6.4", "--training-seeds", "4"]
-    train, made = trainings.train, []
+    train, made = training_run.train, []
 
-    def diverging(config, folder, console):
+    def diverging(config, folder, console, watch=None):
         made.append((config.loss.progress_norm, config.seed))
         if config.loss.progress_norm:
             raise WorkFailed("training diverged at iteration 1")
         return train(config, folder, console)
 
-    monkeypatch.setattr(trainings, "train", diverging)
+    monkeypatch.setattr(training_run, "train", diverging)
     monkeypatch.setattr("suite.train.run.sample_worlds", boxes_worlds)
-    monkeypatch.setattr("suite.experiments.validation.sample_worlds", boxes_worlds)
+    monkeypatch.setattr("suite.experiments.study.validation.sample_worlds", boxes_worlds)
     assert reproduce(tmp_path, "ablation", *args) == 0
     assert made == [(0, 4), (6.4, 4)]
     text, numbers = page(tmp_path, "ablation")
@@ -77,7 +70,8 @@ def runs_of(key, *cross, rate=1.0, v_max=5.0):
     for seed, value in enumerate(cross):
         numbers = {"success_cross": value, "success_rate": rate, "v_max": v_max + seed,
                    "v_max_most": v_max + 2, "gates": 4.0}  # fmt: skip
-        yield Trained(key, seed, 60.0, "c", numbers if value is not None else None)
+        diverged = "" if value is not None else "it diverged"
+        yield Trained(key, seed, "", 60.0, 5.0, "c", diverged, [] if diverged else [numbers])
 
 
 def test_spread_pooled_interval_and_sentences_by_hand():
@@ -87,19 +81,19 @@ def test_spread_pooled_interval_and_sentences_by_hand():
         *runs_of("progress 3.2", 0.3, 0.1, None, rate=0.3),
         *runs_of("normalised 6.4", None),
     ]
-    field, bare, gone = summaries(chosen, runs, 10)
-    assert field.over["success_cross"] == pytest.approx(Spread(0.9, 0.8, 1.0))
-    assert field.over["v_max"] == Spread(6.0, 5.0, 7.0)
-    assert field.pooled["success_cross"] == wilson(27, 30)
+    field, bare, gone = summaries(chosen, runs)
+    assert field.at[-1]["success_cross"] == pytest.approx(Spread(0.9, 0.8, 1.0))
+    assert field.at[-1]["v_max"] == Spread(6.0, 5.0, 7.0)
+    assert pooled(field, "success_cross", 10) == wilson(27, 30)
     assert (bare.seeds, bare.diverged) == (3, 1)
-    assert bare.pooled["success_cross"] == wilson(4, 20)
-    assert not gone.over and gone.diverged == 1
+    assert pooled(bare, "success_cross", 10) == wilson(4, 20)
+    assert not gone.at and gone.diverged == 1
     said = verdict([field, bare, gone])
     assert "(field 0.4), at a success rate of 100 %" in said and "v_max of 6.0 m/s" in said
     assert "The first is 70 points more, and its worst seed above the best one." in said
     assert "at the same lambda_p" not in said, "no weight was trained both ways"
     assert "Every training of normalised 6.4 diverged." in said
-    compared = beside_paper([field, bare, gone])
+    compared = beside_paper([field, bare, gone], 10)
     assert (
         "success cross lies within the range of our seeds or their pooled interval in 2 of 2"
         in (compared)
@@ -109,22 +103,18 @@ def test_spread_pooled_interval_and_sentences_by_hand():
 
 def test_sentences_follow_the_numbers_where_the_field_loses():
     chosen = settings(Config(only=("field 0.4", "progress 3.2")))
-    lost = summaries(
-        chosen, [*runs_of("field 0.4", 0.1, 0.2), *runs_of("progress 3.2", 0.9, 0.8)], 10
-    )
+    lost = summaries(chosen, [*runs_of("field 0.4", 0.1, 0.2), *runs_of("progress 3.2", 0.9, 0.8)])
     assert "The first is 70 points less, and its best seed below the worst one." in verdict(lost)
-    compared = beside_paper(lost)
+    compared = beside_paper(lost, 10)
     assert (
         "in 0 of 2 rows: elsewhere field 0.4: 15 % here, 95 % there; progress 3.2: 85" in compared
     )
     assert "Most success cross of these rows: progress 3.2 here, field 0.4 in the paper" in compared
-    mixed = summaries(
-        chosen, [*runs_of("field 0.4", 0.1, 0.9), *runs_of("progress 3.2", 0.3, 0.5)], 10
-    )
+    mixed = summaries(chosen, [*runs_of("field 0.4", 0.1, 0.9), *runs_of("progress 3.2", 0.3, 0.5)])
     assert "The first is 10 points more, and their seeds overlap." in verdict(mixed)
-    none = summaries(chosen, [*runs_of("field 0.4", 0.0), *runs_of("progress 3.2", 0.0)], 10)
+    none = summaries(chosen, [*runs_of("field 0.4", 0.0), *runs_of("progress 3.2", 0.0)])
     assert "The first is as much." in verdict(none)
-    assert "Most success cross of these rows: no row here" in beside_paper(none)
+    assert "Most success cross of these rows: no row here" in beside_paper(none, 10)
 
 
 def test_the_field_is_compared_at_the_same_weight():
@@ -134,7 +124,7 @@ def test_the_field_is_compared_at_the_same_weight():
         *runs_of("progress 0.8", 0.1, 0.2, rate=0.9, v_max=7.0),
         *runs_of("field 1.6", 0.9, 0.9),
     ]
-    said = verdict(summaries(chosen, runs, 10))
+    said = verdict(summaries(chosen, runs))
     assert said.startswith(
         "Success cross with the field and without it, at the same lambda_p of L_p: 60 and 15 % at "
         "0.8; at 1 of 1 weights every seed with it is above every one without. The most"

@@ -9,11 +9,9 @@ import pytest
 
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.experiments import ideas as module
-from suite.experiments import trainings
-from suite.experiments.ideas import Config, ideas
-from suite.experiments.ideas_tables import compared, lead
-from suite.experiments.trainings import trained_policy
+from suite.experiments.ideas import Config, compared, ideas, is_round, lead
+from suite.experiments.study.training import Looks, train_one
+from suite.train import run as training_run
 from suite.train.overrides import override
 from suite.train.worlds import sample_worlds
 from tests.suite.experiments.test_ablation import SMALL
@@ -34,7 +32,7 @@ def test_every_row_is_the_recipe_with_its_changes():
     assert truncated.loss.gradient_decay == pytest.approx(2 * base.loss.gradient_decay)
     assert by_key["L_proj"].loss.field_gain == 0 < by_key["field and L_proj"].loss.field_gain
     assert by_key["round"].episode == by_key["round, square field"].episode
-    assert [row.key for row in rows if row.round] == ["round", "round, square field"]
+    assert [row.key for row in rows if is_round(row)] == ["round", "round, square field"]
     assert [row.key for row in ideas(Config(only=("longer",)))] == ["recipe", "longer"]
 
 
@@ -61,14 +59,14 @@ def test_differences_and_verdicts_by_hand():
     better = compared("a", [flown(*[1, 1, 0, 0] * 5), flown(*quarter), flown(*quarter)], base, 9.0)
     assert better.success == [0.5, 0.25, 0.25] and better.of_seeds == [0.25, 0.25, 0.25]
     assert better.difference.value == 0.25 and better.difference.low > 0
-    assert better.verdict == "gain" and better.v_max == 4.0 and better.seconds == 9.0
+    assert better.gap.verdict == "gain" and better.v_max == 4.0 and better.seconds == 9.0
     # More over all trials, but not with every seed.
     torn = compared("b", [flown(*[1] * 20), flown(*none), flown(*none)], base, 9.0)
     assert torn.difference.value == 0.25 and torn.of_seeds == [0.75, 0.0, 0.0]
-    assert torn.verdict == "unclear"
+    assert torn.gap.verdict == "unclear"
     worse = compared("c", [flown(*none)] * 3, np.ones((3, 20), bool), 9.0)
-    assert worse.verdict == "loss" and worse.of_seeds == [-1, -1, -1]
-    assert worse._replace(of_seeds=[-1, -1]).verdict == "unclear", "two seeds tell nothing"
+    assert worse.gap.verdict == "loss" and worse.of_seeds == [-1, -1, -1]
+    assert worse._replace(of_seeds=[-1, -1]).gap.verdict == "unclear", "two seeds tell nothing"
     same = compared("recipe", [flown(*row) for row in base], base, 9.0)
     said = lead([same, better, torn, worse])
     assert said.startswith("Of the recipe's trials 8 % succeed. More succeed with a (+25 [")
@@ -82,12 +80,16 @@ def test_the_rows_are_trained_and_judged_once(sky, made, tmp_path, monkeypatch):
     def validation(recipe, *worlds):
         return lambda params: seen.append((recipe, worlds)) or numbers
 
-    monkeypatch.setattr("suite.experiments.validation.make_validation", validation)
-    monkeypatch.setattr("suite.train.curve.read", lambda folder: [{"seconds": 7, "cold": False}])
+    monkeypatch.setattr("suite.experiments.study.validation.make_validation", validation)
+
+    def read(folder, name=""):
+        return [] if name else [{"seconds": 7, "cold": False}]
+
+    monkeypatch.setattr("suite.train.curve.read", read)
     args = ["ideas", "--trials", "1", "--difficulty", "0", "--training-seeds", "3", "5"]
     assert reproduce(tmp_path, *args) == 0
     rows = ideas(Config())
-    judged = [row for row in rows if not row.round]
+    judged = [row for row in rows if not is_round(row)]
     assert len(made) == len(rows) * 2 and {c.seed for c in made} == {3, 5}
     assert len(sky.flown) == len(judged) * 2 * 3
     assert [recipe.loss.field_square for recipe, _ in seen] == [False, False, True, True]
@@ -103,14 +105,14 @@ def test_the_rows_are_trained_and_judged_once(sky, made, tmp_path, monkeypatch):
 
 
 def test_a_training_that_diverges_leaves_its_row_out(sky, made, tmp_path, monkeypatch, capsys):
-    whole = trainings.train
+    whole = training_run.train
 
-    def train(config, folder, console):
+    def train(config, folder, console, watch=None):
         if config.seed == 5 and config.episode.finish in worse:
             raise WorkFailed("training diverged at iteration 7")
         return whole(config, folder, console)
 
-    monkeypatch.setattr(trainings, "train", train)
+    monkeypatch.setattr(training_run, "train", train)
     args = ["ideas", "--trials", "1", "--difficulty", "0", "--training-seeds", "3", "5"]
     args += ["--only", "finish", "curriculum"]
     worse = {True}
@@ -135,9 +137,9 @@ def test_round_gates_are_flown_by_the_trainers_own_code(tmp_path, monkeypatch):
         sampled.append(sample_worlds(config, iteration))
         return sampled[-1]
 
-    monkeypatch.setattr("suite.experiments.validation.sample_worlds", watched)
-    policy = trained_policy(row.recipe, Console(), tmp_path)
-    (found,) = module._flown_round(row, [policy], small)
+    monkeypatch.setattr("suite.experiments.study.validation.sample_worlds", watched)
+    looks = Looks(0, small.round_trials, small.round_seed, small.round_seconds)
+    (found,) = train_one((row.key, row.recipe), Console(), tmp_path, looks).points
     assert set(found) > {"success_cross", "success_rate", "v_max", "gates"}
     (worlds,) = sampled
     assert worlds.scene.gates.opening_g.shape == (2, 8, 8, 2)

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.experiments.randomisation import fixed
-from suite.experiments.randomisation_tables import ALL, _lead, compare
+from suite.experiments.randomisation import ALL, compare, fixed, lead
 from suite.train.presets import preset
 from tests.support.documents import page, reproduce
 
@@ -46,9 +45,9 @@ def test_a_trials_conditions_are_one_draw():
     won = {"a": np.zeros((5, 20), bool), "b": np.tile(first, (5, 1))}
     once = compare({name: each[:1] for name, each in won.items()}, [10, 10])
     often = compare(won, [10, 10])
-    assert once.difference == often.difference
-    assert often.difference.value == 0.5 and often.of_seeds == [0.5, 0.5]
-    assert often.difference.low == pytest.approx(0.3, abs=0.06)
+    assert once.gap == often.gap
+    assert often.gap.difference.value == 0.5 and often.gap.of_seeds == [0.5, 0.5]
+    assert often.gap.difference.low == pytest.approx(0.3, abs=0.06)
     assert often.rates["b"].value == 0.5 and often.rates["a"].value == 0
 
 
@@ -56,11 +55,11 @@ def test_a_seed_that_does_not_agree_is_no_gain():
     won = {"a": np.zeros((1, 90), bool), "b": np.zeros((1, 90), bool)}
     won["b"][0, :60] = True
     torn = compare(won, [30, 30, 30])
-    assert torn.of_seeds == [1.0, 1.0, 0.0] and torn.verdict == "unclear"
+    assert torn.gap.of_seeds == [1.0, 1.0, 0.0] and torn.gap.verdict == "unclear"
     won["b"][0, 60:75] = True
     agreed = compare(won, [30, 30, 30])
-    assert agreed.verdict == "gain"
-    said = _lead({"undisturbed": torn, ALL: agreed})
+    assert agreed.gap.verdict == "gain"
+    said = lead({"undisturbed": torn, ALL: agreed})
     assert said.endswith(
         "Randomisation gains in: all disturbances. These trainings do not tell for: undisturbed."
     )

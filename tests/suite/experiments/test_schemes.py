@@ -1,15 +1,13 @@
 """The comparison of training schemes at a size of seconds, and its numbers by hand."""
 
-import json
-
 import pytest
 
 from suite.experiments.ablation import Config as AblationConfig
 from suite.experiments.ablation import settings
-from suite.experiments.scheme_curves import first_times, summaries, value_at
-from suite.experiments.scheme_tables import verdict
-from suite.experiments.schemes import Config, Learnt, curve_of, schemes
-from suite.experiments.seed_intervals import Spread
+from suite.experiments.schemes import Config, first_times, number_at, schemes, verdict
+from suite.experiments.study.intervals import Spread
+from suite.experiments.study.summary import summaries
+from suite.experiments.study.training import Trained
 from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig
 from tests.suite.experiments.test_ablation import SMALL
@@ -34,7 +32,7 @@ def test_schemes_share_all_but_how_they_learn():
 
 
 def test_the_comparison_from_one_command_and_again(tmp_path, monkeypatch):
-    for module in ("suite.train.run", "suite.train.ppo.run", "suite.experiments.validation"):
+    for module in ("suite.train.run", "suite.train.ppo.run", "suite.experiments.study.validation"):
         monkeypatch.setattr(f"{module}.sample_worlds", boxes_worlds)
     args = [*TINY, "--only", "ours", "ppo", "--training-seeds", "4"]
     assert reproduce(tmp_path, "schemes", *args) == 0
@@ -54,19 +52,6 @@ def test_the_comparison_from_one_command_and_again(tmp_path, monkeypatch):
     assert (tmp_path / "docs" / "schemes.md").read_text() == text
 
 
-def test_time_leaves_compilation_out(tmp_path):
-    seconds = [(0, 30.0, True), (1, 2.0, False), (2, 11.0, True), (3, 3.0, False), (4, 4.0, False)]
-    rows = [{"iteration": k, "seconds": s, "cold": cold} for k, s, cold in seconds]
-    watched = [{"iteration": k, "gates": float(k)} for k in (0, 3, 5)]
-    for name, lines in (("metrics.jsonl", rows), ("validation.jsonl", watched)):
-        (tmp_path / name).write_text("".join(json.dumps(line) + "\n" for line in lines))
-    points, compiling = curve_of(tmp_path, 10)
-    assert [(p["steps"], p["time"], p["gates"]) for p in points] == [
-        (0, 0.0, 0.0), (30, 3 + 2 + 3, 3.0), (50, 3 + 2 + 3 + 3 + 4, 5.0),
-    ]  # fmt: skip
-    assert compiling == 27 + 8
-
-
 def learnt(scheme, seed, pace, gates, diverged=""):
     """Return a run measured at 0, 100 and 200 steps."""
     points = [
@@ -74,7 +59,7 @@ def learnt(scheme, seed, pace, gates, diverged=""):
          "success_rate": 1.0, "success_cross": g / 4}
         for k, g in enumerate(gates)
     ]  # fmt: skip
-    return Learnt(scheme, seed, points, 5.0, "c", diverged)
+    return Trained(scheme, seed, "", 60.0, 5.0, "c", diverged, points)
 
 
 def test_curves_first_times_and_sentences_by_hand():
@@ -87,17 +72,18 @@ def test_curves_first_times_and_sentences_by_hand():
         learnt("ours", 2, 3.0, [0.0], "it diverged"),
     ]
     ppo, ours = summaries(chosen, runs)
-    assert ours.steps == [0, 100, 200] and ours.time == [0, 2, 4] and ours.diverged == 1
-    assert ours.curves["gates"][1:] == [Spread(1.5, 1.0, 2.0), Spread(3.5, 3.0, 4.0)]
-    assert ours.reached[2] == [(200, 2.0), (100, 3.0)] and ours.reached[3] == [(200, 2), (200, 6)]
-    assert ppo.reached[1] == [(200, 8.0)] and ppo.reached[2] == []
-    assert first_times([], 1) == []
-    assert value_at(ppo, "gates", 4.0).mean == 0.5 and value_at(ppo, "gates", 3.9).mean == 0
+    assert [p["steps"].mean for p in ours.at] == [0, 100, 200] and ours.diverged == 1
+    assert [p["time"].mean for p in ours.at] == [0, 2, 4]
+    assert [p["gates"] for p in ours.at[1:]] == [Spread(1.5, 1.0, 2.0), Spread(3.5, 3.0, 4.0)]
+    assert first_times(ours, 2) == [(200, 2.0), (100, 3.0)]
+    assert first_times(ours, 3) == [(200, 2), (200, 6)]
+    assert first_times(ppo, 1) == [(200, 8.0)] and first_times(ppo, 2) == []
+    assert number_at(ppo, 4.0) == 1 and number_at(ppo, 3.9) == 0
     said = verdict([ppo, ours])
     assert "ours: 3.50 gates" in said.lower() and "(8.0 s of training)" in said
     assert "ahead at the end in reward, gates (with every seed above every one of PPO's" in said
     assert "after 4.0 s of training each in reward, gates" in said
-    swapped = verdict([ppo._replace(curves=ours.curves), ours._replace(curves=ppo.curves)])
+    swapped = verdict([ppo._replace(at=ours.at), ours._replace(at=ppo.at)])
     assert "ahead at the end in none of them" in swapped
     gone = summaries(chosen[:1], [learnt("ppo", 0, 4.0, [0.0], "it diverged")])
     assert verdict(gone) == "Every training of PPO diverged."

@@ -182,10 +182,10 @@ def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
     assert _eval(out, "--track", "ellipse", "--trials", "3", "--seed", "2", *policy) == 0
     capfd.readouterr()
     view = ["view", str(out), "--out", str(seen)]
-    assert cli.main([*view, "--pick", "failed", "--count", "2", "--json"]) == 0
+    assert cli.main([*view, "--pick", "failed", "--count", "2", "--gif", "--json"]) == 0
     said = json.loads(capfd.readouterr().out)
     names = sorted(path.name for path in seen.iterdir())
-    assert names == ["ellipse-0-2.png", "ellipse-0-3.png", "trials.rrd"]
+    assert names == ["ellipse-0-2.gif", "ellipse-0-2.png", "ellipse-0-3.png", "trials.rrd"]
     rows = read_trials(out / "trials.parquet")
     assert said["trials"][0]["time_s"] == rows[0].time_s
     assert cli.main([*view, "--pick", "passed"]) == 2

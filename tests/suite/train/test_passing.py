@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from policies.observation import state_vector
-from suite.delta.replay import nominal_plant
+from suite.delta.replay import nominal_model
 from suite.train import losses, rollout
 from suite.train.config import LossConfig, PointMassConfig
 from suite.train.dynamics.point_mass import Constants
@@ -213,4 +213,4 @@ def test_drag_along_the_bodys_z_has_a_range_of_its_own():
     np.testing.assert_array_equal(across, before.drag[:, :2])
     assert np.all((up >= 3.0) & (up <= 4.0))
     np.testing.assert_array_equal(changed.pos_w, plain.pos_w)
-    np.testing.assert_allclose(nominal_plant(physics).drag, [0.45, 0.45, 3.5])
+    np.testing.assert_allclose(nominal_model(physics).drag, [0.45, 0.45, 3.5])

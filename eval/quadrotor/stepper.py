@@ -1,0 +1,264 @@
+"""The stepper: one step of a quadrotor, for numpy and JAX and any leading batch shape.
+
+Command, delay, rate loop, mixer, rotors, effects: `plant_step` makes of them the force and the
+torque on the body, which a world gives to MuJoCo's engine. `step` moves the rigid body with them
+itself, as MuJoCo's Euler integrator does, and `rollout` is many steps in JAX, which can be
+compiled, mapped over flights and differentiated with respect to the state it starts from, its
+inputs, and the values of every effect of its plant, delay and lag included: the differentiable
+quadrotor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from eval.effects.interface import GRAVITY, Array, Flow, Gust
+from eval.quadrotor.delay import delayed
+from eval.quadrotor.mixer import mix
+from eval.quadrotor.plant import Command, Motion, Plant, Wrench, in_order, unpacked
+from eval.quadrotor.rate_loop import rate_torque
+from eval.quadrotor.rigid_body import euler_step
+from eval.quadrotor.rotors import RotorStep, follow, speed_command, steady
+from tracks.geometry.rotation import to_local
+
+
+class PlantState(NamedTuple):
+    """What a plant carries from step to step."""
+
+    rotor_speed: Array
+    """(..., 4) at the start of the step [rad/s]."""
+    past_commands: Array
+    """(..., 4, L) thrust and rates of the last L steps, newest first; L = 0 without a delay."""
+    wind: dict[str, Array]
+    """(..., 3) of each effect that makes random wind [m/s]."""
+
+
+class Inputs(NamedTuple):
+    """What acts on a quadrotor during one step; (T, ...) for `rollout`'s T steps."""
+
+    command: Command | None = None
+    """Held during the step."""
+    rotor_speed: Array | None = None
+    """(..., 4) measured and held during the step, in place of what the command asks for [rad/s]."""
+    noise: Array | None = None
+    """(..., 3) normal draws for random wind; without them there is none."""
+    voltage_drop: Array | None = None
+    """(...,) battery voltage at the start of the flight minus now [V]."""
+    push_b: Array | None = None
+    """(..., 6) further acceleration [m/s^2] and angular acceleration [rad/s^2] in body axes."""
+
+
+class Feedback(NamedTuple):
+    """A push that follows from the simulated state, such as a network's."""
+
+    start: Any
+    """What it carries, at the start."""
+    act: Callable[[Any, Motion, Inputs, Array], tuple[Any, Array]]
+    """(carry, motion, inputs, number of the step) -> (carry, `Inputs.push_b`)."""
+
+
+class Rollout(NamedTuple):
+    """A flown stretch of T steps."""
+
+    motion: Motion
+    """(T + 1, ...): the start and the state after each step."""
+    rotor_speed: Array
+    """(T + 1, ..., 4) [rad/s]."""
+    acc_b: Array
+    """(T, ..., 3) specific force during each step [m/s^2]."""
+    state: PlantState
+    """(...) after the last step, to fly on from."""
+
+
+def hover_state(
+    plant: Plant, batch_shape: tuple[int, ...], xp: Any = np, noise: Array | None = None
+) -> PlantState:
+    """Return the state of plants that hovered until now.
+
+    Args:
+        plant: the plant.
+        batch_shape: leading shape of the states that will be flown.
+        xp: numpy or jax.numpy.
+        noise: (*batch_shape, 3) normal draws for the random wind at the start; without them it
+            starts from none.
+    """
+    still = xp.zeros((*batch_shape, 3))
+    hover = Command(xp.full(batch_shape, GRAVITY), still)
+    past = (*batch_shape, 4, plant.delay_weight.shape[-1])
+    wind = {}
+    for name, value in in_order(plant.effects):
+        start = EFFECTS[name].gust
+        if start is not None:
+            wind[name] = still if noise is None else start(value, noise) + still
+    speed = wanted_speed(plant, hover, still)
+    return PlantState(speed, xp.broadcast_to(hover.packed[..., None], past), wind)
+
+
+def wanted_speed(plant: Plant, command: Command, rate_b: Array) -> Array:
+    """Return the rotor speeds (..., 4) [rad/s] that the rate loop and the mixer ask for."""
+    nominal = plant.nominal
+    torque_b = rate_torque(command.rate_b, rate_b, plant.constants.rate_gain, nominal.inertia)
+    thrust = mix(nominal.unmixer, nominal.thrust_max, nominal.mass * command.thrust, torque_b)
+    return speed_command(thrust, nominal.thrust_coefficient)
+
+
+def rotor_step(
+    plant: Plant, state: PlantState, command: Command, rate_b: Array
+) -> tuple[PlantState, RotorStep]:
+    """Return the state after one step and what the rotors do in it, under `command`."""
+    if plant.delay_weight.shape[-1] > 0:
+        past, acting = delayed(plant.delay_weight, state.past_commands, command.packed)
+        state, command = state._replace(past_commands=past), unpacked(acting)
+    wanted = wanted_speed(plant, command, rate_b)
+    rotors = follow(state.rotor_speed, wanted, plant.constants.time_constant, plant.dt)
+    return state._replace(rotor_speed=rotors.end), rotors
+
+
+def plant_step(
+    plant: Plant, state: PlantState, motion: Motion, inputs: Inputs, time_s: Array | float
+) -> tuple[PlantState, Wrench]:
+    """Return the state after one step of `plant.dt` and the wrench to hold during it.
+
+    Args:
+        plant: the plant.
+        state: from `hover_state` or the step before.
+        motion: at the start of the step.
+        inputs: a command or measured rotor speeds, and what else acts.
+        time_s: (...,) since the start of the flight [s].
+    """
+    if inputs.rotor_speed is not None:
+        rotors = steady(inputs.rotor_speed)
+        state = state._replace(rotor_speed=rotors.end)
+    else:
+        assert inputs.command is not None, "neither a command nor rotor speeds are given"
+        state, rotors = rotor_step(plant, state, inputs.command, motion.rate_b)
+    winds, flow = _flow(plant, state, motion, rotors, inputs, time_s)
+    wrench = _wrench(plant, rotors, flow)
+    if inputs.push_b is not None:
+        constants, push_b = plant.constants, inputs.push_b
+        wrench = Wrench(
+            wrench.force_b + _mass(plant) * push_b[..., :3],
+            wrench.torque_b + constants.inertia * push_b[..., 3:],
+        )
+    return state._replace(wind=winds), wrench
+
+
+def step(
+    plant: Plant, state: PlantState, motion: Motion, inputs: Inputs, time_s: Array | float
+) -> tuple[PlantState, Motion, Wrench]:
+    """Return the state and the motion of a free body after one step, and the wrench during it.
+
+    The arguments are those of `plant_step`.
+    """
+    state, wrench = plant_step(plant, state, motion, inputs, time_s)
+    return state, euler_step(plant, motion, wrench), wrench
+
+
+def rollout(
+    plant: Plant,
+    motion: Motion,
+    inputs: Inputs,
+    state: PlantState | None = None,
+    start_s: Array | float = 0.0,
+    feedback: Feedback | None = None,
+) -> Rollout:
+    """Fly `inputs` (T, ...) from `motion` (...) in JAX.
+
+    Args:
+        plant: the plant.
+        motion: at the start.
+        inputs: of T steps.
+        state: (...) at the start; that of a hover if not given.
+        start_s: (...,) time since the start of the flight at the first step [s].
+        feedback: what pushes in place of `inputs.push_b`.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    start = hover_state(plant, motion.pos_w.shape[:-1], jnp) if state is None else state
+    start, motion = jax.tree.map(jnp.asarray, (start, motion))
+    steps = jnp.arange(len(jax.tree.leaves(inputs)[0]))
+
+    def one(carry: Any, row: tuple[Array, Inputs]) -> tuple[Any, Any]:
+        state, motion, remembered = carry
+        index, now = row
+        if feedback is not None:
+            remembered, push_b = feedback.act(remembered, motion, now, index)
+            now = now._replace(push_b=push_b)
+        state, motion, wrench = step(plant, state, motion, now, start_s + index * plant.dt)
+        acc_b = wrench.force_b / _mass(plant)
+        return (state, motion, remembered), (motion, state.rotor_speed, acc_b)
+
+    begin = (start, motion, None if feedback is None else feedback.start)
+    (last, _, _), (motions, speeds, acc_b) = jax.lax.scan(one, begin, (steps, inputs))
+    motions, speeds = jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None], rest]),
+        (motion, start.rotor_speed),
+        (motions, speeds),
+    )
+    return Rollout(motions, speeds, acc_b, last)
+
+
+def _mass(plant: Plant) -> Array:
+    """Return the true mass beside vectors (..., 3); one of a single plant stays a plain number.
+
+    XLA rounds a division by a number otherwise than one by an array of one.
+    """
+    mass = plant.constants.mass
+    return mass[..., None] if mass.ndim else mass
+
+
+def _flow(
+    plant: Plant,
+    state: PlantState,
+    motion: Motion,
+    rotors: RotorStep,
+    inputs: Inputs,
+    time_s: Array | float,
+) -> tuple[dict[str, Array], Flow]:
+    """Return the random winds of this step and what the effects see of it."""
+    air_vel_w, winds = motion.vel_w, dict(state.wind)
+    still = air_vel_w.__array_namespace__().zeros_like(air_vel_w)
+    for name, value in in_order(plant.effects):
+        blow = EFFECTS[name].wind
+        if blow is not None:
+            before = state.wind.get(name, still)
+            wind_w = blow(value, Gust(before, air_vel_w, inputs.noise, plant.dt))
+            air_vel_w = air_vel_w - wind_w
+            if name in state.wind:
+                winds[name] = wind_w
+    return winds, Flow(
+        constants=plant.constants,
+        pos_w=motion.pos_w,
+        rot_w=motion.rot_w,
+        air_vel_b=to_local(motion.rot_w, air_vel_w),
+        rate_b=motion.rate_b,
+        rotor_speed=rotors.mean,
+        spin=plant.nominal.spin,
+        time_s=time_s,
+        voltage_drop=inputs.voltage_drop,
+    )
+
+
+def _wrench(plant: Plant, rotors: RotorStep, flow: Flow) -> Wrench:
+    """Return what the rotors and the effects do to the body."""
+    constants, arm = plant.constants, plant.constants.rotor_position_b
+    thrust = constants.thrust_coefficient * rotors.mean_square
+    for name, value in in_order(plant.effects):
+        change = EFFECTS[name].thrust
+        thrust = thrust if change is None else change(value, flow, thrust)
+    force_b = thrust.sum(axis=-1)[..., None] * constants.thrust_axis_b
+    about_z = -(flow.spin * constants.torque_coefficient * rotors.mean_square).sum(axis=-1)
+    torque_b = flow.rot_w.__array_namespace__().stack(
+        [(arm[..., 1] * thrust).sum(axis=-1), -(arm[..., 0] * thrust).sum(axis=-1), about_z],
+        axis=-1,
+    )
+    for name, value in in_order(plant.effects):
+        push, twist = EFFECTS[name].force, EFFECTS[name].torque
+        force_b = force_b if push is None else force_b + push(value, flow)
+        torque_b = torque_b if twist is None else torque_b + twist(value, flow)
+    return Wrench(force_b, torque_b)

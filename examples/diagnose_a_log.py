@@ -1,0 +1,40 @@
+"""Ask what a simulation lacks, of three flight logs that come with the suite.
+
+They were flown with a battery strapped on, so that the centre of mass is off. Run: python
+examples/diagnose_a_log.py [FOLDER]; it writes report.html, diagnosis.json and vehicle.toml. Logs of
+your own: `suite import` makes them of PX4, Betaflight, Crazyflie, MCAP and CSV files.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+from eval.logs.flight_log import read_flight
+from suite.cli import main as suite
+from suite.common.console import Console
+from suite.diagnose.run import Wishes, diagnose_files
+
+
+def main(folder: Path) -> None:
+    """Diagnose the example's flights into `folder`."""
+    logs = folder / "logs"
+    suite(["example", "--out", str(logs)])
+    flight = read_flight(logs / "flight_1.parquet")
+    print(f"flight 1: {len(flight.time_s)} rows over {flight.time_s[-1] - flight.time_s[0]:.1f} s")
+
+    found = diagnose_files(
+        [logs], str(logs / "vehicle.toml"), Wishes(recording=False), folder, Console()
+    )
+    print(f"verdict: {found['verdict']}")
+    for effect in found["effects"]:
+        for name, entry in effect["parameters"].items():
+            print(f"{effect['name']}.{name}: {entry['value']}, 95 %: {entry['ci95']}")
+    print(f"report: {folder / 'report.html'}")
+    print(f"the vehicle with the effect in it: {folder / 'vehicle.toml'}")
+
+
+if __name__ == "__main__":
+    given = sys.argv[1:]
+    main(Path(given[0]) if given else Path(tempfile.mkdtemp()))

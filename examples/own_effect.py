@@ -1,0 +1,63 @@
+"""Add a physical effect of your own: a tether that pulls the drone back to the start.
+
+The judge, the MJX world, the differentiable quadrotor and the diagnosis take it as it stands here.
+To have it in every command, put the file into a package with an entry point of the group
+`diffracing_suite.effects` (examples/plugin). Run: python examples/own_effect.py
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+from eval.effects import EFFECTS
+from eval.effects.interface import Array, Effect, Flow, Parameter
+from eval.judging.judge import JudgeOptions, fly
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import TrialSpec
+from policies.policy import load_policy
+from tracks.geometry.rotation import to_local
+
+
+class Tether(NamedTuple):
+    """Values of `tether`."""
+
+    stiffness: Array
+    """(...,) [N/m]."""
+
+
+def pull(values: Tether, flow: Flow) -> Array:
+    """Return R^T (-k p) (..., 3) [N]; numpy and JAX arrays of any leading shape alike."""
+    return to_local(flow.rot_w, -values.stiffness[..., None] * flow.pos_w)
+
+
+TETHER = Effect(
+    name="tether",
+    summary="An elastic tether to the origin of the world",
+    equation="F_b += R^T (-k p)",
+    source="Hooke 1678",
+    values=Tether,
+    parameters=(
+        Parameter("stiffness", "N/m", neutral=0.0, low=0.0, high=10.0, typical=(0.02, 0.2)),
+    ),
+    force=pull,
+)
+
+
+def main() -> None:
+    """Register the effect, and fly with tethers of growing stiffness."""
+    EFFECTS.register(TETHER.name, TETHER)
+    vehicle, policy = load_vehicle("reference"), load_policy("swift")
+    for stiffness in (0.0, 0.1, 0.4):
+        effects = {**vehicle.effects, TETHER.name: Tether(stiffness)}
+        (result,) = fly(
+            policy,
+            [TrialSpec("zigzag", difficulty=0, seed=1)],
+            replace(vehicle, effects=effects),
+            options=JudgeOptions(processes=1),
+        )
+        print(f"{stiffness:.1f} N/m: {result.gates_passed} gates, {result.ending}")
+
+
+if __name__ == "__main__":
+    main()

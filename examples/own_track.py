@@ -1,0 +1,69 @@
+"""Write a track of your own with a mesh on it, draw it, and fly it.
+
+tracks/examples/yard.toml has every key that such a file may have. Run: python
+examples/own_track.py [FOLDER]; then `suite eval --track FOLDER/course.toml`.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import trimesh
+
+from eval.judging.judge import JudgeOptions, fly
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.view.picture import write_picture
+from eval.worlds.trial import TrialSpec
+from policies.policy import load_policy
+from tracks.formats.custom import load_track
+
+COURSE = """
+[[gates]]                  # in flight order; metres, degrees, world z is up
+center = [3.0, 0.0, 1.4]
+width = 1.1
+height = 1.1
+
+[[gates]]
+center = [8.0, 1.5, 1.6]
+yaw_deg = 20.0             # flown through along its own x axis
+radius = 0.6               # a round one
+
+[[cylinders]]
+name = "pole"
+center = [5.5, 2.4, 1.5]
+radius = 0.15
+length = 3.0
+
+[[meshes]]                 # any file that trimesh reads; connected parts must be convex
+name = "roof"
+file = "roof.stl"          # beside this file
+position = [5.5, -2.0, 0.0]
+yaw_deg = 30.0
+"""
+
+
+def main(folder: Path) -> None:
+    """Write course.toml, roof.stl and course.png to `folder`, and fly the course once."""
+    corners = [(x, y, 0.0) for x in (-1, 1) for y in (-0.5, 0.5)] + [(-1, 0, 1.2), (1, 0, 1.2)]
+    trimesh.PointCloud(corners).convex_hull.export(folder / "roof.stl")
+    path = folder / "course.toml"
+    path.write_text(COURSE, encoding="utf-8")
+
+    track = load_track(path)
+    print(f"{track.family}: {len(track.scene.gates.center_w)} gates; solids: {set(track.names)}")
+    write_picture(folder / "course.png", track)
+    (result,) = fly(
+        load_policy("swift"),
+        [TrialSpec(str(path), difficulty=0, seed=0)],
+        load_vehicle("reference"),
+        options=JudgeOptions(processes=1),
+        tracks={str(path): track},
+    )
+    print(f"{result.gates_passed} gates, {result.ending} after {result.time_s:.1f} s")
+
+
+if __name__ == "__main__":
+    given = sys.argv[1:]
+    main(Path(given[0]) if given else Path(tempfile.mkdtemp()))

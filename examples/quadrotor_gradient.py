@@ -1,0 +1,53 @@
+"""Differentiate the judge's quadrotor: which way a flight moves with a number of its vehicle.
+
+One second of commands is flown; the gradient of the squared distance to where a heavier drone ends
+finds that drone's mass. Run: python examples/quadrotor_gradient.py [STEPS]
+"""
+
+from __future__ import annotations
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from eval.effects.mass_offset import MassOffset
+from eval.quadrotor.plant import Command, Motion, fit_plant
+from eval.quadrotor.stepper import Inputs, rollout
+from eval.quadrotor.vehicle_file import load_vehicle
+
+SECONDS, DT = 1.0, 0.002
+GRAVITY = 9.81
+
+
+def main(steps: int) -> None:
+    """Fit the mass by Newton's method with exact derivatives, in `steps` steps."""
+    vehicle = load_vehicle("racer5")
+    count = round(SECONDS / DT)
+    thrust = jnp.full(count, 1.1 * GRAVITY)  # per nominal mass [m/s^2]
+    rate_b = jnp.zeros((count, 3)).at[: count // 4, 1].set(0.8)  # nose down first [rad/s]
+    inputs = Inputs(command=Command(thrust, rate_b))
+    rest = Motion(np.array([0.0, 0.0, 2.0]), np.eye(3), np.zeros(3), np.zeros(3))
+
+    def last_pos_w(mass: jax.Array) -> jax.Array:
+        """Return where the drone is after the commands, (3,) [m], `mass` [kg] heavier."""
+        plant = fit_plant(vehicle, {"mass_offset": MassOffset(mass)}, DT)
+        return rollout(plant, rest, inputs).motion.pos_w[-1]
+
+    truth = 0.06
+    goal_w = last_pos_w(jnp.asarray(truth))
+    residual = jax.jit(lambda mass: last_pos_w(mass) - goal_w)
+    slope = jax.jit(jax.jacfwd(residual))
+    mass = jnp.asarray(0.0)
+    for step in range(steps):
+        error, gradient = residual(mass), slope(mass)
+        print(f"{step}: {float(mass):.5f} kg, {float(jnp.linalg.norm(error)):.2e} m off")
+        mass = mass - gradient @ error / (gradient @ gradient)
+    by_hand = (residual(mass + 1e-2) - residual(mass - 1e-2)) / 2e-2
+    print(f"{float(mass):.5f} kg; the truth is {truth} kg")
+    print(f"d z / d mass: {float(slope(mass)[2]):.3f} m/kg, by differences {float(by_hand[2]):.3f}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if sys.argv[1:] else 4)

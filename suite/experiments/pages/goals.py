@@ -1,0 +1,112 @@
+"""What is asked of each cell of the table, and by how much a policy misses it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from eval.judging.tables import Cell, percent
+from suite.common.report import Grid
+from suite.experiments.pages.paper import sim_to_sim
+from suite.experiments.pages.tables import table
+
+SURE = 0.90
+"""Where others won all of their few trials, our Wilson interval must reach down to this."""
+FLOORS = {0: 0.97, 3: 0.97, 6: 0.90, 9: 0.70}
+"""Success that the shipped policy must reach, by level."""
+
+
+class Goal(NamedTuple):
+    """One cell against what is asked of it; a miss of 0 is met."""
+
+    track: str
+    level: int
+    success: float
+    """What is asked: the best printed rate; 1 asks for an interval from `SURE` up."""
+    success_miss: float
+    floor: float
+    """The shipped policy's success."""
+    floor_miss: float
+    v_max: float
+    """What is asked: the largest printed [m/s]."""
+    v_max_miss: float
+    """[m/s]."""
+
+    @property
+    def met(self) -> bool:
+        """Say whether nothing is missed."""
+        return not (self.success_miss or self.floor_miss or self.v_max_miss)
+
+
+def goals(cells: Sequence[Cell]) -> list[Goal]:
+    """Return the goal of every cell that the paper prints."""
+    printed = sim_to_sim()
+    found = []
+    for cell in cells:
+        others = printed.at(cell.track, cell.difficulty)
+        if not others:
+            continue
+        rate = max(other.won / other.trials for other in others)
+        v_max = max(other.v_max for other in others)
+        missed = SURE - cell.success.low if rate == 1 else rate - cell.success.value
+        floor = FLOORS[cell.difficulty]
+        of_floor, of_speed = floor - cell.success.value, v_max - cell.v_max.value
+        rates = rate, max(0.0, missed), floor, max(0.0, of_floor)
+        found.append(Goal(cell.track, cell.difficulty, *rates, v_max, max(0.0, of_speed)))
+    return found
+
+
+def verdict(found: Sequence[Goal]) -> str:
+    """Return in two sentences how many cells meet the goal, and where the most is missing."""
+    met = sum(goal.met for goal in found)
+    won = sum(goal.success_miss == 0 for goal in found)
+    fast = sum(goal.v_max_miss == 0 for goal in found)
+    text = (
+        f"{met} of {len(found)} cells meet the whole goal: {won} in success against the better of "
+        f"paper and baseline, {fast} in v_max against both."
+    )
+    worst = max(found, key=lambda goal: goal.success_miss)
+    slowest = max(found, key=lambda goal: goal.v_max_miss)
+    if worst.success_miss:
+        text += (
+            f" Success misses most on {worst.track} at level {worst.level}, "
+            f"by {100 * worst.success_miss:.0f} points;"
+        )
+    if slowest.v_max_miss:
+        text += (
+            f" v_max misses most on {slowest.track} at level {slowest.level}, "
+            f"by {slowest.v_max_miss:.1f} m/s."
+        )
+    return text.rstrip(";") + ("" if text.endswith(".") else ".")
+
+
+def goal_grid(cells: Sequence[Cell]) -> Grid:
+    """Return by how much each cell of one policy misses what is asked of it."""
+    by_key = {(cell.track, cell.difficulty): cell for cell in cells}
+    headers = ["track", "level", "success", "best of the others", "missed by", "floor",
+               "missed by", "v_max [m/s]", "largest of the others", "missed by"]  # fmt: skip
+    lines = [
+        (
+            goal.track,
+            str(goal.level),
+            percent(by_key[goal.track, goal.level].success),
+            f"{100 * goal.success:.0f} %",
+            _missed(100 * goal.success_miss, "points"),
+            f"{100 * goal.floor:.0f} %",
+            _missed(100 * goal.floor_miss, "points"),
+            f"{by_key[goal.track, goal.level].v_max.value:.2f}",
+            f"{goal.v_max:.1f}",
+            _missed(goal.v_max_miss, "m/s"),
+        )
+        for goal in goals(cells)
+    ]
+    note = (
+        "Asked of success: the better of the paper's and the baseline's rate; where that is 10 of "
+        f"10, a Wilson interval from {100 * SURE:.0f} % up. The floor is what the shipped policy "
+        "is to reach. Asked of v_max: the largest of the printed ones."
+    )
+    return table(headers, lines, note=note)
+
+
+def _missed(by: float, unit: str) -> str:
+    return f"{by:.1f} {unit}" if by else "met"

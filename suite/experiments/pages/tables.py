@@ -1,0 +1,79 @@
+"""Tables that several documents have, and the cells of all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from eval.judging.statistics import Interval, PairedDifference, paired_success
+from eval.judging.tables import Cell as Judged
+from eval.judging.tables import markdown_table, percent
+from suite.common.report import Cell, Grid, Section
+from suite.experiments.study.disturbed import Tested
+from suite.experiments.study.summary import METRICS
+from suite.experiments.study.training import Trained
+
+
+def table(
+    headers: Sequence[str], lines: Iterable[Sequence[str | Cell]], title: str = "", note: str = ""
+) -> Grid:
+    """Return a table of texts and of cells with a tone."""
+    rows = [[Cell(entry) if isinstance(entry, str) else entry for entry in row] for row in lines]
+    return Grid(title, headers, rows, note=note)
+
+
+def points_cell(difference: PairedDifference | Interval) -> Cell:
+    """Return a difference of success rates in points with its interval, coloured by its sign."""
+    value, low, high = (f"{round(100 * x) + 0.0:+.0f}" for x in difference[:3])
+    tone = "good" if difference.low > 0 else "bad" if difference.high < 0 else ""
+    return Cell(f"{value} [{low}, {high}]", tone)
+
+
+def condition_grid(
+    entries: Sequence[Tested], base: Tested, first: Sequence[str], title: str = ""
+) -> Grid:
+    """Return success and change under each of `entries`, a row each.
+
+    Args:
+        entries: conditions; their other policies are compared with the first.
+        base: the undisturbed one.
+        first: headers of what names a row: the size, or the name and the size.
+        title: of the table.
+    """
+    headers, names = list(first), list(base.results)
+    for name in names:
+        mine = f"{name}: " if len(names) > 1 else ""
+        headers += [f"{mine}success", f"{mine}change"]
+    headers += [f"{name} - {names[0]}" for name in names[1:]]
+    plain = (base.condition.vehicle, base.condition.noise)
+    lines = []
+    for entry in entries:
+        line: list[str | Cell] = [*(entry.condition.name, entry.condition.words)[-len(first) :]]
+        same = entry.condition.vehicle is plain[0] and entry.condition.noise == plain[1]
+        for name in names:
+            change = paired_success(entry.won(name), base.won(name))
+            line += [percent(entry.success(name)), "" if same else points_cell(change)]
+        mine = entry.won(names[0])
+        line += [points_cell(paired_success(entry.won(name), mine)) for name in names[1:]]
+        lines.append(line)
+    return table(headers, lines, title)
+
+
+def every_cell(cells: Sequence[Judged]) -> Section:
+    """Return all numbers of judged cells, at a page's end."""
+    text = markdown_table({"cells": cells, "paired": []}).strip("\n")
+    return Section("Every cell with its intervals", [text])
+
+
+def every_training(
+    what: str, runs: Sequence[Trained], digits: Mapping[str, int], time: Callable[[Trained], str]
+) -> Section:
+    """Return what each training came to at its end: numbers with their `digits`, and its time."""
+    headers = [what, "training seed", *(METRICS[name].title for name in digits), "trained for"]
+    lines = []
+    for run in runs:
+        line = ["diverged"] + ["-"] * (len(digits) - 1)
+        if not run.diverged:
+            last = run.points[-1]
+            line = [f"{METRICS[name].scale * last[name]:.{d}f}" for name, d in digits.items()]
+        lines.append([run.row, str(run.seed), *line, time(run)])
+    return Section("Every training", [table(headers, lines)])

@@ -1,0 +1,130 @@
+"""Policies flown under conditions that differ from what the tables are flown on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.judging.statistics import Interval, paired_success, wilson
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.trial import TrialResult, TrialSpec
+from suite.common.console import Console
+from suite.experiments.study.conditions import (
+    Condition,
+    Sweep,
+    effect_conditions,
+    sweep_conditions,
+    sweeps,
+)
+from suite.experiments.study.judging import Flier, Order, flown
+from tracks.common.names import unknown_name
+
+
+class Tested(NamedTuple):
+    """A condition and how every policy did under it, on the same trials."""
+
+    condition: Condition
+    results: Mapping[str, Sequence[TrialResult]]
+    """By what tables call the policy."""
+
+    def success(self, policy: str) -> Interval:
+        """Return the rate over all tracks and levels."""
+        return wilson(int(self.won(policy).sum()), len(self.results[policy]))
+
+    def won(self, policy: str) -> np.ndarray:
+        """Return which trials succeeded, (n,) bool."""
+        return np.array([row.success for row in self.results[policy]])
+
+
+Grown = dict[Sweep, list[Tested]]
+"""The points of each sweep, the undisturbed first."""
+
+
+def asked_conditions(
+    vehicle: Vehicle, only: Sequence[str], effects: bool = True
+) -> tuple[list[Condition], dict[Sweep, list[Condition]]]:
+    """Return the effects and the sweeps of `vehicle` whose names are in `only`, all if it is empty.
+
+    Raises:
+        ValueError: for a name that there is not; `effects` False leaves those of effects out.
+    """
+    grown, alone = sweeps(vehicle), effect_conditions(vehicle) if effects else []
+    known = dict.fromkeys(entry.name for entry in (*grown, *alone))
+    for name in only:
+        if name not in known:
+            raise unknown_name("effect or sweep" if effects else "sweep", name, known)
+    chosen = only or tuple(known)
+    return (
+        [condition for condition in alone if condition.name in chosen],
+        {sweep: sweep_conditions(vehicle, sweep) for sweep in grown if sweep.name in chosen},
+    )
+
+
+Flights = Sequence[tuple[str, Sequence[TrialSpec]]]
+"""Policies and the trials of each."""
+
+
+def flown_under(
+    alone: Sequence[Condition],
+    grown: Mapping[Sweep, Sequence[Condition]],
+    fliers: Mapping[str, Flights],
+    cache: Path,
+    console: Console,
+) -> tuple[list[Tested], Grown]:
+    """Return conditions, and those of sweeps, with every policy's trials under them.
+
+    Args:
+        alone: conditions.
+        grown: conditions of sweeps.
+        fliers: by what tables call them; several policies under one name fly one after the other.
+        cache: folder of the flights.
+        console: where progress goes.
+    """
+    conditions = [*alone, *(point for points in grown.values() for point in points)]
+    orders = {
+        (at, name, part): Order(Flier(policy, condition.vehicle, condition.noise), trials)
+        for name, parts in fliers.items()
+        for at, condition in enumerate(conditions)
+        for part, (policy, trials) in enumerate(parts)
+    }
+    rows = flown(orders, cache, console, "flying under disturbances")
+    tested = [
+        Tested(
+            condition,
+            {
+                name: [row for part in range(len(parts)) for row in rows[at, name, part]]
+                for name, parts in fliers.items()
+            },
+        )
+        for at, condition in enumerate(conditions)
+    ]
+    rest = iter(tested[len(alone) :])
+    return tested[: len(alone)], {s: [next(rest) for _ in points] for s, points in grown.items()}
+
+
+def tested_numbers(entry: Tested, base: Tested) -> dict[str, Any]:
+    """Return one condition as JSON holds it, track by track too."""
+    found: dict[str, Any] = {
+        "name": entry.condition.name,
+        "size": entry.condition.size,
+        "words": entry.condition.words,
+        "noise": entry.condition.noise,
+        "effects": dict(entry.condition.vehicle.effects),
+        "policies": {},
+    }
+    for name, rows in entry.results.items():
+        tracks = dict.fromkeys(row.track for row in rows)
+        found["policies"][name] = {
+            "success": entry.success(name),
+            "change": paired_success(entry.won(name), base.won(name)),
+            "tracks": {
+                track: float(np.mean([row.success for row in rows if row.track == track]))
+                for track in tracks
+            },
+            "v_max": float(np.median([row.v_max for row in rows])),
+            "v_mean": float(np.median([row.v_mean for row in rows])),
+        }
+    return found

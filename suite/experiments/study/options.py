@@ -1,0 +1,134 @@
+"""What options of experiments have in common: what is allowed, and the recipe they ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from suite.common.choices import at_least, parse_levels
+from suite.common.work import check_jobs
+from suite.train.config import TrainConfig
+
+GATES = 4
+"""Of the paper's tracks in its ablation and its comparison of schemes."""
+LEAST = {
+    "trials": 1,
+    "seed": 0,
+    "iterations": 1,
+    "worlds": 1,
+    "seconds": 0.5,
+    "measurements": 1,
+    "round_trials": 1,
+    "round_seconds": 0.5,
+    "delta_iterations": 0,
+}
+"""The smallest value of options by their fields' names."""
+
+
+@dataclass(frozen=True)
+class FourGates:
+    """What the experiments on tracks of four gates have in common; their options derive from it."""
+
+    preset: str = "racer"
+    """The recipe that all trainings share, but for its size, its gates and what is compared."""
+    set: tuple[str, ...] = ("episode.image_stride=3",)
+    """Change settings of the recipe by name."""
+    iterations: int = 200
+    """Gradient steps, instead of the preset's."""
+    worlds: int = 48
+    """Worlds in one gradient step, instead of the preset's."""
+    training_seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds that everything is trained from."""
+    trials: int = 300
+    """Unseen worlds that are flown at every measurement."""
+    seconds: float = 10.0
+    """Of a trial, from standing start."""
+    seed: int = 1000
+    """Of the unseen worlds; none of the training seeds."""
+
+
+def check(config: Any) -> None:
+    """Refuse numbers of an experiment's options that cannot be used, by their fields' names.
+
+    Raises:
+        ValueError: naming the option and what is allowed.
+    """
+    given = vars(config)
+    seeds = given.get("training_seeds", (0,))
+    if len(set(seeds)) < len(seeds) or not seeds:
+        said = " ".join(map(str, seeds)) or "empty"
+        raise ValueError(f"--training-seeds is {said}; give each once")
+    for seed in seeds:
+        at_least("--training-seeds", seed, 0)
+    for field, least in LEAST.items():
+        if given.get(field) is not None:
+            at_least(f"--{field.replace('_', '-')}", given[field], least)
+    if isinstance(config, FourGates):
+        _check_unseen("--seed", config.seed, seeds)
+    if "round_seed" in given:
+        _check_unseen("--round-seed", given["round_seed"], seeds)
+    if "jobs" in given:
+        check_jobs(given["jobs"])
+    if "difficulty" in given:
+        parse_levels(given["difficulty"])
+
+
+def _check_unseen(option: str, seed: int, training_seeds: Sequence[int]) -> None:
+    at_least(option, seed, 0)
+    if seed in training_seeds:
+        raise ValueError(
+            f"{option} {seed} is one of --training-seeds, whose policies would have seen the "
+            "worlds they are measured on; give another"
+        )
+
+
+def check_owned(changes: Sequence[str], owned: Mapping[str, str]) -> None:
+    """Refuse changes, as --set takes them, of settings that an experiment sets itself.
+
+    Args:
+        changes: SETTING=VALUE each.
+        owned: what to do instead, by a setting's path.
+
+    Raises:
+        ValueError: naming the setting and what to do instead.
+    """
+    for change in changes:
+        path = change.partition("=")[0].strip()
+        if path in owned:
+            raise ValueError(f"--set {change!r}: this experiment sets {path}; {owned[path]}")
+
+
+def asked_recipe(config: Any) -> TrainConfig:
+    """Return --preset with --set and, unless it is None, --iterations.
+
+    Raises:
+        ValueError: for a preset or a change that does not exist.
+    """
+    from suite.train.overrides import override
+    from suite.train.presets import preset, with_iterations
+
+    recipe = override(preset(config.preset), config.set)
+    return recipe if config.iterations is None else with_iterations(recipe, config.iterations)
+
+
+def four_gate_recipe(config: FourGates) -> TrainConfig:
+    """Return the recipe that `config` asks for on tracks of four gates.
+
+    Raises:
+        ValueError: for a preset or a change that does not exist.
+    """
+    owned = {"episode.batch": "give --worlds", "optimizer.iterations": "give --iterations"}
+    check_owned(config.set, {**owned, "episode.gates": f"all fly {GATES}, as in the paper"})
+    base = asked_recipe(config)
+    return replace(base, episode=replace(base.episode, gates=GATES, batch=config.worlds))
+
+
+def recipe_words(config: Any) -> str:
+    """Return --preset and --set as they were asked for."""
+    return " ".join([config.preset, *config.set])
+
+
+def judged_seeds(config: Any) -> str:
+    """Return the first and the last seed of the judged trials."""
+    return f"{config.seed} to {config.seed + config.trials - 1}"

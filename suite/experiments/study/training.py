@@ -1,0 +1,222 @@
+"""Rows x training seeds, trained: what is there already is found by its configuration's hash.
+
+The run's folder is named by the configuration alone: code that has changed since does not start it
+anew, so a document should say the commit of each.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from suite.common.estimate import Estimate, announce
+from suite.common.work import all_done
+from suite.experiments.study.cache import digest
+from suite.train import curve
+from suite.train.config import TrainConfig
+from suite.train.ppo.config import PpoConfig
+from tracks.common.names import unknown_name
+
+if TYPE_CHECKING:
+    from suite.train.rollout import Note
+
+
+class Row(NamedTuple):
+    """What is trained, from every seed."""
+
+    key: str
+    """Its name."""
+    words: str
+    """What tables call it."""
+    recipe: Any
+    """A `TrainConfig` or a `PpoConfig`, with the seed left as it is."""
+    changes: tuple[str, ...] = ()
+    """Of the study's recipe, as --set takes them, where that says it all."""
+
+
+class Looks(NamedTuple):
+    """How policies are flown in worlds that no training has seen."""
+
+    measurements: int
+    """About how many during a training; 0 for one, of the finished policy."""
+    trials: int
+    seed: int
+    """Of the worlds."""
+    seconds: float
+    """Of a trial, from standing start."""
+
+
+class Trained(NamedTuple):
+    """One training of a row."""
+
+    row: str
+    """Its key."""
+    seed: int
+    policy: str
+    """The checkpoint's folder, which is not there where the training diverged."""
+    seconds: float
+    """Spent on gradient steps after those that compile [s]."""
+    compile_s: float
+    """What those that compile took longer than the others [s]."""
+    commit: str
+    """That trained it; several, where it was stopped and gone on with."""
+    diverged: str
+    """What was said where it diverged, else ""."""
+    points: list[dict[str, float]]
+    """Numbers in unseen worlds. Those on the way have `steps`, the environment steps until then,
+    and `time`, the seconds of training until then, without measurements and compilation."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is trained, how often, and how it is looked at."""
+
+    rows: Sequence[Row]
+    seeds: Sequence[int]
+    jobs: int
+    """Trainings at once, each in a process with its own share of the cores."""
+    looks: Looks | None = None
+    """Flights in unseen worlds of the training's dynamics; None flies none."""
+    by_seed: bool = False
+    """Whether the rows take turns, so that they meet the same load of the machine."""
+    may_diverge: bool = True
+    """Whether the others go on where a training diverges."""
+
+    def pieces(self) -> list[tuple[str, Any]]:
+        """Return key and whole configuration of every training, in the order they are done."""
+        if self.by_seed:
+            return [(r.key, replace(r.recipe, seed=s)) for s in self.seeds for r in self.rows]
+        return [(r.key, replace(r.recipe, seed=s)) for r in self.rows for s in self.seeds]
+
+
+def asked_rows(rows: Sequence[Row], only: Sequence[str], what: str) -> list[Row]:
+    """Return the rows whose keys are in `only`, all where it is empty.
+
+    Raises:
+        ValueError: for a key that no row has; `what` says what a row is.
+    """
+    names = [row.key for row in rows]
+    for name in only:
+        if name not in names:
+            raise unknown_name(what, name, names)
+    return [row for row in rows if not only or row.key in only]
+
+
+def trained(study: Study, cache: Path, console: Console) -> list[Trained]:
+    """Return every training of `study`; it is done, or gone on with, where missing.
+
+    Raises:
+        WorkFailed: where one diverges that may not.
+    """
+    from suite.train.ppo.run import estimate as ppo_estimate
+    from suite.train.run import estimate
+
+    pieces = study.pieces()
+    if not pieces:
+        return []
+    needs = [ppo_estimate(c) if isinstance(c, PpoConfig) else estimate(c) for _, c in pieces]
+    memory = study.jobs * max(need.memory_bytes for need in needs)
+    whole = Estimate(sum(need.seconds for need in needs), memory)
+    announce(console, f"{len(pieces)} trainings, less those that are there", whole)
+    do = functools.partial(train_one, cache=cache, looks=study.looks, may_diverge=study.may_diverge)
+    return all_done(do, pieces, study.jobs, console, "training")
+
+
+def train_one(
+    piece: tuple[str, Any],
+    console: Console,
+    cache: Path,
+    looks: Looks | None = None,
+    may_diverge: bool = False,
+) -> Trained:
+    """Train one of `Study.pieces`, or find it, and look at it as `looks` says."""
+    from suite.experiments.study.validation import make_validation, stored_params
+    from suite.train.ppo.run import train_ppo
+    from suite.train.repeat import Watch
+    from suite.train.run import train
+
+    key, config = piece
+    is_ppo, diverged = isinstance(config, PpoConfig), ""
+    folder, watch = cache / "trainings" / digest(config), None
+    if looks and looks.measurements:
+        folder = cache / "schemes" / digest([key, config, looks])
+        shared, iterations = (
+            (config.shared, config.iterations) if is_ppo else (config, config.optimizer.iterations)
+        )
+        measure = make_validation(shared, *looks[1:], rewarded(shared))
+        watch = Watch(max(1, iterations // looks.measurements), measure)
+    try:
+        (train_ppo if is_ppo else train)(config, folder, console, watch=watch)
+    except WorkFailed as failure:
+        if not may_diverge:
+            raise
+        diverged = str(failure)
+        console.note(f"{key}, seed {config.seed}: {diverged}")
+    policy = folder / "policy"
+    points, compile_s = curve_of(folder, config.episode.batch * config.episode.steps)
+    if looks and not (watch or diverged):
+        found = make_validation(config, *looks[1:])(stored_params(policy))
+        points = [found]
+        console.note(
+            f"{key}, seed {config.seed}: success cross {found['success_cross']:.0%}, "
+            f"success rate {found['success_rate']:.0%}, v_max {found['v_max']:.1f} m/s"
+        )
+    seconds = sum(row["seconds"] for row in curve.read(folder) if not row["cold"])
+    about = (str(policy), seconds, compile_s, commit_of(policy))
+    return Trained(key, config.seed, *about, diverged, points)
+
+
+def rewarded(config: TrainConfig) -> Note:
+    """Return the paper's reward, noted at every step of the rollout."""
+    from suite.train.ppo.reward import make_reward
+
+    reward = make_reward(config)
+    return lambda worlds, before, body, target: reward(worlds, before, body, target)[0].total()
+
+
+def curve_of(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
+    """Return a run's measurements with their steps and time, and what compilation took [s].
+
+    Iterations that compile, the first and those after a stop, count as long as the median of the
+    others.
+
+    Args:
+        folder: of the run.
+        frames: environment steps in an iteration.
+    """
+    rows = curve.read(folder)
+    warm = [row["seconds"] for row in rows if not row["cold"]]
+    usual = float(np.median(warm)) if warm else 0.0
+    spent = np.cumsum([0.0, *(usual if row["cold"] else row["seconds"] for row in rows)])
+    compiling = sum(max(0.0, row["seconds"] - usual) for row in rows if row["cold"])
+    points = []
+    for point in curve.read(folder, curve.WATCHED):
+        done = point.pop("iteration")
+        points.append({"steps": done * frames, "time": float(spent[done]), **point})
+    return points, compiling
+
+
+def commit_of(policy: Path) -> str:
+    """Return the commit that trained `policy` (RUN/policy), "unknown" where nothing says so.
+
+    A training that was stopped and gone on with may have several: all of them.
+    """
+    path = policy.parent / "run.json"
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        return ", ".join([*record.get("earlier_commits", []), record["git_commit"] or "unknown"])
+    except (OSError, ValueError, KeyError):
+        return "unknown"
+
+
+def commits(runs: Sequence[Trained]) -> str:
+    """Return the commits of all trainings, each once."""
+    return ", ".join(sorted({run.commit for run in runs}))

@@ -1,0 +1,213 @@
+"""The loop in a world with an effect that the simulation lacks: named, and trained for.
+
+The hidden world's file is read by the judge alone. The simulation learns of it through the
+measured flights only.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.trial import TrialResult
+from suite.common.report import Cell, Grid, Links, Picture, Section
+from suite.loop.charts import success_chart, tuning_chart
+from suite.loop.compare import BEFORE, points, told_apart
+from suite.loop.config import HiddenLoopConfig, LoopConfig
+from suite.loop.report import errors_row
+from suite.loop.standings import Standing, cell_grid, overall_grid, standings
+from suite.loop.variants import DeltaModel, Findings, Loop, Shown, Variant
+from suite.loop.work import named_effects, read_diagnosis
+from suite.train import curve
+from tracks.common.files import to_json
+
+NOMINAL, CONTROL, DELTA, NAMED, BOTH = "nominal", "control", "delta", "named", "both"
+LABELS = {
+    NOMINAL: "before, nothing hidden",
+    BEFORE: "before",
+    CONTROL: "control",
+    DELTA: "with delta",
+    NAMED: "with the named effect",
+    BOTH: "with both",
+}
+"""What tables call the policies."""
+REFERENCES = (BEFORE, CONTROL, NOMINAL)
+"""What the others are held against."""
+MODELS = {CONTROL: "simulation's", NAMED: "corrected"}
+"""Whose Delta Action Models are fitted, in delta-NAME/."""
+JUDGED = "judging the one fine-tuned {}, on the same seeds"
+
+
+def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]) -> Findings:
+    """Return what the finished loop in `out` came to."""
+    assert isinstance(config, HiddenLoopConfig)
+    diagnosis, trials = read_diagnosis(out), config.trials * config.cells
+    stand = standings(results, REFERENCES)
+    told = ("verdict", "effects", "gap", "unexplained")
+    return Findings(
+        verdict=verdict(stand, diagnosis, trials),
+        tables=[overall_grid(stand, REFERENCES, LABELS, trials), cell_grid(stand, LABELS)],
+        errors=[
+            f"Delta Action Model of the {whose} quadrotor\n\n"
+            + (out / f"delta-{name}" / "table.md").read_text(encoding="utf-8")
+            for name, whose in MODELS.items()
+        ],
+        numbers={"standings": stand, "diagnosis": {key: diagnosis[key] for key in told}},
+        facts={
+            "tracks": config.track,
+            "levels": config.difficulty,
+            "simulation's vehicle": config.vehicle,
+            "hidden world": config.world,
+        },
+        chart=Picture(success_chart(stand, LABELS), "Bars: 95 % intervals over trials."),
+        sections=[_diagnosis(config, diagnosis), _delta(out), _training(out, config)],
+    )
+
+
+def verdict(stand: Sequence[Standing], diagnosis: Mapping[str, Any], trials: int) -> str:
+    """Return in a few sentences what the loop showed."""
+    by_name = {one.name: one for one in stand}
+    apart = {other.against: other.success for other in by_name[NAMED].differences}
+
+    def percent(name: str) -> str:
+        return f"{100 * by_name[name].success.value:.0f} %"
+
+    back = "not to be told from" if apart[NOMINAL].high >= 0 else "below"
+    return (
+        f"In the hidden world {percent(BEFORE)} of {trials} trials succeed, in the simulation's "
+        f"vehicle {percent(NOMINAL)}. The diagnosis names {named_effects(diagnosis)}. Fine-tuned "
+        f"with it, {percent(NAMED)} succeed in the hidden world: {told_apart(apart[CONTROL])} the "
+        f"same fine-tuning without it ({percent(CONTROL)}; difference {points(apart[CONTROL])}), "
+        f"and {back} the policy where nothing is hidden (difference {points(apart[NOMINAL])}). "
+        f"With the Delta Action Model instead {percent(DELTA)} succeed, with both {percent(BOTH)}."
+    )
+
+
+def _diagnosis(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Section:
+    gap = diagnosis["gap"]
+    rows = []
+    for effect in diagnosis["effects"]:
+        for name, entry in effect["parameters"].items():
+            value, interval = to_json(entry["value"]), to_json(entry["ci95"])
+            cells = (effect["name"], ", ".join(effect["alternatives"]), name, value, interval)
+            rows.append([Cell(text) for text in (*cells, entry["unit"])])
+    headers = ["effect", "or", "parameter", "value", "95 % interval", "unit"]
+    hidden = hidden_effects(load_vehicle(config.vehicle), load_vehicle(config.world))
+    return Section(
+        "What the diagnosis found in the flights",
+        [
+            f"Verdict: {diagnosis['verdict']}. Held-out gap {gap['before']:.2f} before, "
+            f"{gap['after']:.2f} after; 1 is the noise floor.",
+            Grid("", headers, rows),
+            f"What the world's file holds and the simulation's does not: {hidden}.",
+            Links([("diagnosis/report.html", "the diagnosis's own report")]),
+        ],
+    )
+
+
+def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
+    """Return the effects that `true` has and `simulated` has not, or has otherwise, in words."""
+    parts = [
+        f"{name} {value._asdict()}"
+        for name, value in true.effects.items()
+        if simulated.effects.get(name) != value
+    ]
+    parts += [f"no {name}" for name in simulated.effects if name not in true.effects]
+    return "; ".join(parts) or "other nominal values"
+
+
+def _delta(out: Path) -> Section:
+    rows = []
+    for variant, whose in MODELS.items():
+        text = (out / f"delta-{variant}" / "delta.json").read_text(encoding="utf-8")
+        fitted = json.loads(text)
+        rows.append(errors_row(f"{whose} vehicle", fitted["without"]))
+        rows.append(errors_row(f"{whose} vehicle with delta", fitted["delta_action"]))
+    headers = ["held-out flights, after 1 s", "position error [m]", "velocity error [m/s]"]
+    words = (
+        "Recorded actions are flown again through the differentiable quadrotor; the flights are "
+        "as measured, so the noise of the start is in every row."
+    )
+    return Section("Delta Action Models on held-out flights", [words, Grid("", headers, rows)])
+
+
+def _training(out: Path, config: LoopConfig) -> Section:
+    tuned = (CONTROL, DELTA, NAMED, BOTH)
+    chart = tuning_chart({LABELS[name]: curve.read(out / f"tuned-{name}") for name in tuned})
+    words = (
+        f"{config.tuning.optimizer.iterations} iterations each, from {config.policy}. Each curve "
+        "is of the vehicle that it was trained in, so their levels are not comparable."
+    )
+    return Section("Fine-tuning", [words, Picture(chart, "Running means.")])
+
+
+LOOP = Loop(
+    title="A hidden effect, named and trained for",
+    hidden=True,
+    variants=(
+        Variant(NOMINAL, "judging the policy in the simulation's vehicle", simulated=True),
+        Variant(BEFORE, "judging the policy in the hidden world"),
+        Variant(
+            CONTROL,
+            JUDGED.format("as the control"),
+            "through the simulation's vehicle, as the control",
+        ),
+        Variant(
+            DELTA,
+            JUDGED.format("with the Delta Action Model"),
+            "through the simulation's vehicle and the frozen Delta Action Model",
+            delta="delta-control",
+        ),
+        Variant(
+            NAMED,
+            JUDGED.format("with the named effect"),
+            "through the corrected vehicle",
+            diagnosed=True,
+        ),
+        Variant(
+            BOTH,
+            JUDGED.format("with both"),
+            "through the corrected vehicle and the frozen Delta Action Model of what it lacks",
+            delta="delta-named",
+            diagnosed=True,
+        ),
+    ),
+    models=tuple(
+        DeltaModel(
+            f"delta-{name}",
+            f"fitting the Delta Action Model of the {whose} quadrotor",
+            diagnosed=name == NAMED,
+        )
+        for name, whose in MODELS.items()
+    ),
+    shown=(
+        Shown(BEFORE, "before fine-tuning", "Flights before fine-tuning"),
+        Shown(
+            NAMED, "fine-tuned with the named effect", "Flights fine-tuned with the named effect"
+        ),
+    ),
+    find=find,
+    reading="The first policy flies in the simulation's vehicle and in the hidden world; the "
+    "others are fine-tuned from it, for as many iterations on the same random tracks, and fly in "
+    "the hidden world on the same trials. The control is fine-tuned through the simulation's "
+    "quadrotor as it is, the others through it with its Delta Action Model, through the quadrotor "
+    "corrected by the named effect, and through that with a Delta Action Model of what it still "
+    "lacks. The judge flies the policies alone.",
+    caveat="Intervals are 95 % over trials, for these policies: another seed of the fine-tuning "
+    "gives other policies. Differences are taken trial by trial.",
+    advice="record more (--flights), with another --out",
+    files=(
+        ("table.md", "the tables on this page"),
+        ("loop.json", "the same as numbers, with the configuration"),
+        ("diagnosis/report.html", "how the diagnosis came to its answer"),
+        ("diagnosis/vehicle.toml", "the corrected vehicle file"),
+        ("recording.rrd", "trials before and after, for rerun"),
+        ("flights/flights.json", "the recorded flights"),
+        ("measured/measured.json", "the same as measured"),
+        ("tuned-named/policy/config.json", "the policy tuned with the named effect"),
+    ),
+)

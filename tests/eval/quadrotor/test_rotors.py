@@ -1,0 +1,39 @@
+"""The rotors' lag against an independent integration, and their thrust curve."""
+
+import jax
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from eval.quadrotor.rotors import follow, speed_command
+
+
+@pytest.mark.parametrize("time_constant", [0.0, 1e-6, 0.002, 0.03, 5.0])
+def test_rotors_follow_exactly(time_constant):
+    start, wanted, dt = np.array([1000.0, 500.0, 0.0, 2000.0]), np.full(4, 1500.0), 0.01
+    step = follow(start, wanted, np.asarray(time_constant), dt)
+    if time_constant < 1e-5:
+        np.testing.assert_allclose(step.end, wanted)
+        np.testing.assert_allclose(step.mean_square, wanted**2, rtol=1e-3)
+        return
+
+    def slopes(_, y):
+        return np.concatenate([(wanted - y[:4]) / time_constant, y[:4], y[:4] ** 2])
+
+    begin = np.concatenate([start, np.zeros(8)])
+    end = solve_ivp(slopes, (0.0, dt), begin, rtol=1e-11, atol=1e-9).y[:, -1]
+    np.testing.assert_allclose(step.end, end[:4], rtol=1e-8)
+    np.testing.assert_allclose(step.mean, end[4:8] / dt, rtol=1e-8)
+    np.testing.assert_allclose(step.mean_square, end[8:] / dt, rtol=1e-8)
+
+
+def test_lag_can_be_fitted_from_none():
+    speed, wanted = jax.numpy.full(4, 1000.0), jax.numpy.full(4, 1500.0)
+    slope = jax.grad(lambda tau: follow(speed, wanted, tau, 0.002).mean_square.sum())(0.0)
+    # Thrust comes late: dt mean(Omega^2) loses (Omega_c^2 - Omega^2) tau - (...)^2 tau / 2.
+    expected = 4 * (2 * 1500.0 * -500.0 + 0.5 * 500.0**2) / 0.002
+    assert slope == pytest.approx(expected, rel=1e-5)
+
+
+def test_speed_command_inverts_the_thrust_curve():
+    np.testing.assert_allclose(speed_command(np.array([1.6, 0.0]), 1.6e-6), [1000.0, 0.0])

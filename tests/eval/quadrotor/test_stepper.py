@@ -1,0 +1,332 @@
+"""The stepper: physics, parity with MuJoCo and numpy, and gradients of every effect."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from eval.effects import EFFECTS, all_values
+from eval.quadrotor.model import compile_quadrotor
+from eval.quadrotor.plant import Command, Motion, fit_plant, make_plant
+from eval.quadrotor.rigid_body import accelerations
+from eval.quadrotor.stepper import Feedback, Inputs, hover_state, plant_step, rollout, step
+from eval.quadrotor.vehicle_file import load_vehicle
+from tests.support.vehicles import PLAIN, at_rest, drawn_effects, with_effects, with_lag
+from tracks.geometry.rotation import quat_to_rot
+
+
+@pytest.fixture(autouse=True)
+def double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+def aggressive_commands(steps, seed=0):
+    """Thrust from 0 to twice gravity and rates to the limit, changed every 40 steps."""
+    rng = np.random.default_rng(seed)
+    parts = -(-steps // 40)
+    thrust = np.repeat(rng.uniform(0.0, 22.0, parts), 40)[:steps]
+    rate_b = np.repeat(rng.uniform(-6.0, 6.0, (parts, 3)), 40, axis=0)[:steps]
+    return Command(thrust, rate_b)
+
+
+PART = 50
+ROLLOUT = jax.jit(rollout)
+
+
+def fly(plant, motion, commands, noise=None):
+    """Roll out in parts of one length, so that all tests share one compiled model."""
+    steps = len(commands.thrust)
+    noise = np.zeros((steps, 3)) if noise is None else noise
+    state, motion = hover_state(plant, (), jnp), Motion(*map(jnp.asarray, motion))
+    rows = [motion]
+    for k in range(0, steps, PART):
+        inputs = Inputs(commands, noise=noise)
+        part = jax.tree.map(lambda field, k=k: jnp.asarray(field[k : k + PART]), inputs)
+        flown = ROLLOUT(plant, motion, part, state, k * plant.dt)
+        state, motion = flown.state, Motion(*(field[-1] for field in flown.motion))
+        rows.append(Motion(*(field[1:] for field in flown.motion)))
+    rows[0] = Motion(*(field[None] for field in rows[0]))
+    return Motion(*(np.concatenate(parts) for parts in zip(*rows, strict=True))), state
+
+
+def fly_mujoco(vehicle, motion, commands, noise=None):
+    """Fly the numpy plant on MuJoCo's own `mj_step`, as a world does."""
+    dt = 1.0 / vehicle.controller.frequency
+    model = compile_quadrotor(mujoco.MjSpec(), vehicle, dt)
+    data = mujoco.MjData(model)
+    plant = make_plant(vehicle, dt)
+    state = hover_state(plant, ())
+    data.qpos[:3], data.qpos[3:] = motion.pos_w, [1.0, 0.0, 0.0, 0.0]
+    data.qvel[:3], data.qvel[3:] = motion.vel_w, motion.rate_b
+    rows = [np.concatenate([data.qpos, data.qvel])]
+    for k in range(len(commands.thrust)):
+        rot_w = quat_to_rot(data.qpos[3:].copy())
+        now = Motion(data.qpos[:3].copy(), rot_w, data.qvel[:3].copy(), data.qvel[3:].copy())
+        command = Command(np.asarray(commands.thrust[k]), commands.rate_b[k])
+        inputs = Inputs(command, noise=None if noise is None else noise[k])
+        state, wrench = plant_step(plant, state, now, inputs, k * dt)
+        data.qfrc_applied[:3], data.qfrc_applied[3:] = rot_w @ wrench.force_b, wrench.torque_b
+        mujoco.mj_step(model, data)
+        rows.append(np.concatenate([data.qpos, data.qvel]))
+    return np.array(rows), state
+
+
+def assert_same_flight(rows, flight, tolerance):
+    np.testing.assert_allclose(flight.pos_w, rows[:, :3], atol=tolerance)
+    np.testing.assert_allclose(flight.rot_w, quat_to_rot(rows[:, 3:7]), atol=tolerance)
+    np.testing.assert_allclose(flight.vel_w, rows[:, 7:10], atol=10 * tolerance)
+    np.testing.assert_allclose(flight.rate_b, rows[:, 10:], atol=100 * tolerance)
+
+
+FAST = Motion(np.array([0.0, 0.0, 2.0]), np.eye(3), np.array([6.0, 1.0, 0.0]), np.zeros(3))
+
+
+@pytest.mark.parametrize("name", ["reference", "racer5"])
+def test_a_second_of_aggressive_flight_is_mujocos(name):
+    """Also: the model that holds the whole catalogue, unused, is the vehicle's own."""
+    vehicle = load_vehicle(name)
+    commands = aggressive_commands(500)
+    rows, state = fly_mujoco(vehicle, FAST, commands)
+    assert np.linalg.norm(rows[:, 10:], axis=1).max() > 5.0
+    flight, last = fly(fit_plant(vehicle, {}), FAST, commands)
+    # Rounding only, grown over 500 steps: both step the same equations in double precision.
+    assert_same_flight(rows, flight, 1e-10)
+    np.testing.assert_allclose(last.rotor_speed, state.rotor_speed, rtol=1e-9)
+
+
+def test_the_whole_catalogue_at_once_flies_like_mujoco():
+    vehicle = drawn_effects(np.random.default_rng(8), with_lag(PLAIN, 0.03))
+    inertia = make_plant(vehicle, 0.002).constants.inertia
+    assert inertia[2] > inertia[0] + inertia[1]  # which MuJoCo's compiler would refuse
+    commands, noise = aggressive_commands(250), np.random.default_rng(9).standard_normal((250, 3))
+    rows, _ = fly_mujoco(vehicle, FAST, commands, noise)
+    flight, _ = fly(fit_plant(PLAIN, vehicle.effects), FAST, commands, noise)
+    assert_same_flight(rows, flight, 1e-10)
+
+
+def test_free_fall():
+    flight, _ = fly(fit_plant(PLAIN, {}), FAST, Command(np.zeros(500), np.zeros((500, 3))))
+    t = 1.0
+    np.testing.assert_allclose(flight.vel_w[-1], [6.0, 1.0, -9.81], rtol=1e-12)
+    # Semi-implicit Euler falls g t dt / 2 too far.
+    fallen = 0.5 * 9.81 * t * (t + 0.002)
+    np.testing.assert_allclose(flight.pos_w[-1], [6.0, 1.0, 2.0 - fallen], rtol=1e-12)
+
+
+def test_drag_takes_energy_and_decays_speed_exponentially():
+    vehicle = with_effects(linear_drag=((0.3, 0.3, 0.3),))
+    hover = Command(np.full(500, 9.81), np.zeros((500, 3)))
+    flight, _ = fly(fit_plant(vehicle, {}), FAST, hover)
+    np.testing.assert_allclose(flight.vel_w[-1, :2], np.exp(-0.3) * FAST.vel_w[:2], rtol=1e-3)
+
+
+BASE = with_lag(PLAIN, 0.03)
+TRIMMED = {
+    # Away from every kink: a delay between steps, wind and sag that act, rotors near the ground.
+    "command_delay": (0.0113,),
+    "linear_drag": ((0.2, 0.2, 0.3),),
+    "quadratic_drag": ((0.01, 0.01, 0.02),),
+    "constant_wind": ((1.0, -2.0, 0.3),),
+    "ground_effect": (1.0, 0.0635),
+    "gusts": (0.8, 4.0),
+}
+
+
+@pytest.fixture(scope="module")
+def slopes():
+    """Gradient of a number made of the whole flight, and that number, with every effect."""
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(2)
+        steps = 60
+        command = Command(
+            jnp.asarray(np.repeat(rng.uniform(8.0, 12.0, steps // 5), 5)),
+            jnp.asarray(np.repeat(rng.uniform(-1.5, 1.5, (steps // 5, 3)), 5, axis=0)),
+        )
+        motion = FAST._replace(pos_w=np.array([0.0, 0.0, 0.15]), rate_b=np.array([0.5, -0.4, 0.3]))
+        noise = jnp.asarray(rng.standard_normal((steps, 3)))
+        inputs = Inputs(command, noise=noise, voltage_drop=jnp.linspace(0.0, 1.0, steps))
+        weight = [jnp.asarray(rng.standard_normal(shape)) for shape in ((3,), (3, 3), (3,), (3,))]
+
+        def score(effects):
+            flight = rollout(fit_plant(BASE, effects), motion, inputs)
+            parts = zip(flight.motion, weight, strict=True)
+            return sum((part * w).sum() for part, w in parts)
+
+        start = jax.tree.map(jnp.asarray, all_values(with_effects(BASE, **TRIMMED)))
+        value_and_slope = jax.jit(jax.value_and_grad(score))
+        yield start, lambda effects: value_and_slope(effects)[0], value_and_slope(start)[1]
+
+
+# Faults of a log do not act on the flight, a neutral gust's length and a rotor's radius neither.
+IN_FLIGHT = [name for name, effect in EFFECTS.items() if effect.log is None]
+
+
+@pytest.mark.parametrize("name", IN_FLIGHT)
+def test_gradient_of_every_parameter_is_that_of_finite_differences(slopes, name):
+    start, score, gradient = slopes
+    rng = np.random.default_rng(4)
+    for parameter in EFFECTS[name].parameters:
+        value = getattr(start[name], parameter.name)
+        direction = jnp.asarray(rng.choice([-1.0, 1.0], np.shape(value)))
+        step = 1e-4 * parameter.typical[0]
+
+        def moved(size, value=value, direction=direction, parameter=parameter):
+            change = {parameter.name: value + size * direction}
+            return score({**start, name: start[name]._replace(**change)})
+
+        expected = (moved(step) - moved(-step)) / (2.0 * step)
+        ours = (getattr(gradient[name], parameter.name) * direction).sum()
+        if name == "battery_sag":
+            # With a voltage the rate does not count once per_volt is given: one-sided.
+            expected = (moved(step) - moved(0.0)) / step
+        assert np.isfinite(ours)
+        assert abs(ours) > 0.0
+        np.testing.assert_allclose(ours, expected, rtol=2e-4, atol=1e-7)
+
+
+def test_rollouts_map_over_flights():
+    plant = fit_plant(load_vehicle("reference"), {})
+    flights = [aggressive_commands(PART, seed) for seed in range(3)]
+    commands = Command(*(jnp.stack(parts) for parts in zip(*flights, strict=True)))
+    together = jax.jit(jax.vmap(lambda c: rollout(plant, FAST, Inputs(c)).motion.pos_w))(commands)
+    alone, _ = fly(plant, FAST, flights[1])
+    np.testing.assert_allclose(together[1], alone.pos_w, atol=1e-12)
+
+
+def test_measured_rotor_speeds_stand_for_the_command():
+    plant, speed = make_plant(PLAIN, 0.002), jnp.full((40, 4), 1200.0)
+    held = rollout(plant, FAST, Inputs(aggressive_commands(40), rotor_speed=speed))
+    bare = rollout(plant, FAST, Inputs(rotor_speed=speed))
+    np.testing.assert_array_equal(held.rotor_speed[1:], 1200.0)
+    np.testing.assert_array_equal(held.motion.pos_w, bare.motion.pos_w)
+    np.testing.assert_allclose(held.acc_b[:, 2], 4 * 1.6e-6 * 1200.0**2 / 0.75)
+
+
+def test_a_push_is_an_acceleration_in_body_axes():
+    plant = make_plant(PLAIN, 0.002)
+    inputs = Inputs(Command(np.full(50, 9.81), np.zeros((50, 3))))
+    push_b = np.tile([1.0, -2.0, 0.5, 0.3, 0.2, -0.1], (50, 1))
+    still, start = hover_state(plant, ()), at_rest()
+    bare = plant_step(plant, still, start, jax.tree.map(lambda x: x[0], inputs), 0.0)[1]
+    now = jax.tree.map(lambda x: x[0], inputs._replace(push_b=push_b))
+    pushed = plant_step(plant, still, start, now, 0.0)[1]
+    both = zip(accelerations(plant, start, pushed), accelerations(plant, start, bare), strict=True)
+    found = np.concatenate([new - old for new, old in both])
+    np.testing.assert_allclose(found, push_b[0], atol=1e-12)
+
+    def act(count, motion, inputs, index):
+        return count + 1, jnp.asarray(push_b)[index]
+
+    given = rollout(plant, start, inputs._replace(push_b=push_b))
+    fed = rollout(plant, start, inputs, feedback=Feedback(0, act))
+    np.testing.assert_allclose(fed.motion.vel_w, given.motion.vel_w, atol=1e-12)
+    assert given.motion.vel_w[-1, 0] > 0.09
+
+
+def test_numpy_steps_as_a_rollout_does():
+    plant, commands = make_plant(load_vehicle("reference"), 0.002), aggressive_commands(50)
+    state, motion = hover_state(plant, ()), FAST
+    for k in range(50):
+        inputs = Inputs(Command(*(np.asarray(field[k]) for field in commands)))
+        state, motion, wrench = step(plant, state, motion, inputs, 0.002 * k)
+    flown = rollout(plant, FAST, Inputs(commands))
+    for ours, theirs in zip(motion, flown.motion, strict=True):
+        np.testing.assert_allclose(ours, theirs[-1], atol=1e-12)
+    np.testing.assert_allclose(state.rotor_speed, flown.rotor_speed[-1], rtol=1e-12)
+    np.testing.assert_allclose(wrench.force_b / plant.constants.mass, flown.acc_b[-1], atol=1e-12)
+
+
+def test_hover_holds():
+    plant = make_plant(with_effects(with_lag(PLAIN, 0.03), command_delay=(0.03,)), 0.002)
+    state, motion = hover_state(plant, ()), at_rest()
+    hover = Inputs(Command(np.asarray(9.81), np.zeros(3)))
+    for k in range(500):
+        state, motion, _ = step(plant, state, motion, hover, 0.002 * k)
+    np.testing.assert_allclose(motion.pos_w, [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(motion.rot_w, np.eye(3), atol=1e-12)
+
+
+def test_rate_loop_cancels_the_gyroscopic_torque():
+    plant = make_plant(PLAIN, 0.002)
+    rate = np.array([2.0, -1.0, 1.5])
+    motion = Motion(np.zeros(3), np.eye(3), np.zeros(3), rate)
+    inputs = Inputs(Command(np.asarray(12.0), rate))
+    _, wrench = plant_step(plant, hover_state(plant, ()), motion, inputs, 0.0)
+    _, turn = accelerations(plant, motion, wrench)
+    np.testing.assert_allclose(turn, 0.0, atol=1e-9)
+
+
+def reference_flight(vehicle, command_of, duration, start):
+    """Integrate contracts of the nominal quadrotor in continuous time; shares no code with ours.
+
+    State: position, quaternion xyzw, velocity, body rate, rotor speeds.
+    """
+    hubs, spin = np.array(vehicle.rotors.position), np.array(vehicle.rotors.spin)
+    k_t, k_q = vehicle.rotors.thrust_coefficient, vehicle.rotors.torque_coefficient
+    inertia, gain = np.diag(vehicle.inertia), np.diag(vehicle.controller.rate_gain)
+    allocation = np.array(
+        [[1, y, -x, -s * k_q / k_t] for (x, y, _), s in zip(hubs, spin, strict=True)]
+    ).T
+
+    def slopes(t, y):
+        attitude = Rotation.from_quat(y[3:7])
+        velocity, rate, speed = y[7:10], y[10:13], y[13:]
+        thrust, wanted_rate = command_of(t)
+        torque = inertia @ gain @ (wanted_rate - rate) + np.cross(rate, inertia @ rate)
+        asked = np.linalg.solve(allocation, [vehicle.mass * thrust, *torque])
+        assert np.all((asked > 0) & (asked < vehicle.rotors.thrust_max))
+        push = k_t * speed**2
+        twist = np.sum(
+            [np.cross(hub, [0, 0, f]) for hub, f in zip(hubs, push, strict=True)], axis=0
+        )
+        twist = twist + [0, 0, -(spin * k_q * speed**2).sum()]
+        turn = np.linalg.solve(inertia, twist - np.cross(rate, inertia @ rate))
+        acc = attitude.apply([0, 0, push.sum() / vehicle.mass]) + [0, 0, -9.81]
+        x, yq, z, _ = y[3:7]
+        spun = 0.5 * np.array(
+            [
+                y[6] * rate[0] + yq * rate[2] - z * rate[1],
+                y[6] * rate[1] + z * rate[0] - x * rate[2],
+                y[6] * rate[2] + x * rate[1] - yq * rate[0],
+                -x * rate[0] - yq * rate[1] - z * rate[2],
+            ]
+        )
+        follow_up = (np.sqrt(asked / k_t) - speed) / vehicle.rotors.time_constant
+        return np.concatenate([velocity, spun, acc, turn, follow_up])
+
+    return solve_ivp(slopes, (0.0, duration), start, rtol=1e-10, atol=1e-10).y[:, -1]
+
+
+def smooth_command(t):
+    return 11.0 + 3.0 * np.sin(9.0 * t), np.array(
+        [1.5 * np.sin(7.0 * t), 1.2 * np.cos(6.0 * t) - 1.2, 0.5 * np.sin(4.0 * t)]
+    )
+
+
+def test_flight_converges_to_an_independent_integration_with_order_one():
+    vehicle = with_lag(PLAIN, 0.03)
+    hover = np.sqrt(0.75 * 9.81 / 4 / 1.6e-6)
+    start = np.concatenate([[0, 0, 1], [0, 0, 0, 1], np.zeros(6), np.full(4, hover)])
+    truth = reference_flight(vehicle, smooth_command, 0.8, start)
+    errors = []
+    for dt in (0.004, 0.002, 0.001):
+        plant = make_plant(vehicle, dt)
+        state, motion = hover_state(plant, ()), at_rest()
+        for k in range(round(0.8 / dt)):
+            thrust, rate = smooth_command((k + 0.5) * dt)
+            inputs = Inputs(Command(np.asarray(thrust), rate))
+            state, motion, _ = step(plant, state, motion, inputs, k * dt)
+        attitude = Rotation.from_quat(truth[3:7]).as_matrix()
+        parts = [
+            motion.pos_w - truth[:3], motion.vel_w - truth[7:10], motion.rate_b - truth[10:13],
+            (motion.rot_w - attitude).ravel(),
+        ]  # fmt: skip
+        errors.append(np.linalg.norm(np.concatenate(parts)))
+        np.testing.assert_allclose(state.rotor_speed, truth[13:], rtol=20 * dt)
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert errors[-1] < 0.01
+    assert np.all((orders > 0.8) & (orders < 1.3)), (errors, orders)

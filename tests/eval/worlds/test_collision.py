@@ -1,0 +1,67 @@
+"""Collisions by signed distance: distances worked by hand, and contacts as MuJoCo finds them."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.collision import CONTACT_M, box_distances
+from eval.worlds.engine import compile_model
+from eval.worlds.slots import layout_of
+from tests.support.courses import straight
+from tracks.families import MAX_COUNTS, make_track
+from tracks.geometry.rotation import exp_rot
+from tracks.geometry.scene import stack
+
+VEHICLE = load_vehicle("reference")
+
+
+# The box's front face, and its front edge once it is turned by 45 degrees.
+@pytest.mark.parametrize(("turn", "reach"), [(0.0, 0.1), (np.pi / 4, 0.15 / 2**0.5)])
+def test_distance_to_a_wall_and_to_the_ground_by_hand(turn, reach):
+    scene = stack([straight(wall_at=3.0).scene], MAX_COUNTS)
+    pos_w, rot_w = np.array([[0.0, 0.0, 1.5]]), exp_rot(np.array([[0.0, 0.0, turn]]))
+    half_size, middle_b = np.array([0.1, 0.05, 0.02]), np.array([0.0, 0.0, -0.01])
+    found = np.asarray(box_distances(scene, pos_w, rot_w, half_size, middle_b))[0]
+    assert found[0] == pytest.approx(2.95 - reach, abs=1e-3)
+    assert found[-1] == pytest.approx(1.5 - 0.01 - 0.02)
+
+
+def test_contacts_are_those_of_mujoco():
+    """Random poses close to solids of every kind: contact there, a distance of nought here."""
+    rng = np.random.default_rng(0)
+    track = make_track("circular", 9, 3)
+    model = compile_model(track, VEHICLE, 0.002, layout_of([track]).solids)
+    data = mujoco.MjData(model)
+    scene = track.scene
+    places = np.concatenate(
+        [scene.boxes.center_w, scene.cylinders.center_w, scene.capsules.center_w,
+         scene.spheres.center_w]
+    )  # fmt: skip
+    size = np.concatenate(
+        [np.linalg.norm(scene.boxes.half_size, axis=1),
+         np.hypot(scene.cylinders.radius, scene.cylinders.half_length),
+         scene.capsules.radius + scene.capsules.half_length, scene.spheres.radius]
+    )  # fmt: skip
+    n = 600
+    index = rng.integers(len(places), size=n)
+    away = rng.normal(size=(n, 3))
+    away *= (size[index] * rng.uniform(0, 1.1, n) / np.linalg.norm(away, axis=1))[:, None]
+    quat = rng.normal(size=(n, 4))
+    hits, rot = np.zeros(n, bool), np.zeros((n, 3, 3))
+    pos = places[index] + away
+    for i in range(n):
+        data.qpos[:3], data.qpos[3:] = pos[i], quat[i] / np.linalg.norm(quat[i])
+        mujoco.mj_step1(model, data)
+        hits[i], rot[i] = data.ncon > 0, data.xmat[1].reshape(3, 3)
+    gates = scene.gates
+    assert gates is not None
+    batch = jax.tree.map(lambda a: np.repeat(a, n, 0), stack([scene], MAX_COUNTS))
+    half = np.asarray(VEHICLE.body.half_size, np.float32)
+    found = jax.jit(box_distances)(
+        batch, pos.astype(np.float32), rot.astype(np.float32), half, np.zeros(3, np.float32)
+    )
+    found = (np.asarray(found) <= CONTACT_M).any(-1)
+    assert 0.2 < hits.mean() < 0.8
+    assert (hits == found).mean() > 0.98

@@ -1,0 +1,50 @@
+"""What the worlds on the C engine share: the model of a trial, its rays, its contacts."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.engine import BODY, Eye, compile_model, contact_name, motion_of, start_state
+from eval.worlds.slots import layout_of
+from tests.support.courses import straight
+from tracks.geometry.camera import Camera
+
+VEHICLE = load_vehicle("reference")
+
+
+@pytest.fixture(scope="module")
+def wall():
+    track = straight(wall_at=3.0)
+    model = compile_model(track, VEHICLE, 0.002, layout_of([track]).solids)
+    return track, model, mujoco.MjData(model)
+
+
+def test_the_quadrotor_is_the_first_body_and_starts_at_the_start(wall):
+    track, model, data = wall
+    assert model.body(BODY).name == "quadrotor"
+    data.qpos[:], data.qvel[:] = start_state(track), [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]
+    mujoco.mj_step1(model, data)
+    motion = motion_of(data)
+    np.testing.assert_array_equal(motion.pos_w[0], track.start_pos_w)
+    np.testing.assert_array_equal(motion.rot_w[0], np.eye(3))
+    np.testing.assert_array_equal(motion.vel_w[0], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(motion.rate_b[0], [0.1, 0.2, 0.3])
+
+
+def test_depth_is_planar_and_ends_at_the_range(wall):
+    track, model, data = wall
+    data.qpos[:] = start_state(track)
+    mujoco.mj_step1(model, data)
+    image = Eye(Camera(pitch_deg=0.0)).image(model, data, data.qpos[:3], np.eye(3))
+    middle = image[image.shape[0] // 2 - 1, image.shape[1] // 2]
+    assert middle == pytest.approx(2.95)
+    assert image.max() == Camera().range_m
+
+
+def test_a_contact_has_the_solids_name(wall):
+    track, model, data = wall
+    data.qpos[:] = start_state(track)
+    data.qpos[0] = 2.9
+    mujoco.mj_step1(model, data)
+    assert data.ncon > 0 and contact_name(model, data) == "the wall"

@@ -1,0 +1,36 @@
+"""What a world with slots keeps for each."""
+
+import numpy as np
+
+from eval.worlds.slots import GATES, empty_course, generator_of, layout_of, noise_of, pad_gates
+from eval.worlds.trial import TrialSpec
+from tests.support.courses import straight
+
+TRIAL = TrialSpec("zigzag", 3, 7)
+
+
+def test_a_layout_holds_every_track():
+    layout = layout_of([straight(tuple(range(1, 12)))])
+    assert layout.gates == 11 and layout.corners == 4
+    assert layout.solids == layout_of([]).solids
+
+
+def test_padding_repeats_the_last_gate():
+    gates = straight((1.0, 2.0)).scene.gates
+    padded = pad_gates(gates, 4, 6)
+    np.testing.assert_array_equal(padded.center_w[:, 0], [1.0, 2.0, 2.0, 2.0])
+    np.testing.assert_array_equal(padded.opening_g[:, 3:], padded.opening_g[:, 3:4].repeat(3, 1))
+
+
+def test_an_empty_course_has_room_for_every_gate():
+    course, layout = empty_course(3, layout_of([])), layout_of([])
+    assert course.gates.opening_g.shape == (3, layout.gates, layout.corners, 2)
+    assert np.isfinite(course.gates.rot_w).all() and course.count.tolist() == [1, 1, 1]
+
+
+def test_a_trials_random_numbers_are_its_own_for_each_use():
+    np.testing.assert_array_equal(noise_of(TRIAL, 5), noise_of(TRIAL, 9)[:5])
+    others = TRIAL._replace(seed=8), TRIAL._replace(difficulty=4), TRIAL._replace(track="circular")
+    for other in others:
+        assert (noise_of(other, 5) != noise_of(TRIAL, 5)).all()
+    assert generator_of(TRIAL, GATES).standard_normal() != noise_of(TRIAL, 1)[0, 0]

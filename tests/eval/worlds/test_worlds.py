@@ -1,0 +1,133 @@
+"""Every way in which a trial ends, provoked."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eval.judging.judge import JudgeOptions, fly
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds import mujoco as mujoco_world
+from eval.worlds import reference as reference_world
+from eval.worlds.trial import Rules, TrialSpec
+from tests.support.courses import straight
+from tests.support.pilots import Pursuit, Steady
+
+VEHICLE = load_vehicle(Path(mujoco_world.__file__).parent.parent / "vehicles" / "reference.toml")
+WORLDS = ["mujoco", "reference"]
+RULES = Rules()
+
+
+def one(policy, track, world, rules=RULES, seed=0):
+    options = JudgeOptions(slots=4, rules=rules)
+    trial = TrialSpec(track.family, 0, seed)
+    (result,) = fly(policy, [trial], VEHICLE, world, options, tracks={track.family: track})
+    return result
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_finished(world):
+    result = one(Pursuit(3.0), straight(), world)
+    assert (result.ended_by, result.success, result.gates_passed) == ("finished", True, 2)
+    assert (result.gates_8s, result.gates_035, result.collided_with) == (2, 2, None)
+    # The centre has just crossed the last gate's plane, at the speed it has then.
+    assert 0 <= result.pos_x - 4.0 < result.v_max * 0.002 + 1e-9
+    assert 1.0 < result.v_mean < result.v_max < 3.5
+    assert result.v_mean == pytest.approx(4.0 / result.time_s, rel=0.02)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_collision_with_the_wall(world):
+    result = one(Pursuit(3.0), straight(wall_at=3.0), world)
+    assert (result.ended_by, result.collided_with) == ("collision", "the wall")
+    assert (result.success, result.gates_passed) == (False, 1)
+    # The body's front reaches 0.064 m ahead, lower when pitched; the wall's face is at 2.95 m.
+    assert 2.95 - 0.08 < result.pos_x < 2.95 - 0.03
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_collision_with_the_ground(world):
+    result = one(Steady((0.0, 0.0, -2.0)), straight(), world)
+    assert (result.ended_by, result.collided_with) == ("collision", "ground")
+    assert result.pos_z == pytest.approx(0.025, abs=0.01)
+    # Fell 1.475 m at 2 m/s^2 less the file's vertical drag of 4 x 0.18 1/s (and a little of
+    # 4 x 0.01 1/m), after a delay and a lag of 30 ms each.
+    t = np.linspace(0, 3, 30001)
+    fallen = 2 / 0.72 * (t - (1 - np.exp(-0.72 * t)) / 0.72)
+    assert result.time_s == pytest.approx(t[np.searchsorted(fallen, 1.475)] + 0.06, rel=0.03)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_tipped(world):
+    result = one(Steady((0.0, 20.0, -15.0)), straight(height=30.0), world)
+    assert (result.ended_by, result.success) == ("tipped", False)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_timeout(world):
+    result = one(Steady(), straight(), world, Rules(time_limit_s=1.0))
+    assert (result.ended_by, result.time_s) == ("timeout", pytest.approx(1.0, abs=1e-12))
+    # Hovering: nothing moves but for what the delay of the loops lets through.
+    assert abs(result.pos_z - 1.5) < 0.02 and result.v_max < 0.1
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_gates_in_the_short_window(world):
+    result = one(Pursuit(3.0), straight((1.0, 3.5)), world, Rules(short_window_s=1.1))
+    assert (result.gates_passed, result.gates_8s) == (2, 1)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_crossing_outside_the_opening_does_not_count(world):
+    track = straight((1.0,))
+    track.scene.gates.opening_g[:] *= 0.01  # 1 cm: the pursuit is not that exact
+    result = one(Pursuit(3.0), track, world, Rules(time_limit_s=2.0))
+    assert result.gates_passed == 0 and result.gates_035 == 1
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_diverged_ends_that_trial_only(world, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # MuJoCo would leave its log here
+    module = {"mujoco": mujoco_world, "reference": reference_world}[world]
+    original = module.autopilot_step
+
+    def broken(autopilot, state, motion, action_b, gate_w, step, noise=None):
+        state, wrench = original(autopilot, state, motion, action_b, gate_w, step, noise)
+        ill = (motion.pos_w[:, 0] > 0.5) & (gate_w[:, 0] > 2.0)
+        wrench.force_b[ill] = np.nan
+        return state, wrench
+
+    well, ill = straight((0.8, 1.6), name="well"), straight((2.4, 3.2), name="ill")
+    trials = [TrialSpec("well", 0, 0), TrialSpec("ill", 0, 0), TrialSpec("well", 0, 1)]
+    tracks, options = {"well": well, "ill": ill}, JudgeOptions(slots=4)
+    before = fly(Pursuit(3.0), trials, VEHICLE, world, options, tracks=tracks)
+    monkeypatch.setattr(module, "autopilot_step", broken)
+    after = fly(Pursuit(3.0), trials, VEHICLE, world, options, tracks=tracks)
+    assert (after[0], after[2]) == (before[0], before[2])
+    assert before[1].ended_by == "finished"
+    assert (after[1].ended_by, after[1].success) == ("diverged", False)
+    assert 0.5 < after[1].pos_x < 0.6 and all(map(math.isfinite, after[1][10:16]))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_state_beyond_any_flight_is_diverged(world, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    module = {"mujoco": mujoco_world, "reference": reference_world}[world]
+    original = module.autopilot_step
+
+    def kicked(autopilot, state, motion, action_b, gate_w, step, noise=None):
+        state, wrench = original(autopilot, state, motion, action_b, gate_w, step, noise)
+        return state, wrench._replace(force_b=np.where(step[:, None] == 7, 1e5, wrench.force_b))
+
+    monkeypatch.setattr(module, "autopilot_step", kicked)
+    result = one(Steady(), straight(), world, Rules(speed_limit=100.0))
+    assert (result.ended_by, result.time_s) == ("diverged", pytest.approx(8 * 0.002))
+    assert all(map(math.isfinite, result[10:16])) and list(tmp_path.iterdir()) == []
+
+
+def test_collision_at_the_start():
+    result = one(Pursuit(), straight(wall_at=0.0), "mujoco")
+    assert (result.ended_by, result.time_s, result.collided_with) == ("collision", 0.0, "the wall")
+    assert result.v_max == 0.0

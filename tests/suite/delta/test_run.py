@@ -1,0 +1,56 @@
+"""From flight logs to a checkpoint with its report."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eval.logs.flight_log import write_flight
+from policies.formats.delta_file import load_delta
+from suite.common.console import Console
+from suite.delta.fit import FitConfig
+from suite.delta.replay import nominal_model
+from suite.delta.run import fit_delta, split, table
+from suite.train.config import PointMassConfig
+from tests.support.point_mass_flights import fly
+
+PHYSICS = PointMassConfig(drag=(0.3, 0.3), drag_up=(0.3, 0.3), action_delay=(0.5, 0.5))
+
+
+def test_logs_become_a_checkpoint_with_its_report(tmp_path):
+    (tmp_path / "logs").mkdir()
+    for i, log in enumerate(fly(nominal_model(PHYSICS), 3)):
+        thrust = np.full_like(log.time_s, 9.81)
+        commanded = replace(log, thrust_cmd=thrust, rate_cmd_b=log.rate_b)
+        write_flight(tmp_path / "logs" / f"{i}.parquet", commanded)
+    config = FitConfig(horizon_s=0.6, iterations=3, batch=8, held_out=0.4)
+    result = fit_delta(config, PHYSICS, [tmp_path / "logs"], tmp_path / "out", Console())
+    stored = load_delta(tmp_path / "out" / "delta").params
+    for name, value in result.params.items():
+        np.testing.assert_array_equal(stored[name], value)
+    assert (tmp_path / "out" / "table.md").read_text() == table(result, 0.6)
+    with pytest.raises(ValueError, match="no flight logs in"):
+        fit_delta(config, PHYSICS, [tmp_path / "out"], tmp_path / "again", Console())
+    assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize("share", [0.01, 0.25, 0.5, 0.99])
+def test_a_split_has_no_overlap_and_leaves_nobody_out(share):
+    logs = fly(nominal_model(PointMassConfig()), 7, seconds=1.5)
+    for seed in range(5):
+        known, held = split(logs, share, seed)
+        names = [log.name for log in (*known, *held)]
+        assert sorted(names) == sorted(log.name for log in logs) and len(set(names)) == 7
+        assert known and len(held) == min(6, max(1, round(share * 7)))
+    assert [log.name for log in split(logs, 0.5, 0)[1]] != [
+        log.name for log in split(logs, 0.5, 1)[1]
+    ]
+
+
+def test_what_cannot_be_split_is_refused():
+    log = fly(nominal_model(PointMassConfig()), 1, seconds=1.5)
+    with pytest.raises(ValueError, match="1 flight given, at least 2"):
+        split(log, 0.25, 0)
+    for share in (0.0, 1.0, float("nan")):
+        with pytest.raises(ValueError, match=f"held_out is {share}"):
+            split(log * 2, share, 0)

@@ -1,0 +1,53 @@
+"""Trajectories flown in MuJoCo: what is recorded, and what cannot be flown."""
+
+import numpy as np
+import pytest
+
+from eval.quadrotor.plant import Wrench, make_plant
+from eval.quadrotor.rigid_body import accelerations
+from eval.quadrotor.stepper import Inputs, PlantState, plant_step
+from suite.diagnose.plans.simulate import FULL_V, FlightFailed, fly
+from suite.diagnose.plans.trajectory import Trajectory
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+
+WAYS = [Trajectory("figure_eight", 1.5, speed=2.0), Trajectory("hover", 1.0)]
+VEHICLE = with_effects(with_lag(PLAIN, 0.03), linear_drag=((0.3, 0.3, 0.1),))
+
+
+class Wind:
+    """A push along x, and commands that are a tenth too strong."""
+
+    def command(self, command, time_s):
+        return command._replace(thrust=1.1 * command.thrust)
+
+    def wrench(self, motion, wrench, time_s, dt):
+        return Wrench(np.full_like(motion.pos_w, [0.3, 0.0, 0.0]), np.zeros_like(motion.pos_w))
+
+
+def test_a_recording_is_what_the_stepper_makes_of_its_commands():
+    flight, hover = fly(PLAIN, VEHICLE, WAYS, extra=Wind())
+    assert (len(flight.time_s), len(hover.time_s), flight.period) == (750, 500, 5)
+    np.testing.assert_allclose(flight.acting.thrust, 1.1 * flight.command.thrust)
+    np.testing.assert_array_equal(flight.extra.force_b, np.tile([0.3, 0.0, 0.0], (750, 1)))
+    assert FULL_V == flight.voltage[0] > flight.voltage[-1]
+    plant = make_plant(VEHICLE, flight.dt)
+    state = PlantState(flight.rotor_speed, np.zeros((750, 4, 0)), {})
+    state, wrench = plant_step(plant, state, flight.motion, Inputs(flight.acting), flight.time_s)
+    np.testing.assert_allclose(state.rotor_speed[:-1], flight.rotor_speed[1:], rtol=1e-12)
+    wrench = wrench._replace(force_b=wrench.force_b + flight.extra.force_b)
+    np.testing.assert_allclose(wrench.force_b[:-1] / 0.75, flight.acc_b[1:], atol=1e-9)
+    acc_w, turn_b = accelerations(plant, flight.motion, wrench)
+    moved = np.diff(flight.motion.vel_w, axis=0) / flight.dt
+    np.testing.assert_allclose(moved, acc_w[:-1], atol=1e-8)
+    turned = np.diff(flight.motion.rate_b, axis=0) / flight.dt
+    np.testing.assert_allclose(turned, turn_b[:-1], atol=1e-8)
+
+
+def test_a_flight_into_the_ground_fails_with_its_time():
+    with pytest.raises(FlightFailed, match=r"flight 1 failed at \d\.\d\d s.*gentler"):
+        fly(PLAIN, VEHICLE, [Trajectory("hover", 1.0, height=0.0)])
+
+
+def test_a_rate_must_divide_the_rate_loops():
+    with pytest.raises(ValueError, match="rate_hz = 130: must divide .* 500 Hz"):
+        fly(PLAIN, VEHICLE, WAYS, rate_hz=130.0)

@@ -1,0 +1,71 @@
+"""Effects at their usual size, and sweeps that grow from the vehicle as it is."""
+
+import numpy as np
+import pytest
+
+from eval.effects import EFFECTS
+from eval.judging.sensors import SensorNoise
+from eval.quadrotor.vehicle_file import load_vehicle
+from suite.experiments.study.conditions import (
+    effect_conditions,
+    log_faults,
+    sweep_conditions,
+    sweeps,
+)
+from tests.support.vehicles import with_effects
+
+VEHICLE = load_vehicle("reference")
+
+
+def test_every_effect_that_touches_a_flight_is_flown_at_its_usual_size():
+    conditions = effect_conditions(VEHICLE)
+    flown = {condition.name for condition in conditions}
+    assert flown | set(log_faults()) == set(EFFECTS) and len(log_faults()) == 3
+    for condition in conditions:
+        assert condition.vehicle.effects[condition.name] is not None
+        others = {k: v for k, v in condition.vehicle.effects.items() if k != condition.name}
+        own = {k: v for k, v in VEHICLE.effects.items() if k != condition.name}
+        assert others == own and condition.noise == SensorNoise()
+    by_words = {(c.name, c.words): c.vehicle.effects[c.name] for c in conditions}
+    # The vehicle has drag of its own; what is more of the two stays, axis by axis.
+    assert by_words["linear_drag", "coefficient (0.5, 0.5, 0.72) 1/s"].coefficient[2] == 0.72
+    assert by_words["motor_lag", "time_constant 0.06 s"].time_constant == 0.06
+    assert by_words["command_delay", "delay 0.04 s"].delay == 0.04
+    assert by_words["thrust_scale", "scale 0.85"].scale == pytest.approx(0.85)
+    assert by_words["thrust_scale", "scale 1.15"].scale == pytest.approx(1.15)
+    assert by_words["weak_motor", "scale (0.85, 1, 1, 1)"].scale[0] == pytest.approx(0.85)
+    assert np.linalg.norm(by_words["constant_wind", "velocity (-3, 4, 0) m/s"].velocity) == 5
+    assert np.linalg.norm(
+        by_words["com_offset", "offset (0.006, 0.008, 0) m"].offset
+    ) == pytest.approx(0.01)
+
+
+def test_sweeps_begin_at_the_vehicle_as_it_is_and_grow():
+    for sweep in sweeps(VEHICLE):
+        first, *rest = sweep_conditions(VEHICLE, sweep)
+        assert first.vehicle is VEHICLE and first.noise == SensorNoise() and len(rest) >= 4
+        assert list(sweep.sizes) == sorted(set(sweep.sizes))
+        seen = [(repr(c.vehicle), c.noise) for c in (first, *rest)]
+        assert len(set(seen)) == len(seen), sweep.name
+    named = {sweep.name: sweep for sweep in sweeps(VEHICLE)}
+    assert named["motor lag"].sizes[0] == pytest.approx(30)
+    assert named["latency"].sizes[0] == pytest.approx(30)
+    heavy, _ = named["mass"].make(VEHICLE, 40)
+    assert heavy.effects["mass_offset"].offset == pytest.approx(0.3)
+    drag, _ = named["drag"].make(VEHICLE, 4)
+    assert drag.effects["linear_drag"].coefficient == pytest.approx((0.72, 0.72, 2.88))
+    assert drag.effects["quadratic_drag"].coefficient == pytest.approx((0.04, 0.04, 0.16))
+    late, _ = named["latency"].make(VEHICLE, 80)
+    assert late.effects["command_delay"].delay == pytest.approx(0.08)
+    _, noise = named["state-estimation noise"].make(VEHICLE, 2)
+    assert (noise.pos_m, noise.vel) == pytest.approx((0.06, 0.2))
+    assert noise.attitude_rad == pytest.approx(np.radians(2)) and noise.correlation_s == 0.5
+
+
+def test_sweeps_of_a_vehicle_with_effects_begin_at_those():
+    own = with_effects(VEHICLE, mass_offset=(0.15,), constant_wind=((3.0, -4.0, 0.0),))
+    named = {sweep.name: sweep for sweep in sweeps(own)}
+    assert named["mass"].sizes == (pytest.approx(20), 40, 60)
+    assert named["wind"].sizes == (5.0, 6, 8)
+    heavy = sweep_conditions(own, named["mass"])[1].vehicle
+    assert heavy.effects["mass_offset"].offset == pytest.approx(0.3)

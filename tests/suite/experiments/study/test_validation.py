@@ -1,0 +1,134 @@
+"""The validation on worlds built by hand: who coasts through, who must hit, and when it ends."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from suite.experiments.study.validation import (
+    make_flight,
+    make_validation,
+    measured,
+    scored,
+    validation_worlds,
+)
+from suite.train.rollout import BODY_RADIUS_M
+from suite.train.worlds import sample_worlds
+from tests.support.training import boxes_only, fresh_params, small_config
+from tracks.geometry.scene import Boxes, Gates
+
+CONFIG = small_config(
+    batch=2, gates=2, physics={"drag": (0.0, 0.0), "wind_std": (0, 0, 0), "time_step_std": 0.0}
+)
+FLOWN = validation_worlds(CONFIG, 2, 9, 1.0)
+SPEED, FAR = 6.0, 50.0
+
+
+def params():
+    """Return a policy that never accelerates: it coasts."""
+    return {k: v * (k.split(".")[0] != "action") for k, v in fresh_params().items()}
+
+
+def note(worlds, before, body, target):
+    return jnp.ones_like(body.pos_w[:, 0]) * (1 + target)
+
+
+@cache
+def flight():
+    """Return the flight, compiled once."""
+    return make_flight(FLOWN, note)
+
+
+def measure(worlds):
+    """Return what coasting through these worlds comes to."""
+    return measured(flight()(params(), worlds))
+
+
+def straight(wall_x):
+    """Return two worlds: gates 2 m and 4 m ahead, 6 m/s, and a wall across the second's path."""
+    worlds = sample_worlds(FLOWN, 0)
+    scene = boxes_only(worlds.scene)
+    x = np.array([2.0, 4.0])
+    center = np.stack([x, 0 * x, 0 * x + 1.5], -1)
+    square = 0.6 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    sizes = np.full((2, 2), 0.2)
+    gates = Gates(
+        np.broadcast_to(center, (2, 2, 3)),
+        np.broadcast_to(np.eye(3), (2, 2, 3, 3)),
+        np.broadcast_to(square, (2, 2, 4, 2)),
+        sizes,
+        sizes,
+    )
+    walls = np.full((2, 8, 3), 1e3)
+    walls[1, 0] = [wall_x, 0, 1.5]
+    boxes = Boxes(
+        walls, np.broadcast_to(np.eye(3), (2, 8, 3, 3)), np.full((2, 8, 3), [0.1, 3.0, 3.0])
+    )
+    scene = scene._replace(gates=gates, boxes=boxes)
+    scene = jax.tree.map(lambda array: np.asarray(array, np.float32), scene)
+    row = np.ones((2, 1), np.float32)
+    return worlds._replace(
+        scene=scene,
+        pos_w=row * np.array([0, 0, 1.5], np.float32),
+        vel_w=row * np.array([SPEED, 0, 0], np.float32),
+        heading_w=row * np.array([1, 0, 0], np.float32),
+    )
+
+
+def test_a_straight_flight_through_two_gates_is_a_success():
+    numbers = measure(straight(wall_x=FAR))
+    assert numbers["success_cross"] == numbers["success_rate"] == 1.0
+    assert numbers["gates"] == 2 and numbers["v_max"] == pytest.approx(SPEED)
+    # 0.2 m a step: the first gate in step 10 or 11 and the last in step 20 or 21, the trial's end.
+    assert numbers["reward"] == pytest.approx(10 * 1 + 10 * 2, abs=2)
+
+
+def test_a_wall_in_one_of_two_worlds_is_one_collision_and_ends_that_trial():
+    numbers = measure(straight(wall_x=3.0))
+    assert numbers["success_cross"] == numbers["success_rate"] == 0.5
+    assert numbers["gates"] == 1.5 and numbers["v_max"] == pytest.approx(SPEED)
+
+
+def test_a_wall_behind_the_last_gate_is_no_collision():
+    assert measure(straight(wall_x=5.5))["success_rate"] == 1.0
+
+
+def test_whoever_falls_faster_than_the_policy_can_brake_collides():
+    worlds = straight(wall_x=FAR)
+    falling = worlds._replace(vel_w=np.array([[0, 0, -20]] * 2, np.float32))
+    numbers = measure(falling)
+    assert numbers["success_rate"] == numbers["success_cross"] == numbers["gates"] == 0.0
+
+
+def test_scores_by_hand():
+    clear, near = 1.0, BODY_RADIUS_M - 1e-3
+    passed = np.array([[1, 1, 0, 1], [1, 0, 0, 1], [0, 1, 0, 0], [1, 1, 0, 0]], bool)
+    clearance = np.array(
+        [[clear] * 4, [clear, near, clear, near], [near, clear, clear, clear], [clear] * 4]
+    )
+    speed = np.array([[1.0, 4, 2, 1], [2, 5, 3, 2], [9, 9, 4, 9], [9, 9, 1, 9]])
+    arrays = jnp.asarray(passed), jnp.asarray(clearance), jnp.asarray(speed)
+    found = scored(*arrays, 2, jnp.ones((4, 4)))
+    # Both gates in two steps, a hit after it; a hit in step two; nothing; both in one step.
+    assert found.gates.tolist() == [2, 1, 0, 1]
+    assert found.crossed.tolist() == [True, False, False, False]
+    assert found.collided.tolist() == [False, True, False, True]
+    assert found.v_max.tolist() == [2, 5, 4, 2]
+    assert found.reward.tolist() == [2, 2, 4, 2]
+
+
+def test_worlds_are_fresh_fixed_and_all_at_rest():
+    config = validation_worlds(CONFIG, 5, 9, 2.0)
+    one, two = sample_worlds(config, 0), sample_worlds(config, 0)
+    assert np.array_equal(one.pos_w, two.pos_w) and not one.vel_w.any() and not one.target.any()
+    assert one.scene.gates.center_w.shape[:2] == (5, 2) and config.episode.steps == 60
+    assert (one.fov_scale == 1).all()
+    trained = sample_worlds(validation_worlds(CONFIG, 5, CONFIG.seed, 2.0), 0)
+    assert not np.array_equal(one.pos_w, trained.pos_w)
+
+
+def test_a_trainings_own_seed_is_refused():
+    with pytest.raises(ValueError, match="--seed 0 is a training's seed"):
+        make_validation(CONFIG, 2, CONFIG.seed)

@@ -1,0 +1,34 @@
+"""Training seeds of one recipe: the median and the spread by hand, and the command."""
+
+import numpy as np
+import pytest
+
+from suite.experiments.seeds import repeats
+from tests.support.documents import page, reproduce
+from tests.support.judged_cells import cell
+
+
+def test_the_median_policy_and_the_repeats():
+    rates = {"a": (0.9, 0.7), "b": (1.0, 1.0), "c": (0.2, 0.4), "d": (0.9, 0.8)}
+    cells = {n: [cell("zigzag", k, r) for k, r in enumerate(of)] for n, of in rates.items()}
+    found = repeats({name: cells[name] for name in "abc"})
+    assert found.median == "a" and found.mean_success["c"] == pytest.approx(0.3)
+    assert found.mean == pytest.approx(0.7)
+    assert found.standard_deviation == pytest.approx(np.std([0.8, 1.0, 0.3], ddof=1))
+    assert repeats(cells).median == "a", "of an even number the lower of the middle two"
+    assert np.isnan(repeats({"a": cells["a"]}).standard_deviation)
+
+
+def test_seeds_are_trained_once_and_compared(sky, made, tmp_path):
+    recipe = ["--preset", "small", "--iterations", "3", "--set", "episode.batch=2"]
+    args = [*recipe, "--training-seeds", "0", "4", "--trials", "1"]
+    assert reproduce(tmp_path, "seeds", *args) == 0
+    assert [(c.seed, c.optimizer.iterations, c.episode.batch) for c in made] == [
+        (0, 3, 2),
+        (4, 3, 2),
+    ]
+    assert reproduce(tmp_path, "seeds", *args) == 0
+    assert len(made) == 2 and len(sky.flown) == 24
+    text, numbers = page(tmp_path, "seeds")
+    assert set(numbers["spread"]["mean_success"]) == {"seed 0", "seed 4"}
+    assert "small episode.batch=2" in text

@@ -1,0 +1,87 @@
+"""Three policies on the same trials, compared pair by pair."""
+
+import numpy as np
+import pytest
+
+from eval.judging.statistics import Interval, bootstrap_mean
+from eval.worlds.trial import TrialResult
+from suite.common.report import markdown, rich_table
+from suite.loop.compare import Line, compare, grids, points, told_apart, verdict
+
+
+def _result(seed, success, v_mean, gates=8, level=0):
+    ended = "finished" if success else "collision"
+    rest = dict.fromkeys(TrialResult._fields[-5:], 0)
+    return TrialResult(
+        "zigzag", level, seed, "p", "v", "w", success, gates, ended, None, 0.0, 0.0, 0.0,
+        5.0, v_mean + 1, v_mean, **rest,
+    )  # fmt: skip
+
+
+def test_differences_are_of_the_same_trials():
+    n = 40
+    speed = np.linspace(2, 6, n)
+    won = {"before": 10, "without": 20, "with": 30}
+    results = {
+        name: [
+            _result(k, k < count, speed[k] + 0.5 * (name == "with"), 8 if k < count else 3, k % 2)
+            for k in range(n)
+        ]
+        for name, count in won.items()
+    }
+    lines = compare(results)
+    assert [(line.track, line.difficulty, line.trials) for line in lines] == [
+        ("zigzag", 0, 20),
+        ("zigzag", 1, 20),
+        ("all", None, 40),
+    ]
+    overall = lines[-1]
+    assert [m.value for m in overall.success] == pytest.approx([0.25, 0.5, 0.75, 0.25, 0.5])
+    # 10 pairs, all one way: 2 / 2^10 by hand.
+    assert overall.p_value == pytest.approx(2 / 2**10)
+    assert overall.gates.with_minus_without.value == pytest.approx(5 * 0.25)
+    # Every trial is 0.5 m/s faster: no spread in pairs, whatever the spread between trials.
+    assert tuple(overall.v_mean.with_minus_without) == pytest.approx((0.5, 0.5, 0.5))
+    assert tuple(overall.v_max.with_minus_before) == pytest.approx((0.5, 0.5, 0.5))
+    assert overall.v_mean.before.high - overall.v_mean.before.low > 0.5
+    success = grids(lines)[0]
+    assert [cell.text for cell in success.rows[-1]][:4] == ["all", "all", "40", "25 [14, 40]"]
+    assert success.rows[-1][6].tone == "good" and success.rows[-1][6].text.startswith("+25 [+")
+    assert "75 % of 40 trials succeed: more than" in verdict(overall)
+    with pytest.raises(ValueError, match="same trials"):
+        compare({**results, "with": results["with"][::-1]})
+
+
+def test_no_difference_is_called_none():
+    rows = [_result(k, k < 5, 3.0) for k in range(10)]
+    lines: list[Line] = compare({"before": rows, "without": rows, "with": rows})
+    assert "not to be told from" in verdict(lines[-1])
+    cell = grids(lines)[0].rows[-1][6]
+    assert cell.tone == "" and cell.text.startswith("+0 [")
+    speed = grids(lines)[2].rows[-1][6]
+    assert speed.text == "+0.00 [+0.00, +0.00]"
+
+
+def test_tables_read_alike_as_markdown_and_in_a_terminal():
+    rows = [_result(k, k < 5, 3.0) for k in range(10)]
+    grid = grids(compare({"before": rows, "without": rows, "with": rows}))[0]
+    assert len(markdown(grid).splitlines()) == 2 + 2 + len(grid.rows)
+    table = rich_table(grid)
+    assert table.row_count == len(grid.rows) and len(table.columns) == len(grid.headers)
+
+
+def test_a_difference_is_told_by_its_interval():
+    assert told_apart(Interval(0.1, 0.01, 0.2)) == "more than"
+    assert told_apart(Interval(-0.1, -0.2, -0.01)) == "fewer than"
+    assert told_apart(Interval(0.1, 0.0, 0.2)) == "not to be told from"
+    assert points(Interval(-0.001, -0.05, 0.123)) == "+0 points [-5, +12]"
+
+
+def test_bootstrap_of_a_mean_is_that_of_the_central_limit():
+    values = np.random.default_rng(3).exponential(2.0, 400)
+    found = bootstrap_mean(values)
+    half = 1.96 * values.std() / np.sqrt(len(values))
+    assert found.value == pytest.approx(values.mean())
+    assert found.high - found.value == pytest.approx(half, rel=0.1)
+    assert found.value - found.low == pytest.approx(half, rel=0.1)
+    assert np.isnan(bootstrap_mean(np.array([]))).all()

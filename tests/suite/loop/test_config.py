@@ -1,0 +1,81 @@
+"""What a loop's options come to, and what is refused before anything is written."""
+
+import pytest
+
+from suite import cli
+from suite.loop.config import DeltaLoopConfig, HiddenLoopConfig, resolve
+from suite.train.presets import finetune, preset
+
+EXAMPLE = "examples/hidden.toml"
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--preset", "smal"], "Did you mean 'small'?"),
+        (["--policy", "nobody.onnx"], "needs a checkpoint's folder"),
+        (["--track", "my.toml"], "cannot be held apart"),
+        (["--track", "zigzg"], "Did you mean 'zigzag'?"),
+        (["--difficulty", "10"], "level 10 is not 0 to 9"),
+        (["--vehicle", "referense"], "Did you mean 'reference'?"),
+        (["--trials", "0"], "--trials is 0"),
+        (["--trials", "100001"], "--trials is 100001; it must be 100000 or less"),
+        (["--flights", "1", "--track", "zigzag", "--difficulty", "0"], "--flights is 1"),
+        (["--iterations", "0"], "--iterations is 0"),
+        (["--finetune-iterations", "0"], "--finetune-iterations is 0"),
+        (["--fit-iterations", "0"], "--fit-iterations is 0"),
+        (["--set", "loss.progres=1"], "Did you mean 'progress'?"),
+    ],
+)
+def test_what_cannot_be_used_is_said_before_anything_is_written(args, words, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert cli.main(["loop", *args, "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert words in said and len(said.strip().splitlines()) == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--world", "reference"], "nothing is hidden"),
+        (["--world", "nowhere.toml"], "nowhere.toml: no such file"),
+        (["--world", EXAMPLE, "--iterations", "5"], "--finetune-iterations"),
+        (["--world", EXAMPLE, "--policy", "nobody.onnx"], "needs a checkpoint's folder"),
+        (["--world", EXAMPLE, "--track", "my.toml"], "cannot be held apart"),
+        (["--world", EXAMPLE, "--flights", "0"], "--flights is 0"),
+        (["--world", EXAMPLE, "--set", "quadrotor.mas_std=0"], "Did you mean 'mass_std'"),
+    ],
+)
+def test_what_cannot_be_hidden_is_said_before_anything_is_written(
+    args, words, tmp_path, monkeypatch, root, capsys
+):
+    monkeypatch.chdir(root)
+    out = tmp_path / "out"
+    assert cli.main(["loop", *args, "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert words in said and len(said.strip().splitlines()) == 1
+    assert not out.exists()
+
+
+def test_fine_tuning_is_shorter_and_gentler():
+    base = preset("racer")
+    tuned = finetune(base, 0.1)
+    assert tuned.optimizer.iterations == round(0.1 * base.optimizer.iterations)
+    assert tuned.optimizer.rate < base.optimizer.rate
+    assert tuned.seed != base.seed and tuned.physics == base.physics
+
+
+def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
+    monkeypatch.chdir(root)
+    loop = resolve(recipe="small", seed=3, flights=4)
+    assert isinstance(loop, DeltaLoopConfig)
+    assert (loop.trials, loop.flights, loop.fit.iterations) == (20, 4, 500)
+    assert loop.tuning.optimizer.iterations == round(0.25 * loop.training.optimizer.iterations)
+    assert (loop.recorded_from, loop.cells, loop.true_vehicle) == (100_003, 6, "reference")
+    hidden = resolve(recipe="swift", world=EXAMPLE)
+    assert isinstance(hidden, HiddenLoopConfig)
+    assert (hidden.trials, hidden.flights, hidden.fit.iterations) == (50, 5, 400)
+    assert hidden.tuning.optimizer.iterations == 200 and hidden.tuning.quadrotor is not None
+    assert hidden.true_vehicle == EXAMPLE and hidden.policy == "swift"
+    assert set(hidden.digests) == {"vehicle", "world", "policy"}

@@ -1,0 +1,61 @@
+"""Flights as a state estimator would have logged them, cut before they touch anything."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eval.logs.flight_log import read_flights, write_flight
+from suite.delta.replay import nominal_model
+from suite.loop.measured import CONTACT_MARGIN_S, Noise, cut_end, enough, measure, noisy
+from suite.train.config import PointMassConfig
+from tests.support.point_mass_flights import fly
+
+
+@pytest.fixture(scope="module")
+def logs():
+    flown = fly(nominal_model(PointMassConfig()), 3, seconds=4.0)
+    thrust = np.full_like(flown[0].time_s, 9.81)
+    return [replace(log, thrust_cmd=thrust, rate_cmd_b=log.rate_b) for log in flown]
+
+
+def test_ends_are_cut_and_noise_is_of_its_size(logs):
+    log = logs[0]
+    short = cut_end(log, 0.5)
+    assert log.time_s[-1] - short.time_s[-1] == pytest.approx(0.5, abs=0.034)
+    assert len(short.pos_w) == len(short.extra["action_x"]) == len(short.time_s) < len(log.time_s)
+    shaken = noisy(log, Noise(), np.random.default_rng(0))
+    turn = np.einsum("nij,nik->njk", log.rot_w, shaken.rot_w)
+    angle = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1)
+    assert angle.std() == pytest.approx(Noise().attitude, rel=0.2)
+    assert (shaken.rate_b - log.rate_b).std() == pytest.approx(Noise().gyro, rel=0.2)
+    np.testing.assert_allclose(np.linalg.norm(shaken.quat_wxyz, axis=1), 1, atol=1e-12)
+    np.testing.assert_array_equal(shaken.thrust_cmd, log.thrust_cmd)
+
+
+def test_crashed_flights_lose_their_end_and_short_ones_are_left_out(logs, tmp_path):
+    flights, rows = tmp_path / "flights", []
+    ends = ("collision", "timeout", "finished")
+    for number, (log, ended_by) in enumerate(zip(logs, ends, strict=True)):
+        # The last is too short to be used.
+        kept = log if number < 2 else cut_end(log, log.duration_s - 1.2)
+        write_flight(flights / f"{number}.parquet", kept)
+        rows.append({"file": f"{number}.parquet", "track": "zigzag", "difficulty": 0})
+        rows[-1]["ended_by"] = ended_by
+    rows.append({"file": None, "track": "zigzag", "difficulty": 0, "ended_by": "collision"})
+    (flights / "flights.json").write_text(json.dumps({"flights": rows}))
+    files = measure(flights, tmp_path / "out", 0)
+    assert [file.name for file in files] == ["0.parquet", "1.parquet"]
+    before, after = (
+        [read_flights([folder / file.name])[0][0].duration_s for file in files]
+        for folder in (flights, tmp_path / "out")
+    )
+    assert before[0] - after[0] == pytest.approx(CONTACT_MARGIN_S, abs=0.034)
+    assert before[1] == after[1]
+    assert enough(files, 1.0) == files
+    for row in rows:
+        row["file"] = None
+    (flights / "flights.json").write_text(json.dumps({"flights": rows}))
+    with pytest.raises(ValueError, match="no flight in .* is 1.5 s long"):
+        measure(flights, tmp_path / "none", 0)

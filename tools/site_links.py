@@ -1,0 +1,31 @@
+"""What `make docs` does to a page's links that lead out of docs/: the site holds no such files.
+
+On a page read in the repository such a link opens a file; in the site its path stands there
+instead. A link to a file that does not exist ends the build.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\(((?:\.\./)+[^)#\s]+)(?:#[^)]*)?\)")
+"""A link, not a picture, that climbs at least one folder."""
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
+    """Return a page's text with links out of docs/ as paths within the repository."""
+    docs = Path(config["docs_dir"]).resolve()
+    here = (docs / page.file.src_uri).parent
+
+    def named(match: re.Match[str]) -> str:
+        text, target = match[1], (here / match[2]).resolve()
+        if target.is_relative_to(docs):
+            return match[0]
+        if not target.exists():
+            raise FileNotFoundError(f"{page.file.src_uri}: links to {match[2]}, which is not there")
+        path = f"`{target.relative_to(docs.parent)}`"
+        return path if text.strip("`") in (target.name, path.strip("`")) else f"{text} ({path})"
+
+    return OUTSIDE.sub(named, markdown)
