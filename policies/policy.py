@@ -16,9 +16,9 @@ Hidden = Any
 """What a policy remembers of n trials; only the policy itself looks inside."""
 
 SUFFIXES = {
-    ".pt2": "torch exported program",
-    ".pt": "TorchScript, needs trust",
     ".onnx": "ONNX",
+    ".pt2": "torch exported program, needs trust",
+    ".pt": "TorchScript, needs trust",
 }
 """Kinds of policy file by suffix; a folder is a checkpoint of ours."""
 
@@ -62,11 +62,10 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
     """Return a policy to fly.
 
     Args:
-        name_or_path: the name of a shipped policy, a checkpoint's folder, or a file: .pt2 (torch
-            exported program), .onnx, .pt (TorchScript).
-        trust: also load what can run code on this machine while it is being loaded. Without it
-            only checkpoints of ours, ONNX of standard operators and torch programs of known
-            operators are.
+        name_or_path: the name of a shipped policy, a checkpoint's folder, or a file: .onnx, .pt2
+            (torch exported program), .pt (TorchScript).
+        trust: also load what can run code on this machine while it is being loaded: .pt2 and .pt.
+            Checkpoints of ours and ONNX of standard operators need none.
 
     Raises:
         PolicyError: for an unknown name, or a file that cannot be used or is not safe; the message

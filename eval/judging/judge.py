@@ -8,8 +8,9 @@ is shared between trials.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ import numpy as np
 from eval.judging.guard import ActionLimits, guard_action
 from eval.judging.recorder import Recorder
 from eval.judging.sensors import SensorNoise, Sensors, check_noise
-from eval.judging.sharding import fly_in_processes, usable_cores
 from eval.logs.flight import Flight
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import REFERENCE, World, world_class
@@ -34,11 +34,16 @@ from eval.worlds.trial import (
 )
 from policies.observation import observe
 from policies.policy import Policy
+from tracks.common.work import usable_cores, work_off
 from tracks.families import check_family
 from tracks.track import Track
 
 OnResult = Callable[[TrialResult, Flight | None], None]
 """Called with each trial as it ends, in no set order; the flight where flights are recorded."""
+Numbered = tuple[int, TrialSpec]
+"""A trial and its place among those asked for."""
+Ended = tuple[int, TrialResult, Flight | None]
+"""The place of a trial, what came of it, and its flight where flights are recorded."""
 
 
 @dataclass(frozen=True)
@@ -68,15 +73,15 @@ class JudgeOptions:
 
 
 @dataclass(frozen=True)
-class _Task:
-    """What every process needs to know to fly its share."""
+class Task:
+    """What a process needs to know to fly its share; the fields are those of `fly`."""
 
     policy: Any
     vehicle: Vehicle
-    world: str
-    options: JudgeOptions
-    record: Record | None
-    tracks: Mapping[str, Track]
+    world: str = "mujoco"
+    options: JudgeOptions = field(default_factory=JudgeOptions)
+    record: Record | None = None
+    tracks: Mapping[str, Track] = field(default_factory=dict)
 
 
 def fly(
@@ -107,7 +112,7 @@ def fly(
     Raises:
         ValueError: for an unknown world or track, noise that cannot be, a policy faster than the
             physics, or a policy that returns something else than actions.
-        RuntimeError: where a process of its own died.
+        WorkerDied: where a process of its own died.
     """
     options = options or JudgeOptions()
     world_class(world)
@@ -119,19 +124,20 @@ def fly(
         raise ValueError(
             "world 'reference' records no flights; record in 'mujoco', which flies alike"
         )
-    task = _Task(policy, vehicle, world, options, record, tracks or {})
+    task = Task(policy, vehicle, world, options, record, tracks or {})
     results: dict[int, TrialResult] = {}
 
-    def keep(index: int, result: TrialResult, flight: Flight | None) -> None:
+    def keep(share: int, ended: Ended) -> None:
+        index, result, flight = ended
         results[index] = result
         if on_result:
             on_result(result, flight)
 
     processes = _process_count(task, len(trials))
-    if processes > 1:
-        fly_in_processes(_fly_share, task, list(enumerate(trials)), processes, keep)
-    else:
-        _fly_share(task, list(enumerate(trials)), keep)
+    numbered = list(enumerate(trials))
+    # Every k-th trial, as neighbours, which are alike, then spread over the processes.
+    shares = [numbered[k::processes] for k in range(processes)]
+    work_off(partial(fly_share, task), shares, processes, keep)
     return [results[index] for index in range(len(trials))]
 
 
@@ -140,7 +146,7 @@ def _is_policy(policy: object) -> bool:
     return hasattr(policy, "act") and not isinstance(policy, type)
 
 
-def _process_count(task: _Task, trials: int) -> int:
+def _process_count(task: Task, trials: int) -> int:
     if task.options.processes is not None:
         return max(1, min(task.options.processes, trials))
     # A process takes seconds to start, and a policy object may not be of the kind that travels.
@@ -149,41 +155,29 @@ def _process_count(task: _Task, trials: int) -> int:
     return usable_cores()
 
 
-def _fly_share(
-    task: _Task,
-    share: list[tuple[int, TrialSpec]],
-    emit: Callable[[int, TrialResult, Flight | None], None],
-) -> None:
-    """Fly numbered trials in this process."""
+def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
+    """Fly numbered trials in this process and yield each as it ends."""
     policy = task.policy if _is_policy(task.policy) else task.policy()
+    options = task.options
     if task.world == REFERENCE:
         for index, trial in share:
-            track = track_of(task.tracks, trial)
-            options = task.options
             result = world_class(REFERENCE)(
-                policy,
-                trial,
-                track,
-                task.vehicle,
-                options.rules,
-                options.limits,
-                options.slots,
-                options.noise,
-            )
-            emit(index, result, None)
+                policy, trial, track_of(task.tracks, trial), task.vehicle, options.rules,
+                options.limits, options.slots, options.noise,
+            )  # fmt: skip
+            yield index, result, None
         return
-    layout = layout_of(task.tracks.values())
     world = world_class(task.world)(
-        task.vehicle, policy.spec.camera, layout, task.options.rules,
-        slots=task.options.slots, threads=task.options.threads,
+        task.vehicle, policy.spec.camera, layout_of(task.tracks.values()), options.rules,
+        slots=options.slots, threads=options.threads,
     )  # fmt: skip
-    _Slots(task, policy, world).run(share, emit)
+    yield from _Slots(task, policy, world).run(share)
 
 
 class _Slots:
     """The slots of a world with the trial and the policy's memory in each."""
 
-    def __init__(self, task: _Task, policy: Policy, world: World) -> None:
+    def __init__(self, task: Task, policy: Policy, world: World) -> None:
         rate = policy.spec.rate_hz
         if not 0 < rate <= 1 / world.dt * (1 + 1e-9):
             raise ValueError(
@@ -204,11 +198,7 @@ class _Slots:
         noise, range_m = task.options.noise, policy.spec.camera.range_m
         self._sensors = None if noise.is_none else Sensors(noise, n, rate, range_m)
 
-    def run(
-        self,
-        share: list[tuple[int, TrialSpec]],
-        emit: Callable[[int, TrialResult, Flight | None], None],
-    ) -> None:
+    def run(self, share: Sequence[Numbered]) -> Iterator[Ended]:
         """Fly the numbered trials; every slot takes the next one when its own has ended."""
         waiting = list(reversed(share))
         while waiting or (self._index >= 0).any():
@@ -221,9 +211,9 @@ class _Slots:
                 if self._recorder:
                     flight = self._recorder.finish(int(slot), result._asdict())
                 self._index[slot] = -1
-                emit(index, result, flight)
+                yield index, result, flight
 
-    def _fill(self, waiting: list[tuple[int, TrialSpec]]) -> None:
+    def _fill(self, waiting: list[Numbered]) -> None:
         entries = []
         for slot in np.flatnonzero(self._index < 0).tolist():
             if not waiting:

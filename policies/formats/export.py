@@ -18,7 +18,7 @@ from tracks.common.names import unknown_name
 def export_policy(
     name_or_folder: str | Path, out: Path, formats: Iterable[str] = ("torch", "onnx")
 ) -> list[Path]:
-    """Write a policy of ours as torch program and ONNX; `load_policy` reads both.
+    """Write a policy of ours as torch program and ONNX; `load_policy` reads both (.pt2 with trust).
 
     Args:
         name_or_folder: a shipped policy's name or a checkpoint's folder.

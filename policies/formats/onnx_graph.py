@@ -1,6 +1,9 @@
 """Our network as an ONNX graph of standard operators, built node by node.
 
-Opset 17 and IR version 8 (2022) are old enough for the runtimes on companion computers.
+Opset 17 and IR version 8 (2022) are old enough for the runtimes on companion computers. Torch's own
+exporters (2.13) cannot give this graph of `torch_twin`: the one over TorchScript (`dynamo=False`)
+takes the GRU apart into fifteen operators and warns that it will be removed; the one over
+`torch.export` does so too, writes IR version 10 and needs the package onnxscript.
 """
 
 from __future__ import annotations

@@ -1,9 +1,13 @@
-"""Torch exported programs (.pt2) and TorchScript (.pt) as `Policy`, on one CPU thread."""
+"""Torch exported programs (.pt2) and TorchScript (.pt) as `Policy`, on one CPU thread.
+
+Neither is loaded without trust: `torch.jit.load` runs what a file says by design, and
+`torch.export.load` unpickles sample inputs and some weights, resolves operators by dotted paths and
+evaluates expressions, all from the file; torch has no safe mode for it.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import io
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,30 +20,21 @@ from policies.block_policy import BlockPolicy, proven
 from policies.errors import PolicyError
 from policies.formats.embedded_spec import KEY, extract
 from policies.formats.program_inputs import INPUTS, check_inputs, inputs_message
-from policies.formats.torch_archive import safe_archive
 from policies.spec import ACTION_SIZE
 
 
 def load_program(path: Path, trust: bool = False) -> BlockPolicy:
     """Return the policy of a torch exported program.
 
-    Args:
-        path: the .pt2 file.
-        trust: hand the file to torch as it is, unchecked; that can run code that it holds.
-
     Raises:
-        PolicyError: where the file is damaged, not safe, or its inputs and outputs do not fit.
+        PolicyError: without trust, or where the file is damaged or its inputs and outputs do not
+            fit.
     """
+    _check_trusted(path, "a torch exported program", trust)
     extra = {KEY: ""}
-    if trust:
-        with _refusing(path):
-            program = torch.export.load(path, extra_files=extra)
-        spec = extract(extra[KEY], str(path))
-    else:
-        archive = safe_archive(path)
-        spec = extract(archive.spec_text, str(path))
-        with _refusing(path):
-            program = torch.export.load(io.BytesIO(archive.data))
+    with _refusing(path):
+        program = torch.export.load(path, extra_files=extra)
+    spec = extract(extra[KEY], str(path))
     inputs = program.graph_signature.user_inputs
     values = {node.name: node.meta.get("val") for node in program.graph.nodes}
     shapes = {str(name): tuple(getattr(values.get(str(name)), "shape", ())) for name in inputs}
@@ -57,11 +52,7 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
         PolicyError: without trust, or where it is no TorchScript or its inputs and outputs do not
             fit.
     """
-    if not trust:
-        raise PolicyError(
-            f"{path}: TorchScript can run any code while it is loaded; if you trust who made the "
-            "file, pass --trust; to share a policy, export it as .pt2 or .onnx instead"
-        )
+    _check_trusted(path, "TorchScript", trust)
     extra = {KEY: ""}
     with _refusing(path):
         module = torch.jit.load(str(path), map_location="cpu", _extra_files=extra).eval()
@@ -72,6 +63,15 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
     hidden_shape = (spec.hidden_size,) if names == INPUTS else (0,)
     model = _as_model(module, path, hidden_shape)
     return proven(BlockPolicy(path.name, spec, model, hidden_shape), str(path))
+
+
+def _check_trusted(path: Path, kind: str, trust: bool) -> None:
+    if not trust:
+        raise PolicyError(
+            f"{path}: {kind} can run any code of its maker's while torch loads it; if you trust "
+            "who made the file, pass --trust; a policy to be shared needs none as .onnx "
+            "(torch.onnx.export; suite export for one of ours)"
+        )
 
 
 def _as_model(module: Callable[..., Any], path: Path, hidden_shape: tuple[int, ...]) -> Any:

@@ -36,7 +36,9 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     A `ValueError` counts as a message to the user only where our own code raised it on purpose
     (or its class is ours): one that numpy or a cast threw is a bug.
     """
-    if isinstance(error, WorkFailed):
+    from tracks.common.work import WorkerDied
+
+    if isinstance(error, (WorkFailed, WorkerDied)):
         return FAILED, str(error)
     if isinstance(error, OSError):
         return _explain_os(error)

@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from eval.judging.sharding import usable_cores
 from tracks.common.files import write_json
 from tracks.common.provenance import stamp
+from tracks.common.work import usable_cores
 
 PACKAGES = (
     "numpy",

@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from eval.judging.sharding import usable_cores
 from suite.common.choices import is_track_file
+from tracks.common.work import usable_cores
 
 if TYPE_CHECKING:
     from eval.judging.judge import JudgeOptions

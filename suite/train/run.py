@@ -14,7 +14,6 @@ import jax
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from eval.judging.sharding import usable_cores
 from policies.networks import delta_network, network
 from suite.common.console import Console
 from suite.common.estimate import Estimate
@@ -24,6 +23,7 @@ from suite.train.repeat import Method, Outcome, Run, Watch, repeat
 from suite.train.update import device_mesh, make_update, start_state
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
+from tracks.common.work import usable_cores
 
 STEPS_PER_CORE_S = 5000.0
 """Gradient steps a second that one processor core makes, for the estimate."""

@@ -59,7 +59,7 @@ def test_a_file_cut_anywhere_is_refused_by_name(exported, tmp_path_factory, file
     data = (exported / file).read_bytes()
     path.write_bytes(data[: int(keep * len(data))])
     with pytest.raises(PolicyError) as caught:
-        load_policy(path)
+        load_policy(path, trust=True)
     assert str(path) in str(caught.value)
 
 
@@ -83,7 +83,7 @@ def program(folder, module, *shapes, free=True):
 @pytest.mark.parametrize(("rows", "free"), [(2, True), (5, False), (1, False)])
 def test_a_policy_without_memory_and_of_any_batch_flies(tmp_path, rows, free):
     path = program(tmp_path, Reactive(), (rows, 12), (rows, 24, 32), free=free)
-    policy = load_policy(path)
+    policy = load_policy(path, trust=True)
     assert isinstance(policy, BlockPolicy)
     assert policy.block == (64 if free else rows)
     state = np.random.default_rng(0).normal(size=(7, 12)).astype(np.float32)
@@ -120,7 +120,7 @@ class TooFew(torch.nn.Module):
 )
 def test_a_program_that_does_not_fit_is_told_what_does(tmp_path, module, shapes, said):
     with pytest.raises(PolicyError, match=said):
-        load_policy(program(tmp_path, module, *shapes))
+        load_policy(program(tmp_path, module, *shapes), trust=True)
 
 
 def test_torchscript_needs_trust_and_then_flies(tmp_path):

@@ -19,7 +19,7 @@ from policies.spec import PolicySpec
 @pytest.fixture(scope="module", params=["native", "torch", "onnx"])
 def policy(request, checkpoint, exported):
     files = {"native": checkpoint, "torch": "tiny.pt2", "onnx": "tiny.onnx"}
-    return load_policy(exported / files[request.param])
+    return load_policy(exported / files[request.param], trust=True)
 
 
 def observe(seed, n):

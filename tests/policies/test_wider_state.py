@@ -95,7 +95,7 @@ def test_checkpoint_torch_and_onnx_are_one_policy(tmp_path, kind, spec, request)
     expected = actions(ours, spec.state_size)
     assert np.abs(expected).std() > 1.0
     for path in export_policy(folder, tmp_path):
-        theirs = load_policy(path)
+        theirs = load_policy(path, trust=True)
         assert theirs.spec == spec
         np.testing.assert_allclose(actions(theirs, spec.state_size), expected, atol=5e-5, rtol=1e-5)
 

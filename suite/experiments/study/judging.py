@@ -6,17 +6,17 @@ cache, and each trial goes there as it ends; documents that share flights share 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
-from eval.judging.judge import JudgeOptions, fly
+from eval.judging.judge import JudgeOptions, Task, fly_share
 from eval.judging.results import Journal
 from eval.judging.sensors import SensorNoise
-from eval.judging.sharding import fly_in_processes, usable_cores
 from eval.judging.tables import Cell, summarise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult, TrialSpec
@@ -33,6 +33,7 @@ from suite.judging.flying import (
     policy_digest,
     trial_list,
 )
+from tracks.common.work import usable_cores, work_off
 from tracks.families import JUDGED
 
 Key = TypeVar("Key", bound=Hashable)
@@ -98,15 +99,15 @@ def flown(
             numbers, open_journals = count(total - left + 1), list(journals.values())
             with console.progress(what, total) as update:
 
-                def keep(number: int, result: TrialResult) -> None:
+                def keep(piece: int, ended: tuple[int, TrialResult]) -> None:
+                    number, result = ended
                     open_journals[number].append(result)
                     update(next(numbers))
 
-                work = list(fliers.values()), _shares(missing, processes)
-                if processes > 1:
-                    fly_in_processes(_fly_shares, *work, processes, keep)
-                else:
-                    _fly_shares(*work, keep)
+                shares = _shares(missing, processes)
+                pieces = [shares[k::processes] for k in range(processes)]
+                work = partial(_fly_shares, list(fliers.values()))
+                work_off(work, pieces, processes, keep)
     return {
         key: [journals[names[key]].done[trial] for trial in order.trials]
         for key, order in orders.items()
@@ -155,22 +156,15 @@ def _shares(missing: Sequence[list[TrialSpec]], processes: int) -> list[Share]:
 
 
 def _fly_shares(
-    fliers: list[Flier], shares: list[Share], emit: Callable[[int, TrialResult], None]
-) -> None:
-    """Fly in this process; each policy is loaded and compiled once."""
+    fliers: Sequence[Flier], shares: Sequence[Share]
+) -> Iterator[tuple[int, TrialResult]]:
+    """Yield (number of the flier, result) of trials flown here; each policy is loaded once."""
     loaded: dict[str, Policy] = {}
     for number, trials in shares:
         flier = fliers[number]
         if flier.policy not in loaded:
             loaded[flier.policy] = load_policy(flier.policy)
-
-        def emit_one(result: TrialResult, flight: object, number: int = number) -> None:
-            emit(number, result)
-
-        fly(
-            loaded[flier.policy],
-            trials,
-            flier.vehicle,
-            options=JudgeOptions(processes=1, noise=flier.noise),
-            on_result=emit_one,
-        )
+        options = JudgeOptions(processes=1, noise=flier.noise)
+        task = Task(loaded[flier.policy], flier.vehicle, options=options)
+        for _, result, _ in fly_share(task, list(enumerate(trials))):
+            yield number, result

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from suite.common.choices import at_least, parse_levels
-from suite.common.side_by_side import check_jobs
+from suite.common.work import check_jobs
 from suite.train.config import TrainConfig
 
 GATES = 4

@@ -18,7 +18,7 @@ import numpy as np
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate, announce
-from suite.common.side_by_side import all_done
+from suite.common.work import all_done
 from suite.experiments.study.cache import digest
 from suite.train import curve
 from suite.train.config import TrainConfig

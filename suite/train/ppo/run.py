@@ -8,7 +8,6 @@ from pathlib import Path
 import jax
 from jax.sharding import SingleDeviceSharding
 
-from eval.judging.sharding import usable_cores
 from suite.common.console import Console
 from suite.common.estimate import Estimate
 from suite.train.checks import check
@@ -17,6 +16,7 @@ from suite.train.ppo.update import make_update, start_state
 from suite.train.repeat import Method, Outcome, Run, Watch, repeat
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
+from tracks.common.work import usable_cores
 
 STEPS_PER_CORE_S = 8000.0
 """Steps of worlds a second that a processor core rolls out, or learns from once; an estimate."""

@@ -6,7 +6,6 @@ import pytest
 
 from eval.judging.judge import JudgeOptions, Record, fly
 from eval.judging.results import Journal
-from eval.judging.sharding import fly_in_processes
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
@@ -89,30 +88,3 @@ def test_a_policy_that_cannot_travel_is_refused_with_what_to_do():
     setattr(policy, "unpicklable", lambda: None)  # noqa: B010
     with pytest.raises(ValueError, match="functools.partial"):
         fly(policy, [TrialSpec("zigzag", 0, 0)] * 2, VEHICLE, options=JudgeOptions(processes=2))
-
-
-def _work(task, share, emit):
-    if task == "refuse":
-        raise ValueError("wrong policy file")
-    if task == "break":
-        raise ZeroDivisionError
-    if task == "die":
-        import os
-
-        os._exit(9)
-    for item in share:
-        emit(item, item * 10)
-
-
-def test_processes_share_items_and_report_what_went_wrong():
-    found = []
-    fly_in_processes(_work, "fine", list(range(5)), 2, lambda *x: found.append(x))
-    assert sorted(found) == [(i, 10 * i) for i in range(5)]
-    for task, error, text in [
-        ("refuse", ValueError, "wrong policy file"),
-        ("break", RuntimeError, "ZeroDivisionError"),
-        ("die", RuntimeError, "exit code 9"),
-    ]:
-        with pytest.raises(error, match=text):
-            fly_in_processes(_work, task, [1, 2], 2, print)
-    assert multiprocessing.active_children() == []

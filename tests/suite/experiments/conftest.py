@@ -16,20 +16,18 @@ class Sky:
     def __init__(self, monkeypatch):
         self.flown = []
         self.stop_after = None
-        self._fly = judging.fly
-        monkeypatch.setattr(judging, "fly", self.fly)
+        self._fly = judging.fly_share
+        monkeypatch.setattr(judging, "fly_share", self.fly)
         monkeypatch.setattr(judging, "usable_cores", lambda: 1)
 
-    def fly(self, policy, trials, vehicle, options, on_result):
-        def keep(result, flight):
-            self.flown.append((policy.name, vehicle, options.noise, result.trial))
-            on_result(result, flight)
+    def fly(self, task, share):
+        options = replace(task.options, slots=8, rules=Rules(time_limit_s=1.0))
+        for index, result, flight in self._fly(replace(task, options=options), share):
+            self.flown.append((task.policy.name, task.vehicle, options.noise, result.trial))
+            yield index, result, flight
             if self.stop_after == len(self.flown):
                 self.stop_after = None
                 raise KeyboardInterrupt
-
-        options = replace(options, slots=8, rules=Rules(time_limit_s=1.0))
-        return self._fly(policy, trials, vehicle, options=options, on_result=keep)
 
 
 @pytest.fixture

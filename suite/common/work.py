@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from functools import partial
+from typing import TypeVar
 
 from rich.console import RenderableType
 
-from eval.judging.sharding import fly_in_processes, usable_cores
 from suite.common.console import Console, Update
 from suite.common.errors import WorkFailed
+from tracks.common.work import WorkerDied, usable_cores, work_off
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -50,15 +50,6 @@ def check_jobs(jobs: int) -> None:
         raise ValueError(f"--jobs is {jobs}; allowed is 1 to {cores}, the cores there are")
 
 
-def core_shares(jobs: int) -> list[list[int]]:
-    """Return the cores of each of `jobs` processes; empty lists where a system cannot pin."""
-    if not hasattr(os, "sched_getaffinity"):
-        return [[] for _ in range(jobs)]
-    cores = sorted(os.sched_getaffinity(0))
-    each = len(cores) // jobs
-    return [cores[k * each : (k + 1) * each] for k in range(jobs)]
-
-
 def all_done(
     do: Callable[[Piece, Console], Result],
     pieces: Sequence[Piece],
@@ -78,25 +69,21 @@ def all_done(
         what: the pieces are, in a few words.
 
     Raises:
-        WorkFailed: as `do` raises it, and where a process ends badly.
+        WorkFailed: where a process dies.
+        Exception: what `do` raises.
     """
     if jobs == 1:
         return [do(piece, console) for piece in pieces]
-    shares, found = core_shares(jobs), {}
-    items = [(number, shares[number % jobs], piece) for number, piece in enumerate(pieces)]
+    found: dict[int, Result] = {}
     with console.progress(what, len(pieces)) as update:
 
-        def keep(number: int, result: Result | WorkFailed) -> None:
-            if isinstance(result, WorkFailed):
-                raise result
+        def keep(number: int, result: Result) -> None:
             found[number] = result
             update(len(found))
 
         try:
-            fly_in_processes(_do_share, do, items, jobs, keep)
-        except WorkFailed:
-            raise
-        except RuntimeError as error:
+            work_off(partial(_silently, do), pieces, jobs, keep, pinned=True)
+        except WorkerDied as error:
             raise WorkFailed(
                 f"{what}: a process ended badly, what the others finished is kept; the same "
                 f"command goes on, with --jobs 1 in one process. It said: {error}"
@@ -104,16 +91,5 @@ def all_done(
     return [found[number] for number in range(len(pieces))]
 
 
-def _do_share(
-    do: Callable[[Any, Console], Any],
-    share: list[tuple[int, list[int], Any]],
-    emit: Callable[[int, Any], None],
-) -> None:
-    for number, cores, piece in share:
-        if cores:
-            # Before JAX makes its threads: there will be as many as cores.
-            os.sched_setaffinity(0, cores)
-        try:
-            emit(number, do(piece, Silent()))
-        except WorkFailed as failure:
-            emit(number, failure)
+def _silently(do: Callable[[Piece, Console], Result], piece: Piece) -> Iterator[Result]:
+    yield do(piece, Silent())

@@ -1,0 +1,119 @@
+"""Torch's files can run code when torch loads them: refused without trust, checked with it."""
+
+import contextlib
+import io
+import os
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+
+from policies.errors import PolicyError
+from policies.policy import load_policy
+
+PROGRAM = "models/model.json"
+WEIGHTS = "data/weights/model_weights_config.json"
+SAMPLES = "data/sample_inputs/model.pt"
+
+
+def rewrite(source, target, change):
+    """Copy an archive with `change(files)` done to its entries by name."""
+    with zipfile.ZipFile(source) as archive:
+        top = archive.namelist()[0].partition("/")[0]
+        files = {n.partition("/")[2]: archive.read(n) for n in archive.namelist()}
+    change(files)
+    with zipfile.ZipFile(target, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(f"{top}/{name}", data)
+    return target
+
+
+class Payload:
+    """A pickle that makes a folder when it is read."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def test_without_trust_nothing_of_a_file_reaches_torch(exported, tmp_path):
+    mark, pickled = tmp_path / "it_ran", io.BytesIO()
+    torch.save((Payload(mark),), pickled, pickle_module=pickle)
+    path = rewrite(
+        exported / "tiny.pt2",
+        tmp_path / "bad.pt2",
+        lambda files: files.update({SAMPLES: pickled.getvalue()}),
+    )
+    with pytest.raises(PolicyError, match=r"bad\.pt2: .*any code.*--trust.*\.onnx"):
+        load_policy(path)
+    assert not mark.exists()
+    with contextlib.suppress(PolicyError):
+        load_policy(path, trust=True)
+    assert mark.exists(), "the attack itself does not work, so this test shows nothing"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda files: files.pop(PROGRAM), "cannot load it"),
+        (lambda files: files.pop("data/weights/weight_0"), "cannot load it"),
+        (lambda files: files.update({PROGRAM: b"{"}), "cannot load it"),
+        (lambda files: files.update({PROGRAM: b"{}"}), "cannot load it"),
+        (lambda files: files.update({WEIGHTS: b'{"config": []}'}), "cannot load it"),
+        (lambda files: files.update({"data/weights/weight_0": b"abc"}), "cannot load it"),
+        (lambda files: files.update({"extra/policy.json": b"{"}), "policy.json: not JSON"),
+        (lambda files: files.update({"extra/policy.json": b'{"schema": 9}'}), "schema 1"),
+        (
+            lambda files: files.update({"extra/policy.json": b'{"spec": {"rate": 1}}'}),
+            "unknown key 'rate'",
+        ),
+    ],
+)
+def test_a_damaged_archive_is_refused(exported, tmp_path, change, said):
+    path = rewrite(exported / "tiny.pt2", tmp_path / "bad.pt2", change)
+    with pytest.raises(PolicyError, match=said):
+        load_policy(path, trust=True)
+
+
+class Everything(torch.nn.Module):
+    """Layers that people's policies are made of."""
+
+    def __init__(self):
+        super().__init__()
+        self.encoder = torch.nn.Sequential(
+            torch.nn.Conv2d(1, 4, 3, stride=2, padding=1),
+            torch.nn.BatchNorm2d(4),
+            torch.nn.ELU(),
+            torch.nn.AdaptiveAvgPool2d(2),
+            torch.nn.Flatten(),
+        )
+        self.mlp = torch.nn.Sequential(
+            torch.nn.Linear(28, 16), torch.nn.LayerNorm(16), torch.nn.SiLU(), torch.nn.Dropout(0.1)
+        )
+        self.gru = torch.nn.GRU(16, 8)
+        self.head = torch.nn.Linear(8, 6)
+
+    def forward(self, state, image, hidden):
+        features = self.mlp(torch.cat([state, self.encoder(image[:, None])], -1))
+        out, hidden = self.gru(features[None], hidden[None].contiguous())
+        mean, spread = self.head(out[0]).chunk(2, -1)
+        return torch.tanh(mean) * 20.0 * torch.exp(spread).clamp(max=1.0), hidden[0]
+
+
+@pytest.mark.filterwarnings("ignore:The tensor attributes:UserWarning")
+def test_common_layers_pass_and_answer_as_torch_does(tmp_path):
+    module = Everything().eval()
+    inputs = (torch.randn(2, 12), torch.randn(2, 24, 32), torch.randn(2, 8))
+    batch = {0: torch.export.Dim("batch")}
+    program = torch.export.export(module, inputs, dynamic_shapes=(batch, batch, batch))
+    torch.export.save(program, tmp_path / "it.pt2")
+    policy = load_policy(tmp_path / "it.pt2", trust=True)
+    state, image, hidden = (x.numpy() for x in inputs)
+    found = policy.act(hidden, state, image, np.zeros(2, bool))
+    with torch.no_grad():
+        for mine, theirs in zip(found, module(*inputs), strict=True):
+            np.testing.assert_allclose(mine, theirs, atol=1e-5)
