@@ -11,7 +11,7 @@ from policies.observation import View, observe
 from suite.delta.replay import nominal_model
 from suite.train import losses, rollout
 from suite.train.config import LossConfig, PointMassConfig
-from suite.train.dynamics.point_mass import Constants
+from suite.train.dynamics.point_mass import PointMassParams
 from suite.train.gradient import make_gradient
 from suite.train.rollout import make_rollout
 from suite.train.worlds import sample_worlds
@@ -209,7 +209,7 @@ def test_drag_along_the_bodys_z_has_a_range_of_its_own():
     physics = replace(config.physics, drag_up=(3.0, 4.0))
     changed = sample_worlds(replace(config, physics=physics), 2)
     before, after = (worlds.constants for worlds in (plain, changed))
-    assert isinstance(before, Constants) and isinstance(after, Constants)
+    assert isinstance(before, PointMassParams) and isinstance(after, PointMassParams)
     across, up = after.drag[:, :2], after.drag[:, 2]
     np.testing.assert_array_equal(across, before.drag[:, :2])
     assert np.all((up >= 3.0) & (up <= 4.0))

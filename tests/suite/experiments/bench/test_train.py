@@ -19,10 +19,7 @@ from tracks.geometry.scene import PARKED_Z
 def pair():
     """Return (config, worlds, params, our gradient, our loss, the baseline after backward)."""
     base = train.bench_config(6, 12)
-    physics = replace(base.physics, depth_noise=0.0, state_delay=1)
-    loss = replace(base.loss, approach_m=1.5)
-    spec = replace(base.spec, second_gate=True, gate_axis=True)
-    config = replace(base, physics=physics, loss=loss, spec=spec)
+    config = replace(base, physics=replace(base.physics, depth_noise=0.0))
     worlds, params = train.bench_worlds(config), fresh_params(config.spec)
     gradient, loss, _ = jax.jit(make_gradient(config))(params, worlds, jax.random.key(0), None)
     baseline = Baseline(config, {name: np.asarray(value) for name, value in params.items()})
@@ -72,6 +69,15 @@ def test_the_work_of_a_step_is_what_xla_counts():
     encoder = flops(network.encode, params, image)
     recurrent = flops(network.recur, params, hidden, hidden, state)
     assert train.work_per_step(config) == pytest.approx(4 * encoder + 3 * recurrent, rel=0.05)
+
+
+def test_the_baseline_refuses_what_its_preset_does_not_have():
+    base = train.bench_config(2, 3)
+    params = {name: np.asarray(value) for name, value in fresh_params(base.spec).items()}
+    for part, change in (("loss", {"projection": 1.0}), ("spec", {"gate_axis": True})):
+        config = replace(base, **{part: replace(getattr(base, part), **change)})
+        with pytest.raises(ValueError, match=f"{part}.{next(iter(change))} is .* preset paper"):
+            Baseline(config, params)
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ import pytest
 from policies.formats.checkpoint import load_arrays
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import network
+from suite.common import curve
 from suite.common.console import Console
-from suite.train import curve
 from suite.train.ppo import run
 from suite.train.ppo.config import ppo_like
 from suite.train.ppo.objective import Actor, Sequences, action_means
