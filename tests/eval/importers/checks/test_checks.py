@@ -159,7 +159,7 @@ def test_degrees_are_told_by_how_far_the_attitude_turns():
     assert "time is in s and rates are in deg/s" in finding.text
     same, (finding,) = check_units(given, fix=False)
     assert same is given and finding.level == "doubt" and "left as they are" in finding.text
-    # Five times too fast is no unit's doing.
+    # Two hundred times too slow is no unit's doing.
     same, (finding,) = check_units(turning(1 / 200.0), fix=True)
     assert finding.level == "doubt" and "no mix-up of units explains" in finding.text
 
