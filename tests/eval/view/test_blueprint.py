@@ -1,20 +1,9 @@
 """A recording opens laid out: a tab a trial, and the time before the first gate."""
 
-import pytest
 import rerun.chunk
 
-from eval.view.recording import write_recording
 from tests.support.flights import rollout
 from tests.support.recordings import columns
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
-    path = tmp_path_factory.mktemp("rrd") / "two.rrd"
-    crash = rollout("collision", 1.5, False)
-    assert write_recording(path, [rollout(), crash]) == path
-    assert [p.name for p in path.parent.iterdir()] == ["two.rrd"]
-    return path, columns(path)
 
 
 def test_a_recording_opens_laid_out(recorded):

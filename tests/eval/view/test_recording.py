@@ -9,17 +9,7 @@ import pytest
 from eval.view import colours
 from eval.view.recording import write_recording
 from tests.support.flights import rollout
-from tests.support.recordings import columns
 from tracks.geometry.camera import Camera, pixel_rays_b
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
-    path = tmp_path_factory.mktemp("rrd") / "two.rrd"
-    crash = rollout("collision", 1.5, False)
-    assert write_recording(path, [rollout(), crash]) == path
-    assert [p.name for p in path.parent.iterdir()] == ["two.rrd"]
-    return path, columns(path)
 
 
 def nanoseconds(time_s):

@@ -1,4 +1,4 @@
-"""Recordings, pictures and videos show what was flown, and are read back to see that."""
+"""Views of flights that went wrong, and the colours that all views share."""
 
 import numpy as np
 
@@ -49,3 +49,16 @@ def test_the_synthetic_flight_is_consistent():
     force = np.gradient(flight.vel_w, flight.time_s, axis=0) + [0, 0, 9.81]
     force /= np.linalg.norm(force, axis=1, keepdims=True)
     assert np.median(np.einsum("ti,ti->t", up, force)) > 0.999
+
+
+def test_the_fastest_and_the_nearest_have_the_ends_of_their_colours():
+    assert colours.hexed((1, 16, 255)) == "#0110ff"
+    speed = np.array([0.0, 4.0, 9.0])
+    slow, fast, faster = colours.speed_colours(speed, 4.0).tolist()
+    assert fast == faster != slow
+    assert colours.top_speed(np.array([0.2, np.nan])) == 1.0
+    assert colours.top_speed(np.array([2.5, np.nan])) == 2.5
+    near, far = colours.depth_colours(np.array([0.0, 10.0]), 10.0).astype(int)
+    assert near[0] > near[2] and far[2] > far[0]
+    np.testing.assert_allclose(colours.brightness(colours.LIGHT_W), 1.0)
+    np.testing.assert_allclose(colours.brightness(-colours.LIGHT_W), 0.44)
