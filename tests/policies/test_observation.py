@@ -54,12 +54,12 @@ def test_the_gates_direction_comes_last_and_turns_with_the_body():
 
 
 def test_the_papers_twelve_numbers():
-    """After a quarter turn to the left, what lies to the left is ahead; z is free of yaw."""
-    left = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    """Rolled a quarter turn to the right, so that its left points up and its top to the right."""
+    rolled = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     pos, vel, gate = np.array([1.0, 2.0, 3.0]), np.array([0.0, 5.0, 1.0]), np.array([1.0, 6.0, 2.0])
     last = np.array([7.0, 8.0, 9.0])
-    state = state_of(PolicySpec(), pos, vel, left, gate, last, gate, vel)
-    expected = [5, 0, 1, 0, 0, 1, 4, 0, -1, 7, 8, 9]
+    state = state_of(PolicySpec(), pos, vel, rolled, gate, last, gate, vel)
+    expected = [0, 1, -5, 0, 1, 0, 0, -1, -4, 7, 8, 9]
     np.testing.assert_allclose(state, expected, atol=1e-15)
 
 
