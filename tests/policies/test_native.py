@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 
 from policies.native import load_native, native_policy
@@ -24,7 +25,7 @@ def test_a_checkpoint_is_named_and_flies_as_its_parameters_do(checkpoint, params
     answers = [policy.act(policy.start(3), state, image, fresh) for policy in (loaded, made)]
     for one, two in zip(*answers, strict=True):
         assert one.tobytes() == two.tobytes()
-    expected, _ = network.step(params, np.zeros((3, 64), np.float32), state, image)
+    expected, _ = network.step(params, *map(jnp.asarray, (made.start(3), state, image)))
     np.testing.assert_allclose(answers[0][0], expected, atol=1e-5, rtol=1e-5)
 
 

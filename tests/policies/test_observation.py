@@ -66,14 +66,15 @@ def test_the_papers_twelve_numbers():
 def test_depths_are_inverse_and_clipped_on_both_sides():
     """3 / d - 0.6, from 0.3 m to the camera's range of 6 m."""
     spec = PolicySpec(camera=Camera(range_m=6.0))
-    depth = np.array([[0.1, 0.3], [2.0, 50.0]])
-    view = View(np.zeros(3), np.eye(3), np.zeros(3), *np.zeros((3, 3)), depth)
-    image = observe(spec, view, np.zeros(3)).image
+    zero, depth = np.zeros(3), np.array([[0.1, 0.3], [2.0, 50.0]])
+    view = View(zero, np.eye(3), zero, zero, zero, zero, depth)
+    image = observe(spec, view, zero).image
     np.testing.assert_allclose(image, [[9.4, 9.4], [0.9, -0.1]], atol=1e-12)
-    assert observe(spec, view._replace(depth_m=None), np.zeros(3)).image is None
+    assert observe(spec, view._replace(depth_m=None), zero).image is None
 
 
 def test_the_gates_axis_is_its_frames_x():
-    gates = square_gates(np.zeros((2, 3)), np.array([0.0, 0.5 * np.pi]), *np.ones((3, 2)))
-    view = view_of(*np.zeros((3, 2, 3)), gates, gates, None)
+    one, zero = np.ones(2), np.zeros((2, 3))
+    gates = square_gates(zero, np.array([0.0, 0.5 * np.pi]), one, one, one)
+    view = view_of(zero, np.tile(np.eye(3), (2, 1, 1)), zero, gates, gates, None)
     np.testing.assert_allclose(view.axis_w, [[1, 0, 0], [0, 1, 0]], atol=1e-15)
