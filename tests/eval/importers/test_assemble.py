@@ -34,6 +34,7 @@ def test_a_recording_becomes_a_log_that_says_where_it_is_from():
     log, findings = assemble(recording(), "made", ImportOptions(vehicle=PLAIN))
     parts = flight(end=2.0)
     np.testing.assert_allclose(log.pos_w, parts["pos"], atol=1e-12)
+    assert log.thrust_cmd is not None
     np.testing.assert_allclose(log.thrust_cmd, parts["cmd_thrust"][:, 0], atol=1e-12)
     known = {key: log.about[key] for key in ("firmware", "source", "imported_from", "vehicle")}
     assert known == {

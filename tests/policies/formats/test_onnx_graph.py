@@ -19,7 +19,7 @@ def test_the_graph_is_our_network(params):
     feed = {"state": state, "image": image, "hidden": hidden}
     theirs = ReferenceEvaluator(model).run(None, feed)
     for a, b in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(a, b, atol=2e-5, rtol=1e-5)
+        np.testing.assert_allclose(a, np.asarray(b), atol=2e-5, rtol=1e-5)
 
 
 def test_it_asks_for_old_standard_operators_only_and_carries_its_texts(params):
