@@ -1,5 +1,7 @@
 """A small track and a smooth flight through its gates, for tests of logs and views."""
 
+from functools import cache
+
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
@@ -113,6 +115,14 @@ def result_of(track, flight, ended_by="finished"):
         limited_actions=0,
         late_actions=0,
     )
+
+
+@cache
+def rollout(ended_by="finished", duration_s=None, depth=True):
+    """A small track, a flight on it and its result, made once."""
+    track = small_track()
+    flight = smooth_flight(track, duration_s=duration_s, depth=depth)
+    return track, flight, result_of(track, flight, ended_by)
 
 
 def small_log():

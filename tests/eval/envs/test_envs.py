@@ -129,3 +129,12 @@ def test_nonsense_actions_do_not_break_it():
     for value in (np.nan, np.inf, 1e30):
         observation, reward, *_ = env.step(np.full(3, value, np.float32))
         assert np.isfinite(observation["state"]).all() and np.isfinite(reward)
+
+
+def test_the_second_gate_and_the_direction_are_shown_where_asked_for():
+    env = RaceEnv("zigzag", 0, 1, spec=PolicySpec(second_gate=True, gate_axis=True))
+    seen, _ = env.reset(seed=0)
+    state = seen["state"]
+    assert env.observation_space.contains(seen) and state.shape == (18,)
+    assert np.linalg.norm(state[12:15] - state[6:9]) > 3.0
+    np.testing.assert_allclose(state[15:], [1, 0, 0], atol=0.3)  # at rest before the first gate

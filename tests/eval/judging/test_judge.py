@@ -1,7 +1,8 @@
-"""The judge's doors: wrong input, interrupts, processes, recording."""
+"""The judge: wrong input, interrupts, and outcomes that are the trial's alone, to the bit."""
 
 import multiprocessing
 
+import numpy as np
 import pytest
 
 from eval.judging.judge import JudgeOptions, Record, fly
@@ -10,7 +11,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import straight
-from tests.support.pilots import Pursuit, Steady
+from tests.support.pilots import Pursuit, RandomNetwork, Steady
 
 VEHICLE = load_vehicle("reference")
 SHORT = Rules(time_limit_s=0.3)
@@ -88,3 +89,78 @@ def test_a_policy_that_cannot_travel_is_refused_with_what_to_do():
     setattr(policy, "unpicklable", lambda: None)  # noqa: B010
     with pytest.raises(ValueError, match="functools.partial"):
         fly(policy, [TrialSpec("zigzag", 0, 0)] * 2, VEHICLE, options=JudgeOptions(processes=2))
+
+
+TRIALS = [
+    TrialSpec(track, level, seed)
+    for track in ("zigzag", "circular", "ellipse")
+    for level in (1, 6)
+    for seed in (0, 1)
+]
+
+RULES = Rules(time_limit_s=2.0)
+
+
+def results(trials, slots=64, threads=1, processes=1, policy=None):
+    options = JudgeOptions(slots, threads, processes, RULES)
+    return fly(policy or network(), trials, VEHICLE, "mujoco", options)
+
+
+_made = {}
+
+
+def network():
+    return _made.setdefault("network", RandomNetwork())
+
+
+@pytest.fixture(scope="module")
+def expected():
+    found = dict(zip(TRIALS, results(TRIALS), strict=True))
+    # Something must be going on: not all the same end, all the same numbers.
+    assert len({result.v_max for result in found.values()}) == len(TRIALS)
+    return found
+
+
+def same(trials, found, expected):
+    assert [result.trial for result in found] == list(trials)
+    assert found == [expected[trial] for trial in trials]
+
+
+def test_repeats(expected):
+    same(TRIALS, results(TRIALS), expected)
+
+
+def test_order_and_subset(expected):
+    order = [TRIALS[i] for i in np.random.default_rng(1).permutation(len(TRIALS))][:7]
+    same(order, results(order), expected)
+
+
+def test_alone(expected):
+    same(TRIALS[5:6], results(TRIALS[5:6]), expected)
+
+
+@pytest.mark.parametrize("slots", [3, 20])
+def test_number_of_slots(expected, slots):
+    # With 3 slots trials start in the middle of others, each in any slot.
+    same(TRIALS, results(TRIALS, slots), expected)
+
+
+def test_threads(expected):
+    same(TRIALS, results(TRIALS, slots=5, threads=2), expected)
+
+
+def test_processes(expected):
+    policy = RandomNetwork  # made anew in each process
+    same(TRIALS[:6], results(TRIALS[:6], processes=2, policy=policy), expected)
+
+
+def test_pursuit_by_a_scripted_policy_is_deterministic_too():
+    first = results(TRIALS[:4], slots=2, policy=Pursuit())
+    assert first == results(TRIALS[:4], slots=64, policy=Pursuit())
+
+
+def test_reference_world_flies_the_same(expected):
+    trials = TRIALS[3::4]
+    options = JudgeOptions(rules=RULES)
+    found = fly(network(), trials, VEHICLE, "reference", options)
+    assert [r._replace(world="mujoco") for r in found] == [expected[t] for t in trials]

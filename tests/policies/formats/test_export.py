@@ -2,8 +2,8 @@
 
 import json
 import zipfile
+from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import onnx
 import pytest
@@ -12,10 +12,9 @@ import torch
 from policies.errors import PolicyError
 from policies.formats.embedded_spec import KEY
 from policies.formats.export import export_policy
-from policies.formats.torch_twin import torch_twin
-from policies.networks import network
+from policies.formats.policy_file import save_policy
 from policies.policy import load_policy
-from tests.policies.conftest import SPEC
+from tests.policies.conftest import SPEC, lively
 
 
 def rollout(policy, n, steps):
@@ -23,7 +22,7 @@ def rollout(policy, n, steps):
     rng = np.random.default_rng(7)
     hidden, actions = policy.start(n), []
     for _ in range(steps):
-        state = rng.normal(size=(n, 12)).astype(np.float32)
+        state = rng.normal(size=(n, policy.spec.state_size)).astype(np.float32)
         image = rng.uniform(-0.3, 9.4, (n, 24, 32)).astype(np.float32)
         action, hidden = policy.act(hidden, state, image, rng.random(n) < 0.1)
         actions.append(action)
@@ -37,18 +36,6 @@ def test_the_three_are_equal_over_a_rollout(checkpoint, exported):
         policy = load_policy(exported / file, trust=file.endswith(".pt2"))
         assert policy.spec == SPEC
         np.testing.assert_allclose(rollout(policy, 70, 40), ours, atol=5e-5, rtol=1e-5)
-
-
-def test_the_twin_is_our_network_layer_for_layer(params):
-    rng = np.random.default_rng(0)
-    state, image, hidden = (
-        rng.normal(size=(5, *shape)).astype(np.float32) for shape in ((12,), (24, 32), (64,))
-    )
-    ours = network.step(params, *map(jnp.asarray, (hidden, state, image)))
-    with torch.no_grad():
-        theirs = torch_twin(params, SPEC)(*map(torch.from_numpy, (state, image, hidden)))
-    for a, b in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(a, b, atol=2e-5, rtol=1e-5)
 
 
 def test_the_files_carry_where_they_come_from(exported):
@@ -89,3 +76,17 @@ def test_exporting_again_replaces_the_file(tmp_path, checkpoint):
     for _ in range(2):
         assert export_policy(checkpoint, tmp_path, ["onnx"]) == [tmp_path / "tiny.onnx"]
     assert [p.name for p in tmp_path.iterdir()] == ["tiny.onnx"]
+
+
+@pytest.mark.parametrize("extras", [{"second_gate"}, {"second_gate", "gate_axis"}])
+def test_policies_that_see_more_are_one_policy_as_well(tmp_path, extras):
+    spec = replace(SPEC, **dict.fromkeys(extras, True))
+    folder = save_policy(tmp_path / "more", lively(spec, 3), spec, seed=1)
+    ours = load_policy(folder)
+    assert ours.spec == spec
+    expected = rollout(ours, 70, 5)
+    assert np.abs(expected).std() > 1.0
+    for path in export_policy(folder, tmp_path):
+        theirs = load_policy(path, trust=True)
+        assert theirs.spec == spec
+        np.testing.assert_allclose(rollout(theirs, 70, 5), expected, atol=5e-5, rtol=1e-5)

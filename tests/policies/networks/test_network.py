@@ -1,7 +1,10 @@
-"""A fresh network can be trained: its first steps leave its memory able to tell things apart."""
+"""A fresh network can be trained, and a trained one goes on as one that sees more."""
+
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import pytest
 
@@ -9,6 +12,10 @@ from policies.networks import network
 from policies.spec import PolicySpec
 
 SPEC = PolicySpec(rate_hz=15.0)
+SMALL = PolicySpec(rate_hz=33.0, hidden_size=64)
+SECOND = replace(SMALL, second_gate=True)
+AXIS = replace(SMALL, gate_axis=True)
+BOTH = replace(SECOND, gate_axis=True)
 CLIMB_B = jnp.asarray([1.0, 0.0, 1.0])
 ADAMW = optax.adamw(2e-3, b2=0.99, weight_decay=1e-2)
 
@@ -45,3 +52,44 @@ def test_one_action_for_all_is_learned_without_saturating_the_memory(seed):
         params, optimizer, loss, hidden = learn(params, optimizer, jax.random.key(100 + i))
     assert loss < 0.1
     assert jnp.abs(hidden).mean() < 0.65
+
+
+@pytest.mark.parametrize(
+    ("seen", "spec", "columns"),
+    [
+        (SMALL, SECOND, slice(0, 12)),
+        (SMALL, BOTH, slice(0, 12)),
+        (SECOND, BOTH, slice(0, 15)),
+        (AXIS, BOTH, np.r_[0:12, 15:18]),
+    ],
+)
+def test_a_policy_goes_on_as_one_that_sees_more(seen, spec, columns):
+    """It acts as before, whatever the new numbers are."""
+    rng = np.random.default_rng(0)
+    params = network.init(jax.random.key(5), seen)
+    wide = network.fitted(params, seen, spec)
+    state, image, hidden = (
+        jnp.asarray(rng.normal(size=(4, *s)), jnp.float32)
+        for s in ((spec.state_size,), (24, 32), (64,))
+    )
+    before = network.step(params, hidden, state[:, columns], image)
+    for a, b in zip(before, network.step(wide, hidden, state, image), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("seen", "spec", "key"),
+    [(SECOND, SMALL, "second_gate"), (AXIS, SECOND, "gate_axis"), (BOTH, AXIS, "second_gate")],
+)
+def test_a_policy_that_sees_more_is_refused(seen, spec, key):
+    params = network.init(jax.random.key(5), seen)
+    with pytest.raises(ValueError, match=rf"has spec\.{key}; set spec\.{key}=True"):
+        network.fitted(params, seen, spec)
+
+
+def test_a_policy_of_another_size_or_rate_is_refused():
+    params = network.init(jax.random.key(5), SMALL)
+    for changed, words in (({"hidden_size": 32}, "hidden_size 64, and this run 32"),
+                           ({"rate_hz": 60.0}, "rate_hz .*, and this run 60.0")):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            network.fitted(params, SMALL, replace(SMALL, **changed))

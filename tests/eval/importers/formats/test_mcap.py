@@ -1,0 +1,52 @@
+"""MCAP logs, on small files of the true format made from a flight that is known exactly."""
+
+import numpy as np
+import pytest
+
+from eval.importers import import_log
+from eval.importers.options import ImportOptions
+from eval.logs.columns import FlightLogError
+from tests.support import foreign_logs as made
+from tests.support import known_flight
+from tests.support.imported import levels, near, quat_off, text
+
+FULL = ImportOptions(full_thrust=30.0)
+
+
+def test_mcap_equals_the_flight(tmp_path):
+    log, findings = import_log(made.write_mcap(tmp_path / "log.mcap"), None, FULL)
+    truth = known_flight.fly(log.time_s)
+    near(log.pos_w, truth.pos, 1e-6)
+    near(log.vel_w, truth.vel, 1e-6)
+    assert quat_off(log, truth) < 1e-6
+    near(log.rate_b, truth.rate, 1e-9)
+    near(log.acc_b, truth.acc, 1e-9)
+    near(np.asarray(log.rate_cmd_b)[::2], truth.cmd_rate[::2], 1e-9)
+    near(np.asarray(log.thrust_cmd)[::2], truth.thrust[::2], 1e-5)
+    assert "/odom_slow" in text(findings, "topics")
+    assert {"corrected", "doubt"}.isdisjoint(levels(findings).values())
+
+
+def test_mcap_topics_are_chosen_by_a_map(tmp_path):
+    path = made.write_mcap(tmp_path / "log.mcap", span=(0, 4))
+    chosen = tmp_path / "map.toml"
+    chosen.write_text('[topics]\nodometry = "/odom_slow"\n')
+    log, findings = import_log(path, None, ImportOptions(map=chosen, full_thrust=30.0))
+    assert "10 Hz" in text(findings, "position")
+    # Rows at twice the rate of the slow poses: every other one has a pose, and that is exact.
+    assert np.isnan(log.pos_w[1::2]).all() and np.isfinite(log.rate_b).all()
+    near(log.pos_w[::2], known_flight.fly(log.time_s[::2]).pos, 1e-6)
+    chosen.write_text('[topics]\nodometry = "/imu"\n')
+    with pytest.raises(FlightLogError, match="'/imu' has no nav_msgs/Odometry"):
+        import_log(path, None, ImportOptions(map=chosen))
+
+
+def test_mcap_that_is_cut_or_lacks_motion(tmp_path):
+    whole = made.write_mcap(tmp_path / "log.mcap", span=(0, 2))
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:3000])
+    with pytest.raises(FlightLogError, match=r"cut\.mcap"):
+        import_log(cut)
+    still = made.write_mcap(tmp_path / "imu.mcap", span=(0, 2), motion=False)
+    with pytest.raises(FlightLogError, match="no position and no attitude"):
+        import_log(still)

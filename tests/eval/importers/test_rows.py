@@ -1,0 +1,86 @@
+"""Signals of different rates come onto the rows of one log: nothing is made up or told twice."""
+
+import numpy as np
+import pytest
+
+from eval.importers import import_log
+from eval.importers.options import ImportOptions
+from eval.importers.rows import averaged, smoothed
+from tests.support import known_flight
+from tests.support.imported import flight, of, write
+
+
+def test_differing_rates_jitter_and_holes(tmp_path):
+    rng = np.random.default_rng(1)
+    time = np.cumsum(rng.uniform(0.003, 0.007, 1600))
+    truth = known_flight.fly(time)
+    parts = {"time": time, "pos": truth.pos, "quat": truth.quat, "rate": truth.rate}
+    parts |= {"cmd_thrust": truth.thrust[:, None], "cmd_rate": truth.cmd_rate}
+    every = np.arange(len(time))
+    hole = (time > 3.0) & (time < 3.6)
+    keep = {
+        "pos": (every % 4 == 0) & ~hole,
+        "quat": every % 2 == 0,
+        "cmd_rate": every % 5 == 0,
+        "cmd_thrust": every % 5 == 0,
+    }
+    log, findings = import_log(write(tmp_path / "log.csv", parts, keep))
+    assert {"position", "rows"} <= of(findings, "note")
+    at = log.time_s + time[0]
+    np.testing.assert_allclose(at, time[keep["pos"]], atol=1e-9)
+    found = known_flight.fly(at)
+    np.testing.assert_allclose(log.pos_w, found.pos, atol=1e-9)
+    np.testing.assert_allclose(log.rate_b, found.rate, atol=2e-3)
+    # A derived velocity is not there beside the hole.
+    assert log.velocity_derived
+    clear = (at < 2.9) | (at > 3.8)
+    np.testing.assert_allclose(log.vel_w[clear], found.vel[clear], atol=0.1)
+
+
+@pytest.mark.parametrize(("pos", "quat", "vel"), [(4, 1, 8), (10, 5, 10), (2, 3, 2)])
+def test_a_measurement_is_in_one_row_only(tmp_path, pos, quat, vel):
+    """Values copied to rows between them would look like less noise than there is."""
+    good = flight(noise=1.0)
+    every = np.arange(len(good["time"]))
+    keep = {"pos": every % pos == 0, "quat": every % quat == 1 % quat, "vel": every % vel == 0}
+    log, _ = import_log(write(tmp_path / "log.csv", good, keep))
+    for name, value in (("pos", log.pos_w), ("quat", log.quat_wxyz), ("vel", log.vel_w)):
+        count = np.isfinite(value[:, 0]).sum()
+        assert count <= keep[name].sum() and count > 0.9 * min(keep[name].sum(), len(value))
+    both = (every % np.lcm(pos, vel) == 0).sum()
+    assert log.whole.sum() > 0.9 * min(both, len(log.time_s))
+    # Slower than 20 Hz only with rows between.
+    assert 1 / np.median(np.diff(log.time_s)) > 19.0
+
+
+def test_faster_signals_are_smoothed_and_commands_hold_their_mean(tmp_path):
+    parts = flight(hz=1000.0, end=6.0)
+    shake = 5.0 * np.sin(2 * np.pi * 240.0 * parts["time"])[:, None]
+    parts["rate"] = parts["rate"] + shake
+    path = write(tmp_path / "log.csv", parts)
+    log, _ = import_log(path, None, ImportOptions(rate_hz=50.0))
+    truth = known_flight.fly(log.time_s)
+    assert len(log.time_s) == 300
+    assert np.abs(log.rate_b - truth.rate)[2:-2].max() < 1.0
+    middle = known_flight.fly(log.time_s + 0.0095).cmd_rate
+    np.testing.assert_allclose(np.asarray(log.rate_cmd_b)[:-1], middle[:-1], atol=0.01)
+
+
+def test_smoothing_does_not_flatten_what_is_curved():
+    t = np.arange(0.0, 2.0, 0.001)
+    wave = np.sin(2 * np.pi * 8.0 * t)[:, None]
+    at = np.arange(0.1, 1.9, 0.01)
+    exact = np.sin(2 * np.pi * 8.0 * at)[:, None]
+    assert np.abs(smoothed(t, wave, at, 0.01) - exact).max() < 5e-4
+    assert np.abs(averaged(t, wave, at, 0.01) - exact).max() > 5e-3
+    noise = np.random.default_rng(0).normal(size=wave.shape)
+    assert np.std(smoothed(t, noise, at, 0.01)) < 0.55
+
+
+def test_a_command_that_stops_is_not_held_for_long(tmp_path):
+    good = flight()
+    before = good["time"] < 5.0
+    path = write(tmp_path / "log.csv", good, {"cmd_rate": before, "cmd_thrust": before})
+    log, _ = import_log(path)
+    missing = np.isnan(np.asarray(log.thrust_cmd))
+    assert missing[log.time_s > 5.6].all() and not missing[log.time_s < 5.4].any()

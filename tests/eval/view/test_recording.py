@@ -1,0 +1,125 @@
+"""Recordings hold what was flown, and are read back to see that."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from eval.view import colours
+from eval.view.recording import write_recording
+from tests.support.flights import rollout
+from tracks.geometry.camera import Camera, pixel_rays_b
+
+
+def nanoseconds(time_s):
+    return np.round(time_s * 1e9).astype(np.int64)
+
+
+def test_a_recording_holds_every_row_of_the_flight(recorded):
+    _, found = recorded
+    _, flight, _ = rollout()
+    for name, values in {
+        "speed": np.linalg.norm(flight.vel_w, axis=1)[:, None],
+        "thrust/command": flight.thrust_cmd[:, None],
+        "rates/measured": flight.rate_b,
+        "rates/command": flight.rate_cmd_b,
+        "rotors": flight.rotor_speed,
+    }.items():
+        times, scalars = found[f"/trial_0/{name}", "Scalars:scalars"]
+        np.testing.assert_array_equal(times, nanoseconds(flight.time_s))
+        np.testing.assert_array_equal(scalars, values)
+    step = flight.policy_step
+    times, scalars = found["/trial_0/action", "Scalars:scalars"]
+    np.testing.assert_array_equal(times, nanoseconds(flight.time_s[step]))
+    np.testing.assert_array_equal(scalars, flight.action_b[step])
+    for entity in ("speed", "rates/measured", "rotors"):
+        assert found[f"/trial_0/{entity}", "SeriesLines:names"][0] is None
+
+
+def test_a_recording_moves_the_drone_as_it_flew(recorded):
+    _, found = recorded
+    _, flight, _ = rollout()
+    drone = "/trial_0/world/drone"
+    times, places = found[drone, "Transform3D:translation"]
+    np.testing.assert_array_equal(times, nanoseconds(flight.time_s))
+    np.testing.assert_allclose(np.squeeze(places, 1), flight.pos_w, rtol=1e-6)
+    xyzw = np.squeeze(found[drone, "Transform3D:quaternion"][1], 1)
+    np.testing.assert_allclose(np.roll(xyzw, 1, axis=1), flight.quat_wxyz, atol=1e-6)
+    assert (f"{drone}/body", "Boxes3D:half_sizes") in found
+
+
+def test_a_recording_has_the_depth_images_in_metres_at_the_policys_rate(recorded):
+    _, found = recorded
+    _, flight, _ = rollout()
+    entity = "/trial_0/world/drone/camera/depth"
+    times, buffers = found[entity, "DepthImage:buffer"]
+    np.testing.assert_array_equal(times, nanoseconds(flight.time_s[flight.policy_step]))
+    images = np.array(buffers, dtype=np.uint8).reshape(len(times), -1).view(np.float32)
+    assert flight.depth_m is not None
+    np.testing.assert_array_equal(images.reshape(-1, 24, 32), flight.depth_m)
+    assert found[entity, "DepthImage:meter"][1] == [[1.0]]
+    layout = found[entity, "DepthImage:format"][1][0][0]
+    assert (layout["width"], layout["height"]) == (32, 24)
+    assert not any("/trial_1" in entity and "camera" in entity for entity, _ in found)
+
+
+def test_the_recorded_camera_has_the_rays_of_ours(recorded):
+    _, found = recorded
+    eye = "/trial_0/world/drone/camera"
+    camera = Camera()
+    matrix = np.reshape(found[eye, "Pinhole:image_from_camera"][1], (3, 3)).T
+    mount = np.reshape(found[eye, "Transform3D:mat3x3"][1], (3, 3)).T
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    pixel = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3)
+    rays_b = pixel @ np.linalg.inv(matrix).T @ mount.T
+    np.testing.assert_allclose(rays_b, pixel_rays_b(camera), atol=1e-5)
+
+
+def test_gates_turn_colour_when_they_are_passed(recorded):
+    _, found = recorded
+    for number, (track, flight, _) in enumerate((rollout(), rollout("collision", 1.5, False))):
+        for gate in range(len(track.scene.gates.center_w)):
+            entity = f"/trial_{number}/world/gates/{gate}"
+            times, values = found[entity, "Mesh3D:albedo_factor"]
+            shades = [tuple(value[0].to_bytes(4, "big")[:3]) for value in values]
+            passed = np.flatnonzero(flight.gate > gate)
+            assert shades == [colours.AHEAD, colours.PASSED][: 1 + (len(passed) > 0)]
+            assert list(times[1:]) == list(nanoseconds(flight.time_s[passed[:1]]))
+            assert found[entity, "Mesh3D:vertex_positions"][0] is None
+
+
+def test_obstacles_path_end_and_events_are_there(recorded):
+    path, found = recorded
+    track, flight, result = rollout("collision", 1.5, False)
+    entities = {entity.replace("\\", "") for entity, _ in found}
+    for name in ("plate 0", "pillar 0", "capsule 0", "sphere 0"):
+        assert f"/trial_1/world/obstacles/{name}" in entities
+    strips = found["/trial_1/world/path", "LineStrips3D:strips"][1][0]
+    assert len(strips) == len(flight.time_s) - 1
+    assert len(set(found["/trial_1/world/path", "LineStrips3D:colors"][1][0])) > 10
+    end = found["/trial_1/world/end", "Points3D:positions"][1][0]
+    np.testing.assert_allclose(end, [[result.pos_x, result.pos_y, result.pos_z]], rtol=1e-6)
+    label = found["/trial_1/world/end", "Points3D:labels"][1][0]
+    assert label == ["collision with pillar 0"]
+    times, texts = found["/trial_1/events", "TextLog:text"]
+    assert texts == [["gate 0 passed"], ["collision with pillar 0"]]
+    assert times[-1] == nanoseconds(flight.time_s[-1])
+    about = {name for entity, name in found if entity == "/__properties/suite"}
+    assert {"schema", "suite_version"} <= {name.split(":")[-1] for name in about}
+
+
+def test_the_rerun_command_finds_the_recording_sound(recorded):
+    path, _ = recorded
+    command = [sys.executable, "-m", "rerun", "rrd", "verify", path]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_recordings_of_nothing_and_of_a_folder_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="at least one rollout"):
+        write_recording(tmp_path / "a.rrd", [])
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError):
+        write_recording(tmp_path / "file" / "a.rrd", [rollout()])

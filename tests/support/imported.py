@@ -1,0 +1,90 @@
+"""What an import gave, beside the flight that the file was made from; and tables to import."""
+
+import csv
+
+import numpy as np
+
+from tests.support import known_flight
+
+NAMES = {
+    "pos": ["pos_x", "pos_y", "pos_z"],
+    "quat": ["quat_w", "quat_x", "quat_y", "quat_z"],
+    "vel": ["vel_x", "vel_y", "vel_z"],
+    "rate": ["rate_x", "rate_y", "rate_z"],
+    "acc": ["acc_x", "acc_y", "acc_z"],
+    "cmd_thrust": ["cmd_thrust"],
+    "cmd_rate": ["cmd_rate_x", "cmd_rate_y", "cmd_rate_z"],
+}
+
+
+def flight(hz=200.0, end=8.0, noise=0.0, seed=0):
+    """The columns of a good table as arrays by signal."""
+    truth = known_flight.fly(np.arange(0, end, 1 / hz))
+    rng = np.random.default_rng(seed)
+    parts = {
+        "time": truth.time,
+        "pos": truth.pos,
+        "quat": truth.quat,
+        "vel": truth.vel,
+        "rate": truth.rate,
+        "acc": truth.acc,
+        "cmd_thrust": truth.thrust[:, None],
+        "cmd_rate": truth.cmd_rate,
+    }
+    if noise:
+        sizes = {"pos": 0.003, "vel": 0.05, "rate": 0.05, "acc": 0.5, "quat": 0.0015}
+        for name, size in sizes.items():
+            parts[name] = parts[name] + noise * size * rng.normal(size=parts[name].shape)
+        parts["quat"] /= np.linalg.norm(parts["quat"], axis=1, keepdims=True)
+    return parts
+
+
+def write(path, parts, keep=None):
+    """Write `parts` as CSV; cells that `keep` (signal -> mask of rows) leaves out stay empty."""
+    columns = {"time": [repr(float(t)) for t in parts["time"]]}
+    for name, names in NAMES.items():
+        if name not in parts:
+            continue
+        mask = np.ones(len(parts["time"]), bool) if keep is None else keep.get(name)
+        mask = np.ones(len(parts["time"]), bool) if mask is None else mask
+        for k, column in enumerate(names):
+            values = parts[name][:, k]
+            columns[column] = [
+                repr(float(v)) if m else "" for v, m in zip(values, mask, strict=True)
+            ]
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(columns)
+        table.writerows(zip(*columns.values(), strict=True))
+    return path
+
+
+def of(findings, level):
+    """The subjects of that level."""
+    return {finding.subject for finding in findings if finding.level == level}
+
+
+def levels(findings):
+    """Level by subject."""
+    return {finding.subject: finding.level for finding in findings}
+
+
+def text(findings, subject):
+    """All that is said of a subject."""
+    return " ".join(finding.text for finding in findings if finding.subject == subject)
+
+
+def quat_off(log, truth):
+    """The largest difference of quaternions, whatever their signs."""
+    sign = np.sign(np.sum(log.quat_wxyz * truth.quat, axis=1, keepdims=True))
+    return np.abs(log.quat_wxyz * sign - truth.quat).max()
+
+
+def near(value, wanted, tolerance):
+    """Check what is known of `value`, which must be nearly all, against `wanted`."""
+    # Signals that are slower than the rows end before them.
+    value, wanted = np.asarray(value), np.asarray(wanted)
+    known = np.isfinite(value)
+    assert known.mean() > 0.97
+    value, wanted = value[known], np.broadcast_to(wanted, known.shape)[known]
+    np.testing.assert_allclose(value, wanted, rtol=0, atol=tolerance)
