@@ -17,7 +17,7 @@ CATALOGUES = ("eval/effects", "suite/commands")
 """Folders that hold one file a thing, and a test for all of them."""
 
 
-def tests_of(module):
+def places_of(module):
     """Return where the test of `module` may stand: at its own path, or as its folder's."""
     folder = Path("tests", *module.parts[:-1])
     return folder / f"test_{module.stem}.py", folder / f"test_{module.parts[-2]}.py"
@@ -37,7 +37,7 @@ def test_a_modules_test_is_found_from_its_path(module):
     if str(module.parent) in CATALOGUES:
         assert any((ROOT / "tests" / module.parent).glob("test_*.py"))
         return
-    own, folders = tests_of(module)
+    own, folders = places_of(module)
     if not (ROOT / own).is_file():
         name = ".".join(module.with_suffix("").parts)
         assert (ROOT / folders).is_file(), f"neither {own} nor {folders}"
@@ -45,7 +45,7 @@ def test_a_modules_test_is_found_from_its_path(module):
 
 
 def test_a_tests_module_is_found_from_its_path():
-    known = {place for module in MODULES for place in tests_of(module)}
+    known = {place for module in MODULES for place in places_of(module)}
     whole = ("tests/examples", "tests/suite/commands", "tests/eval/effects")
     lost = [
         path
