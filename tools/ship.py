@@ -18,10 +18,10 @@ from typing import Any
 
 from policies.formats.checkpoint import CONFIG, WEIGHTS
 from policies.formats.policy_file import load_policy_checkpoint
+from suite.common import curve
 from suite.common.console import duration
 from suite.loop.charts import training_chart
 from suite.loop.compare import BEFORE
-from suite.train import curve
 from tracks.common.files import replacing_folder
 
 SHELF = Path(__file__).resolve().parent.parent / "policies" / "shipped"

@@ -23,7 +23,7 @@ SKY, GROUND, GRID = (232, 238, 245), (214, 217, 212), (200, 204, 200)
 GRID_REACH_M = 24
 
 
-class View(NamedTuple):
+class Viewpoint(NamedTuple):
     """A pinhole camera anywhere in the world."""
 
     eye_w: np.ndarray
@@ -55,27 +55,29 @@ class Lines(NamedTuple):
     width_m: float
 
 
-def look_at(eye_w: np.ndarray, target_w: np.ndarray, fov_deg: float, size: tuple[int, int]) -> View:
+def look_at(
+    eye_w: np.ndarray, target_w: np.ndarray, fov_deg: float, size: tuple[int, int]
+) -> Viewpoint:
     """Return the level camera at `eye_w` that looks at `target_w`; `fov_deg` is across."""
     forward = (target_w - eye_w) / np.linalg.norm(target_w - eye_w)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= max(float(np.linalg.norm(right)), 1e-9)
     axes = np.stack([right, np.cross(forward, right), forward])
-    return View(eye_w, axes, size[0] / 2 / np.tan(np.deg2rad(fov_deg) / 2), size)
+    return Viewpoint(eye_w, axes, size[0] / 2 / np.tan(np.deg2rad(fov_deg) / 2), size)
 
 
-def to_camera(view: View, points_w: np.ndarray) -> np.ndarray:
+def to_camera(view: Viewpoint, points_w: np.ndarray) -> np.ndarray:
     """Return points (..., 3) in camera axes: right, down, forward [m]."""
     return (points_w - view.eye_w) @ view.axes_w.T
 
 
-def to_pixels(view: View, points_c: np.ndarray) -> np.ndarray:
+def to_pixels(view: Viewpoint, points_c: np.ndarray) -> np.ndarray:
     """Return the pixels (..., 2) of points in camera axes (..., 3) in front of the eye."""
     middle = np.array(view.size) / 2
     return middle + view.focal * points_c[..., :2] / points_c[..., 2:]
 
 
-def paint(view: View, faces: Faces, lines: Lines) -> Image.Image:
+def paint(view: Viewpoint, faces: Faces, lines: Lines) -> Image.Image:
     """Return the picture of sky, ground, faces and lines."""
     image = Image.new("RGB", view.size, SKY)
     draw = ImageDraw.Draw(image)
@@ -113,7 +115,7 @@ def _fade(colour: np.ndarray, distance: np.ndarray) -> np.ndarray:
     return np.clip((1 - share) * colour + share * np.array(SKY), 0, 255)
 
 
-def _paint_ground(draw: ImageDraw.ImageDraw, view: View) -> None:
+def _paint_ground(draw: ImageDraw.ImageDraw, view: Viewpoint) -> None:
     reach = 500.0
     square = np.array([[-reach, -reach], [reach, -reach], [reach, reach], [-reach, reach]])
     ground = np.insert(square + view.eye_w[:2], 2, 0.0, axis=1)

@@ -20,7 +20,7 @@ from policies.networks import delta_network
 from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before, state_after
 from suite.delta.windows import refuse_none, stacked
 from suite.train.config import QuadrotorConfig
-from suite.train.dynamics.quadrotor import Body, Grid, fly_period, plant_of, whole_steps
+from suite.train.dynamics.quadrotor import Grid, QuadrotorState, fly_period, plant_of, whole_steps
 from tracks.geometry.rotation import to_local
 
 
@@ -154,7 +154,7 @@ def replay_quadrotor(
         hover.wind,
     )
     zero = jnp.zeros((count, 3))
-    body = Body(
+    body = QuadrotorState(
         pos_w=jnp.asarray(windows.pos_w)[:, 0],
         vel_w=jnp.asarray(windows.vel_w)[:, 0],
         acc_w=zero,

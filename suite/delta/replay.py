@@ -54,7 +54,7 @@ def replay(
     rot_w = jnp.asarray(windows.rot_w)
     air_b = to_local(rot_w, windows.vel_w[:, 0])
     thrust_w = windows.acc_w + to_world(rot_w, model.drag * air_b)
-    body = point_mass.Body(
+    body = point_mass.PointMassState(
         pos_w=jnp.asarray(windows.pos_w[:, 0]),
         vel_w=jnp.asarray(windows.vel_w[:, 0]),
         thrust_w=thrust_w,
@@ -65,15 +65,15 @@ def replay(
     )
 
     def step(
-        carry: tuple[point_mass.Body, jax.Array], inputs: tuple[jax.Array, ...]
-    ) -> tuple[tuple[point_mass.Body, jax.Array], tuple[jax.Array, ...]]:
+        carry: tuple[point_mass.PointMassState, jax.Array], inputs: tuple[jax.Array, ...]
+    ) -> tuple[tuple[point_mass.PointMassState, jax.Array], tuple[jax.Array, ...]]:
         body, hidden = carry
         action, heading, time_step = inputs
         correction = jnp.zeros_like(action)
         if delta is not None:
             vel_b = to_local(body.rot_w, body.vel_w)
             correction, hidden = delta_network.step(delta, hidden, vel_b, body.rot_w[:, 2], action)
-        constants = point_mass.Constants(
+        constants = point_mass.PointMassParams(
             lag=jnp.broadcast_to(model.lag, count),
             drag=jnp.broadcast_to(model.drag, (count, 3)),
             wind_w=jnp.zeros((count, 3)),

@@ -82,7 +82,7 @@ class Config:
     """A shipped vehicle's name or a vehicle file (.toml)."""
 
 
-class Variant(NamedTuple):
+class TablePolicy(NamedTuple):
     """A policy of the table."""
 
     name: str
@@ -128,7 +128,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     }
 
 
-def variants_of(config: Config, place: Place, console: Console) -> list[Variant]:
+def variants_of(config: Config, place: Place, console: Console) -> list[TablePolicy]:
     """Return the policies to be judged; the loop that makes the fine-tuned ones is run if asked.
 
     Raises:
@@ -156,7 +156,7 @@ def variants_of(config: Config, place: Place, console: Console) -> list[Variant]
     for name, path in chosen.items():
         load_policy(path)
         label = made if config.delta_iterations and name != OURS else path
-        variants.append(Variant(name, path, f"{label}, SHA-256 {policy_digest(path)[:16]}"))
+        variants.append(TablePolicy(name, path, f"{label}, SHA-256 {policy_digest(path)[:16]}"))
     return variants
 
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from eval.worlds.trial import TrialResult
+from suite.common import curve
 from suite.common.choices import parse_tracks
 from suite.common.report import Grid, Picture, Section
 from suite.loop.charts import comparison_chart, delta_chart, training_chart
@@ -18,7 +19,6 @@ from suite.loop.compare import BEFORE, CAVEAT, WITH, WITHOUT, compare, grids, ve
 from suite.loop.config import DeltaLoopConfig, LoopConfig
 from suite.loop.report import errors_row
 from suite.loop.variants import DeltaModel, Findings, Loop, Shown, Variant
-from suite.train import curve
 
 JUDGED = "judging the one fine-tuned {} the Delta Action Model, on the same seeds"
 

@@ -25,11 +25,11 @@ from policies.formats.policy_file import save_policy
 from policies.networks import network
 from policies.networks.tree_arrays import tree_from_arrays, tree_to_arrays
 from policies.spec import PolicySpec
+from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate, announce
 from suite.common.provenance import write_run_record
-from suite.train import curve
 from suite.train.worlds import Worlds
 from tracks.common.files import recover_folder
 

@@ -19,7 +19,7 @@ from policies.networks import delta_network, network
 from policies.observation import View, encode_depth, observe
 from suite.train import losses
 from suite.train.config import LossConfig, TrainConfig
-from suite.train.dynamics.interface import Body, make_dynamics
+from suite.train.dynamics.interface import DynamicsState, make_dynamics
 from suite.train.worlds import Worlds
 from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.clearance import nearest_obstacle
@@ -39,7 +39,7 @@ BODY_RADIUS_M = 0.08
 """Closer than this to a surface counts as a collision in the curves [m]."""
 
 
-class Memory(NamedTuple):
+class RolloutCarry(NamedTuple):
     """What a world carries from step to step."""
 
     body: Any
@@ -83,7 +83,7 @@ class StepRecord(NamedTuple):
     """What `note` returned, where there was one."""
 
 
-Note = Callable[[Worlds, Body, Body, jax.Array], Any]
+Note = Callable[[Worlds, DynamicsState, DynamicsState, jax.Array], Any]
 """note(worlds, before, body, target) -> arrays (B, ...) to be kept of a step; `target` is that of
 its beginning."""
 
@@ -101,7 +101,7 @@ def target_gate(gates: Gates, target: jax.Array, ahead: int = 0) -> tuple[Gates,
     return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
 
 
-def view_in(worlds: Worlds, body: Body, target: jax.Array) -> View:
+def view_in(worlds: Worlds, body: DynamicsState, target: jax.Array) -> View:
     """Return what drones at `body` that have passed `target` (B,) gates can observe, but images."""
     gates = worlds.scene.gates
     gate, target_w = target_gate(gates, target)
@@ -117,12 +117,12 @@ def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def make_look(
     config: TrainConfig,
-) -> Callable[[Worlds, Body, jax.Array], jax.Array]:
+) -> Callable[[Worlds, DynamicsState, jax.Array], jax.Array]:
     """Return look(worlds, body, key) -> (B, height, width), the encoded image with its noise."""
     spec, physics = config.spec, config.physics
     rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
 
-    def look(worlds: Worlds, body: Body, key: jax.Array) -> jax.Array:
+    def look(worlds: Worlds, body: DynamicsState, key: jax.Array) -> jax.Array:
         # Scaling the rays across the optical axis changes the field of view; every world of an
         # iteration shares it, so that the rays stay one array.
         axis = rays.mean(0)
@@ -145,7 +145,7 @@ def make_judge(
     """
 
     def judge(
-        worlds: Worlds, before: Body, body: Body, target: jax.Array
+        worlds: Worlds, before: DynamicsState, body: DynamicsState, target: jax.Array
     ) -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
         gate, _ = target_gate(worlds.scene.gates, target)
         count = worlds.scene.gates.center_w.shape[1]
@@ -198,17 +198,15 @@ def make_rollout(
 
     def act(
         params: network.Params,
-        memory: Memory,
+        carry: RolloutCarry,
         embedding: jax.Array,
         seen: View,
-    ) -> tuple[jax.Array, Memory]:
-        state, states = queue(memory.states, observe(spec, seen, memory.action_b).state)
-        embedding, embeddings = queue(memory.embeddings, embedding)
-        action, hidden = network.recur(params, memory.hidden, embedding, state)
-        memory = memory._replace(
-            hidden=hidden, action_b=action, embeddings=embeddings, states=states
-        )
-        return action, memory
+    ) -> tuple[jax.Array, RolloutCarry]:
+        state, states = queue(carry.states, observe(spec, seen, carry.action_b).state)
+        embedding, embeddings = queue(carry.embeddings, embedding)
+        action, hidden = network.recur(params, carry.hidden, embedding, state)
+        carry = carry._replace(hidden=hidden, action_b=action, embeddings=embeddings, states=states)
+        return action, carry
 
     def rollout(
         params: network.Params,
@@ -220,7 +218,7 @@ def make_rollout(
     ) -> tuple[jax.Array, StepRecord]:
         steps, batch, width = embedding_shift.shape
         body = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
-        memory = Memory(
+        carry = RolloutCarry(
             body=body,
             target=worlds.target,
             hidden=jnp.asarray(worlds.hidden),
@@ -232,27 +230,27 @@ def make_rollout(
         )
 
         def step(
-            memory: Memory, inputs: tuple[jax.Array, jax.Array, jax.Array]
-        ) -> tuple[Memory, StepRecord]:
+            carry: RolloutCarry, inputs: tuple[jax.Array, jax.Array, jax.Array]
+        ) -> tuple[RolloutCarry, StepRecord]:
             shift_now, key_now, number = inputs
-            before = memory.body
+            before = carry.body
             image = look(worlds, jax.lax.stop_gradient(before), key_now)
-            seen = view_in(worlds, before, memory.target)
+            seen = view_in(worlds, before, carry.target)
             embedding = encode(params, image) + shift_now
-            action, memory = act(params, memory, embedding, seen)
+            action, carry = act(params, carry, embedding, seen)
             if delta is not None:
                 vel_b = to_local(jax.lax.stop_gradient(before.rot_w), before.vel_w)
                 correction, delta_hidden = delta_network.step(
-                    delta, memory.delta_hidden, vel_b, before.rot_w[:, 2], action
+                    delta, carry.delta_hidden, vel_b, before.rot_w[:, 2], action
                 )
                 action = action + correction
-                memory = memory._replace(delta_hidden=delta_hidden)
+                carry = carry._replace(delta_hidden=delta_hidden)
             body = dynamics.step(before, worlds.constants, action, seen.gate_w, key_now)
-            terms, clearance, passed = judge(worlds, before, body, memory.target)
-            terms = {name: term * memory.alive for name, term in terms.items()}
-            alive = memory.alive * (clearance > -weights.crash_depth_m)
+            terms, clearance, passed = judge(worlds, before, body, carry.target)
+            terms = {name: term * carry.alive for name, term in terms.items()}
+            alive = carry.alive * (clearance > -weights.crash_depth_m)
             alive = alive * (number + 1 < worlds.stop)
-            target = memory.target + passed
+            target = carry.target + passed
             if config.episode.finish:
                 alive = alive * (target < worlds.scene.gates.center_w.shape[1])
             record = StepRecord(
@@ -262,14 +260,14 @@ def make_rollout(
                 clearance=clearance,
                 passed=passed,
                 pos_w=body.pos_w,
-                hidden=memory.hidden,
-                alive=memory.alive,
-                noted=None if note is None else note(worlds, before, body, memory.target),
+                hidden=carry.hidden,
+                alive=carry.alive,
+                noted=None if note is None else note(worlds, before, body, carry.target),
             )
-            return memory._replace(body=body, target=target, alive=alive), record
+            return carry._replace(body=body, target=target, alive=alive), record
 
         keys = jax.random.split(key, steps)
-        _, records = jax.lax.scan(step, memory, (embedding_shift, keys, jnp.arange(steps)))
+        _, records = jax.lax.scan(step, carry, (embedding_shift, keys, jnp.arange(steps)))
         loss = functools.reduce(jnp.add, (records.terms[name].mean() for name in losses.LOSSES))
         return loss, jax.lax.stop_gradient(records)
 

@@ -31,7 +31,7 @@ class Worlds(NamedTuple):
     """(B, 3) unit, horizontal."""
     target: Array
     """(B,) index of the first gate to pass."""
-    constants: dynamics.Constants
+    constants: dynamics.WorldParams
     """Of the dynamics."""
     hidden: Array
     """(B, hidden) the policy's recurrent state at the start, zero for worlds that start at rest."""
@@ -108,14 +108,14 @@ def _beside_a_gate(
     return point, speed_limit * onward, target
 
 
-def _quadrotor_constants(config: TrainConfig, iteration: int) -> dynamics.Constants:
+def _quadrotor_constants(config: TrainConfig, iteration: int) -> dynamics.WorldParams:
     """Return the quadrotors of an iteration, from draws of their own: the tracks stay the same."""
-    from suite.train.dynamics.quadrotor import Constants, draw_effects
+    from suite.train.dynamics.quadrotor import QuadrotorParams, draw_effects
 
     assert config.quadrotor is not None
     batch, rng = config.episode.batch, np.random.default_rng([config.seed, iteration, 1])
     period = np.full(batch, 1.0 / config.spec.rate_hz, np.float32)
-    return Constants(period, draw_effects(config.quadrotor, batch, rng))
+    return QuadrotorParams(period, draw_effects(config.quadrotor, batch, rng))
 
 
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
@@ -151,14 +151,14 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     stretch = np.clip(1 + physics.time_step_std * rng.standard_normal(batch), 0.5, 1.5)
     low_drag, high_drag = np.transpose([physics.drag, physics.drag, physics.drag_up])
     lag = physics.lag_mean + physics.lag_std * rng.standard_normal(batch)
-    point = point_mass.Constants(
+    point = point_mass.PointMassParams(
         lag=np.clip(lag, 0.2 * physics.lag_mean, None),
         drag=rng.uniform(low_drag, high_drag, (batch, 3)),
         wind_w=rng.standard_normal((batch, 3)) * np.asarray(physics.wind_std),
         time_step=period * stretch,
         delay=rng.uniform(*physics.action_delay, batch),
     )
-    constants = point_mass.Constants(*(np.asarray(x, np.float32) for x in point))
+    constants = point_mass.PointMassParams(*(np.asarray(x, np.float32) for x in point))
     if config.quadrotor is not None:
         constants = _quadrotor_constants(config, iteration)
     return Worlds(

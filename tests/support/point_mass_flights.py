@@ -29,7 +29,7 @@ def fly(plant, count=4, seconds=3.0, seed=0, extra_b=None):
         jnp.asarray(rng.normal(0, 2, (count, 3)), jnp.float32),
         jnp.tile(jnp.asarray([1.0, 0.0, 0.0]), (count, 1)),
     )
-    constants = point_mass.Constants(
+    constants = point_mass.PointMassParams(
         lag=jnp.full(count, plant.lag),
         drag=jnp.broadcast_to(jnp.asarray(plant.drag, jnp.float32), (count, 3)),
         wind_w=jnp.zeros((count, 3)),

@@ -1,12 +1,14 @@
 """The trainer's method as a plain torch-eager loop: the baseline of `suite bench train`.
 
-Same network, point mass, losses, field, delays and noise as `suite.train`, one step after another
-with the encoder inside the loop, and backward through it.
+Same network, point mass, losses, field, delays and noise as `suite.train` with the preset `paper`,
+one step after another with the encoder inside the loop, and backward through it. What the preset
+does not use is not here, so that a yardstick stays what it is while the trainer grows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import torch
@@ -15,16 +17,20 @@ from policies.formats.torch_twin import torch_twin
 from suite.experiments.bench import torch_scene
 from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
-from suite.train.dynamics.point_mass import GRAVITY, Constants
-from suite.train.losses import APPROACH_FREE_M, MAX_PULL, UNIT_FIELD
+from suite.train.dynamics.point_mass import GRAVITY, PointMassParams
+from suite.train.losses import MAX_PULL, UNIT_FIELD
+from suite.train.presets import paper
 from suite.train.rollout import BEYOND_M
 from suite.train.worlds import Worlds
 from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.scene import Gates
 
+SIZES = ("camera", "hidden_size")
+"""What may differ from the preset: the network's and the image's size."""
 
-class Body(NamedTuple):
-    """State of the point mass as tensors; shapes and units are `point_mass.Body`'s."""
+
+class TorchState(NamedTuple):
+    """State of the point mass as tensors; shapes and units are `point_mass.PointMassState`'s."""
 
     pos_w: Tensor
     vel_w: Tensor
@@ -61,8 +67,12 @@ def attitude(thrust_w: Tensor, heading_w: Tensor) -> Tensor:
 
 
 def step(
-    body: Body, constants: Constants, action: Tensor, target_w: Tensor, config: TrainConfig
-) -> Body:
+    body: TorchState,
+    constants: PointMassParams,
+    action: Tensor,
+    target_w: Tensor,
+    config: TrainConfig,
+) -> TorchState:
     """Advance one policy period; see `suite.train.dynamics.point_mass.step`."""
     dt = constants.time_step[:, None]
     history = torch.cat([to_world(body.rot_w, action)[:, None], body.commands_w], 1)
@@ -83,7 +93,7 @@ def step(
         size = heading.norm(dim=-1, keepdim=True)
         heading = torch.where(size > 1e-3, heading / size.clamp(min=1e-3), body.heading_w)
         rot = attitude(thrust, heading)
-    return Body(pos, vel, thrust, acc, rot, heading, history[:, :2])
+    return TorchState(pos, vel, thrust, acc, rot, heading, history[:, :2])
 
 
 class Baseline:
@@ -93,10 +103,17 @@ class Baseline:
         """Take over the parameters of `policies.networks.network`.
 
         Raises:
-            ValueError: for `loss.field_square`, which it does not have.
+            ValueError: for a setting of the loss or the observation that is not the preset's.
         """
-        if config.loss.field_square:
-            raise ValueError("loss.field_square is True, allowed for the torch baseline is False")
+        for part in ("loss", "spec"):
+            mine, fixed = getattr(config, part), getattr(paper(), part)
+            for field in fields(fixed):
+                value, allowed = getattr(mine, field.name), getattr(fixed, field.name)
+                if value != allowed and field.name not in SIZES:
+                    raise ValueError(
+                        f"{part}.{field.name} is {value!r}, allowed for the torch baseline is "
+                        f"{allowed!r}, that of the preset paper"
+                    )
         self.config = config
         self.network = torch_twin(params, config.spec).requires_grad_(True)
         rate, decay = config.optimizer.rate, config.optimizer.weight_decay
@@ -108,8 +125,6 @@ class Baseline:
         self.optimizer.zero_grad()
         loss = self.loss(worlds)
         loss.backward()
-        if self.config.optimizer.clip > 0:
-            torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.optimizer.clip)
         self.optimizer.step()
         return float(loss.detach())
 
@@ -118,7 +133,7 @@ class Baseline:
         config, physics = self.config, self.config.physics
         count = worlds.pos_w.shape[0]
         zero = torch.zeros(count, 3)
-        body = Body(
+        body = TorchState(
             worlds.pos_w, worlds.vel_w, zero, zero, attitude(zero, worlds.heading_w),
             worlds.heading_w, torch.zeros(count, 2, 3),
         )  # fmt: skip
@@ -128,44 +143,33 @@ class Baseline:
         upright[:, 5] = 1.0
         states = [upright] * physics.state_delay
         hidden = worlds.hidden
-        action, target, alive = zero, worlds.target.long(), torch.ones(count)
+        action, target = zero, worlds.target.long()
         total = torch.zeros(())
-        for number in range(config.episode.steps):
+        for _ in range(config.episode.steps):
             gate, target_w = self.target_gate(worlds.scene.gates, target)
             images.append(self.look(worlds, body))
             seen = [to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w)]
             numbers = [seen[0], body.rot_w[:, 2], seen[1], action]
-            if config.spec.second_gate:
-                _, second_w = self.target_gate(worlds.scene.gates, target, ahead=1)
-                numbers.append(to_local(body.rot_w, second_w - body.pos_w))
-            if config.spec.gate_axis:
-                numbers.append(to_local(body.rot_w, gate.rot_w[:, :, 0]))
             states.append(torch.cat(numbers, -1))
             action, hidden = self.network(states.pop(0), images.pop(0), hidden)
             constants = worlds.constants
-            assert isinstance(constants, Constants)  # the baseline flies the point mass alone
+            assert isinstance(constants, PointMassParams)  # the baseline flies the point mass alone
             before, body = body, step(body, constants, action, target_w, config)
             passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
-            passed = passed & (target < worlds.scene.gates.center_w.shape[1])
-            aim = self.target_gate(worlds.scene.gates, target + passed * config.loss.pass_first)
-            loss, clearance = self.judge(worlds, before, body, gate, *aim)
-            total = total + (loss * alive).mean()
-            alive = alive * (clearance > -config.loss.crash_depth_m) * (number + 1 < worlds.stop)
-            target = target + passed
-            if config.episode.finish:
-                alive = alive * (target < worlds.scene.gates.center_w.shape[1])
+            total = total + self.judge(worlds, before, body, gate, target_w).mean()
+            target = target + (passed & (target < worlds.scene.gates.center_w.shape[1]))
         return total / config.episode.steps
 
-    def target_gate(self, gates: Gates, target: Tensor, ahead: int = 0) -> tuple[Gates, Tensor]:
-        """Return each world's current gate, or the one `ahead`, and the point to fly to (B, 3)."""
+    def target_gate(self, gates: Gates, target: Tensor) -> tuple[Gates, Tensor]:
+        """Return each world's current gate and the point to fly to (B, 3)."""
         count = gates.center_w.shape[1]
         rows = torch.arange(len(target))
-        gate = Gates(*(array[rows, (target + ahead).clamp(max=count - 1)] for array in gates))
+        gate = Gates(*(array[rows, target.clamp(max=count - 1)] for array in gates))
         beyond = torch.where(target >= count, BEYOND_M, 0.0)[:, None]
         return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
 
     @torch.no_grad()
-    def look(self, worlds: Worlds, body: Body) -> Tensor:
+    def look(self, worlds: Worlds, body: TorchState) -> Tensor:
         """Return the encoded images (B, height, width) with their noise."""
         camera, encoding = self.config.spec.camera, self.config.spec.depth
         axis = self.rays.mean(0)
@@ -176,9 +180,9 @@ class Baseline:
         return image.reshape(-1, camera.height, camera.width)
 
     def judge(
-        self, worlds: Worlds, before: Body, body: Body, gate: Gates, aim: Gates, aim_w: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the loss of a step (B,) and the smallest distance on its path (B,)."""
+        self, worlds: Worlds, before: TorchState, body: TorchState, gate: Gates, target_w: Tensor
+    ) -> Tensor:
+        """Return the loss of a step (B,)."""
         config = self.config.loss
         share = (torch.arange(config.path_samples) + 1.0) / config.path_samples
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
@@ -194,21 +198,12 @@ class Baseline:
         loss = loss + config.acceleration * (body.acc_w**2).sum(-1)
         loss = loss + config.jerk * (jerk**2).sum(-1)
 
-        local = to_local(aim.rot_w, body.pos_w - aim.center_w).detach()
-        off = local[:, 1:].norm(dim=-1) + local[:, 0].clamp(min=0)
-        ahead = (aim_w == aim.center_w).all(-1)  # past the last gate the point is no gate's centre
-        shift = ahead * (off - APPROACH_FREE_M).clamp(0.0, config.approach_m)
-        to_gate = aim_w - shift[:, None] * aim.rot_w[:, :, 0] - body.pos_w
-        towards = (body.vel_w * to_gate).sum(-1) / _norm(to_gate)
-        loss = loss - config.progress * towards
-        loss = loss - config.progress_norm * towards / (_norm(body.vel_w) + 1e-3)
-        lateral = to_local(aim.rot_w, body.pos_w - aim.center_w)[:, 1:]
-        near = (-config.projection_decay * _norm(to_gate).detach()).exp()
-        loss = loss + config.projection * (lateral**2).sum(-1) * near
+        to_gate = target_w - body.pos_w
+        loss = loss - config.progress * (body.vel_w * to_gate).sum(-1) / _norm(to_gate)
 
         pull = self.pull(gate, body.pos_w.detach(), body.vel_w.detach())
         guidance = (pull * (body.pos_w - body.pos_w.detach())).sum(-1)
-        return loss - config.field_gain * guidance, distance.amin(-1)
+        return loss - config.field_gain * guidance
 
     def pull(self, gate: Gates, pos_w: Tensor, vel_w: Tensor) -> Tensor:
         """Return u_A (B, 3), 1 across the centre of a gate of 1 m."""

@@ -1,7 +1,7 @@
 """`suite bench train`: gradient steps a second against a plain torch-eager loop.
 
 Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids at
-the CPU preset: batch 64, 150 steps, 24x32 images, two threads.
+the preset `paper`: batch 64, 150 steps, 24x32 images, two threads.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ ENOUGH_S = 60.0
 
 
 def bench_config(batch: int = BATCH, steps: int = STEPS) -> TrainConfig:
-    """Return the CPU preset at the bench's size, on one device."""
-    base = preset("racer")
+    """Return the preset `paper` at the bench's size, on one device."""
+    base = preset("paper")
     return replace(base, devices=1, episode=replace(base.episode, batch=batch, steps=steps))
 
 

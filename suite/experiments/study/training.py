@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate, announce
 from suite.common.work import all_done
 from suite.experiments.study.cache import digest
-from suite.train import curve
 from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig
 from tracks.common.names import unknown_name

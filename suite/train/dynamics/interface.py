@@ -12,7 +12,7 @@ from suite.train.dynamics import point_mass
 from tracks.geometry.scene import Array
 
 
-class Body(Protocol):
+class DynamicsState(Protocol):
     """What a rollout reads of a state; all but these is the dynamics' own."""
 
     @property
@@ -36,7 +36,7 @@ class Body(Protocol):
         ...
 
 
-class Constants(Protocol):
+class WorldParams(Protocol):
     """What is drawn once per world."""
 
     @property
@@ -46,7 +46,7 @@ class Constants(Protocol):
 
 
 class Dynamics(NamedTuple):
-    """Two pure functions over B worlds; `Body` and constants are pytrees of arrays (B, ...)."""
+    """Two pure functions over B worlds; state and parameters are pytrees of arrays (B, ...)."""
 
     start: Callable[[Any, jax.Array, jax.Array, jax.Array], Any]
     """(constants, pos_w (B, 3), vel_w (B, 3), heading_w (B, 3)) -> body, upright."""
@@ -65,17 +65,17 @@ def make_dynamics(config: TrainConfig) -> Dynamics:
         return Dynamics(start, step)
 
     def start_point(
-        _: point_mass.Constants, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
-    ) -> point_mass.Body:
+        _: point_mass.PointMassParams, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
+    ) -> point_mass.PointMassState:
         return point_mass.start(pos_w, vel_w, heading_w)
 
     def step_point(
-        body: point_mass.Body,
-        constants: point_mass.Constants,
+        body: point_mass.PointMassState,
+        constants: point_mass.PointMassParams,
         action_b: jax.Array,
         target_w: jax.Array,
         _: jax.Array,
-    ) -> point_mass.Body:
+    ) -> point_mass.PointMassState:
         rate, decay = config.physics.heading_rate, config.loss.gradient_decay
         return point_mass.step(body, constants, action_b, target_w, rate, decay)
 

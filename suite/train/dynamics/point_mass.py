@@ -18,7 +18,7 @@ GRAVITY = 9.81
 """[m/s^2]."""
 
 
-class Constants(NamedTuple):
+class PointMassParams(NamedTuple):
     """What is drawn once per world, by numpy or JAX."""
 
     lag: Array
@@ -33,7 +33,7 @@ class Constants(NamedTuple):
     """(B,) delay of a command in time steps, within [0, 2]."""
 
 
-class Body(NamedTuple):
+class PointMassState(NamedTuple):
     """State of the point mass."""
 
     pos_w: jax.Array
@@ -67,12 +67,12 @@ def attitude(thrust_w: jax.Array, heading_w: jax.Array) -> jax.Array:
     return jnp.stack([jnp.cross(left, up), left, up], axis=-1)
 
 
-def start(pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> Body:
+def start(pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> PointMassState:
     """Return a body that hovers or coasts at vel_w (B, 3) [m/s] in pos_w (B, 3) [m], upright."""
     zero = jnp.zeros_like(pos_w)
     rot_w = attitude(zero, heading_w)
     commands = jnp.zeros((pos_w.shape[0], 2, 3), pos_w.dtype)
-    return Body(pos_w, vel_w, zero, zero, rot_w, heading_w, commands)
+    return PointMassState(pos_w, vel_w, zero, zero, rot_w, heading_w, commands)
 
 
 def faded(x: jax.Array, factor: jax.Array | float) -> jax.Array:
@@ -81,13 +81,13 @@ def faded(x: jax.Array, factor: jax.Array | float) -> jax.Array:
 
 
 def step(
-    body: Body,
-    constants: Constants,
+    body: PointMassState,
+    constants: PointMassParams,
     action_b: jax.Array,
     target_w: jax.Array,
     heading_rate: float,
     gradient_decay: float,
-) -> Body:
+) -> PointMassState:
     """Return the body one policy period later.
 
     The command acts `delay` steps late; between two commands the mean over the step is taken.
@@ -125,4 +125,4 @@ def step(
     size = jnp.linalg.norm(heading, axis=-1, keepdims=True)
     heading = jnp.where(size > 1e-3, heading / jnp.maximum(size, 1e-3), body.heading_w)
     rot = attitude(jax.lax.stop_gradient(thrust), heading)
-    return Body(pos, vel, thrust, acc, rot, heading, history[:, :2])
+    return PointMassState(pos, vel, thrust, acc, rot, heading, history[:, :2])

@@ -27,7 +27,7 @@ from suite.train.dynamics.point_mass import attitude, faded
 from tracks.geometry.scene import Array
 
 
-class Constants(NamedTuple):
+class QuadrotorParams(NamedTuple):
     """What is drawn once per world."""
 
     time_step: Array
@@ -36,7 +36,7 @@ class Constants(NamedTuple):
     """Values (B, ...) by name, of the effects that vary; the vehicle has the others."""
 
 
-class Body(NamedTuple):
+class QuadrotorState(NamedTuple):
     """State of the quadrotor at a decision of the policy."""
 
     pos_w: jax.Array
@@ -134,11 +134,13 @@ def plant_of(
     return make_plant(config.vehicle, dt, {**own, **effects}, longest)
 
 
-def start_body(plant: Plant, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> Body:
+def start_state(
+    plant: Plant, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
+) -> QuadrotorState:
     """Return bodies (B, ...) that hovered until now, upright, at vel_w [m/s]."""
     batch = pos_w.shape[:1]
     zero = jnp.zeros_like(pos_w)
-    return Body(
+    return QuadrotorState(
         pos_w=pos_w,
         vel_w=vel_w,
         acc_w=zero,
@@ -154,12 +156,12 @@ def fly_period(
     vehicle: Vehicle,
     plant: Plant,
     cut: Grid,
-    body: Body,
+    body: QuadrotorState,
     action_b: jax.Array,
     heading: Callable[[jax.Array, jax.Array], jax.Array],
     noise: jax.Array | None = None,
     yaw_rate: jax.Array | None = None,
-) -> Body:
+) -> QuadrotorState:
     """Return the bodies one policy period later, without any fading of gradients.
 
     Args:
@@ -200,7 +202,7 @@ def fly_period(
     motion = Motion(body.pos_w, body.rot_w, body.vel_w, body.rate_b)
     start = (body.heading_w, body.plant, motion, body.time_s)
     (heading_w, state, motion, time_s), _ = jax.lax.scan(loop, start, noise, length=cut.attitude)
-    return Body(
+    return QuadrotorState(
         pos_w=motion.pos_w,
         vel_w=motion.vel_w,
         acc_w=(motion.vel_w - body.vel_w) / (cut.attitude * cut.physics * dt),
@@ -214,7 +216,7 @@ def fly_period(
 
 def quadrotor_dynamics(
     config: QuadrotorConfig, period_s: float, gradient_decay: float
-) -> tuple[Callable[..., Body], Callable[..., Body]]:
+) -> tuple[Callable[..., QuadrotorState], Callable[..., QuadrotorState]]:
     """Return start and step as in `suite.train.dynamics.interface.Dynamics`.
 
     Args:
@@ -227,20 +229,20 @@ def quadrotor_dynamics(
     turn_s = cut.physics * cut.dt
 
     def start(
-        constants: Constants, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
-    ) -> Body:
-        return start_body(plant_of(config, constants.effects, cut.dt), pos_w, vel_w, heading_w)
+        constants: QuadrotorParams, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
+    ) -> QuadrotorState:
+        return start_state(plant_of(config, constants.effects, cut.dt), pos_w, vel_w, heading_w)
 
     # What happens inside a period is computed again on the way back: kept, it would be many times
     # all the rest of a rollout.
     @jax.checkpoint
     def step(
-        body: Body,
-        constants: Constants,
+        body: QuadrotorState,
+        constants: QuadrotorParams,
         action_b: jax.Array,
         target_w: jax.Array,
         key: jax.Array,
-    ) -> Body:
+    ) -> QuadrotorState:
         plant = plant_of(config, constants.effects, cut.dt)
         noise = None
         if uses_noise(plant):

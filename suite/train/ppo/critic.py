@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from suite.train.dynamics.interface import Body
+from suite.train.dynamics.interface import DynamicsState
 from suite.train.rollout import NEAR, target_gate
 from suite.train.worlds import Worlds
 from tracks.geometry.clearance import nearest_obstacle
@@ -27,7 +27,7 @@ TOUCH_M = 0.2
 """Distance over which an obstacle becomes urgent [m]."""
 
 
-def features(worlds: Worlds, body: Body, target: jax.Array) -> jax.Array:
+def features(worlds: Worlds, body: DynamicsState, target: jax.Array) -> jax.Array:
     """Return what the critic sees of worlds that have passed `target` (B,) gates, (B, FEATURES).
 
     Position, velocity, acceleration, the next gate, the drone's forward and up axes and the

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from suite.train import losses
 from suite.train.config import TrainConfig
-from suite.train.dynamics.interface import Body
+from suite.train.dynamics.interface import DynamicsState
 from suite.train.rollout import NEAR, target_gate
 from suite.train.worlds import Worlds
 from tracks.geometry.clearance import nearest_obstacle
@@ -69,7 +69,7 @@ def make_reward(
     weights = replace(config.loss, barrier_height=1.0)
 
     def reward(
-        worlds: Worlds, before: Body, body: Body, target: jax.Array
+        worlds: Worlds, before: DynamicsState, body: DynamicsState, target: jax.Array
     ) -> tuple[RewardTerms, jax.Array, jax.Array]:
         gates = worlds.scene.gates
         gate, _ = target_gate(gates, target)

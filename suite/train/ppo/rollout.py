@@ -18,7 +18,7 @@ from suite.train.rollout import BODY_RADIUS_M, make_look, queue, states_at_start
 from suite.train.worlds import Worlds
 
 
-class Memory(NamedTuple):
+class EpisodeCarry(NamedTuple):
     """What an episode carries from step to step."""
 
     body: Any
@@ -94,7 +94,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
         params: network.Params, log_deviation: jax.Array, worlds: Worlds, key: jax.Array
     ) -> tuple[Record, jax.Array]:
         batch = worlds.pos_w.shape[0]
-        start = Memory(
+        start = EpisodeCarry(
             body=dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w),
             target=worlds.target,
             hidden=jnp.asarray(worlds.hidden),
@@ -104,17 +104,17 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
             states=states_at_start(batch, config),
         )
 
-        def step(memory: Memory, key: jax.Array) -> tuple[Memory, Record]:
-            before = memory.body
-            seen = critic.features(worlds, before, memory.target)
-            view = view_in(worlds, before, memory.target)
-            state, states = queue(memory.states, observe(spec, view, memory.action_b).state)
-            image, images = queue(memory.images, look(worlds, before, key))
-            mean, hidden = network.step(params, memory.hidden, state, image)
+        def step(carry: EpisodeCarry, key: jax.Array) -> tuple[EpisodeCarry, Record]:
+            before = carry.body
+            seen = critic.features(worlds, before, carry.target)
+            view = view_in(worlds, before, carry.target)
+            state, states = queue(carry.states, observe(spec, view, carry.action_b).state)
+            image, images = queue(carry.images, look(worlds, before, key))
+            mean, hidden = network.step(params, carry.hidden, state, image)
             noise = jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
             action = mean + jnp.exp(log_deviation) * noise
             body = dynamics.step(before, worlds.constants, action, view.gate_w, key)
-            terms, clearance, passed = reward(worlds, before, body, memory.target)
+            terms, clearance, passed = reward(worlds, before, body, carry.target)
             done = clearance < BODY_RADIUS_M
             record = Record(
                 image=image,
@@ -128,8 +128,8 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
                 passed=passed,
                 speed=jnp.linalg.norm(body.vel_w, axis=-1),
             )
-            target = memory.target + passed
-            going = Memory(body, target, hidden, action, images, states)
+            target = carry.target + passed
+            going = EpisodeCarry(body, target, hidden, action, images, states)
             return chosen(done, start, going), record
 
         last, records = jax.lax.scan(step, start, jax.random.split(key, config.episode.steps))

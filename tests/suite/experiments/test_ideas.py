@@ -85,7 +85,7 @@ def test_the_rows_are_trained_and_judged_once(sky, made, tmp_path, monkeypatch):
     def read(folder, name=""):
         return [] if name else [{"seconds": 7, "cold": False}]
 
-    monkeypatch.setattr("suite.train.curve.read", read)
+    monkeypatch.setattr("suite.common.curve.read", read)
     args = ["ideas", "--trials", "1", "--difficulty", "0", "--training-seeds", "3", "5"]
     assert reproduce(tmp_path, *args) == 0
     rows = ideas(Config())

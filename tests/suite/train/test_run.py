@@ -14,9 +14,10 @@ import pytest
 from policies.formats.checkpoint import load_arrays, read_config
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import delta_network
+from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.train import curve, repeat, run
+from suite.train import repeat, run
 from suite.train.dynamics import point_mass
 from tests.support.training import boxes_worlds, fresh_params, small_config
 
@@ -154,12 +155,6 @@ def test_a_kill_between_the_two_renames_of_the_state_loses_nothing(whole, tmp_pa
     assert_same_run(tmp_path, whole)
 
 
-def test_rows_written_twice_by_an_interrupted_save_count_once(tmp_path):
-    for first in (0, 1):
-        curve.append(tmp_path, [{"iteration": i, "loss": 1.0} for i in range(first, 3)])
-    assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1, 2]
-
-
 BARE = """
 import os, sys
 class Blocker:
@@ -200,7 +195,7 @@ def test_numbers_that_are_not_finite_stop_the_run_before_they_are_kept(tmp_path,
         good = boxes_worlds(config, iteration)
         if iteration < 2:
             return good
-        assert isinstance(good.constants, point_mass.Constants)
+        assert isinstance(good.constants, point_mass.PointMassParams)
         lag = good.constants.lag * np.float32(np.nan)
         return good._replace(constants=good.constants._replace(lag=lag))
 

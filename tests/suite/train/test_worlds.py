@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from suite.delta.replay import nominal_model
-from suite.train.dynamics.point_mass import Constants
+from suite.train.dynamics.point_mass import PointMassParams
 from suite.train.worlds import difficulty_range, sample_worlds
 from tests.support.training import small_config
 
@@ -54,7 +54,7 @@ def test_drag_along_the_bodys_z_has_a_range_of_its_own():
     physics = replace(config.physics, drag_up=(3.0, 4.0))
     changed = sample_worlds(replace(config, physics=physics), 2)
     before, after = (worlds.constants for worlds in (plain, changed))
-    assert isinstance(before, Constants) and isinstance(after, Constants)
+    assert isinstance(before, PointMassParams) and isinstance(after, PointMassParams)
     across, up = after.drag[:, :2], after.drag[:, 2]
     np.testing.assert_array_equal(across, before.drag[:, :2])
     assert np.all((up >= 3.0) & (up <= 4.0))

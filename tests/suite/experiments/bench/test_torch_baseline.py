@@ -17,10 +17,7 @@ from tests.support.training import fresh_params
 def pair():
     """Return (our gradient, our loss, the baseline after backward, its loss, config)."""
     base = train.bench_config(6, 12)
-    physics = replace(base.physics, depth_noise=0.0, state_delay=1)
-    loss = replace(base.loss, approach_m=1.5)
-    spec = replace(base.spec, second_gate=True, gate_axis=True)
-    config = replace(base, physics=physics, loss=loss, spec=spec)
+    config = replace(base, physics=replace(base.physics, depth_noise=0.0))
     worlds, params = train.bench_worlds(config), fresh_params(config.spec)
     gradient, loss, _ = jax.jit(make_gradient(config))(params, worlds, jax.random.key(0), None)
     baseline = Baseline(config, {name: np.asarray(value) for name, value in params.items()})
@@ -42,3 +39,12 @@ def test_both_sides_compute_the_same_gradient(pair):
         size = float(expected[name].abs().max())
         assert value.grad is not None and size > 0
         assert float((value.grad - expected[name]).abs().max()) < 0.01 * size, name
+
+
+def test_the_baseline_refuses_what_its_preset_does_not_have():
+    base = train.bench_config(2, 3)
+    params = {name: np.asarray(value) for name, value in fresh_params(base.spec).items()}
+    for part, change in (("loss", {"projection": 1.0}), ("spec", {"gate_axis": True})):
+        config = replace(base, **{part: replace(getattr(base, part), **change)})
+        with pytest.raises(ValueError, match=f"{part}.{next(iter(change))} is .* preset paper"):
+            Baseline(config, params)

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from suite.train.dynamics import point_mass
-from suite.train.dynamics.point_mass import Body, Constants
+from suite.train.dynamics.point_mass import PointMassParams, PointMassState
 
 ROLL = np.array(Rotation.from_euler("ZYX", [0.7, -0.3, 0.4]).as_matrix())
 
@@ -26,7 +26,7 @@ def constants(
     def rows(value):
         return jnp.broadcast_to(jnp.asarray(value, float), (n, *np.shape(value)))
 
-    return Constants(rows(lag), rows(drag), rows(wind), rows(time_step), rows(delay))
+    return PointMassParams(rows(lag), rows(drag), rows(wind), rows(time_step), rows(delay))
 
 
 def some_body(n=2, rot_w=ROLL):
@@ -35,7 +35,7 @@ def some_body(n=2, rot_w=ROLL):
     heading = jnp.tile(jnp.asarray([0.6, 0.8, 0.0]), (n, 1))
     rot = jnp.tile(jnp.asarray(rot_w), (n, 1, 1))
     commands = jnp.asarray(rng.normal(0, 3, (n, 2, 3)))
-    return Body(pos, vel, thrust, acc, rot, heading, commands)
+    return PointMassState(pos, vel, thrust, acc, rot, heading, commands)
 
 
 TARGET = jnp.asarray(np.array([[5.0, 1.0, 2.0], [-3.0, 2.0, 1.0]]))

@@ -15,7 +15,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from suite.commands.train import Config, resolve
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
-from suite.train.dynamics.quadrotor import Constants, grid, quadrotor_dynamics
+from suite.train.dynamics.quadrotor import QuadrotorParams, grid, quadrotor_dynamics
 from suite.train.gradient import make_gradient
 from suite.train.rollout import make_rollout
 from suite.train.worlds import sample_worlds
@@ -72,7 +72,7 @@ def fly_trainer(config, actions, rate_hz):
     start, step = quadrotor_dynamics(config, 1 / rate_hz, 0.0)
     batch = actions.shape[1]
     effects = quadrotor.draw_effects(config, batch, np.random.default_rng(0))
-    constants = Constants(np.full(batch, 1 / rate_hz), doubled(effects))
+    constants = QuadrotorParams(np.full(batch, 1 / rate_hz), doubled(effects))
     towards = jnp.tile(jnp.asarray([1.0, 0.0, 0.0]), (batch, 1))
     still = jnp.zeros((batch, 3))
     body = start(constants, still + jnp.asarray([0.0, 0.0, 10.0]), still, towards)
@@ -140,7 +140,7 @@ def test_gradients_of_a_flight_are_those_of_finite_differences(float64, monkeypa
     start, step = quadrotor_dynamics(config, 1 / 15, 0.0)
     rng = np.random.default_rng(3)
     effects = doubled(quadrotor.draw_effects(config, 2, rng))
-    constants = Constants(np.full(2, 1 / 15), effects)
+    constants = QuadrotorParams(np.full(2, 1 / 15), effects)
     weight = [jnp.asarray(rng.normal(size=(2, 3))) for _ in range(3)]
     still, key = jnp.zeros((2, 3)), jax.random.key(0)
 
@@ -210,7 +210,7 @@ def test_gradients_of_the_motion_fade_as_those_of_the_point_mass(float64):
     config = QuadrotorConfig(PLAIN, **ALIKE)
     still = jnp.zeros((1, 3))
     effects = doubled(quadrotor.draw_effects(config, 1, np.random.default_rng(0)))
-    constants = Constants(np.full(1, 0.05), effects)
+    constants = QuadrotorParams(np.full(1, 0.05), effects)
 
     def end(pos_w, decay):
         start, step = quadrotor_dynamics(config, 0.05, decay)
@@ -229,8 +229,8 @@ def test_quadrotors_vary_around_the_vehicle_and_the_tracks_stay_the_same():
     one, two, again = sample_worlds(point, 3), sample_worlds(quad, 3), sample_worlds(quad, 3)
     np.testing.assert_array_equal(one.pos_w, two.pos_w)
     np.testing.assert_array_equal(one.scene.boxes.center_w, two.scene.boxes.center_w)
-    assert isinstance(two.constants, quadrotor.Constants)
-    assert isinstance(again.constants, quadrotor.Constants)
+    assert isinstance(two.constants, quadrotor.QuadrotorParams)
+    assert isinstance(again.constants, quadrotor.QuadrotorParams)
     effects = two.constants.effects
     for name, value in effects.items():
         for field, repeated in zip(value, again.constants.effects[name], strict=True):

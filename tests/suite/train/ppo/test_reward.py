@@ -28,7 +28,7 @@ def worlds_with(sphere_w, radius=0.5):
     boxes = type(worlds.scene.boxes)(*(array[:, :0] for array in worlds.scene.boxes))
     spheres = Spheres(np.array([[sphere_w]], float), np.array([[radius]]))
     scene = worlds.scene._replace(gates=gates, boxes=boxes, spheres=spheres)
-    assert isinstance(worlds.constants, point_mass.Constants)
+    assert isinstance(worlds.constants, point_mass.PointMassParams)
     constants = worlds.constants._replace(time_step=np.full(1, DT))
     return jax.tree.map(jnp.asarray, worlds._replace(scene=scene, constants=constants))
 

@@ -8,8 +8,8 @@ import pytest
 
 from policies.formats.checkpoint import load_arrays
 from policies.formats.policy_file import load_policy_checkpoint
+from suite.common import curve
 from suite.common.console import Console
-from suite.train import curve
 from suite.train.ppo import run
 from suite.train.ppo.config import ppo_like
 from tests.support.training import SPEC, boxes_worlds, small_config
