@@ -1,5 +1,6 @@
 """The baseline's geometry in torch is that of `tracks.geometry`."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -28,7 +29,8 @@ def near(spread, seed=0):
 
 def test_images():
     rays, reach = pixel_rays_b(CONFIG.spec.camera).astype(np.float32), 10.0
-    ours = depth.depth_image(WORLDS.scene, jnp.asarray(WORLDS.pos_w), YAW, rays, reach)
+    image = jax.jit(depth.depth_image)
+    ours = image(WORLDS.scene, jnp.asarray(WORLDS.pos_w), YAW, rays, reach)
     found = torch_scene.depth_image(
         SCENE, *(torch.as_tensor(x) for x in (WORLDS.pos_w, YAW, rays)), reach
     )
@@ -39,7 +41,8 @@ def test_images():
 
 def test_nearest_obstacles():
     points = near(2.0)
-    ours = [np.asarray(x) for x in clearance.nearest_obstacle(WORLDS.scene, jnp.asarray(points))]
+    nearest = jax.jit(clearance.nearest_obstacle)
+    ours = [np.asarray(x) for x in nearest(WORLDS.scene, jnp.asarray(points))]
     found = [x.numpy() for x in torch_scene.nearest_obstacle(SCENE, torch.as_tensor(points))]
     np.testing.assert_allclose(found[0], ours[0], atol=1e-4)
     assert np.ptp(ours[0]) > 1.0

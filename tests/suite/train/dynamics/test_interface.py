@@ -35,7 +35,7 @@ def test_a_vehicle_is_flown_as_a_quadrotor_of_the_same_interface():
     config = replace(CONFIG, quadrotor=QuadrotorConfig(PLAIN))
     worlds, dynamics, body = started(config)
     np.testing.assert_allclose(body.rot_w[:, 2, 2], 1.0, atol=1e-6, err_msg="upright")
-    after = dynamics.step(body, worlds.constants, ACTION, TARGET, jax.random.key(0))
+    after = jax.jit(dynamics.step)(body, worlds.constants, ACTION, TARGET, jax.random.key(0))
     np.testing.assert_allclose(worlds.constants.time_step, 1 / config.spec.rate_hz, rtol=1e-6)
     moved = np.asarray(after.pos_w - body.pos_w)
     wanted = worlds.vel_w / config.spec.rate_hz

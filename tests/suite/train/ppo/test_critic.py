@@ -36,15 +36,16 @@ def test_the_features_of_a_state():
         distance, np.exp(-distance / 0.2),
         [0.5], [1.0, 0.0], [1.0], [1.0],  # the plane in half a second, at the opening's edge
     ])  # fmt: skip
-    found = critic.features(worlds, body, jnp.asarray([0]))
+    features = jax.jit(critic.features)
+    found = features(worlds, body, jnp.asarray([0]))
     assert found.shape == (1, critic.FEATURES)
     np.testing.assert_allclose(found[0], expected, atol=1e-5)
-    last = critic.features(worlds, body, jnp.asarray([2]))[0]
+    last = features(worlds, body, jnp.asarray([2]))[0]
     assert last[-1] == -1.0 and not np.any(last[9:12]), "no gate is left, and none comes after"
 
 
 def test_a_fresh_value_is_near_zero_and_is_that_of_a_plain_loop():
-    params = critic.init(jax.random.key(0), 6)
+    params = jax.jit(critic.init, static_argnums=1)(jax.random.key(0), 6)
     seen = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3, critic.FEATURES)))
     found = critic.value(params, seen)
     assert found.shape == (5, 3) and 0 < np.abs(found).max() < 0.05
