@@ -61,11 +61,8 @@ def test_a_step_through_a_gate(side, passes):
     ahead, left = GATE.rot_w[..., 0], GATE.rot_w[..., 1]
     before = GATE.center_w - 0.2 * ahead + side * left
     after = GATE.center_w + 0.3 * ahead + side * left
-    gate, points = (
-        to_torch(GATE),
-        [torch.as_tensor(x, dtype=torch.float32) for x in (before, after)],
-    )
-    gate = type(gate)(*(x.float() for x in gate))
+    gate = Gates(*(array.float() for array in to_torch(GATE)))
+    points = [torch.as_tensor(x, dtype=torch.float32) for x in (before, after)]
     assert torch_scene.crossed(gate, *points).tolist() == [passes] * 3
     assert torch_scene.crossed(gate, *reversed(points)).tolist() == [False] * 3
     assert crossing.crossing(*GATE[:3], before, after)[0].tolist() == [passes] * 3
