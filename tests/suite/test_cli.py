@@ -2,24 +2,17 @@
 
 import errno
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-import traceback
 import types
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
-import numpy as np
 import pytest
 
 from suite import cli
-from suite.common.console import Console, duration, size
-from suite.common.errors import explain
 from tracks.common.version import VERSION
-from tracks.geometry.scene import Boxes, Counts, Gates, Scene, Spheres, no_rods, pad
 
 HEAVY = ("numpy", "jax", "mujoco", "torch", "tyro", "rich", "scipy", "pyarrow", "argparse")
 SLOW = ("jax", "mujoco", "torch", "dm_control", "trimesh", "matplotlib", "rerun", "scipy")
@@ -158,31 +151,6 @@ def test_an_error_raised_on_purpose_in_our_rooms_is_a_message(capsys):
     assert "unknown benchmark 'nothing'" in said and "Traceback" not in said
 
 
-def _pad_one_box(to_boxes, center_w):
-    none = np.zeros((0, 3))
-    gates = Gates(none, np.zeros((0, 3, 3)), np.zeros((0, 4, 2)), np.zeros(0), np.zeros(0))
-    boxes = Boxes(np.array([center_w]), np.zeros((1, 3, 3)), np.ones((1, 3)))
-    spheres = Spheres(none, np.zeros(0))
-    scene = Scene(gates, boxes, no_rods(), no_rods(), spheres, np.zeros((0, 3, 3)))
-    return pad(scene, Counts(to_boxes, 0, 0, 0))
-
-
-def test_a_value_error_that_numpy_throws_in_our_rooms_is_a_bug():
-    with pytest.raises(ValueError) as met:
-        _pad_one_box(2, [0.0, 0.0])
-    frames = traceback.extract_tb(met.value.__traceback__)
-    assert frames[-1].filename.endswith("scene.py"), "the case is one with no frame of numpy's"
-    assert explain(met.value) is None
-
-
-def test_an_error_raised_on_purpose_in_a_worker_process_is_a_message():
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        with pytest.raises(ValueError, match="more than the 0") as met:
-            list(pool.map(_pad_one_box, [0], [[0.0, 0.0, 0.0]]))
-    explained = explain(met.value)
-    assert explained is not None and explained[0] == 2
-
-
 def test_ctrl_c_at_the_program_itself_is_code_130():
     code = (
         "import os, signal, sys, types\n"
@@ -217,25 +185,3 @@ def test_info_says_versions_devices_and_machine(capfd):
     assert facts["suite"] == VERSION
     assert facts["packages"]["mujoco"].startswith("3.")
     assert facts["jax_devices"] and facts["machine"]["cores"] >= 1
-
-
-def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
-    now = [0.0]
-    with Console().progress("flying", 100, clock=lambda: now[0]) as update:
-        for done in range(101):
-            now[0] = done * 0.5
-            update(done, "3.1 m/s")
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 5
-    assert lines[0] == "flying: 20 of 100, 40 s left, 3.1 m/s"
-
-
-def test_figures_for_people():
-    assert [duration(s) for s in (0.44, 9.96, 59.6, 200, 7500)] == [
-        "0.4 s",
-        "10 s",
-        "1 min 00 s",
-        "3 min 20 s",
-        "2 h 05 min",
-    ]
-    assert [size(b) for b in (5, 812e3, 2.06e9)] == ["5 B", "812 kB", "2.1 GB"]

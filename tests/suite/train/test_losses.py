@@ -290,3 +290,20 @@ def test_the_field_is_held_near_the_wires_and_carries_no_gradient_itself():
     assert not np.any(jax.grad(of_velocity)(vel))
     bend = jax.jacrev(jax.grad(lambda p: guidance_term(config, gates, p, vel).sum()))(wire - 0.3)
     assert not np.any(bend)
+
+
+@pytest.mark.parametrize(
+    ("place_g", "shift"),
+    [
+        ((-4.0, 0.2, 0.1), 0.0),  # on the axis: straight on
+        ((-4.0, 0.0, 1.0), 0.7),  # as much before the gate as it is off the axis, less 0.3
+        ((0.0, 0.0, 1.2), 0.9),  # above the frame
+        ((0.8, 0.6, 0.0), 1.1),  # beyond the plane
+        ((2.0, 3.0, 0.0), 1.5),  # at most so far
+    ],
+)
+def test_the_point_before_the_gate_that_progress_is_measured_to(place_g, shift):
+    config = LossConfig(approach_m=1.5)
+    found = losses.approach_shift(config, jnp.array([place_g]))
+    np.testing.assert_allclose(found, [shift], atol=1e-6)
+    assert losses.approach_shift(LossConfig(), jnp.array([place_g])) == 0.0

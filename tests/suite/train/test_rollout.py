@@ -9,9 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from policies.networks import delta_network, network
-from policies.observation import observe
+from policies.observation import View, observe
+from suite.train import rollout
+from suite.train.config import PointMassConfig
 from suite.train.dynamics import point_mass
-from suite.train.gradient import encoder_gradient, make_gradient
+from suite.train.gradient import make_gradient
 from suite.train.losses import UNIT_FIELD
 from suite.train.rollout import make_rollout, target_gate, view_in
 from tests.support.training import (
@@ -54,27 +56,6 @@ def two_pass():
     config = small_config(physics={"depth_noise": 0.02})
     worlds, params = boxes_worlds(config), fresh_params()
     return config, worlds, params, *jax.jit(make_gradient(config))(params, worlds, KEY, None)
-
-
-def test_images_outside_the_loop_give_the_gradient_of_the_plain_loop(two_pass):
-    """The sums run in another order in float32: 1e-4 of each array's largest entry."""
-    config, worlds, params, gradient, loss, _ = two_pass
-    plain = jax.jit(jax.value_and_grad(loss_of(config, network.encode)))
-    expected_loss, expected = plain(params, worlds, None, config.loss.field_gain)
-    assert float(loss) == pytest.approx(float(expected_loss), rel=1e-5)
-    sizes = {k: float(np.abs(np.array(g)).max()) for k, g in expected.items()}
-    assert min(sizes.values()) > 1e-7, sizes
-    assert largest_difference(gradient, expected) < 1e-4
-
-
-def test_the_encoders_gradient_does_not_depend_on_its_chunks(two_pass, monkeypatch):
-    params = two_pass[2]
-    rng = np.random.default_rng(0)
-    images = jnp.asarray(rng.normal(size=(12, 20, 20)), jnp.float32)
-    cotangents = jnp.asarray(rng.normal(size=(12, 8)), jnp.float32)
-    whole = encoder_gradient(params, images, cotangents)
-    monkeypatch.setattr("suite.train.gradient.CHUNK", 5)
-    assert largest_difference(encoder_gradient(params, images, cotangents), whole) < 1e-5
 
 
 def test_records_are_those_of_the_flight(two_pass):
@@ -245,3 +226,147 @@ def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
     total = np.abs(sum(np.array(term) for term in records.terms.values()))
     assert np.all(total[0] > 0)
     assert not np.any(total[1:, :2]) and np.all(total[1:, 2:] > 0)
+
+
+STILL = {
+    "drag": (0.0, 0.0),
+    "drag_up": (0.0, 0.0),
+    "wind_std": (0.0, 0.0, 0.0),
+    "action_delay": (0.0, 0.0),
+}
+
+
+def flown(config, worlds):
+    embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
+    run = jax.jit(make_rollout(config), static_argnums=4)
+    return run(fresh_params(config.spec), embedding_shift, worlds, KEY, blind)[1]
+
+
+def at_first_gate(config, ahead_m):
+    """Worlds that fly at 3 m/s along the first gate's axis, the next one 4 m behind it."""
+    worlds = boxes_worlds(config)
+    gates = worlds.scene.gates
+    forward = gates.rot_w[:, 0, :, 0]
+    center = np.array(gates.center_w)
+    center[:, 1] = center[:, 0] + 4 * forward
+    return worlds._replace(
+        scene=worlds.scene._replace(gates=gates._replace(center_w=center)),
+        pos_w=center[:, 0] - ahead_m * forward, vel_w=3 * forward,
+        target=np.zeros(len(center), np.int32),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("pass_first", "progress"), [(True, -3.0), (False, 3.0)])
+def test_the_step_that_passes_a_gate_is_progress_to_the_next_where_asked(pass_first, progress):
+    loss = {"progress": 1.0, "pass_first": pass_first}
+    config = small_config(1, 1, physics=STILL, loss=loss)
+    records = flown(config, at_first_gate(config, 0.02))
+    assert bool(records.passed[0, 0])
+    assert float(records.terms["progress"][0, 0]) == pytest.approx(progress, abs=0.2)
+
+
+def test_the_step_before_is_progress_to_the_gate():
+    config = small_config(1, 1, physics=STILL, loss={"progress": 1.0})
+    records = flown(config, at_first_gate(config, 1.0))
+    assert not bool(records.passed[0, 0])
+    assert float(records.terms["progress"][0, 0]) == pytest.approx(-3.0, abs=0.2)
+
+
+def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
+    """The second gate's centre, the last one's where none comes after, and the next's direction."""
+    seen = []
+
+    def spy(spec, view, action_b):
+        jax.debug.callback(lambda *shown: seen.append(shown), view.second_w, view.axis_w)
+        return observe(spec, view, action_b)
+
+    monkeypatch.setattr(rollout, "observe", spy)
+    config = replace(small_config(3, 1), spec=replace(SPEC, second_gate=True, gate_axis=True))
+    worlds = boxes_worlds(config)._replace(target=np.array([0, 3, 7], np.int32))
+
+    @jax.jit
+    def fly(params):
+        embedding_shift = jnp.zeros((1, 3, SPEC.hidden_size))
+        make_rollout(config)(params, embedding_shift, worlds, KEY, blind)
+
+    fly(fresh_params(config.spec))  # nothing is returned, so little is compiled
+    jax.effects_barrier()
+    center = worlds.scene.gates.center_w
+    expected = [center[0, 1], center[1, 4], center[2, 7]]
+    np.testing.assert_allclose(seen[0][0], expected, atol=1e-6)
+    rot = worlds.scene.gates.rot_w
+    expected = [rot[0, 0, :, 0], rot[1, 3, :, 0], rot[2, 7, :, 0]]
+    np.testing.assert_allclose(seen[0][1], expected, atol=1e-6)
+
+
+def test_a_state_on_its_way_at_the_start_is_that_of_a_level_drone_at_rest():
+    """The judge's own words for it: the third row of the rotation is (0, 0, 1)."""
+    config = replace(small_config(2), physics=PointMassConfig(state_delay=1))
+    zero = np.zeros(3)
+    seen = View(zero, np.eye(3), zero, zero, zero, zero)
+    expected = observe(config.spec, seen, zero).state
+    np.testing.assert_array_equal(rollout.states_at_start(2, config), np.tile(expected, (2, 1, 1)))
+
+
+def test_hovering_above_the_frame_there_is_progress_to_be_made_backwards():
+    """1.2 m above the gate the way to its centre is down, through the bar; the goal lies before."""
+    terms = {}
+    for approach in (0.0, 1.5):
+        loss = {"progress": 1.0, "approach_m": approach}
+        config = small_config(2, 1, physics=STILL, loss=loss)
+        worlds = at_first_gate(config, 0.0)
+        turn = worlds.scene.gates.rot_w[:, 0]
+        worlds = worlds._replace(pos_w=worlds.pos_w + 1.2 * turn[:, :, 2], vel_w=-2 * turn[:, :, 0])
+        terms[approach] = np.asarray(flown(config, worlds).terms["progress"][0])
+    assert np.all(terms[0.0] > -0.3) and np.all(terms[1.5] < -0.8)
+
+
+def test_beyond_the_last_gate_progress_goes_straight_on():
+    loss = {"progress": 1.0, "approach_m": 1.5}
+    config = small_config(1, 1, physics=STILL, loss=loss)
+    worlds = at_first_gate(config, -3.0)
+    first = worlds.scene.gates.center_w[:, 0]
+    center = np.array(worlds.scene.gates.center_w)
+    center[:, -1] = first
+    turn = np.array(worlds.scene.gates.rot_w)
+    turn[:, -1] = turn[:, 0]
+    gates = worlds.scene.gates._replace(center_w=center, rot_w=turn)
+    worlds = worlds._replace(
+        scene=worlds.scene._replace(gates=gates), target=np.full(1, center.shape[1], np.int32)
+    )
+    term = flown(config, worlds).terms["progress"]
+    assert float(term[0, 0]) == pytest.approx(-3.0, abs=0.2)
+
+
+def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
+    config = small_config(steps=4)
+    worlds, params = boxes_worlds(config), fresh_params()
+    run = jax.jit(make_gradient(config))
+    _, _, records = run(params, worlds._replace(stop=np.array([4, 2, 1, 4])), KEY, None)
+    assert np.array_equal(records.alive.T, [[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 0, 0], [1] * 4])
+    for term in records.terms.values():
+        assert (np.asarray(term)[np.asarray(records.alive) == 0] == 0).all()
+    remembered = worlds._replace(hidden=np.full_like(worlds.hidden, 0.5))
+    first = run(params, remembered, KEY, None)[2].hidden[0]
+    assert np.abs(np.asarray(first - records.hidden[0])).max() > 0.1
+
+
+@pytest.mark.parametrize("finish", [False, True])
+def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the_finish(finish):
+    config = small_config(steps=4, finish=finish)
+    worlds = boxes_worlds(config)
+    gates, last = worlds.scene.gates, worlds.scene.gates.center_w.shape[1] - 1
+    ahead = gates.rot_w[:, last, :, 0]
+    # 0.2 m before their last gates at 4 m/s, but for one that has the gate before them to pass.
+    worlds = worlds._replace(
+        pos_w=gates.center_w[:, last] - 0.2 * ahead,
+        vel_w=4 * ahead,
+        heading_w=ahead,
+        target=np.array([last, last, last, last - 1]),
+    )
+    records = jax.jit(make_gradient(config))(fresh_params(lively=0.0), worlds, KEY, None)[2]
+    passed = np.asarray(records.passed)
+    assert (passed.sum(0) == [1, 1, 1, 0]).all()
+    after = np.cumsum(passed, 0) - passed > 0
+    assert after.any()
+    assert np.array_equal(np.asarray(records.alive) == 0, after & finish)

@@ -22,8 +22,6 @@ from suite.train.dynamics import point_mass
 from tests.support.training import boxes_worlds, fresh_params, small_config
 
 CONFIG = small_config(physics={"depth_noise": 0.02})
-
-
 make_update = run.make_update
 
 
@@ -157,12 +155,6 @@ def test_a_kill_between_the_two_renames_of_the_state_loses_nothing(whole, tmp_pa
     assert_same_run(tmp_path, whole)
 
 
-def test_rows_written_twice_by_an_interrupted_save_count_once(tmp_path):
-    for first in (0, 1):
-        curve.append(tmp_path, [{"iteration": i, "loss": 1.0} for i in range(first, 3)])
-    assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1, 2]
-
-
 BARE = """
 import os, sys
 class Blocker:
@@ -246,35 +238,6 @@ def test_a_delta_action_stays_as_it_is_while_the_policy_is_trained_under_it(whol
     assert rows(tmp_path)[0]["loss"] != rows(whole)[0]["loss"]
     arrays = load_arrays(tmp_path / "state", kind="training").arrays
     assert arrays.keys() == load_arrays(whole / "state", kind="training").arrays.keys()
-
-
-TWO_DEVICES = """
-import jax
-jax.config.update("jax_num_cpu_devices", 2)
-import numpy as np
-from jax.sharding import Mesh
-from suite.train.gradient import shard_gradient
-from suite.train.update import device_mesh
-from tests.support.training import boxes_worlds, fresh_params, largest_difference, small_config
-config = small_config()
-assert device_mesh(config).size == 2
-args = (fresh_params(), boxes_worlds(config), jax.random.key(0), None)
-results = []
-for count in (1, 2):
-    mesh = Mesh(np.array(jax.devices()[:count]), ("worlds",))
-    gradient, loss, records = jax.jit(shard_gradient(config, mesh))(*args)
-    results.append((gradient, loss, records.pos_w, records.terms))
-print(largest_difference(results[1], results[0]))
-"""
-
-
-def test_two_devices_give_the_gradient_of_one(root):
-    """Without noise, which each device draws for its own worlds; the sums differ in order."""
-    done = subprocess.run(
-        [sys.executable, "-c", TWO_DEVICES], capture_output=True, text=True, cwd=root
-    )
-    assert done.returncode == 0, done.stderr
-    assert float(done.stdout) < 1e-4
 
 
 def test_thirty_iterations_on_an_easy_course_reduce_the_loss(tmp_path, monkeypatch):

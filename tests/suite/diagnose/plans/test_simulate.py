@@ -1,11 +1,16 @@
 """Trajectories flown in MuJoCo: what is recorded, and what cannot be flown."""
 
+from dataclasses import replace
+from types import MappingProxyType
+
 import numpy as np
 import pytest
 
+from eval.effects import EFFECTS
 from eval.quadrotor.plant import Wrench, make_plant
 from eval.quadrotor.rigid_body import accelerations
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
+from suite.blind.oracle.strength import given_vehicle
 from suite.diagnose.plans.simulate import FULL_V, FlightFailed, fly
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.vehicles import PLAIN, with_effects, with_lag
@@ -51,3 +56,39 @@ def test_a_flight_into_the_ground_fails_with_its_time():
 def test_a_rate_must_divide_the_rate_loops():
     with pytest.raises(ValueError, match="rate_hz = 130: must divide .* 500 Hz"):
         fly(PLAIN, VEHICLE, WAYS, rate_hz=130.0)
+
+
+EIGHT = Trajectory("figure_eight", duration_s=2.5, speed=4.0, size=2.0, turn="wobble")
+CIRCLE = Trajectory("circle", duration_s=2.5, speed=3.0, size=3.0)
+BARE = given_vehicle("bare")
+
+
+def having(vehicle=BARE, **effects):
+    values = {name: EFFECTS[name].values(*numbers) for name, numbers in effects.items()}
+    return replace(vehicle, effects=MappingProxyType({**vehicle.effects, **values}))
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return fly(BARE, BARE, [EIGHT, CIRCLE])
+
+
+def test_a_flight_that_cannot_be_flown_is_refused():
+    with pytest.raises(FlightFailed, match="gentler"):
+        fly(BARE, having(thrust_scale=(0.2,)), [EIGHT])
+
+
+def test_flights_side_by_side_are_those_flown_alone(flights):
+    alone = fly(BARE, BARE, [CIRCLE])[0]
+    np.testing.assert_array_equal(alone.motion.pos_w, flights[1].motion.pos_w)
+
+
+def test_drag_is_in_the_flight_as_worked_by_hand():
+    """Decelerations: two flights under the same command differ by D v in the first moments."""
+    truth = having(linear_drag=((0.5, 0.5, 0.0),))
+    with_it, without = fly(BARE, truth, [CIRCLE])[0], fly(BARE, BARE, [CIRCLE])[0]
+    row = 500
+    drag = with_it.acc_b[row, :2]
+    vel_b = with_it.motion.rot_w[row - 1].T @ with_it.motion.vel_w[row - 1]
+    np.testing.assert_allclose(drag, -0.5 * vel_b[:2], rtol=1e-6)
+    np.testing.assert_allclose(without.acc_b[row, :2], 0.0, atol=1e-12)

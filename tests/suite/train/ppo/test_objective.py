@@ -73,14 +73,6 @@ def actor_of(seed=0):
     return doubled(Actor(fresh_params(seed=seed), jnp.log(jnp.asarray([0.5, 1.0, 2.0]))))
 
 
-def test_the_density_is_a_normal_one():
-    mean, action = jnp.asarray([1.0, 2.0, 3.0]), jnp.asarray([1.5, 2.0, 1.0])
-    deviation = np.array([0.5, 1.0, 2.0])
-    density = np.exp(-0.5 * np.array([1.0, 0.0, -1.0]) ** 2) / (deviation * np.sqrt(2 * np.pi))
-    found = log_probability(mean, jnp.log(deviation), action)
-    assert float(found) == pytest.approx(np.log(density.prod()))
-
-
 def test_where_nothing_has_changed_its_gradient_is_the_policy_gradient():
     """Central differences of -mean(log density x advantage) along random directions."""
     actor = actor_of()

@@ -3,21 +3,16 @@
 from dataclasses import replace
 from functools import cache
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from policies.formats.checkpoint import load_arrays
 from policies.formats.policy_file import load_policy_checkpoint
-from policies.networks import network
 from suite.common import curve
 from suite.common.console import Console
 from suite.train.ppo import run
 from suite.train.ppo.config import ppo_like
-from suite.train.ppo.objective import Actor, Sequences, action_means
-from suite.train.ppo.rollout import log_probability, make_rollout
-from tests.support.training import SPEC, boxes_worlds, fresh_params, small_config
+from tests.support.training import SPEC, boxes_worlds, small_config
 
 DELAYS = {"image_delay": 2, "state_delay": 1, "depth_noise": 0.02}
 CONFIG = replace(
@@ -25,8 +20,8 @@ CONFIG = replace(
     epochs=2, minibatches=2, critic_epochs=2, critic_size=8,
 )  # fmt: skip
 
+
 make_update = cache(run.make_update)
-roll = jax.jit(make_rollout(CONFIG.shared))
 
 
 @pytest.fixture(autouse=True)
@@ -68,53 +63,3 @@ def test_a_stopped_run_resumes_exactly_and_leaves_a_policy(tmp_path, monkeypatch
     assert rows(stopped) == rows(whole)
     with pytest.raises(ValueError, match="holds another run.*discount"):
         run.train_ppo(replace(CONFIG, discount=0.5), whole, Console())
-
-
-@pytest.mark.parametrize("wrong", [{"minibatches": 3}, {"minibatches": 0}])
-def test_minibatches_that_do_not_divide_the_batch_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"minibatches is \d, allowed are divisors .*\(4\)"):
-        run.make_update(replace(CONFIG, **wrong))
-
-
-def test_an_image_stride_that_does_not_divide_the_steps_is_refused():
-    episode = replace(CONFIG.episode, image_stride=4)
-    with pytest.raises(ValueError, match=r"image_stride is 4, allowed are divisors .*\(6\)"):
-        run.make_update(replace(CONFIG, episode=episode))
-
-
-def crashing(worlds):
-    """Return the worlds with the first one just above the ground and sinking."""
-    pos, vel = np.array(worlds.pos_w), np.array(worlds.vel_w)
-    pos[0], vel[0] = [100.0, 0.0, 0.5], [0.0, 0.0, -4.0]
-    return worlds._replace(pos_w=pos, vel_w=vel)
-
-
-def flown(worlds):
-    actor = Actor(fresh_params(), jnp.full(3, -1.0))
-    records, _ = roll(actor.params, actor.log_deviation, worlds, jax.random.key(2))
-    return actor, records
-
-
-def test_the_learner_meets_the_actions_density_that_the_rollout_recorded():
-    """Through delays, collisions and recurrent states of the start: a ratio of one everywhere."""
-    worlds = crashing(boxes_worlds(CONFIG.shared))
-    hidden = np.random.default_rng(0).normal(size=worlds.hidden.shape).astype(np.float32)
-    actor, records = flown(worlds._replace(hidden=hidden))
-    assert bool(records.done[:, 0].any()) and not bool(records.done[-1, 0])
-    embeddings = network.encode(actor.params, records.image.reshape(-1, 20, 20))
-    sequences = Sequences(
-        state=records.state, action_b=records.action_b, log_prob=records.log_prob,
-        done=records.done, advantage=records.log_prob, start=jnp.asarray(hidden)[None],
-    )  # fmt: skip
-    mean = action_means(actor.params, embeddings.reshape(6, 4, -1), sequences)
-    found = log_probability(mean, actor.log_deviation, records.action_b)
-    np.testing.assert_allclose(found, records.log_prob, atol=1e-3)
-
-
-def test_a_world_that_crashed_starts_again_as_it_started():
-    worlds = crashing(boxes_worlds(CONFIG.shared))
-    _, records = flown(worlds)
-    again = int(np.argmax(records.done[:, 0])) + 1
-    np.testing.assert_allclose(records.seen[again, 0], records.seen[0, 0], atol=1e-6)
-    np.testing.assert_array_equal(records.state[again, 0], records.state[0, 0])
-    assert not np.allclose(records.seen[again, 1], records.seen[0, 1])

@@ -1,0 +1,66 @@
+"""Logs of simulated flights: their noise, what they leave out, and their faults."""
+
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+
+from eval.effects import EFFECTS
+from suite.blind.oracle.strength import given_vehicle
+from suite.blind.sensors import SENSORS, log_of
+from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.trajectory import Trajectory
+
+EIGHT = Trajectory("figure_eight", duration_s=2.5, speed=4.0, size=2.0, turn="wobble")
+CIRCLE = Trajectory("circle", duration_s=2.5, speed=3.0, size=3.0)
+BARE = given_vehicle("bare")
+
+
+def having(vehicle=BARE, **effects):
+    values = {name: EFFECTS[name].values(*numbers) for name, numbers in effects.items()}
+    return replace(vehicle, effects=MappingProxyType({**vehicle.effects, **values}))
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return fly(BARE, BARE, [EIGHT, CIRCLE])
+
+
+def test_noise_is_as_stated(flights):
+    flight, sensors = flights[0], SENSORS["full"]
+    twin = log_of(flight, BARE, sensors, None)
+    draws = [log_of(flight, BARE, sensors, np.random.default_rng(seed)) for seed in range(8)]
+
+    def spread(name):
+        return np.std([getattr(draw, name) - getattr(twin, name) for draw in draws])
+
+    for name, stated in (
+        ("pos_w", sensors.pos),
+        ("vel_w", sensors.vel),
+        ("rate_b", sensors.gyro),
+        ("acc_b", sensors.acc),
+        ("rotor_speed", sensors.rotor),
+        ("voltage", sensors.voltage),
+    ):
+        assert spread(name) == pytest.approx(stated, rel=0.06), name
+    inner = np.abs([(draw.quat_wxyz * twin.quat_wxyz).sum(1) for draw in draws])
+    angle = 2.0 * np.sqrt(np.maximum(2.0 * (1.0 - inner), 0.0))
+    assert np.sqrt((angle**2).mean() / 3.0) == pytest.approx(sensors.attitude, rel=0.06)
+    np.testing.assert_array_equal(twin.thrust_cmd, draws[0].thrust_cmd)
+
+
+def test_a_log_without_velocity_does_not_carry_it(flights):
+    log = log_of(flights[0], BARE, SENSORS["capture"], np.random.default_rng(0))
+    assert log.velocity_derived and log.acc_b is None and log.rotor_speed is None
+
+
+def test_faults_of_the_log_are_in_the_log():
+    truth = having(gyro_bias=((0.1, -0.2, 0.3),), clock_offset=(0.02,))
+    flight = fly(BARE, truth, [EIGHT])[0]
+    log = log_of(flight, truth, SENSORS["estimator"], None)
+    rows = slice(None, None, flight.period)
+    bias = log.rate_b - flight.motion.rate_b[rows]
+    np.testing.assert_allclose(bias, np.tile([0.1, -0.2, 0.3], (len(bias), 1)), atol=1e-12)
+    # 0.02 s are two rows of 0.01 s.
+    np.testing.assert_allclose(log.pos_w[2:], flight.motion.pos_w[rows][:-2], atol=1e-9)

@@ -1,0 +1,26 @@
+"""The options of the train command become a run's settings."""
+
+import pytest
+
+from policies import shipped
+from suite import cli
+from suite.commands.train import Config, resolve
+from suite.judging.flying import checkpoint_folder
+
+
+def test_an_unknown_preset_is_refused_with_the_names_there_are():
+    with pytest.raises(ValueError, match="Did you mean 'racer'"):
+        resolve(Config(preset="rcaer"))
+
+
+def test_options_become_settings():
+    config = resolve(Config(preset="small", seed=4, iterations=7, set=("optimizer.rate=1",)))
+    assert (config.seed, config.optimizer.iterations, config.optimizer.rate) == (4, 7, 1.0)
+
+
+def test_training_goes_on_from_a_shipped_policy_by_its_name(tmp_path, capsys):
+    assert checkpoint_folder("racer", "--from") == shipped.folder("racer")
+    assert cli.main(["train", "--from", "racr", "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert "--from racr: " in said and "a shipped policy's name (racer, swift" in said
+    assert not (tmp_path / "run").exists()

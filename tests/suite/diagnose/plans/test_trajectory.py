@@ -1,0 +1,38 @@
+"""Commanded trajectories: their start, their slope, and words that are none."""
+
+import numpy as np
+import pytest
+
+from suite.blind.oracle.strength import given_vehicle
+from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.trajectory import KINDS, Trajectory
+
+EIGHT = Trajectory("figure_eight", duration_s=2.5, speed=4.0, size=2.0, turn="wobble")
+CIRCLE = Trajectory("circle", duration_s=2.5, speed=3.0, size=3.0)
+BARE = given_vehicle("bare")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_trajectory_starts_at_rest_and_its_velocity_is_its_slope(kind):
+    way = Trajectory(kind, duration_s=4.0, speed=2.0, size=2.0, direction=0.7)
+    time_s = np.linspace(0.0, 4.0, 2001)
+    now = way.reference(time_s)
+    np.testing.assert_allclose(now.vel_w[0], 0.0, atol=0.01)
+    slope = np.gradient(now.pos_w, time_s, axis=0)[1:-1]
+    np.testing.assert_allclose(now.vel_w[1:-1], slope, atol=2e-3)
+    assert np.isfinite(now.acc_w).all()
+
+
+def test_a_constant_circle_is_one():
+    now = CIRCLE.reference(np.array([20.0]))
+    assert np.linalg.norm(now.vel_w) == pytest.approx(3.0, rel=1e-3)
+    assert np.linalg.norm(now.acc_w) == pytest.approx(3.0, rel=1e-3)  # v^2 / r
+
+
+def test_unknown_words_are_refused():
+    with pytest.raises(ValueError, match="cirkle"):
+        Trajectory("cirkle").reference(np.zeros(1))
+    with pytest.raises(ValueError, match="turn"):
+        Trajectory("hover", turn="swep").reference(np.zeros(1))
+    with pytest.raises(ValueError, match="rate_hz"):
+        fly(BARE, BARE, [EIGHT], rate_hz=120.0)

@@ -1,0 +1,65 @@
+"""suite collect: logs that read back, and flights that are none."""
+
+import json
+
+import eval.judging.judge
+import eval.logs.flight_log
+from eval.logs.flight_log import read_flight
+from suite import cli
+
+
+def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkeypatch, capfd):
+    out = tmp_path / "flights"
+    args = ["collect", "--policy", pilots["pursuit"], "--track", "zigzag", "--difficulty", "0"]
+    args += ["--trials", "2", "--seed", "7", "--out", str(out)]
+    assert cli.main(args) == 0
+    logs = sorted(out.glob("*.parquet"))
+    assert [log.name for log in logs] == ["zigzag-0-7.parquet", "zigzag-0-8.parquet"]
+    log = read_flight(logs[0])
+    assert log.about["seed"] == 7 and log.time_s[-1] >= 1
+    found = json.loads((out / "flights.json").read_text())
+    assert [row["file"] for row in found["flights"]] == [log.name for log in logs]
+    logs[1].unlink()
+    flown = []
+    fly = eval.judging.judge.fly
+
+    def count(policy, trials, *rest, **more):
+        flown.extend(trials)
+        return fly(policy, trials, *rest, **more)
+
+    monkeypatch.setattr(eval.judging.judge, "fly", count)
+    capfd.readouterr()
+    assert cli.main([*args, "--json"]) == 0
+    assert [trial.seed for trial in flown] == [8]
+    assert json.loads(capfd.readouterr().out)["flights"] == found["flights"]
+
+
+def test_a_flight_of_under_a_second_is_no_log(pilots, tmp_path, capfd):
+    out = tmp_path / "flights"
+    args = ["collect", "--policy", pilots["diver"], "--track", "zigzag", "--difficulty", "0"]
+    assert cli.main([*args, "--trials", "1", "--out", str(out)]) == 0
+    (row,) = json.loads((out / "flights.json").read_text())["flights"]
+    assert row["file"] is None and row["time_s"] < 1
+    assert not list(out.glob("*.parquet"))
+
+
+def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
+    pilots, tmp_path, monkeypatch, capfd
+):
+    log_from_flight = eval.logs.flight_log.log_from_flight
+
+    def broken(flight, name):
+        log = log_from_flight(flight, name)
+        if name.endswith("-7.parquet"):
+            log.rate_b[4, 0] = 300.0
+        return log
+
+    monkeypatch.setattr(eval.logs.flight_log, "log_from_flight", broken)
+    out = tmp_path / "flights"
+    args = ["collect", "--policy", pilots["pursuit"], "--track", "zigzag", "--difficulty", "0"]
+    assert cli.main([*args, "--trials", "2", "--seed", "7", "--out", str(out)]) == 0
+    flights = json.loads((out / "flights.json").read_text())["flights"]
+    assert [row["file"] for row in flights] == [None, "zigzag-0-8.parquet"]
+    said = capfd.readouterr()
+    assert "zigzag-0-7.parquet: column rate_x, row 5: 300" in said.err
+    assert "1 without a log, 0 of them under 1 s" in said.out

@@ -1,0 +1,97 @@
+"""suite eval, flown by pilots that need no training."""
+
+import json
+
+import pyarrow.parquet as pq
+import pytest
+
+import eval.judging.judge
+import eval.logs.flight_log
+from eval.judging.results import read_trials
+from suite import cli
+
+
+def _eval(out, *args):
+    return cli.main(["eval", "--out", str(out), *args])
+
+
+def test_eval_writes_the_tables_and_says_them(pilots, tmp_path, capfd):
+    out = tmp_path / "out"
+    args = ["--track", "zigzag", "--trials", "2", "--seed", "5", "--json"]
+    code = _eval(out, *args, "--policy", pilots["pursuit"], "--policy", pilots["diver"])
+    said = json.loads(capfd.readouterr().out)
+    assert code == 0
+    names = {path.name for path in out.iterdir()}
+    assert names == {"trials.parquet", "table.md", "summary.json", "run.json"}
+    rows = read_trials(out / "trials.parquet")
+    keys = [(row.track, row.difficulty, row.seed, row.policy) for row in rows]
+    assert keys == [("zigzag", 0, s, p) for p in ("pursuit", "diver") for s in (5, 6)]
+    assert rows[0].gates_passed > 0 and rows[2].ended_by == "collision"
+    summary = json.loads((out / "summary.json").read_text())
+    assert {key: said[key] for key in summary} == summary
+    assert [cell["policy"] for cell in summary["cells"]] == ["pursuit", "diver"]
+    assert summary["paired"][0]["trials"] == 2
+    header = json.loads(pq.read_schema(out / "trials.parquet").metadata[b"suite"])
+    assert set(header) >= {"schema", "suite_version", "git_commit", "seed"}
+
+
+def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkeypatch, capfd):
+    args = ["--track", "circular,zigzag", "--trials", "2", "--policy", pilots["pursuit"]]
+    assert _eval(tmp_path / "whole", *args) == 0
+    fly = eval.judging.judge.fly
+    flown = []
+
+    def fly_until_interrupted(policy, trials, vehicle, world, options, on_result, **rest):
+        def keep(result, flight):
+            on_result(result, flight)
+            flown.append(result.trial)
+            if len(flown) == 1:
+                raise KeyboardInterrupt
+
+        return fly(policy, trials, vehicle, world, options, keep, **rest)
+
+    monkeypatch.setattr(eval.judging.judge, "fly", fly_until_interrupted)
+    assert _eval(tmp_path / "again", *args) == 130
+    assert not (tmp_path / "again" / "trials.parquet").exists()
+    assert _eval(tmp_path / "again", *args) == 0
+    assert len(flown) == len(set(flown)) == 4, "no trial is flown twice"
+    assert "1 trials were flown before" in capfd.readouterr().err
+    whole, again = (read_trials(tmp_path / name / "trials.parquet") for name in ("whole", "again"))
+    assert again == whole
+
+
+def test_a_journal_of_something_else_is_not_mixed_in(pilots, tmp_path, monkeypatch, capsys):
+    def interrupted(*args, **rest):
+        raise KeyboardInterrupt
+
+    args = ["--track", "zigzag", "--trials", "1"]
+    with monkeypatch.context() as patch:
+        patch.setattr(eval.judging.judge, "fly", interrupted)
+        assert _eval(tmp_path / "out", *args, "--policy", pilots["pursuit"]) == 130
+    assert _eval(tmp_path / "out", *args, "--policy", pilots["diver"]) == 2
+    assert "another --out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--trials", "0"], "--trials is 0; it must be 1 or more"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["--difficulty", "10"], "level 10 is not 0 to 9"),
+        (["--track", "zigzg"], "Did you mean 'zigzag'?"),
+        (["--track", "no_such.toml"], "no_such.toml"),
+        (["--world", "mujco"], "Did you mean 'mujoco'?"),
+        (["--vehicle", "referense"], "Did you mean 'reference'?"),
+        (["--policy", "nobody_we_know"], "nobody_we_know"),
+        (["--rerun", "trials.mp4"], "must end in .rrd"),
+    ],
+)
+def test_what_cannot_be_used_is_said_before_the_first_flight(
+    args, words, pilots, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(eval.judging.judge, "fly", None)
+    given = [] if "--policy" in args else ["--policy", pilots["diver"]]
+    assert _eval(tmp_path / "out", *args, *given) == 2
+    said = capsys.readouterr().err
+    assert words in said and "Traceback" not in said
+    assert len(said.strip().splitlines()) == 1

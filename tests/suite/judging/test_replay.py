@@ -1,0 +1,32 @@
+"""suite view flies judged trials again."""
+
+import json
+
+from eval.judging.results import read_trials
+from suite import cli
+
+
+def _eval(out, *args):
+    return cli.main(["eval", "--out", str(out), *args])
+
+
+def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
+    out, seen = tmp_path / "out", tmp_path / "seen"
+    policy = ["--policy", pilots["diver"]]
+    assert _eval(out, "--track", "ellipse", "--trials", "3", "--seed", "2", *policy) == 0
+    capfd.readouterr()
+    view = ["view", str(out), "--out", str(seen)]
+    assert cli.main([*view, "--pick", "failed", "--count", "2", "--gif", "--json"]) == 0
+    said = json.loads(capfd.readouterr().out)
+    names = sorted(path.name for path in seen.iterdir())
+    assert names == ["ellipse-0-2.gif", "ellipse-0-2.png", "ellipse-0-3.png", "trials.rrd"]
+    rows = read_trials(out / "trials.parquet")
+    assert said["trials"][0]["time_s"] == rows[0].time_s
+    assert cli.main([*view, "--pick", "passed"]) == 2
+    assert "--pick passed" in capfd.readouterr().err
+
+
+def test_view_of_something_else_is_refused(tmp_path, capsys):
+    (tmp_path / "trials.parquet").write_text("no parquet")
+    assert cli.main(["view", str(tmp_path)]) == 2
+    assert "run.json" in capsys.readouterr().err

@@ -1,0 +1,56 @@
+"""What the critic sees, worked by hand: two gates along x, a sphere beside."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from suite.train.dynamics import point_mass
+from suite.train.ppo import critic
+from tests.support.training import boxes_worlds, small_config
+from tracks.geometry.gates import square_gates
+from tracks.geometry.scene import Gates, Spheres
+
+
+def worlds_with(sphere_w, radius):
+    """Return a world of two gates of 1 m at 50 m of height, whose frames are no solids."""
+    worlds = boxes_worlds(small_config(1, 1))
+    zero, one = np.zeros(2), np.ones(2)
+    centers = np.array([[0.0, 0, 50], [0, 4, 50]])
+    gates = Gates(*(x[None] for x in square_gates(centers, zero, one, 0.2 * one, 0.1 * one)))
+    boxes = type(worlds.scene.boxes)(*(array[:, :0] for array in worlds.scene.boxes))
+    spheres = Spheres(np.array([[sphere_w]], float), np.array([[radius]]))
+    scene = worlds.scene._replace(gates=gates, boxes=boxes, spheres=spheres)
+    return jax.tree.map(jnp.asarray, worlds._replace(scene=scene))
+
+
+def test_the_features_of_a_state():
+    worlds = worlds_with((-1.0, 2.0, 50.0), 0.5)
+    pos, vel, ahead = ([-1.0, 0.5, 50.0], [2.0, 0.0, 0.0], [1.0, 0.0, 0.0])
+    body = point_mass.start(*(jnp.asarray([x]) for x in (pos, vel, ahead)))
+    body = body._replace(acc_w=jnp.asarray([[0.0, 5.0, 0.0]]))
+    # The sphere's centre is 1.5 m to the left, and further behind as time goes on.
+    distance = np.hypot(1.5, 2.0 * np.array(critic.AHEAD_S)) - 0.5
+    expected = np.concatenate([
+        [-0.2, 0.1, 0.0], [0.4, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.8, 0.0],
+        ahead, [0.0, 0.0, 1.0], [0.0, -1.0, 0.0], np.tanh([-2.0, 1.0, 0.0]),
+        distance, np.exp(-distance / 0.2),
+        [0.5], [1.0, 0.0], [1.0], [1.0],  # the plane in half a second, at the opening's edge
+    ])  # fmt: skip
+    features = jax.jit(critic.features)
+    found = features(worlds, body, jnp.asarray([0]))
+    assert found.shape == (1, critic.FEATURES)
+    np.testing.assert_allclose(found[0], expected, atol=1e-5)
+    last = features(worlds, body, jnp.asarray([2]))[0]
+    assert last[-1] == -1.0 and not np.any(last[9:12]), "no gate is left, and none comes after"
+
+
+def test_a_fresh_value_is_near_zero_and_is_that_of_a_plain_loop():
+    params = jax.jit(critic.init, static_argnums=1)(jax.random.key(0), 6)
+    seen = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3, critic.FEATURES)))
+    found = critic.value(params, seen)
+    assert found.shape == (5, 3) and 0 < np.abs(found).max() < 0.05
+    hidden = np.asarray(seen[2, 1])
+    for layer in range(2):
+        hidden = np.tanh(hidden @ params[f"weight{layer}"] + params[f"bias{layer}"])
+    out = hidden @ params["weight2"] + params["bias2"]
+    np.testing.assert_allclose(found[2, 1], out[0], rtol=1e-4, atol=1e-7)

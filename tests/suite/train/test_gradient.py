@@ -1,0 +1,116 @@
+"""The trainer's gradient: images outside the loop, in chunks, few of them, and over devices."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from policies.networks import network
+from suite.train.gradient import encoder_gradient, make_gradient
+from suite.train.rollout import make_rollout
+from tests.support.training import (
+    SPEC,
+    boxes_worlds,
+    fresh_params,
+    largest_difference,
+    small_config,
+)
+
+KEY = jax.random.key(5)
+
+
+def blind(params, image):
+    """Return embeddings of nothing, for tests that are not about images."""
+    return jnp.zeros((image.shape[0], SPEC.hidden_size))
+
+
+def loss_of(config, encode=blind):
+    """Return loss(params, worlds, delta, field_gain) of the plain loop with `encode` inside."""
+
+    def loss(params, worlds, delta=None, field_gain=0.0):
+        weighted = replace(config, loss=replace(config.loss, field_gain=field_gain))
+        embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
+        return make_rollout(weighted)(params, embedding_shift, worlds, KEY, encode, delta)[0]
+
+    return loss
+
+
+@pytest.fixture(scope="module")
+def two_pass():
+    """Return (config, worlds, params, gradient, loss, records) of the trainer's own method."""
+    config = small_config(physics={"depth_noise": 0.02})
+    worlds, params = boxes_worlds(config), fresh_params()
+    return config, worlds, params, *jax.jit(make_gradient(config))(params, worlds, KEY, None)
+
+
+def test_images_outside_the_loop_give_the_gradient_of_the_plain_loop(two_pass):
+    """The sums run in another order in float32: 1e-4 of each array's largest entry."""
+    config, worlds, params, gradient, loss, _ = two_pass
+    plain = jax.jit(jax.value_and_grad(loss_of(config, network.encode)))
+    expected_loss, expected = plain(params, worlds, None, config.loss.field_gain)
+    assert float(loss) == pytest.approx(float(expected_loss), rel=1e-5)
+    sizes = {k: float(np.abs(np.array(g)).max()) for k, g in expected.items()}
+    assert min(sizes.values()) > 1e-7, sizes
+    assert largest_difference(gradient, expected) < 1e-4
+
+
+def test_the_encoders_gradient_does_not_depend_on_its_chunks(two_pass, monkeypatch):
+    params = two_pass[2]
+    rng = np.random.default_rng(0)
+    images = jnp.asarray(rng.normal(size=(12, 20, 20)), jnp.float32)
+    cotangents = jnp.asarray(rng.normal(size=(12, 8)), jnp.float32)
+    whole = encoder_gradient(params, images, cotangents)
+    monkeypatch.setattr("suite.train.gradient.CHUNK", 5)
+    assert largest_difference(encoder_gradient(params, images, cotangents), whole) < 1e-5
+
+
+def test_the_encoders_gradient_from_every_third_image_is_right_on_average():
+    """Without noise the key sets nothing but the first image: the three choices' mean is exact."""
+    config = small_config(steps=6, physics={"depth_noise": 0.0})
+    sparse = replace(config, episode=replace(config.episode, image_stride=3))
+    worlds, params = boxes_worlds(config), fresh_params()
+    whole = make_gradient(config)(params, worlds, KEY, None)[0]
+    run, found = jax.jit(make_gradient(sparse)), {}
+    for seed in range(40):
+        gradient = run(params, worlds, jax.random.key(seed), None)[0]
+        found[round(float(gradient["conv1.weight"][0, 0, 0, 0]), 9)] = gradient
+        if len(found) == 3:
+            break
+    assert len(found) == 3
+    mean = jax.tree.map(lambda *parts: sum(parts) / 3, *found.values())
+    assert largest_difference(mean, whole) < 1e-4
+    for gradient in found.values():
+        np.testing.assert_allclose(gradient["action.weight"], whole["action.weight"], atol=1e-6)
+
+
+TWO_DEVICES = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+import numpy as np
+from jax.sharding import Mesh
+from suite.train.gradient import shard_gradient
+from suite.train.update import device_mesh
+from tests.support.training import boxes_worlds, fresh_params, largest_difference, small_config
+config = small_config()
+assert device_mesh(config).size == 2
+args = (fresh_params(), boxes_worlds(config), jax.random.key(0), None)
+results = []
+for count in (1, 2):
+    mesh = Mesh(np.array(jax.devices()[:count]), ("worlds",))
+    gradient, loss, records = jax.jit(shard_gradient(config, mesh))(*args)
+    results.append((gradient, loss, records.pos_w, records.terms))
+print(largest_difference(results[1], results[0]))
+"""
+
+
+def test_two_devices_give_the_gradient_of_one(root):
+    """Without noise, which each device draws for its own worlds; the sums differ in order."""
+    done = subprocess.run(
+        [sys.executable, "-c", TWO_DEVICES], capture_output=True, text=True, cwd=root
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) < 1e-4

@@ -1,0 +1,109 @@
+"""A method that only counts, repeated in a folder: what is measured, resumed and refused."""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from suite.common import curve
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from suite.common.estimate import Estimate
+from suite.train import repeat as module
+from suite.train.repeat import Method, Run, Watch, repeat
+from tests.support.training import SPEC, fresh_params, small_config
+from tracks.common.files import plain
+
+CONFIG = small_config()
+
+
+class Count(NamedTuple):
+    params: Any
+    iteration: jax.Array
+
+
+FRESH = Count(fresh_params(), jnp.zeros((), int))
+
+
+def counting(iterations=10, stop=None, bad=None):
+    """Return a method whose loss is 100 less the iteration; `stop` interrupts, `bad` diverges."""
+
+    def update(state, worlds):
+        if worlds == stop:
+            raise KeyboardInterrupt
+        loss = jnp.nan if worlds == bad else 100.0 - worlds
+        return state._replace(iteration=state.iteration + 1), {"loss": jnp.asarray(loss)}
+
+    return Method(iterations, 24, Estimate(1.0, 1.0), lambda i: i, lambda: update, str)
+
+
+def run_in(folder, config=CONFIG, start=None):
+    origin = {"config": plain(config), "from": start, "delta": None}
+    place = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    return Run(config, SPEC, config.seed, origin, folder, place)
+
+
+def watch_of(seen):
+    def measure(params):
+        seen.append(params)
+        return {"speed": float(len(seen))}
+
+    return Watch(4, measure)
+
+
+def measured(folder):
+    return [row["iteration"] for row in curve.read(folder, curve.WATCHED)]
+
+
+def test_the_outcome_is_of_the_last_tenth_and_the_policy_is_measured_on_the_way(tmp_path):
+    seen = []
+    outcome = repeat(counting(20), run_in(tmp_path), FRESH, Console(), watch_of(seen))
+    assert outcome.iterations == 20 and outcome.policy == tmp_path / "policy"
+    assert outcome.last["loss"] == (100.0 - 18 + 100.0 - 19) / 2
+    assert measured(tmp_path) == [0, 4, 8, 12, 16, 20] and len(seen) == 6
+    rows = curve.read(tmp_path)
+    assert [row["loss"] for row in rows] == [100.0 - i for i in range(20)]
+    assert [row["cold"] for row in rows] == [True] + [False] * 19
+    repeat(counting(20), run_in(tmp_path), FRESH, Console(), watch_of(seen))
+    assert len(seen) == 6, "a finished run is neither repeated nor measured again"
+
+
+def test_a_stopped_run_goes_on_with_its_curve_and_its_measurements(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        repeat(counting(stop=6), run_in(tmp_path), FRESH, Console(), watch_of([]))
+    assert len(curve.read(tmp_path)) == 6 and measured(tmp_path) == [0, 4]
+    assert repeat(counting(), run_in(tmp_path), FRESH, Console(), watch_of([])).iterations == 10
+    assert [row["iteration"] for row in curve.read(tmp_path)] == list(range(10))
+    assert measured(tmp_path) == [0, 4, 8, 10]
+
+
+def test_rows_of_a_save_that_was_cut_off_are_computed_again(tmp_path, monkeypatch):
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "save_arrays", full)
+        with pytest.raises(OSError, match="No space"):
+            repeat(counting(3), run_in(tmp_path), FRESH, Console())
+    assert len(curve.read(tmp_path)) == 3 and not (tmp_path / "state").exists()
+    repeat(counting(3), run_in(tmp_path), FRESH, Console())
+    assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1, 2]
+
+
+def test_a_number_that_is_not_finite_ends_the_run_with_the_last_good_state(tmp_path):
+    with pytest.raises(WorkFailed, match="diverged at iteration 3: loss not finite.*clip"):
+        repeat(counting(bad=3), run_in(tmp_path), FRESH, Console())
+    assert len(curve.read(tmp_path)) == 3
+    outcome = repeat(counting(), run_in(tmp_path), FRESH, Console())
+    assert outcome.iterations == 10 and np.isfinite(outcome.last["loss"])
+
+
+def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
+    repeat(counting(2), run_in(tmp_path), FRESH, Console())
+    with pytest.raises(ValueError, match=r"holds another run \(it differs in seed\); give another"):
+        repeat(counting(2), run_in(tmp_path, replace(CONFIG, seed=9)), FRESH, Console())
+    with pytest.raises(ValueError, match="differs in --from"):
+        repeat(counting(2), run_in(tmp_path, start="a digest"), FRESH, Console())

@@ -1,0 +1,73 @@
+"""The worlds of an iteration follow the settings."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from suite.delta.replay import nominal_model
+from suite.train.dynamics.point_mass import PointMassParams
+from suite.train.worlds import difficulty_range, sample_worlds
+from tests.support.training import small_config
+
+
+def test_difficulty_grows_from_its_lower_end():
+    config = small_config(difficulty=(0.2, 0.8), easy_until=0.5)
+    assert difficulty_range(config, 0) == (0.2, 0.2)
+    assert difficulty_range(config, 3) == (0.2, 0.8) == difficulty_range(config, 5)
+    at_once = replace(config, episode=replace(config.episode, easy_until=0.0))
+    assert difficulty_range(at_once, 0) == (0.2, 0.8)
+
+
+def test_gates_heights_follow_the_setting():
+    usual, wide = (
+        sample_worlds(small_config(batch=16, height_spread=share), 0).scene.gates.center_w[..., 2]
+        for share in (1.0, 2.0)
+    )
+    assert np.ptp(wide, axis=1).mean() > 1.4 * np.ptp(usual, axis=1).mean()
+
+
+def test_worlds_beside_a_gate_have_missed_it():
+    config = small_config(batch=60, rest_share=0.0, missed_share=1.0, start_speed=5.0)
+    worlds = sample_worlds(config, 0)
+    gates, rows = worlds.scene.gates, np.arange(60)
+    turn = gates.rot_w[rows, worlds.target]
+    local = np.einsum("bij,bi->bj", turn, worlds.pos_w - gates.center_w[rows, worlds.target])
+    assert np.all(np.abs(local[:, 0] - 0.25) < 0.96)
+    assert np.mean(np.hypot(local[:, 1], local[:, 2]) > 0.85) > 0.9
+    assert np.all(local[:, 2] < 1.81) and np.any(local[:, 2] > 1.0)
+    assert np.linalg.norm(worlds.vel_w, axis=-1).max() < 5.0
+
+
+def test_none_has_missed_a_gate_unless_asked():
+    """The default's worlds are what they were before there was the setting."""
+    config = small_config(batch=8, rest_share=0.0)
+    with_some = replace(config, episode=replace(config.episode, missed_share=0.5))
+    one, other = (sample_worlds(c, 3).pos_w for c in (config, with_some))
+    assert np.abs(one - other).max() > 0.1
+    gates = sample_worlds(config, 3).scene.gates
+    assert np.all(np.isfinite(gates.center_w))
+
+
+def test_drag_along_the_bodys_z_has_a_range_of_its_own():
+    config = small_config()
+    plain = sample_worlds(config, 2)
+    physics = replace(config.physics, drag_up=(3.0, 4.0))
+    changed = sample_worlds(replace(config, physics=physics), 2)
+    before, after = (worlds.constants for worlds in (plain, changed))
+    assert isinstance(before, PointMassParams) and isinstance(after, PointMassParams)
+    across, up = after.drag[:, :2], after.drag[:, 2]
+    np.testing.assert_array_equal(across, before.drag[:, :2])
+    assert np.all((up >= 3.0) & (up <= 4.0))
+    np.testing.assert_array_equal(changed.pos_w, plain.pos_w)
+    np.testing.assert_allclose(nominal_model(physics).drag, [0.45, 0.45, 3.5])
+
+
+def test_worlds_at_rest_stop_early_and_forget_the_others_remember():
+    config = small_config(batch=64, steps=30, rest_share=0.5, stop_from=0.33)
+    worlds = sample_worlds(config, 0)
+    rests = worlds.remembers == 0
+    assert 0 < rests.sum() < 64
+    assert (worlds.vel_w[rests] == 0).all()
+    assert (worlds.stop[~rests] == 30).all()
+    assert worlds.stop[rests].min() >= 10
+    assert len(np.unique(worlds.stop[rests])) > 5
