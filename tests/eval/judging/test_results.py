@@ -1,13 +1,12 @@
-"""Result files, the journal and the tables."""
+"""Result files and the journal."""
 
 import json
-import math
 
 import pyarrow.parquet as pq
 import pytest
 
 from eval.judging.results import JOURNAL, Journal, read_trials, write_results
-from eval.judging.tables import NOTE, markdown_table, rich_tables, summarise
+from eval.judging.tables import NOTE, markdown_table, summarise
 from eval.worlds.trial import TrialResult, TrialSpec
 
 COLUMNS = """track difficulty seed policy vehicle world success gates_passed ended_by collided_with
@@ -52,39 +51,6 @@ def test_a_bad_file_is_named(tmp_path):
     path.write_bytes(b"PAR1 nothing")
     with pytest.raises(ValueError, match=r"trials\.parquet: not a readable"):
         read_trials(path)
-
-
-def test_paired_differences_are_on_the_same_trials():
-    other = [result(seed, policy="theirs", speed=4.0) for seed in (3, 2, 1)]
-    summary = summarise([*ROWS, *other, result(0, difficulty=9, policy="theirs")])
-    assert [cell.policy for cell in summary["cells"]] == ["ours", "theirs", "theirs"]
-    (pair,) = summary["paired"]
-    assert (pair.policy, pair.against, pair.trials) == ("theirs", "ours", 3)
-    assert pair.success.value == pytest.approx(1 / 3) and pair.p_value == 1.0
-    assert pair.v_mean == (-1.0, -1.0, -1.0)
-    assert "theirs - ours" in markdown_table(summary)
-
-
-def test_a_cell_without_a_finished_trial():
-    summary = summarise([result(0, False)])
-    assert math.isnan(summary["cells"][0].lap_s.value)
-    assert "collision 1" in markdown_table(summary)
-
-
-def test_cells_do_not_depend_on_what_else_is_in_the_table():
-    alone = summarise(ROWS)["cells"][0]
-    beside = summarise([result(5, difficulty=1), *ROWS])["cells"][1]
-    assert alone == beside
-
-
-def test_terminal_table():
-    from rich.console import Console
-
-    console = Console(width=200, record=True, file=open("/dev/null", "w"))
-    with console.file:
-        for table in rich_tables(summarise(ROWS)):
-            console.print(table)
-        assert "75 % [30, 95]" in console.export_text()
 
 
 def test_journal_resumes_after_a_kill(tmp_path):
