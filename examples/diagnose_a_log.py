@@ -14,7 +14,7 @@ from pathlib import Path
 from eval.logs.flight_log import read_flight
 from suite.cli import main as suite
 from suite.common.console import Console
-from suite.diagnose.run import Wishes, diagnose_files
+from suite.diagnose.run import diagnose_files
 
 
 def main(folder: Path) -> None:
@@ -24,9 +24,8 @@ def main(folder: Path) -> None:
     flight = read_flight(logs / "flight_1.parquet")
     print(f"flight 1: {len(flight.time_s)} rows over {flight.time_s[-1] - flight.time_s[0]:.1f} s")
 
-    found = diagnose_files(
-        [logs], str(logs / "vehicle.toml"), Wishes(recording=False), folder, Console()
-    )
+    vehicle = str(logs / "vehicle.toml")
+    found = diagnose_files([logs], vehicle, folder, Console(), recording=False)
     print(f"verdict: {found['verdict']}")
     for effect in found["effects"]:
         for name, entry in effect["parameters"].items():

@@ -153,7 +153,7 @@ def compare(before: Path, after: Path) -> int:
 
 def main() -> int:
     """Write the digests, or compare two files of them."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("fingerprint.json"))
     parser.add_argument("--work", type=Path, default=Path("runs/fingerprint"))
     parser.add_argument("--only", nargs="*", choices=PARTS, default=list(PARTS))

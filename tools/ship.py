@@ -78,7 +78,7 @@ def joined_curve(runs: Sequence[Path]) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Write policies/shipped/NAME from the command line's folders."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("runs", type=Path, nargs="+", help="folders of suite train, in order")
     parser.add_argument("--eval", type=Path, help="folder of suite eval of the last run's policy")
     parser.add_argument("--name", default="racer", help="the shipped policy's name")

@@ -103,7 +103,7 @@ def work_off(
         for pool in pools:
             pool.shutdown(cancel_futures=True)
     if died:
-        codes = sorted({p.exitcode or 0 for p in processes} - {0, -signal.SIGTERM})
+        codes = sorted({p.exitcode for p in processes if p.exitcode} - {-signal.SIGTERM})
         raise WorkerDied(
             f"a process died (exit code {', '.join(map(str, codes)) or 'unknown'}); out of memory? "
             "Work with fewer processes."
