@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,7 @@ from eval.judging.statistics import (
     wilson,
 )
 from eval.worlds.trial import ENDINGS, TrialResult
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from tracks.common.grid import Grid, markdown, table
 
 NOTE = (
     "Success: rate with its 95 % Wilson interval. v_max, v_mean, lap: median over the cell's "
@@ -38,9 +36,11 @@ HEADERS = (
     "lap [s]",
     "ended otherwise by",
 )
+PAIR_HEADERS = ("difference", "track", "level", "pairs", "success", "p (McNemar)", "v_mean [m/s]")
+PAIR_NOTE = "Differences are on the same trials; success: Newcombe's paired interval."
 
 
-class Cell(NamedTuple):
+class Tally(NamedTuple):
     """What the trials of one policy on one track at one level come to."""
 
     policy: str
@@ -79,7 +79,7 @@ class Pairing(NamedTuple):
 def summarise(results: Sequence[TrialResult]) -> dict[str, Any]:
     """Return the cells, and the pairings with the first policy where there are several.
 
-    The keys are `cells` and `paired`, lists of `Cell` and `Pairing` in order of appearance.
+    The keys are `cells` and `paired`, lists of `Tally` and `Pairing` in order of appearance.
     """
     groups: dict[tuple[str, str, int], list[TrialResult]] = {}
     for result in results:
@@ -100,13 +100,13 @@ def _seed(*key: object) -> int:
     return zlib.crc32(repr(key).encode())
 
 
-def _cell(policy: str, track: str, difficulty: int, rows: list[TrialResult]) -> Cell:
+def _cell(policy: str, track: str, difficulty: int, rows: list[TrialResult]) -> Tally:
     seed = _seed(track, difficulty)
 
     def median(values: list[float]) -> Interval:
         return bootstrap_median(np.array(values), seed)
 
-    return Cell(
+    return Tally(
         policy,
         track,
         difficulty,
@@ -157,37 +157,47 @@ def _number(interval: Interval) -> str:
     return f"{interval.value:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
-def _rows(cells: Sequence[Cell]) -> list[tuple[str, ...]]:
-    rows = []
+def grids(summary: dict[str, Any]) -> list[Grid]:
+    """Return what `summarise` gave as tables for people: the cells, and the pairings if any."""
+    made = [_cell_grid(summary["cells"])]
+    if summary["paired"]:
+        made.append(_pair_grid(summary["paired"]))
+    return made
+
+
+def markdown_table(summary: dict[str, Any]) -> str:
+    """Return what `summarise` gave as Markdown."""
+    return "\n".join(map(markdown, grids(summary)))
+
+
+def _cell_grid(cells: Sequence[Tally]) -> Grid:
+    lines = []
     for cell in cells:
         ended = [f"{how} {n}" for how, n in cell.ended_by.items() if how != "finished"]
-        rows.append(
-            (
-                cell.policy,
-                cell.track,
-                str(cell.difficulty),
-                str(cell.trials),
-                percent(cell.success),
-                f"{cell.gates_passed:.1f}",
-                _number(cell.v_max),
-                _number(cell.v_mean),
-                _number(cell.lap_s),
-                ", ".join(ended) or "-",
-            )
+        line = (
+            cell.policy,
+            cell.track,
+            str(cell.difficulty),
+            str(cell.trials),
+            percent(cell.success),
+            f"{cell.gates_passed:.1f}",
+            _number(cell.v_max),
+            _number(cell.v_mean),
+            _number(cell.lap_s),
+            ", ".join(ended) or "-",
         )
-    return rows
+        lines.append(line)
+    return table(HEADERS, lines, note=NOTE)
 
 
-_PAIR_HEADERS = ("difference", "track", "level", "pairs", "success", "p (McNemar)", "v_mean [m/s]")
-
-
-def _pair_rows(paired: Sequence[Pairing]) -> list[tuple[str, ...]]:
+def _pair_grid(paired: Sequence[Pairing]) -> Grid:
     def points(interval: Interval) -> str:
         value, low, high = (100 * x for x in interval)
         return f"{value:+.0f} [{low:+.0f}, {high:+.0f}] points"
 
-    return [
-        (
+    lines = []
+    for pair in paired:
+        line = (
             f"{pair.policy} - {pair.against}",
             pair.track,
             str(pair.difficulty),
@@ -196,41 +206,5 @@ def _pair_rows(paired: Sequence[Pairing]) -> list[tuple[str, ...]]:
             f"{pair.p_value:.3g}",
             f"{pair.v_mean.value:+.2f} [{pair.v_mean.low:+.2f}, {pair.v_mean.high:+.2f}]",
         )
-        for pair in paired
-    ]
-
-
-def markdown_table(summary: dict[str, Any]) -> str:
-    """Return what `summarise` gave as Markdown."""
-
-    def table(headers: Sequence[str], rows: list[tuple[str, ...]]) -> str:
-        lines = [headers, ["---"] * len(headers), *rows]
-        return "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in r) + " |" for r in lines)
-
-    parts = [table(HEADERS, _rows(summary["cells"])), NOTE]
-    if summary["paired"]:
-        parts += [
-            table(_PAIR_HEADERS, _pair_rows(summary["paired"])),
-            "Differences are on the same trials; success: Newcombe's paired interval.",
-        ]
-    return "\n\n".join(parts) + "\n"
-
-
-def rich_tables(summary: dict[str, Any]) -> list[Table]:
-    """Return what `summarise` gave as tables for a terminal, the note as caption."""
-    from rich.table import Table
-
-    def table(headers: Sequence[str], rows: list[tuple[str, ...]], caption: str) -> Table:
-        made = Table(*headers, caption=caption, caption_justify="left")
-        for row in rows:
-            made.add_row(*row)
-        return made
-
-    tables = [table(HEADERS, _rows(summary["cells"]), NOTE)]
-    if summary["paired"]:
-        tables.append(
-            table(
-                _PAIR_HEADERS, _pair_rows(summary["paired"]), "Differences are on the same trials."
-            )
-        )
-    return tables
+        lines.append(line)
+    return table(PAIR_HEADERS, lines, note=PAIR_NOTE)

@@ -6,32 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from suite.common.console import Console
+from suite.judging.requests import Collection
 
 
 @dataclass(frozen=True)
 class Config:
     """Fly a policy and record every flight as a log (Parquet)."""
 
-    policy: str = ""
-    """A shipped policy's name, a checkpoint's folder, or a policy file; by default the shipped
-    policy."""
-    track: str = "all"
-    """As in suite eval."""
-    difficulty: str = "0,3"
-    """As in suite eval."""
-    trials: int = 5
-    """Flights on every track at every level."""
-    vehicle: str = "reference"
-    """A shipped vehicle's name or a vehicle file (.toml)."""
-    world: str = "mujoco"
-    """As in suite eval."""
-    seed: int = 100_000
-    """Seed of the first trial; by default far from those that suite eval flies."""
+    flown: tyro.conf.OmitArgPrefixes[Collection] = Collection()
+    """What is flown."""
     out: Path = Path("runs/flights")
     """Folder for the flights, and for flights.json, which lists them."""
-    trust: bool = False
-    """Also load policy files that can run code on this machine."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -42,16 +30,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
     """
-    from suite.judging.collect import Collection, collect
+    from suite.judging.collect import collect
 
-    collection = Collection(
-        policy=config.policy,
-        track=config.track,
-        difficulty=config.difficulty,
-        trials=config.trials,
-        vehicle=config.vehicle,
-        world=config.world,
-        seed=config.seed,
-        trust=config.trust,
-    )
-    return collect(collection, config.out, console)
+    return collect(config.flown, config.out, console)

@@ -9,35 +9,17 @@ from typing import Any
 import tyro
 
 from suite.common.console import Console
+from suite.judging.requests import Evaluation
 
 
 @dataclass(frozen=True)
 class Config:
     """Fly trials and write the result tables; two policies or more are compared in pairs."""
 
-    track: str = "all"
-    """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
-    difficulty: str = "0"
-    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
-    trials: int = 10
-    """Trials of every policy on every track at every level."""
-    policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2 or .pt file; may be given
-    several times. Without it the shipped policy flies."""
-    vehicle: str = "reference"
-    """A shipped vehicle's name or a vehicle file (.toml)."""
-    world: str = "mujoco"
-    """mujoco (fast on CPUs), mjx (for GPUs) or reference (slow and simple)."""
-    seed: int = 0
-    """Seed of the first trial; the others follow by one."""
+    flown: tyro.conf.OmitArgPrefixes[Evaluation] = Evaluation()
+    """What is flown."""
     out: Path = Path("runs/eval")
     """Folder for trials.parquet, table.md, summary.json and run.json."""
-    procs: int | None = None
-    """Processes that share the trials; by default as many cores as are worth it."""
-    deadline_s: float | None = None
-    """A policy's answer for a batch that takes longer is late and not flown [s]."""
-    trust: bool = False
-    """Also load policy files that can run code on this machine."""
     rerun: Path | None = None
     """Also write a rerun recording (.rrd) of the first trial of every track and level."""
     json: bool = False
@@ -50,26 +32,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
     """
-    from suite.judging.evaluate import Judgement, evaluate
+    from suite.judging.evaluate import evaluate
 
-    judgement = Judgement(
-        policies=tuple(config.policy),
-        track=config.track,
-        difficulty=config.difficulty,
-        trials=config.trials,
-        seed=config.seed,
-        vehicle=config.vehicle,
-        world=config.world,
-        processes=config.procs,
-        deadline_s=config.deadline_s,
-        trust=config.trust,
-    )
     if config.rerun and config.rerun.suffix != ".rrd":
         raise ValueError(f"--rerun {config.rerun}: a recording's name must end in .rrd")
-    answer = evaluate(judgement, config.out, console)
+    answer = evaluate(config.flown, config.out, console)
     if config.rerun:
         from suite.judging.replay import record_first_trials
 
-        record_first_trials(judgement, config.rerun, console)
+        record_first_trials(config.flown, config.rerun, console)
         answer["rerun"] = str(config.rerun)
     return answer

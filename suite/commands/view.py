@@ -14,7 +14,7 @@ from suite.common.console import Console
 if TYPE_CHECKING:
     from eval.view.recording import Rollout
     from eval.worlds.trial import TrialSpec
-    from suite.judging.evaluate import Judgement
+    from suite.judging.requests import Evaluation
 
 
 @dataclass(frozen=True)
@@ -61,15 +61,15 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     recording = config.rerun or config.out / "trials.rrd"
     if recording.suffix != ".rrd":
         raise ValueError(f"--rerun {recording}: a recording's name must end in .rrd")
-    judgement, trials = _chosen(config)
+    evaluation, trials = _chosen(config)
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.view.picture import write_picture
     from eval.view.recording import write_recording
     from suite.judging.replay import drone_of, fly_again
 
     console.note(f"flying {len(trials)} trials again")
-    rollouts = fly_again(judgement, trials)
-    write_recording(recording, rollouts, drone_of(load_vehicle(judgement.vehicle)))
+    rollouts = fly_again(evaluation, trials)
+    write_recording(recording, rollouts, drone_of(load_vehicle(evaluation.vehicle)))
     written = [recording]
     for rollout in rollouts:
         written.append(write_picture(config.out / f"{_name(rollout)}.png", *rollout))
@@ -103,13 +103,13 @@ def _name(rollout: Rollout) -> str:
     return f"{Path(result.track).stem}-{result.difficulty}-{result.seed}"
 
 
-def _chosen(config: Config) -> tuple[Judgement, list[TrialSpec]]:
-    from suite.judging.evaluate import Judgement
-    from suite.judging.replay import first_trials, read_judgement
+def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec]]:
+    from suite.judging.replay import first_trials, read_evaluation
+    from suite.judging.requests import Evaluation
 
     folder = Path(config.run)
     if not (folder / "trials.parquet").is_file():
-        judgement = Judgement(
+        evaluation = Evaluation(
             policies=(config.run,),
             track=config.track,
             difficulty=config.difficulty,
@@ -117,14 +117,14 @@ def _chosen(config: Config) -> tuple[Judgement, list[TrialSpec]]:
             vehicle=config.vehicle,
             trust=config.trust,
         )
-        return judgement, first_trials(judgement)[: config.count]
+        return evaluation, first_trials(evaluation)[: config.count]
     from eval.judging.results import read_trials
 
-    judgement = read_judgement(folder)
+    evaluation = read_evaluation(folder)
     results = read_trials(folder / "trials.parquet")
     results = [result for result in results if result.policy == results[0].policy]
     if config.pick != "first":
         results = [result for result in results if result.success == (config.pick == "passed")]
     if not results:
         raise ValueError(f"--pick {config.pick}: {folder} holds no such trial")
-    return judgement, [result.trial for result in results[: config.count]]
+    return evaluation, [result.trial for result in results[: config.count]]

@@ -74,6 +74,16 @@ class Console:
         yield update
 
 
+class Quiet(Console):
+    """Leaves the lines of a result out and keeps progress: who called has lines of its own."""
+
+    def say(self, text: str = "") -> None:
+        """Print nothing."""
+
+    def show(self, table: RenderableType) -> None:
+        """Print nothing."""
+
+
 @contextmanager
 def _bar(label: str, total: float) -> Iterator[Update]:
     from rich.console import Console as RichConsole

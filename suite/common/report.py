@@ -1,4 +1,4 @@
-"""Reports: one HTML file that needs nothing else, and its tables for terminals and Markdown."""
+"""Reports: one HTML file that needs nothing else."""
 
 from __future__ import annotations
 
@@ -9,43 +9,16 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, NamedTuple
 
 from tracks.common.files import write_text
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from tracks.common.grid import Grid, html_table
 
 TEMPLATE = Path(__file__).with_name("report.html")
-
-
-class Cell(NamedTuple):
-    """One cell of a table."""
-
-    text: str
-    tone: str = ""
-    """good, bad, or nothing: whether the number speaks for or against what is judged."""
 
 
 def ranged(mean: float, least: float, most: float, digits: int) -> str:
     """Return a mean over training seeds as cells show it, with the least and the most of one."""
     return f"{mean:.{digits}f} [{least:.{digits}f}, {most:.{digits}f}]"
-
-
-@dataclass(frozen=True)
-class Grid:
-    """A table."""
-
-    title: str
-    """Above it."""
-    headers: Sequence[str]
-    """One a column."""
-    rows: Sequence[Sequence[Cell]]
-    """Cells, as many as headers in each."""
-    strong_last: bool = False
-    """Whether the last row sums up the others."""
-    note: str = ""
-    """Below it."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +106,7 @@ def html(report: Report) -> str:
 
 def _part(part: Part) -> str:
     if isinstance(part, Grid):
-        return _table(part)
+        return html_table(part)
     if isinstance(part, Picture):
         data, caption = base64.b64encode(part.png).decode("ascii"), escape(part.caption)
         image = f'<img src="data:image/png;base64,{data}" alt="{caption}">'
@@ -149,54 +122,3 @@ def _part(part: Part) -> str:
         summary = f"<summary>{escape(part.summary)}</summary>"
         return f"<details>{summary}<pre>{escape(part.text)}</pre></details>"
     return f"<p>{escape(part)}</p>"
-
-
-def _table(grid: Grid) -> str:
-    head = "".join(f'<th scope="col">{escape(header)}</th>' for header in grid.headers)
-    rows = []
-    for number, row in enumerate(grid.rows):
-        strong = grid.strong_last and number == len(grid.rows) - 1
-        cells = "".join(
-            f'<td class="{cell.tone}">{escape(cell.text)}</td>' if cell.tone
-            else f"<td>{escape(cell.text)}</td>"
-            for cell in row
-        )  # fmt: skip
-        rows.append(f'<tr class="sum">{cells}</tr>' if strong else f"<tr>{cells}</tr>")
-    caption = f"<caption>{escape(grid.title)}</caption>" if grid.title else ""
-    note = f'<p class="note">{escape(grid.note)}</p>' if grid.note else ""
-    body = "\n".join(rows)
-    table = f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table>"
-    return f'<div class="scroll">{table}</div>{note}'
-
-
-def markdown(grid: Grid) -> str:
-    """Return a table as Markdown."""
-    rows = [[cell.text for cell in row] for row in grid.rows]
-    lines = [list(grid.headers), ["---"] * len(grid.headers), *rows]
-    text = "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in r) + " |" for r in lines)
-    return "\n\n".join(part for part in (grid.title, text, grid.note) if part) + "\n"
-
-
-def rich_table(grid: Grid) -> Table:
-    """Return a table for a terminal."""
-    from rich.markup import escape as literal
-    from rich.table import Table
-
-    tones = {"good": "green", "bad": "red", "": ""}
-    table = Table(
-        *map(literal, grid.headers),
-        title=grid.title and literal(grid.title),
-        title_justify="left",
-        caption=grid.note or None,
-        caption_justify="left",
-    )
-    for number, row in enumerate(grid.rows):
-        last = grid.strong_last and number == len(grid.rows) - 1
-        if last:
-            table.add_section()
-        cells = [
-            f"[{tone}]{literal(cell.text)}[/]" if (tone := tones[cell.tone]) else literal(cell.text)
-            for cell in row
-        ]
-        table.add_row(*cells, style="bold" if last else None)
-    return table

@@ -7,9 +7,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TypeVar
 
-from rich.console import RenderableType
-
-from suite.common.console import Console, Update
+from suite.common.console import Console, Quiet, Update
 from suite.common.errors import WorkFailed
 from tracks.common.work import WorkerDied, usable_cores, work_off
 
@@ -17,14 +15,8 @@ Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 
-class Silent(Console):
+class Silent(Quiet):
     """Says nothing: several at once would write into each other's lines."""
-
-    def say(self, text: str = "") -> None:
-        """Print nothing."""
-
-    def show(self, table: RenderableType) -> None:
-        """Print nothing."""
 
     def note(self, text: str) -> None:
         """Print nothing."""

@@ -10,12 +10,13 @@ import numpy as np
 
 from eval.judging.statistics import Interval, wilson
 from suite.common.console import Console, duration
-from suite.common.report import Grid, Picture, Report, Section
+from suite.common.report import Picture, Report, Section
 from suite.experiments.pages import paper
 from suite.experiments.pages.document import Place
-from suite.experiments.pages.tables import every_training, table
+from suite.experiments.pages.tables import every_training
 from suite.experiments.study import options, training
 from suite.experiments.study.summary import Summary, summaries
+from tracks.common.grid import Grid, table
 
 PROGRESS = (0.4, 0.8, 1.6, 3.2)
 """lambda_p of L_p. The paper has the field at the first alone; here it is on and off at each and at

@@ -13,14 +13,15 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialResult
 from suite.common.console import Console, duration
 from suite.common.errors import WorkFailed
-from suite.common.report import Grid, Picture, Report, Section, ranged
+from suite.common.report import Picture, Report, Section, ranged
 from suite.experiments.pages.document import Place
-from suite.experiments.pages.tables import points_cell, table
+from suite.experiments.pages.tables import points_cell
 from suite.experiments.schemes import PROJECTION, PROJECTION_DECAY
 from suite.experiments.study import judging, options, training
 from suite.experiments.study.intervals import Gap, crossed, spread
 from suite.experiments.study.summary import Summary, summaries
 from suite.train.overrides import override
+from tracks.common.grid import Grid, table
 
 RECIPE = "recipe"
 """The key of the row that all others are compared with."""

@@ -11,13 +11,14 @@ import numpy as np
 from eval.judging.statistics import Interval, wilson
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.common.console import Console
-from suite.common.report import Grid, Picture, Report, Section
+from suite.common.report import Picture, Report, Section
 from suite.experiments.pages.document import Place
-from suite.experiments.pages.tables import condition_grid, points_cell, table
+from suite.experiments.pages.tables import condition_grid, points_cell
 from suite.experiments.study import disturbed, judging, options, training
 from suite.experiments.study.disturbed import Tested
 from suite.experiments.study.intervals import Gap, nested
 from suite.train.config import PointMassConfig, TrainConfig
+from tracks.common.grid import Grid, table
 
 FIXED, RANDOMISED = "fixed", "randomised"
 ALL = "all disturbances"

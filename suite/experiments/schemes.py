@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from suite.common.console import Console, duration
-from suite.common.report import Grid, Picture, Report, Section
+from suite.common.report import Picture, Report, Section
 from suite.experiments.pages.document import Place
-from suite.experiments.pages.tables import every_training, table
+from suite.experiments.pages.tables import every_training
 from suite.experiments.study import options, training
 from suite.experiments.study.intervals import Spread
 from suite.experiments.study.summary import METRICS, Summary, summaries
 from suite.train.ppo.config import ppo_like
+from tracks.common.grid import Grid, table
 
 PROJECTION, PROJECTION_DECAY = 3.0, 0.5
 """lambda_proj and beta_3 of the paper's scheme without the field."""

@@ -9,15 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.judging.tables import Cell
+from eval.judging.tables import Tally
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.policy import load_policy
 from suite.common.console import Console
-from suite.common.report import Grid, Picture, Report, Section
+from suite.common.report import Picture, Report, Section
 from suite.experiments.pages.document import Place
-from suite.experiments.pages.tables import every_cell, table
+from suite.experiments.pages.tables import every_cell
 from suite.experiments.study import judging, options, training
 from suite.judging.flying import labels, policy_digest
+from tracks.common.grid import Grid, table
 
 LEVELS = (0, 3, 6, 9)
 """The levels of the paper's table."""
@@ -127,7 +128,7 @@ def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:
     return dict(zip(names, chosen, strict=True))
 
 
-def repeats(cells: Mapping[str, Sequence[Cell]]) -> Repeats:
+def repeats(cells: Mapping[str, Sequence[Tally]]) -> Repeats:
     """Return how the policies differ in mean success over their cells."""
     means = {name: float(np.mean([c.success.value for c in some])) for name, some in cells.items()}
     ordered, values = sorted(means, key=lambda name: means[name]), list(means.values())
@@ -140,8 +141,8 @@ def _std(values: Sequence[float]) -> float:
 
 def _grid(
     title: str,
-    cells: Mapping[str, Sequence[Cell]],
-    pick: Callable[[Cell], float],
+    cells: Mapping[str, Sequence[Tally]],
+    pick: Callable[[Tally], float],
     scale: float,
     digits: int,
 ) -> Grid:

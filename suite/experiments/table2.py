@@ -8,21 +8,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from eval.judging.tables import Cell, percent
+from eval.judging.tables import Tally, percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialResult
 from policies.policy import load_policy
 from suite.common.choices import LEVELS
 from suite.common.console import Console
-from suite.common.report import Grid, Picture, Report, Section
+from suite.common.report import Picture, Report, Section
 from suite.experiments.pages.document import Place
 from suite.experiments.pages.goals import goal_grid, goals, verdict
 from suite.experiments.pages.paper import sim_to_sim
-from suite.experiments.pages.tables import every_cell, table
+from suite.experiments.pages.tables import every_cell
 from suite.experiments.study import judging, options
 from suite.experiments.study.cache import code_digest, digest
 from suite.judging.flying import default_policy, policy_digest
 from suite.loop import compare
+from tracks.common.grid import Grid, table
 from tracks.families import JUDGED
 
 if TYPE_CHECKING:
@@ -191,7 +192,7 @@ def _merit(results: Mapping[str, Sequence[TrialResult]]) -> list[compare.Line]:
 
 
 def _sections(
-    cells: Mapping[str, Sequence[Cell]], lines: Sequence[compare.Line]
+    cells: Mapping[str, Sequence[Tally]], lines: Sequence[compare.Line]
 ) -> Iterator[Section]:
     from suite.experiments.pages.charts import level_chart
 
@@ -210,7 +211,7 @@ def _sections(
     yield every_cell(everything)
 
 
-def beside_the_paper(cells: Mapping[str, Sequence[Cell]]) -> Grid:
+def beside_the_paper(cells: Mapping[str, Sequence[Tally]]) -> Grid:
     """Return our rows and the printed ones, a method and level each, tracks as columns."""
     printed = sim_to_sim()
     lines = [
@@ -228,7 +229,7 @@ def beside_the_paper(cells: Mapping[str, Sequence[Cell]]) -> Grid:
     return table(["method", "level", *COLUMNS], lines, note=f"Printed rows: {printed.source}.")
 
 
-def _ours(cells: Sequence[Cell], level: int) -> list[str]:
+def _ours(cells: Sequence[Tally], level: int) -> list[str]:
     """Return one policy's numbers at a level, track by track."""
     by_track, texts = {cell.track: cell for cell in cells if cell.difficulty == level}, []
     for cell in (by_track[track] for track in JUDGED):
@@ -237,7 +238,7 @@ def _ours(cells: Sequence[Cell], level: int) -> list[str]:
     return texts
 
 
-def where_it_breaks(policy: str, cells: Sequence[Cell]) -> str:
+def where_it_breaks(policy: str, cells: Sequence[Tally]) -> str:
     """Return up to which level a policy flies each track well, and by half."""
     parts = []
     for track in JUDGED:

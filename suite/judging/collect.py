@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from eval.logs.columns import DURATION_MIN
-from suite.common.choices import at_least, parse_levels, parse_tracks
 from suite.common.console import Console
-from suite.common.estimate import Estimate, announce
+from suite.common.estimate import announce
 from suite.common.provenance import write_run_record
 from suite.judging.flying import (
-    PROCESS_BYTES,
-    SECONDS_A_TRIAL,
-    START_SECONDS,
     about_policy,
-    custom_tracks,
     default_policy,
+    flying_needs,
     options_for,
-    trial_list,
+    read_course,
     who_flies,
 )
+from suite.judging.requests import Collection
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
 
@@ -32,28 +28,6 @@ if TYPE_CHECKING:
 
 LIST = "flights.json"
 """Name of the list of flights in the output folder."""
-
-
-@dataclass(frozen=True)
-class Collection:
-    """What is to be recorded."""
-
-    policy: str = ""
-    """A shipped name, a checkpoint's folder or a policy file; empty: the shipped default."""
-    track: str = "all"
-    """As in `suite.common.choices.parse_tracks`."""
-    difficulty: str = "0,3"
-    """As in `suite.common.choices.parse_levels`."""
-    trials: int = 5
-    """Flights on every track at every level."""
-    vehicle: str = "reference"
-    """A shipped vehicle's name or a vehicle file."""
-    world: str = "mujoco"
-    """Where it flies."""
-    seed: int = 100_000
-    """Seed of the first trial; the others follow by one."""
-    trust: bool = False
-    """Also load policy files that can run code."""
 
 
 def collect(collection: Collection, out: Path, console: Console) -> dict[str, Any]:
@@ -69,27 +43,23 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
             flights of another collection.
     """
     from eval.judging.judge import Record, fly
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.worlds import world_class
     from policies.policy import load_policy
 
-    world_class(collection.world)
-    at_least("--trials", collection.trials, 1)
-    at_least("--seed", collection.seed, 0)
-    names = parse_tracks(collection.track)
-    levels = parse_levels(collection.difficulty)
-    trials = trial_list(names, levels, collection.trials, collection.seed)
-    vehicle, tracks = load_vehicle(collection.vehicle), custom_tracks(names)
+    course = read_course(collection)
+    trials = course.trials
     asked = collection.policy or default_policy()
     policy = load_policy(asked, collection.trust)
     out = Path(out)
-    about = {"collection": collection, "policy": about_policy(asked, policy), "vehicle": vehicle}
+    about = {
+        "collection": collection,
+        "policy": about_policy(asked, policy),
+        "vehicle": course.vehicle,
+    }
     rows = _rows_there(out, plain(about))
     missing = [trial for trial in trials if trial not in rows]
     options = options_for(len(missing), None, collection.world)
-    seconds = START_SECONDS + len(missing) * SECONDS_A_TRIAL / (options.processes or 1)
     what = f"{len(missing)} flights in the {collection.world} world"
-    announce(console, what, Estimate(seconds, PROCESS_BYTES * (options.processes or 1)))
+    announce(console, what, flying_needs(len(missing), options.processes or 1))
 
     def write_list() -> dict[str, Any]:
         flights = [rows[trial] for trial in trials if trial in rows]
@@ -111,12 +81,12 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
             fly(
                 who_flies(policy, asked, collection.trust, options.processes),
                 missing,
-                vehicle,
+                course.vehicle,
                 collection.world,
                 options,
                 keep,
                 Record(depth=False),
-                tracks,
+                course.tracks,
             )
     found = write_list()
     write_run_record(out, collection, collection.seed)

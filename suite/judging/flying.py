@@ -6,13 +6,16 @@ import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from suite.common.choices import is_track_file
+from suite.common.choices import at_least, is_track_file, parse_levels, parse_tracks
+from suite.common.estimate import Estimate
+from suite.judging.requests import Collection, Evaluation
 from tracks.common.work import usable_cores
 
 if TYPE_CHECKING:
     from eval.judging.judge import JudgeOptions
+    from eval.vehicles.vehicle import Vehicle
     from eval.worlds.trial import TrialSpec
     from policies.policy import Policy
     from tracks.track import Track
@@ -110,6 +113,40 @@ def trial_list(
         for level in ([0] if is_track_file(track) else levels)
         for number in seeds
     ]
+
+
+class Course(NamedTuple):
+    """What a command is asked to fly, read and checked."""
+
+    trials: list[TrialSpec]
+    """In the order of the rows of results."""
+    tracks: dict[str, Track]
+    """Those that come from files, by the name that trials call them."""
+    vehicle: Vehicle
+    """On what."""
+
+
+def read_course(wanted: Evaluation | Collection) -> Course:
+    """Return what is to be flown.
+
+    Raises:
+        ValueError: for an unknown world or track, too few trials, or a bad track or vehicle file.
+    """
+    from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.worlds import world_class
+
+    world_class(wanted.world)
+    at_least("--trials", wanted.trials, 1)
+    at_least("--seed", wanted.seed, 0)
+    names = parse_tracks(wanted.track)
+    trials = trial_list(names, parse_levels(wanted.difficulty), wanted.trials, wanted.seed)
+    return Course(trials, custom_tracks(names), load_vehicle(wanted.vehicle))
+
+
+def flying_needs(trials: int, processes: int) -> Estimate:
+    """Return about how long `trials` take in MuJoCo, and their memory."""
+    seconds = START_SECONDS + trials * SECONDS_A_TRIAL / processes
+    return Estimate(seconds, processes * PROCESS_BYTES)
 
 
 def custom_tracks(names: Sequence[str]) -> dict[str, Track]:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from suite.common.choices import parse_levels, parse_tracks
 from suite.common.console import Console
-from suite.judging.evaluate import Judgement
 from suite.judging.flying import custom_tracks, default_policy, trial_list
+from suite.judging.requests import Evaluation
 
 if TYPE_CHECKING:
     from eval.logs.flight import Flight
@@ -19,40 +19,39 @@ if TYPE_CHECKING:
     from eval.worlds.trial import TrialResult, TrialSpec
 
 
-def read_judgement(folder: Path) -> Judgement:
+def read_evaluation(folder: Path) -> Evaluation:
     """Return what `suite eval --out folder` judged.
 
     Raises:
-        ValueError: where `folder` holds no finished judgement.
+        ValueError: where `folder` holds no finished run of suite eval.
     """
     path = folder / "run.json"
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         config: dict[str, Any] = record["config"]
-        known = {field.name for field in dataclasses.fields(Judgement)}
-        fits = record["config_type"].endswith(".Judgement") and set(config) <= known
+        fits = set(config) == {field.name for field in dataclasses.fields(Evaluation)}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the record of a run ({error})") from error
     if not fits:
         raise ValueError(f"{path}: not a run of suite eval; give the --out of one")
-    return Judgement(**{**config, "policies": tuple(config["policies"])})
+    return Evaluation(**{**config, "policies": tuple(config["policies"])})
 
 
-def first_trials(judgement: Judgement) -> list[TrialSpec]:
-    """Return the first trial of every track and level that `judgement` flies."""
-    tracks, levels = parse_tracks(judgement.track), parse_levels(judgement.difficulty)
-    return trial_list(tracks, levels, 1, judgement.seed)
+def first_trials(evaluation: Evaluation) -> list[TrialSpec]:
+    """Return the first trial of every track and level that `evaluation` flies."""
+    tracks, levels = parse_tracks(evaluation.track), parse_levels(evaluation.difficulty)
+    return trial_list(tracks, levels, 1, evaluation.seed)
 
 
 def fly_again(
-    judgement: Judgement, trials: list[TrialSpec], policy: str | None = None
+    evaluation: Evaluation, trials: list[TrialSpec], policy: str | None = None
 ) -> list[Rollout]:
     """Return track, flight (with the depth images) and result of each of `trials`.
 
     Args:
-        judgement: what the trials are part of.
+        evaluation: what the trials are part of.
         trials: which.
-        policy: one of the judgement's; its first if None.
+        policy: one of the evaluation's; its first if None.
     """
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, Record, fly
@@ -60,8 +59,8 @@ def fly_again(
     from eval.worlds.trial import track_of
     from policies.policy import load_policy
 
-    name = policy or (judgement.policies or (default_policy(),))[0]
-    tracks = custom_tracks(parse_tracks(judgement.track))
+    name = policy or (evaluation.policies or (default_policy(),))[0]
+    tracks = custom_tracks(parse_tracks(evaluation.track))
     flights: dict[TrialSpec, Flight] = {}
 
     def keep(result: TrialResult, flight: Flight | None) -> None:
@@ -69,11 +68,11 @@ def fly_again(
             flights[result.trial] = flight
 
     results = fly(
-        load_policy(name, judgement.trust),
+        load_policy(name, evaluation.trust),
         trials,
-        load_vehicle(judgement.vehicle),
-        judgement.world,
-        JudgeOptions(processes=1, limits=ActionLimits(deadline_s=judgement.deadline_s)),
+        load_vehicle(evaluation.vehicle),
+        evaluation.world,
+        JudgeOptions(processes=1, limits=ActionLimits(deadline_s=evaluation.deadline_s)),
         keep,
         Record(depth=True),
         tracks,
@@ -91,11 +90,11 @@ def drone_of(vehicle: Vehicle) -> Drone:
     return Drone(vehicle.body.half_size, vehicle.rotors.position, vehicle.camera)
 
 
-def record_first_trials(judgement: Judgement, path: Path, console: Console) -> None:
+def record_first_trials(evaluation: Evaluation, path: Path, console: Console) -> None:
     """Write a rerun recording of the first trial of every track and level to `path`."""
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.view.recording import write_recording
 
-    rollouts = fly_again(judgement, first_trials(judgement))
-    write_recording(path, rollouts, drone_of(load_vehicle(judgement.vehicle)))
+    rollouts = fly_again(evaluation, first_trials(evaluation))
+    write_recording(path, rollouts, drone_of(load_vehicle(evaluation.vehicle)))
     console.say(f"written: {path} (open it with: rerun {path})")

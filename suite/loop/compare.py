@@ -22,7 +22,7 @@ from eval.judging.statistics import (
     wilson,
 )
 from eval.worlds.trial import TrialResult, TrialSpec
-from suite.common.report import Cell, Grid
+from tracks.common.grid import Cell, Grid
 
 BEFORE, WITHOUT, WITH = "before", "without", "with"
 VARIANTS = (BEFORE, WITHOUT, WITH)

@@ -13,12 +13,13 @@ from pathlib import Path
 from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.choices import parse_tracks
-from suite.common.report import Grid, Picture, Section
+from suite.common.report import Picture, Section
 from suite.loop.charts import comparison_chart, delta_chart, training_chart
 from suite.loop.compare import BEFORE, CAVEAT, WITH, WITHOUT, compare, grids, verdict
 from suite.loop.config import DeltaLoopConfig, LoopConfig
 from suite.loop.report import errors_row
 from suite.loop.variants import DeltaModel, Findings, Loop, Shown, Variant
+from tracks.common.grid import Grid
 
 JUDGED = "judging the one fine-tuned {} the Delta Action Model, on the same seeds"
 

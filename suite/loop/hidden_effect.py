@@ -15,7 +15,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult
 from suite.common import curve
-from suite.common.report import Cell, Grid, Links, Picture, Section
+from suite.common.report import Links, Picture, Section
 from suite.loop.charts import success_chart, tuning_chart
 from suite.loop.compare import BEFORE, points, told_apart
 from suite.loop.config import HiddenLoopConfig, LoopConfig
@@ -24,6 +24,7 @@ from suite.loop.standings import Standing, cell_grid, overall_grid, standings
 from suite.loop.variants import DeltaModel, Findings, Loop, Shown, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
+from tracks.common.grid import Cell, Grid
 
 NOMINAL, CONTROL, DELTA, NAMED, BOTH = "nominal", "control", "delta", "named", "both"
 LABELS = {

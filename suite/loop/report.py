@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from suite.common.console import duration
-from suite.common.report import Cell, Details, Grid, Links, Picture, Report, Section, write_report
+from suite.common.report import Details, Links, Picture, Report, Section, write_report
 from suite.loop.config import LoopConfig
 from suite.loop.variants import Findings, Loop
 from tracks.common.files import to_json
+from tracks.common.grid import Cell, Grid
 from tracks.common.provenance import git_commit
 from tracks.common.version import VERSION
 

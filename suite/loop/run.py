@@ -11,13 +11,13 @@ from typing import Any
 
 from eval.judging.results import read_trials
 from suite.common.console import Console
-from suite.common.report import markdown, rich_table
 from suite.common.stages import claim, do_stages
 from suite.loop import delta_action, hidden_effect
 from suite.loop.config import HiddenLoopConfig, LoopConfig
 from suite.loop.report import write_loop_report
 from suite.loop.work import LoopRun, plan
 from tracks.common.files import plain, write_json, write_text
+from tracks.common.grid import markdown, rich_table
 from tracks.common.provenance import stamp
 
 FILES = ("table.md", "report.html", "recording.rrd")

@@ -10,8 +10,8 @@ import numpy as np
 
 from eval.judging.statistics import Interval, bootstrap_mean, bootstrap_median, paired_success
 from eval.worlds.trial import TrialResult
-from suite.common.report import Cell, Grid
 from suite.loop.compare import difference_cell, rate, same_trials, value_text
+from tracks.common.grid import Cell, Grid
 
 
 class Difference(NamedTuple):

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from eval.worlds.trial import TrialResult
-from suite.common.report import Grid, Picture, Section
+from suite.common.report import Picture, Section
 from suite.loop.config import LoopConfig
+from tracks.common.grid import Grid
 
 
 @dataclass(frozen=True)

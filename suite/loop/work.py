@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from rich.console import RenderableType
 
 from eval.judging.results import read_trials
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -19,21 +18,16 @@ from policies.formats.delta_file import load_delta
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks.network import fitted
 from suite.common.choices import parse_levels
-from suite.common.console import Console
+from suite.common.console import Console, Quiet
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate
 from suite.common.stages import Stage
 from suite.delta.run import fit_delta, fitting_estimate
-from suite.judging.collect import Collection, collect
-from suite.judging.evaluate import Judgement, evaluate
-from suite.judging.flying import (
-    PROCESS_BYTES,
-    SECONDS_A_TRIAL,
-    START_SECONDS,
-    checkpoint_folder,
-    options_for,
-)
+from suite.judging.collect import collect
+from suite.judging.evaluate import evaluate
+from suite.judging.flying import checkpoint_folder, flying_needs, options_for
 from suite.judging.replay import drone_of, first_trials, fly_again
+from suite.judging.requests import Collection, Evaluation
 from suite.loop.compare import BEFORE
 from suite.loop.config import DeltaLoopConfig, LoopConfig
 from suite.loop.measured import enough, measure
@@ -53,16 +47,6 @@ PHYSICS_HZ = 200.0
 """Steps of the quadrotor in which a Delta Action Model is fitted, for the estimate [Hz]."""
 QUADROTOR_COST = 3.0
 """A gradient step through the quadrotor over one through the point mass, for the estimate."""
-
-
-class Quiet(Console):
-    """Keeps progress and leaves the lines of a stage's own result out: the loop has its own."""
-
-    def say(self, text: str = "") -> None:
-        """Print nothing."""
-
-    def show(self, table: RenderableType) -> None:
-        """Print nothing."""
 
 
 @dataclass(frozen=True)
@@ -134,14 +118,12 @@ def _begin(run: LoopRun) -> Stage:
 
 def _flying(trials: int) -> Estimate:
     """Return about how long `trials` take in MuJoCo, and their memory."""
-    processes = options_for(trials, None, "mujoco").processes or 1
-    seconds = START_SECONDS + trials * SECONDS_A_TRIAL / processes
-    return Estimate(seconds, processes * PROCESS_BYTES)
+    return flying_needs(trials, options_for(trials, None, "mujoco").processes or 1)
 
 
-def _judgement(run: LoopRun, variant: Variant) -> Judgement:
+def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
     config = run.config
-    return Judgement(
+    return Evaluation(
         policies=(str(run.policy(variant)),),
         track=config.track,
         difficulty=config.difficulty,
@@ -153,7 +135,7 @@ def _judgement(run: LoopRun, variant: Variant) -> Judgement:
 
 def _judge(run: LoopRun, variant: Variant) -> Stage:
     def work(folder: Path) -> None:
-        evaluate(_judgement(run, variant), folder, Quiet())
+        evaluate(_evaluation(run, variant), folder, Quiet())
 
     def tell(folder: Path) -> None:
         rows = read_trials(folder / "trials.parquet")
@@ -292,9 +274,9 @@ def _replay(run: LoopRun) -> Stage:
     same one flown by the other policy.
     """
     by_name = {variant.name: variant for variant in run.loop.variants}
-    judgement = _judgement(run, by_name[BEFORE])
+    evaluation = _evaluation(run, by_name[BEFORE])
     levels = parse_levels(run.config.difficulty)
-    ends = replace(judgement, difficulty=f"{min(levels)},{max(levels)}")
+    ends = replace(evaluation, difficulty=f"{min(levels)},{max(levels)}")
 
     def work(folder: Path) -> None:
         from eval.view.picture import write_grid
@@ -303,11 +285,11 @@ def _replay(run: LoopRun) -> Stage:
         trials, flown = first_trials(ends), []
         columns = len(set(trial.difficulty for trial in trials))
         for variant, label, _ in run.loop.shown:
-            rollouts = fly_again(judgement, trials, str(run.policy(by_name[variant])))
+            rollouts = fly_again(evaluation, trials, str(run.policy(by_name[variant])))
             flown.append([(*pair, result._replace(policy=label)) for *pair, result in rollouts])
             write_grid(folder / f"{variant}.png", flown[-1], columns)
         pairs = [rollout for pair in zip(*flown, strict=True) for rollout in pair]
-        drone = drone_of(load_vehicle(judgement.vehicle))
+        drone = drone_of(load_vehicle(evaluation.vehicle))
         write_recording(folder.parent / "recording.rrd", pairs, drone)
 
     words = "flying a few trials again for the recording and the pictures"

@@ -1,14 +1,14 @@
 """Trials and cells of a table, with the numbers that documents look at."""
 
 from eval.judging.statistics import Interval
-from eval.judging.tables import Cell
+from eval.judging.tables import Tally
 from eval.worlds.trial import TrialResult
 
 
 def cell(track, level, success, v_max=5.0, low=None):
     speed = Interval(v_max, v_max, v_max)
     rate = Interval(success, success if low is None else low, 1.0)
-    return Cell("p", track, level, 100, rate, 8.0, speed, speed, speed, {})
+    return Tally("p", track, level, 100, rate, 8.0, speed, speed, speed, {})
 
 
 def result(seed, success=True, policy="ours", difficulty=3, speed=5.0):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from suite.common.report import Cell, Grid
+from tracks.common.grid import Cell, Grid
 
 
 def cells(*texts: str) -> list[Cell]:

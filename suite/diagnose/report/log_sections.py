@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from eval.effects import EFFECTS
-from suite.common.report import Grid, Part, Section
+from suite.common.report import Part, Section
 from suite.diagnose.data.actuators import ActuatorMismatch
 from suite.diagnose.data.kinematics import Kinematics
 from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.report.cells import grid, short_name
 from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
+from tracks.common.grid import Grid
 
 SHOWN = 12
 """Logs in the table."""

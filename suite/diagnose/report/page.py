@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from eval.effects import EFFECTS
-from suite.common.report import Cell, Details, Grid, Links, Part, Picture, Report, Section
+from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.data.windows import UNITS
 from suite.diagnose.report.cells import cells, grid, short_name
 from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
@@ -15,6 +15,7 @@ from suite.diagnose.report.log_sections import actuators_section, logs_section, 
 from suite.diagnose.report.result_sections import held_out_section, residual_section
 from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
+from tracks.common.grid import Cell, Grid
 
 VERDICTS = {
     "no_gap": "Simulation and flights agree within the measurement noise.",

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from suite.common.report import Grid, Part, Picture, Section
+from suite.common.report import Part, Picture, Section
 from suite.diagnose.data.windows import UNITS
 from suite.diagnose.report.cells import grid
 from suite.diagnose.report.charts import (
@@ -22,6 +22,7 @@ from suite.diagnose.verdict.black_box import BlackBoxComparison
 from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import MEASURE, Gap
+from tracks.common.grid import Grid
 
 SHAPES = 5
 """Shapes of the residual in the table."""

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eval.judging.tables import Cell
+from eval.judging.tables import Tally
 from suite.common.charts import LINES, png, titled
 from suite.experiments.pages.paper import Ablated, sim_to_sim
 from suite.experiments.study.conditions import Sweep
@@ -28,7 +28,7 @@ def _legend(figure: Figure, axes: Axes, columns: int = 3) -> None:
     )
 
 
-def level_chart(cells: Sequence[Cell]) -> bytes:
+def level_chart(cells: Sequence[Tally]) -> bytes:
     """Return success (left) and v_max (right) by level; colours are tracks, styles policies."""
     figure = Figure(figsize=(10.4, 4.0), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -58,7 +58,7 @@ def level_chart(cells: Sequence[Cell]) -> bytes:
     return png(figure)
 
 
-def cells_chart(cells: Mapping[str, Sequence[Cell]]) -> bytes:
+def cells_chart(cells: Mapping[str, Sequence[Tally]]) -> bytes:
     """Return success of every policy, cell by cell, as dots with intervals."""
     figure = Figure(figsize=(10.4, 3.6), layout="constrained")
     axes = figure.subplots()

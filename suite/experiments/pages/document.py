@@ -11,8 +11,9 @@ from typing import Any
 
 from suite.common.console import Console
 from suite.common.provenance import machine, package_versions
-from suite.common.report import Details, Grid, Links, Part, Picture, Report, markdown
+from suite.common.report import Details, Links, Part, Picture, Report
 from tracks.common.files import plain, replacing_file, write_json, write_text
+from tracks.common.grid import Grid, markdown
 from tracks.common.provenance import stamp
 
 SCHEMA = 1

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from eval.judging.tables import Cell, percent
-from suite.common.report import Grid
+from eval.judging.tables import Tally, percent
 from suite.experiments.pages.paper import sim_to_sim
-from suite.experiments.pages.tables import table
+from tracks.common.grid import Grid, table
 
 SURE = 0.90
 """Where others won all of their few trials, our Wilson interval must reach down to this."""
@@ -38,7 +37,7 @@ class Goal(NamedTuple):
         return not (self.success_miss or self.floor_miss or self.v_max_miss)
 
 
-def goals(cells: Sequence[Cell]) -> list[Goal]:
+def goals(cells: Sequence[Tally]) -> list[Goal]:
     """Return the goal of every cell that the paper prints."""
     printed = sim_to_sim()
     found = []
@@ -80,7 +79,7 @@ def verdict(found: Sequence[Goal]) -> str:
     return text.rstrip(";") + ("" if text.endswith(".") else ".")
 
 
-def goal_grid(cells: Sequence[Cell]) -> Grid:
+def goal_grid(cells: Sequence[Tally]) -> Grid:
     """Return by how much each cell of one policy misses what is asked of it."""
     by_key = {(cell.track, cell.difficulty): cell for cell in cells}
     headers = ["track", "level", "success", "best of the others", "missed by", "floor",

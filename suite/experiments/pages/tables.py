@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from eval.judging.statistics import Interval, PairedDifference, paired_success
-from eval.judging.tables import Cell as Judged
-from eval.judging.tables import markdown_table, percent
-from suite.common.report import Cell, Grid, Section
+from eval.judging.tables import Tally, markdown_table, percent
+from suite.common.report import Section
 from suite.experiments.study.disturbed import Tested
 from suite.experiments.study.summary import METRICS
 from suite.experiments.study.training import Trained
-
-
-def table(
-    headers: Sequence[str], lines: Iterable[Sequence[str | Cell]], title: str = "", note: str = ""
-) -> Grid:
-    """Return a table of texts and of cells with a tone."""
-    rows = [[Cell(entry) if isinstance(entry, str) else entry for entry in row] for row in lines]
-    return Grid(title, headers, rows, note=note)
+from tracks.common.grid import Cell, Grid, table
 
 
 def points_cell(difference: PairedDifference | Interval) -> Cell:
@@ -58,7 +50,7 @@ def condition_grid(
     return table(headers, lines, title)
 
 
-def every_cell(cells: Sequence[Judged]) -> Section:
+def every_cell(cells: Sequence[Tally]) -> Section:
     """Return all numbers of judged cells, at a page's end."""
     text = markdown_table({"cells": cells, "paired": []}).strip("\n")
     return Section("Every cell with its intervals", [text])

@@ -17,22 +17,15 @@ from typing import Any, TypeVar
 from eval.judging.judge import JudgeOptions, Task, fly_share
 from eval.judging.results import Journal
 from eval.judging.sensors import SensorNoise
-from eval.judging.tables import Cell, summarise
+from eval.judging.tables import Tally, summarise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy, load_policy
 from suite.common.choices import parse_levels
 from suite.common.console import Console
-from suite.common.estimate import Estimate, announce
+from suite.common.estimate import announce
 from suite.experiments.study.cache import code_digest, digest, engines
-from suite.judging.flying import (
-    PROCESS_BYTES,
-    SECONDS_A_TRIAL,
-    START_SECONDS,
-    TRIALS_A_PROCESS,
-    policy_digest,
-    trial_list,
-)
+from suite.judging.flying import TRIALS_A_PROCESS, flying_needs, policy_digest, trial_list
 from tracks.common.work import usable_cores, work_off
 from tracks.families import JUDGED
 
@@ -92,10 +85,7 @@ def flown(
             console.note(f"{what}: {total - left} of {total} trials were flown before")
         if left:
             processes = min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
-            seconds = START_SECONDS + left * SECONDS_A_TRIAL / processes
-            announce(
-                console, f"{what}: {left} trials", Estimate(seconds, processes * PROCESS_BYTES)
-            )
+            announce(console, f"{what}: {left} trials", flying_needs(left, processes))
             numbers, open_journals = count(total - left + 1), list(journals.values())
             with console.progress(what, total) as update:
 
@@ -116,7 +106,7 @@ def flown(
 
 def judged_cells(
     orders: Mapping[str, Order], cache: Path, console: Console, what: str
-) -> tuple[dict[str, list[TrialResult]], dict[str, list[Cell]]]:
+) -> tuple[dict[str, list[TrialResult]], dict[str, list[Tally]]]:
     """Return results and their cells, as `flown` does, by what tables call the policies."""
     results = flown(orders, cache, console, what)
     return results, {

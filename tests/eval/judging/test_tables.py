@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from eval.judging.tables import markdown_table, rich_tables, summarise
+from eval.judging.tables import HEADERS, NOTE, grids, markdown_table, summarise
 from tests.support.judged_cells import ROWS, result
 
 
@@ -31,11 +31,9 @@ def test_cells_do_not_depend_on_what_else_is_in_the_table():
     assert alone == beside
 
 
-def test_terminal_table():
-    from rich.console import Console
-
-    console = Console(width=200, record=True, file=open("/dev/null", "w"))
-    with console.file:
-        for table in rich_tables(summarise(ROWS)):
-            console.print(table)
-        assert "75 % [30, 95]" in console.export_text()
+def test_one_table_for_the_cells_and_one_for_the_pairs():
+    (cells,) = grids(summarise(ROWS))
+    assert (cells.headers, cells.note) == (HEADERS, NOTE)
+    assert cells.rows[0][4].text == "75 % [30, 95]"
+    both = grids(summarise([*ROWS, result(3, policy="theirs")]))
+    assert [grid.headers[0] for grid in both] == ["policy", "difference"]

@@ -7,8 +7,10 @@ same pages.
 """
 
 import ast
-import dataclasses
+import contextlib
+import functools
 import importlib
+import io
 import os
 import re
 import shlex
@@ -69,9 +71,12 @@ def test_every_command_is_one_that_exists(marked, body):
         _check(words)
 
 
+@functools.cache
 def _options(name):
-    config = importlib.import_module(f"suite.commands.{name}").Config
-    return {f"--{field.name.rstrip('_').replace('_', '-')}" for field in dataclasses.fields(config)}
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        cli.main([name, "--help"])
+    return set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", said.getvalue()))
 
 
 def _check_sentence(text):

@@ -1,23 +1,9 @@
-"""A report as one HTML file, and its tables for terminals and Markdown."""
+"""A report as one HTML file."""
 
 import base64
-import io
 
-from rich.console import Console
-
-from suite.common.report import (
-    Cell,
-    Details,
-    Grid,
-    Links,
-    Picture,
-    Report,
-    Section,
-    markdown,
-    ranged,
-    rich_table,
-    write_report,
-)
+from suite.common.report import Details, Links, Picture, Report, Section, ranged, write_report
+from tracks.common.grid import Cell, Grid
 
 GRID = Grid(
     "Speeds",
@@ -41,20 +27,6 @@ def test_a_page_holds_everything_and_escapes_what_is_text(tmp_path):
     assert "data:image/png;base64," + base64.b64encode(b"a png").decode() in page
     assert '<a href="a.md">' in page and "<pre>1 &amp; 2</pre>" in page
     assert "<script" not in page and "http" not in page
-
-
-def test_a_table_as_markdown():
-    assert markdown(GRID) == (
-        "Speeds\n\n| who | m/s |\n| --- | --- |\n| a\\|b | 3.1 |\n| <all> | 2.0 |\n\n"
-        "Higher is better.\n"
-    )
-
-
-def test_a_table_for_a_terminal_shows_brackets_as_they_are():
-    file = io.StringIO()
-    grid = Grid("t", ["speed [m/s]"], [[Cell("[bold]", "bad")]])
-    Console(file=file, width=60).print(rich_table(grid))
-    assert "speed [m/s]" in file.getvalue() and "[bold]" in file.getvalue()
 
 
 def test_a_mean_with_its_least_and_most():

@@ -5,8 +5,8 @@ import pytest
 
 from eval.judging.statistics import Interval, bootstrap_mean
 from eval.worlds.trial import TrialResult
-from suite.common.report import markdown, rich_table
 from suite.loop.compare import Line, compare, grids, points, told_apart, verdict
+from tracks.common.grid import markdown, rich_table
 
 
 def _result(seed, success, v_mean, gates=8, level=0):

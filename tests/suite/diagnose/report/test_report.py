@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.common.report import Grid, html
+from suite.common.report import html
 from suite.diagnose.report.cells import cells, grid, short_name
 from suite.diagnose.report.charts import (
     black_box_chart,
@@ -21,6 +21,7 @@ from suite.diagnose.report.result_sections import held_out_section, residual_sec
 from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
 from suite.diagnose.verdict.disagreement import by_group
 from tracks.common.files import plain
+from tracks.common.grid import Grid
 
 PNG = b"\x89PNG"
 

@@ -31,9 +31,8 @@ def test_images():
     rays, reach = pixel_rays_b(CONFIG.spec.camera).astype(np.float32), 10.0
     image = jax.jit(depth.depth_image)
     ours = image(WORLDS.scene, jnp.asarray(WORLDS.pos_w), YAW, rays, reach)
-    found = torch_scene.depth_image(
-        SCENE, *(torch.as_tensor(x) for x in (WORLDS.pos_w, YAW, rays)), reach
-    )
+    pos_w, rot_w, rays_b = (torch.as_tensor(x) for x in (WORLDS.pos_w, YAW, rays))
+    found = torch_scene.depth_image(SCENE, pos_w, rot_w, rays_b, reach)
     assert np.ptp(np.asarray(ours)) > 5.0
     # A ray along an edge may hit or miss by the last digit.
     assert np.mean(np.abs(found.numpy() - np.asarray(ours)) > 1e-3) < 0.002

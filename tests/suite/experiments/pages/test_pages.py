@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 from eval.judging.statistics import Interval
 from suite.common.console import Console
-from suite.common.report import Cell, Grid, Picture, Report, Section
+from suite.common.report import Picture, Report, Section
 from suite.experiments.pages import charts
 from suite.experiments.pages.document import Place, write_document
-from suite.experiments.pages.tables import every_training, points_cell, table
+from suite.experiments.pages.tables import every_training, points_cell
 from suite.experiments.study.intervals import Gap
 from suite.experiments.study.training import Trained
 from tests.support.judged_cells import cell
+from tracks.common.grid import Cell, Grid, table
 from tracks.families import JUDGED
 
 PNG = b"\x89PNG"

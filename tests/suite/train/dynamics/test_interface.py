@@ -25,6 +25,7 @@ def started(config):
 
 def test_the_point_mass_is_stepped_with_the_runs_settings():
     worlds, dynamics, body = started(CONFIG)
+    assert isinstance(worlds.constants, point_mass.PointMassParams)
     found = dynamics.step(body, worlds.constants, ACTION, TARGET, jax.random.key(0))
     expected = point_mass.step(body, worlds.constants, ACTION, TARGET, 3.0, 0.4)
     for ours, theirs in zip(found, expected, strict=True):

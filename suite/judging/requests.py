@@ -1,0 +1,60 @@
+"""What `suite eval` and `suite collect` are asked to fly: their options, and what runs record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Which trials are flown, by whom and in what; `suite eval` has these as options."""
+
+    policies: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="policy")
+    ] = ()
+    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2 or .pt file; may be given
+    several times. Without it the shipped policy flies."""
+    track: str = "all"
+    """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
+    difficulty: str = "0"
+    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
+    trials: int = 10
+    """Trials of every policy on every track at every level."""
+    seed: int = 0
+    """Seed of the first trial; the others follow by one."""
+    vehicle: str = "reference"
+    """A shipped vehicle's name or a vehicle file (.toml)."""
+    world: str = "mujoco"
+    """mujoco (fast on CPUs), mjx (for GPUs) or reference (slow and simple)."""
+    processes: Annotated[int | None, tyro.conf.arg(name="procs")] = None
+    """Processes that share the trials; by default as many cores as are worth it."""
+    deadline_s: float | None = None
+    """A policy's answer for a batch that takes longer is late and not flown [s]."""
+    trust: bool = False
+    """Also load policy files that can run code on this machine."""
+
+
+@dataclass(frozen=True)
+class Collection:
+    """Which flights are recorded; `suite collect` has these as options."""
+
+    policy: str = ""
+    """A shipped policy's name, a checkpoint's folder, or a policy file; by default the shipped
+    policy."""
+    track: str = "all"
+    """As in suite eval."""
+    difficulty: str = "0,3"
+    """As in suite eval."""
+    trials: int = 5
+    """Flights on every track at every level."""
+    vehicle: str = "reference"
+    """A shipped vehicle's name or a vehicle file (.toml)."""
+    world: str = "mujoco"
+    """As in suite eval."""
+    seed: int = 100_000
+    """Seed of the first trial; by default far from those that suite eval flies."""
+    trust: bool = False
+    """Also load policy files that can run code on this machine."""

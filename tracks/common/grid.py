@@ -1,0 +1,95 @@
+"""A table as a value, and what it looks like in Markdown, in a terminal and in HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+class Cell(NamedTuple):
+    """One cell of a table."""
+
+    text: str
+    tone: str = ""
+    """good, bad, or nothing: whether the number speaks for or against what is judged."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table."""
+
+    title: str
+    """Above it."""
+    headers: Sequence[str]
+    """One a column."""
+    rows: Sequence[Sequence[Cell]]
+    """Cells, as many as headers in each."""
+    strong_last: bool = False
+    """Whether the last row sums up the others."""
+    note: str = ""
+    """Below it."""
+
+
+def table(
+    headers: Sequence[str], lines: Iterable[Sequence[str | Cell]], title: str = "", note: str = ""
+) -> Grid:
+    """Return a table of texts and of cells with a tone."""
+    rows = [[Cell(entry) if isinstance(entry, str) else entry for entry in row] for row in lines]
+    return Grid(title, headers, rows, note=note)
+
+
+def markdown(grid: Grid) -> str:
+    """Return a table as Markdown."""
+    rows = [[cell.text for cell in row] for row in grid.rows]
+    lines = [list(grid.headers), ["---"] * len(grid.headers), *rows]
+    text = "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in r) + " |" for r in lines)
+    return "\n\n".join(part for part in (grid.title, text, grid.note) if part) + "\n"
+
+
+def rich_table(grid: Grid) -> Table:
+    """Return a table for a terminal."""
+    from rich.markup import escape as literal
+    from rich.table import Table
+
+    tones = {"good": "green", "bad": "red", "": ""}
+    table = Table(
+        *map(literal, grid.headers),
+        title=grid.title and literal(grid.title),
+        title_justify="left",
+        caption=grid.note or None,
+        caption_justify="left",
+    )
+    for number, row in enumerate(grid.rows):
+        last = grid.strong_last and number == len(grid.rows) - 1
+        if last:
+            table.add_section()
+        cells = [
+            f"[{tone}]{literal(cell.text)}[/]" if (tone := tones[cell.tone]) else literal(cell.text)
+            for cell in row
+        ]
+        table.add_row(*cells, style="bold" if last else None)
+    return table
+
+
+def html_table(grid: Grid) -> str:
+    """Return a table as HTML; its rows of class sum and cells of a tone are for a style sheet."""
+    head = "".join(f'<th scope="col">{escape(header)}</th>' for header in grid.headers)
+    rows = []
+    for number, row in enumerate(grid.rows):
+        strong = grid.strong_last and number == len(grid.rows) - 1
+        cells = "".join(
+            f'<td class="{cell.tone}">{escape(cell.text)}</td>' if cell.tone
+            else f"<td>{escape(cell.text)}</td>"
+            for cell in row
+        )  # fmt: skip
+        rows.append(f'<tr class="sum">{cells}</tr>' if strong else f"<tr>{cells}</tr>")
+    caption = f"<caption>{escape(grid.title)}</caption>" if grid.title else ""
+    note = f'<p class="note">{escape(grid.note)}</p>' if grid.note else ""
+    body = "\n".join(rows)
+    table = f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table>"
+    return f'<div class="scroll">{table}</div>{note}'
