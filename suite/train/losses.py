@@ -38,10 +38,8 @@ class Step(NamedTuple):
     """(B, 3) that of the step before [m/s^2]."""
     time_step: Array
     """(B,) length of the step [s]."""
-    path_w: jax.Array
-    """(B, S, 3) points of the step's path, with gradient [m]."""
-    distance: jax.Array
-    """(B, S) signed distance of the nearest obstacle at `path_w`, no gradient [m]."""
+    gap: jax.Array
+    """(B, S) from `gap_to_obstacles`, at points of the step's path [m]."""
     away_w: jax.Array
     """(B, S, 3) unit vectors along which it grows."""
     goal_w: jax.Array
@@ -58,7 +56,7 @@ Term = Callable[[LossConfig, Step], jax.Array]
 
 def clearance(config: LossConfig, step: Step) -> jax.Array:
     """Return L_clearance, the mean over the path [1]."""
-    barrier = config.barrier_height * jax.nn.softplus(config.barrier_slope * _gap(config, step))
+    barrier = config.barrier_height * jax.nn.softplus(config.barrier_slope * step.gap)
     return barrier.mean(-1)
 
 
@@ -66,7 +64,7 @@ def collide(config: LossConfig, step: Step) -> jax.Array:
     """Return L_collide, the mean over the path [m^3/s]."""
     held_vel = jax.lax.stop_gradient(step.vel_w)
     closing = jnp.maximum(-(step.away_w * held_vel[:, None]).sum(-1), 0.0)
-    return (closing * jnp.maximum(1.0 - _gap(config, step), 0.0) ** 2).mean(-1)
+    return (closing * jnp.maximum(1.0 - step.gap, 0.0) ** 2).mean(-1)
 
 
 def acceleration(_: LossConfig, step: Step) -> jax.Array:
@@ -137,6 +135,24 @@ def weighted(config: LossConfig, step: Step) -> dict[str, jax.Array]:
     return {name: total(terms) for name, terms in LOSSES.items()}
 
 
+def gap_to_obstacles(
+    config: LossConfig, path_w: jax.Array, distance: jax.Array, away_w: jax.Array
+) -> jax.Array:
+    """Return the distance to the nearest obstacle beyond the safety radius, (B, S) [m].
+
+    The nearest obstacle comes from outside the differentiated graph; the distance's gradient with
+    respect to the path is the direction away from it, which is exact.
+
+    Args:
+        config: the safety radius.
+        path_w: (B, S, 3) points with gradient [m].
+        distance: (B, S) signed distance there, no gradient [m].
+        away_w: (B, S, 3) unit vectors along which it grows.
+    """
+    moved = ((path_w - jax.lax.stop_gradient(path_w)) * away_w).sum(-1)
+    return distance + moved - config.safety_radius_m
+
+
 def approach_shift(config: LossConfig, local_g: jax.Array) -> jax.Array:
     """Return how far before the gate the point lies that progress is measured to, (B,) [m].
 
@@ -152,16 +168,6 @@ def approach_shift(config: LossConfig, local_g: jax.Array) -> jax.Array:
 def _norm(vector: jax.Array) -> jax.Array:
     """Return the length over the last axis, with a finite gradient at zero."""
     return jnp.sqrt((vector * vector).sum(-1) + 1e-12)
-
-
-def _gap(config: LossConfig, step: Step) -> jax.Array:
-    """Return the distance to the nearest obstacle beyond the safety radius, (B, S) [m].
-
-    The nearest obstacle comes from outside the differentiated graph; the distance's gradient with
-    respect to the path is the direction away from it, which is exact.
-    """
-    moved = ((step.path_w - jax.lax.stop_gradient(step.path_w)) * step.away_w).sum(-1)
-    return step.distance + moved - config.safety_radius_m
 
 
 def _square_around(opening_g: jax.Array) -> jax.Array:

@@ -45,15 +45,14 @@ def a_step(batch, **known):
     """Return a step of `batch` worlds at rest before a gate, but for what is `known`."""
     zero = jnp.zeros((batch, 3))
     rest = {name: zero for name in ("pos_w", "vel_w", "acc_w", "acc_before_w", "goal_w", "place_g")}
-    path = {"path_w": zero[:, None], "distance": jnp.ones((batch, 1)), "away_w": zero[:, None]}
+    path = {"gap": jnp.ones((batch, 1)), "away_w": zero[:, None]}
     whole = {**rest, **path, "time_step": jnp.ones(batch), "gate": unit_gate(batch), **known}
     return Step(**whole)
 
 
 def obstacle_terms(config, distance, away_w, path_w, vel_w):
-    step = a_step(
-        len(vel_w), distance=distance, away_w=away_w, path_w=path_w, vel_w=jnp.asarray(vel_w)
-    )
+    gap = losses.gap_to_obstacles(config, path_w, distance, away_w)
+    step = a_step(len(vel_w), gap=gap, away_w=away_w, vel_w=jnp.asarray(vel_w))
     return losses.clearance(config, step), losses.collide(config, step)
 
 
