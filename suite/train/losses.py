@@ -46,8 +46,7 @@ def acceleration(_: LossConfig, step: Step) -> jax.Array:
 
 def jerk(_: LossConfig, step: Step) -> jax.Array:
     """Return L_j [m^2/s^6]."""
-    change = (step.acc_w - step.acc_before_w) / step.time_step[:, None]
-    return (change * change).sum(-1)
+    return (step.jerk_w * step.jerk_w).sum(-1)
 
 
 def progress(_: LossConfig, step: Step) -> jax.Array:

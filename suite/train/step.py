@@ -13,7 +13,7 @@ from suite.train.worlds import Worlds
 from tracks.geometry.clearance import nearest_obstacle
 from tracks.geometry.crossing import crossing
 from tracks.geometry.rotation import to_local
-from tracks.geometry.scene import Array, Counts, Gates
+from tracks.geometry.scene import Counts, Gates
 
 NEAR = Counts(boxes=8, cylinders=4, capsules=3, spheres=3)
 """Solids of each kind among which the nearest obstacle is looked for."""
@@ -33,10 +33,8 @@ class Step(NamedTuple):
     """(B, 3) [m/s]."""
     acc_w: jax.Array
     """(B, 3) net acceleration [m/s^2]."""
-    acc_before_w: jax.Array
-    """(B, 3) that of the step before [m/s^2]."""
-    time_step: Array
-    """(B,) length of the step [s]."""
+    jerk_w: jax.Array
+    """(B, 3) change of the acceleration from the step before, over the step's time [m/s^3]."""
     gap: jax.Array
     """(B, S) distance to the nearest solid beyond r_q at points of the path, with gradient [m]."""
     away_w: jax.Array
@@ -101,6 +99,11 @@ def gap_beyond(
     return distance + moved - config.safety_radius_m
 
 
+def speed_towards(way_w: jax.Array, vel_w: jax.Array) -> jax.Array:
+    """Return the speed (B,) along the way (B, 3) to a point, of a velocity (B, 3) [m/s]."""
+    return (vel_w * way_w).sum(-1) / norm(way_w)
+
+
 def make_step(
     config: LossConfig,
     worlds: Worlds,
@@ -123,7 +126,7 @@ def make_step(
     aim, aim_w = target_gate(gates, goal)
     place_g = to_local(aim.rot_w, after.pos_w - aim.center_w)
     shift = (goal < count) * approach_shift(config, place_g)
-    to_goal = aim_w - shift[:, None] * aim.rot_w[:, :, 0] - after.pos_w
+    goal_w = aim_w - shift[:, None] * aim.rot_w[:, :, 0]
     share = (jnp.arange(config.path_samples) + 1.0) / config.path_samples
     path_w = before.pos_w[:, None] + share[:, None] * (after.pos_w - before.pos_w)[:, None]
     distance, away_w = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path_w), NEAR)
@@ -131,11 +134,10 @@ def make_step(
         pos_w=after.pos_w,
         vel_w=after.vel_w,
         acc_w=after.acc_w,
-        acc_before_w=before.acc_w,
-        time_step=worlds.constants.time_step,
+        jerk_w=(after.acc_w - before.acc_w) / worlds.constants.time_step[:, None],
         gap=gap_beyond(config, distance, away_w, path_w),
         away_w=away_w,
-        closing_speed=(after.vel_w * to_goal).sum(-1) / norm(to_goal),
+        closing_speed=speed_towards(goal_w - after.pos_w, after.vel_w),
         place_g=place_g,
         gate=gate,
         passed=passed,
