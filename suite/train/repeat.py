@@ -71,8 +71,16 @@ class Method(NamedTuple):
     """The fresh worlds of an iteration."""
     make_update: Callable[[], Callable[[Any, Worlds], tuple[Any, dict[str, jax.Array]]]]
     """Called once: update(state, worlds) -> (state', numbers of the curve)."""
-    goal: str
-    """The number of the curve that people watch beside gates, collisions and speed."""
+    note: Callable[[Mapping[str, float]], str]
+    """A few words for people about a row of the curve."""
+
+
+def flight_note(goal: str, row: Mapping[str, float]) -> str:
+    """Return a row's number called `goal`, and how its worlds flew, in a few words."""
+    return (
+        f"{goal} {row[goal]:.2f}, gates {row['gates']:.2f}, collided {row['collided']:.0%}, "
+        f"{row['speed']:.1f} m/s"
+    )
 
 
 class Run(NamedTuple):
@@ -154,20 +162,13 @@ def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watc
                 rows.append({"iteration": iteration, **row, "steps_per_s": round(speed), **clock})
                 state = after
                 look()
-                show(iteration + 1, f"{_told(method.goal, row)}, {speed:.0f} steps/s")
+                show(iteration + 1, f"{method.note(row)}, {speed:.0f} steps/s")
                 if time.monotonic() - saved_at > SAVE_PERIOD_S:
                     save()
                     saved_at = time.monotonic()
     finally:
         save()
     return state
-
-
-def _told(goal: str, row: Mapping[str, float]) -> str:
-    return (
-        f"{goal} {row[goal]:.2f}, gates {row['gates']:.2f}, collided {row['collided']:.0%}, "
-        f"{row['speed']:.1f} m/s"
-    )
 
 
 def _is_due(watch: Watch, done: int, total: int) -> bool:

@@ -5,6 +5,7 @@ Worlds and noise depend on the seed and the iteration alone; `repeat.py` says wh
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +19,7 @@ from policies.networks import delta_network, network
 from suite.common.console import Console
 from suite.common.estimate import Estimate
 from suite.train.config import TrainConfig, check
-from suite.train.repeat import Method, Outcome, Run, Watch, repeat
+from suite.train.repeat import Method, Outcome, Run, Watch, flight_note, repeat
 from suite.train.update import device_mesh, make_update, start_state
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
@@ -86,7 +87,7 @@ def train(
         estimate=estimate(config),
         worlds=lambda iteration: sample_worlds(config, iteration),
         make_update=lambda: make_update(config, mesh, delta),
-        goal="loss",
+        note=functools.partial(flight_note, "loss"),
     )
     # Placed as the update returns it: placed otherwise, the second step would compile it again.
     place = NamedSharding(mesh, PartitionSpec())

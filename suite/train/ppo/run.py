@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import jax
@@ -12,7 +13,7 @@ from suite.train import run as trainer
 from suite.train.config import check
 from suite.train.ppo.config import PpoConfig
 from suite.train.ppo.update import make_update, start_state
-from suite.train.repeat import Method, Outcome, Run, Watch, repeat
+from suite.train.repeat import Method, Outcome, Run, Watch, flight_note, repeat
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
 
@@ -48,7 +49,7 @@ def train_ppo(
         ),
         worlds=lambda iteration: sample_worlds(shared, iteration),
         make_update=lambda: make_update(config),
-        goal="reward",
+        note=functools.partial(flight_note, "reward"),
     )
     place = SingleDeviceSharding(jax.devices()[0])
     origin = {"config": plain(config), "from": None, "delta": None, "method": "ppo"}
