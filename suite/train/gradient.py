@@ -10,7 +10,6 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from policies.networks import delta_network, network
-from suite.train.checks import check_stride
 from suite.train.config import TrainConfig
 from suite.train.rollout import StepRecord, make_rollout
 from suite.train.worlds import Worlds
@@ -57,16 +56,35 @@ def encoder_gradient(
     return jax.lax.scan(body, zero, split)[0]
 
 
+def sampled_encoder_gradient(
+    params: network.Params,
+    images: jax.Array,
+    cotangents: jax.Array,
+    stride: int,
+    key: jax.Array,
+) -> network.Params:
+    """Return the encoder's gradient from one in `stride` steps' images, weighted accordingly.
+
+    Args:
+        params: the policy's parameters.
+        images: (T, B, height, width).
+        cotangents: (T, B, hidden) gradient of the loss with respect to the embeddings.
+        stride: a divisor of T.
+        key: picks the first step.
+    """
+    first = jax.random.randint(key, (), 0, stride)
+    images, cotangents = (
+        every(stride, first, array).reshape(-1, *array.shape[2:])
+        for array in (images, stride * cotangents)
+    )
+    return encoder_gradient(params, images, cotangents)
+
+
 def make_gradient(
     config: TrainConfig,
 ) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
-    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) on one device.
-
-    Raises:
-        ValueError: where `episode.image_stride` does not divide `episode.steps`.
-    """
-    steps, stride = config.episode.steps, config.episode.image_stride
-    check_stride(stride, steps)
+    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) on one device."""
+    stride = config.episode.image_stride
     rollout = make_rollout(config)
     width = config.spec.hidden_size
 
@@ -83,12 +101,9 @@ def make_gradient(
         (loss, records), (direct, cotangents) = jax.value_and_grad(
             rollout, argnums=(0, 1), has_aux=True
         )(params, embedding_shift, worlds, key, frozen_encode, delta)
-        first = jax.random.randint(jax.random.fold_in(key, stride), (), 0, stride)
-        images, cotangents = (
-            every(stride, first, array).reshape(-1, *array.shape[2:])
-            for array in (records.image, stride * cotangents)
+        through_images = sampled_encoder_gradient(
+            params, records.image, cotangents, stride, jax.random.fold_in(key, stride)
         )
-        through_images = encoder_gradient(params, images, cotangents)
         return jax.tree.map(jnp.add, direct, through_images), loss, records
 
     return gradient

@@ -7,47 +7,19 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from suite.train.config import LossConfig
+from suite.train.step import Step, norm
 from tracks.geometry.field import CURRENT, attractive_field, magnetic_field
 from tracks.geometry.gates import rectangle
-from tracks.geometry.scene import Array, Gates
 
 UNIT_FIELD = 11.313708498984761
 """|B| / C_I at the centre of a square gate of 1 m: 8 sqrt(2) [1/m]."""
 MAX_PULL = 5.0
 """Largest field pull relative to that at the centre of a 1 m gate [1]."""
-APPROACH_FREE_M = 0.3
-"""So far off its axis a gate is still flown at straight [m]."""
-
-
-class Step(NamedTuple):
-    """What a term may look at: one step of B worlds."""
-
-    pos_w: jax.Array
-    """(B, 3) at the step's end [m]."""
-    vel_w: jax.Array
-    """(B, 3) [m/s]."""
-    acc_w: jax.Array
-    """(B, 3) net acceleration [m/s^2]."""
-    acc_before_w: jax.Array
-    """(B, 3) that of the step before [m/s^2]."""
-    time_step: Array
-    """(B,) length of the step [s]."""
-    gap: jax.Array
-    """(B, S) from `gap_to_obstacles`, at points of the step's path [m]."""
-    away_w: jax.Array
-    """(B, S, 3) unit vectors along which it grows."""
-    goal_w: jax.Array
-    """(B, 3) the point that progress is measured to [m]."""
-    place_g: jax.Array
-    """(B, 3) position in the frame of the gate flown to, wherever before it the goal is [m]."""
-    gate: Gates
-    """(B, ...) whose field pulls: the one to pass when the step began."""
 
 
 Term = Callable[[LossConfig, Step], jax.Array]
@@ -60,7 +32,7 @@ def clearance(config: LossConfig, step: Step) -> jax.Array:
     return barrier.mean(-1)
 
 
-def collide(config: LossConfig, step: Step) -> jax.Array:
+def collide(_: LossConfig, step: Step) -> jax.Array:
     """Return L_collide, the mean over the path [m^3/s]."""
     held_vel = jax.lax.stop_gradient(step.vel_w)
     closing = jnp.maximum(-(step.away_w * held_vel[:, None]).sum(-1), 0.0)
@@ -74,24 +46,22 @@ def acceleration(_: LossConfig, step: Step) -> jax.Array:
 
 def jerk(_: LossConfig, step: Step) -> jax.Array:
     """Return L_j [m^2/s^6]."""
-    change = (step.acc_w - step.acc_before_w) / step.time_step[:, None]
-    return (change * change).sum(-1)
+    return (step.jerk_w * step.jerk_w).sum(-1)
 
 
 def progress(_: LossConfig, step: Step) -> jax.Array:
     """Return L_p, minus the speed towards the goal [m/s]."""
-    to_goal = step.goal_w - step.pos_w
-    return -(step.vel_w * to_goal).sum(-1) / _norm(to_goal)
+    return -step.closing_speed
 
 
-def progress_norm(config: LossConfig, step: Step) -> jax.Array:
+def progress_norm(_: LossConfig, step: Step) -> jax.Array:
     """Return L_p^norm, the ablation's progress by direction alone [1]."""
-    return progress(config, step) / (_norm(step.vel_w) + 1e-3)
+    return -step.closing_speed / (norm(step.vel_w) + 1e-3)
 
 
 def projection(config: LossConfig, step: Step) -> jax.Array:
     """Return L_proj, the scalar substitute for the field: how far off the gate's axis [m^2]."""
-    near = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(_norm(step.place_g)))
+    near = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(norm(step.place_g)))
     return (step.place_g[:, 1:] ** 2).sum(-1) * near
 
 
@@ -106,7 +76,7 @@ def guidance(config: LossConfig, step: Step) -> jax.Array:
     field = magnetic_field(gate.center_w, gate.rot_w, wires_g, held_pos)
     pull = attractive_field(field, held_vel, config.field_decay)
     pull = pull / (CURRENT * UNIT_FIELD) ** (1 - config.field_decay)
-    pull = pull * jnp.minimum(1.0, MAX_PULL / _norm(pull))[:, None]
+    pull = pull * jnp.minimum(1.0, MAX_PULL / norm(pull))[:, None]
     return -(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos)).sum(-1)
 
 
@@ -133,41 +103,6 @@ def weighted(config: LossConfig, step: Step) -> dict[str, jax.Array]:
         return functools.reduce(jnp.add, parts)
 
     return {name: total(terms) for name, terms in LOSSES.items()}
-
-
-def gap_to_obstacles(
-    config: LossConfig, path_w: jax.Array, distance: jax.Array, away_w: jax.Array
-) -> jax.Array:
-    """Return the distance to the nearest obstacle beyond the safety radius, (B, S) [m].
-
-    The nearest obstacle comes from outside the differentiated graph; the distance's gradient with
-    respect to the path is the direction away from it, which is exact.
-
-    Args:
-        config: the safety radius.
-        path_w: (B, S, 3) points with gradient [m].
-        distance: (B, S) signed distance there, no gradient [m].
-        away_w: (B, S, 3) unit vectors along which it grows.
-    """
-    moved = ((path_w - jax.lax.stop_gradient(path_w)) * away_w).sum(-1)
-    return distance + moved - config.safety_radius_m
-
-
-def approach_shift(config: LossConfig, local_g: jax.Array) -> jax.Array:
-    """Return how far before the gate the point lies that progress is measured to, (B,) [m].
-
-    Args:
-        config: the largest shift, `approach_m`.
-        local_g: (B, 3) positions in the gates' frames [m].
-    """
-    local_g = jax.lax.stop_gradient(local_g)
-    off = _norm(local_g[:, 1:]) + jnp.maximum(local_g[:, 0], 0.0)
-    return jnp.clip(off - APPROACH_FREE_M, 0.0, config.approach_m)
-
-
-def _norm(vector: jax.Array) -> jax.Array:
-    """Return the length over the last axis, with a finite gradient at zero."""
-    return jnp.sqrt((vector * vector).sum(-1) + 1e-12)
 
 
 def _square_around(opening_g: jax.Array) -> jax.Array:

@@ -75,6 +75,14 @@ class Method(NamedTuple):
     """A few words for people about a row of the curve."""
 
 
+def flight_note(goal: str, row: Mapping[str, float]) -> str:
+    """Return a row's number called `goal`, and how its worlds flew, in a few words."""
+    return (
+        f"{goal} {row[goal]:.2f}, gates {row['gates']:.2f}, collided {row['collided']:.0%}, "
+        f"{row['speed']:.1f} m/s"
+    )
+
+
 class Run(NamedTuple):
     """Where a run lives and what tells it from others."""
 

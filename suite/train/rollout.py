@@ -16,25 +16,19 @@ import jax
 import jax.numpy as jnp
 
 from policies.networks import delta_network, network
-from policies.observation import View, encode_depth, observe
+from policies.observation import Observation, View, observe
 from suite.train import losses
-from suite.train.config import LossConfig, TrainConfig
+from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import DynamicsState, make_dynamics
+from suite.train.step import make_step, target_gate
 from suite.train.worlds import Worlds
 from tracks.geometry.camera import pixel_rays_b
-from tracks.geometry.clearance import nearest_obstacle
-from tracks.geometry.crossing import crossing
 from tracks.geometry.depth import depth_image
 from tracks.geometry.rotation import to_local
-from tracks.geometry.scene import Counts, Gates
+from tracks.geometry.scene import Counts
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
 """Solids of each kind that a training image shows, nearest first; the judge shows all."""
-NEAR = Counts(boxes=8, cylinders=4, capsules=3, spheres=3)
-"""Solids of each kind among which the nearest obstacle is looked for."""
-BEYOND_M = 10.0
-"""After the last gate the target is this far behind it, so that nothing is gained by braking; with
-`episode.finish` that is for the one step that passes the gate."""
 BODY_RADIUS_M = 0.08
 """Closer than this to a surface counts as a collision in the curves [m]."""
 
@@ -42,7 +36,7 @@ BODY_RADIUS_M = 0.08
 class RolloutCarry(NamedTuple):
     """What a world carries from step to step."""
 
-    body: Any
+    state: Any
     """Of the dynamics."""
     target: jax.Array
     """(B,) gates passed, counted from the track's first."""
@@ -52,7 +46,7 @@ class RolloutCarry(NamedTuple):
     """(B, 3) the policy's last action, without correction [m/s^2]."""
     embeddings: jax.Array
     """(B, image_delay, hidden) the images on their way, oldest first."""
-    states: jax.Array
+    observed: jax.Array
     """(B, state_delay, state_size) the states on their way, oldest first."""
     delta_hidden: jax.Array
     """(B, 32) of the Delta Action network."""
@@ -84,29 +78,16 @@ class StepRecord(NamedTuple):
 
 
 Note = Callable[[Worlds, DynamicsState, DynamicsState, jax.Array], Any]
-"""note(worlds, before, body, target) -> arrays (B, ...) to be kept of a step; `target` is that of
+"""note(worlds, before, after, target) -> arrays (B, ...) to be kept of a step; `target` is that of
 its beginning."""
 
 
-def target_gate(gates: Gates, target: jax.Array, ahead: int = 0) -> tuple[Gates, jax.Array]:
-    """Return each world's current gate (B, ...) and the point to fly to (B, 3).
-
-    With `ahead` it is the gate so many after that, or the last one where there is none, as the
-    judge has it.
-    """
-    count = gates.center_w.shape[1]
-    index = jnp.minimum(target + ahead, count - 1)
-    gate = jax.tree.map(lambda array: jax.vmap(lambda rows, i: rows[i])(array, index), gates)
-    beyond = jnp.where(target >= count, BEYOND_M, 0.0)[:, None]
-    return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
-
-
-def view_in(worlds: Worlds, body: DynamicsState, target: jax.Array) -> View:
-    """Return what drones at `body` that have passed `target` (B,) gates can observe, but images."""
+def view_in(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
+    """Return what drones in `state` that have passed `target` (B,) gates observe, but the image."""
     gates = worlds.scene.gates
     gate, target_w = target_gate(gates, target)
     _, second_w = target_gate(gates, target, ahead=1)
-    return View(body.pos_w, body.rot_w, body.vel_w, target_w, second_w, gate.rot_w[:, :, 0])
+    return View(state.pos_w, state.rot_w, state.vel_w, target_w, second_w, gate.rot_w[:, :, 0])
 
 
 def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -115,69 +96,36 @@ def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
     return line[:, 0], line[:, 1:]
 
 
-def make_look(
-    config: TrainConfig,
-) -> Callable[[Worlds, DynamicsState, jax.Array], jax.Array]:
-    """Return look(worlds, body, key) -> (B, height, width), the encoded image with its noise."""
+def make_sight(config: TrainConfig) -> Callable[..., Observation]:
+    """Return sight(worlds, state, target, last_action_b, key) -> what the policy is given.
+
+    The image has its noise, and carries no gradient to the state.
+    """
     spec, physics = config.spec, config.physics
     rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
 
-    def look(worlds: Worlds, body: DynamicsState, key: jax.Array) -> jax.Array:
+    def sight(
+        worlds: Worlds,
+        state: DynamicsState,
+        target: jax.Array,
+        last_action_b: jax.Array,
+        key: jax.Array,
+    ) -> Observation:
         # Scaling the rays across the optical axis changes the field of view; every world of an
         # iteration shares it, so that the rays stay one array.
         axis = rays.mean(0)
         wide = axis + (rays - axis) * worlds.fov_scale[0]
-        depth = depth_image(worlds.scene, body.pos_w, body.rot_w, wide, spec.camera.range_m, SEEN)
-        image = encode_depth(spec.depth, depth, spec.camera.range_m)
-        image = image + physics.depth_noise * jax.random.normal(key, image.shape)
-        return image.reshape(-1, spec.camera.height, spec.camera.width)
+        pos_w, rot_w = jax.lax.stop_gradient((state.pos_w, state.rot_w))
+        depth_m = depth_image(worlds.scene, pos_w, rot_w, wide, spec.camera.range_m, SEEN)
+        view = view_in(worlds, state, target)._replace(depth_m=depth_m)
+        seen = observe(spec, view, last_action_b)
+        image = seen.image + physics.depth_noise * jax.random.normal(key, depth_m.shape)
+        return seen._replace(image=image.reshape(-1, spec.camera.height, spec.camera.width))
 
-    return look
-
-
-def make_judge(
-    weights: LossConfig,
-) -> Callable[..., tuple[dict[str, jax.Array], jax.Array, jax.Array]]:
-    """Return judge(worlds, before, body, target) -> (terms, clearance, passed), (B,) each.
-
-    It scores the step from `before` to `body` of worlds that have passed `target` gates: the
-    weighted terms, the smallest distance to a solid on the way [m] and whether a gate was passed.
-    """
-
-    def judge(
-        worlds: Worlds, before: DynamicsState, body: DynamicsState, target: jax.Array
-    ) -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
-        gate, _ = target_gate(worlds.scene.gates, target)
-        count = worlds.scene.gates.center_w.shape[1]
-        held = jax.lax.stop_gradient((before.pos_w, body.pos_w))
-        passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
-        passed = passed & (target < count)
-        goal = target + (passed & weights.pass_first)
-        aim, aim_w = target_gate(worlds.scene.gates, goal)
-        local = to_local(aim.rot_w, body.pos_w - aim.center_w)
-        shift = (goal < count) * losses.approach_shift(weights, local)
-        goal_w = aim_w - shift[:, None] * aim.rot_w[:, :, 0]
-        share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
-        path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
-        distance, away = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path), NEAR)
-        step = losses.Step(
-            pos_w=body.pos_w,
-            vel_w=body.vel_w,
-            acc_w=body.acc_w,
-            acc_before_w=before.acc_w,
-            time_step=worlds.constants.time_step,
-            gap=losses.gap_to_obstacles(weights, path, distance, away),
-            away_w=away,
-            goal_w=goal_w,
-            place_g=local,
-            gate=gate,
-        )
-        return losses.weighted(weights, step), distance.min(-1), passed
-
-    return judge
+    return sight
 
 
-def states_at_start(batch: int, config: TrainConfig) -> jax.Array:
+def observed_at_start(batch: int, config: TrainConfig) -> jax.Array:
     """Return the states on their way at the start, (B, state_delay, state_size): level, at rest."""
     size = config.spec.state_size
     return jnp.zeros((batch, config.physics.state_delay, size)).at[:, :, 5].set(1.0)
@@ -192,20 +140,8 @@ def make_rollout(
     the frozen Delta Action network's parameters or None. The loss is the mean over steps and
     worlds; records are (T, B, ...).
     """
-    spec, physics, weights = config.spec, config.physics, config.loss
-    look, judge, dynamics = make_look(config), make_judge(weights), make_dynamics(config)
-
-    def act(
-        params: network.Params,
-        carry: RolloutCarry,
-        embedding: jax.Array,
-        seen: View,
-    ) -> tuple[jax.Array, RolloutCarry]:
-        state, states = queue(carry.states, observe(spec, seen, carry.action_b).state)
-        embedding, embeddings = queue(carry.embeddings, embedding)
-        action, hidden = network.recur(params, carry.hidden, embedding, state)
-        carry = carry._replace(hidden=hidden, action_b=action, embeddings=embeddings, states=states)
-        return action, carry
+    physics, weights = config.physics, config.loss
+    sight, dynamics = make_sight(config), make_dynamics(config)
 
     def rollout(
         params: network.Params,
@@ -216,14 +152,13 @@ def make_rollout(
         delta: delta_network.Params | None = None,
     ) -> tuple[jax.Array, StepRecord]:
         steps, batch, width = embedding_shift.shape
-        body = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
-        carry = RolloutCarry(
-            body=body,
+        start = RolloutCarry(
+            state=dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w),
             target=worlds.target,
             hidden=jnp.asarray(worlds.hidden),
             action_b=jnp.zeros((batch, 3)),
             embeddings=jnp.zeros((batch, physics.image_delay, width)),
-            states=states_at_start(batch, config),
+            observed=observed_at_start(batch, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
         )
@@ -232,41 +167,53 @@ def make_rollout(
             carry: RolloutCarry, inputs: tuple[jax.Array, jax.Array, jax.Array]
         ) -> tuple[RolloutCarry, StepRecord]:
             shift_now, key_now, number = inputs
-            before = carry.body
-            image = look(worlds, jax.lax.stop_gradient(before), key_now)
-            seen = view_in(worlds, before, carry.target)
-            embedding = encode(params, image) + shift_now
-            action, carry = act(params, carry, embedding, seen)
+            before, target = carry.state, carry.target
+            seen = sight(worlds, before, target, carry.action_b, key_now)
+            embedding = encode(params, seen.image) + shift_now
+            embedding, embeddings = queue(carry.embeddings, embedding)
+            state, observed = queue(carry.observed, seen.state)
+            action, hidden = network.recur(params, carry.hidden, embedding, state)
+            flown, delta_hidden = action, carry.delta_hidden
             if delta is not None:
                 vel_b = to_local(jax.lax.stop_gradient(before.rot_w), before.vel_w)
                 correction, delta_hidden = delta_network.step(
-                    delta, carry.delta_hidden, vel_b, before.rot_w[:, 2], action
+                    delta, delta_hidden, vel_b, before.rot_w[:, 2], action
                 )
-                action = action + correction
-                carry = carry._replace(delta_hidden=delta_hidden)
-            body = dynamics.step(before, worlds.constants, action, seen.gate_w, key_now)
-            terms, clearance, passed = judge(worlds, before, body, carry.target)
-            terms = {name: term * carry.alive for name, term in terms.items()}
-            alive = carry.alive * (clearance > -weights.crash_depth_m)
+                flown = action + correction
+            _, target_w = target_gate(worlds.scene.gates, target)
+            after = dynamics.step(before, worlds.constants, flown, target_w, key_now)
+            made = make_step(weights, worlds, before, after, target)
+            terms = losses.weighted(weights, made)
+            passed_after = target + made.passed
+            alive = carry.alive * (made.clearance > -weights.crash_depth_m)
             alive = alive * (number + 1 < worlds.stop)
-            target = carry.target + passed
             if config.episode.finish:
-                alive = alive * (target < worlds.scene.gates.center_w.shape[1])
+                alive = alive * (passed_after < worlds.scene.gates.center_w.shape[1])
             record = StepRecord(
-                image=image,
-                terms=terms,
-                speed=jnp.linalg.norm(body.vel_w, axis=-1),
-                clearance=clearance,
-                passed=passed,
-                pos_w=body.pos_w,
-                hidden=carry.hidden,
+                image=seen.image,
+                terms={name: term * carry.alive for name, term in terms.items()},
+                speed=jnp.linalg.norm(after.vel_w, axis=-1),
+                clearance=made.clearance,
+                passed=made.passed,
+                pos_w=after.pos_w,
+                hidden=hidden,
                 alive=carry.alive,
-                noted=None if note is None else note(worlds, before, body, carry.target),
+                noted=None if note is None else note(worlds, before, after, target),
             )
-            return carry._replace(body=body, target=target, alive=alive), record
+            carry = RolloutCarry(
+                state=after,
+                target=passed_after,
+                hidden=hidden,
+                action_b=action,
+                embeddings=embeddings,
+                observed=observed,
+                delta_hidden=delta_hidden,
+                alive=alive,
+            )
+            return carry, record
 
         keys = jax.random.split(key, steps)
-        _, records = jax.lax.scan(step, carry, (embedding_shift, keys, jnp.arange(steps)))
+        _, records = jax.lax.scan(step, start, (embedding_shift, keys, jnp.arange(steps)))
         loss = functools.reduce(jnp.add, (records.terms[name].mean() for name in losses.LOSSES))
         return loss, jax.lax.stop_gradient(records)
 

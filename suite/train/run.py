@@ -5,6 +5,7 @@ Worlds and noise depend on the seed and the iteration alone; `repeat.py` says wh
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,9 +18,8 @@ from jax.sharding import NamedSharding, PartitionSpec
 from policies.networks import delta_network, network
 from suite.common.console import Console
 from suite.common.estimate import Estimate
-from suite.train.checks import check
-from suite.train.config import TrainConfig
-from suite.train.repeat import Method, Outcome, Run, Watch, repeat
+from suite.train.config import TrainConfig, check
+from suite.train.repeat import Method, Outcome, Run, Watch, flight_note, repeat
 from suite.train.update import device_mesh, make_update, start_state
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
@@ -31,15 +31,28 @@ COMPILE_S = 15.0
 """Time to compile, for the estimate [s]."""
 
 
-def estimate(config: TrainConfig) -> Estimate:
-    """Return about how long a run takes on this machine's devices and what memory it needs."""
-    episode = config.episode
-    frames = episode.batch * episode.steps
+def estimate(
+    config: TrainConfig,
+    steps_per_core_s: float = STEPS_PER_CORE_S,
+    compile_s: float = COMPILE_S,
+    passes: int = 1,
+    images: int = 2,
+) -> Estimate:
+    """Return about how long a run takes on this machine's devices and what memory it needs.
+
+    Args:
+        config: the run.
+        steps_per_core_s: steps of worlds that a processor core makes, or learns from once [1/s].
+        compile_s: time to compile [s].
+        passes: how often an iteration goes through its steps.
+        images: how many copies of its images are held at once.
+    """
+    frames = config.episode.batch * config.episode.steps
     pixels = config.spec.camera.height * config.spec.camera.width
-    on_cpu = jax.default_backend() == "cpu"
-    speed = STEPS_PER_CORE_S * usable_cores() if on_cpu else 50 * STEPS_PER_CORE_S
-    seconds = COMPILE_S + config.optimizer.iterations * frames / speed
-    return Estimate(seconds, 8e8 + frames * (2 * pixels + 24 * config.spec.hidden_size) * 4.0)
+    cores = usable_cores() if jax.default_backend() == "cpu" else 50
+    seconds = compile_s + config.optimizer.iterations * frames * passes / (steps_per_core_s * cores)
+    floats = frames * (images * pixels + 24 * config.spec.hidden_size)
+    return Estimate(seconds, 8e8 + floats * 4.0)
 
 
 def train(
@@ -74,7 +87,7 @@ def train(
         estimate=estimate(config),
         worlds=lambda iteration: sample_worlds(config, iteration),
         make_update=lambda: make_update(config, mesh, delta),
-        note=_note,
+        note=functools.partial(flight_note, "loss"),
     )
     # Placed as the update returns it: placed otherwise, the second step would compile it again.
     place = NamedSharding(mesh, PartitionSpec())
@@ -90,10 +103,3 @@ def _digest(params: Mapping[str, Any] | None) -> str | None:
     for name in sorted(params):
         digest.update(name.encode() + np.asarray(params[name], order="C").tobytes())
     return digest.hexdigest()
-
-
-def _note(row: Mapping[str, float]) -> str:
-    return (
-        f"loss {row['loss']:.2f}, gates {row['gates']:.2f}, collided {row['collided']:.0%}, "
-        f"{row['speed']:.1f} m/s"
-    )

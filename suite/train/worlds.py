@@ -5,6 +5,7 @@ A pure function of (config, iteration), so a resumed run sees the worlds that it
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -61,26 +62,39 @@ def _clearance(track: Track, point_w: np.ndarray) -> float:
     return float((np.linalg.norm(away, axis=-1) - radius).min(initial=np.inf))
 
 
-def _on_the_way(
-    track: Track, speed_limit: float, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return position, velocity and next gate somewhere between two gates, clear of obstacles."""
-    gates = track.scene.gates
+def _roomiest(
+    track: Track, rng: np.random.Generator, place: Callable[[int], np.ndarray]
+) -> tuple[np.ndarray, int]:
+    """Return one of up to six points that `place` draws for random next gates, and that gate.
+
+    It is the first with 0.5 m of room, or the one with the most.
+    """
     best = (-np.inf, track.start_pos_w, 0)
     for _ in range(6):
-        target = int(rng.integers(0, len(gates.center_w)))
-        behind = track.start_pos_w if target == 0 else gates.center_w[target - 1]
-        share = rng.uniform(0.1, 0.7)
-        point = behind + share * (gates.center_w[target] - behind)
-        point = point + rng.normal(0, 0.25, 3)
+        target = int(rng.integers(0, len(track.scene.gates.center_w)))
+        point = place(target)
         point[2] = max(point[2], 0.4)
         room = _clearance(track, point)
         if room > best[0]:
             best = (room, point, target)
         if room > 0.5:
             break
-    _, point, target = best
-    towards = gates.center_w[target] - point
+    return best[1], best[2]
+
+
+def _on_the_way(
+    track: Track, speed_limit: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return position, velocity and next gate somewhere between two gates, clear of obstacles."""
+    center_w = track.scene.gates.center_w
+
+    def place(target: int) -> np.ndarray:
+        behind = track.start_pos_w if target == 0 else center_w[target - 1]
+        share = rng.uniform(0.1, 0.7)
+        return behind + share * (center_w[target] - behind) + rng.normal(0, 0.25, 3)
+
+    point, target = _roomiest(track, rng, place)
+    towards = center_w[target] - point
     towards = towards / max(np.linalg.norm(towards), 1e-6)
     sideways = rng.normal(0, 0.25, 3)
     return point, rng.uniform(0, speed_limit) * (towards + sideways), target
@@ -91,19 +105,13 @@ def _beside_a_gate(
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Return position, velocity and next gate of a drone that has missed that gate."""
     gates = track.scene.gates
-    best = (-np.inf, track.start_pos_w, 0)
-    for _ in range(6):
-        target = int(rng.integers(0, len(gates.center_w)))
+
+    def place(target: int) -> np.ndarray:
         angle, beside = rng.uniform(-np.pi, np.pi), rng.uniform(0.9, 1.8)
         point_g = np.array([rng.uniform(-0.7, 1.2), beside * np.cos(angle), beside * np.sin(angle)])
-        point = gates.center_w[target] + gates.rot_w[target] @ point_g
-        point[2] = max(point[2], 0.4)
-        room = _clearance(track, point)
-        if room > best[0]:
-            best = (room, point, target)
-        if room > 0.5:
-            break
-    _, point, target = best
+        return gates.center_w[target] + gates.rot_w[target] @ point_g
+
+    point, target = _roomiest(track, rng, place)
     onward = rng.uniform(0, 0.4) * gates.rot_w[target, :, 0] + rng.normal(0, 0.08, 3)
     return point, speed_limit * onward, target
 

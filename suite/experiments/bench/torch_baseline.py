@@ -20,7 +20,7 @@ from suite.train.config import TrainConfig
 from suite.train.dynamics.point_mass import GRAVITY, PointMassParams
 from suite.train.losses import MAX_PULL, UNIT_FIELD
 from suite.train.presets import paper
-from suite.train.rollout import BEYOND_M
+from suite.train.step import BEYOND_M
 from suite.train.worlds import Worlds
 from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.scene import Gates

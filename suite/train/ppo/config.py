@@ -14,6 +14,9 @@ from suite.train.config import (
     TrainConfig,
 )
 
+SHARED = ("spec", "physics", "quadrotor", "loss", "episode", "seed")
+"""Settings that both trainings have."""
+
 
 @dataclass(frozen=True)
 class PpoConfig:
@@ -65,25 +68,11 @@ class PpoConfig:
     @property
     def shared(self) -> TrainConfig:
         """The differentiable training in the same worlds and dynamics."""
-        return TrainConfig(
-            spec=self.spec,
-            physics=self.physics,
-            quadrotor=self.quadrotor,
-            loss=self.loss,
-            episode=self.episode,
-            optimizer=OptimizerConfig(iterations=self.iterations),
-            seed=self.seed,
-        )
+        same = {name: getattr(self, name) for name in SHARED}
+        return TrainConfig(**same, optimizer=OptimizerConfig(iterations=self.iterations))
 
 
 def ppo_like(config: TrainConfig, iterations: int) -> PpoConfig:
     """Return PPO with its default settings in the worlds and dynamics of `config`."""
-    return PpoConfig(
-        spec=config.spec,
-        physics=config.physics,
-        quadrotor=config.quadrotor,
-        loss=config.loss,
-        episode=config.episode,
-        seed=config.seed,
-        iterations=iterations,
-    )
+    same = {name: getattr(config, name) for name in SHARED}
+    return PpoConfig(**same, iterations=iterations)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from suite.train.dynamics.interface import DynamicsState
-from suite.train.rollout import NEAR, target_gate
+from suite.train.step import NEAR, target_gate
 from suite.train.worlds import Worlds
 from tracks.geometry.clearance import nearest_obstacle
 from tracks.geometry.rotation import to_local

@@ -13,15 +13,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from suite.train import losses
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import DynamicsState
-from suite.train.rollout import NEAR, target_gate
+from suite.train.step import make_step
 from suite.train.worlds import Worlds
-from tracks.geometry.clearance import nearest_obstacle
-from tracks.geometry.crossing import crossing
 
 COLLISION = -30.0
 """lambda_1, of a step that comes closer to a solid than r_q [1]."""
@@ -56,9 +53,9 @@ class RewardTerms(NamedTuple):
 def make_reward(
     config: TrainConfig,
 ) -> Callable[..., tuple[RewardTerms, jax.Array, jax.Array]]:
-    """Return reward(worlds, before, body, target) -> (terms, clearance, passed), (B,) each.
+    """Return reward(worlds, before, after, target) -> (terms, clearance, passed), (B,) each.
 
-    It scores the step from `before` to `body` of worlds that have passed `target` (B,) gates: the
+    It scores the step from `before` to `after` of worlds that have passed `target` (B,) gates: the
     weighted terms, the smallest signed distance to a solid on the way [m] and whether a gate was
     passed. A gate is passed where the judge says so, by crossing its opening, instead of within
     r_th of its centre; such a step's progress is towards the next gate.
@@ -66,41 +63,21 @@ def make_reward(
     Args:
         config: beta_2, r_q and the points of a step's path are those of its `loss`.
     """
-    weights = replace(config.loss, barrier_height=1.0)
+    weights = replace(config.loss, barrier_height=1.0, pass_first=True, approach_m=0.0)
 
     def reward(
-        worlds: Worlds, before: DynamicsState, body: DynamicsState, target: jax.Array
+        worlds: Worlds, before: DynamicsState, after: DynamicsState, target: jax.Array
     ) -> tuple[RewardTerms, jax.Array, jax.Array]:
-        gates = worlds.scene.gates
-        gate, _ = target_gate(gates, target)
-        passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, before.pos_w, body.pos_w)
-        passed = passed & (target < gates.center_w.shape[1])
-        _, goal_w = target_gate(gates, target + passed)
-        share = (jnp.arange(weights.path_samples) + 1.0) / weights.path_samples
-        path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
-        distance, away = nearest_obstacle(worlds.scene, path, NEAR)
-        clearance = distance.min(-1)
-        step = losses.Step(
-            pos_w=body.pos_w,
-            vel_w=body.vel_w,
-            acc_w=body.acc_w,
-            acc_before_w=before.acc_w,
-            time_step=worlds.constants.time_step,
-            gap=losses.gap_to_obstacles(weights, path, distance, away),
-            away_w=away,
-            goal_w=goal_w,
-            place_g=jnp.zeros((1, 3)),
-            gate=gate,
-        )
+        step = make_step(weights, worlds, before, after, target)
         avoid = BARRIER * losses.clearance(weights, step)
         smooth = ACCELERATION * losses.acceleration(weights, step)
         terms = RewardTerms(
-            collision=COLLISION * (clearance < weights.safety_radius_m),
+            collision=COLLISION * (step.clearance < weights.safety_radius_m),
             avoid=avoid + CLOSING * losses.collide(weights, step),
             smooth=smooth + JERK * losses.jerk(weights, step),
-            passing=PASS * passed,
+            passing=PASS * step.passed,
             progress=-PROGRESS * losses.progress(weights, step),
         )
-        return terms, clearance, passed
+        return terms, step.clearance, step.passed
 
     return reward

@@ -9,19 +9,19 @@ import jax
 import jax.numpy as jnp
 
 from policies.networks import network
-from policies.observation import observe
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import make_dynamics
 from suite.train.ppo import critic
 from suite.train.ppo.reward import RewardTerms, make_reward
-from suite.train.rollout import BODY_RADIUS_M, make_look, queue, states_at_start, view_in
+from suite.train.rollout import BODY_RADIUS_M, make_sight, observed_at_start, queue
+from suite.train.step import target_gate
 from suite.train.worlds import Worlds
 
 
 class EpisodeCarry(NamedTuple):
     """What an episode carries from step to step."""
 
-    body: Any
+    state: Any
     """Of the dynamics."""
     target: jax.Array
     """(B,) gates passed, counted from the track's first."""
@@ -31,7 +31,7 @@ class EpisodeCarry(NamedTuple):
     """(B, 3) the last action [m/s^2]."""
     images: jax.Array
     """(B, image_delay, height, width) on their way, oldest first."""
-    states: jax.Array
+    observed: jax.Array
     """(B, state_delay, state_size) on their way, oldest first."""
 
 
@@ -88,51 +88,50 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
     with the recurrent state that it had. `seen` is what the critic sees after the last step.
     """
     spec, physics = config.spec, config.physics
-    look, reward, dynamics = make_look(config), make_reward(config), make_dynamics(config)
+    sight, reward, dynamics = make_sight(config), make_reward(config), make_dynamics(config)
 
     def rollout(
         params: network.Params, log_deviation: jax.Array, worlds: Worlds, key: jax.Array
     ) -> tuple[Record, jax.Array]:
         batch = worlds.pos_w.shape[0]
         start = EpisodeCarry(
-            body=dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w),
+            state=dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w),
             target=worlds.target,
             hidden=jnp.asarray(worlds.hidden),
             action_b=jnp.zeros((batch, 3)),
             # An image of zeros is embedded as zeros, which is how the trainer's rollouts start.
             images=jnp.zeros((batch, physics.image_delay, spec.camera.height, spec.camera.width)),
-            states=states_at_start(batch, config),
+            observed=observed_at_start(batch, config),
         )
 
         def step(carry: EpisodeCarry, key: jax.Array) -> tuple[EpisodeCarry, Record]:
-            before = carry.body
-            seen = critic.features(worlds, before, carry.target)
-            view = view_in(worlds, before, carry.target)
-            state, states = queue(carry.states, observe(spec, view, carry.action_b).state)
-            image, images = queue(carry.images, look(worlds, before, key))
+            before, target = carry.state, carry.target
+            seen = sight(worlds, before, target, carry.action_b, key)
+            state, observed = queue(carry.observed, seen.state)
+            image, images = queue(carry.images, seen.image)
             mean, hidden = network.step(params, carry.hidden, state, image)
             noise = jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
             action = mean + jnp.exp(log_deviation) * noise
-            body = dynamics.step(before, worlds.constants, action, view.gate_w, key)
-            terms, clearance, passed = reward(worlds, before, body, carry.target)
+            _, target_w = target_gate(worlds.scene.gates, target)
+            after = dynamics.step(before, worlds.constants, action, target_w, key)
+            terms, clearance, passed = reward(worlds, before, after, target)
             done = clearance < BODY_RADIUS_M
             record = Record(
                 image=image,
                 state=state,
                 action_b=action,
                 log_prob=log_probability(mean, log_deviation, action),
-                seen=seen,
+                seen=critic.features(worlds, before, target),
                 reward=terms,
                 done=done,
                 hidden=hidden,
                 passed=passed,
-                speed=jnp.linalg.norm(body.vel_w, axis=-1),
+                speed=jnp.linalg.norm(after.vel_w, axis=-1),
             )
-            target = carry.target + passed
-            going = EpisodeCarry(body, target, hidden, action, images, states)
+            going = EpisodeCarry(after, target + passed, hidden, action, images, observed)
             return chosen(done, start, going), record
 
         last, records = jax.lax.scan(step, start, jax.random.split(key, config.episode.steps))
-        return records, critic.features(worlds, last.body, last.target)
+        return records, critic.features(worlds, last.state, last.target)
 
     return rollout

@@ -16,8 +16,7 @@ import numpy as np
 import optax
 
 from policies.networks import network
-from suite.train.checks import check_stride
-from suite.train.gradient import encoder_gradient, every
+from suite.train.gradient import sampled_encoder_gradient
 from suite.train.ppo import critic
 from suite.train.ppo.config import PpoConfig
 from suite.train.ppo.objective import Actor, Sequences, advantages, clipped_loss
@@ -99,12 +98,7 @@ def actor_gradient(
         clipped_loss, argnums=(1, 2), has_aux=True
     )(config, actor, embeddings, sequences)
     stride = config.episode.image_stride
-    first = jax.random.randint(key, (), 0, stride)
-    images, cotangents = (
-        every(stride, first, array).reshape(-1, *array.shape[2:])
-        for array in (images, stride * cotangents)
-    )
-    through_images = encoder_gradient(actor.params, images, cotangents)
+    through_images = sampled_encoder_gradient(actor.params, images, cotangents, stride, key)
     params = jax.tree.map(jnp.add, direct.params, through_images)
     return direct._replace(params=params), {"loss": loss, **numbers}
 
@@ -130,15 +124,13 @@ def make_update(
     """Return update(state, worlds) -> (state', numbers of the curve), compiled on first call.
 
     Raises:
-        ValueError: where `minibatches` does not divide `episode.batch`, or `episode.image_stride`
-            `episode.steps`.
+        ValueError: where `minibatches` does not divide `episode.batch`.
     """
     batch, steps = config.episode.batch, config.episode.steps
     if config.minibatches < 1 or batch % config.minibatches:
         raise ValueError(
             f"minibatches is {config.minibatches}, allowed are divisors of episode.batch ({batch})"
         )
-    check_stride(config.episode.image_stride, steps)
     rollout = make_rollout(config.shared)
     actor_optimizer, critic_optimizer = make_optimizers(config)
     seed = jax.random.key(np.uint32(config.seed))

@@ -15,7 +15,8 @@ from suite.train.config import PointMassConfig
 from suite.train.dynamics import point_mass
 from suite.train.gradient import make_gradient
 from suite.train.losses import UNIT_FIELD
-from suite.train.rollout import make_rollout, target_gate, view_in
+from suite.train.rollout import make_rollout, view_in
+from suite.train.step import target_gate
 from tests.support.training import (
     SPEC,
     boxes_worlds,
@@ -305,7 +306,8 @@ def test_a_state_on_its_way_at_the_start_is_that_of_a_level_drone_at_rest():
     zero = np.zeros(3)
     seen = View(zero, np.eye(3), zero, zero, zero, zero)
     expected = observe(config.spec, seen, zero).state
-    np.testing.assert_array_equal(rollout.states_at_start(2, config), np.tile(expected, (2, 1, 1)))
+    found = rollout.observed_at_start(2, config)
+    np.testing.assert_array_equal(found, np.tile(expected, (2, 1, 1)))
 
 
 def test_hovering_above_the_frame_there_is_progress_to_be_made_backwards():

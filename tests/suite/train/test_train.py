@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.train.rollout import NEAR, SEEN
+from suite.train.rollout import SEEN
+from suite.train.step import NEAR
 from tracks.families import FAMILIES, MAX_COUNTS, make_track
 from tracks.geometry.camera import Camera, pixel_rays_b
 from tracks.geometry.clearance import nearest_obstacle

@@ -63,3 +63,10 @@ def test_a_stopped_run_resumes_exactly_and_leaves_a_policy(tmp_path, monkeypatch
     assert rows(stopped) == rows(whole)
     with pytest.raises(ValueError, match="holds another run.*discount"):
         run.train_ppo(replace(CONFIG, discount=0.5), whole, Console())
+
+
+def test_an_image_stride_that_does_not_divide_the_steps_is_refused(tmp_path):
+    config = replace(CONFIG, episode=replace(CONFIG.episode, image_stride=4))
+    with pytest.raises(ValueError, match=r"image_stride is 4, allowed are divisors .*\(6\)"):
+        run.train_ppo(config, tmp_path / "run", Console())
+    assert not list(tmp_path.iterdir())

@@ -19,9 +19,3 @@ CONFIG = replace(
 def test_minibatches_that_do_not_divide_the_batch_are_refused(wrong):
     with pytest.raises(ValueError, match=r"minibatches is \d, allowed are divisors .*\(4\)"):
         make_update(replace(CONFIG, **wrong))
-
-
-def test_an_image_stride_that_does_not_divide_the_steps_is_refused():
-    episode = replace(CONFIG.episode, image_stride=4)
-    with pytest.raises(ValueError, match=r"image_stride is 4, allowed are divisors .*\(6\)"):
-        make_update(replace(CONFIG, episode=episode))

@@ -1,0 +1,67 @@
+"""What a step is measured against: the gate to pass, the point to fly to, the nearest solid."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from suite.train.config import LossConfig
+from suite.train.dynamics import point_mass
+from suite.train.step import BEYOND_M, approach_shift, make_step, target_gate
+from tests.support.training import boxes_worlds, small_config
+
+
+@pytest.mark.parametrize(
+    ("place_g", "shift"),
+    [
+        ((-4.0, 0.2, 0.1), 0.0),  # on the axis: straight on
+        ((-4.0, 0.0, 1.0), 0.7),  # as much before the gate as it is off the axis, less 0.3
+        ((0.0, 0.0, 1.2), 0.9),  # above the frame
+        ((0.8, 0.6, 0.0), 1.1),  # beyond the plane
+        ((2.0, 3.0, 0.0), 1.5),  # at most so far
+    ],
+)
+def test_the_point_before_the_gate_that_progress_is_measured_to(place_g, shift):
+    config = LossConfig(approach_m=1.5)
+    found = approach_shift(config, jnp.array([place_g]))
+    np.testing.assert_allclose(found, [shift], atol=1e-6)
+    assert approach_shift(LossConfig(), jnp.array([place_g])) == 0.0
+
+
+def test_past_the_last_gate_the_point_to_fly_to_lies_behind_it():
+    worlds = boxes_worlds(small_config(3))
+    gates, rows = worlds.scene.gates, np.arange(3)
+    gate, goal_w = target_gate(gates, jnp.array([0, 7, 8]))
+    number = np.array([0, 7, 7])
+    np.testing.assert_allclose(gate.center_w, gates.center_w[rows, number])
+    beyond = gates.rot_w[rows, number, :, 0] * np.array([0.0, 0.0, BEYOND_M])[:, None]
+    np.testing.assert_allclose(goal_w, gate.center_w + beyond, atol=1e-5)
+    after, _ = target_gate(gates, jnp.array([0, 7, 8]), ahead=1)
+    np.testing.assert_allclose(after.center_w, gates.center_w[rows, [1, 7, 7]])
+
+
+@pytest.mark.parametrize(("pass_first", "speed"), [(False, -3.0), (True, 3.0)])
+def test_a_step_through_a_gate_and_its_numbers(pass_first, speed):
+    """From 0.1 m before the first gate to 0.1 m behind it at 3 m/s; the second is straight on."""
+    worlds = boxes_worlds(small_config(2))
+    gates = worlds.scene.gates
+    forward, center = gates.rot_w[:, 0, :, 0], np.array(gates.center_w)
+    center[:, 1] = center[:, 0] + 4 * forward
+    worlds = worlds._replace(scene=worlds.scene._replace(gates=gates._replace(center_w=center)))
+    before, after = (
+        point_mass.start(center[:, 0] + x * forward, 3 * forward, worlds.heading_w)
+        for x in (-0.1, 0.1)
+    )
+    after = after._replace(acc_w=jnp.asarray([[1.0, 0, 0], [0, 2.0, 0]]))
+    config = LossConfig(pass_first=pass_first)
+    step = make_step(config, worlds, before, after, jnp.zeros(2, int))
+    assert step.passed.all()
+    np.testing.assert_allclose(step.closing_speed, [speed, speed], atol=1e-3)
+    aim = center[:, int(pass_first)]
+    turn = gates.rot_w[:, int(pass_first)]
+    place = np.einsum("bij,bi->bj", turn, np.array(after.pos_w) - aim)
+    np.testing.assert_allclose(step.place_g, place, atol=1e-4)
+    np.testing.assert_allclose(step.jerk_w, after.acc_w / worlds.constants.time_step[:, None])
+    assert step.gap.shape == (2, config.path_samples)
+    np.testing.assert_allclose(step.clearance, step.gap.min(-1) + config.safety_radius_m, atol=1e-6)
+    beside = make_step(config, worlds, before, after, jnp.full(2, 8))
+    assert not beside.passed.any()
