@@ -9,6 +9,7 @@ import jax
 from jax.sharding import SingleDeviceSharding
 
 from suite.common.console import Console
+from suite.common.estimate import Estimate
 from suite.train import run as trainer
 from suite.train.config import check
 from suite.train.ppo.config import PpoConfig
@@ -21,6 +22,12 @@ STEPS_PER_CORE_S = 8000.0
 """Steps of worlds a second that a processor core rolls out, or learns from once; an estimate."""
 COMPILE_S = 20.0
 """Time to compile, for the estimate [s]."""
+
+
+def estimate(config: PpoConfig) -> Estimate:
+    """Return about how long a run takes on this machine's devices and what memory it needs."""
+    passes = 1 + config.epochs
+    return trainer.estimate(config.shared, STEPS_PER_CORE_S, COMPILE_S, passes=passes, images=3)
 
 
 def train_ppo(
@@ -44,9 +51,7 @@ def train_ppo(
     method = Method(
         iterations=config.iterations,
         frames=config.episode.batch * config.episode.steps,
-        estimate=trainer.estimate(
-            shared, STEPS_PER_CORE_S, COMPILE_S, passes=1 + config.epochs, images=3
-        ),
+        estimate=estimate(config),
         worlds=lambda iteration: sample_worlds(shared, iteration),
         make_update=lambda: make_update(config),
         note=functools.partial(flight_note, "reward"),
