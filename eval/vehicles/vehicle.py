@@ -6,7 +6,7 @@ Body frame: x forward, y left, z up, origin at the nominal centre of mass. SI un
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -75,3 +75,8 @@ class Vehicle:
     camera: Camera = field(default_factory=Camera)
     effects: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     """Values (the effect's NamedTuple) by the effect's name, see `eval.effects.EFFECTS`."""
+
+
+def with_effects(nominal: Vehicle, effects: Mapping[str, Any]) -> Vehicle:
+    """Return `nominal` with `effects`, values by name, in place of its own of these names."""
+    return replace(nominal, effects=MappingProxyType({**nominal.effects, **effects}))

@@ -10,9 +10,9 @@ import numpy as np
 
 from eval.effects import EFFECTS, all_values
 from eval.logs.flight_log import FlightLog
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.blind.cases import Case
-from suite.blind.hidden import changed_values, draw_change, true_parameters, with_effects
+from suite.blind.hidden import changed_values, draw_change, true_parameters
 from suite.blind.oracle.information import (
     ALLOWED,
     REQUIRED,
@@ -39,8 +39,8 @@ from suite.blind.oracle.stretches import (
 )
 from suite.blind.outside import KINDS, make_outside
 from suite.blind.rotorpy_flight import fly_rotorpy
-from suite.blind.sensors import SENSORS, Sensors, log_of
 from suite.common.errors import WorkFailed
+from suite.diagnose.plans.sensors import SENSORS, Sensors, log_of
 from suite.diagnose.plans.separating import SEPARATIONS
 from suite.diagnose.plans.simulate import FALL_V_PER_S, FlightFailed, Recording, fly
 from suite.diagnose.plans.trajectory import Trajectory, long_flights, ordinary_flights

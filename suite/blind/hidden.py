@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -72,11 +69,6 @@ def changed_values(
             fields[parameter.name][component] = rng.uniform(-size, size)
     plain = {k: tuple(v.tolist()) if v.ndim else float(v) for k, v in fields.items()}
     return type(given)(**plain)
-
-
-def with_effects(nominal: Vehicle, effects: Mapping[str, Any]) -> Vehicle:
-    """Return the vehicle that is flown: `nominal` with `effects` in place of its own."""
-    return replace(nominal, effects=MappingProxyType({**nominal.effects, **effects}))
 
 
 def true_parameters(effect: str, values: Any, has_voltage: bool) -> dict[str, Any]:

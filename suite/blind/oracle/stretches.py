@@ -17,7 +17,7 @@ from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant
 from eval.quadrotor.rigid_body import euler_step
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from eval.vehicles.vehicle import Vehicle
-from suite.blind.sensors import Sensors
+from suite.diagnose.plans.sensors import Sensors
 from suite.diagnose.plans.simulate import FULL_V, Recording
 from tracks.geometry.rotation import exp_rot
 

@@ -14,8 +14,8 @@ import numpy as np
 from eval.effects.com_offset import ComOffset
 from eval.logs.flight_log import FlightLog, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
-from suite.blind.hidden import with_effects
-from suite.blind.sensors import Sensors, log_of
+from eval.vehicles.vehicle import with_effects
+from suite.diagnose.plans.sensors import Sensors, log_of
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import Trajectory
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from eval.logs.flight_log import write_flight
 from eval.vehicles.vehicle import Vehicle
-from suite.blind.sensors import Sensors, log_of
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.plans.files import NAME, SCHEMA, write_plan
+from suite.diagnose.plans.sensors import Sensors, log_of
 from suite.diagnose.plans.separating import plan_for, separations_of
 from suite.diagnose.plans.simulate import FlightFailed, fly
 from suite.diagnose.plans.trajectory import Trajectory

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from eval.effects import EFFECTS
 from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
-from suite.blind.sensors import SENSORS, log_of
 from suite.cli import main
 from suite.common.report import html
 from suite.diagnose.diagnose import diagnose
+from suite.diagnose.plans.sensors import SENSORS, log_of
 from suite.diagnose.plans.simulate import fly as fly_ways
 from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json

@@ -7,7 +7,7 @@ from eval.effects import EFFECTS
 from suite.blind.oracle.information import Column, columns_of, detectable, information, left_over
 from suite.blind.oracle.strength import given_vehicle
 from suite.blind.oracle.stretches import cut
-from suite.blind.sensors import SENSORS
+from suite.diagnose.plans.sensors import SENSORS
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import Trajectory
 

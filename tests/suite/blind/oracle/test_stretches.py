@@ -12,7 +12,7 @@ from suite.blind.oracle.stretches import (
     whitened,
     without_start,
 )
-from suite.blind.sensors import SENSORS
+from suite.diagnose.plans.sensors import SENSORS
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import Trajectory
 

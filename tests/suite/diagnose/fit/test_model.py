@@ -4,11 +4,11 @@ import jax
 import numpy as np
 import pytest
 
-from suite.blind.sensors import SENSORS, log_of
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.fit.model import RolloutModel
 from suite.diagnose.fit.parameters import candidates, make_space
+from suite.diagnose.plans.sensors import SENSORS, log_of
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import Trajectory, ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json

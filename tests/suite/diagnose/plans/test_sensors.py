@@ -8,7 +8,7 @@ import pytest
 
 from eval.effects import EFFECTS
 from suite.blind.oracle.strength import given_vehicle
-from suite.blind.sensors import SENSORS, log_of
+from suite.diagnose.plans.sensors import SENSORS, log_of
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import Trajectory
 
