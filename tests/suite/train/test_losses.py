@@ -77,10 +77,9 @@ def guidance_term(config, gates, pos_w, vel_w):
 
 def test_every_weight_of_the_table_scales_its_term_alone():
     rng = np.random.default_rng(9)
-    step = a_step(4, **{
-        name: jnp.asarray(rng.normal(0, 2, (4, 3)))
-        for name in ("pos_w", "vel_w", "acc_w", "goal_w", "place_g")
-    })  # fmt: skip
+    names = ("pos_w", "vel_w", "acc_w", "jerk_w", "place_g")
+    drawn = {name: jnp.asarray(rng.normal(0, 2, (4, 3))) for name in names}
+    step = a_step(4, **drawn, closing_speed=jnp.asarray(rng.normal(0, 2, 4)))
     nothing = {weight: 0.0 for terms in losses.LOSSES.values() for _, weight in terms}
     for name, terms in losses.LOSSES.items():
         for term, weight in terms:
