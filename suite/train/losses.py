@@ -49,14 +49,20 @@ def jerk(_: LossConfig, step: Step) -> jax.Array:
     return (step.jerk_w * step.jerk_w).sum(-1)
 
 
+def speed_to_goal(step: Step) -> jax.Array:
+    """Return the speed (B,) towards the point that progress is measured to [m/s]."""
+    to_goal = step.goal_w - step.pos_w
+    return (step.vel_w * to_goal).sum(-1) / norm(to_goal)
+
+
 def progress(_: LossConfig, step: Step) -> jax.Array:
     """Return L_p, minus the speed towards the goal [m/s]."""
-    return -step.closing_speed
+    return -speed_to_goal(step)
 
 
 def progress_norm(_: LossConfig, step: Step) -> jax.Array:
     """Return L_p^norm, the ablation's progress by direction alone [1]."""
-    return -step.closing_speed / (norm(step.vel_w) + 1e-3)
+    return -speed_to_goal(step) / (norm(step.vel_w) + 1e-3)
 
 
 def projection(config: LossConfig, step: Step) -> jax.Array:

@@ -39,8 +39,8 @@ class Step(NamedTuple):
     """(B, S) distance to the nearest solid beyond r_q at points of the path, with gradient [m]."""
     away_w: jax.Array
     """(B, S, 3) unit vectors along which it grows."""
-    closing_speed: jax.Array
-    """(B,) towards the point that progress is measured to [m/s]."""
+    goal_w: jax.Array
+    """(B, 3) the point that progress is measured to [m]."""
     place_g: jax.Array
     """(B, 3) position in the frame of the gate flown to, wherever before it the goal is [m]."""
     gate: Gates
@@ -99,11 +99,6 @@ def gap_beyond(
     return distance + moved - config.safety_radius_m
 
 
-def speed_towards(way_w: jax.Array, vel_w: jax.Array) -> jax.Array:
-    """Return the speed (B,) along the way (B, 3) to a point, of a velocity (B, 3) [m/s]."""
-    return (vel_w * way_w).sum(-1) / norm(way_w)
-
-
 def make_step(
     config: LossConfig,
     worlds: Worlds,
@@ -137,7 +132,7 @@ def make_step(
         jerk_w=(after.acc_w - before.acc_w) / worlds.constants.time_step[:, None],
         gap=gap_beyond(config, distance, away_w, path_w),
         away_w=away_w,
-        closing_speed=speed_towards(goal_w - after.pos_w, after.vel_w),
+        goal_w=goal_w,
         place_g=place_g,
         gate=gate,
         passed=passed,

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from suite.train import losses
 from suite.train.config import LossConfig
 from suite.train.losses import MAX_PULL, weighted
-from suite.train.step import Step, gap_beyond, speed_towards
+from suite.train.step import Step, gap_beyond
 from tracks.geometry.clearance import nearest_obstacle
 from tracks.geometry.field import attractive_field, magnetic_field
 from tracks.geometry.gates import round_gates, square_gates
@@ -45,11 +45,10 @@ def one_of_each() -> Scene:
 def a_step(batch, **known):
     """Return a step of `batch` worlds at rest before a gate, but for what is `known`."""
     zero = jnp.zeros((batch, 3))
-    rest = {name: zero for name in ("pos_w", "vel_w", "acc_w", "jerk_w", "place_g")}
+    rest = {name: zero for name in ("pos_w", "vel_w", "acc_w", "jerk_w", "goal_w", "place_g")}
     path = {"gap": jnp.ones((batch, 1)), "away_w": zero[:, None], "clearance": jnp.ones(batch)}
     gate = {"gate": unit_gate(batch), "passed": jnp.zeros(batch, bool)}
-    whole = {**rest, **path, **gate, "closing_speed": jnp.zeros(batch), **known}
-    return Step(**whole)
+    return Step(**{**rest, **path, **gate, **known})
 
 
 def obstacle_terms(config, distance, away_w, path_w, vel_w):
@@ -59,8 +58,7 @@ def obstacle_terms(config, distance, away_w, path_w, vel_w):
 
 
 def progress_term(config, pos_w, vel_w, goal_w, place_g):
-    speed = speed_towards(goal_w - pos_w, vel_w)
-    step = a_step(len(pos_w), pos_w=pos_w, vel_w=vel_w, closing_speed=speed, place_g=place_g)
+    step = a_step(len(pos_w), pos_w=pos_w, vel_w=vel_w, goal_w=goal_w, place_g=place_g)
     return weighted(config, step)["progress"]
 
 
@@ -77,9 +75,8 @@ def guidance_term(config, gates, pos_w, vel_w):
 
 def test_every_weight_of_the_table_scales_its_term_alone():
     rng = np.random.default_rng(9)
-    names = ("pos_w", "vel_w", "acc_w", "jerk_w", "place_g")
-    drawn = {name: jnp.asarray(rng.normal(0, 2, (4, 3))) for name in names}
-    step = a_step(4, **drawn, closing_speed=jnp.asarray(rng.normal(0, 2, 4)))
+    names = ("pos_w", "vel_w", "acc_w", "jerk_w", "goal_w", "place_g")
+    step = a_step(4, **{name: jnp.asarray(rng.normal(0, 2, (4, 3))) for name in names})
     nothing = {weight: 0.0 for terms in losses.LOSSES.values() for _, weight in terms}
     for name, terms in losses.LOSSES.items():
         for term, weight in terms:

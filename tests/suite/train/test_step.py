@@ -6,6 +6,7 @@ import pytest
 
 from suite.train.config import LossConfig
 from suite.train.dynamics import point_mass
+from suite.train.losses import speed_to_goal
 from suite.train.step import BEYOND_M, approach_shift, make_step, target_gate
 from tests.support.training import boxes_worlds, small_config
 
@@ -55,7 +56,7 @@ def test_a_step_through_a_gate_and_its_numbers(pass_first, speed):
     config = LossConfig(pass_first=pass_first)
     step = make_step(config, worlds, before, after, jnp.zeros(2, int))
     assert step.passed.all()
-    np.testing.assert_allclose(step.closing_speed, [speed, speed], atol=1e-3)
+    np.testing.assert_allclose(speed_to_goal(step), [speed, speed], atol=1e-3)
     aim = center[:, int(pass_first)]
     turn = gates.rot_w[:, int(pass_first)]
     place = np.einsum("bij,bi->bj", turn, np.array(after.pos_w) - aim)
