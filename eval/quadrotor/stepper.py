@@ -10,7 +10,7 @@ quadrotor.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -136,12 +136,12 @@ def plant_step(
     else:
         assert inputs.command is not None, "neither a command nor rotor speeds are given"
         state, rotors = rotor_step(plant, state, inputs.command, motion.rate_b)
-    winds, flow = _flow(plant, state, motion, rotors, inputs, time_s)
-    wrench = _wrench(plant, rotors, flow)
+    winds, flow = wind_and_flow(plant, state.wind, motion, rotors, inputs, time_s)
+    wrench = wrench_on(plant, rotors, flow)
     if inputs.push_b is not None:
         constants, push_b = plant.constants, inputs.push_b
         wrench = Wrench(
-            wrench.force_b + _mass(plant) * push_b[..., :3],
+            wrench.force_b + mass_of(plant) * push_b[..., :3],
             wrench.torque_b + constants.inertia * push_b[..., 3:],
         )
     return state._replace(wind=winds), wrench
@@ -190,7 +190,7 @@ def rollout(
             remembered, push_b = feedback.act(remembered, motion, now, index)
             now = now._replace(push_b=push_b)
         state, motion, wrench = step(plant, state, motion, now, start_s + index * plant.dt)
-        acc_b = wrench.force_b / _mass(plant)
+        acc_b = wrench.force_b / mass_of(plant)
         return (state, motion, remembered), (motion, state.rotor_speed, acc_b)
 
     begin = (start, motion, None if feedback is None else feedback.start)
@@ -203,7 +203,7 @@ def rollout(
     return Rollout(motions, speeds, acc_b, last)
 
 
-def _mass(plant: Plant) -> Array:
+def mass_of(plant: Plant) -> Array:
     """Return the true mass beside vectors (..., 3); one of a single plant stays a plain number.
 
     XLA rounds a division by a number otherwise than one by an array of one.
@@ -212,24 +212,24 @@ def _mass(plant: Plant) -> Array:
     return mass[..., None] if mass.ndim else mass
 
 
-def _flow(
+def wind_and_flow(
     plant: Plant,
-    state: PlantState,
+    wind: Mapping[str, Array],
     motion: Motion,
     rotors: RotorStep,
     inputs: Inputs,
     time_s: Array | float,
 ) -> tuple[dict[str, Array], Flow]:
-    """Return the random winds of this step and what the effects see of it."""
-    air_vel_w, winds = motion.vel_w, dict(state.wind)
+    """Return the random winds of this step, after `wind`, and what the effects see of it."""
+    air_vel_w, winds = motion.vel_w, dict(wind)
     still = air_vel_w.__array_namespace__().zeros_like(air_vel_w)
     for name, value in in_order(plant.effects):
         blow = EFFECTS[name].wind
         if blow is not None:
-            before = state.wind.get(name, still)
+            before = wind.get(name, still)
             wind_w = blow(value, Gust(before, air_vel_w, inputs.noise, plant.dt))
             air_vel_w = air_vel_w - wind_w
-            if name in state.wind:
+            if name in wind:
                 winds[name] = wind_w
     return winds, Flow(
         constants=plant.constants,
@@ -244,19 +244,27 @@ def _flow(
     )
 
 
-def _wrench(plant: Plant, rotors: RotorStep, flow: Flow) -> Wrench:
-    """Return what the rotors and the effects do to the body."""
+def rotor_wrench(plant: Plant, rotors: RotorStep, thrust: Array | None = None) -> Wrench:
+    """Return what the rotors' `thrust` (..., 4) [N] does to the body; that in still air if None."""
     constants, arm = plant.constants, plant.constants.rotor_position_b
-    thrust = constants.thrust_coefficient * rotors.mean_square
-    for name, value in in_order(plant.effects):
-        change = EFFECTS[name].thrust
-        thrust = thrust if change is None else change(value, flow, thrust)
+    if thrust is None:
+        thrust = constants.thrust_coefficient * rotors.mean_square
     force_b = thrust.sum(axis=-1)[..., None] * constants.thrust_axis_b
-    about_z = -(flow.spin * constants.torque_coefficient * rotors.mean_square).sum(axis=-1)
-    torque_b = flow.rot_w.__array_namespace__().stack(
+    about_z = -(plant.nominal.spin * constants.torque_coefficient * rotors.mean_square).sum(axis=-1)
+    torque_b = thrust.__array_namespace__().stack(
         [(arm[..., 1] * thrust).sum(axis=-1), -(arm[..., 0] * thrust).sum(axis=-1), about_z],
         axis=-1,
     )
+    return Wrench(force_b, torque_b)
+
+
+def wrench_on(plant: Plant, rotors: RotorStep, flow: Flow) -> Wrench:
+    """Return what the rotors and the effects do to the body."""
+    thrust = plant.constants.thrust_coefficient * rotors.mean_square
+    for name, value in in_order(plant.effects):
+        change = EFFECTS[name].thrust
+        thrust = thrust if change is None else change(value, flow, thrust)
+    force_b, torque_b = rotor_wrench(plant, rotors, thrust)
     for name, value in in_order(plant.effects):
         push, twist = EFFECTS[name].force, EFFECTS[name].torque
         force_b = force_b if push is None else force_b + push(value, flow)

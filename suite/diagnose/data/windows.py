@@ -1,12 +1,12 @@
-"""Flight logs cut into short stretches on the physics steps of the model.
+"""Flight logs cut into short stretches, on steps of the model that lie between their rows.
 
-A window starts at a row of the log. Commands are held from row to row as the log says; measured
-rotor speeds are joined by the curve of the rotors' lag. What was measured stays on its own times.
+A window starts at a row of the log. Commands act from the times of their rows on; measured rotor
+speeds are joined by the curve of the rotors' lag. What was measured stays on its own times.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,8 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.resample import hold, interpolate
+from suite.diagnose.data.resample import interpolate
+from suite.diagnose.data.steps import LONGEST_S, StepGrid, padded_grid, step_grid, with_lost_rows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.scene import Array
 
@@ -24,8 +25,12 @@ HISTORY_S = 0.1
 """Commands before a window that a delay may reach [s]."""
 BURN_IN_S = 0.2
 """Before a window: the rotors follow the commands at the measured rates [s]."""
-SHORTEST_STEP_S = 0.002
-"""The model's step is the rate loop's period, or this where that is shorter [s]."""
+STEPS = 64
+"""A window has a multiple of so many steps, those over of no length, so that shapes are few."""
+BURN_IN_STEPS = 16
+"""The same of the burn-in."""
+COMMANDS = 64
+"""The same of its commands."""
 ROWS = 101
 """Measured rows in a window; a log that has more of them is thinned."""
 CHANNELS = 19
@@ -47,18 +52,30 @@ UNITS = {
 
 
 class FlightWindows(NamedTuple):
-    """W windows of S steps with N measured rows each."""
+    """W windows of S steps, after Q of burn-in, with N measured rows each.
+
+    All times are since a window's start, but for `start_s`.
+    """
 
     flight: Array
     """(W,) number of the flight."""
     start_s: Array
     """(W,) since the first row of the flight [s]."""
+    edge_s: Array
+    """(W, Q + S + 1) ends of steps; edge Q is the window's start [s]."""
+    look_s: Array
+    """(W, Q + S) and `lead_s`, as `StepGrid` has them [s]."""
+    lead_s: Array
+    command_s: Array
+    """(W, K) times from which commands act, before any delay [s]."""
     command: Array
-    """(W, H + S, 4) thrust and rates held during each step, H of them before the window."""
+    """(W, K, 4) thrust and rates."""
+    command_sum: Array
+    """(W, K, 4) their integral from the first one's time to each one's."""
     burn_in_rate_b: Array
-    """(W, steps of `BURN_IN_S`, 3) measured [rad/s]."""
+    """(W, Q, 3) measured, where the loop looks [rad/s]."""
     rotor_speed: Array
-    """(W, S, 4) measured [rad/s]; zeros where there is none."""
+    """(W, S, 4) measured, in the middle of each step [rad/s]; zeros where there is none."""
     voltage_drop: Array
     """(W, S) [V]; zeros where there is none."""
     pos_w: Array
@@ -80,13 +97,8 @@ class FlightWindows(NamedTuple):
 
 
 def step_s(vehicle: Vehicle) -> float:
-    """Return the length of a physics step [s]: the rate loop's period, 2 ms or longer."""
-    return max(1.0 / vehicle.controller.frequency, SHORTEST_STEP_S)
-
-
-def steps_before(dt: float) -> tuple[int, int]:
-    """Return how many steps of `dt` [s] of history, and then of burn-in, precede a window."""
-    return round(HISTORY_S / dt) + 1, round(BURN_IN_S / dt)
+    """Return about the length of a step [s]: the rate loop's period, at least 2 ms."""
+    return max(1.0 / vehicle.controller.frequency, LONGEST_S)
 
 
 def cut(
@@ -100,22 +112,28 @@ def cut(
 
     Args:
         logs: flights, known by their place.
-        vehicle: whose physics step and motor lag are used.
+        vehicle: whose rate loop's frequency and motor lag are used.
         rotor_input: the measured rotor speeds are the input; they are no measurement then.
         stride_s: from the start of one window to that of the next [s]; by default no row counts
             twice.
         limits: the longest hole in a window.
     """
-    parts: list[FlightWindows] = []
+    places: list[tuple[int, int]] = []
     warnings: list[str] = []
     shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
     for number, log in enumerate(logs):
         starts = _starts(log, stride_s, limits.longest_hole_s)
         if not starts:
             warnings.append(f"{log.name}: no stretch of {shortest_s:g} s without a hole")
-        parts += [_window(log, number, first, vehicle, rotor_input) for first in starts]
-    if not parts:
+        places += [(number, first) for first in starts]
+    if not places:
         return None, warnings
+    drives = [_drive(logs[number], first, vehicle) for number, first in places]
+    drives = _of_one_shape(drives)
+    parts = [
+        _window(logs[number], number, first, vehicle, rotor_input, drive)
+        for (number, first), drive in zip(places, drives, strict=True)
+    ]
     return FlightWindows(*(np.stack(field) for field in zip(*parts, strict=True))), warnings
 
 
@@ -140,31 +158,85 @@ def _starts(log: FlightLog, stride_s: float, hole_s: float) -> list[int]:
         next_s = time[first] + stride_s
 
 
-def _window(
-    log: FlightLog, number: int, first: int, vehicle: Vehicle, rotor_input: bool
-) -> FlightWindows:
-    dt, time = step_s(vehicle), log.time_s
-    before, burn_in = steps_before(dt)
-    steps = round(LENGTH_S / dt)
-    begin = time[first]
-    at = begin + dt * np.arange(-(before + burn_in), steps)
-    command = np.concatenate([np.full((len(at), 1), GRAVITY), np.zeros((len(at), 3))], axis=1)
+class _Drive(NamedTuple):
+    """What drives one window, as in `FlightWindows`."""
+
+    burn_in: StepGrid
+    window: StepGrid
+    command_s: np.ndarray
+    command: np.ndarray
+
+
+def _drive(log: FlightLog, first: int, vehicle: Vehicle) -> _Drive:
+    begin, period = log.time_s[first], 1.0 / vehicle.controller.frequency
+    end = log.time_s[_rows(log, begin)[-1]] - begin
+    time, given = log.time_s, np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(log.time_s), 1))
     if log.thrust_cmd is not None and log.rate_cmd_b is not None:
-        given = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-        if np.isfinite(given).all(axis=1).any():
-            command = hold(at, time, given)
-    rates = interpolate(at[before : before + burn_in], time, log.rate_b)
-    speed = np.zeros((steps, 4))
+        command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
+        good = np.isfinite(command).all(axis=1)
+        if good.any():
+            time, given = time[good], command[good]
+    near = slice(
+        max(np.searchsorted(time, begin - BURN_IN_S - HISTORY_S - 1e-9) - 1, 0),
+        np.searchsorted(time, begin + end + 1e-9) + 1,
+    )
+    time, given = with_lost_rows(time[near] - begin, given[near])
+
+    def grid(since: float, until: float) -> StepGrid:
+        inside = time[(time > since + 1e-6) & (time < until - 1e-6)]
+        return step_grid(np.array([since, *inside, until]), period)
+
+    return _Drive(grid(-BURN_IN_S, 0.0), grid(0.0, end), time, given)
+
+
+def _of_one_shape(drives: Sequence[_Drive]) -> list[_Drive]:
+    """Return `drives` with as many steps and commands each, so that few shapes are compiled."""
+
+    def most(counts: Iterable[int], multiple: int) -> int:
+        return -(-max(counts) // multiple) * multiple
+
+    burn_in = most((len(d.burn_in.look_s) for d in drives), BURN_IN_STEPS)
+    steps = most((len(d.window.look_s) for d in drives), STEPS)
+    commands = most((len(d.command_s) for d in drives), COMMANDS)
+    return [
+        _Drive(
+            padded_grid(d.burn_in, burn_in, at_front=True),
+            padded_grid(d.window, steps),
+            np.pad(d.command_s, (0, commands - len(d.command_s)), constant_values=np.inf),
+            np.pad(d.command, ((0, commands - len(d.command)), (0, 0))),
+        )
+        for d in drives
+    ]
+
+
+def _rows(log: FlightLog, begin: float) -> np.ndarray:
+    """Return the rows of the window from `begin` [s] on, thinned to `ROWS` at most."""
+    time = log.time_s
+    rows = np.flatnonzero((time >= begin - 1e-9) & (time <= begin + LENGTH_S + 1e-9))
+    return rows[:: -(-len(rows) // ROWS)]
+
+
+def _window(
+    log: FlightLog,
+    number: int,
+    first: int,
+    vehicle: Vehicle,
+    rotor_input: bool,
+    drive: _Drive,
+) -> FlightWindows:
+    time, begin = log.time_s, log.time_s[first]
+    before, window = drive.burn_in, drive.window
+    rates = interpolate(begin + before.edge_s[:-1] + before.lead_s, time, log.rate_b)
+    middle = begin + 0.5 * (window.edge_s[:-1] + window.edge_s[1:])
+    speed = np.zeros((len(middle), 4))
     if log.rotor_speed is not None and rotor_input:
-        middle = begin + dt * (np.arange(steps) + 0.5)
         speed = _rotors(middle, time, log.rotor_speed, vehicle.rotors.time_constant)
-    drop = np.zeros(steps)
+    drop = np.zeros(len(middle))
     if log.voltage is not None and np.isfinite(log.voltage).any():
         first_volt = log.voltage[np.flatnonzero(np.isfinite(log.voltage))[0]]
-        drop = first_volt - interpolate(at[-steps:], time, log.voltage[:, None])[:, 0]
+        drop = first_volt - interpolate(middle, time, log.voltage[:, None])[:, 0]
     rot_w = log.rot_w
-    rows = np.flatnonzero((time >= begin - 1e-9) & (time <= begin + LENGTH_S + 1e-9))
-    rows = rows[:: -(-len(rows) // ROWS)]
+    rows = _rows(log, begin)
     blank = np.full((len(time), 4), np.nan)
     acc = blank[:, :3] if log.acc_b is None else log.acc_b
     rotors = blank if log.rotor_speed is None else log.rotor_speed
@@ -186,7 +258,12 @@ def _window(
     return FlightWindows(
         np.asarray(number),
         np.asarray(begin - time[0]),
-        command,
+        np.concatenate([before.edge_s[:-1], window.edge_s]),
+        np.concatenate([before.look_s, window.look_s]),
+        np.concatenate([before.lead_s, window.lead_s]),
+        drive.command_s,
+        drive.command,
+        _integral(drive.command_s, drive.command),
         rates,
         speed,
         drop,
@@ -198,6 +275,12 @@ def _window(
         *(padded(values) for values in measured),
         seen=mask,
     )
+
+
+def _integral(time: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """Return the integral (K, 4) of a held `command` (K, 4) from the first of `time` (K,) on."""
+    span = np.diff(np.where(np.isfinite(time), time, time[np.isfinite(time)].max()))
+    return np.concatenate([np.zeros((1, 4)), np.cumsum(span[:, None] * command[:-1], axis=0)])
 
 
 def _rotors(

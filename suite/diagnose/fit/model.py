@@ -15,9 +15,10 @@ from eval.effects.interface import Constants
 from eval.quadrotor.plant import Nominal, assemble, nominal_quadrotor
 from eval.quadrotor.stepper import Feedback
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.windows import FlightWindows, step_s, take
 from suite.diagnose.fit.parameters import ParameterLayout, ParameterSpace, effects_at
-from suite.diagnose.fit.rollout import KNOTS, STATE, Flown, difference, fly_windows
+from suite.diagnose.fit.rollout import KNOTS, STATE, Flown, at_knots, difference, fly_windows
 
 BATCH = 12
 """Windows a call: one shape, compiled once."""
@@ -58,12 +59,17 @@ class RolloutModel:
     """A vehicle's compiled rollout: residuals of windows and their slopes."""
 
     def __init__(
-        self, vehicle: Vehicle, space: ParameterSpace, rotor_input: bool, voltage: bool
+        self,
+        vehicle: Vehicle,
+        space: ParameterSpace,
+        rotor_input: bool,
+        voltage: bool,
+        integrator: str = "continuous",
     ) -> None:
         """Prepare the rollout of `vehicle` with the numbers of `space`.
 
         With `rotor_input` measured rotor speeds are the input, not the commands; `voltage` says
-        whether the windows have one.
+        whether the windows have one; `integrator` is that of `fly_windows`.
         """
         self.space = space
         self.size = len(space.entries)
@@ -74,8 +80,9 @@ class RolloutModel:
         base = {name: v for name, v in space.base.items() if not EFFECTS[name].random}
         self.given = VehicleArrays(*nominal_quadrotor(vehicle), base)
         self.dt = step_s(vehicle)
-        """Length of a step [s]."""
-        self._kind = (space.layout, self.dt, rotor_input, voltage)
+        """About the length of a step [s]."""
+        self.integrator = integrator
+        self._kind = (space.layout, rotor_input, voltage, integrator)
         self._linear = _slopes(*self._kind)
         self.fly: Callable[..., Any] = partial(_flight(*self._kind), self.given)
         """(theta, offset, windows, push, feedback) -> (simulated - measured, the flight), to be
@@ -139,10 +146,10 @@ def batches(
 
 @cache
 def _slopes(
-    layout: ParameterLayout, dt: float, rotor_input: bool, voltage: bool
+    layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
 ) -> Callable[..., Any]:
     """Return the compiled slopes: XLA takes longer over them than a diagnosis does."""
-    fly = _flight(layout, dt, rotor_input, voltage)
+    fly = _flight(layout, rotor_input, voltage, integrator)
 
     def linear(
         given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows, directions: Any
@@ -161,9 +168,9 @@ def _slopes(
 
 @cache
 def _responses(
-    layout: ParameterLayout, dt: float, rotor_input: bool, voltage: bool
+    layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
 ) -> Callable[..., Any]:
-    fly = _flight(layout, dt, rotor_input, voltage)
+    fly = _flight(layout, rotor_input, voltage, integrator)
 
     def respond(
         given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows
@@ -176,14 +183,13 @@ def _responses(
 
         slopes = jax.vmap(lambda d: along(d)[1], out_axes=-1)(jnp.eye(KNOTS * 6))
         _, flown = fly(given, theta, offset, windows)
-        ends = np.linspace(0, flown.rotor_speed.shape[1] - 1, KNOTS).round().astype(int)
-        return KnotResponse(slopes, jax.tree.map(lambda x: x[:, ends], flown))
+        return KnotResponse(slopes, at_knots(flown, windows))
 
     return jax.jit(respond)
 
 
 def _flight(
-    layout: ParameterLayout, dt: float, rotor_input: bool, voltage: bool
+    layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
 ) -> Callable[..., tuple[Any, Flown]]:
     """Return the function that flies windows: simulated - measured, and the flight itself."""
 
@@ -196,8 +202,10 @@ def _flight(
         feedback: Feedback | None = None,
     ) -> tuple[Any, Flown]:
         values = effects_at(layout, given.base, theta)
-        plant = assemble(given.nominal, given.constants, values, dt, 0.0)
-        flown = fly_windows(plant, values, rotor_input, voltage, offset, windows, push, feedback)
-        return difference(plant, values, flown, windows), flown
+        plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0)
+        flown = fly_windows(
+            plant, values, rotor_input, voltage, integrator, offset, windows, push, feedback
+        )
+        return difference(values, integrator, flown, windows), flown
 
     return fly

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import f as fisher
 
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.windows import STATE_GROUPS, FlightWindows, step_s, steps_before
+from suite.diagnose.data.windows import STATE_GROUPS, FlightWindows
 from suite.diagnose.fit.model import RolloutModel
 from suite.diagnose.fit.rollout import STATE
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -110,14 +110,14 @@ def conditions_of(
     windows: FlightWindows, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> dict[str, np.ndarray]:
     """Return what each of W rollouts flew through, (W,) by the names of `UNITS`."""
-    dt = step_s(vehicle)
-    first = sum(steps_before(dt))
-    steps = round(limits.thrust_mean_s / dt)
-    thrust = np.asarray(windows.command)[:, first : first + steps, 0].mean(axis=1)
-    speed = np.asarray(windows.rotor_speed)[:, :steps]
+    early = np.asarray(windows.command_s)
+    early = (early > -1e-9) & (early < limits.thrust_mean_s)
+    thrust = _mean(np.asarray(windows.command)[..., 0], early)
+    speed = np.asarray(windows.rotor_speed)
     if speed.any():
+        early = np.asarray(windows.edge_s)[:, -speed.shape[1] - 1 : -1] < limits.thrust_mean_s
         force = vehicle.rotors.thrust_coefficient * (speed**2).sum(axis=-1)
-        thrust = force.mean(axis=1) / vehicle.mass
+        thrust = _mean(force, early) / vehicle.mass
     return {
         "speed": np.linalg.norm(windows.vel_w, axis=-1),
         "height": np.asarray(windows.pos_w)[:, 2],
@@ -125,6 +125,11 @@ def conditions_of(
         "thrust": thrust,
         "time in flight": np.asarray(windows.start_s),
     }
+
+
+def _mean(values: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """Return the means (W,) of what is `counted` (W, K) of `values` (W, K)."""
+    return np.where(counted, values, 0.0).sum(axis=1) / np.maximum(counted.sum(axis=1), 1)
 
 
 def binned(found: Disagreement, over: np.ndarray, condition: str) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,216 @@
+"""The quadrotor in continuous time: steps of any length, a rate loop that looks at its own times.
+
+A simulator's step is its own affair. Where a flight is only known by its log, its commands act
+from the times of its rows on, whatever those are, and its rate loop has a frequency of its own. So
+steps end where commands change, and are otherwise as long as accuracy allows. The body is moved by
+the explicit midpoint rule (order 2; Hairer, Norsett & Wanner 1993, Sec. II.1), with what the air
+does half a step on taken from the step before; rotors follow their first-order lag exactly.
+Flights that MuJoCo's Euler integrator has made are met by the same steps under its own rule.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from eval.effects.interface import Array
+from eval.quadrotor.plant import Command, Motion, Plant, Wrench
+from eval.quadrotor.rigid_body import accelerations
+from eval.quadrotor.rotors import RotorStep, follow, steady
+from eval.quadrotor.stepper import (
+    Feedback,
+    Inputs,
+    mass_of,
+    rotor_wrench,
+    wanted_speed,
+    wind_and_flow,
+    wrench_on,
+)
+from tracks.geometry.rotation import exp_rot
+
+INTEGRATORS = ("continuous", "euler")
+"""How the body moves: by the equations themselves, or as MuJoCo's Euler steps of that length."""
+SHORTEST_S = 1e-9
+"""A step of no length is one of this [s], which moves nothing."""
+
+
+class Steps(NamedTuple):
+    """T steps of flights; (T, ...) each."""
+
+    length_s: Array
+    """Of the step [s]; those of no length move nothing."""
+    looks: Array
+    """Bool: the rate loop looks at the rates, and the command may change, when the step begins."""
+    lead_s: Array
+    """By how much later than that the loop looks on average until its next look here [s].
+
+    Looks of a fast loop are taken together: the rates of now, carried on by so much along their
+    slope, stand for all of them.
+    """
+
+
+class Carry(NamedTuple):
+    """What a quadrotor carries from step to step."""
+
+    rotor_speed: Array
+    """(..., 4) [rad/s]."""
+    wanted_speed: Array
+    """(..., 4) what the loop has asked for since its last look [rad/s]."""
+    turn_b: Array
+    """(..., 3) angular acceleration of the last step [rad/s^2]."""
+    air: Wrench
+    """(..., 3) what acted in the last step besides the rotors' own thrust."""
+
+
+class Flight(NamedTuple):
+    """T flown steps."""
+
+    motion: Motion
+    """(T + 1, ...): the start and the state after each step."""
+    rotor_speed: Array
+    """(T + 1, ..., 4) [rad/s]."""
+    acc_b: Array
+    """(T, ..., 3) specific force as each step ends; under Euler that during the step [m/s^2]."""
+
+
+def fly(
+    plant: Plant,
+    motion: Motion,
+    steps: Steps,
+    inputs: Inputs,
+    rotor_speed: Array,
+    start_s: Array,
+    integrator: str = "continuous",
+    feedback: Feedback | None = None,
+) -> Flight:
+    """Fly `inputs` (T, ...) for `steps` from `motion` (...) in JAX.
+
+    Commands are those that act: a delay is theirs, not the plant's.
+
+    Args:
+        plant: the plant; its `dt` and `delay_weight` are not used.
+        motion: at the start.
+        steps: T of them.
+        inputs: of T steps; a command counts where the loop looks.
+        rotor_speed: (..., 4) at the start [rad/s].
+        start_s: (...,) since the start of the flight [s].
+        integrator: one of `INTEGRATORS`.
+        feedback: what pushes in place of `inputs.push_b`.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    still = jnp.zeros_like(motion.vel_w)
+    none = Wrench(still, still)
+    start = Carry(rotor_speed, rotor_speed, still, none)
+    # What the air does at the start, so that the first step is as good as the others.
+    first = jax.tree.map(lambda given: given[0], inputs)._replace(push_b=None)
+    start = start._replace(air=_air(plant, motion, steady(rotor_speed), first, start_s)[1])
+
+    def one(carry: Any, row: tuple[Array, Steps, Inputs]) -> tuple[Any, Any]:
+        (now, motion, time_s, remembered), (index, span, given) = carry, row
+        if feedback is not None:
+            remembered, push_b = feedback.act(remembered, motion, given, index)
+            given = given._replace(push_b=push_b)
+        now, motion, acc_b = step(plant, now, motion, span, given, time_s, integrator)
+        carry = (now, motion, time_s + span.length_s, remembered)
+        return carry, (motion, now.rotor_speed, acc_b)
+
+    begin = (start, motion, start_s, None if feedback is None else feedback.start)
+    rows = (jnp.arange(len(steps.length_s)), steps, inputs)
+    _, (motions, speeds, acc_b) = jax.lax.scan(one, begin, rows)
+    motions, speeds = jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None], rest]),
+        (motion, rotor_speed),
+        (motions, speeds),
+    )
+    return Flight(motions, speeds, acc_b)
+
+
+def look(plant: Plant, carry: Carry, span: Steps, command: Command, rate_b: Array) -> Carry:
+    """Return `carry` after the loop has looked at `rate_b` (..., 3), where it does."""
+    xp = rate_b.__array_namespace__()
+    ahead_b = rate_b + span.lead_s[..., None] * carry.turn_b
+    asked = wanted_speed(plant, command, ahead_b)
+    return carry._replace(wanted_speed=xp.where(span.looks[..., None], asked, carry.wanted_speed))
+
+
+def turn_rotors(plant: Plant, carry: Carry, span: Steps) -> tuple[Carry, RotorStep]:
+    """Return what the rotors do in a step towards what was asked of them."""
+    xp = span.length_s.__array_namespace__()
+    length_s = xp.maximum(span.length_s, SHORTEST_S)
+    rotors = follow(carry.rotor_speed, carry.wanted_speed, plant.constants.time_constant, length_s)
+    return carry._replace(rotor_speed=rotors.end), rotors
+
+
+def step(
+    plant: Plant,
+    carry: Carry,
+    motion: Motion,
+    span: Steps,
+    inputs: Inputs,
+    time_s: Array,
+    integrator: str = "continuous",
+) -> tuple[Carry, Motion, Array]:
+    """Return carry and motion after one step, and its specific force (..., 3) [m/s^2].
+
+    The arguments are those of `fly`, of one step.
+    """
+    if inputs.rotor_speed is not None:
+        rotors = steady(inputs.rotor_speed)
+        carry = carry._replace(rotor_speed=rotors.end)
+    else:
+        assert inputs.command is not None, "neither a command nor rotor speeds are given"
+        carry = look(plant, carry, span, inputs.command, motion.rate_b)
+        carry, rotors = turn_rotors(plant, carry, span)
+    length = span.length_s[..., None]
+    if integrator == "euler":
+        whole, _ = _air(plant, motion, rotors, inputs, time_s)
+        acc_w, turn_b = accelerations(plant, motion, whole)
+        carry = carry._replace(turn_b=turn_b)
+        return carry, _euler(motion, acc_w, turn_b, length), whole.force_b / mass_of(plant)
+    thrust = rotor_wrench(plant, rotors)
+    half, air = 0.5 * length, carry.air
+    guess = Wrench(thrust.force_b + air.force_b, thrust.torque_b + air.torque_b)
+    middle = _midpoint(motion, *accelerations(plant, motion, guess), half)
+    whole, air = _air(plant, middle, rotors, inputs, time_s + 0.5 * span.length_s)
+    acc_w, turn_b = accelerations(plant, middle, whole)
+    end = _midpoint(motion, acc_w, turn_b, length)
+    # Rotors may have sped up within the step; the air hardly does more at its end.
+    ends = rotor_wrench(plant, steady(rotors.end))
+    acc_b = (ends.force_b + air.force_b) / mass_of(plant)
+    return carry._replace(turn_b=turn_b, air=air), end, acc_b
+
+
+def _air(
+    plant: Plant, motion: Motion, rotors: RotorStep, inputs: Inputs, time_s: Array
+) -> tuple[Wrench, Wrench]:
+    """Return the whole wrench, and what of it is not the rotors' own thrust."""
+    _, flow = wind_and_flow(plant, {}, motion, rotors, inputs, time_s)
+    whole = wrench_on(plant, rotors, flow)
+    if inputs.push_b is not None:
+        whole = Wrench(
+            whole.force_b + mass_of(plant) * inputs.push_b[..., :3],
+            whole.torque_b + plant.constants.inertia * inputs.push_b[..., 3:],
+        )
+    thrust = rotor_wrench(plant, rotors)
+    return whole, Wrench(whole.force_b - thrust.force_b, whole.torque_b - thrust.torque_b)
+
+
+def _midpoint(motion: Motion, acc_w: Array, turn_b: Array, length: Array) -> Motion:
+    """Return the motion after `length` (..., 1) [s] under accelerations held that long."""
+    rate_b = motion.rate_b + length * turn_b
+    turned = exp_rot(0.5 * length * (motion.rate_b + rate_b))
+    xp = rate_b.__array_namespace__()
+    return Motion(
+        motion.pos_w + length * (motion.vel_w + 0.5 * length * acc_w),
+        xp.matmul(motion.rot_w, turned),
+        motion.vel_w + length * acc_w,
+        rate_b,
+    )
+
+
+def _euler(motion: Motion, acc_w: Array, turn_b: Array, length: Array) -> Motion:
+    """Return the motion after `length` (..., 1) [s] as MuJoCo's Euler step leaves it."""
+    vel_w, rate_b = motion.vel_w + length * acc_w, motion.rate_b + length * turn_b
+    rot_w = motion.rot_w.__array_namespace__().matmul(motion.rot_w, exp_rot(length * rate_b))
+    return Motion(motion.pos_w + length * vel_w, rot_w, vel_w, rate_b)
