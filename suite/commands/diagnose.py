@@ -23,6 +23,9 @@ class Config:
     """Folder for diagnosis.json, vehicle.toml, report.html and recording.rrd."""
     drive: Literal["auto", "commands", "motors"] = "auto"
     """What drives the model: logged commands, measured rotor speeds, or what the logs allow."""
+    integrator: Literal["auto", "continuous", "euler"] = "auto"
+    """How the flights' bodies were moved: by the equations themselves, as every real one, by
+    MuJoCo's Euler steps of the rate loop's period, or as the logs say."""
     compare_delta: bool = False
     """Fit a Delta Action Model to the same flights and show what it removes; takes minutes."""
     plan: bool = False
@@ -52,6 +55,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         config.out,
         console,
         drive=config.drive,
+        integrator=config.integrator,
         compare_delta=config.compare_delta,
         plan=config.plan,
         fly=config.fly,

@@ -15,7 +15,11 @@ from eval.effects.log_faults import lateness
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.hold_out import choose_held_out
-from suite.diagnose.data.input_source import another_controller, rotors_are_input
+from suite.diagnose.data.input_source import (
+    another_controller,
+    integrator_of,
+    rotors_are_input,
+)
 from suite.diagnose.data.windows import FlightWindows, cut, take
 from suite.diagnose.fit.model import Linearisation, RolloutModel
 from suite.diagnose.fit.normal_equations import (
@@ -47,6 +51,7 @@ def diagnose(
     say: Callable[[str], None] = lambda _: None,
     seed: int = 0,
     limits: Thresholds = THRESHOLDS,
+    integrator: str = "auto",
 ) -> Diagnosis:
     """Find what explains how `logs` differ from `vehicle`.
 
@@ -58,19 +63,43 @@ def diagnose(
         say: told of the search's steps.
         seed: of the null's draws.
         limits: of every step.
+        integrator: how the flights' bodies were moved: "continuous", as every real one, "euler",
+            as MuJoCo's steps of the rate loop's period do it, or "auto": what the logs say.
 
     Raises:
         ValueError: where no flight can be used, or not in the way that was asked for.
     """
     began = time.monotonic()
+    moved = integrator_of(logs, integrator)
+    found = _diagnose(logs, vehicle, drive, say, seed, limits, moved)
+    if integrator == "auto" and moved == "continuous" and _looks_stepped(found, limits):
+        say("pose and rates are apart by half a step: once more, as MuJoCo's Euler steps")
+        stepped = _diagnose(logs, vehicle, drive, say, seed, limits, "euler")
+        if not _late(stepped):
+            told = "flown as if by MuJoCo's Euler steps, which explain half a step between pose "
+            told += "and rates; --integrator continuous does without"
+            found = replace(stepped, warnings=[*stepped.warnings, told])
+    return replace(found, seconds=time.monotonic() - began)
+
+
+def _diagnose(
+    logs: Sequence[FlightLog],
+    vehicle: Vehicle,
+    drive: str,
+    say: Callable[[str], None],
+    seed: int,
+    limits: Thresholds,
+    integrator: str,
+) -> Diagnosis:
+    """Return the diagnosis with bodies that `integrator` moves."""
     rotor_input, warnings = rotors_are_input(logs, drive), list[str]()
     if drive == "auto" and not rotor_input and another_controller(logs, vehicle, limits):
         warnings.append("the nominal rate loop does not give the measured rotor speeds; they drive")
         rotor_input = True
     space = make_space(vehicle)
     voltage = all(log.voltage is not None for log in logs)
-    model = RolloutModel(vehicle, space, rotor_input, voltage)
-    whole, notes = cut(logs, vehicle, rotor_input, limits=limits)
+    model = RolloutModel(vehicle, space, rotor_input, voltage, integrator)
+    whole, notes = cut(logs, vehicle, rotor_input, limits=limits, integrator=integrator)
     if whole is None:
         raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
     warnings += notes
@@ -100,7 +129,7 @@ def diagnose(
     say(f"{len(windows.flight)} stretches of 1 s to fit, {len(apart.flight)} held out")
     found = search(model, windows, among, say, _take(linear, inside), seed, limits)
 
-    held = _held_out(logs, vehicle, rotor_input, apart, limits)
+    held = _held_out(logs, vehicle, rotor_input, apart, limits, integrator)
     before = measure(model, begin.theta, held, found.sigma, limits)
     after = before
     if found.named:
@@ -120,7 +149,6 @@ def diagnose(
         labels = ", ".join(candidate.label for candidate in found.candidates)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
         found, after = _without_names(model, found), before
-    warnings += _of_another_integrator(model, found, limits)
     return Diagnosis(
         verdict=verdict,
         search=found,
@@ -138,7 +166,7 @@ def diagnose(
         held_out=names,
         held_windows=held,
         model=model,
-        seconds=time.monotonic() - began,
+        seconds=0.0,
         warnings=warnings,
         seed=seed,
         limits=limits,
@@ -173,19 +201,17 @@ def _without_names(model: RolloutModel, found: SearchResult) -> SearchResult:
     return replace(found, named=(), estimate=start_estimate(model, found.windows), explained=0.0)
 
 
-def _of_another_integrator(
-    model: RolloutModel, found: SearchResult, limits: Thresholds
-) -> list[str]:
-    """Return a warning where a clock's offset may be a simulator's way to integrate."""
-    values = model.space.effects(found.estimate.theta)
-    named = dict.fromkeys(candidate.name for candidate in found.candidates)
-    late = {name: float(lateness({name: values[name]})) for name in named if EFFECTS[name].late}
-    return [
-        f"{name}: {1e3 * offset:.2g} ms is about half a physics step; flights of a simulator "
-        "that integrates in another way look like this"
-        for name, offset in late.items()
-        if abs(offset) <= limits.integrator_share * model.dt
-    ]
+def _late(found: Diagnosis) -> dict[str, float]:
+    """Return by name how much later than they were poses are logged [s], of what was named."""
+    values = found.model.space.effects(found.search.estimate.theta)
+    named = dict.fromkeys(candidate.name for candidate in found.search.candidates)
+    return {name: float(lateness({name: values[name]})) for name in named if EFFECTS[name].late}
+
+
+def _looks_stepped(found: Diagnosis, limits: Thresholds) -> bool:
+    """Say whether pose and rates are apart by what MuJoCo's Euler steps make of them."""
+    step = 1.0 / found.nominal.controller.frequency
+    return any(abs(offset) <= limits.integrator_share * step for offset in _late(found).values())
 
 
 def _sound(linear: Linearisation, limits: Thresholds) -> np.ndarray:
@@ -211,11 +237,12 @@ def _held_out(
     rotor_input: bool,
     apart: FlightWindows,
     limits: Thresholds,
+    integrator: str,
 ) -> FlightWindows:
     """Return overlapping windows over what is held out, of which `apart` do not overlap."""
     if not len(apart.flight):
         raise ValueError("nothing is left to hold out: fly longer, or log a second flight")
-    many, _ = cut(logs, vehicle, rotor_input, limits.gap_stride_s, limits)
+    many, _ = cut(logs, vehicle, rotor_input, limits.gap_stride_s, limits, integrator)
     assert many is not None
     inside = np.isin(many.flight, apart.flight) & (many.start_s >= apart.start_s.min() - 1e-6)
     return take(many, inside)

@@ -34,6 +34,7 @@ def diagnose_files(
     console: Console,
     *,
     drive: str = "auto",
+    integrator: str = "auto",
     compare_delta: bool = False,
     plan: bool = False,
     fly: str | None = None,
@@ -48,6 +49,7 @@ def diagnose_files(
         out: folder for the files.
         console: told of the work as it goes.
         drive: what the model's input is: "auto", "commands" or "motors".
+        integrator: how the bodies were moved: "auto", "continuous" or "euler".
         compare_delta: fit a Delta Action Model to the same flights and show it beside the names.
         plan: write flights that tell apart what these could not.
         fly: fly the plan in simulation with this vehicle.
@@ -62,7 +64,7 @@ def diagnose_files(
     logs, warnings = read_flights(flight_files(paths))
     for warning in warnings:
         console.note(f"warning: {warning}")
-    result = diagnose(logs, vehicle, drive, console.note, seed)
+    result = diagnose(logs, vehicle, drive, console.note, seed, integrator=integrator)
     checks = run_checks(result)
     if compare_delta:
         with console.progress("fitting the Delta Action Model", 1.0) as show:

@@ -26,7 +26,11 @@ class Truth:
     def __init__(self, vehicle, lag_s=0.0, drag=(0.0, 0.0, 0.0)):
         rotors = vehicle.rotors
         self.mass, self.inertia = vehicle.mass, np.array(vehicle.inertia)
-        self.gain, self.lag_s, self.drag = np.array(vehicle.controller.rate_gain), lag_s, np.array(drag)
+        self.gain, self.lag_s, self.drag = (
+            np.array(vehicle.controller.rate_gain),
+            lag_s,
+            np.array(drag),
+        )
         self.k_t, self.k_q = rotors.thrust_coefficient, rotors.torque_coefficient
         self.arm, self.spin = np.array(rotors.position), np.array(rotors.spin, float)
         ratio = self.k_q / self.k_t
@@ -65,7 +69,9 @@ class Truth:
 
     def rk4(self, state, asked, h):
         def moved(slope, by):
-            return SimpleNamespace(**{k: v + by * getattr(slope, k) for k, v in vars(state).items()})
+            return SimpleNamespace(
+                **{k: v + by * getattr(slope, k) for k, v in vars(state).items()}
+            )
 
         one = self.slope(state, asked)
         two = self.slope(moved(one, h / 2), asked)

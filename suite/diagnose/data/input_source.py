@@ -1,4 +1,4 @@
-"""What the model's input is: the recorded commands, or the measured rotor speeds."""
+"""How flights came about: what drives them, commands or measured rotor speeds; whose steps."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.continuous import INTEGRATORS
 from eval.quadrotor.plant import make_plant
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.actuators import rate_loop_demand
@@ -30,6 +31,21 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str) -> bool:
     if (drive == "commands" and not commands) or (drive == "motors" and not motors):
         raise ValueError(f"drive = {drive!r}, but not every flight has them")
     return drive == "motors" or not commands
+
+
+def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:
+    """Return how the bodies of `logs` were moved: as was asked for, or as all their makers say.
+
+    Raises:
+        ValueError: for an unknown `integrator`.
+    """
+    if integrator in INTEGRATORS:
+        return integrator
+    if integrator != "auto":
+        allowed = ", ".join(("auto", *INTEGRATORS))
+        raise ValueError(f"integrator = {integrator!r}; allowed: {allowed}")
+    told = {log.about.get("integrator") for log in logs}
+    return "euler" if told == {"euler"} else "continuous"
 
 
 def another_controller(

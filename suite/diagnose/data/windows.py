@@ -107,6 +107,7 @@ def cut(
     rotor_input: bool,
     stride_s: float = LENGTH_S,
     limits: Thresholds = THRESHOLDS,
+    integrator: str = "continuous",
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` and warnings; None where no flight has one.
 
@@ -117,6 +118,7 @@ def cut(
         stride_s: from the start of one window to that of the next [s]; by default no row counts
             twice.
         limits: the longest hole in a window.
+        integrator: whose steps they are: those of "euler" are the rate loop's periods.
     """
     places: list[tuple[int, int]] = []
     warnings: list[str] = []
@@ -128,7 +130,8 @@ def cut(
         places += [(number, first) for first in starts]
     if not places:
         return None, warnings
-    drives = [_drive(logs[number], first, vehicle) for number, first in places]
+    longest_s = 1.0 / vehicle.controller.frequency if integrator == "euler" else LONGEST_S
+    drives = [_drive(logs[number], first, vehicle, longest_s) for number, first in places]
     drives = _of_one_shape(drives)
     parts = [
         _window(logs[number], number, first, vehicle, rotor_input, drive)
@@ -167,7 +170,7 @@ class _Drive(NamedTuple):
     command: np.ndarray
 
 
-def _drive(log: FlightLog, first: int, vehicle: Vehicle) -> _Drive:
+def _drive(log: FlightLog, first: int, vehicle: Vehicle, longest_s: float) -> _Drive:
     begin, period = log.time_s[first], 1.0 / vehicle.controller.frequency
     end = log.time_s[_rows(log, begin)[-1]] - begin
     time, given = log.time_s, np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(log.time_s), 1))
@@ -184,7 +187,7 @@ def _drive(log: FlightLog, first: int, vehicle: Vehicle) -> _Drive:
 
     def grid(since: float, until: float) -> StepGrid:
         inside = time[(time > since + 1e-6) & (time < until - 1e-6)]
-        return step_grid(np.array([since, *inside, until]), period)
+        return step_grid(np.array([since, *inside, until]), period, longest_s)
 
     return _Drive(grid(-BURN_IN_S, 0.0), grid(0.0, end), time, given)
 

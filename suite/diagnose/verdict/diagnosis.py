@@ -72,6 +72,7 @@ class Diagnosis:
 
     def cut(self, stride_s: float) -> FlightWindows:
         """Return windows of all flights, one every `stride_s` [s]."""
-        windows, _ = cut(self.logs, self.nominal, self.rotor_input, stride_s, self.limits)
+        how = (self.rotor_input, stride_s, self.limits, self.model.integrator)
+        windows, _ = cut(self.logs, self.nominal, *how)
         assert windows is not None  # the diagnosis has cut them before
         return windows

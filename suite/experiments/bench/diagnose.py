@@ -47,7 +47,9 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
     if not sysid_baseline.is_installed():
         raise WorkFailed("mujoco.sysid lacks some of its packages: pip install 'mujoco[sysid]'")
     task = make_task(seed, duration_s)
-    model = RolloutModel(task.nominal, task.space, rotor_input=True, voltage=False)
+    model = RolloutModel(
+        task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
+    )
     problem = sysid_baseline.prepare(task, _noise(model, task))
     answers: dict[str, tuple[np.ndarray, NormalEquations]] = {}
 

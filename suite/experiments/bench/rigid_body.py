@@ -72,7 +72,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
         logs = [
             log_of(flight, truth, sensors, rng, f"flight {i}") for i, flight in enumerate(flights)
         ]
-        windows, _ = cut(logs, nominal, rotor_input=True)
+        windows, _ = cut(logs, nominal, rotor_input=True, integrator="euler")
         assert windows is not None
         return Task(
             nominal, space, indices, make_space(truth).array("start")[list(indices)], windows

@@ -14,7 +14,9 @@ from suite.experiments.bench.rigid_body import make_task
 def both():
     """Return (task, model, the baseline's problem) of short flights."""
     task = make_task(20_000, 2.5)
-    model = RolloutModel(task.nominal, task.space, rotor_input=True, voltage=False)
+    model = RolloutModel(
+        task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
+    )
     begin = start_estimate(model, task.windows)
     residual = model.residual(begin.theta, begin.offset, task.windows)
     return task, model, sysid_baseline.prepare(task, noise_of(residual, task.windows)), residual
