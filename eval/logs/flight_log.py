@@ -109,8 +109,9 @@ class FlightLog:
     def step_s(self) -> float | None:
         """Length of the steps of `integrator` [s], or None where it is not said."""
         step = self.about.get("step_s")
-        is_number = isinstance(step, (int, float)) and not isinstance(step, bool)
-        return float(step) if is_number and step > 0.0 else None
+        if isinstance(step, bool) or not isinstance(step, (int, float)):
+            return None
+        return float(step) if step > 0.0 else None
 
     @property
     def action_b(self) -> np.ndarray | None:
