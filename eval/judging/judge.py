@@ -174,6 +174,12 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     yield from _Slots(task, policy, world).run(share)
 
 
+def _stepping(world: World) -> dict[str, Any]:
+    """Return what a log says of how `world` steps; nothing where it does not say."""
+    integrator = getattr(world, "integrator", None)
+    return {} if integrator is None else {"integrator": integrator, "step_s": world.dt}
+
+
 class _Slots:
     """The slots of a world with the trial and the policy's memory in each."""
 
@@ -209,7 +215,8 @@ class _Slots:
                 result = self._result(int(slot))
                 flight = None
                 if self._recorder:
-                    flight = self._recorder.finish(int(slot), result._asdict())
+                    about = result._asdict() | _stepping(self._world)
+                    flight = self._recorder.finish(int(slot), about)
                 self._index[slot] = -1
                 yield index, result, flight
 

@@ -41,4 +41,5 @@ class Flight(NamedTuple):
     """(P, H, W) float32 depth images, one for each row with `policy_step`, or None."""
     about: dict[str, Any]
     """Where the flight comes from: a row of trials.parquet (track, difficulty, seed, policy,
-    vehicle, world, ended_by, ...) as plain Python values; JSON can hold it."""
+    vehicle, world, ended_by, ...) and how the world steps (integrator, step_s), as plain Python
+    values; JSON can hold it."""

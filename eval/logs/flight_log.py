@@ -65,7 +65,7 @@ class FlightLog:
     extra: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Unknown columns by name, (T,) each, as they were in the file."""
     about: Mapping[str, Any] = field(default_factory=dict)
-    """The JSON of metadata key `flight`: vehicle, source, notes, track, seed, ..."""
+    """The JSON of metadata key `flight`: vehicle, source, notes, track, seed, integrator, ..."""
     velocity_derived: bool = False
     """True where `vel_w` was not in the file but comes from `pos_w`."""
     warnings: tuple[str, ...] = ()
@@ -95,6 +95,23 @@ class FlightLog:
         elif self.rotor_speed is not None:
             parts.append(self.rotor_speed)
         return np.all(np.isfinite(np.concatenate(parts, axis=1)), axis=1)
+
+    @property
+    def integrator(self) -> str | None:
+        """How a simulator stepped the flight: `euler` (semi-implicit), or None if it is not said.
+
+        A flight without it is taken as continuous in time.
+        """
+        named = self.about.get("integrator")
+        return named if isinstance(named, str) else None
+
+    @property
+    def step_s(self) -> float | None:
+        """Length of the steps of `integrator` [s], or None where it is not said."""
+        step = self.about.get("step_s")
+        if isinstance(step, bool) or not isinstance(step, (int, float)):
+            return None
+        return float(step) if step > 0.0 else None
 
     @property
     def action_b(self) -> np.ndarray | None:

@@ -59,7 +59,11 @@ class Rows(NamedTuple):
 
 
 class World(Protocol):
-    """A fixed number of slots, each flying one trial at a time."""
+    """A fixed number of slots, each flying one trial at a time.
+
+    A world whose step shows in its flights has an attribute `integrator` (`"euler"`), which its
+    logs then carry together with the step; without it they count as continuous in time.
+    """
 
     name: str
     slots: int

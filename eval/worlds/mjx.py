@@ -69,6 +69,7 @@ class MjxWorld:
     """Slots of one compiled program."""
 
     name = "mjx"
+    integrator = "euler"
 
     def __init__(
         self,

@@ -45,6 +45,7 @@ class MujocoWorld:
     """Slots of a `mujoco.batch.Batch`; everything but the engine is numpy over all slots."""
 
     name = "mujoco"
+    integrator = "euler"
 
     def __init__(
         self,

@@ -49,8 +49,8 @@ def make_flights() -> list[FlightLog]:
         rounded: dict[str, Any] = {}
         for name, bits in FINEST.items():
             rounded[name] = np.round(getattr(log, name) * 2.0**bits) / 2.0**bits
-        about = {"vehicle": nominal.name, "source": "simulated", "notes": NOTES, "seed": SEED}
-        logs.append(replace(log, **rounded, about=about))
+        told = {"vehicle": nominal.name, "source": "simulated", "notes": NOTES, "seed": SEED}
+        logs.append(replace(log, **rounded, about={**log.about, **told}))
     return logs
 
 

@@ -101,9 +101,9 @@ def fly_plan(
             continue
         name = f"{FLIGHTS}/plan_{number}_{way.kind}.parquet"
         log = log_of(recording, truth, sensors, rng, name)
-        about = {"source": "suite diagnose --fly", "vehicle": truth.name, "seed": seed}
+        told = {"source": "suite diagnose --fly", "vehicle": truth.name, "seed": seed}
         (folder / FLIGHTS).mkdir(parents=True, exist_ok=True)
-        write_flight(folder / name, replace(log, about=about))
+        write_flight(folder / name, replace(log, about={**log.about, **told}))
         flights.append({**flight, "flown": name})
     plan = {**plan, "flights": flights}
     if flights:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -86,6 +87,9 @@ def log_of(
     }
     seen = apply_log_faults(truth.effects, true)
     rows = slice(None, None, recording.period)
+    about: dict[str, Any] = {"source": "suite blind"}
+    if recording.integrator is not None:
+        about |= {"integrator": recording.integrator, "step_s": recording.dt}
 
     def measured(values: np.ndarray, sigma: float) -> np.ndarray:
         values = np.array(values[rows])
@@ -112,7 +116,7 @@ def log_of(
         rotor_speed=measured(recording.rotor_speed, sensors.rotor) if sensors.rotor else None,
         acc_b=measured(seen["acc_b"], sensors.acc) if sensors.acc else None,
         voltage=measured(recording.voltage, sensors.voltage) if sensors.voltage else None,
-        about={"source": "suite blind"},
+        about=about,
         # Not written to a file, as if it had not been measured.
         velocity_derived=not sensors.vel,
     )

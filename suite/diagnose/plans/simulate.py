@@ -21,6 +21,9 @@ FALL_V_PER_S = 0.02
 SAG_V = 0.35
 """Further fall of the voltage where the rotors take twice the power of a hover [V]."""
 
+INTEGRATOR = "euler"
+"""MuJoCo's of our models; a command acts on whole steps of it."""
+
 
 class Extra(Protocol):
     """Physics besides the vehicle's, acting on N flights at once."""
@@ -59,6 +62,8 @@ class Recording(NamedTuple):
     """(K, ...) what acted, before the vehicle's own delay; differs from `command` by an `Extra`."""
     extra: Wrench
     """(K, 3) what an `Extra` added."""
+    integrator: str | None = None
+    """How the simulator stepped where its step shows in the flight: `euler`, by `dt`."""
 
 
 class FlightFailed(RuntimeError):
@@ -196,4 +201,5 @@ def _recording(kept: list[Any], index: int, steps: int, dt: float, period: int) 
         voltage=column(lambda entry: entry[5]),
         acting=Command(*(column(lambda entry, i=i: entry[6][i]) for i in range(2))),
         extra=Wrench(*(column(lambda entry, i=i: entry[7][i]) for i in range(2))),
+        integrator=INTEGRATOR,
     )

@@ -1,5 +1,7 @@
 """Flight logs come back as they were written, and bad ones are refused by name."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
@@ -66,6 +68,17 @@ def test_our_flight_round_trips_bit_for_bit_with_its_extras(tmp_path, kind):
     assert back.about["track"] == "zigzag" and back.about["seed"] == 5
     assert {"schema", "suite_version", "git_commit"} <= set(back.about)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_how_a_simulator_stepped_comes_back_and_nothing_is_made_up(tmp_path, kind):
+    log = log_from_flight(smooth_flight(small_track()))
+    assert log.integrator is None and log.step_s is None
+    said = replace(log, about={**log.about, "integrator": "euler", "step_s": 0.002})
+    back = read_flight(write_flight(tmp_path / f"a.{kind}", said))
+    assert (back.integrator, back.step_s) == ("euler", 0.002)
+    for odd in ({"integrator": 4, "step_s": "fine"}, {"step_s": 0.0}, {"step_s": True}):
+        assert (replace(log, about=odd).integrator, replace(log, about=odd).step_s) == (None, None)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -17,6 +17,7 @@ def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkey
     assert [log.name for log in logs] == ["zigzag-0-7.parquet", "zigzag-0-8.parquet"]
     log = read_flight(logs[0])
     assert log.about["seed"] == 7 and log.time_s[-1] >= 1
+    assert (log.integrator, log.step_s) == ("euler", 0.002)
     found = json.loads((out / "flights.json").read_text())
     assert [row["file"] for row in found["flights"]] == [log.name for log in logs]
     logs[1].unlink()

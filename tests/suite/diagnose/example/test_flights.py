@@ -17,6 +17,7 @@ def test_the_files_are_what_the_script_makes():
     assert [path.stem for path in FILES] == [log.name for log in made]
     for path, log in zip(FILES, made, strict=True):
         kept = read_flight(path)
+        assert (kept.integrator, kept.step_s) == (log.integrator, log.step_s) == ("euler", 0.002)
         for name, bits in FINEST.items():
             # Another machine's rounding may fall to the other side of a step.
             np.testing.assert_allclose(

@@ -74,6 +74,7 @@ def test_a_plan_is_flown_with_the_noise_of_the_logs(tmp_path):
     assert len(flown["warnings"]) == 1 and "could not be flown" in flown["warnings"][0]
     log = read_flight(tmp_path / "plan" / names[0])
     assert log.velocity_derived and log.rotor_speed is None
+    assert (log.integrator, log.step_s) == ("euler", 1.0 / LAGGED.controller.frequency)
     still = log.time_s > 1.5
     assert 0.001 < np.std(log.pos_w[still, 2]) < 0.003
     assert json.loads((tmp_path / "plan" / "plan.json").read_text())["flights"][0]["flown"]

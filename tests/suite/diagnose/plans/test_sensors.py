@@ -55,6 +55,12 @@ def test_a_log_without_velocity_does_not_carry_it(flights):
     assert log.velocity_derived and log.acc_b is None and log.rotor_speed is None
 
 
+def test_a_log_says_how_its_simulator_stepped_where_the_step_shows(flights):
+    assert log_of(flights[0], BARE, SENSORS["capture"], None).integrator == "euler"
+    continuous = flights[0]._replace(integrator=None)
+    assert set(log_of(continuous, BARE, SENSORS["capture"], None).about) == {"source"}
+
+
 def test_faults_of_the_log_are_in_the_log():
     truth = having(gyro_bias=((0.1, -0.2, 0.3),), clock_offset=(0.02,))
     flight = fly(BARE, truth, [EIGHT])[0]
