@@ -110,4 +110,5 @@ def fly(vehicle, seed, duration_s=10.0, speed=5.0, noise=1.0, motors=False, acc=
         table[:, 15:18],
         with_noise(table[:, 18:22], "motor") if motors else None,
         acc_b=with_noise(columns["acc_b"], "acc") if acc else None,
+        about={"integrator": "euler", "step_s": dt},
     )

@@ -44,7 +44,7 @@ def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:
     if integrator != "auto":
         allowed = ", ".join(("auto", *INTEGRATORS))
         raise ValueError(f"integrator = {integrator!r}; allowed: {allowed}")
-    told = {log.about.get("integrator") for log in logs}
+    told = {log.integrator for log in logs}
     return "euler" if told == {"euler"} else "continuous"
 
 

@@ -14,6 +14,7 @@ from eval.effects.log_faults import lateness, measured, restored
 from eval.quadrotor.continuous import Carry, Steps, fly, look, turn_rotors
 from eval.quadrotor.plant import Motion, Plant, Wrench, unpacked
 from eval.quadrotor.stepper import Feedback, Inputs, wanted_speed
+from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.windows import CHANNELS, LENGTH_S, FlightWindows
 from tracks.geometry.rotation import exp_rot
 
@@ -165,8 +166,9 @@ def _acting(windows: FlightWindows, delay: Any) -> Any:
     They act `delay` (...,) [s] after their rows, within steps too.
     """
     since_s = jnp.asarray(windows.edge_s)[:, :-1] - delay
+    # Where the loop does not look any command will do, but for the first: the rotors begin with it.
     look_s = jnp.asarray(windows.look_s)
-    held = jnp.maximum(look_s, 1e-9)
+    held = jnp.where(look_s > 0.0, look_s, LONGEST_S)
 
     def integral(at_s: Any, time_s: Any, command: Any, total: Any) -> Any:
         # At a row's own time the command before it: a delay can only grow from none.

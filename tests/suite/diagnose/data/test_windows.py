@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from suite.diagnose.data.windows import LENGTH_S, SLICES, cut, step_s, steps_before, take
+from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut, take
 from suite.diagnose.thresholds import Thresholds
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
@@ -15,13 +15,19 @@ def test_windows_hold_the_rows_and_commands_of_their_time():
     windows, warnings = cut([log], PLAIN, False)
     assert windows is not None and not warnings
     assert len(windows.flight) == 3 and np.diff(windows.start_s).min() >= LENGTH_S - 1e-9
-    dt, first = step_s(PLAIN), sum(steps_before(step_s(PLAIN)))
-    assert windows.command.shape[1] == first + round(LENGTH_S / dt)
+    burn_in = windows.burn_in_rate_b.shape[1]
+    np.testing.assert_allclose(windows.edge_s[:, [0, burn_in, -1]], [[-BURN_IN_S, 0, LENGTH_S]] * 3)
+    steps = windows.rotor_speed.shape[1]
+    assert steps % STEPS == 0 and windows.edge_s.shape[1] == burn_in + steps + 1
+    assert np.diff(windows.edge_s).min() >= 0.0
     row = int(np.searchsorted(log.time_s, windows.start_s[1] - 1e-9))
     np.testing.assert_array_equal(windows.pos_w[1], log.pos_w[row])
     np.testing.assert_array_equal(windows.row_pos_w[1][7], log.pos_w[row + 7])
     assert log.thrust_cmd is not None
-    assert windows.command[1, first, 0] == log.thrust_cmd[row]
+    now = int(np.searchsorted(windows.command_s[1], -1e-9))
+    assert windows.command[1, now, 0] == log.thrust_cmd[row]
+    held = np.diff(windows.command_s[1, now : now + 2]) * windows.command[1, now]
+    np.testing.assert_allclose(np.diff(windows.command_sum[1, now : now + 2], axis=0)[0], held)
     chosen = take(windows, windows.start_s > 1.0)
     np.testing.assert_array_equal(chosen.pos_w, windows.pos_w[1:])
 

@@ -34,10 +34,10 @@ def logs_of(ways, rng):
 def test_the_simulated_log_has_it():
     """Residuals of a flight without noise all but vanish where the model has the true fault."""
     ways = [Trajectory("figure_eight", duration_s=4.0, speed=4.0, size=2.0, turn="wobble")]
-    windows, _ = cut(logs_of(ways, None), GIVEN, False)
+    windows, _ = cut(logs_of(ways, None), GIVEN, False, integrator="euler")
     assert windows is not None
     space = make_space(GIVEN)
-    model, start = RolloutModel(GIVEN, space, False, False), space.array("start")
+    model, start = RolloutModel(GIVEN, space, False, False, "euler"), space.array("start")
     true = start.copy()
     names = [(e.effect, e.parameter, e.component) for e in space.entries]
     for (parameter, component), value in {
