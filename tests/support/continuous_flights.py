@@ -1,4 +1,4 @@
-"""Flights in continuous time: the equations of docs/conventions.md integrated finely, by themselves.
+"""Flights in continuous time: the equations of a quadrotor integrated finely, by themselves.
 
 Nothing here is the model's: Runge-Kutta of order 4 at a fixed fine step between the events of one
 flight (a row's stamp, a look of the rate loop, a command that arrives late), scalar loops, so that
@@ -77,10 +77,12 @@ class Truth:
         two = self.slope(moved(one, h / 2), asked)
         three = self.slope(moved(two, h / 2), asked)
         four = self.slope(moved(three, h), asked)
-        new = SimpleNamespace(**{
-            k: v + h / 6 * (getattr(one, k) + 2 * getattr(two, k) + 2 * getattr(three, k) + getattr(four, k))
-            for k, v in vars(state).items()
-        })  # fmt: skip
+        mean = {
+            k: (getattr(one, k) + 2 * getattr(two, k) + 2 * getattr(three, k) + getattr(four, k))
+            / 6
+            for k in vars(state)
+        }
+        new = moved(SimpleNamespace(**mean), h)
         if self.lag_s == 0.0:
             new.speed = asked
         return new

@@ -1,0 +1,57 @@
+"""The model of a window against flights integrated finely, at any spacing of rows and any loop."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from suite.diagnose.data.windows import SLICES, cut
+from suite.diagnose.fit.model import RolloutModel
+from suite.diagnose.fit.parameters import make_space
+from tests.support.continuous_flights import fly_finely
+from tests.support.diagnosis_flights import NOISE
+from tests.support.vehicles import PLAIN, with_effects
+
+DRAG = (0.3, 0.35, 0.1)
+CHANNELS = {"position": "pos", "attitude": "att", "velocity": "vel", "rates": "rate",
+            "accelerometer": "acc"}  # fmt: skip
+
+
+def beyond_noise(frequency, rate_hz, jitter=0.3, lag=0.0, delay=0.0, seed=1):
+    """Return the RMS of (simulated - measured) over the noise of each channel, truth known."""
+    vehicle = replace(PLAIN, controller=replace(PLAIN.controller, frequency=frequency))
+    log = fly_finely(vehicle, seed, 2.5, rate_hz, jitter, lag_s=lag, delay_s=delay, drag=DRAG)
+    late = {"command_delay": (delay,)} if delay else {}
+    truth = with_effects(vehicle, linear_drag=(DRAG,), motor_lag=(lag,), **late)
+    windows, _ = cut([log], truth, False)
+    assert windows is not None and len(windows.flight) == 2
+    model = RolloutModel(truth, make_space(truth), False, False)
+    start = np.zeros((len(windows.flight), model.free))
+    residual = model.residual(model.space.array("start"), start, windows)
+    return {
+        name: float(np.sqrt((residual[..., SLICES[name]] ** 2).mean())) / NOISE[short]
+        for name, short in CHANNELS.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("frequency", "rate_hz", "lag", "delay"),
+    [
+        (500.0, 100.0, 0.0, 0.0),
+        (500.0, 100.0, 0.03, 0.0),
+        (1000.0, 100.0, 0.015, 0.0),
+        (2000.0, 100.0, 0.0, 0.01),
+        (200.0, 100.0, 0.03, 0.0273),
+        (500.0, 50.0, 0.03, 0.0273),
+        (1000.0, 1000.0, 0.03, 0.005),
+    ],
+)
+def test_a_second_of_flight_is_met_within_a_tenth_of_the_noise(frequency, rate_hz, lag, delay):
+    for name, ratio in beyond_noise(frequency, rate_hz, lag=lag, delay=delay).items():
+        assert ratio < 0.1, (name, ratio)
+
+
+def test_a_delay_of_part_of_a_step_acts_inside_it():
+    """Slopes along the delay are those of flights with another one."""
+    found = [beyond_noise(500.0, 100.0, delay=delay)["rates"] for delay in (0.0007, 0.0013)]
+    assert max(found) < 0.1
