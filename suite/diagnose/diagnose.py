@@ -130,10 +130,10 @@ def _diagnose(
     found = search(model, windows, among, say, _take(linear, inside), seed, limits)
 
     held = _held_out(logs, vehicle, rotor_input, apart, limits, integrator)
-    before = measure(model, begin.theta, held, found.sigma, limits)
+    before = measure(model, begin.theta, held, found.noise, limits)
     after = before
     if found.named:
-        after = measure(model, found.estimate.theta, held, found.sigma, limits)
+        after = measure(model, found.estimate.theta, held, found.noise, limits)
         if worse(before, after, limits=limits):
             warnings.append("what was found on the fitted flights does not hold on held-out ones")
             found, after = _without_names(model, found), before
@@ -261,7 +261,7 @@ def _without_each(
             theta[list(one.indices)] = start[list(one.indices)]
             without = Estimate(theta, found.estimate.offset)
             theta = _refit(model, found, without, indices_of(others), limits)
-        gaps[one.label] = measure(model, theta, held, found.sigma, limits)
+        gaps[one.label] = measure(model, theta, held, found.noise, limits)
     return gaps
 
 
@@ -276,7 +276,7 @@ def _control(
         return None
     start = start_estimate(model, found.windows)
     theta = _refit(model, found, start, list(wrong.indices), limits)
-    return wrong.label, measure(model, theta, held, found.sigma, limits)
+    return wrong.label, measure(model, theta, held, found.noise, limits)
 
 
 def _refit(

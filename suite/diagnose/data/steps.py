@@ -92,7 +92,7 @@ def padded_grid(grid: StepGrid, count: int, at_front: bool = False) -> StepGrid:
 
 
 def _kept(row_s: np.ndarray, shortest_s: float) -> np.ndarray:
-    """Return the rows that end steps, first and last among them, no two nearer than `shortest_s`."""
+    """Return the rows that end steps, first and last among them, `shortest_s` apart or more."""
     if len(row_s) < 3 or np.diff(row_s).min() >= shortest_s:
         return np.arange(len(row_s))
     kept = [0]

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.stats import t as student
 
-from suite.diagnose.data.noise import noise_of
+from suite.diagnose.data.colour import measured_noise
 from suite.diagnose.data.windows import FlightWindows
 from suite.diagnose.fit.model import Linearisation, RolloutModel
 from suite.diagnose.fit.parameters import ParameterSpace
@@ -84,8 +84,8 @@ def information(
     limits: Thresholds = THRESHOLDS,
 ) -> np.ndarray:
     """Return what each window tells of each of the first `directions`, (W, K)."""
-    sigma = noise_of(linear.residual, windows, limits=limits)
-    whitening = make_whitening(linear, sigma, windows, limits)
+    noise = measured_noise(linear.residual, windows, limits)
+    whitening = make_whitening(linear, noise, windows, limits)
     return np.einsum("wkk->wk", normal_equations_of(whitening, linear, directions).hessian)
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.noise import noise_of
+from suite.diagnose.data.colour import Noise, measured_noise
 from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.fit.model import Linearisation, RolloutModel
 from suite.diagnose.fit.normal_equations import (
@@ -53,13 +53,18 @@ class SearchResult:
     estimate: Estimate
     equations: NormalEquations
     """Along the named numbers, at the end of the search."""
-    sigma: np.ndarray
-    """(19,) measurement noise of each channel in its unit; NaN where nothing was measured."""
+    noise: Noise
+    """Measured beside what was found."""
     whitening: Whitening
     first: list[CandidateScore]
     """Scores of all candidates before anything was named, best first."""
     explained: float
     """Fall of chi-square that the named effects bring."""
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(19,) measurement noise of each channel in its unit; NaN where nothing was measured."""
+        return self.noise.sigma
 
     @property
     def candidates(self) -> list[Candidate]:
@@ -110,7 +115,7 @@ class _Look(NamedTuple):
     """As long as these slopes can be trusted."""
     whitening: Whitening
     equations: NormalEquations
-    sigma: np.ndarray
+    noise: Noise
 
 
 def search(
@@ -154,7 +159,7 @@ def search(
         _, nothing = task.fit(look, start_estimate(model, look.windows), [])
     explained = float(nothing.chi2.sum() - last.chi2.sum())
     return SearchResult(
-        tuple(named), look.windows, estimate, last, look.sigma, look.whitening, first, explained
+        tuple(named), look.windows, estimate, last, look.noise, look.whitening, first, explained
     )
 
 
@@ -188,11 +193,11 @@ def _look(task: _Task, estimate: Estimate, known: Linearisation | None = None) -
     linear = known
     if linear is None:
         linear = model.linearise(estimate.theta, estimate.offset, task.windows, None)
-    sigma = noise_of(linear.residual, task.windows, limits=limits)
+    noise = measured_noise(linear.residual, task.windows, limits)
     view = trusted(task.windows, linear.residual, limits)
-    whitening = make_whitening(linear, sigma, view, limits)
+    whitening = make_whitening(linear, noise, view, limits)
     equations = normal_equations_of(whitening, linear, model.size)
-    return _Look(linear, view, whitening, equations, sigma)
+    return _Look(linear, view, whitening, equations, noise)
 
 
 def _best_of_short_list(

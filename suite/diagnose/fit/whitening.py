@@ -8,13 +8,15 @@ well, but for rows that say how large they may be.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import eval_legendre
 
+from suite.diagnose.data.colour import Noise, colour_filter
 from suite.diagnose.data.noise import rotor_noise
-from suite.diagnose.data.windows import FlightWindows
+from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.fit.model import Linearisation
 from suite.diagnose.fit.rollout import KNOTS, STATE
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -35,23 +37,29 @@ class Whitening(NamedTuple):
     """(W, 12, N, L) unit slow errors of pose, velocity and rates, channel by channel."""
     slow_freedom: np.ndarray
     """(W, 12) expected energy along them where there is noise only, by channel."""
+    filters: Mapping[str, np.ndarray]
+    """(W, N, N) by group of channels whose noise has a colour: from rows over their noise to
+    independent ones."""
 
 
 def make_whitening(
     linear: Linearisation,
-    sigma: np.ndarray,
+    noise: Noise,
     windows: FlightWindows,
     limits: Thresholds = THRESHOLDS,
 ) -> Whitening:
-    """Return the whitening of `windows` by the noise `sigma` (19,), each in its channel's unit.
+    """Return the whitening of `windows` by their noise.
 
     The last columns of the slopes in `linear` are those along what is free.
     """
-    weight = np.where(windows.seen, 1.0 / np.where(np.isfinite(sigma), sigma, 1.0), 0.0)
+    sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 1.0)
+    weight = np.where(windows.seen, 1.0 / sigma, 0.0)
+    filters = {name: colour_filter(noise, name, windows) for name in noise.coloured}
     count, rows, channels = weight.shape
     size = linear.offset.shape[1]
     prior = np.full(size - STATE, 1.0 / rotor_spread(windows, limits) if size > STATE else 1.0)
-    slope = (linear.slope[..., -size:] * weight[..., None]).reshape(count, -1, size)
+    slope = _filtered(linear.slope[..., -size:] * weight[..., None], filters)
+    slope = slope.reshape(count, -1, size)
     held = np.zeros((count, size - STATE, size))
     held[:, :, STATE:] = np.diag(prior)
     start, upper = orthonormal(np.concatenate([slope, held], axis=1), limits.singular)
@@ -64,7 +72,7 @@ def make_whitening(
     inside = start[:, : rows * channels].reshape(count, rows, channels, size)[:, :, :STATE]
     taken = np.moveaxis(inside, 1, 3) @ slow
     slow_freedom = (slow**2).sum(axis=(2, 3)) - (taken**2).sum(axis=(2, 3))
-    return Whitening(weight, prior, start, upper, slow, slow_freedom)
+    return Whitening(weight, prior, start, upper, slow, slow_freedom, filters)
 
 
 def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.ndarray]:
@@ -102,9 +110,21 @@ def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> flo
 def whiten(whitening: Whitening, values: np.ndarray) -> np.ndarray:
     """Return `values` (W, N, 19, K) over their noise, (W, M, K), with zeros in the last rows."""
     count, rows, channels, directions = values.shape
-    flat = (values * whitening.weight[..., None]).reshape(count, rows * channels, directions)
+    over = _filtered(values * whitening.weight[..., None], whitening.filters)
+    flat = over.reshape(count, rows * channels, directions)
     last = np.zeros((count, len(whitening.prior), directions))
     return np.concatenate([flat, last], axis=1)
+
+
+def _filtered(over: np.ndarray, filters: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return rows over their noise (W, N, 19, K) as independent ones; changes `over`."""
+    count, rows, _, directions = over.shape
+    for name, one in filters.items():
+        part = over[:, :, SLICES[name]]
+        width = part.shape[2]
+        flat = one @ part.reshape(count, rows, width * directions)
+        over[:, :, SLICES[name]] = flat.reshape(count, rows, width, directions)
+    return over
 
 
 def project_out_start(whitening: Whitening, white: np.ndarray) -> np.ndarray:

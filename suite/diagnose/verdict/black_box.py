@@ -58,20 +58,20 @@ def compare_black_box(
     """
     began = time.monotonic()
     limits, search = diagnosis.limits, diagnosis.search
-    model, sigma, held = diagnosis.model, search.sigma, diagnosis.held_windows
+    model, noise, held = diagnosis.model, search.noise, diagnosis.held_windows
 
     def show(part: int) -> Callable[[int, str], None]:
         return lambda step, words: progress(0.5 * (part + step / config.iterations), words)
 
     known = _not_held_out(diagnosis.cut(limits.check_stride_s), held)
-    params = fit_black_box(model, known, sigma, config, show(0))
+    params = fit_black_box(model, known, noise, config, show(0))
     held_out = BlackBoxComparison(
         judged_on="flights left out",
         fitted=len(known.flight),
         judged=len(held.flight),
         before=diagnosis.before,
         named=diagnosis.after if search.named else None,
-        black_box=black_box_gap(model, params, held, sigma, limits),
+        black_box=black_box_gap(model, params, held, noise, limits),
     )
     every = diagnosis.cut(LENGTH_S)
     top, mean = _speeds(diagnosis.logs, every)
@@ -79,21 +79,21 @@ def compare_black_box(
     slow, fast = take(every, top <= split), take(every, mean > split)
     outside = None
     if min(len(slow.flight), len(fast.flight)) >= limits.least_judged:
-        params = fit_black_box(model, slow, sigma, replace(config, seed=config.seed + 1), show(1))
+        params = fit_black_box(model, slow, noise, replace(config, seed=config.seed + 1), show(1))
         named = None
         if search.named:
             start = start_estimate(model, slow)
             linear = model.linearise(start.theta, start.offset, slow, model.starts)
-            whitening = make_whitening(linear, sigma, slow, limits)
+            whitening = make_whitening(linear, noise, slow, limits)
             best, _ = fit(model, slow, whitening, start, search.indices, limits=limits)
-            named = measure(model, best.theta, fast, sigma, limits)
+            named = measure(model, best.theta, fast, noise, limits)
         outside = BlackBoxComparison(
             judged_on=f"speeds above {split:.1f} m/s, fitted below",
             fitted=len(slow.flight),
             judged=len(fast.flight),
-            before=measure(model, diagnosis.start, fast, sigma, limits),
+            before=measure(model, diagnosis.start, fast, noise, limits),
             named=named,
-            black_box=black_box_gap(model, params, fast, sigma, limits),
+            black_box=black_box_gap(model, params, fast, noise, limits),
         )
     return BlackBoxComparisons(held_out, outside, split, time.monotonic() - began)
 

@@ -22,6 +22,7 @@ from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Motion
 from eval.quadrotor.stepper import Feedback, Inputs
 from policies.networks import delta_network
+from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.windows import FlightWindows, take
 from suite.diagnose.fit.model import BATCH, RolloutModel, batches
 from suite.diagnose.fit.rollout import STATE
@@ -50,11 +51,11 @@ class BlackBoxConfig:
 def fit_black_box(
     model: RolloutModel,
     windows: FlightWindows,
-    sigma: np.ndarray,
+    noise: Noise,
     config: BlackBoxConfig,
     show: Callable[[int, str], None] = lambda *_: None,
 ) -> dict[str, np.ndarray]:
-    """Return the network fitted to `windows`, of noise `sigma` (19,), at the start numbers.
+    """Return the network fitted to `windows`, of such `noise`, at the start numbers.
 
     `show` is called with (iteration, words) as it goes.
 
@@ -64,7 +65,7 @@ def fit_black_box(
     theta = model.space.array("start")
     offset = true_starts(model, theta, windows)
     slope = model.linearise(theta, offset, windows, model.starts).slope[..., :STATE, :STATE]
-    weight = 1.0 / (noise_floor(slope, start_noise(sigma, windows, STATE)) + 1e-9)
+    weight = 1.0 / (noise_floor(slope, start_noise(noise.sigma, windows, STATE)) + 1e-9)
     optimizer = optax.adam(optax.cosine_decay_schedule(config.rate, config.iterations))
 
     def loss(params: Any, offset: Any, windows: FlightWindows, weight: Any) -> Any:
@@ -96,7 +97,7 @@ def black_box_gap(
     model: RolloutModel,
     params: dict[str, np.ndarray],
     windows: FlightWindows,
-    sigma: np.ndarray,
+    noise: Noise,
     limits: Thresholds = THRESHOLDS,
 ) -> Gap:
     """Return the gap on `windows` that is left with the fitted network."""
@@ -106,7 +107,7 @@ def black_box_gap(
     fly = jax.jit(lambda x, w: _apart(model, theta, params, x, w))
     with jax.enable_x64(True):
         parts = [np.asarray(fly(x, w))[:count] for x, w, count in batches(offset, windows)]
-    return gap_of(linear._replace(residual=-np.concatenate(parts)), windows, sigma, limits)
+    return gap_of(linear._replace(residual=-np.concatenate(parts)), windows, noise, limits)
 
 
 def _start(seed: int) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.effects.log_faults import lateness
+from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.windows import SLICES, STATE_GROUPS, FlightWindows
 from suite.diagnose.fit.model import Linearisation, RolloutModel
 from suite.diagnose.fit.normal_equations import normal_equations_of
@@ -56,31 +57,31 @@ def measure(
     model: RolloutModel,
     theta: np.ndarray,
     windows: FlightWindows,
-    sigma: np.ndarray,
+    noise: Noise,
     limits: Thresholds = THRESHOLDS,
 ) -> Gap:
-    """Return the gap of `model` at `theta` (P,) on `windows` with noise `sigma` (19,)."""
+    """Return the gap of `model` at `theta` (P,) on `windows` with `noise`."""
     offset = true_starts(model, theta, windows)
     linear = model.linearise(theta, offset, windows, model.starts)
-    return gap_of(linear, windows, sigma, limits)
+    return gap_of(linear, windows, noise, limits)
 
 
 def gap_of(
     linear: Linearisation,
     windows: FlightWindows,
-    sigma: np.ndarray,
+    noise: Noise,
     limits: Thresholds = THRESHOLDS,
 ) -> Gap:
     """Return the gap of residuals; the slopes in `linear` are those along what is free."""
-    whitening = make_whitening(linear, sigma, windows, limits)
+    whitening = make_whitening(linear, noise, windows, limits)
     slow = normal_equations_of(whitening, linear, 0).slow_energy
     score = slow.sum(axis=1) / whitening.slow_freedom.sum(axis=1)
-    noise = start_noise(sigma, windows, linear.offset.shape[1], limits)
+    free = start_noise(noise.sigma, windows, linear.offset.shape[1], limits)
     table = {}
     for horizon in HORIZONS_S:
         at = at_horizon(windows, horizon)
         error = linear.residual[at][:, :STATE]
-        floor = np.maximum(noise_floor(linear.slope[at][:, :STATE], noise), 1e-12)
+        floor = np.maximum(noise_floor(linear.slope[at][:, :STATE], free), 1e-12)
         table[horizon] = {
             name: (_rms(error[:, SLICES[name]]), _rms(floor[:, SLICES[name]]))
             for name in STATE_GROUPS

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from suite.common.errors import WorkFailed
+from suite.diagnose.data.colour import measured_noise
 from suite.diagnose.data.noise import noise_of
 from suite.diagnose.fit.model import RolloutModel
 from suite.diagnose.fit.normal_equations import (
@@ -81,7 +82,7 @@ def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]
     while True:
         linear = model.linearise(state.theta, state.offset, task.windows, [*indices, *model.starts])
         view = trusted(task.windows, linear.residual)
-        whitening = make_whitening(linear, noise_of(linear.residual, task.windows), view)
+        whitening = make_whitening(linear, measured_noise(linear.residual, task.windows), view)
         state, equations = fit(model, view, whitening, state, indices)
         if view.seen.sum() <= seen:
             return state.theta[indices], equations

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS
+from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.windows import cut
 from suite.diagnose.fit.model import BATCH, DIRECTIONS, RolloutModel, batches
 from suite.diagnose.fit.normal_equations import normal_equations_of, start_estimate
@@ -84,7 +85,7 @@ def test_batches_are_of_one_size_and_whole(flown):
 def test_what_the_start_explains_is_projected_out(flown):
     model, windows, linear = flown
     sigma = np.where(windows.seen.any(axis=(0, 1)), 0.01, np.nan)
-    whitening = make_whitening(linear, sigma, windows)
+    whitening = make_whitening(linear, Noise(sigma, {}), windows)
     moved = np.random.default_rng(0).standard_normal((len(windows.flight), STATE))
     slope = linear.slope[..., -STATE:]
     by_start = np.einsum("wnck,wk->wnc", slope, moved)[..., None]

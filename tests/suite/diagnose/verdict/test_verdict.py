@@ -96,7 +96,7 @@ def test_a_diagnosis_is_measured_on_what_was_held_out(drag):
     assert isinstance(drag, diagnosis.Diagnosis) and drag.verdict.label == "named"
     assert drag.input_source == "commands" and drag.fitted is not None
     sigma, held = drag.search.sigma, drag.held_windows
-    again = measure(drag.model, drag.fitted, held, sigma)
+    again = measure(drag.model, drag.fitted, held, drag.search.noise)
     np.testing.assert_array_equal(again.score, drag.after.score)
     assert drag.after.rms < 1.3 < drag.before.rms
     noise = start_noise(sigma, held, drag.model.free)
