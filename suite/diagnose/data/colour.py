@@ -17,9 +17,8 @@ from suite.diagnose.data.noise import noise_of
 from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
-SHARES = (0.3, 0.6, 0.85, 0.97)
-LASTS_S = (0.01, 0.025, 0.06, 0.15)
-"""Where the search for the best colour begins: the best pair of these."""
+TRIED = ((0.6, 0.02), (0.6, 0.08), (0.95, 0.02), (0.95, 0.08), (0.95, 0.2))
+"""Shares and times T [s] of which the likeliest is where the search for a colour begins."""
 LEAST_ROWS = 30
 """A window with fewer rows says nothing of colours."""
 
@@ -35,7 +34,7 @@ class Noise(NamedTuple):
 
 
 class _Stretches(NamedTuple):
-    """Rows of one group of channels, the same number N of each of V windows."""
+    """Rows of channels that were seen together, the same number N each of V windows."""
 
     time_s: np.ndarray
     """(V, N) [s]."""
@@ -50,17 +49,29 @@ def measured_noise(
 ) -> Noise:
     """Return the noise in `residual` (W, N, 19), measured - simulated in `windows`."""
     sigma, coloured = noise_of(residual, windows, limits=limits), {}
+    seen = {name: np.asarray(windows.seen)[..., at].all(axis=-1) for name, at in SLICES.items()}
+    together: dict[bytes, list[str]] = {}
     for name, channels in SLICES.items():
-        stretches = _stretches(residual, windows, channels, limits)
-        if stretches is None or not np.isfinite(sigma[channels]).all():
+        if np.isfinite(sigma[channels]).all():
+            together.setdefault(seen[name].tobytes(), []).append(name)
+    for names in together.values():
+        channels = np.concatenate([np.arange(19)[SLICES[name]] for name in names])
+        stretches = _stretches(residual[..., channels], windows, seen[names[0]], limits)
+        if stretches is None:
             continue
-        found = _colour(stretches, limits)
-        if found is not None:
-            coloured[name] = found
-            energy, freedom, _ = _whitened(stretches, *found)
+        tried = [(pair, _likelihood(stretches, *pair)) for pair in ((0.0, 1.0), *TRIED)]
+        for name in names:
+            at = np.isin(channels, np.arange(19)[SLICES[name]])
+            (_, white), *others = [(pair, float(likely[at].sum())) for pair, likely in tried]
+            start, best = max(others, key=lambda one: one[1])
+            if best - white < limits.colour_gain:
+                continue
+            own = stretches._replace(values=stretches.values[..., at])
+            coloured[name] = _likeliest(own, start)
+            energy, freedom, _ = _beside_polynomial(own, *coloured[name])
             # The median of chi-square over n is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
             level = np.median(energy / freedom, axis=0) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
-            sigma[channels] = np.maximum(np.sqrt(level), sigma[channels])
+            sigma[SLICES[name]] = np.maximum(np.sqrt(level), sigma[SLICES[name]])
     return Noise(sigma, coloured)
 
 
@@ -83,9 +94,9 @@ def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray
 
 
 def _stretches(
-    residual: np.ndarray, windows: FlightWindows, channels: slice, limits: Thresholds
+    values: np.ndarray, windows: FlightWindows, seen: np.ndarray, limits: Thresholds
 ) -> _Stretches | None:
-    seen = np.asarray(windows.seen)[..., channels].all(axis=-1)
+    """Return the rows of `values` (W, N, C) that were `seen` (W, N); None where too few are."""
     count = seen.sum(axis=1)
     if not len(count) or count.max() < LEAST_ROWS:
         return None
@@ -94,48 +105,52 @@ def _stretches(
     chosen = chosen[:: -(-len(chosen) // limits.colour_windows)]
     first = np.argsort(~seen[chosen], axis=1, kind="stable")[:, :rows]
     time_s = np.take_along_axis(np.asarray(windows.row_s)[chosen], first, axis=1)
-    values = np.take_along_axis(residual[chosen][..., channels], first[..., None], axis=1)
     span = time_s - time_s.mean(axis=1, keepdims=True)
     span = span / np.abs(span).max(axis=1, keepdims=True)
-    return _Stretches(time_s, values, span[..., None] ** np.arange(limits.colour_degree + 1))
+    powers = span[..., None] ** np.arange(limits.colour_degree + 1)
+    return _Stretches(time_s, np.take_along_axis(values[chosen], first[..., None], axis=1), powers)
 
 
-def _whitened(stretches: _Stretches, share: float, lasts_s: float) -> tuple[np.ndarray, int, float]:
-    """Return the energy (V, C) beside the polynomial, its degrees of freedom, and log-likelihood.
+def _beside_polynomial(
+    stretches: _Stretches, share: float, lasts_s: float
+) -> tuple[np.ndarray, int, np.ndarray]:
+    """Return the energy (V, C) beside the polynomial, its freedom, and log-determinants (V,).
 
-    Every stretch has a size of noise of its own, so that a few bad ones do not decide.
+    Rows are whitened by the colour first.
     """
     lower = np.linalg.cholesky(_correlation(stretches.time_s, share, lasts_s))
     over = np.linalg.solve(lower, np.concatenate([stretches.powers, stretches.values], axis=-1))
     degree = stretches.powers.shape[-1]
-    basis, upper = np.linalg.qr(over[..., :degree])
-    values = over[..., degree:]
-    left = values - basis @ (np.swapaxes(basis, 1, 2) @ values)
-    energy, freedom = (left**2).sum(axis=1), stretches.values.shape[1] - degree
+    powers, values = over[..., :degree], over[..., degree:]
+    turned = np.swapaxes(powers, 1, 2)
+    gram, along = turned @ powers, turned @ values
+    energy = (values**2).sum(axis=1) - (along * np.linalg.solve(gram, along)).sum(axis=1)
     spread = np.log(np.einsum("vii->vi", lower)).sum(axis=1)
-    spread += np.log(np.abs(np.einsum("vii->vi", upper))).sum(axis=1)
+    return energy, values.shape[1] - degree, spread + 0.5 * np.linalg.slogdet(gram)[1]
+
+
+def _likelihood(stretches: _Stretches, share: float, lasts_s: float) -> np.ndarray:
+    """Return the restricted log-likelihood (C,) of a colour.
+
+    Every stretch has a size of noise of its own, so that a few bad ones do not decide.
+    """
+    energy, freedom, spread = _beside_polynomial(stretches, share, lasts_s)
     size = 0.5 * freedom * np.log(np.maximum(energy, 1e-300))
-    return energy, freedom, -float((spread[:, None] + size).sum())
+    return -(spread[:, None] + size).sum(axis=0)
 
 
-def _colour(stretches: _Stretches, limits: Thresholds) -> tuple[float, float] | None:
-    """Return (share, T) of the likeliest colour; None where white noise is as good."""
-
-    def likelihood(share: float, lasts_s: float) -> float:
-        return _whitened(stretches, share, lasts_s)[2]
-
-    white = likelihood(0.0, 1.0)
-    start = max(
-        ((share, lasts_s) for share in SHARES for lasts_s in LASTS_S),
-        key=lambda pair: likelihood(*pair),
-    )
-    if likelihood(*start) - white < limits.colour_gain:
-        return None
+def _likeliest(stretches: _Stretches, start: tuple[float, float]) -> tuple[float, float]:
+    """Return (share, T) of the likeliest colour, from `start` on."""
 
     def pair(x: np.ndarray) -> tuple[float, float]:
         return float(1.0 / (1.0 + np.exp(-x[0]))), float(np.exp(np.clip(x[1], -6.0, 0.0)))
 
     begin = np.array([np.log(start[0] / (1.0 - start[0])), np.log(start[1])])
-    options = {"maxfev": 50, "xatol": 0.02, "fatol": 0.2}
-    best = minimize(lambda x: -likelihood(*pair(x)), begin, method="Nelder-Mead", options=options)
+    options = {"maxfev": 40, "xatol": 0.05, "fatol": 0.2}
+    best = minimize(
+        lambda x: -_likelihood(stretches, *pair(x)).sum(),
+        begin,
+        method="Nelder-Mead",
+        options=options,
+    )
     return pair(best.x)

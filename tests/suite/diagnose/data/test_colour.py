@@ -33,7 +33,7 @@ def noise_like(windows, share, lasts_s, rng):
     return np.where(windows.seen, values, 0.0)
 
 
-@pytest.mark.parametrize(("share", "lasts_s"), [(0.85, 0.02), (0.7, 0.06), (0.9, 0.12)])
+@pytest.mark.parametrize(("share", "lasts_s"), [(0.85, 0.02), (0.7, 0.06), (0.9, 0.1)])
 def test_a_colour_is_found_where_it_is(windows, share, lasts_s):
     noise = measured_noise(noise_like(windows, share, lasts_s, np.random.default_rng(0)), windows)
     assert set(noise.coloured) == {GROUP}
