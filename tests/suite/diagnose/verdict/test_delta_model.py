@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.windows import CHANNELS, cut, take
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.fit.model import BATCH, RolloutModel
@@ -17,8 +18,12 @@ from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)
 TRUTH = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
-SIGMA = np.repeat(
-    [NOISE["pos"], NOISE["att"], NOISE["vel"], NOISE["rate"], np.nan], [3, 3, 3, 3, CHANNELS - 12]
+WHITE = Noise(
+    np.repeat(
+        [NOISE["pos"], NOISE["att"], NOISE["vel"], NOISE["rate"], np.nan],
+        [3, 3, 3, 3, CHANNELS - 12],
+    ),
+    {},
 )
 
 
@@ -34,8 +39,8 @@ def few():
 def test_a_network_that_was_not_fitted_changes_nothing(few):
     model, windows = few
     params = {name: np.asarray(value) for name, value in _start(0).items()}
-    plain = measure(model, model.space.array("start"), windows, SIGMA)
-    boxed = black_box_gap(model, params, windows, SIGMA)
+    plain = measure(model, model.space.array("start"), windows, WHITE)
+    boxed = black_box_gap(model, params, windows, WHITE)
     np.testing.assert_allclose(boxed.score, plain.score, rtol=1e-6)
     assert plain.rms > 2.0
 
@@ -50,7 +55,7 @@ def test_its_output_pushes_the_body(few):
     same = np.broadcast_to(push, (BATCH, KNOTS, 6))
     with jax.enable_x64(True):
         apart = np.asarray(jax.jit(model.fly)(theta, offset, windows, same)[0])
-    boxed = black_box_gap(model, params, windows, SIGMA)
+    boxed = black_box_gap(model, params, windows, WHITE)
     at = np.abs(np.asarray(windows.row_s) - 1.0).argmin(axis=1)
     error = apart[np.arange(BATCH), at][:, :3]
     rms = np.sqrt((error**2).sum(axis=1).mean())
@@ -73,6 +78,6 @@ def test_it_learns_and_the_named_effect_holds_up_better_outside():
 def test_the_same_seed_gives_the_same_network(few):
     model, windows = few
     config = BlackBoxConfig(iterations=3, seed=4)
-    one, two = (fit_black_box(model, windows, SIGMA, config) for _ in range(2))
+    one, two = (fit_black_box(model, windows, WHITE, config) for _ in range(2))
     assert all(np.array_equal(one[name], two[name]) for name in one)
     assert np.abs(one["output.weight"]).max() > 0.0
