@@ -1,9 +1,8 @@
 """Commands act late.
 
 A delay that is no multiple of the step makes a step's command the mean of the two that share it,
-so that a delay can be fitted by gradients. A plant that goes step by step weighs the commands that
-it remembers (`delayed`), and a flight whose commands are all known is delayed at once
-(`delayed_series`).
+so that a delay has a gradient. A flight whose commands are all known needs no memory of them: the
+diagnosis takes means over its own steps (`suite/diagnose/fit/rollout.py`).
 """
 
 from __future__ import annotations
@@ -47,18 +46,3 @@ def delayed(weight: Array, past: Array, command: Array) -> tuple[Array, Array]:
     xp = command.__array_namespace__()
     past = xp.concatenate([command[..., None], past[..., :-1]], axis=-1)
     return past, xp.matmul(past, xp.asarray(weight)[..., :, None])[..., 0]
-
-
-def delayed_series(commands: Array, delay: Array, dt: float, first: int) -> Array:
-    """Return the commands (B, T - first, C) that act in each step from `first` on.
-
-    Args:
-        commands: (B, T, C), one a step; those before `first` are what a delay may reach back to.
-        delay: () for all of them [s].
-        dt: length of a step [s].
-        first: the first step of interest.
-    """
-    xp = commands.__array_namespace__()
-    whole, part = whole_steps(delay, dt)
-    index = xp.arange(first, commands.shape[1]) - whole.astype(int)
-    return (1.0 - part) * commands[:, index] + part * commands[:, xp.maximum(index - 1, 0)]

@@ -18,9 +18,8 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.effects.interface import GRAVITY, Array, Flow, Gust
 from eval.quadrotor.delay import delayed
-from eval.quadrotor.mixer import mix
+from eval.quadrotor.mixer import mix, rate_torque
 from eval.quadrotor.plant import Command, Motion, Plant, Wrench, in_order, unpacked
-from eval.quadrotor.rate_loop import rate_torque
 from eval.quadrotor.rigid_body import euler_step
 from eval.quadrotor.rotors import RotorStep, follow, speed_command, steady
 from tracks.geometry.rotation import to_local

@@ -14,9 +14,8 @@ from beartype import beartype
 from jaxtyping import Float, Shaped, jaxtyped
 
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
-from eval.quadrotor.mixer import mix
+from eval.quadrotor.mixer import mix, rate_torque
 from eval.quadrotor.plant import Motion, Wrench, make_plant
-from eval.quadrotor.rate_loop import rate_torque
 from eval.quadrotor.rigid_body import accelerations, euler_step
 from eval.quadrotor.rotors import follow, speed_command
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
