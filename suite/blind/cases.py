@@ -23,6 +23,9 @@ ROTORPY_NULLS = 10
 """Cases of its set that hide nothing."""
 CONTINUOUS_FULL = {"null": 24, "single": 22, "pair": 10, "outside": 4}
 """Cases of the set that is flown in continuous time."""
+TOO_ROUGH = "hysteresis"
+"""Physics outside the catalogue that this set leaves out: at its usual strength the pass close to
+the ground mostly ends there."""
 MUJOCO, ROTORPY, CONTINUOUS = "mujoco", "rotorpy", "continuous"
 """Who can fly a case."""
 
@@ -113,7 +116,7 @@ def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case
     share = _share_of(count, sum(CONTINUOUS_FULL.values()))
     rng = np.random.default_rng([seed, 2])
     singles = rng.permutation(list(EFFECTS))
-    others = rng.permutation(list(KINDS))
+    others = rng.permutation([kind for kind in KINDS if kind != TOO_ROUGH])
     cases = []
     for kind, number in CONTINUOUS_FULL.items():
         for index in range(max(round(share * number), 1)):
