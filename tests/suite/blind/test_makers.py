@@ -51,7 +51,9 @@ def test_conditions_are_drawn_from_the_cases_seed():
     assert maker.conditions["row_hz"] == drawn.row_hz
     assert maker.given.controller.frequency == drawn.loop_hz
     assert maker.judged.controller.frequency == 500.0
-    assert not maker_of(Case("null", (), 0.0, "bare", "full", (1, 1)), None).conditions
+    assert not maker_of(
+        Case("null", (), 0.0, "bare", "full", (1, 1)), np.random.default_rng()
+    ).conditions
 
 
 def test_a_set_of_continuous_cases_gives_nothing_away(tmp_path, monkeypatch):
