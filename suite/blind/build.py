@@ -13,7 +13,6 @@ from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.blind.cases import Case
 from suite.blind.hidden import changed_values, draw_change, true_parameters
-from suite.blind.makers import Flights, Maker, maker_of
 from suite.blind.oracle.information import (
     ALLOWED,
     REQUIRED,
@@ -38,6 +37,7 @@ from suite.blind.oracle.stretches import (
     without_start,
 )
 from suite.blind.outside import KINDS, make_outside
+from suite.blind.simulators import Flights, Simulator, simulator_for
 from suite.common.errors import WorkFailed
 from suite.diagnose.plans.sensors import SENSORS, Sensors
 from suite.diagnose.plans.separating import SEPARATIONS
@@ -85,10 +85,10 @@ class _Unsuitable(Exception):
 
 def _attempt(case: Case, rng: np.random.Generator) -> Built:
     ways, sensors = _trajectories(case, rng), SENSORS[case.sensors]
-    maker = maker_of(case, rng)
-    nominal, ways = maker.judged, ways[: maker.most]
+    simulator = simulator_for(case, rng)
+    nominal, ways = simulator.judged, ways[: simulator.most]
     if case.kind == "outside":
-        return _outside(case, maker, sensors, ways, rng)
+        return _outside(case, simulator, sensors, ways, rng)
     changes, multiples, effects = {}, {}, {}
     # A pair's truth must not hang on what is logged of it.
     table = "capture" if case.separation >= 0 else case.sensors
@@ -101,8 +101,8 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
     has_voltage = bool(sensors.voltage)
     if case.separation >= 0 and has_voltage:
         _by_voltage(nominal, changes, effects)
-    truth = with_effects(maker.given, effects)
-    flown = maker.fly(truth, ways, rng)
+    truth = with_effects(simulator.given, effects)
+    flown = simulator.fly(truth, ways, rng)
     flights = flown.recordings
     answer: dict[str, Any] = {"kind": case.kind, "verdict": "no_gap", "effects": []}
     named = {name: change for name, change in changes.items() if not EFFECTS[name].random}
@@ -133,7 +133,7 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
         answer["effects"].append(entry)
     if case.hidden:
         answer["verdict"] = "named"
-    return _built(case, maker, truth, ways, flown, answer, rng)
+    return _built(case, simulator, truth, ways, flown, answer, rng)
 
 
 def _by_voltage(nominal: Vehicle, changes: dict[str, np.ndarray], effects: dict[str, Any]) -> None:
@@ -174,7 +174,7 @@ def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarra
 
 def _outside(
     case: Case,
-    maker: Maker,
+    simulator: Simulator,
     sensors: Sensors,
     ways: Sequence[Trajectory],
     rng: np.random.Generator,
@@ -184,13 +184,13 @@ def _outside(
     Its strength is worked out on a flight at the usual strength: `case.multiple` times what can
     just be detected after the whole catalogue was fitted to it.
     """
-    name, nominal = case.hidden[0], maker.judged
+    name, nominal = case.hidden[0], simulator.judged
     kind = KINDS[name]
-    trial = maker.fly(maker.given, ways, rng, make_outside(name, kind.usual, nominal.mass))
+    trial = simulator.fly(simulator.given, ways, rng, make_outside(name, kind.usual, nominal.mass))
     rest = unnameable(nominal, trial.recordings, sensors)
     wanted = case.multiple * kind.usual * np.sqrt(THRESHOLD / max(rest, 1e-9))
     strength = float(np.clip(wanted, 0.2 * kind.usual, kind.most))
-    flown = maker.fly(maker.given, ways, rng, make_outside(name, strength, nominal.mass))
+    flown = simulator.fly(simulator.given, ways, rng, make_outside(name, strength, nominal.mass))
     rest = unnameable(nominal, flown.recordings, sensors)
     pushed = np.concatenate([flight.extra.force_b for flight in flown.recordings]) / nominal.mass
     answer = {
@@ -205,7 +205,7 @@ def _outside(
             "rms_m_s2": float(np.sqrt((pushed**2).sum(-1).mean())),
         },
     }
-    return _built(case, maker, maker.given, ways, flown, answer, rng)
+    return _built(case, simulator, simulator.given, ways, flown, answer, rng)
 
 
 def unnameable(nominal: Vehicle, flights: Sequence[Recording], sensors: Sensors) -> float:
@@ -244,7 +244,7 @@ def _check_pair(info: Information, named: dict[str, np.ndarray], nominal: Vehicl
 
 def _built(
     case: Case,
-    maker: Maker,
+    simulator: Simulator,
     truth: Vehicle,
     ways: Sequence[Trajectory],
     flown: Flights,
@@ -252,8 +252,8 @@ def _built(
     rng: np.random.Generator,
 ) -> Built:
     logs = flown.logs(rng)
-    if maker.conditions:
-        answer = {**answer, "conditions": maker.conditions}
+    if simulator.conditions:
+        answer = {**answer, "conditions": simulator.conditions}
     answer = {
         **answer,
         "case": asdict(case),
@@ -261,4 +261,4 @@ def _built(
         # Without it the hash of a short answer could be guessed.
         "salt": rng.bytes(16).hex(),
     }
-    return Built(maker.given, truth, tuple(ways), logs, tuple(flown.recordings), answer)
+    return Built(simulator.given, truth, tuple(ways), logs, tuple(flown.recordings), answer)

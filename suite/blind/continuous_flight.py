@@ -13,8 +13,9 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Command, Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
+from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery, rotation
 from suite.blind.continuous.conditions import Conditions
-from suite.blind.continuous.engine import POS, QUAT, RATE, VEL, Battery, Flown, Rows, fly, rotation
+from suite.blind.continuous.engine import Flown, Rows, fly
 from suite.blind.continuous.log import Noise, log_of_flight, state_at
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import STEP_S, jittered_stamps, schedule

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
+from suite.blind.continuous.body import POS, QUAT, RATE, VEL
 from suite.blind.continuous.conditions import Conditions
-from suite.blind.continuous.engine import POS, QUAT, RATE, VEL, Flown
+from suite.blind.continuous.engine import Flown
 
 IN_A_ROW = 3
 """Rows without a pose follow each other in such stretches."""

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from suite.blind.continuous.engine import POS, QUAT, RATE, VEL, Battery, fly, rotation
+from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery, rotation
+from suite.blind.continuous.engine import fly
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import schedule
 from tests.support.vehicles import PLAIN, with_effects, with_lag

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery
 from suite.blind.continuous.conditions import Conditions
-from suite.blind.continuous.engine import POS, QUAT, RATE, VEL, Battery, fly
+from suite.blind.continuous.engine import fly
 from suite.blind.continuous.log import Noise, gauss_markov, log_of_flight, state_at, turned
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import jittered_stamps, schedule

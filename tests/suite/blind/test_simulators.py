@@ -12,7 +12,7 @@ from suite.blind.build import build
 from suite.blind.cases import Case
 from suite.blind.continuous.conditions import draw_conditions
 from suite.blind.make import make_set, open_answers
-from suite.blind.makers import maker_of
+from suite.blind.simulators import simulator_for
 from suite.common.console import Console
 
 SINGLE = Case(
@@ -46,12 +46,12 @@ def test_only_the_simulator_with_a_step_says_so():
 
 
 def test_conditions_are_drawn_from_the_cases_seed():
-    maker = maker_of(NULL, np.random.default_rng(3))
+    simulator = simulator_for(NULL, np.random.default_rng(3))
     drawn = draw_conditions(np.random.default_rng(3))
-    assert maker.conditions["row_hz"] == drawn.row_hz
-    assert maker.given.controller.frequency == drawn.loop_hz
-    assert maker.judged.controller.frequency == 500.0
-    assert not maker_of(
+    assert simulator.conditions["row_hz"] == drawn.row_hz
+    assert simulator.given.controller.frequency == drawn.loop_hz
+    assert simulator.judged.controller.frequency == 500.0
+    assert not simulator_for(
         Case("null", (), 0.0, "bare", "full", (1, 1)), np.random.default_rng()
     ).conditions
 

@@ -53,7 +53,7 @@ class Fly(Protocol):
 
 
 @dataclass(frozen=True)
-class Maker:
+class Simulator:
     """A simulator, set up for one case."""
 
     given: Vehicle
@@ -67,7 +67,7 @@ class Maker:
     """Under which it is flown and logged, for the answer."""
 
 
-def maker_of(case: Case, rng: np.random.Generator) -> Maker:
+def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
     """Return who flies `case`; `rng` is for the conditions, where a simulator draws any."""
     given, sensors = given_vehicle(case.vehicle), SENSORS[case.sensors]
 
@@ -93,7 +93,7 @@ def maker_of(case: Case, rng: np.random.Generator) -> Maker:
 
     if case.simulator != CONTINUOUS:
         most = ROTORPY_FLIGHTS if case.simulator == ROTORPY else None
-        return Maker(given, given, on_grid, most)
+        return Simulator(given, given, on_grid, most)
 
     conditions = draw_conditions(rng)
     looped = with_loop(given, conditions.loop_hz)
@@ -110,6 +110,6 @@ def maker_of(case: Case, rng: np.random.Generator) -> Maker:
             lambda rng: logs_of(flown, ways, truth, sensors, conditions, rng),
         )
 
-    return Maker(
+    return Simulator(
         looped, with_loop(given, GRID_HZ), in_continuous_time, conditions=asdict(conditions)
     )
