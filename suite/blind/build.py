@@ -27,7 +27,6 @@ from suite.blind.oracle.information import (
     signatures,
     start_of,
 )
-from suite.blind.oracle.strength import given_vehicle
 from suite.blind.oracle.stretches import (
     EVERY_S,
     LONG_S,
@@ -38,15 +37,13 @@ from suite.blind.oracle.stretches import (
     without_start,
 )
 from suite.blind.outside import KINDS, make_outside
-from suite.blind.rotorpy_flight import fly_rotorpy
+from suite.blind.simulators import Flights, Simulator, simulator_for
 from suite.common.errors import WorkFailed
-from suite.diagnose.plans.sensors import SENSORS, Sensors, log_of
+from suite.diagnose.plans.sensors import SENSORS, Sensors
 from suite.diagnose.plans.separating import SEPARATIONS
 from suite.diagnose.plans.simulate import FALL_V_PER_S, FlightFailed, Recording, fly
 from suite.diagnose.plans.trajectory import Trajectory, long_flights, ordinary_flights
 
-ROTORPY_FLIGHTS = 4
-"""Of the ordinary flights, for RotorPy is slow; its table of strengths has one more."""
 TRIES = 6
 """Draws of flights and strengths before a case is given up."""
 
@@ -87,10 +84,11 @@ class _Unsuitable(Exception):
 
 
 def _attempt(case: Case, rng: np.random.Generator) -> Built:
-    nominal, sensors = given_vehicle(case.vehicle), SENSORS[case.sensors]
-    ways = _trajectories(case, rng)
+    ways, sensors = _trajectories(case, rng), SENSORS[case.sensors]
+    simulator = simulator_for(case, rng)
+    nominal, ways = simulator.judged, ways[: simulator.most]
     if case.kind == "outside":
-        return _outside(case, nominal, sensors, ways, rng)
+        return _outside(case, simulator, sensors, ways, rng)
     changes, multiples, effects = {}, {}, {}
     # A pair's truth must not hang on what is logged of it.
     table = "capture" if case.separation >= 0 else case.sensors
@@ -103,12 +101,9 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
     has_voltage = bool(sensors.voltage)
     if case.separation >= 0 and has_voltage:
         _by_voltage(nominal, changes, effects)
-    truth = with_effects(nominal, effects)
-    if case.simulator == "rotorpy":
-        ways = ways[:ROTORPY_FLIGHTS]
-        flights = fly_rotorpy(nominal, truth, ways, sensors.rate_hz)
-    else:
-        flights = fly(nominal, truth, ways, sensors.rate_hz, rng=rng, has_voltage=has_voltage)
+    truth = with_effects(simulator.given, effects)
+    flown = simulator.fly(truth, ways, rng)
+    flights = flown.recordings
     answer: dict[str, Any] = {"kind": case.kind, "verdict": "no_gap", "effects": []}
     named = {name: change for name, change in changes.items() if not EFFECTS[name].random}
     info = long = None
@@ -138,7 +133,7 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
         answer["effects"].append(entry)
     if case.hidden:
         answer["verdict"] = "named"
-    return _built(case, nominal, truth, sensors, ways, flights, answer, rng)
+    return _built(case, simulator, truth, ways, flown, answer, rng)
 
 
 def _by_voltage(nominal: Vehicle, changes: dict[str, np.ndarray], effects: dict[str, Any]) -> None:
@@ -179,7 +174,7 @@ def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarra
 
 def _outside(
     case: Case,
-    nominal: Vehicle,
+    simulator: Simulator,
     sensors: Sensors,
     ways: Sequence[Trajectory],
     rng: np.random.Generator,
@@ -189,18 +184,15 @@ def _outside(
     Its strength is worked out on a flight at the usual strength: `case.multiple` times what can
     just be detected after the whole catalogue was fitted to it.
     """
-    name = case.hidden[0]
+    name, nominal = case.hidden[0], simulator.judged
     kind = KINDS[name]
-    trial = fly(
-        nominal, nominal, ways, sensors.rate_hz, make_outside(name, kind.usual, nominal.mass)
-    )
-    rest = unnameable(nominal, trial, sensors)
+    trial = simulator.fly(simulator.given, ways, rng, make_outside(name, kind.usual, nominal.mass))
+    rest = unnameable(nominal, trial.recordings, sensors)
     wanted = case.multiple * kind.usual * np.sqrt(THRESHOLD / max(rest, 1e-9))
     strength = float(np.clip(wanted, 0.2 * kind.usual, kind.most))
-    extra = make_outside(name, strength, nominal.mass)
-    flights = fly(nominal, nominal, ways, sensors.rate_hz, extra)
-    rest = unnameable(nominal, flights, sensors)
-    pushed = np.concatenate([flight.extra.force_b for flight in flights]) / nominal.mass
+    flown = simulator.fly(simulator.given, ways, rng, make_outside(name, strength, nominal.mass))
+    rest = unnameable(nominal, flown.recordings, sensors)
+    pushed = np.concatenate([flight.extra.force_b for flight in flown.recordings]) / nominal.mass
     answer = {
         "kind": case.kind,
         "verdict": "unknown",
@@ -213,7 +205,7 @@ def _outside(
             "rms_m_s2": float(np.sqrt((pushed**2).sum(-1).mean())),
         },
     }
-    return _built(case, nominal, nominal, sensors, ways, flights, answer, rng)
+    return _built(case, simulator, simulator.given, ways, flown, answer, rng)
 
 
 def unnameable(nominal: Vehicle, flights: Sequence[Recording], sensors: Sensors) -> float:
@@ -252,18 +244,16 @@ def _check_pair(info: Information, named: dict[str, np.ndarray], nominal: Vehicl
 
 def _built(
     case: Case,
-    nominal: Vehicle,
+    simulator: Simulator,
     truth: Vehicle,
-    sensors: Sensors,
     ways: Sequence[Trajectory],
-    flights: Sequence[Recording],
+    flown: Flights,
     answer: dict[str, Any],
     rng: np.random.Generator,
 ) -> Built:
-    logs = tuple(
-        log_of(flight, truth, sensors, rng, f"flight_{index + 1}")
-        for index, flight in enumerate(flights)
-    )
+    logs = flown.logs(rng)
+    if simulator.conditions:
+        answer = {**answer, "conditions": simulator.conditions}
     answer = {
         **answer,
         "case": asdict(case),
@@ -271,4 +261,4 @@ def _built(
         # Without it the hash of a short answer could be guessed.
         "salt": rng.bytes(16).hex(),
     }
-    return Built(nominal, truth, tuple(ways), logs, tuple(flights), answer)
+    return Built(simulator.given, truth, tuple(ways), logs, tuple(flown.recordings), answer)

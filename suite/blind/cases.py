@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +21,13 @@ SETS = {"tuning": 1_000_000, "published": 2_000_000}
 """Seeds of the two sets; the published one is run once."""
 ROTORPY_NULLS = 10
 """Cases of its set that hide nothing."""
+CONTINUOUS_FULL = {"null": 24, "single": 22, "pair": 10, "outside": 4}
+"""Cases of the set that is flown in continuous time."""
+TOO_ROUGH = "hysteresis"
+"""Physics outside the catalogue that this set leaves out: at its usual strength the pass close to
+the ground mostly ends there."""
+MUJOCO, ROTORPY, CONTINUOUS = "mujoco", "rotorpy", "continuous"
+"""Who can fly a case."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +48,8 @@ class Case:
     """Of everything else: the set's seed and the case's number within its kind."""
     separation: int = -1
     """Number of the entry of `SEPARATIONS`, where there is one."""
-    simulator: str = "mujoco"
-    """Who flies it: mujoco or rotorpy."""
+    simulator: str = MUJOCO
+    """Who flies it."""
 
 
 def full_count() -> int:
@@ -59,14 +67,13 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     Raises:
         ValueError: for a count below 1.
     """
-    if count is not None and count < 1:
-        raise ValueError(f"count = {count}: must be at least 1")
-    share = 1.0 if count is None else min(count / full_count(), 1.0)
+    share = _share_of(count, full_count())
     rng = np.random.default_rng([seed, 0])
     cases = _singles(rng, seed, share)
     for kind, number in FULL.items():
         for index in range(max(round(share * number), 1)):
-            cases.append(_drawn(rng, kind, index, seed))
+            own = (seed, 20_000 + 1_000 * list(FULL).index(kind) + index)
+            cases.append(_drawn(rng, kind, index, own))
     order = rng.permutation(len(cases))
     digits = max(len(str(len(cases))), 3)
     return {f"case_{i + 1:0{digits}d}": cases[at] for i, at in enumerate(order)}
@@ -89,9 +96,54 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
         sensors = str(rng.choice(["capture", "estimator", "full"]))
         kind, number = ("single" if hidden else "null"), (seed, 50_000 + int(index))
         cases[f"case_{i + 1:03d}"] = Case(
-            kind, hidden, multiple, "bare", sensors, number, simulator="rotorpy"
+            kind, hidden, multiple, "bare", sensors, number, simulator=ROTORPY
         )
     return cases
+
+
+def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case]:
+    """Return the set that is flown in continuous time.
+
+    Every single effect is another one, half of them at each multiple.
+
+    Args:
+        seed: of the set.
+        count: about how many; every kind keeps its share, and at least one. All if not given.
+
+    Raises:
+        ValueError: for a count below 1.
+    """
+    share = _share_of(count, sum(CONTINUOUS_FULL.values()))
+    rng = np.random.default_rng([seed, 2])
+    singles = rng.permutation(list(EFFECTS))
+    others = rng.permutation([kind for kind in KINDS if kind != TOO_ROUGH])
+    cases = []
+    for kind, number in CONTINUOUS_FULL.items():
+        for index in range(max(round(share * number), 1)):
+            own = (seed, 70_000 + 1_000 * list(CONTINUOUS_FULL).index(kind) + index)
+            if kind == "single":
+                name, multiple = str(singles[index]), MULTIPLES[index % len(MULTIPLES)]
+                case = Case(kind, (name,), multiple, *_equipment(rng, (name,)), own)
+            else:
+                case = _drawn(rng, kind, index, own)
+            if kind == "outside":
+                case = replace(case, hidden=(str(others[index]),))
+            cases.append(replace(case, simulator=CONTINUOUS))
+    return {f"case_{i + 1:03d}": cases[at] for i, at in enumerate(rng.permutation(len(cases)))}
+
+
+DRAWERS: dict[str, Callable[[int, int | None], dict[str, Case]]] = {
+    MUJOCO: draw_cases,
+    ROTORPY: draw_rotorpy_cases,
+    CONTINUOUS: draw_continuous_cases,
+}
+"""Who draws the cases of a simulator's set, from its seed and about how many there are to be."""
+
+
+def _share_of(count: int | None, full: int) -> float:
+    if count is not None and count < 1:
+        raise ValueError(f"count = {count}: must be at least 1")
+    return 1.0 if count is None else min(count / full, 1.0)
 
 
 def _singles(rng: np.random.Generator, seed: int, share: float) -> list[Case]:
@@ -106,8 +158,8 @@ def _singles(rng: np.random.Generator, seed: int, share: float) -> list[Case]:
     return found
 
 
-def _drawn(rng: np.random.Generator, kind: str, index: int, seed: int) -> Case:
-    number = (seed, 20_000 + 1_000 * list(FULL).index(kind) + index)
+def _drawn(rng: np.random.Generator, kind: str, index: int, number: tuple[int, int]) -> Case:
+    seed = number[0]
     if kind == "outside":
         name = list(KINDS)[index % len(KINDS)]
         vehicle, sensors = _equipment(rng, ())

@@ -16,7 +16,7 @@ from typing import Any
 from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import save_vehicle
 from suite.blind.build import build
-from suite.blind.cases import draw_cases, draw_rotorpy_cases
+from suite.blind.cases import DRAWERS, MUJOCO
 from suite.blind.oracle.strength import TABLE
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
@@ -39,7 +39,7 @@ class Manifest:
 
 
 def make_set(
-    out: Path, seed: int, count: int | None, console: Console, simulator: str = "mujoco"
+    out: Path, seed: int, count: int | None, console: Console, simulator: str = MUJOCO
 ) -> Manifest:
     """Make the cases that `out` does not have yet, and the manifest.
 
@@ -48,14 +48,14 @@ def make_set(
         seed: of the set.
         count: about how many cases; all if None.
         console: for progress.
-        simulator: `mujoco`, or `rotorpy` for the smaller set of another simulator.
+        simulator: who flies them, one of `DRAWERS`; all but `mujoco` have smaller sets.
 
     Raises:
         ValueError: where `out` holds a set of another seed, count, simulator or table of strengths.
     """
     about = {"seed": seed, "count": count, "simulator": simulator, "strengths": _hash(TABLE)}
     _same_set(out, about)
-    cases = draw_cases(seed, count) if simulator == "mujoco" else draw_rotorpy_cases(seed, count)
+    cases = DRAWERS[simulator](seed, count)
     failed: dict[str, str] = {}
     with console.progress("cases", len(cases)) as update:
         for done, (name, case) in enumerate(cases.items()):

@@ -29,8 +29,9 @@ class Config:
     """Of a set of your own, in place of the two."""
     count: int | None = None
     """About how many cases, every kind with its share; all 242 if not given."""
-    simulator: Literal["mujoco", "rotorpy"] = "mujoco"
-    """Who flies the cases; rotorpy makes a smaller set (pip install diffracing-suite[rotorpy])."""
+    simulator: Literal["mujoco", "rotorpy", "continuous"] = "mujoco"
+    """Who flies the cases: rotorpy (pip install diffracing-suite[rotorpy]) makes 30, continuous, an
+    engine in continuous time that shares no code with the model that fits, 60."""
     effects: tuple[str, ...] = ()
     """For plan: names that your data could not tell apart."""
     json: bool = False

@@ -22,8 +22,7 @@ def short_flights(monkeypatch):
 
 @pytest.fixture
 def small_set(tmp_path, monkeypatch, short_flights):
-    monkeypatch.setattr(
-        make_module, "draw_cases", lambda seed, count: {"case_001": SINGLE, "case_002": NULL}
-    )
+    cases = {"case_001": SINGLE, "case_002": NULL}
+    monkeypatch.setitem(make_module.DRAWERS, "mujoco", lambda seed, count: cases)
     make_set(tmp_path, 5, None, Console())
     return tmp_path

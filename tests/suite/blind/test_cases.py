@@ -5,7 +5,14 @@ from collections import Counter
 import pytest
 
 from eval.effects import EFFECTS
-from suite.blind.cases import SETS, draw_cases, draw_rotorpy_cases
+from suite.blind.cases import (
+    DRAWERS,
+    MULTIPLES,
+    SETS,
+    draw_cases,
+    draw_continuous_cases,
+    draw_rotorpy_cases,
+)
 
 
 def test_a_full_set_has_the_numbers_that_were_promised():
@@ -37,3 +44,29 @@ def test_sets_repeat_by_seed_and_do_not_share_cases():
     with pytest.raises(ValueError, match="count"):
         draw_cases(1, 0)
     assert {case.simulator for case in draw_rotorpy_cases(1).values()} == {"rotorpy"}
+
+
+def test_the_continuous_set_has_its_numbers_and_each_single_effect_once():
+    cases = draw_continuous_cases(SETS["published"])
+    kinds = Counter(case.kind for case in cases.values())
+    assert kinds == {"null": 24, "single": 22, "pair": 10, "outside": 4}
+    singles = [case for case in cases.values() if case.kind == "single"]
+    assert len({case.hidden for case in singles}) == 22
+    assert Counter(case.multiple for case in singles) == {m: 11 for m in MULTIPLES}
+    assert {case.simulator for case in cases.values()} == {"continuous"}
+    assert not any("hysteresis" in case.hidden for case in cases.values())
+    few = Counter(case.kind for case in draw_continuous_cases(3, 6).values())
+    assert few == {"null": 2, "single": 2, "pair": 1, "outside": 1}
+    with pytest.raises(ValueError, match="count"):
+        draw_continuous_cases(1, 0)
+
+
+def test_no_two_simulators_and_no_two_sets_share_a_seed():
+    seeds = [
+        case.seed
+        for draw in DRAWERS.values()
+        for seed in SETS.values()
+        for case in draw(seed, None).values()
+        if case.kind != "separated"
+    ]
+    assert len(seeds) == len(set(seeds))

@@ -1,0 +1,142 @@
+"""The effects that act through air, rotors and body, each by its equation in the catalogue.
+
+A `Moment` is what they see of N flights. Thrusts are changed in the order of `THRUSTS`: what adds
+to a rotor's thrust, then what scales it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Moment(NamedTuple):
+    """N flights at one moment."""
+
+    mass: float
+    """True [kg]."""
+    inertia: np.ndarray
+    """(3,) true [kg m^2]."""
+    arm: np.ndarray
+    """(4, 3) rotors from the true centre of mass, body axes [m]."""
+    spin: np.ndarray
+    """(4,) s_i."""
+    pos_w: np.ndarray
+    """(N, 3) [m]."""
+    rot_w: np.ndarray
+    """(N, 3, 3) body to world."""
+    air_b: np.ndarray
+    """(N, 3) v_b, velocity relative to the air in body axes [m/s]."""
+    rate_b: np.ndarray
+    """(N, 3) [rad/s]."""
+    speed: np.ndarray
+    """(N, 4) of the rotors [rad/s]."""
+    time_s: np.ndarray
+    """(N, 1) since the first row [s]."""
+    fallen_v: np.ndarray
+    """(N, 1) voltage of the first row less the present one [V]."""
+
+
+Force = Callable[[Any, Moment], np.ndarray]
+Thrust = Callable[[Any, Moment, np.ndarray], np.ndarray]
+
+GROUND_CAP = 1.5
+"""Largest factor of the ground on a thrust."""
+GROUND_HEIGHT = 1e-3
+"""A rotor is never lower than this for it [m]."""
+
+
+def _inflow(effect: Any, at: Moment, thrust: np.ndarray) -> np.ndarray:
+    """Rotor thrust += -k Omega_i v_b.e3."""
+    return thrust - effect.coefficient * at.speed * at.air_b[:, 2:]
+
+
+def _ground_effect(effect: Any, at: Moment, thrust: np.ndarray) -> np.ndarray:
+    """Rotor thrust x 1 / (1 - g (r / 4 z_i)^2), z_i its height above z = 0, at most 1.5."""
+    height = at.pos_w[:, 2:] + at.rot_w[:, 2] @ at.arm.T
+    ratio = effect.rotor_radius / (4.0 * np.maximum(height, GROUND_HEIGHT))
+    share = effect.strength * ratio**2
+    # Beyond a share of 1 the formula turns over; it is capped long before.
+    return thrust / (1.0 - np.minimum(share, 1.0 - 1.0 / GROUND_CAP))
+
+
+def _battery_sag(effect: Any, at: Moment, thrust: np.ndarray) -> np.ndarray:
+    """Thrust scale 1 - rate t, or 1 - a (V0 - V); a case has one of the two."""
+    lost = effect.rate * np.maximum(at.time_s, 0.0) + effect.per_volt * at.fallen_v
+    return thrust * np.maximum(1.0 - lost, 0.0)
+
+
+def _linear_drag(effect: Any, at: Moment) -> np.ndarray:
+    """F_b += -m D v_b."""
+    return -at.mass * np.multiply(effect.coefficient, at.air_b)
+
+
+def _quadratic_drag(effect: Any, at: Moment) -> np.ndarray:
+    """F_b += -m C |v_b| v_b."""
+    airspeed = np.sqrt((at.air_b * at.air_b).sum(axis=1, keepdims=True))
+    return -at.mass * np.multiply(effect.coefficient, airspeed * at.air_b)
+
+
+def _rotor_drag(effect: Any, at: Moment) -> np.ndarray:
+    """F_b += -k (sum Omega_i) (v_b - (v_b.e3) e3)."""
+    all_speeds = at.speed.sum(axis=1, keepdims=True)
+    return -effect.coefficient * all_speeds * at.air_b * [1.0, 1.0, 0.0]
+
+
+def _translational_lift(effect: Any, at: Moment) -> np.ndarray:
+    """F_b += m k (v_bx^2 + v_by^2) e3."""
+    across = at.air_b[:, :1] ** 2 + at.air_b[:, 1:2] ** 2
+    return at.mass * effect.coefficient * across * [0.0, 0.0, 1.0]
+
+
+def _blade_flapping(effect: Any, at: Moment) -> np.ndarray:
+    """tau_b += k (sum Omega_i) (v_b x e3)."""
+    all_speeds = at.speed.sum(axis=1, keepdims=True)
+    return effect.coefficient * all_speeds * _times_e3(at.air_b)
+
+
+def _torque_trim(effect: Any, at: Moment) -> np.ndarray:
+    """Constant body torque."""
+    return np.broadcast_to(np.asarray(effect.torque, dtype=float), at.rate_b.shape)
+
+
+def _rotor_gyroscopic(effect: Any, at: Moment) -> np.ndarray:
+    """tau_b += -J_r (sum s_i Omega_i) (w x e3)."""
+    net = (at.speed * at.spin).sum(axis=1, keepdims=True)
+    return -effect.rotor_inertia * net * _times_e3(at.rate_b)
+
+
+def _angular_damping(effect: Any, at: Moment) -> np.ndarray:
+    """tau_b += -J d w."""
+    return -at.inertia * np.multiply(effect.coefficient, at.rate_b)
+
+
+def _times_e3(vector: np.ndarray) -> np.ndarray:
+    """Return vector x e3 (N, 3)."""
+    return vector[:, [1, 0, 2]] * [1.0, -1.0, 0.0]
+
+
+THRUSTS: dict[str, Thrust] = {
+    "inflow": _inflow,
+    "ground_effect": _ground_effect,
+    "battery_sag": _battery_sag,
+}
+"""By effect: (values, moment, thrusts (N, 4) [N]) to thrusts."""
+FORCES: dict[str, Force] = {
+    "linear_drag": _linear_drag,
+    "quadratic_drag": _quadratic_drag,
+    "rotor_drag": _rotor_drag,
+    "translational_lift": _translational_lift,
+}
+"""By effect: (values, moment) to a force on the centre of mass (N, 3), body axes [N]."""
+TORQUES: dict[str, Force] = {
+    "blade_flapping": _blade_flapping,
+    "torque_trim": _torque_trim,
+    "rotor_gyroscopic": _rotor_gyroscopic,
+    "angular_damping": _angular_damping,
+}
+"""By effect: (values, moment) to a torque (N, 3), body axes [N m]."""
+WINDS = ("constant_wind", "gusts")
+"""Effects that move the air."""

@@ -1,0 +1,136 @@
+"""What flies: the true constants of a vehicle with its effects, and what its controller believes.
+
+Read off the numbers of a vehicle by shared definitions alone: the nominal quadrotor's five steps
+and the catalogue's table of equations. No hook of the catalogue is called.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.vehicles.vehicle import Vehicle
+from suite.blind.continuous.air import FORCES, THRUSTS, TORQUES, WINDS
+
+GRAVITY = 9.81
+"""[m/s^2]."""
+CONSTANTS = (
+    "motor_lag", "command_delay", "thrust_scale", "mass_offset", "com_offset", "inertia_scale",
+    "rate_gain", "weak_motor", "thrust_tilt", "frame_tilt",
+)  # fmt: skip
+"""Effects that change a constant of the vehicle or of the world."""
+OF_LOGS = ("gyro_bias", "accelerometer_bias", "clock_offset")
+"""Effects that change what is logged, and nothing in flight."""
+
+
+class Believed(NamedTuple):
+    """What the rate loop and the mixer go by: the vehicle file's nominal values."""
+
+    mass: float
+    """[kg]."""
+    inertia: np.ndarray
+    """(3,) [kg m^2]."""
+    rate_gain: np.ndarray
+    """(3,) K, as it truly is: the catalogue's `rate_gain` is an error of the loop [1/s]."""
+    shares: np.ndarray
+    """(4, 4) thrust of each rotor for a unit of (collective, torque about x, y, z)."""
+    thrust_max: float
+    """Of one rotor [N]."""
+    thrust_coefficient: float
+    """k_T [N/(rad/s)^2]."""
+    period_s: float
+    """Of the rate loop [s]."""
+
+
+class Quadrotor(NamedTuple):
+    """The truth."""
+
+    believed: Believed
+    mass: float
+    """[kg]."""
+    inertia: np.ndarray
+    """(3,) [kg m^2]."""
+    gravity_w: np.ndarray
+    """(3,) [m/s^2]."""
+    arm: np.ndarray
+    """(4, 3) rotors from the true centre of mass, body axes [m]."""
+    spin: np.ndarray
+    """(4,) s_i."""
+    thrust_coefficient: np.ndarray
+    """(4,) [N/(rad/s)^2]."""
+    torque_coefficient: np.ndarray
+    """(4,) [N m/(rad/s)^2]."""
+    thrust_axis: np.ndarray
+    """(3,) along which the total thrust pushes, body axes."""
+    time_constant: float
+    """Of the rotors [s]; 0 follows at once."""
+    delay: float
+    """By which commands act late [s]."""
+    effects: dict[str, Any]
+    """Values of every effect, by name."""
+
+
+def quadrotor_of(vehicle: Vehicle) -> Quadrotor:
+    """Return what the numbers of `vehicle` say.
+
+    Raises:
+        ValueError: for an effect that this engine has no equation for.
+    """
+    effects = dict(vehicle.effects)
+    known = {*CONSTANTS, *OF_LOGS, *THRUSTS, *FORCES, *TORQUES, *WINDS}
+    for name in effects:
+        if name not in known:
+            raise ValueError(
+                f"effects.{name}: the continuous engine has no equation for it; allowed: "
+                f"{', '.join(sorted(known))}"
+            )
+
+    def value(effect: str, parameter: str, absent: Any) -> Any:
+        given = getattr(effects[effect], parameter) if effect in effects else absent
+        return np.asarray(given, dtype=float)
+
+    rotors, controller = vehicle.rotors, vehicle.controller
+    hubs, spin = np.array(rotors.position, dtype=float), np.array(rotors.spin, dtype=float)
+    weak = value("weak_motor", "scale", np.ones(4))
+    believed = Believed(
+        mass=vehicle.mass,
+        inertia=np.array(vehicle.inertia),
+        rate_gain=np.array(controller.rate_gain) * value("rate_gain", "scale", np.ones(3)),
+        shares=np.linalg.inv(
+            np.array(
+                [
+                    np.ones(4),
+                    hubs[:, 1],
+                    -hubs[:, 0],
+                    -spin * rotors.torque_coefficient / rotors.thrust_coefficient,
+                ]
+            )
+        ),
+        thrust_max=rotors.thrust_coefficient * rotors.speed_max**2,
+        thrust_coefficient=rotors.thrust_coefficient,
+        period_s=1.0 / controller.frequency,
+    )
+    return Quadrotor(
+        believed=believed,
+        mass=vehicle.mass + float(value("mass_offset", "offset", 0.0)),
+        inertia=believed.inertia * value("inertia_scale", "scale", np.ones(3)),
+        gravity_w=-GRAVITY * leaning_z(value("frame_tilt", "angle", np.zeros(2))),
+        arm=hubs - value("com_offset", "offset", np.zeros(3)),
+        spin=spin,
+        thrust_coefficient=rotors.thrust_coefficient
+        * float(value("thrust_scale", "scale", 1.0))
+        * weak,
+        torque_coefficient=rotors.torque_coefficient * weak,
+        thrust_axis=leaning_z(value("thrust_tilt", "angle", np.zeros(2))),
+        time_constant=float(value("motor_lag", "time_constant", rotors.time_constant)),
+        delay=float(value("command_delay", "delay", 0.0)),
+        effects=effects,
+    )
+
+
+def leaning_z(angle: np.ndarray) -> np.ndarray:
+    """Return Rot(a_x, a_y, 0) e3 (3,): e3 rolled by a_x, then pitched by a_y [rad]."""
+    roll, pitch = angle
+    rolled = np.array([0.0, -np.sin(roll), np.cos(roll)])
+    return np.array([np.sin(pitch) * rolled[2], rolled[1], np.cos(pitch) * rolled[2]])

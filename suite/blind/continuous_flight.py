@@ -1,0 +1,206 @@
+"""Commanded trajectories flown in continuous time by an engine that shares no code with the fit.
+
+The pilot is the one of the other simulators, for it only gives commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from eval.logs.flight_log import FlightLog
+from eval.quadrotor.plant import Command, Motion, Wrench
+from eval.vehicles.vehicle import Vehicle
+from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery, rotation
+from suite.blind.continuous.conditions import Conditions
+from suite.blind.continuous.engine import Flown, Rows, fly
+from suite.blind.continuous.log import Noise, log_of_flight, state_at
+from suite.blind.continuous.quadrotor import quadrotor_of
+from suite.blind.continuous.timing import STEP_S, jittered_stamps, schedule
+from suite.diagnose.plans.pilot import Gains, steer
+from suite.diagnose.plans.sensors import Sensors
+from suite.diagnose.plans.simulate import (
+    FALL_V_PER_S,
+    FULL_V,
+    SAG_V,
+    Extra,
+    FlightFailed,
+    Recording,
+)
+from suite.diagnose.plans.trajectory import Reference, Trajectory
+
+ROLL_S = 0.25
+"""Flown before the first row and after the last, for poses that are logged late or early [s]."""
+GRID_HZ = 500.0
+"""Of the recordings that an oracle works with; commands and rows of a log do not lie on it."""
+OFF_M = 4.0
+"""A flight further off its trajectory than this has failed [m]."""
+LOWEST_M = 0.02
+"""A flight lower than this has failed [m]."""
+
+
+def with_loop(vehicle: Vehicle, frequency: float) -> Vehicle:
+    """Return `vehicle` with its rate loop at `frequency` [Hz]."""
+    return replace(vehicle, controller=replace(vehicle.controller, frequency=frequency))
+
+
+def fly_continuous(
+    nominal: Vehicle,
+    truth: Vehicle,
+    trajectories: Sequence[Trajectory],
+    conditions: Conditions,
+    rng: np.random.Generator,
+    extra: Extra | None = None,
+    step_s: float = STEP_S,
+) -> Flown:
+    """Fly `trajectories` side by side.
+
+    Args:
+        nominal: what the pilot believes.
+        truth: what is flown; its loop's frequency is that of `conditions`.
+        trajectories: N of them.
+        conditions: rates and jitter.
+        rng: of stamps and gusts.
+        extra: physics besides the effects.
+        step_s: longest step [s].
+
+    Raises:
+        FlightFailed: where a flight tips over, leaves the air or its trajectory.
+        ValueError: for an effect that the engine has no equation for.
+    """
+    quadrotor = quadrotor_of(with_loop(truth, conditions.loop_hz))
+    last = max(way.duration_s for way in trajectories)
+    stamp_s = jittered_stamps(
+        rng, len(trajectories), -ROLL_S, last + ROLL_S, conditions.row_hz, conditions.jitter
+    )
+    lag = quadrotor.time_constant
+    finest = min(step_s, lag / 5.0) if lag > 0.0 else step_s
+    plan = schedule(stamp_s, 1.0 / conditions.loop_hz, quadrotor.delay, max(finest, 0.02 * step_s))
+    pilot = _Pilot(nominal, trajectories, stamp_s, extra)
+    start = np.zeros((len(trajectories), 13))
+    for index, way in enumerate(trajectories):
+        # A trajectory rests until time 0, but for its heading.
+        first = way.reference(stamp_s[:1, index])
+        half = 0.5 * float(first.yaw[0])
+        start[index, POS] = first.pos_w[0]
+        start[index, QUAT] = [np.cos(half), 0.0, 0.0, np.sin(half)]
+    battery = Battery(FULL_V, FALL_V_PER_S, SAG_V)
+    push = None if extra is None else pilot.push
+    return fly(quadrotor, plan, start, pilot, rng, battery, push)
+
+
+class _Pilot:
+    """Steers N flights along their trajectories, row by row."""
+
+    def __init__(
+        self, nominal: Vehicle, ways: Sequence[Trajectory], stamp_s: np.ndarray, extra: Extra | None
+    ) -> None:
+        self._nominal, self._stamp_s, self._extra = nominal, stamp_s, extra
+        each = [way.reference(stamp_s[:, index]) for index, way in enumerate(ways)]
+        self._wanted = Reference(*(np.stack(parts, axis=1) for parts in zip(*each, strict=True)))
+        self._summed_w = np.zeros((len(ways), 3))
+
+    def __call__(self, seen: Rows) -> tuple[np.ndarray, np.ndarray]:
+        """Return the command that is logged and the one that acts, (N, 4) each."""
+        row = seen.number
+        now = Reference(*(part[row] for part in self._wanted))
+        off = now.pos_w - seen.pos_w
+        far = np.sqrt((off**2).sum(axis=1))
+        # Written so that a state that is no number fails too.
+        sound = (far < OFF_M) & (seen.rot_w[:, 2, 2] > 0.0) & (seen.pos_w[:, 2] > LOWEST_M)
+        if not sound.all():
+            bad = int(np.flatnonzero(~sound)[0])
+            raise FlightFailed(
+                f"flight {bad + 1} failed at {seen.time_s[bad]:.2f} s, {far[bad]:.1f} m off its "
+                "trajectory; make the trajectory gentler or the effect weaker"
+            )
+        since = self._stamp_s[row] - self._stamp_s[max(row - 1, 0)]
+        self._summed_w = np.clip(self._summed_w + since[:, None] * off, -1.0, 1.0)
+        motion = Motion(seen.pos_w, seen.rot_w, seen.vel_w, seen.rate_b)
+        given = steer(self._nominal, Gains(), now, motion, self._summed_w)
+        acting = given
+        if self._extra is not None:
+            acting = self._extra.command(given, float(seen.time_s[0]))
+        return given.packed, acting.packed
+
+    def push(self, seen: Rows, force_b: np.ndarray, length_s: np.ndarray) -> np.ndarray:
+        """Return what the physics besides adds in a step (N, 3) [N]."""
+        assert self._extra is not None
+        motion = Motion(seen.pos_w, seen.rot_w, seen.vel_w, seen.rate_b)
+        wrench = Wrench(force_b, np.zeros_like(force_b))
+        time_s = seen.time_s[:, None]
+        # Arrays of one number a flight, where other simulators have one for all.
+        return self._extra.wrench(motion, wrench, time_s, length_s).force_b  # pyright: ignore[reportArgumentType]
+
+
+def recordings_of(
+    flown: Flown, trajectories: Sequence[Trajectory], rate_hz: float
+) -> list[Recording]:
+    """Return the flights on an even grid, with rows at `rate_hz`, for what works on one.
+
+    A command is there from the first moment of the grid at or after its own.
+    """
+    dt, period = 1.0 / GRID_HZ, round(GRID_HZ / rate_hz)
+    return [
+        _recording(flown, index, np.arange(round(way.duration_s * GRID_HZ)) * dt, dt, period)
+        for index, way in enumerate(trajectories)
+    ]
+
+
+def _recording(flown: Flown, index: int, time_s: np.ndarray, dt: float, period: int) -> Recording:
+    state = state_at(flown, index, time_s)
+    stamps = flown.schedule.stamp_s[:-1, index]
+    ends = flown.time_s[:, index]
+    row = np.searchsorted(stamps, time_s + 1e-9, side="right") - 1
+    step = np.clip(np.searchsorted(ends, time_s + 1e-9, side="right") - 1, 0, len(ends) - 2)
+
+    def between(ends: np.ndarray, series: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(time_s, ends, column) for column in series.T], axis=1)
+
+    command, acting = flown.command[row, index], flown.acting[row, index]
+    push_b = flown.push_b[step, index]
+    return Recording(
+        dt=dt,
+        period=period,
+        time_s=time_s,
+        motion=Motion(state[:, POS], rotation(state[:, QUAT]), state[:, VEL], state[:, RATE]),
+        quat_wxyz=state[:, QUAT],
+        rotor_speed=between(ends, flown.speed[:, index]),
+        command=Command(command[:, 0], command[:, 1:]),
+        acc_b=between(stamps, flown.acc_b[:, index]),
+        voltage=np.interp(time_s, stamps, flown.voltage[:, index]),
+        acting=Command(acting[:, 0], acting[:, 1:]),
+        extra=Wrench(push_b, np.zeros_like(push_b)),
+    )
+
+
+def logs_of(
+    flown: Flown,
+    trajectories: Sequence[Trajectory],
+    truth: Vehicle,
+    sensors: Sensors,
+    conditions: Conditions,
+    rng: np.random.Generator | None,
+) -> tuple[FlightLog, ...]:
+    """Return the flights' logs with noise as `sensors` has it a second; `rng` None logs without."""
+    noise = Noise(
+        sensors.rate_hz,
+        sensors.pos,
+        sensors.attitude,
+        sensors.gyro,
+        sensors.vel,
+        sensors.acc,
+        sensors.rotor,
+        sensors.voltage,
+        sensors.lost,
+    )
+    about = {"source": "suite blind", "vehicle": truth.name}
+    return tuple(
+        log_of_flight(
+            flown, index, way.duration_s, truth.effects, noise, conditions, rng,
+            f"flight_{index + 1}", about,
+        )
+        for index, way in enumerate(trajectories)
+    )  # fmt: skip

@@ -1,0 +1,115 @@
+"""Who flies a case: MuJoCo, RotorPy, or the engine in continuous time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle
+from suite.blind.cases import CONTINUOUS, ROTORPY, Case
+from suite.blind.continuous.conditions import draw_conditions
+from suite.blind.continuous_flight import (
+    GRID_HZ,
+    fly_continuous,
+    logs_of,
+    recordings_of,
+    with_loop,
+)
+from suite.blind.oracle.strength import given_vehicle
+from suite.blind.rotorpy_flight import fly_rotorpy
+from suite.diagnose.plans.sensors import SENSORS, log_of
+from suite.diagnose.plans.simulate import Extra, Recording, fly
+from suite.diagnose.plans.trajectory import Trajectory
+
+ROTORPY_FLIGHTS = 4
+"""Of the ordinary flights, for RotorPy is slow; its table of strengths has one more."""
+
+
+class Flights(NamedTuple):
+    """A case's flights."""
+
+    recordings: Sequence[Recording]
+    """Without noise, on an even grid."""
+    logs: Callable[[np.random.Generator], tuple[FlightLog, ...]]
+    """What is logged of them, with noise."""
+
+
+class Fly(Protocol):
+    """Flies trajectories side by side with a vehicle and what is true besides."""
+
+    def __call__(
+        self,
+        truth: Vehicle,
+        ways: Sequence[Trajectory],
+        rng: np.random.Generator,
+        extra: Extra | None = None,
+    ) -> Flights:
+        """Return the flights of `truth`; `rng` is for what happens by chance in flight."""
+        ...
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulator, set up for one case."""
+
+    given: Vehicle
+    """Given to the diagnosis."""
+    judged: Vehicle
+    """The same at the rate of the recordings' grid, for what works on that."""
+    fly: Fly
+    most: int | None = None
+    """Flights of a case; all if None."""
+    conditions: dict[str, Any] = field(default_factory=dict)
+    """Under which it is flown and logged, for the answer."""
+
+
+def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
+    """Return who flies `case`; `rng` is for the conditions, where a simulator draws any."""
+    given, sensors = given_vehicle(case.vehicle), SENSORS[case.sensors]
+
+    def on_grid(
+        truth: Vehicle,
+        ways: Sequence[Trajectory],
+        rng: np.random.Generator,
+        extra: Extra | None = None,
+    ) -> Flights:
+        if case.simulator == ROTORPY:
+            flown = fly_rotorpy(given, truth, ways, sensors.rate_hz)
+        else:
+            has_voltage = bool(sensors.voltage)
+            flown = fly(given, truth, ways, sensors.rate_hz, extra, rng, has_voltage)
+
+        def logs(rng: np.random.Generator) -> tuple[FlightLog, ...]:
+            return tuple(
+                log_of(flight, truth, sensors, rng, f"flight_{index + 1}")
+                for index, flight in enumerate(flown)
+            )
+
+        return Flights(flown, logs)
+
+    if case.simulator != CONTINUOUS:
+        most = ROTORPY_FLIGHTS if case.simulator == ROTORPY else None
+        return Simulator(given, given, on_grid, most)
+
+    conditions = draw_conditions(rng)
+    looped = with_loop(given, conditions.loop_hz)
+
+    def in_continuous_time(
+        truth: Vehicle,
+        ways: Sequence[Trajectory],
+        rng: np.random.Generator,
+        extra: Extra | None = None,
+    ) -> Flights:
+        flown = fly_continuous(looped, truth, ways, conditions, rng, extra)
+        return Flights(
+            recordings_of(flown, ways, sensors.rate_hz),
+            lambda rng: logs_of(flown, ways, truth, sensors, conditions, rng),
+        )
+
+    return Simulator(
+        looped, with_loop(given, GRID_HZ), in_continuous_time, conditions=asdict(conditions)
+    )

@@ -1,0 +1,124 @@
+"""Every effect that acts in flight, against numbers worked by hand from the catalogue's table."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from suite.blind.continuous.air import FORCES, THRUSTS, TORQUES, Moment
+
+# Body x points along world y, body y along world -x.
+QUARTER = np.array([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+ARM = np.array([[0.1, -0.1, 0.0], [-0.1, -0.1, 0.0], [-0.1, 0.1, 0.0], [0.1, 0.1, 0.02]])
+
+
+def moment(**given):
+    values = {
+        "mass": 0.5,
+        "inertia": np.array([0.002, 0.003, 0.004]),
+        "arm": ARM,
+        "spin": np.array([1.0, -1.0, 1.0, -1.0]),
+        "pos_w": np.array([[0.0, 0.0, 0.05]]),
+        "rot_w": QUARTER,
+        "air_b": np.array([[3.0, -4.0, 2.0]]),
+        "rate_b": np.array([[2.0, -1.0, 0.5]]),
+        "speed": np.array([[1000.0, 900.0, 1100.0, 800.0]]),
+        "time_s": np.array([[4.0]]),
+        "fallen_v": np.array([[0.5]]),
+    }
+    return Moment(**(values | given))
+
+
+def effect(**values):
+    return SimpleNamespace(**values)
+
+
+def test_linear_drag():
+    # -0.5 kg x (0.3, 0.2, 0.1) 1/s x (3, -4, 2) m/s
+    force = FORCES["linear_drag"](effect(coefficient=(0.3, 0.2, 0.1)), moment())
+    np.testing.assert_allclose(force, [[-0.45, 0.4, -0.1]], atol=1e-15)
+
+
+def test_quadratic_drag():
+    # |v| = sqrt(9 + 16 + 144) = 13; -0.5 x 13 x (0.01, 0.02, 0.03) x (3, -4, 12)
+    at = moment(air_b=np.array([[3.0, -4.0, 12.0]]))
+    force = FORCES["quadratic_drag"](effect(coefficient=(0.01, 0.02, 0.03)), at)
+    np.testing.assert_allclose(force, [[-0.195, 0.52, -2.34]], atol=1e-15)
+
+
+def test_rotor_drag():
+    # -1e-5 kg/rad x 3800 rad/s x (3, -4, 0) m/s
+    force = FORCES["rotor_drag"](effect(coefficient=1e-5), moment())
+    np.testing.assert_allclose(force, [[-0.114, 0.152, 0.0]], atol=1e-15)
+
+
+def test_translational_lift():
+    # 0.5 kg x 0.02 1/m x 25 m^2/s^2, up
+    force = FORCES["translational_lift"](effect(coefficient=0.02), moment())
+    np.testing.assert_allclose(force, [[0.0, 0.0, 0.25]], atol=1e-15)
+
+
+def test_inflow():
+    # Climbing at 2 m/s: each rotor loses 1e-4 x Omega x 2.
+    thrust = THRUSTS["inflow"](effect(coefficient=1e-4), moment(), np.full((1, 4), 2.0))
+    np.testing.assert_allclose(thrust, [[1.8, 1.82, 1.78, 1.84]], atol=1e-15)
+
+
+def test_ground_effect_goes_by_each_rotors_height():
+    # z = 0.05 m: 1 / (1 - 2 (0.06 / 0.2)^2) = 1 / 0.82; the fourth hub is 0.02 m higher.
+    values = effect(strength=2.0, rotor_radius=0.06)
+    thrust = THRUSTS["ground_effect"](values, moment(), np.ones((1, 4)))
+    high = 1.0 / (1.0 - 2.0 * (0.06 / 0.28) ** 2)
+    np.testing.assert_allclose(thrust, [[1.0 / 0.82] * 3 + [high]], rtol=1e-14)
+
+
+def test_ground_effect_sees_a_bank_and_is_capped():
+    # Rolled by 0.3 rad: hubs on the left (y = 0.1) are sin(0.3) x 0.1 m higher.
+    cos, sin = np.cos(0.3), np.sin(0.3)
+    rolled = np.array([[[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]]])
+    values = effect(strength=1.0, rotor_radius=0.06)
+    at = moment(rot_w=rolled, pos_w=np.array([[0.0, 0.0, 0.09]]))
+    thrust = THRUSTS["ground_effect"](values, at, np.ones((1, 4)))
+    left, right = (
+        1.0 / (1.0 - (0.06 / (4.0 * (0.09 + 0.1 * side * sin))) ** 2) for side in (1, -1)
+    )
+    assert thrust[0, 2] == pytest.approx(left) and thrust[0, 0] == pytest.approx(right)
+    low = moment(pos_w=np.array([[0.0, 0.0, 0.001]]))
+    assert THRUSTS["ground_effect"](values, low, np.ones((1, 4)))[0, 0] == pytest.approx(1.5)
+
+
+def test_battery_sag_by_time_and_by_voltage():
+    by_time = THRUSTS["battery_sag"](effect(rate=0.01, per_volt=0.0), moment(), np.ones((1, 4)))
+    np.testing.assert_allclose(by_time, 0.96)
+    by_volt = THRUSTS["battery_sag"](effect(rate=0.0, per_volt=0.1), moment(), np.ones((1, 4)))
+    np.testing.assert_allclose(by_volt, 0.95)
+    before = moment(time_s=np.array([[-1.0]]))
+    kept = THRUSTS["battery_sag"](effect(rate=0.01, per_volt=0.0), before, np.ones((1, 4)))
+    np.testing.assert_allclose(kept, 1.0)
+
+
+def test_thrusts_are_added_to_before_they_are_scaled():
+    assert list(THRUSTS) == ["inflow", "ground_effect", "battery_sag"]
+
+
+def test_blade_flapping():
+    # v x e3 = (v_y, -v_x, 0): 1e-6 x 3800 x (-4, -3, 0). Flying forward pitches the nose up.
+    torque = TORQUES["blade_flapping"](effect(coefficient=1e-6), moment())
+    np.testing.assert_allclose(torque, [[-0.0152, -0.0114, 0.0]], atol=1e-16)
+
+
+def test_torque_trim():
+    torque = TORQUES["torque_trim"](effect(torque=(0.01, -0.02, 0.003)), moment())
+    np.testing.assert_array_equal(torque, [[0.01, -0.02, 0.003]])
+
+
+def test_rotor_gyroscopic():
+    # sum s Omega = 1000 - 900 + 1100 - 800 = 400; w x e3 = (-1, -2, 0)
+    torque = TORQUES["rotor_gyroscopic"](effect(rotor_inertia=1e-5), moment())
+    np.testing.assert_allclose(torque, [[0.004, 0.008, 0.0]], atol=1e-16)
+
+
+def test_angular_damping():
+    # -(0.002, 0.003, 0.004) x (1, 2, 3) x (2, -1, 0.5)
+    torque = TORQUES["angular_damping"](effect(coefficient=(1.0, 2.0, 3.0)), moment())
+    np.testing.assert_allclose(torque, [[-0.004, 0.006, -0.006]], atol=1e-16)

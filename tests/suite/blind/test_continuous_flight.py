@@ -1,0 +1,107 @@
+"""Trajectories flown in continuous time, and what others get of them."""
+
+import numpy as np
+import pytest
+
+from suite.blind.continuous.conditions import Conditions
+from suite.blind.continuous_flight import (
+    fly_continuous,
+    logs_of,
+    recordings_of,
+    with_loop,
+)
+from suite.blind.outside import make_outside
+from suite.diagnose.plans.sensors import SENSORS
+from suite.diagnose.plans.simulate import FlightFailed
+from suite.diagnose.plans.trajectory import Trajectory
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+
+LAGGED = with_lag(PLAIN, 0.02)
+WAYS = (
+    Trajectory("figure_eight", 2.0, speed=4.0, size=2.0, turn="wobble"),
+    Trajectory("climb", 1.5, speed=2.0, size=1.5),
+)
+CONDITIONS = Conditions(733.0, 90.0, 0.3, 1e-4, 0.01, 0.7, 0.05)
+
+
+def run(seed, truth=LAGGED, conditions=CONDITIONS, extra=None):
+    rng = np.random.default_rng(seed)
+    flown = fly_continuous(LAGGED, truth, WAYS, conditions, rng, extra)
+    return flown, logs_of(flown, WAYS, truth, SENSORS["full"], conditions, rng)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_one_does_not():
+    (_, first), (_, again), (_, other) = run(5), run(5), run(6)
+    for one, two in zip(first, again, strict=True):
+        for name in ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b", "thrust_cmd", "acc_b"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert first[0].time_s[3] != other[0].time_s[3] and first[0].pos_w[3, 0] != other[0].pos_w[3, 0]
+
+
+def test_logs_are_as_long_as_their_trajectories_and_say_nothing():
+    flown, logs = run(5)
+    for log, way in zip(logs, WAYS, strict=True):
+        assert abs(log.time_s[0]) <= 1e-4 and way.duration_s - 0.03 < log.time_s[-1]
+        assert log.time_s[-1] < way.duration_s + 1e-4
+        assert log.about == {"source": "suite blind", "vehicle": "plain"}
+        assert log.integrator is None
+        # The pilot keeps it on its way.
+        assert np.abs(log.pos_w - way.reference(log.time_s).pos_w).max() < 1.5
+    assert flown.schedule.stamp_s[0].max() < -0.2, "it flew before the first row"
+
+
+def test_recordings_are_the_flight_on_an_even_grid():
+    flown, _ = run(5, conditions=Conditions(500.0, 100.0, 0.0, 0.0, 0.0, 0.0, 0.1))
+    recordings = recordings_of(flown, WAYS, 125.0)
+    for index, (recording, way) in enumerate(zip(recordings, WAYS, strict=True)):
+        assert (recording.dt, recording.period) == (0.002, 4) and recording.integrator is None
+        assert len(recording.time_s) == round(way.duration_s * 500)
+        # Without jitter its rows lie on the grid, every fifth.
+        rows = np.searchsorted(flown.schedule.stamp_s[:, index], recording.time_s[::5] - 1e-9)
+        state = flown.state[flown.schedule.block[rows], index]
+        np.testing.assert_allclose(recording.motion.pos_w[::5], state[:, :3], atol=1e-9)
+        np.testing.assert_allclose(recording.motion.rate_b[::5], state[:, 10:], atol=1e-9)
+        thrust = recording.command.thrust.reshape(-1, 5)
+        np.testing.assert_array_equal(thrust, np.repeat(thrust[:, :1], 5, axis=1))
+        np.testing.assert_allclose(
+            recording.acc_b[::5], flown.acc_b[rows, index], rtol=1e-6, atol=1e-9
+        )
+
+
+def test_a_command_is_on_the_grid_from_its_first_moment_after_the_stamp():
+    flown, _ = run(5)
+    recording = recordings_of(flown, WAYS, 100.0)[0]
+    stamps = flown.schedule.stamp_s[:-1, 0]
+    changes = np.flatnonzero(np.diff(recording.command.thrust)) + 1
+    row = np.searchsorted(stamps, recording.time_s[changes], side="right") - 1
+    late = recording.time_s[changes] - stamps[row]
+    assert (late >= 0.0).all() and late.max() < 0.002
+    np.testing.assert_array_equal(recording.command.thrust[changes], flown.command[row, 0, 0])
+
+
+def test_a_flight_that_cannot_be_flown_fails_by_name():
+    heavy = with_effects(LAGGED, mass_offset=(2.0,))
+    with pytest.raises(FlightFailed, match="flight [12] failed at .* off its trajectory"):
+        run(5, heavy)
+
+
+def test_physics_from_outside_acts_and_is_recorded():
+    plain, _ = run(5)
+    flown, _ = run(5, extra=make_outside("tether", 0.1, 0.75))
+    recording = recordings_of(flown, WAYS, 100.0)[0]
+    pull_w = np.einsum("tij,tj->ti", recording.motion.rot_w, recording.extra.force_b)
+    # A spring of 0.1 1/s^2 x 0.75 kg to (1, -1, 0), held for a millisecond at a time.
+    hand = -0.075 * (recording.motion.pos_w - [1.0, -1.0, 0.0])
+    np.testing.assert_allclose(pull_w, hand, atol=2e-3)
+    assert np.abs(flown.state[-1] - plain.state[-1]).max() > 1e-3
+    bent, _ = run(5, extra=make_outside("bent_thrust", 0.2, 0.75))
+    given = bent.command[..., 0]
+    np.testing.assert_allclose(bent.acting[..., 0], given + 0.2 * (given - 9.81) ** 2 / 9.81)
+
+
+def test_the_loop_of_the_conditions_is_the_one_that_flies():
+    slow = Conditions(200.0, 50.0, 0.0, 0.0, 0.0, 0.0, 0.1)
+    flown, _ = run(5, conditions=slow)
+    ticks = flown.schedule.start_s[flown.schedule.is_tick[:, 0], 0]
+    np.testing.assert_allclose(np.diff(ticks), 0.005, atol=1e-9)
+    assert with_loop(LAGGED, 321.0).controller.frequency == 321.0

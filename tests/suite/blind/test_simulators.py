@@ -1,0 +1,74 @@
+"""Who flies a case: what the diagnosis is given of it, and what it is not."""
+
+import json
+
+import numpy as np
+import pytest
+
+from eval.logs.flight_log import read_flight
+from eval.quadrotor.vehicle_file import load_vehicle
+from suite.blind import make as make_module
+from suite.blind.build import build
+from suite.blind.cases import Case
+from suite.blind.continuous.conditions import draw_conditions
+from suite.blind.make import make_set, open_answers
+from suite.blind.simulators import simulator_for
+from suite.common.console import Console
+
+SINGLE = Case(
+    "single", ("linear_drag",), 6.0, "bare", "estimator", (6, 70_001), simulator="continuous"
+)
+NULL = Case("null", (), 0.0, "dragged", "capture", (6, 70_002), simulator="continuous")
+
+pytestmark = pytest.mark.usefixtures("short_flights")
+
+
+def test_a_continuous_case_is_the_same_to_the_bit_and_its_vehicle_has_the_loop_that_flew():
+    first, again = build(SINGLE), build(SINGLE)
+    np.testing.assert_array_equal(first.logs[0].pos_w, again.logs[0].pos_w)
+    assert first.answer == again.answer
+    conditions = first.answer["conditions"]
+    assert first.nominal.controller.frequency == conditions["loop_hz"]
+    assert first.nominal.name == "bare" and not first.nominal.effects
+    assert first.recordings[0].dt == 0.002, "for the oracle"
+    spacing = np.median(np.diff(first.logs[0].time_s))
+    assert spacing == pytest.approx(1.0 / conditions["row_hz"], rel=0.1)
+    # Thirty sigma on flights like those of the table; this one is short.
+    hidden = first.answer["effects"][0]
+    assert hidden["sigma"] > 2.0 and "linear_drag" not in hidden["allowed"]
+
+
+def test_only_the_simulator_with_a_step_says_so():
+    assert build(NULL).logs[0].integrator is None
+    flat = Case("null", (), 0.0, "dragged", "capture", (5, 2))
+    log = build(flat).logs[0]
+    assert (log.integrator, log.step_s) == ("euler", 0.002)
+
+
+def test_conditions_are_drawn_from_the_cases_seed():
+    simulator = simulator_for(NULL, np.random.default_rng(3))
+    drawn = draw_conditions(np.random.default_rng(3))
+    assert simulator.conditions["row_hz"] == drawn.row_hz
+    assert simulator.given.controller.frequency == drawn.loop_hz
+    assert simulator.judged.controller.frequency == 500.0
+    assert not simulator_for(
+        Case("null", (), 0.0, "bare", "full", (1, 1)), np.random.default_rng()
+    ).conditions
+
+
+def test_a_set_of_continuous_cases_gives_nothing_away(tmp_path, monkeypatch):
+    cases = {"case_001": SINGLE, "case_002": NULL}
+    monkeypatch.setitem(make_module.DRAWERS, "continuous", lambda seed, count: cases)
+    make_set(tmp_path, 6, None, Console(), "continuous")
+    answers = open_answers(tmp_path)
+    assert answers["case_001"]["case"]["simulator"] == "continuous"
+    for name in cases:
+        folder = tmp_path / "cases" / name
+        log = read_flight(folder / "flight_1.parquet")
+        vehicle = load_vehicle(str(folder / "vehicle.toml"))
+        about = dict(log.about)
+        assert about.pop("source") == "suite blind" and about.pop("vehicle") == vehicle.name
+        assert about.pop("seed") is None
+        assert set(about) == {"schema", "suite_version", "git_commit"}
+        assert vehicle.controller.frequency == answers[name]["conditions"]["loop_hz"]
+        assert "conditions" not in json.dumps(log.about)
