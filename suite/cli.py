@@ -117,6 +117,7 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 def _run(name: str, args: list[str]) -> int:
     from suite.common.compiled import keep_compiled
     from suite.common.console import Console, stdout_kept_clean
+    from tracks.input.ranges import check_ranges
 
     keep_compiled()
     try:
@@ -124,6 +125,7 @@ def _run(name: str, args: list[str]) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     with stdout_kept_clean() if config.json else nullcontext():
+        check_ranges(config, options=True)
         answer = command.run(config, Console())
     if config.json:
         from tracks.common.files import to_json
