@@ -18,6 +18,7 @@ import pyarrow.parquet
 
 from eval.logs.columns import KNOWN, FlightLogError
 from tracks.common.files import replacing_file
+from tracks.input.reading import LOG_BYTES, InputError, check_file
 
 METADATA = "flight"
 """Parquet metadata key and CSV column of the JSON text."""
@@ -34,10 +35,14 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[st
         FlightLogError: where the file is missing, empty, corrupt or neither Parquet nor CSV.
     """
     try:
+        check_file(path, LOG_BYTES)
         with path.open("rb") as file:
             head = file.read(4096)
     except OSError as error:
         reason = f"cannot be read: {error.strerror or error}"
+        raise FlightLogError(str(path), None, None, reason) from None
+    except InputError as error:
+        reason = str(error).removeprefix(f"{path}: ")
         raise FlightLogError(str(path), None, None, reason) from None
     if not head:
         raise FlightLogError(str(path), None, None, "the file is empty; record or copy it again")

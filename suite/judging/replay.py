@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ from suite.common.choices import parse_levels, parse_tracks
 from suite.common.console import Console
 from suite.judging.flying import custom_tracks, default_policy, trial_list
 from suite.judging.requests import Evaluation
+from tracks.input.reading import read_json
 
 if TYPE_CHECKING:
     from eval.logs.flight import Flight
@@ -27,7 +27,7 @@ def read_evaluation(folder: Path) -> Evaluation:
     """
     path = folder / "run.json"
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = read_json(path)
         config: dict[str, Any] = record["config"]
         fits = set(config) == {field.name for field in dataclasses.fields(Evaluation)}
     except (OSError, ValueError, KeyError, TypeError) as error:
