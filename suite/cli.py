@@ -2,7 +2,8 @@
 
 A command is a module with `Config`, a frozen dataclass that becomes its options (one docstring
 line under each field is its help), and `run(config, console)`, which does the work and returns
-what --json prints. See docs/commands.md for how to add one.
+what --json prints; where it has `written(config)`, no other command writes into these folders
+meanwhile. See docs/commands.md for how to add one.
 """
 
 from __future__ import annotations
@@ -117,6 +118,7 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 def _run(name: str, args: list[str]) -> int:
     from suite.common.compiled import keep_compiled
     from suite.common.console import Console, stdout_kept_clean
+    from suite.common.running.lock import one_writer_each
     from tracks.input.ranges import check_ranges
 
     keep_compiled()
@@ -126,7 +128,9 @@ def _run(name: str, args: list[str]) -> int:
         return int(stop.code or 0)
     with stdout_kept_clean() if config.json else nullcontext():
         check_ranges(config, options=True)
-        answer = command.run(config, Console())
+        folders = command.written(config) if hasattr(command, "written") else []
+        with one_writer_each(folders):
+            answer = command.run(config, Console())
     if config.json:
         from tracks.common.files import to_json
 

@@ -38,6 +38,11 @@ class Config:
     """Print one JSON object to standard output and nothing else."""
 
 
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out]
+
+
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Diagnose, and say what was found.
 

@@ -44,6 +44,11 @@ class Config:
     """Print one JSON object to standard output and nothing else."""
 
 
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out]
+
+
 def resolve(config: Config) -> TrainConfig:
     """Return the run that the options ask for.
 
