@@ -14,9 +14,8 @@ from policies.block_policy import BlockPolicy, proven
 from policies.errors import PolicyError
 from policies.formats.embedded_spec import KEY, extract
 from policies.formats.program_inputs import INPUTS, check_inputs
+from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
-MAX_BYTES = 512 * 2**20
-"""Larger files, external data included, are refused."""
 _STANDARD = ("", "ai.onnx")
 
 
@@ -89,8 +88,8 @@ def read_checked(path: Path) -> onnx.ModelProto:
     size = path.stat().st_size
     for tensor in external:
         size += _data_file(path, tensor).stat().st_size
-    if size > MAX_BYTES:
-        raise PolicyError(f"{path}: {size} bytes with its data, allowed are {MAX_BYTES}")
+    if size > MODEL_BYTES:
+        raise PolicyError(f"{path}: {size} bytes with its data, allowed are up to {MODEL_BYTES}")
     try:
         if external:
             onnx.load_external_data_for_model(proto, str(path.resolve().parent))
@@ -112,9 +111,11 @@ def files_of(path: Path) -> list[Path]:
 
 def _graph_of(path: Path) -> onnx.ModelProto:
     try:
-        return onnx.load_model(path, load_external_data=False)
+        return onnx.load_model_from_string(read_bytes(path, MODEL_BYTES))
     except OSError as error:
-        raise PolicyError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+        raise PolicyError(f"{path}: cannot be read ({reason(error)}); check the file") from None
+    except InputError as error:
+        raise PolicyError(str(error)) from None
     except Exception as error:  # protobuf's DecodeError; protobuf is no dependency of ours
         raise PolicyError(
             f"{path}: not a whole ONNX file ({_first_line(error)}); export it again"

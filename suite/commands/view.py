@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
+from tracks.common.files import check_place
 from tracks.input.ranges import Range, Seed
 
 if TYPE_CHECKING:
@@ -59,6 +60,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     recording = config.rerun or config.out / "trials.rrd"
     if recording.suffix != ".rrd":
         raise ValueError(f"--rerun {recording}: a recording's name must end in .rrd")
+    check_place(recording)
+    check_place(config.out / "picture.png")
     evaluation, trials = _chosen(config)
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.view.picture import write_picture
