@@ -1,4 +1,4 @@
-"""ONNX files as `Policy`: standard operators only, run by onnxruntime on one CPU thread."""
+"""ONNX files as `Policy`: standard operators only, run by onnxruntime in a process of its own."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 
 from policies.block_policy import BlockPolicy, proven
 from policies.errors import PolicyError
+from policies.formats.apart.process import Apart
 from policies.formats.embedded_spec import KEY, extract
 from policies.formats.program_inputs import INPUTS, check_inputs
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
@@ -29,26 +29,14 @@ def load_onnx(path: Path) -> BlockPolicy:
     proto = read_checked(path)
     text = next((entry.value for entry in proto.metadata_props if entry.key == KEY), None)
     spec = extract(text, str(path))
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.use_deterministic_compute = True
-    options.log_severity_level = 4
-    try:
-        session = onnxruntime.InferenceSession(
-            proto.SerializeToString(), options, providers=["CPUExecutionProvider"]
-        )
-    except Exception as error:  # onnxruntime's own exceptions share no public base
-        raise PolicyError(
-            f"{path}: onnxruntime {onnxruntime.__version__} cannot load it "
-            f"({_first_line(error)}); export it for an older opset"
-        ) from error
-    for value in (*session.get_inputs(), *session.get_outputs()):
-        if value.type != "tensor(float)":
-            raise PolicyError(f"{path}: {value.name!r} is {value.type}, expected tensor(float)")
-    found = {value.name: tuple(value.shape) for value in session.get_inputs()}
+    loaded = Apart(proto.SerializeToString(), str(path))
+    for value in (*loaded.inputs, *loaded.outputs):
+        if value.kind != "tensor(float)":
+            raise PolicyError(f"{path}: {value.name!r} is {value.kind}, expected tensor(float)")
+    found = {value.name: value.shape for value in loaded.inputs}
     order = sorted(found, key=(*INPUTS, *found).index)
     block, hidden_shape = check_inputs({name: found[name] for name in order}, spec, str(path))
-    outputs = [value.name for value in session.get_outputs()]
+    outputs = [value.name for value in loaded.outputs]
     if len(outputs) != 1 + (hidden_shape != (0,)):
         raise PolicyError(
             f"{path}: outputs are {', '.join(outputs)}; expected the action and, where there is an "
@@ -59,8 +47,8 @@ def load_onnx(path: Path) -> BlockPolicy:
         state: np.ndarray, image: np.ndarray, hidden: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         feed = {"state": state, "image": image, "hidden": hidden}
-        action, *after = session.run(outputs, {name: feed[name] for name in found})
-        return np.asarray(action), np.asarray(after[0]) if after else hidden
+        action, *after = loaded.run({name: feed[name] for name in found})
+        return action, after[0] if after else hidden
 
     return proven(BlockPolicy(path.name, spec, model, hidden_shape, block, block), str(path))
 
