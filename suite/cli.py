@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import importlib
 import os
-import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from types import FrameType, ModuleType
+from collections.abc import Sequence
+from contextlib import nullcontext
+from types import ModuleType
 from typing import Any
 
 from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
+from suite.common.running.interrupts import end_at_once, ends_in_seconds
 
 COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
@@ -60,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line (`argv` without the program's name) and return the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     try:
-        with _termination_as_interrupt():
+        with ends_in_seconds():
             code = _dispatch(args)
             sys.stdout.flush()
             return code
@@ -138,31 +138,16 @@ def _run(name: str, args: list[str]) -> int:
     return DONE
 
 
-@contextmanager
-def _termination_as_interrupt() -> Iterator[None]:
-    """Let a polite kill end a command as Ctrl-C does: cleaning up, keeping what is finished."""
-
-    def interrupt(signum: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    try:
-        before = signal.signal(signal.SIGTERM, interrupt)
-    except ValueError:  # not in the main thread: signals are someone else's business
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def _complain(message: str) -> None:
     print(f"suite: {message}", file=sys.stderr)
 
 
 def entry() -> None:
     """Be the program `suite`."""
-    raise SystemExit(main())
+    code = main()
+    if code == INTERRUPTED:
+        end_at_once(code)
+    raise SystemExit(code)
 
 
 if __name__ == "__main__":
