@@ -64,6 +64,7 @@ def read_checked(path: Path) -> onnx.ModelProto:
         raise PolicyError(f"{path}: holds functions or training graphs; export inference alone")
     for graph in _graphs(proto.graph):
         for node in graph.node:
+            _check_text(path, node.op_type, node.domain)
             if node.domain not in _STANDARD:
                 raise PolicyError(
                     f"{path}: operator {node.op_type!r} is of domain {node.domain!r}; only "
@@ -113,6 +114,7 @@ def _graph_of(path: Path) -> onnx.ModelProto:
 def _data_file(path: Path, tensor: onnx.TensorProto) -> Path:
     """Return the file that a tensor's data lie in, which is in the same folder."""
     location = next((e.value for e in tensor.external_data if e.key == "location"), "")
+    _check_text(path, location)
     folder = path.resolve().parent
     file = (folder / location).resolve()
     if not location or Path(location).is_absolute() or not file.is_relative_to(folder):
@@ -123,6 +125,12 @@ def _data_file(path: Path, tensor: onnx.TensorProto) -> Path:
     if not file.is_file():
         raise PolicyError(f"{path}: tensor {tensor.name!r} is kept in {file}, which is missing")
     return file
+
+
+def _check_text(path: Path, *texts: object) -> None:
+    """Refuse what should be text and is none; protobuf hands such a field over as bytes."""
+    if not all(isinstance(text, str) and "\0" not in text for text in texts):
+        raise PolicyError(f"{path}: names in it are not UTF-8 ({texts}); export it again")
 
 
 def _graphs(graph: onnx.GraphProto) -> Iterator[onnx.GraphProto]:
