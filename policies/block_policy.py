@@ -118,7 +118,7 @@ def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
 
 def _told(action: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Answer NaN where the memory is no number any more: such a row does not fly, it is counted."""
-    lost = ~np.isfinite(hidden).all(axis=tuple(range(1, hidden.ndim)))
+    lost = ~np.asarray(np.isfinite(hidden).all(axis=tuple(range(1, hidden.ndim))))
     if lost.any():
         action = np.where(lost[:, None], np.float32(np.nan), action)
     return action, hidden

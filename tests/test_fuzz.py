@@ -37,6 +37,7 @@ KINDS = (
 )
 EACH = 1000
 """Inputs of each kind at full size."""
+SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture]
 WITHIN_S = 10.0
 """None takes longer."""
 MAPPING = """
@@ -129,7 +130,7 @@ def drawn_and_used(kind, folder):
 def fuzz(kind, folder, count):
     inputs, use = drawn_and_used(kind, folder)
 
-    @settings(max_examples=count, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=count, deadline=None, suppress_health_check=SLOW)
     @given(inputs)
     def each(given_input):
         answered(use, given_input)

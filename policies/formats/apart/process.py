@@ -98,7 +98,7 @@ class Apart:
         """
         arrays = {name: np.ascontiguousarray(value, np.float32) for name, value in feed.items()}
         head = {"arrays": [[name, value.shape] for name, value in arrays.items()]}
-        data = [memoryview(value).cast("B") for value in arrays.values() if value.size]
+        data = [value.reshape(-1).view(np.uint8).data for value in arrays.values() if value.size]
         found, answer = self._ask(head, data, ANSWER_S, "answered")
         if "error" in found:
             raise PolicyError(

@@ -17,10 +17,10 @@ import resource
 import signal
 import struct
 import sys
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 
-def write_frame(file: BinaryIO, head: dict[str, Any], *data: Any) -> None:
+def write_frame(file: IO[bytes], head: dict[str, Any], *data: Any) -> None:
     """Write one frame: its head, then the buffers of its data."""
     text = json.dumps(head).encode()
     file.write(struct.pack("<I", len(text)) + text)
@@ -29,7 +29,7 @@ def write_frame(file: BinaryIO, head: dict[str, Any], *data: Any) -> None:
     file.flush()
 
 
-def read_frame(file: BinaryIO) -> tuple[dict[str, Any], bytearray]:
+def read_frame(file: IO[bytes]) -> tuple[dict[str, Any], bytearray]:
     """Return one frame's head and its data.
 
     Raises:
@@ -45,7 +45,7 @@ def data_bytes(head: dict[str, Any]) -> int:
     return head.get("bytes", 0) + sum(4 * math.prod(shape) for _, shape in head.get("arrays", ()))
 
 
-def _exactly(file: BinaryIO, count: int) -> bytearray:
+def _exactly(file: IO[bytes], count: int) -> bytearray:
     data = bytearray(count)
     view, done = memoryview(data), 0
     while done < count:
@@ -56,7 +56,7 @@ def _exactly(file: BinaryIO, count: int) -> bytearray:
     return data
 
 
-def serve(source: BinaryIO, answers: BinaryIO) -> None:
+def serve(source: IO[bytes], answers: IO[bytes]) -> None:
     """Load the model of the first frame and answer until the parent closes the input."""
     head, model = read_frame(source)
     resource.setrlimit(resource.RLIMIT_AS, (head["memory_bytes"],) * 2)
