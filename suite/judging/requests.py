@@ -34,7 +34,8 @@ class Evaluation:
     processes: Annotated[int | None, Range(1, 256), tyro.conf.arg(name="procs")] = None
     """Processes that share the trials; by default as many cores as are worth it."""
     deadline_s: Annotated[float, Range(0.0, 3600.0, above=True)] | None = None
-    """A policy's answer for a batch that takes longer is late and not flown [s]."""
+    """A policy's answer for a batch that takes longer is late and not flown; ten in a row end the
+    trials in the air, as out of time [s]."""
     trust: bool = False
     """Also load policy files that can run code on this machine."""
 
