@@ -27,20 +27,21 @@ COMMANDS = {
     "train": f"train --preset small --iterations 60 --set {WORLDS}",
     "eval": f"eval --policy racer --trials 12 {EASY}",
     "collect": f"collect --policy racer --trials 12 {EASY}",
-    "delta": "delta suite/diagnose/example --iterations 60",
+    "delta": "delta FLIGHTS --iterations 60",
     "diagnose": "diagnose suite/diagnose/example --vehicle suite/diagnose/example/vehicle.toml",
     "loop": f"loop --preset small --iterations 6 --finetune-iterations 3 --fit-iterations 10 "
     f"--trials 2 --flights 2 {EASY} --set {WORLDS}",
 }
-"""What is killed, without its --out."""
+"""What is killed, without its --out; FLIGHTS is a folder of recorded ones."""
 COMPARED = ("*.safetensors", "*.parquet", "metrics.jsonl", "diagnosis.json", "flights.json")
 TIMES = ("seconds", "steps_per_s", "cold", "git_commit", "out", "took_s")
 """Keys that differ between runs that are alike."""
 
 
 def start(command: str, out: Path) -> subprocess.Popen[bytes]:
-    """Start a command with its files in `out`."""
-    args = [sys.executable, "-m", "suite.cli", *COMMANDS[command].split(), "--out", str(out)]
+    """Start a command with its files in `out`, two folders below that of all."""
+    words = COMMANDS[command].replace("FLIGHTS", str(out.parents[1] / "collect" / "plain")).split()
+    args = [sys.executable, "-m", "suite.cli", *words, "--out", str(out)]
     return subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
 
@@ -90,7 +91,10 @@ def main() -> int:
     asked = parser.parse_args()
     draw, bad, tried = random.Random(asked.seed), 0, 0
     with tempfile.TemporaryDirectory() as folder:
-        for command in asked.commands:
+        if "delta" in asked.commands and "collect" not in asked.commands:
+            finish("collect", Path(folder, "collect", "plain"))
+        # Flights first: what is fitted to them finds them.
+        for command in sorted(asked.commands, key=list(COMMANDS).index):
             plain = Path(folder, command, "plain")
             finish(command, plain)
             took_s, wanted = finish(command, Path(folder, command, "warm")), digest(plain)
