@@ -34,8 +34,8 @@ COMMANDS = {
 }
 """What is killed, without its --out; FLIGHTS is a folder of recorded ones."""
 COMPARED = ("*.safetensors", "*.parquet", "metrics.jsonl", "diagnosis.json", "flights.json")
-TIMES = ("seconds", "steps_per_s", "cold", "git_commit", "out", "took_s")
-"""Keys that differ between runs that are alike."""
+TIMES = ("seconds", "steps_per_s", "cold", "git_commit", "out", "collection", "source")
+"""Keys that differ between runs that are alike: times, and the folders of what a loop made."""
 
 
 def start(command: str, out: Path) -> subprocess.Popen[bytes]:
