@@ -50,11 +50,14 @@ class BlockPolicy:
     def act(
         self, hidden: np.ndarray, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return (action_b (n, 3) [m/s^2], hidden'); see `policies.policy.Policy.act`."""
+        """Return (action_b (n, 3) [m/s^2], hidden'); see `policies.policy.Policy.act`.
+
+        Where the memory overflows the answer is NaN, which the judge counts and does not fly.
+        """
         hidden = np.where(np.reshape(fresh, (-1, *[1] * len(self.hidden_shape))), 0, hidden)
         inputs = [np.asarray(x, np.float32) for x in (state, image, hidden)]
         if len(state) == self.rows == self.block:
-            return self.model(*inputs)
+            return _told(*self.model(*inputs))
         actions = np.empty((len(state), ACTION_SIZE), np.float32)
         remembered = np.empty_like(inputs[2])
         for low in range(0, len(state), self.rows):
@@ -62,7 +65,7 @@ class BlockPolicy:
             action, after = self.model(*(self._padded(x[used]) for x in inputs))
             actions[used] = action[: used.stop - low]
             remembered[used] = after[: used.stop - low]
-        return actions, remembered
+        return _told(actions, remembered)
 
     def _padded(self, rows: np.ndarray) -> np.ndarray:
         if len(rows) == self.block:
@@ -111,6 +114,14 @@ def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
         if not _same(tuple(wanted), policy.model(*everywhere)):
             return dataclasses.replace(policy, rows=1)
     return policy
+
+
+def _told(action: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Answer NaN where the memory is no number any more: such a row does not fly, it is counted."""
+    lost = ~np.asarray(np.isfinite(hidden).all(axis=tuple(range(1, hidden.ndim))))
+    if lost.any():
+        action = np.where(lost[:, None], np.float32(np.nan), action)
+    return action, hidden
 
 
 def _same(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> bool:

@@ -7,8 +7,10 @@ policy asks for the gate after the next one or for the next gate's flight direct
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from tracks.geometry.camera import Camera
+from tracks.input.ranges import Range, check_ranges
 
 STATE_SIZE = 12
 """Numbers in the paper's state: v_b (3), third row of R (3), gate in body axes (3), u (3)."""
@@ -18,15 +20,20 @@ ACTION_SIZE = 3
 """Numbers in an action: wanted net acceleration in current body axes [m/s^2]."""
 
 
+PIXELS_MOST = 640 * 480
+"""Pixels of an image: those of the usual depth cameras at full size. 64 trials' images of this size
+and what they are made with fit into 2 GB."""
+
+
 @dataclass(frozen=True)
 class DepthEncoding:
     """Inverse depth as the network sees it: scale / clip(depth, near, far) - offset."""
 
-    scale: float = 3.0
+    scale: Annotated[float, Range(1e-6, 1e6)] = 3.0
     """Numerator [m]."""
-    near: float = 0.3
+    near: Annotated[float, Range(1e-3, 100.0)] = 0.3
     """Depths below this read as this [m]."""
-    offset: float = 0.6
+    offset: Annotated[float, Range(-1e6, 1e6)] = 0.6
     """Subtracted, so that far pixels are near zero [1]."""
 
 
@@ -34,13 +41,13 @@ class DepthEncoding:
 class PolicySpec:
     """What trainer and judge must agree on for a policy to fly; stored in its checkpoint."""
 
-    rate_hz: float = 30.0
+    rate_hz: Annotated[float, Range(1.0, 500.0)] = 30.0
     """Actions per second [Hz]."""
     camera: Camera = field(default_factory=Camera)
     """The camera that the images come from; depths are clipped to its range."""
     depth: DepthEncoding = field(default_factory=DepthEncoding)
     """How a depth becomes an input."""
-    hidden_size: int = 192
+    hidden_size: Annotated[int, Range(1, 4096)] = 192
     """Width of the embeddings and of the recurrent state."""
     second_gate: bool = False
     """Whether the state goes on with the centre of the gate after the next one, in body axes."""
@@ -51,3 +58,41 @@ class PolicySpec:
     def state_size(self) -> int:
         """Numbers in the state observation."""
         return STATE_SIZE + 3 * sum(getattr(self, key) for key in EXTRAS)
+
+
+def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
+    """Refuse a spec that no policy can have.
+
+    Args:
+        spec: what to check.
+        where: what stands before a key in the message.
+
+    Raises:
+        ValueError: naming the key, its value and what is allowed.
+    """
+    check_ranges(spec, where)
+    camera = spec.camera
+    if camera.width * camera.height > PIXELS_MOST:
+        raise ValueError(
+            f"{where}camera.width x camera.height is {camera.width} x {camera.height}, allowed "
+            f"is up to {PIXELS_MOST} pixels, as many as 640 x 480"
+        )
+    if spec.depth.near >= camera.range_m:
+        raise ValueError(
+            f"{where}depth.near is {spec.depth.near:g} m, allowed is below camera.range_m "
+            f"({camera.range_m:g} m)"
+        )
+
+
+def check_image_size(spec: PolicySpec) -> None:
+    """Refuse an image that our network cannot take.
+
+    Raises:
+        ValueError: naming the side, its pixels and what is allowed.
+    """
+    for side, pixels in (("width", spec.camera.width), ("height", spec.camera.height)):
+        if pixels % 4 or pixels < 20:
+            raise ValueError(
+                f"spec.camera.{side} is {pixels}, allowed for our network are multiples of 4 from "
+                "20 on"
+            )

@@ -2,22 +2,23 @@
 
 A command is a module with `Config`, a frozen dataclass that becomes its options (one docstring
 line under each field is its help), and `run(config, console)`, which does the work and returns
-what --json prints. See docs/commands.md for how to add one.
+what --json prints; where it has `written(config)`, no other command writes into these folders
+meanwhile. See docs/commands.md for how to add one.
 """
 
 from __future__ import annotations
 
 import importlib
 import os
-import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from types import FrameType, ModuleType
+from collections.abc import Sequence
+from contextlib import nullcontext
+from types import ModuleType
 from typing import Any
 
 from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
+from suite.common.running.interrupts import end_at_once, ends_in_seconds
 
 COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
@@ -59,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line (`argv` without the program's name) and return the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     try:
-        with _termination_as_interrupt():
+        with ends_in_seconds():
             code = _dispatch(args)
             sys.stdout.flush()
             return code
@@ -117,6 +118,8 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 def _run(name: str, args: list[str]) -> int:
     from suite.common.compiled import keep_compiled
     from suite.common.console import Console, stdout_kept_clean
+    from suite.common.running.lock import one_writer_each
+    from tracks.input.ranges import check_ranges
 
     keep_compiled()
     try:
@@ -124,30 +127,15 @@ def _run(name: str, args: list[str]) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     with stdout_kept_clean() if config.json else nullcontext():
-        answer = command.run(config, Console())
+        check_ranges(config, options=True)
+        folders = command.written(config) if hasattr(command, "written") else []
+        with one_writer_each(folders):
+            answer = command.run(config, Console())
     if config.json:
         from tracks.common.files import to_json
 
         print(to_json(answer, indent=2), flush=True)
     return DONE
-
-
-@contextmanager
-def _termination_as_interrupt() -> Iterator[None]:
-    """Let a polite kill end a command as Ctrl-C does: cleaning up, keeping what is finished."""
-
-    def interrupt(signum: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    try:
-        before = signal.signal(signal.SIGTERM, interrupt)
-    except ValueError:  # not in the main thread: signals are someone else's business
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _complain(message: str) -> None:
@@ -156,7 +144,10 @@ def _complain(message: str) -> None:
 
 def entry() -> None:
     """Be the program `suite`."""
-    raise SystemExit(main())
+    code = main()
+    if code == INTERRUPTED:
+        end_at_once(code)
+    raise SystemExit(code)
 
 
 if __name__ == "__main__":

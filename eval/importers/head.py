@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from eval.logs.columns import FlightLogError
+from tracks.input.reading import LOG_BYTES, InputError, check_file
 
 
 def read_head(path: Path) -> bytes:
@@ -14,10 +15,14 @@ def read_head(path: Path) -> bytes:
         FlightLogError: where it cannot be read or is empty.
     """
     try:
+        check_file(path, LOG_BYTES)
         with path.open("rb") as file:
             head = file.read(8192)
     except OSError as error:
         reason = f"cannot be read: {error.strerror or error}"
+        raise FlightLogError(str(path), None, None, reason) from None
+    except InputError as error:
+        reason = str(error).removeprefix(f"{path}: ")
         raise FlightLogError(str(path), None, None, reason) from None
     if not head:
         raise FlightLogError(str(path), None, None, "the file is empty")

@@ -18,6 +18,9 @@ class ActionLimits:
     deadline_s: float | None = None
     """A policy's answer for its batch that takes longer than this is late and not flown [s]; None
     sets no deadline. With one, outcomes depend on the machine's load and do not repeat."""
+    late_most: int = 10
+    """So many answers in a row that come late end the trials in the air, as out of time: a policy
+    that is too slow would be waited for thousands of times."""
 
 
 class Guarded(NamedTuple):

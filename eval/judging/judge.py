@@ -27,6 +27,7 @@ from eval.worlds.trial import (
     ENDINGS,
     FINISHED,
     FLYING,
+    TIMEOUT,
     Rules,
     TrialResult,
     TrialSpec,
@@ -198,6 +199,7 @@ class _Slots:
         self._decision = np.zeros(n)
         self._action_b = np.zeros((n, 3))
         self._faults = np.zeros((n, 3), int)
+        self._late = np.zeros(n, int)  # answers in a row
         self._fresh = np.ones(n, bool)
         self._hidden = policy.start(n)
         self._recorder = Recorder(n, task.record.depth) if task.record else None
@@ -210,7 +212,8 @@ class _Slots:
         while waiting or (self._index >= 0).any():
             self._fill(waiting)
             self._decide_and_fly()
-            for slot in np.flatnonzero((self._index >= 0) & (self._world.progress.ended != FLYING)):
+            over = (self._world.progress.ended != FLYING) | self._is_given_up()
+            for slot in np.flatnonzero((self._index >= 0) & over):
                 index = int(self._index[slot])
                 result = self._result(int(slot))
                 flight = None
@@ -220,6 +223,9 @@ class _Slots:
                 self._index[slot] = -1
                 yield index, result, flight
 
+    def _is_given_up(self) -> np.ndarray:
+        return self._late >= self._task.options.limits.late_most
+
     def _fill(self, waiting: list[Numbered]) -> None:
         entries = []
         for slot in np.flatnonzero(self._index < 0).tolist():
@@ -228,6 +234,7 @@ class _Slots:
             self._index[slot], trial = waiting.pop()
             self._trial[slot] = trial
             self._decision[slot], self._action_b[slot], self._faults[slot] = 0, 0.0, 0
+            self._late[slot] = 0
             self._fresh[slot] = True
             if self._recorder:
                 self._recorder.start(slot)
@@ -255,6 +262,7 @@ class _Slots:
         )
         self._action_b = guarded.action_b
         self._faults += np.stack([guarded.bad, guarded.limited, guarded.late], axis=-1)
+        self._late = np.where(guarded.late, self._late + 1, 0)
         self._fresh[:] = False
         if self._recorder:
             self._recorder.decided(np.flatnonzero(flying), self._action_b, seen.depth_m)
@@ -270,7 +278,7 @@ class _Slots:
         trial, task = self._trial[slot], self._task
         assert trial is not None
         progress = self._world.progress
-        ended, step = int(progress.ended[slot]), int(progress.step[slot])
+        ended, step = int(progress.ended[slot]) or TIMEOUT, int(progress.step[slot])
         how = ENDINGS[ended - 1]
         judged = step + (ended != DIVERGED)  # states whose speed is in v_sum
         return TrialResult(

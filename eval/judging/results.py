@@ -6,7 +6,6 @@ a kill, and the same command again flies the rest.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterable, Sequence
@@ -17,6 +16,7 @@ from typing import Any, TextIO
 from eval.worlds.trial import TrialResult, TrialSpec
 from tracks.common.files import plain, replacing_file, to_json, write_json, write_text
 from tracks.common.provenance import stamp
+from tracks.input.reading import LOG_BYTES, parse_json, read_bytes
 
 SCHEMA = 1
 """Version of the result files."""
@@ -142,11 +142,11 @@ class Journal:
     def _read(self, about: dict[str, Any]) -> int:
         """Fill `done`; return how many bytes of the file are whole lines."""
         keep = 0
-        for number, line in enumerate(self.path.read_bytes().splitlines(keepends=True)):
+        for number, line in enumerate(read_bytes(self.path, LOG_BYTES).splitlines(keepends=True)):
             if not line.endswith(b"\n"):
                 break
             try:
-                entry = json.loads(line)
+                entry = parse_json(line, "it")
                 result = None if number == 0 else _result(entry)
             except ValueError as error:
                 raise ValueError(

@@ -6,6 +6,7 @@ Parquet keeps the text in the metadata key `flight`. CSV keeps it in the first r
 
 from __future__ import annotations
 
+import codecs
 import csv
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,10 +19,12 @@ import pyarrow.parquet
 
 from eval.logs.columns import KNOWN, FlightLogError
 from tracks.common.files import replacing_file
+from tracks.input.reading import LOG_BYTES, InputError, check_file
 
 METADATA = "flight"
 """Parquet metadata key and CSV column of the JSON text."""
 PARQUET_MAGIC = b"PAR1"
+NOT_CSV = "neither a Parquet file nor CSV in UTF-8"
 
 
 def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
@@ -34,10 +37,14 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[st
         FlightLogError: where the file is missing, empty, corrupt or neither Parquet nor CSV.
     """
     try:
+        check_file(path, LOG_BYTES)
         with path.open("rb") as file:
             head = file.read(4096)
     except OSError as error:
         reason = f"cannot be read: {error.strerror or error}"
+        raise FlightLogError(str(path), None, None, reason) from None
+    except InputError as error:
+        reason = str(error).removeprefix(f"{path}: ")
         raise FlightLogError(str(path), None, None, reason) from None
     if not head:
         raise FlightLogError(str(path), None, None, "the file is empty; record or copy it again")
@@ -95,6 +102,7 @@ def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[s
 
 def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
     names = _csv_header(path)
+    _check_utf8(path)
     bad_rows: list[Any] = []
 
     def remember(row: Any) -> str:
@@ -133,9 +141,23 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
         if row < last:
             raise FlightLogError(str(path), None, row, reason)
         warnings.append(f"{path}: row {row}, the last, is left out: {reason}")
+    if not table.num_rows:
+        raise FlightLogError(str(path), None, None, "a header, but no whole rows")
     columns = _arrays(table, path)
     text = columns.pop(METADATA, np.array([None]))[0]
     return columns, text if isinstance(text, str) else None, warnings
+
+
+def _check_utf8(path: Path) -> None:
+    """Refuse other bytes than UTF-8: pyarrow trips over them in a row that it tells of."""
+    decode = codecs.getincrementaldecoder("utf-8")().decode
+    try:
+        with path.open("rb") as file:
+            while part := file.read(2**20):
+                decode(part)
+        decode(b"", True)
+    except UnicodeDecodeError:
+        raise FlightLogError(str(path), None, None, NOT_CSV) from None
 
 
 def _csv_header(path: Path) -> list[str]:
@@ -143,8 +165,7 @@ def _csv_header(path: Path) -> list[str]:
         with path.open(encoding="utf-8-sig", newline="") as file:
             names = [name.strip() for name in next(csv.reader(file), [])]
     except (UnicodeDecodeError, csv.Error):
-        reason = "neither a Parquet file nor CSV in UTF-8"
-        raise FlightLogError(str(path), None, None, reason) from None
+        raise FlightLogError(str(path), None, None, NOT_CSV) from None
     if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
         reason = "the first line has no commas; separate the columns by commas"
         raise FlightLogError(str(path), None, None, reason)

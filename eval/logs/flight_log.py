@@ -7,7 +7,6 @@ other readers see as unknown ones; unknown columns of any origin are kept.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from eval.logs.velocity import velocity_from_position
 from tracks.common.files import to_json
 from tracks.common.provenance import stamp
 from tracks.geometry.rotation import quat_to_rot
+from tracks.input.reading import InputError, parse_json
 
 SCHEMA = 1
 """Version of the flight log's layout, in the metadata of every file we write."""
@@ -240,8 +240,8 @@ def read_flight(path: str | Path) -> FlightLog:
     about: Any = {}
     if text is not None:
         try:
-            about = json.loads(text)
-        except ValueError:
+            about = parse_json(text, str(path))
+        except InputError:
             about = None
         if not isinstance(about, dict):
             warnings.append(f"{path}: metadata `flight` is not a JSON object; ignored")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +19,11 @@ from eval.effects.interface import Effect, at
 from eval.vehicles.vehicle import CollisionBox, Controller, Rotors, Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
 from tracks.common.files import write_text
-from tracks.common.names import closest, unknown_name
+from tracks.common.names import LONGEST, closest, unknown_name
 from tracks.common.toml_text import to_toml
 from tracks.geometry.camera import Camera
+from tracks.input.ranges import is_finite, shown
+from tracks.input.reading import InputError, read_toml, reason
 
 SCHEMA = 1
 SHIPPED = Path(__file__).resolve().parents[1] / "vehicles"
@@ -55,14 +56,14 @@ def load_vehicle(source: str | os.PathLike[str]) -> Vehicle:
             raise unknown_name("vehicle (or file)", str(source), shipped_vehicles())
         path = SHIPPED / f"{source}.toml"
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = read_toml(path)
     except FileNotFoundError as error:
         known = ", ".join(shipped_vehicles())
         raise VehicleFileError(f"{path}: no such file; shipped by name: {known}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise VehicleFileError(f"{path}: cannot be read as text: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise VehicleFileError(f"{path}: not valid TOML: {error}") from error
+    except OSError as error:
+        raise VehicleFileError(f"{path}: cannot be read: {reason(error)}") from error
+    except InputError as error:
+        raise VehicleFileError(str(error)) from error
     try:
         return parse_vehicle(table)
     except ValueError as error:
@@ -77,10 +78,12 @@ def parse_vehicle(table: Mapping[str, Any]) -> Vehicle:
     """
     _known_keys("", table, KEYS)
     if table.get("schema", SCHEMA) != SCHEMA:
-        raise ValueError(f"schema = {table['schema']!r}: this version of the suite reads {SCHEMA}")
+        raise ValueError(
+            f"schema = {shown(table['schema'])}: this version of the suite reads {SCHEMA}"
+        )
     name = _required("", table, "name")
     if not isinstance(name, str) or not name:
-        raise ValueError(f"name = {name!r}: must be a text that is not empty")
+        raise ValueError(f"name = {shown(name)}: must be a text that is not empty")
     vehicle = Vehicle(
         name=name,
         mass=_number("mass", _required("", table, "mass")),
@@ -142,7 +145,7 @@ def _effects(tables: Mapping[str, Any], vehicle: Vehicle) -> dict[str, Any]:
     for name, table in tables.items():
         effect = find_effect(name)
         if not isinstance(table, Mapping):
-            raise ValueError(f"effects.{name} = {table!r}: must be a table [effects.{name}]")
+            raise ValueError(f"effects.{name} = {shown(table)}: must be a table [effects.{name}]")
         if effect.read:
             try:
                 values[name] = effect.read(table)
@@ -196,7 +199,9 @@ def _rotors(table: Mapping[str, Any]) -> Rotors:
     _known_keys(where, table, names)
     hubs = _required(where, table, "position")
     if not isinstance(hubs, list) or len(hubs) != 4:
-        raise ValueError(f"rotors.position = {hubs!r}: must be a list of 4 lists of 3 numbers [m]")
+        raise ValueError(
+            f"rotors.position = {shown(hubs)}: must be a list of 4 lists of 3 numbers [m]"
+        )
     spin = _numbers("rotors.spin", _required(where, table, "spin"), 4)
     if any(direction not in (1, -1) for direction in spin):
         raise ValueError(
@@ -245,7 +250,7 @@ def _camera(table: Mapping[str, Any]) -> Camera:
 def _section(table: Mapping[str, Any], key: str, needed: bool = True) -> Mapping[str, Any]:
     section = _required("", table, key) if needed else table.get(key, {})
     if not isinstance(section, Mapping):
-        raise ValueError(f"{key} = {section!r}: must be a table [{key}]")
+        raise ValueError(f"{key} = {shown(section)}: must be a table [{key}]")
     return section
 
 
@@ -260,18 +265,20 @@ def _known_keys(where: str, table: Mapping[str, Any], allowed: Any) -> None:
         if key not in allowed:
             guess = closest(key, allowed)
             meant = f" did you mean {guess!r}?" if guess else ""
-            raise ValueError(f"{where}{key}: unknown key;{meant} allowed: {', '.join(allowed)}")
+            raise ValueError(
+                f"{where}{key[:LONGEST]}: unknown key;{meant} allowed: {', '.join(allowed)}"
+            )
 
 
 def _number(key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"{key} = {value!r}: must be a finite number")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not is_finite(value):
+        raise ValueError(f"{key} = {shown(value)}: must be a finite number")
     return float(value)
 
 
 def _numbers(key: str, value: Any, size: int) -> Any:
     if not isinstance(value, list) or len(value) != size:
-        raise ValueError(f"{key} = {value!r}: must be a list of {size} numbers")
+        raise ValueError(f"{key} = {shown(value)}: must be a list of {size} numbers")
     return tuple(_number(key, entry) for entry in value)
 
 

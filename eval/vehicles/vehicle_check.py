@@ -18,8 +18,8 @@ def check_vehicle(vehicle: Vehicle) -> None:
         ValueError: with the key, the value and what is allowed.
     """
     rotors, controller, camera = vehicle.rotors, vehicle.controller, vehicle.camera
-    _positive("mass", vehicle.mass, "kg")
-    _positive("inertia", vehicle.inertia, "kg m^2")
+    _between("mass", vehicle.mass, 0.0001, 10000.0, "kg")
+    _between("inertia", vehicle.inertia, 1e-10, 10000.0, "kg m^2")
     x, y, z = vehicle.inertia
     # A flat body has A + B = C exactly; rounding must not refuse it.
     if 2.0 * max(x, y, z) > (x + y + z) * (1.0 + 1e-12):
@@ -27,19 +27,20 @@ def check_vehicle(vehicle: Vehicle) -> None:
             f"inertia = {list(vehicle.inertia)}: no body has this; the largest must be at most "
             "the sum of the other two"
         )
-    _positive("rotors.thrust_coefficient", rotors.thrust_coefficient, "N/(rad/s)^2")
-    _positive("rotors.torque_coefficient", rotors.torque_coefficient, "N m/(rad/s)^2")
-    _positive("rotors.speed_max", rotors.speed_max, "rad/s")
+    _between("rotors.thrust_coefficient", rotors.thrust_coefficient, 1e-15, 1000.0, "N/(rad/s)^2")
+    _between("rotors.torque_coefficient", rotors.torque_coefficient, 1e-18, 1000.0, "N m/(rad/s)^2")
+    _between("rotors.speed_max", rotors.speed_max, 1.0, 1000000.0, "rad/s")
+    for hub in rotors.position:
+        _between("rotors.position", hub, -100.0, 100.0, "m")
     _between("rotors.time_constant", rotors.time_constant, 0.0, 0.5, "s")
-    _positive("controller.rate_gain", controller.rate_gain, "1/s")
+    _between("controller.rate_gain", controller.rate_gain, 0.001, 10000.0, "1/s")
     _between("controller.frequency", controller.frequency, 50.0, 10000.0, "Hz")
-    _positive("controller.attitude_gain", controller.attitude_gain, "1/s")
-    _positive("controller.rate_max", controller.rate_max, "rad/s")
-    _positive("body.half_size", vehicle.body.half_size, "m")
+    _between("controller.attitude_gain", controller.attitude_gain, 0.001, 10000.0, "1/s")
+    _between("controller.rate_max", controller.rate_max, 0.001, 200.0, "rad/s")
+    _between("body.half_size", vehicle.body.half_size, 0.0001, 100.0, "m")
     _between("camera.pitch_deg", camera.pitch_deg, -90.0, 90.0, "deg")
-    for angle in camera.fov_deg:
-        _between("camera.fov_deg", angle, 1.0, 170.0, "deg")
-    _positive("camera.range", camera.range_m, "m")
+    _between("camera.fov_deg", camera.fov_deg, 1.0, 170.0, "deg")
+    _between("camera.range", camera.range_m, 0.1, 1000.0, "m")
     _check_rotors(vehicle)
 
 
@@ -69,12 +70,7 @@ def _check_rotors(vehicle: Vehicle) -> None:
         )
 
 
-def _positive(key: str, value: Any, unit: str) -> None:
-    if np.min(value) <= 0.0:
-        shown = list(value) if isinstance(value, tuple) else value
-        raise ValueError(f"{key} = {shown}: must be above 0 {unit}")
-
-
-def _between(key: str, value: float, low: float, high: float, unit: str) -> None:
-    if not low <= value <= high:
-        raise ValueError(f"{key} = {value}: must be from {low:g} to {high:g} {unit}")
+def _between(key: str, value: Any, low: float, high: float, unit: str) -> None:
+    if not (np.min(value) >= low and np.max(value) <= high):
+        given = list(value) if isinstance(value, tuple) else value
+        raise ValueError(f"{key} = {given}: must be from {low:g} to {high:g} {unit}")

@@ -7,7 +7,6 @@ was cut short, mixed up with another or changed is refused.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,15 @@ import numpy as np
 from policies.errors import PolicyError
 from tracks.common.files import recover_folder, replacing_folder, to_json
 from tracks.common.provenance import stamp
+from tracks.input.ranges import shown
+from tracks.input.reading import (
+    TEXT_BYTES,
+    WEIGHTS_BYTES,
+    InputError,
+    parse_json,
+    read_bytes,
+    reason,
+)
 
 WEIGHTS = "weights.safetensors"
 CONFIG = "config.json"
@@ -101,13 +109,15 @@ def load_arrays(folder: Path, *, kind: str, finite: bool = True) -> Stored:
             f"give a checkpoint of that kind"
         )
     path = folder / WEIGHTS
-    weights = _read(path)
     expected = config["weights"]
-    if len(weights) != expected["bytes"]:
+    # Before gigabytes are read: a file of another size is refused unread.
+    size = path.stat().st_size if path.is_file() else expected["bytes"]
+    if size != expected["bytes"]:
         raise PolicyError(
-            f"{path}: {len(weights)} bytes, {CONFIG} says {expected['bytes']}; "
+            f"{path}: {size} bytes, {CONFIG} says {expected['bytes']}; "
             "the file is cut short or another's: copy the whole folder again"
         )
+    weights = _read(path, WEIGHTS_BYTES)
     digest = hashlib.sha256(weights).hexdigest()
     if digest != expected["sha256"]:
         raise PolicyError(
@@ -134,11 +144,11 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG
     try:
-        config = json.loads(_read(path))
-    except ValueError as error:
-        raise PolicyError(
-            f"{path}: not JSON ({error}); the file is damaged: copy the whole folder again"
-        ) from None
+        config = parse_json(_read(path, TEXT_BYTES), str(path))
+    except PolicyError:
+        raise
+    except InputError as error:
+        raise PolicyError(f"{error}; the file is damaged: copy the whole folder again") from None
     if not isinstance(config, dict):
         raise PolicyError(f"{path}: holds a {type(config).__name__}, expected an object")
     _require(path, config, "schema", int)
@@ -193,21 +203,23 @@ def check_shapes(
             )
 
 
-def _read(path: Path) -> bytes:
+def _read(path: Path, most_bytes: int) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path, most_bytes)
     except FileNotFoundError:
         raise PolicyError(
             f"{path}: missing; a checkpoint is a folder with {WEIGHTS} and {CONFIG}"
         ) from None
     except OSError as error:
-        raise PolicyError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+        raise PolicyError(f"{path}: cannot be read ({reason(error)}); check the file") from None
+    except InputError as error:
+        raise PolicyError(f"{error}; check the file") from None
 
 
 def _require(path: Path, table: Mapping[str, Any], key: str, kind: type) -> None:
     value = table.get(key)
     if not isinstance(value, kind) or isinstance(value, bool):
         raise PolicyError(
-            f"{path}: key {key!r} is {value!r}, expected a value of type {kind.__name__}; "
+            f"{path}: key {key!r} is {shown(value)}, expected a value of type {kind.__name__}; "
             "the file is damaged or not a checkpoint's: copy the whole folder again"
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from policies.errors import PolicyError
@@ -10,6 +9,7 @@ from policies.formats.spec_json import spec_from_json, spec_to_json
 from policies.spec import PolicySpec
 from tracks.common.files import to_json
 from tracks.common.provenance import stamp
+from tracks.input.reading import InputError, parse_json
 
 KEY = "policy.json"
 """Name of the extra file in a torch archive, and of the metadata entry in ONNX."""
@@ -36,9 +36,9 @@ def extract(text: str | bytes | None, where: str) -> PolicySpec:
         return PolicySpec()
     where = f"{where}: {KEY}"
     try:
-        data: Any = json.loads(text)
-    except ValueError as error:
-        raise PolicyError(f"{where}: not JSON ({error}); write it again") from None
+        data: Any = parse_json(text, where)
+    except InputError as error:
+        raise PolicyError(f"{error}; write it again") from None
     if not isinstance(data, dict) or data.get("schema", SCHEMA) != SCHEMA:
         raise PolicyError(f"{where}: expected an object with schema {SCHEMA}; update the suite")
     return spec_from_json(data.get("spec", {}), f"{where}: spec")

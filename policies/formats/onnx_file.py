@@ -1,4 +1,4 @@
-"""ONNX files as `Policy`: standard operators only, run by onnxruntime on one CPU thread."""
+"""ONNX files as `Policy`: standard operators only, run by onnxruntime in a process of its own."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 
 from policies.block_policy import BlockPolicy, proven
 from policies.errors import PolicyError
+from policies.formats.apart.process import Apart
 from policies.formats.embedded_spec import KEY, extract
 from policies.formats.program_inputs import INPUTS, check_inputs
+from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
-MAX_BYTES = 512 * 2**20
-"""Larger files, external data included, are refused."""
 _STANDARD = ("", "ai.onnx")
 
 
@@ -30,26 +29,14 @@ def load_onnx(path: Path) -> BlockPolicy:
     proto = read_checked(path)
     text = next((entry.value for entry in proto.metadata_props if entry.key == KEY), None)
     spec = extract(text, str(path))
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.use_deterministic_compute = True
-    options.log_severity_level = 4
-    try:
-        session = onnxruntime.InferenceSession(
-            proto.SerializeToString(), options, providers=["CPUExecutionProvider"]
-        )
-    except Exception as error:  # onnxruntime's own exceptions share no public base
-        raise PolicyError(
-            f"{path}: onnxruntime {onnxruntime.__version__} cannot load it "
-            f"({_first_line(error)}); export it for an older opset"
-        ) from error
-    for value in (*session.get_inputs(), *session.get_outputs()):
-        if value.type != "tensor(float)":
-            raise PolicyError(f"{path}: {value.name!r} is {value.type}, expected tensor(float)")
-    found = {value.name: tuple(value.shape) for value in session.get_inputs()}
+    loaded = Apart(proto.SerializeToString(), str(path))
+    for value in (*loaded.inputs, *loaded.outputs):
+        if value.kind != "tensor(float)":
+            raise PolicyError(f"{path}: {value.name!r} is {value.kind}, expected tensor(float)")
+    found = {value.name: value.shape for value in loaded.inputs}
     order = sorted(found, key=(*INPUTS, *found).index)
     block, hidden_shape = check_inputs({name: found[name] for name in order}, spec, str(path))
-    outputs = [value.name for value in session.get_outputs()]
+    outputs = [value.name for value in loaded.outputs]
     if len(outputs) != 1 + (hidden_shape != (0,)):
         raise PolicyError(
             f"{path}: outputs are {', '.join(outputs)}; expected the action and, where there is an "
@@ -60,8 +47,8 @@ def load_onnx(path: Path) -> BlockPolicy:
         state: np.ndarray, image: np.ndarray, hidden: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         feed = {"state": state, "image": image, "hidden": hidden}
-        action, *after = session.run(outputs, {name: feed[name] for name in found})
-        return np.asarray(action), np.asarray(after[0]) if after else hidden
+        action, *after = loaded.run({name: feed[name] for name in found})
+        return action, after[0] if after else hidden
 
     return proven(BlockPolicy(path.name, spec, model, hidden_shape, block, block), str(path))
 
@@ -77,6 +64,7 @@ def read_checked(path: Path) -> onnx.ModelProto:
         raise PolicyError(f"{path}: holds functions or training graphs; export inference alone")
     for graph in _graphs(proto.graph):
         for node in graph.node:
+            _check_text(path, node.op_type, node.domain)
             if node.domain not in _STANDARD:
                 raise PolicyError(
                     f"{path}: operator {node.op_type!r} is of domain {node.domain!r}; only "
@@ -89,8 +77,8 @@ def read_checked(path: Path) -> onnx.ModelProto:
     size = path.stat().st_size
     for tensor in external:
         size += _data_file(path, tensor).stat().st_size
-    if size > MAX_BYTES:
-        raise PolicyError(f"{path}: {size} bytes with its data, allowed are {MAX_BYTES}")
+    if size > MODEL_BYTES:
+        raise PolicyError(f"{path}: {size} bytes with its data, allowed are up to {MODEL_BYTES}")
     try:
         if external:
             onnx.load_external_data_for_model(proto, str(path.resolve().parent))
@@ -112,9 +100,11 @@ def files_of(path: Path) -> list[Path]:
 
 def _graph_of(path: Path) -> onnx.ModelProto:
     try:
-        return onnx.load_model(path, load_external_data=False)
+        return onnx.load_model_from_string(read_bytes(path, MODEL_BYTES))
     except OSError as error:
-        raise PolicyError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+        raise PolicyError(f"{path}: cannot be read ({reason(error)}); check the file") from None
+    except InputError as error:
+        raise PolicyError(str(error)) from None
     except Exception as error:  # protobuf's DecodeError; protobuf is no dependency of ours
         raise PolicyError(
             f"{path}: not a whole ONNX file ({_first_line(error)}); export it again"
@@ -124,6 +114,7 @@ def _graph_of(path: Path) -> onnx.ModelProto:
 def _data_file(path: Path, tensor: onnx.TensorProto) -> Path:
     """Return the file that a tensor's data lie in, which is in the same folder."""
     location = next((e.value for e in tensor.external_data if e.key == "location"), "")
+    _check_text(path, location)
     folder = path.resolve().parent
     file = (folder / location).resolve()
     if not location or Path(location).is_absolute() or not file.is_relative_to(folder):
@@ -134,6 +125,12 @@ def _data_file(path: Path, tensor: onnx.TensorProto) -> Path:
     if not file.is_file():
         raise PolicyError(f"{path}: tensor {tensor.name!r} is kept in {file}, which is missing")
     return file
+
+
+def _check_text(path: Path, *texts: object) -> None:
+    """Refuse what should be text and is none; protobuf hands such a field over as bytes."""
+    if not all(isinstance(text, str) and "\0" not in text for text in texts):
+        raise PolicyError(f"{path}: names in it are not UTF-8 ({texts}); export it again")
 
 
 def _graphs(graph: onnx.GraphProto) -> Iterator[onnx.GraphProto]:

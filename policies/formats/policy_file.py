@@ -12,7 +12,7 @@ import numpy as np
 from policies.errors import PolicyError
 from policies.formats.checkpoint import CONFIG, WEIGHTS, check_shapes, load_arrays, save_arrays
 from policies.formats.spec_json import spec_from_json, spec_to_json
-from policies.spec import PolicySpec
+from policies.spec import PolicySpec, check_image_size
 
 KIND = "policy"
 
@@ -81,11 +81,9 @@ def expected_shapes(spec: PolicySpec, where: str) -> dict[str, tuple[int, ...]]:
 
     from policies.networks import network
 
-    for side, pixels in (("height", spec.camera.height), ("width", spec.camera.width)):
-        if pixels % 4 or pixels < 20:
-            raise PolicyError(
-                f"{where}: spec.camera.{side} is {pixels}, our network takes multiples of 4 "
-                "from 20 on"
-            )
+    try:
+        check_image_size(spec)
+    except ValueError as error:
+        raise PolicyError(f"{where}: {error}") from None
     shapes = jax.eval_shape(lambda key: network.init(key, spec), jax.random.key(0))
     return {name: tuple(value.shape) for name, value in shapes.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from policies.block_policy import BLOCK
@@ -11,6 +12,12 @@ from policies.spec import PolicySpec
 
 INPUTS = ("state", "image", "hidden")
 """Names of a program's inputs, in order; a policy without memory leaves the last out."""
+
+
+BLOCK_MOST = 4096
+"""Rows of a model with a fixed batch."""
+HIDDEN_MOST = 2**16
+"""Numbers in one row's recurrent state."""
 
 
 def check_inputs(
@@ -35,6 +42,11 @@ def check_inputs(
         raise PolicyError(
             f"{where}: inputs have shapes {shapes}; all need the batch as first axis, and the "
             "other axes of 'hidden' must be fixed"
+        )
+    if not 1 <= block <= BLOCK_MOST or not 0 <= math.prod(hidden) <= HIDDEN_MOST:
+        raise PolicyError(
+            f"{where}: inputs have shapes {shapes}; allowed are batches of 1 to {BLOCK_MOST} rows "
+            f"and up to {HIDDEN_MOST} numbers in 'hidden'"
         )
     image = (spec.camera.height, spec.camera.width)
     for name, expected in (("state", (spec.state_size,)), ("image", image)):

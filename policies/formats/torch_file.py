@@ -21,6 +21,7 @@ from policies.errors import PolicyError
 from policies.formats.embedded_spec import KEY, extract
 from policies.formats.program_inputs import INPUTS, check_inputs, inputs_message
 from policies.spec import ACTION_SIZE
+from tracks.input.reading import MODEL_BYTES, InputError, check_file
 
 
 def load_program(path: Path, trust: bool = False) -> BlockPolicy:
@@ -31,6 +32,7 @@ def load_program(path: Path, trust: bool = False) -> BlockPolicy:
             fit.
     """
     _check_trusted(path, "a torch exported program", trust)
+    _check_file(path)
     extra = {KEY: ""}
     with _refusing(path):
         program = torch.export.load(path, extra_files=extra)
@@ -53,6 +55,7 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
             fit.
     """
     _check_trusted(path, "TorchScript", trust)
+    _check_file(path)
     extra = {KEY: ""}
     with _refusing(path):
         module = torch.jit.load(str(path), map_location="cpu", _extra_files=extra).eval()
@@ -74,6 +77,13 @@ def _check_trusted(path: Path, kind: str, trust: bool) -> None:
         )
 
 
+def _check_file(path: Path) -> None:
+    try:
+        check_file(path, MODEL_BYTES)
+    except InputError as error:
+        raise PolicyError(str(error)) from None
+
+
 def _as_model(module: Callable[..., Any], path: Path, hidden_shape: tuple[int, ...]) -> Any:
     memory = hidden_shape != (0,)
 
@@ -83,7 +93,13 @@ def _as_model(module: Callable[..., Any], path: Path, hidden_shape: tuple[int, .
         arrays = (state, image, hidden) if memory else (state, image)
         inputs = [torch.from_numpy(np.ascontiguousarray(x)) for x in arrays]
         with _one_thread(), torch.inference_mode():
-            found = module(*inputs)
+            try:
+                found = module(*inputs)
+            except Exception as error:  # whatever the file's own code and torch raise
+                line = (str(error).strip() or type(error).__name__).splitlines()[-1][:200]
+                raise PolicyError(
+                    f"{path}: fails while it runs ({line}); export it again"
+                ) from error
         outputs = list(found) if isinstance(found, (tuple, list)) else [found]
         if len(outputs) != 1 + memory or not all(isinstance(x, torch.Tensor) for x in outputs):
             raise PolicyError(

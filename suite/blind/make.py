@@ -8,7 +8,6 @@ hidden; `OUT/manifest.json`, the hashes of all of them.
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from tracks.common.files import replacing_folder, write_json
 from tracks.common.provenance import stamp
+from tracks.input.reading import read_json
 
 SCHEMA = 1
 
@@ -97,7 +97,7 @@ def load_manifest(out: Path) -> Manifest:
     path = out / "manifest.json"
     if not path.is_file():
         raise ValueError(f"{path}: missing; make the set first with `suite blind make`")
-    table = json.loads(path.read_text(encoding="utf-8"))
+    table = read_json(path)
     return Manifest(table["cases"], table["answers"], table["failed"])
 
 
@@ -114,7 +114,7 @@ def open_answers(out: Path) -> dict[str, dict[str, Any]]:
             _check(out / "cases" / name / file, digest)
         path = out / "answers" / f"{name}.json"
         _check(path, manifest.answers[name])
-        answers[name] = json.loads(path.read_text(encoding="utf-8"))
+        answers[name] = read_json(path)
     return answers
 
 
@@ -128,7 +128,7 @@ def _check(path: Path, digest: str) -> None:
 def _same_set(out: Path, wanted: dict[str, Any]) -> None:
     path = out / "set.json"
     if path.is_file():
-        there = json.loads(path.read_text(encoding="utf-8"))
+        there = read_json(path)
         for key, value in wanted.items():
             if there.get(key) != value:
                 raise ValueError(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from suite.blind.make import load_manifest
 from suite.common.console import Console
-from suite.common.errors import WorkFailed
+from suite.common.errors import INTERRUPTED, WorkFailed
 from tracks.common.files import write_json
 
 Diagnose = Callable[[Sequence[Path], Path, Path], None]
@@ -65,6 +65,8 @@ def by_command(flights: Sequence[Path], vehicle: Path, out: Path) -> None:
     args = [*map(str, flights), "--vehicle", str(vehicle), "--out", str(out)]
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         code = main(["diagnose", *args])
+    if code == INTERRUPTED:
+        raise KeyboardInterrupt
     if code:
         last = said.getvalue().strip().splitlines()[-1:]
         raise WorkFailed(f"suite diagnose ended with code {code}: {' '.join(last)}")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from suite.common.console import Console
+from tracks.input.ranges import Range, Seed
 
 if TYPE_CHECKING:
     from suite.blind.make import Manifest
@@ -25,9 +26,9 @@ class Config:
     """Folder of the set; the same command again goes on where it stopped."""
     set: Literal["tuning", "published"] = "tuning"
     """Which seeds: the published ones are run once."""
-    seed: int | None = None
+    seed: Seed | None = None
     """Of a set of your own, in place of the two."""
-    count: int | None = None
+    count: Annotated[int, Range(1, 100_000)] | None = None
     """About how many cases, every kind with its share; all 242 if not given."""
     simulator: Literal["mujoco", "rotorpy", "continuous"] = "mujoco"
     """Who flies the cases: rotorpy (pip install diffracing-suite[rotorpy]) makes 30, continuous, an
@@ -36,6 +37,11 @@ class Config:
     """For plan: names that your data could not tell apart."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
+
+
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out] if config.what in ("make", "run") else []
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

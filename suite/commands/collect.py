@@ -24,6 +24,11 @@ class Config:
     """Print one JSON object to standard output and nothing else."""
 
 
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out]
+
+
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Record as `config` says; flights that are there already are not flown again.
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from suite.common.console import Console
+from tracks.input.ranges import Iterations, Range, Seed
 
 
 @dataclass(frozen=True)
@@ -25,14 +26,19 @@ class Config:
     """What is corrected: the point mass, or the quadrotor of --vehicle with its effects."""
     vehicle: str | None = None
     """With --model quad: a shipped vehicle's name or a vehicle file (.toml)."""
-    held_out: float = 0.25
+    held_out: Annotated[float, Range(0.0, 1.0, above=True, below=True)] = 0.25
     """Share of the flights that take no part in the fit."""
-    iterations: int = 1500
+    iterations: Iterations = 1500
     """Gradient steps."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the network, the split and the batches."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
+
+
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out]
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

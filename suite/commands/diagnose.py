@@ -9,6 +9,7 @@ from typing import Any, Literal
 import tyro
 
 from suite.common.console import Console
+from tracks.input.ranges import Seed
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,15 @@ class Config:
     """Fly the plan in simulation with this vehicle (a file or a shipped name); write its logs."""
     recording: bool = True
     """Whether the held-out flights, measured and simulated, become a recording for rerun."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the null's draws, of the intervals' and of simulated noise."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
+
+
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out]
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

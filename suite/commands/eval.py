@@ -10,6 +10,7 @@ import tyro
 
 from suite.common.console import Console
 from suite.judging.requests import Evaluation
+from tracks.common.files import check_place
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,11 @@ class Config:
     """Print one JSON object to standard output and nothing else."""
 
 
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out]
+
+
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Judge as `config` says.
 
@@ -36,6 +42,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     if config.rerun and config.rerun.suffix != ".rrd":
         raise ValueError(f"--rerun {config.rerun}: a recording's name must end in .rrd")
+    if config.rerun:
+        check_place(config.rerun)
     answer = evaluate(config.flown, config.out, console)
     if config.rerun:
         from suite.judging.replay import record_first_trials

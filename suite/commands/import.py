@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
 from suite.common.console import Console
+from tracks.input.ranges import Range
 
 
 @dataclass(frozen=True)
@@ -29,15 +30,15 @@ class Config:
     """Mapping file (TOML) of --pose."""
     vehicle: str = ""
     """A shipped vehicle's name or a vehicle file: order of the motors, full thrust."""
-    full_thrust: float | None = None
+    full_thrust: Annotated[float, Range(0.0, 1000.0, above=True, below=True)] | None = None
     """Thrust per mass at full throttle [m/s^2], where the log has normalised thrust."""
-    motor_poles: int = 14
+    motor_poles: Annotated[int, Range(2, 1000)] = 14
     """Magnets on a motor's bell (Betaflight's eRPM)."""
-    rate: float = 250.0
+    rate: Annotated[float, Range(1.0, 10_000.0)] = 250.0
     """At most this many rows a second."""
-    start: float = 0.0
+    start: Annotated[float, Range(0.0, 1e9)] = 0.0
     """Leave out what is earlier [s after the first row]."""
-    end: float | None = None
+    end: Annotated[float, Range(0.0, 1e9)] | None = None
     """Leave out what is later [s after the first row]."""
     no_fix: bool = False
     """Say what looks wrong, but correct nothing."""
@@ -91,11 +92,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 def _check(config: Config) -> None:
     if config.out.suffix.lower() not in (".parquet", ".csv"):
         raise ValueError(f"--out is {str(config.out)!r}; its ending must be .parquet or .csv")
-    if not 1.0 <= config.rate <= 10_000.0:
-        raise ValueError(f"--rate is {config.rate:g}; allowed are 1 to 10000 rows a second")
-    if config.full_thrust is not None and not 0.0 < config.full_thrust < 1000.0:
-        raise ValueError(f"--full-thrust is {config.full_thrust:g}; above 0 and below 1000 m/s^2")
-    if config.start < 0 or (config.end is not None and config.end <= config.start):
+    if config.end is not None and config.end <= config.start:
         raise ValueError(f"--start {config.start:g} --end {config.end}: 0 <= start < end, in s")
     if config.pose_map is not None and config.pose is None:
         raise ValueError("--pose-map describes the file of --pose, which is not given")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from suite.common.console import Console
+from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials
 
 
 @dataclass(frozen=True)
@@ -24,22 +25,22 @@ class Config:
     """zigzag, circular, ellipse, all of these, or a list with commas."""
     difficulty: str = "0,3"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
-    trials: int | None = None
+    trials: Trials | None = None
     """Trials of each policy on every track at every level; by default 50, or 20 with small."""
-    flights: int | None = None
+    flights: Trials | None = None
     """Recorded flights on every track at every level; by default 20, or 8 with small."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str | None = None
     """A vehicle file with an effect that --vehicle lacks: fly there, name the effect, fine-tune
     through the corrected quadrotor. Without --policy the shipped one flies."""
-    seed: int = 0
+    seed: Annotated[int, Range(0, SEED_MOST - 10**6)] = 0
     """Seed of the training and of the first trial; recorded flights begin 100,000 above."""
-    iterations: int | None = None
+    iterations: Iterations | None = None
     """Gradient steps of the training, instead of the preset's."""
-    finetune_iterations: int | None = None
+    finetune_iterations: Iterations | None = None
     """Gradient steps of each fine-tuning, instead of a share of the training's."""
-    fit_iterations: int | None = None
+    fit_iterations: Iterations | None = None
     """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with small."""
     set: tuple[str, ...] = ()
     """Change settings of the recipe by name, such as loss.progress=0.4 episode.batch=128."""
@@ -47,6 +48,11 @@ class Config:
     """Folder of the loop; a loop that stands there is gone on with."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
+
+
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out]
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -44,6 +44,11 @@ class Config:
     """Print one JSON object to standard output and nothing else."""
 
 
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out, config.cache]
+
+
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write its document.
 

@@ -11,6 +11,7 @@ import tyro
 
 from suite.common.choices import is_track_file, parse_levels
 from suite.common.console import Console
+from tracks.input.ranges import Seed
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Config:
     """A family's name or a track file (.toml); without it, the families are listed."""
     difficulty: str = "0"
     """Level, 0 to 9; several as 0,3,9 or 0-3 or all."""
-    seed: int = 0
+    seed: Seed = 0
     """The track's seed."""
     out: Path = Path("runs/tracks")
     """Folder for the pictures (PNG)."""

@@ -9,10 +9,11 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
-from suite.train.config import TrainConfig
+from suite.train.config import TrainConfig, check
 from suite.train.overrides import override
 from suite.train.presets import chosen_model, preset, with_iterations
 from tracks.common.files import plain
+from tracks.input.ranges import Iterations, Seed
 
 
 @dataclass(frozen=True)
@@ -28,9 +29,9 @@ class Config:
     """With --model quad: a shipped vehicle's name or a vehicle file (.toml)."""
     out: Path = Path("runs/train")
     """Folder of the run; a run that stands there is resumed."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the parameters, the tracks and the randomisation."""
-    iterations: int | None = None
+    iterations: Iterations | None = None
     """Gradient steps, instead of the preset's."""
     from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
     """Start from this policy instead of fresh parameters: a checkpoint's folder or a shipped
@@ -41,6 +42,11 @@ class Config:
     """Change settings by name, such as loss.progress=0.4 episode.batch=128."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
+
+
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out]
 
 
 def resolve(config: Config) -> TrainConfig:
@@ -54,7 +60,9 @@ def resolve(config: Config) -> TrainConfig:
     run = chosen_model(run, config.model, config.vehicle)
     if config.iterations is not None:
         run = with_iterations(run, config.iterations)
-    return override(run, config.set)
+    run = override(run, config.set)
+    check(run)
+    return run
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from suite.common.choices import at_least
 from suite.common.console import Console
+from tracks.common.files import check_place
+from tracks.input.ranges import Range, Seed
 
 if TYPE_CHECKING:
     from eval.view.recording import Rollout
@@ -26,7 +27,7 @@ class Config:
     file."""
     pick: Literal["first", "failed", "passed"] = "first"
     """Which trials of the run: the first ones, or the first that failed or passed."""
-    count: int = 3
+    count: Annotated[int, Range(1, 1000)] = 3
     """How many trials at most."""
     track: str = "all"
     """For a policy: the tracks, as in suite eval."""
@@ -34,7 +35,7 @@ class Config:
     """For a policy: the levels, as in suite eval."""
     vehicle: str = "reference"
     """For a policy: a shipped vehicle's name or a vehicle file (.toml)."""
-    seed: int = 0
+    seed: Seed = 0
     """For a policy: the trials' seed."""
     out: Path = Path("runs/view")
     """Folder for the pictures (PNG), the video and the GIF."""
@@ -56,11 +57,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: where `config.run` is neither a run nor a policy, or no trial is to be seen.
     """
-    at_least("--count", config.count, 1)
-    at_least("--seed", config.seed, 0)
     recording = config.rerun or config.out / "trials.rrd"
     if recording.suffix != ".rrd":
         raise ValueError(f"--rerun {recording}: a recording's name must end in .rrd")
+    check_place(recording)
+    check_place(config.out / "picture.png")
     evaluation, trials = _chosen(config)
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.view.picture import write_picture

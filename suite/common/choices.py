@@ -56,13 +56,3 @@ def parse_tracks(text: str) -> list[str]:
 def is_track_file(name: str) -> bool:
     """Say whether `name` means a track file and not a family."""
     return name.endswith(".toml")
-
-
-def at_least(option: str, value: float, least: float) -> None:
-    """Refuse an option's value that is too small.
-
-    Raises:
-        ValueError: naming the option, the value and the least that is allowed.
-    """
-    if not value >= least:
-        raise ValueError(f"{option} is {value:g}; it must be {least:g} or more")

@@ -11,6 +11,8 @@ import errno
 from pathlib import Path
 from types import TracebackType
 
+SHOWN = 300
+"""Characters of a name in a message."""
 DONE = 0
 """The work is done."""
 FAILED = 1
@@ -23,7 +25,14 @@ INTERRUPTED = 130
 _ROOT = Path(__file__).resolve().parents[2]
 _ROOMS = tuple(str(_ROOT / room) for room in ("tracks", "policies", "eval", "suite"))
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+_UNUSABLE = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENXIO, errno.EINVAL)
 _NO_SUCH_INPUT = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError)
+
+
+_NUL = "embedded null"
+"""In what Python says of such a name."""
+SHOWN = 300
+"""Characters of a file's name in a message."""
 
 
 class WorkFailed(RuntimeError):
@@ -42,6 +51,8 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         return FAILED, str(error)
     if isinstance(error, OSError):
         return _explain_os(error)
+    if isinstance(error, ValueError) and _NUL in str(error):
+        return UNUSABLE, "the name of a file or folder holds a NUL character; give another name"
     if isinstance(error, ValueError) and _raised_on_purpose(error):
         return UNUSABLE, str(error)
     if isinstance(error, ModuleNotFoundError) and not _is_ours(error.name):
@@ -53,12 +64,14 @@ def explain(error: BaseException) -> tuple[int, str] | None:
 
 
 def _explain_os(error: OSError) -> tuple[int, str] | None:
-    where = f": {error.filename}" if error.filename else ""
+    where = f": {str(error.filename)[:SHOWN]}" if error.filename else ""
     if error.errno in _FULL:
         hint = "free some space or give another --out; what was finished before is kept"
         return FAILED, f"the disk is full{where}; {hint}"
-    if isinstance(error, (*_NO_SUCH_INPUT, PermissionError)):
+    if isinstance(error, (*_NO_SUCH_INPUT, PermissionError)) or error.errno in _UNUSABLE:
         return UNUSABLE, f"{(error.strerror or 'cannot be used').lower()}{where}"
+    if error.errno and error.filename:
+        return FAILED, f"{(error.strerror or 'the system refuses').lower()}{where}"
     return None
 
 

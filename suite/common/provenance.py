@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata as metadata
-import json
 import os
 import platform
 import sys
@@ -13,6 +12,7 @@ from typing import Any
 from tracks.common.files import write_json
 from tracks.common.provenance import stamp
 from tracks.common.work import usable_cores
+from tracks.input.reading import read_json
 
 PACKAGES = (
     "numpy",
@@ -99,7 +99,10 @@ def write_run_record(
     path, record = Path(folder) / "run.json", run_record(config, seed)
     commits: set[str] = set()
     if goes_on and path.is_file():
-        before = json.loads(path.read_text(encoding="utf-8"))
-        commits = {*before.get("earlier_commits", []), before["git_commit"] or "unknown"}
+        try:
+            before = read_json(path)
+            commits = {*before.get("earlier_commits", []), before["git_commit"] or "unknown"}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
     earlier = sorted(commits - {record["git_commit"]})
     write_json(path, {**record, "earlier_commits": earlier} if earlier else record)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from suite.common.console import Console, duration
 from suite.common.estimate import Estimate, announce
 from suite.common.provenance import write_run_record
 from tracks.common.files import plain, write_json
+from tracks.input.reading import read_json
 
 MARK = "stage.json"
 """Name of the file that says that a stage's folder is finished; written last."""
@@ -29,7 +29,7 @@ def claim(out: Path, config: Any, seed: int) -> None:
         write_run_record(out, config, seed)
         return
     try:
-        theirs = json.loads(path.read_text(encoding="utf-8"))["config"]
+        theirs = read_json(path)["config"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
     changes = differences(theirs, plain(config))
@@ -100,7 +100,13 @@ def _do(stage: Stage, folder: Path, number: str, console: Console) -> float:
     """Do a stage unless it is finished, and return how long it took [s]."""
     if is_done(folder):
         console.note(f"{number} {stage.words}: done before, in {folder}")
-        return float(json.loads((folder / MARK).read_text(encoding="utf-8"))["seconds"])
+        try:
+            return float(read_json(folder / MARK)["seconds"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{folder / MARK}: not the mark of a finished stage ({error}); remove the file to "
+                "do the stage again"
+            ) from error
     console.note(f"{number} {stage.words}")
     started = time.monotonic()
     stage.work(folder)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from dataclasses import replace as changed
 from functools import partial
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from policies.networks import delta_network
 from suite.delta.replay import PointMassModel, nominal_model, replay
 from suite.delta.windows import PointMassWindows
 from suite.train.config import PointMassConfig
+from tracks.input.ranges import Iterations, Range, Seed
 
 IDENTIFY_RATE = 3e-2
 """Least learning rate of lag, drag and delay: they have further to go than a network's weights."""
@@ -34,23 +35,23 @@ WATCHED = 512
 class FitConfig:
     """The fit."""
 
-    horizon_s: float = 1.0
+    horizon_s: Annotated[float, Range(0.01, 60.0)] = 1.0
     """Length of a replayed window [s]."""
-    stride_s: float = 0.2
+    stride_s: Annotated[float, Range(0.001, 60.0)] = 0.2
     """Time between the starts of windows [s]."""
-    held_out: float = 0.25
+    held_out: Annotated[float, Range(0.0, 1.0, above=True, below=True)] = 0.25
     """Share of the flights that take no part in the fit."""
-    iterations: int = 1500
+    iterations: Iterations = 1500
     """Gradient steps."""
-    batch: int = 256
+    batch: Annotated[int, Range(1, 10**6)] = 256
     """PointMassWindows per gradient step."""
-    rate: float = 5e-3
+    rate: Annotated[float, Range(0.0, 10.0)] = 5e-3
     """Peak learning rate; it falls to zero as a cosine."""
-    velocity_weight: float = 0.3
+    velocity_weight: Annotated[float, Range(0.0, 1e6)] = 0.3
     """Weight of the velocity's error beside the position's [s]."""
-    size_weight: float = 1e-3
+    size_weight: Annotated[float, Range(0.0, 1e6)] = 1e-3
     """Weight of the correction's size, so that it is no larger than it must be [s^2]."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the network, the split and the batches."""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from suite.experiments.pages.tables import every_training
 from suite.experiments.study import options, training
 from suite.experiments.study.summary import Summary, summaries
 from tracks.common.grid import Grid, table
+from tracks.input.ranges import Range
 
 PROGRESS = (0.4, 0.8, 1.6, 3.2)
 """lambda_p of L_p. The paper has the field at the first alone; here it is on and off at each and at
@@ -59,7 +60,7 @@ class Config(options.FourGates):
 
     only: tuple[str, ...] = ()
     """Settings, such as "field 0.4"; all if none is named."""
-    jobs: int = 1
+    jobs: Annotated[int, Range(1, 256)] = 1
     """Trainings at once, each in a process with its own share of the cores."""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from suite.experiments.study.intervals import Gap, crossed, spread
 from suite.experiments.study.summary import Summary, summaries
 from suite.train.overrides import override
 from tracks.common.grid import Grid, table
+from tracks.input.ranges import Iterations, Range, Seed, Trials
 
 RECIPE = "recipe"
 """The key of the row that all others are compared with."""
@@ -56,27 +57,27 @@ class Config:
     """The recipe."""
     set: tuple[str, ...] = ("episode.image_stride=3",)
     """Change settings of the recipe, and so of all rows, by name."""
-    iterations: int | None = None
+    iterations: Iterations | None = None
     """Gradient steps, instead of the preset's."""
-    training_seeds: tuple[int, ...] = (0, 1, 2)
+    training_seeds: tuple[Seed, ...] = (0, 1, 2)
     """Seeds that every row is trained from; less than three tell nothing."""
     difficulty: str = "0,3,6"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
-    trials: int = 10
+    trials: Trials = 10
     """Trials of every training on every track at every level, the same for all."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first trial; the others follow by one."""
-    round_trials: int = 300
+    round_trials: Trials = 300
     """Unseen worlds with round gates that each of their trainings flies."""
-    round_seed: int = 1000
+    round_seed: Seed = 1000
     """Of those worlds; none of the training seeds."""
-    round_seconds: float = 20.0
+    round_seconds: Annotated[float, Range(0.5, 3600.0)] = 20.0
     """Of a trial there, from standing start."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     only: tuple[str, ...] = ()
     """Rows besides the recipe's; all if none is named."""
-    jobs: int = 1
+    jobs: Annotated[int, Range(1, 256)] = 1
     """Trainings at once, each in a process with its own share of the cores."""
 
 

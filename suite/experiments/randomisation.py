@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from suite.experiments.study.disturbed import Tested
 from suite.experiments.study.intervals import Gap, nested
 from suite.train.config import PointMassConfig, TrainConfig
 from tracks.common.grid import Grid, table
+from tracks.input.ranges import Iterations, Range, Seed, Trials
 
 FIXED, RANDOMISED = "fixed", "randomised"
 ALL = "all disturbances"
@@ -42,21 +43,21 @@ class Config:
     """The recipe."""
     set: tuple[str, ...] = ()
     """Change settings of the recipe by name."""
-    iterations: int | None = None
+    iterations: Iterations | None = None
     """Gradient steps, instead of the preset's."""
-    training_seeds: tuple[int, ...] = (0, 1, 2)
+    training_seeds: tuple[Seed, ...] = (0, 1, 2)
     """Seeds that both settings are trained from."""
     difficulty: str = "3"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
-    trials: int = 32
+    trials: Trials = 32
     """Trials of each setting on every track at every level under every condition."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """What is disturbed: a shipped vehicle's name or a vehicle file (.toml)."""
     only: tuple[str, ...] = ()
     """Only these sweeps, by name; by default all."""
-    jobs: int = 1
+    jobs: Annotated[int, Range(1, 256)] = 1
     """Trainings at once, each in a process with its own share of the cores."""
 
 

@@ -19,6 +19,7 @@ from suite.experiments.study import disturbed, judging, options
 from suite.experiments.study.conditions import STATE_UNIT, Condition, log_faults
 from suite.experiments.study.disturbed import Grown, Tested
 from suite.judging.flying import default_policy, labels, policy_digest
+from tracks.input.ranges import Seed, Trials
 
 UNDISTURBED = "undisturbed"
 MEANINGS = (
@@ -54,9 +55,9 @@ class Config:
     Without it the shipped policy flies."""
     difficulty: str = "3"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
-    trials: int = 32
+    trials: Trials = 32
     """Trials of every policy on every track at every level under every condition."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """What is disturbed: a shipped vehicle's name or a vehicle file (.toml)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from suite.experiments.study.intervals import Spread
 from suite.experiments.study.summary import METRICS, Summary, summaries
 from suite.train.ppo.config import ppo_like
 from tracks.common.grid import Grid, table
+from tracks.input.ranges import Iterations, Range, Trials
 
 PROJECTION, PROJECTION_DECAY = 3.0, 0.5
 """lambda_proj and beta_3 of the paper's scheme without the field."""
@@ -57,17 +58,17 @@ class Config(options.FourGates):
     found again by the hash of their configuration and of what is measured on the way.
     """
 
-    progress: float = 0.4
+    progress: Annotated[float, Range(0.0, 1e6)] = 0.4
     """lambda_p of both differentiable schemes; the paper's."""
-    ppo_iterations: int | None = None
+    ppo_iterations: Iterations | None = None
     """Rollouts of PPO; as many as the others' gradient steps if not given."""
-    trials: int = 100
+    trials: Trials = 100
     """Unseen worlds that are flown at every measurement."""
-    measurements: int = 20
+    measurements: Annotated[int, Range(1, 10_000)] = 20
     """About how many a training has; their time is no part of the curves."""
     only: tuple[str, ...] = ()
     """Schemes: ppo, ours, projection; all if none is named."""
-    jobs: int = 1
+    jobs: Annotated[int, Range(1, 256)] = 1
     """Trainings at once, each in a process with its own share of the cores; the curves over time
     are those of such a share."""
 

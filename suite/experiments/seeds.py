@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from suite.experiments.pages.tables import every_cell
 from suite.experiments.study import judging, options, training
 from suite.judging.flying import labels, policy_digest
 from tracks.common.grid import Grid, table
+from tracks.input.ranges import Iterations, Range, Seed, Trials
 
 LEVELS = (0, 3, 6, 9)
 """The levels of the paper's table."""
@@ -42,17 +43,17 @@ class Config:
     """Without --policies: the recipe."""
     set: tuple[str, ...] = ()
     """Without --policies: change settings of the recipe by name."""
-    iterations: int | None = None
+    iterations: Iterations | None = None
     """Without --policies: gradient steps, instead of the preset's."""
-    training_seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    training_seeds: tuple[Seed, ...] = (0, 1, 2, 3, 4)
     """Without --policies: the seeds that are trained."""
-    trials: int = 100
+    trials: Trials = 100
     """Trials of every policy on every track at levels 0, 3, 6 and 9."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
-    jobs: int = 1
+    jobs: Annotated[int, Range(1, 256)] = 1
     """Without --policies: trainings at once, each in a process with its own share of the cores."""
 
 

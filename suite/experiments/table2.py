@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from eval.judging.tables import Tally, percent
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -25,6 +25,7 @@ from suite.judging.flying import default_policy, policy_digest
 from suite.loop import compare
 from tracks.common.grid import Grid, table
 from tracks.families import JUDGED
+from tracks.input.ranges import Range, Seed, Trials
 
 if TYPE_CHECKING:
     from suite.loop.config import LoopConfig
@@ -71,13 +72,13 @@ class Config:
     """The same fine-tuned under a Delta Action Model: tuned-with/policy of a `suite loop`."""
     control_policy: str | None = None
     """The same fine-tuned as long without it: tuned-without/policy of that loop."""
-    delta_iterations: int = 0
+    delta_iterations: Annotated[int, Range(0, 10**9)] = 0
     """Make both by a `suite loop` with as many gradient steps of fine-tuning; 0 does not."""
     delta_set: tuple[str, ...] = ()
     """Settings of that fine-tuning, such as loss.safety_radius_m=0.3."""
-    trials: int = 100
+    trials: Trials = 100
     """Trials of every policy on every track at every level that it flies."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from suite.judging.flying import (
 from suite.judging.requests import Collection
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
+from tracks.input.reading import read_json
 
 if TYPE_CHECKING:
     from eval.logs.flight import Flight
@@ -123,7 +123,7 @@ def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, dict[str, A
     if not path.is_file():
         return {}
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path)
         same = {key: found[key] for key in about} == about
         rows = {
             TrialSpec(row["track"], row["difficulty"], row["seed"]): row for row in found["flights"]

@@ -8,10 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from suite.common.choices import at_least, is_track_file, parse_levels, parse_tracks
+from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.common.estimate import Estimate
 from suite.judging.requests import Collection, Evaluation
 from tracks.common.work import usable_cores
+from tracks.input.ranges import check_ranges
 
 if TYPE_CHECKING:
     from eval.judging.judge import JudgeOptions
@@ -136,8 +137,7 @@ def read_course(wanted: Evaluation | Collection) -> Course:
     from eval.worlds import world_class
 
     world_class(wanted.world)
-    at_least("--trials", wanted.trials, 1)
-    at_least("--seed", wanted.seed, 0)
+    check_ranges(wanted, options=True)
     names = parse_tracks(wanted.track)
     trials = trial_list(names, parse_levels(wanted.difficulty), wanted.trials, wanted.seed)
     return Course(trials, custom_tracks(names), load_vehicle(wanted.vehicle))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,8 @@ from suite.common.choices import parse_levels, parse_tracks
 from suite.common.console import Console
 from suite.judging.flying import custom_tracks, default_policy, trial_list
 from suite.judging.requests import Evaluation
+from tracks.input.ranges import check_ranges, shown
+from tracks.input.reading import read_json
 
 if TYPE_CHECKING:
     from eval.logs.flight import Flight
@@ -27,14 +28,25 @@ def read_evaluation(folder: Path) -> Evaluation:
     """
     path = folder / "run.json"
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = read_json(path)
         config: dict[str, Any] = record["config"]
         fits = set(config) == {field.name for field in dataclasses.fields(Evaluation)}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the record of a run ({error})") from error
     if not fits:
         raise ValueError(f"{path}: not a run of suite eval; give the --out of one")
-    return Evaluation(**{**config, "policies": tuple(config["policies"])})
+    policies = config["policies"]
+    if not isinstance(policies, list) or not all(isinstance(name, str) for name in policies):
+        raise ValueError(f"{path}: policies is {shown(policies)}, allowed is a list of names")
+    asked = Evaluation(**{**config, "policies": tuple(policies)})
+    for name, value in vars(asked).items():
+        default = getattr(Evaluation, name)
+        # Those that are None by default are numbers.
+        kind = (int, float, type(None)) if default is None else type(default)
+        if not isinstance(value, kind) or (isinstance(value, bool) and default is not False):
+            raise ValueError(f"{path}: {name} is {shown(value)}, expected one like {default!r}")
+    check_ranges(asked, f"{path}: ")
+    return asked
 
 
 def first_trials(evaluation: Evaluation) -> list[TrialSpec]:

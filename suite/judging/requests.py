@@ -7,6 +7,8 @@ from typing import Annotated
 
 import tyro
 
+from tracks.input.ranges import Range, Seed, Trials
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -21,18 +23,19 @@ class Evaluation:
     """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
     difficulty: str = "0"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
-    trials: int = 10
+    trials: Trials = 10
     """Trials of every policy on every track at every level."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str = "mujoco"
     """mujoco (fast on CPUs), mjx (for GPUs) or reference (slow and simple)."""
-    processes: Annotated[int | None, tyro.conf.arg(name="procs")] = None
+    processes: Annotated[int | None, Range(1, 256), tyro.conf.arg(name="procs")] = None
     """Processes that share the trials; by default as many cores as are worth it."""
-    deadline_s: float | None = None
-    """A policy's answer for a batch that takes longer is late and not flown [s]."""
+    deadline_s: Annotated[float, Range(0.0, 3600.0, above=True)] | None = None
+    """A policy's answer for a batch that takes longer is late and not flown; ten in a row end the
+    trials in the air, as out of time [s]."""
     trust: bool = False
     """Also load policy files that can run code on this machine."""
 
@@ -48,13 +51,13 @@ class Collection:
     """As in suite eval."""
     difficulty: str = "0,3"
     """As in suite eval."""
-    trials: int = 5
+    trials: Trials = 5
     """Flights on every track at every level."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str = "mujoco"
     """As in suite eval."""
-    seed: int = 100_000
+    seed: Seed = 100_000
     """Seed of the first trial; by default far from those that suite eval flies."""
     trust: bool = False
     """Also load policy files that can run code on this machine."""

@@ -5,29 +5,33 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
-from suite.common.choices import at_least, is_track_file, parse_levels, parse_tracks
+from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
-from suite.train.config import TrainConfig
+from suite.train.config import TrainConfig, check
 from suite.train.overrides import override
 from suite.train.presets import finetune, preset, with_iterations, with_quadrotor
 from tracks.common.files import to_json
+from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials, check_ranges
 
 RECORDED_FROM = 100_000
 """Recorded flights have seeds this far above the judged trials', so that none is both."""
+LOOP_SEEDS = Range(0, SEED_MOST - 10 * RECORDED_FROM)
+"""A loop's seed: those of its fine-tunings and recorded flights are above."""
 
 
 @dataclass(frozen=True)
 class LoopSize:
     """How much a loop flies and fits."""
 
-    trials: int
+    trials: Trials
     """Judged trials of each policy on every track at every level."""
-    flights: int
+    flights: Trials
     """Recorded flights on every track at every level."""
-    fit_iterations: int
+    fit_iterations: Iterations
     """Gradient steps of the fit of a Delta Action Model."""
-    finetune_iterations: int | None = None
+    finetune_iterations: Iterations | None = None
     """Gradient steps of each fine-tuning; None: a share of the training's."""
 
 
@@ -51,13 +55,13 @@ class LoopConfig:
     """As in `suite.common.choices.parse_tracks`, families only."""
     difficulty: str
     """As in `suite.common.choices.parse_levels`."""
-    trials: int
+    trials: Trials
     """Judged trials of each policy on every track at every level."""
-    flights: int
+    flights: Trials
     """Recorded flights on every track at every level."""
     vehicle: str
     """What the simulation knows: a shipped vehicle's name or a vehicle file."""
-    seed: int
+    seed: Annotated[int, LOOP_SEEDS]
     """Seed of what is trained and of the first judged trial."""
     digests: dict[str, str]
     """SHA-256 of what comes from files: vehicles and, where one is given, the policy."""
@@ -130,12 +134,12 @@ def resolve(
     sizes = SIZES if world is None else HIDDEN_SIZES
     size = sizes.get(recipe, sizes[""])
     if iterations is not None:
-        at_least("--iterations", iterations, 1)
         training = with_iterations(training, iterations)
     simulated = load_vehicle(vehicle)
     digests = {"vehicle": _digest(simulated)}
     if world is None:
         training = override(training, changes)
+        check(training)
     else:
         if iterations is not None:
             raise ValueError(
@@ -157,12 +161,11 @@ def resolve(
     tuning = finetune(training)
     longer = size.finetune_iterations if finetune_iterations is None else finetune_iterations
     if longer is not None:
-        at_least("--finetune-iterations", longer, 1)
         tuning = with_iterations(tuning, longer)
     if world is not None:
         tuning = override(with_quadrotor(tuning, simulated), changes)
     fitted = size.fit_iterations if fit_iterations is None else fit_iterations
-    at_least("--fit-iterations", fitted, 1)
+    check(tuning)
     config = LoopConfig(
         tuning=tuning,
         fit=FitConfig(iterations=fitted, seed=seed),
@@ -175,6 +178,7 @@ def resolve(
         seed=seed,
         digests=digests,
     )
+    check_ranges(config)
     _check_seeds(config)
     if world is None:
         return DeltaLoopConfig(training=training, **vars(config))
@@ -196,14 +200,6 @@ def _check_seeds(config: LoopConfig) -> None:
         raise ValueError(
             f"--track {files[0]}: a track from a file is the same at every seed, so flights on it "
             "cannot be held apart from trials; give families (zigzag, circular, ellipse)"
-        )
-    at_least("--seed", config.seed, 0)
-    at_least("--trials", config.trials, 1)
-    at_least("--flights", config.flights, 1)
-    if config.trials > RECORDED_FROM:
-        raise ValueError(
-            f"--trials is {config.trials}; it must be {RECORDED_FROM} or less, since recorded "
-            "flights have the seeds above"
         )
     if config.flights * config.cells < 2:
         raise ValueError(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated
 
 from eval.vehicles.vehicle import Vehicle
-from policies.spec import PolicySpec
+from policies.spec import PolicySpec, check_image_size, check_spec
+from tracks.input.ranges import Iterations, Range, Seed, Share, check_ranges
 
 
 @dataclass(frozen=True)
@@ -19,31 +19,31 @@ class PointMassConfig:
     delay drawn from wider ranges.
     """
 
-    lag_mean: float = 12.0
+    lag_mean: Annotated[float, Range(0.1, 1000.0)] = 12.0
     """Mean rate at which the acceleration follows the command [1/s]."""
-    lag_std: float = 2.0
+    lag_std: Annotated[float, Range(0.0, 1000.0)] = 2.0
     """Its standard deviation over worlds [1/s]."""
-    drag: tuple[float, float] = (0.1, 0.8)
+    drag: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.1, 0.8)
     """Range of the linear drag along the body's x and y [1/s]."""
-    drag_up: tuple[float, float] = (0.1, 0.8)
+    drag_up: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.1, 0.8)
     """Range of the linear drag along the body's z, which pushes a drone that leans forward down;
     real rotors have more of it than of the other two [1/s]."""
-    wind_std: tuple[float, float, float] = (1.0, 1.0, 0.2)
+    wind_std: Annotated[tuple[float, float, float], Range(0.0, 100.0)] = (1.0, 1.0, 0.2)
     """Standard deviation of the constant wind over worlds [m/s]."""
-    time_step_std: float = 0.1
+    time_step_std: Share = 0.1
     """Standard deviation of a world's time step as a share of the policy's period [1]."""
-    action_delay: tuple[float, float] = (0.0, 1.5)
+    action_delay: Annotated[tuple[float, float], Range(0.0, 2.0, ordered=True)] = (0.0, 1.5)
     """Range of the delay after which a command acts [policy periods, at most 2]."""
-    state_delay: int = 0
+    state_delay: Annotated[int, Range(0, 100)] = 0
     """Age of the state that the policy sees [policy periods]."""
-    image_delay: int = 0
+    image_delay: Annotated[int, Range(0, 100)] = 0
     """Age of the image that the policy sees [policy periods]."""
-    depth_noise: float = 0.02
+    depth_noise: Annotated[float, Range(0.0, 10.0)] = 0.02
     """Standard deviation of the noise on the encoded inverse depth [1]."""
-    fov_scale: tuple[float, float] = (0.95, 1.05)
+    fov_scale: Annotated[tuple[float, float], Range(0.1, 10.0, ordered=True)] = (0.95, 1.05)
     """Range by which the images' half widths, as tangents, are scaled: the field of view, drawn per
     iteration [1]."""
-    heading_rate: float = 6.0
+    heading_rate: Annotated[float, Range(0.0, 1000.0)] = 6.0
     """Rate at which the heading follows the direction to the gate [1/s]."""
 
 
@@ -56,22 +56,22 @@ class QuadrotorConfig:
 
     vehicle: Vehicle
     """The simulation's vehicle with its effects."""
-    attitude_hz: float = 100.0
+    attitude_hz: Annotated[float, Range(1.0, 10_000.0)] = 100.0
     """About how often the attitude loop runs: a whole number of times a policy period [Hz]."""
-    physics_hz: float = 250.0
+    physics_hz: Annotated[float, Range(10.0, 10_000.0)] = 250.0
     """About how often rate loop and rigid body are stepped; the judge steps at the vehicle's
     controller.frequency [Hz]."""
-    mass_std: float = 0.03
+    mass_std: Share = 0.03
     """Standard deviation of the true mass over worlds, as a share of the vehicle's [1]."""
-    lag_spread: float = 0.3
+    lag_spread: Share = 0.3
     """The rotors' time constant varies by up to this share of the vehicle's either way [1]."""
-    drag_spread: float = 0.1
+    drag_spread: Annotated[float, Range(0.0, 100.0)] = 0.1
     """Linear drag varies by up to this on each axis either way, and is never negative [1/s]."""
-    delay_spread_s: float = 0.01
+    delay_spread_s: Share = 0.01
     """The delay of commands varies by up to this either way, and is never negative [s]."""
-    gain_spread: float = 0.1
+    gain_spread: Share = 0.1
     """The rate loop's gain varies by up to this share either way [1]."""
-    wind_std: tuple[float, float, float] = (1.0, 1.0, 0.2)
+    wind_std: Annotated[tuple[float, float, float], Range(0.0, 100.0)] = (1.0, 1.0, 0.2)
     """Standard deviation of the constant wind over worlds, around the vehicle's [m/s]."""
 
 
@@ -82,48 +82,48 @@ class LossConfig:
     The defaults race best on two cores; the preset `paper` has the printed ones.
     """
 
-    clearance: float = 3.0
+    clearance: Annotated[float, Range(0.0, 1e6)] = 3.0
     """Weight of L_clearance, with the paper's lambda_C [1]."""
-    collide: float = 0.2
+    collide: Annotated[float, Range(0.0, 1e6)] = 0.2
     """Weight of L_collide; the paper's lambda_C of 3 stops the drone in front of gates [1]."""
-    acceleration: float = 1e-2
+    acceleration: Annotated[float, Range(0.0, 1e6)] = 1e-2
     """lambda_a [s^4/m^2]."""
-    jerk: float = 1e-3
+    jerk: Annotated[float, Range(0.0, 1e6)] = 1e-3
     """lambda_j [s^6/m^2]."""
-    progress: float = 1.2
+    progress: Annotated[float, Range(0.0, 1e6)] = 1.2
     """lambda_p of L_p [s/m]."""
-    progress_norm: float = 0.0
+    progress_norm: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Weight of L_p^norm, the ablation's direction-only progress [1]."""
-    projection: float = 0.0
+    projection: Annotated[float, Range(0.0, 1e6)] = 0.0
     """lambda_proj of L_proj, the scalar substitute for the field [1/m^2]."""
-    approach_m: float = 0.0
+    approach_m: Annotated[float, Range(0.0, 100.0)] = 0.0
     """Where the drone is off a gate's axis or beyond its plane, progress is measured towards a
     point on the axis before the gate, by as much as it is off, at most this far: straight to the
     centre the frame is in the way, and the drone hovers above it; 0: always the centre [m]."""
     pass_first: bool = False
     """Whether the step that passes a gate measures progress towards the next one already, and not
     backwards to the one that was passed: faster, and less careful at these weights."""
-    projection_decay: float = 0.5
+    projection_decay: Annotated[float, Range(0.0, 1000.0)] = 0.5
     """beta_3 of L_proj [1/m]."""
-    barrier_height: float = 2.0
+    barrier_height: Annotated[float, Range(0.0, 1e6)] = 2.0
     """beta_1 of L_clearance [1]."""
-    barrier_slope: float = -32.0
+    barrier_slope: Annotated[float, Range(-1e4, 0.0)] = -32.0
     """beta_2 of L_clearance [1/m]."""
-    safety_radius_m: float = 0.2
+    safety_radius_m: Annotated[float, Range(0.0, 10.0)] = 0.2
     """r_q, the drone's radius with its margin [m]."""
-    field_gain: float = 10.0
+    field_gain: Annotated[float, Range(0.0, 1e6)] = 10.0
     """Gradient per step, of the loss before averaging over time and batch, that u_A adds at the
     centre of a 1 m gate to a velocity across it [1/m]; 0 turns the field off."""
     field_square: bool = False
     """Whether every gate pulls as the square around its opening would, whatever its shape."""
-    field_decay: float = 0.3
+    field_decay: Annotated[float, Range(0.0, 1000.0, above=True)] = 0.3
     """lambda_A, how slowly u_A falls with distance [1]."""
-    gradient_decay: float = 0.916
+    gradient_decay: Annotated[float, Range(0.0, 1000.0)] = 0.916
     """alpha, the rate at which gradients of position and velocity fade back in time [1/s]."""
-    crash_depth_m: float = 0.0
+    crash_depth_m: Annotated[float, Range(0.0, math.inf)] = 0.0
     """A world that gets deeper than this into a solid leaves the loss for the rest of the rollout:
     from there on its gradients say nothing about flying [m]."""
-    path_samples: int = 4
+    path_samples: Annotated[int, Range(1, 1000)] = 4
     """Points of every step's path at which the nearest obstacle is looked up."""
 
 
@@ -131,46 +131,46 @@ class LossConfig:
 class EpisodeConfig:
     """The worlds of one iteration."""
 
-    batch: int = 64
+    batch: Annotated[int, Range(1, 10**6)] = 64
     """Worlds per iteration, over all devices."""
-    steps: int = 90
+    steps: Annotated[int, Range(1, 10**5)] = 90
     """Policy periods per rollout."""
-    image_stride: int = 1
+    image_stride: Annotated[int, Range(1, 10**5)] = 1
     """The encoder's gradient is taken from one in so many of a rollout's images, with a random
     first one, and weighted accordingly: neighbours look alike. Must divide `steps`."""
-    gates: int = 8
+    gates: Annotated[int, Range(1, 8)] = 8
     """Gates of a track, the first so many of those that it is made with, at most 8."""
-    difficulty: tuple[float, float] = (0.0, 1.0)
+    difficulty: Annotated[tuple[float, float], Range(0.0, 1.0, ordered=True)] = (0.0, 1.0)
     """Range of the tracks' difficulty."""
-    easy_until: float = 0.0
+    easy_until: Share = 0.0
     """Share of training during which the range of difficulty grows from its lower end."""
-    rest_share: float = 0.3
+    rest_share: Share = 0.3
     """Share of worlds that start at rest at the track's start; the others start on the way, with a
     recurrent state from a random step of the last rollout."""
-    stop_from: float = 0.33
+    stop_from: Share = 0.33
     """Worlds that start at rest leave the loss at a random step from this share of `steps` on, so
     that the policy cannot count the steps left and go for broke at the end; 1: none leaves."""
-    start_speed: float = 6.0
+    start_speed: Annotated[float, Range(0.0, 100.0)] = 6.0
     """Largest speed towards the gate of a world that starts on the way; sideways some is added
     [m/s]."""
-    missed_share: float = 0.0
+    missed_share: Share = 0.0
     """Share of the worlds that start on the way which start beside or above their gate's frame, as
     one does that has missed it."""
-    sharp_share: float = 0.55
+    sharp_share: Share = 0.55
     """Share of tracks with one or two sharp turns."""
-    density: tuple[float, float] = (0.0, 1.3)
+    density: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.0, 1.3)
     """Range of the obstacles' density as a share of the judged families'."""
-    bare_share: float = 0.2
+    bare_share: Share = 0.2
     """Share of tracks without obstacles."""
     finish: bool = False
     """Whether a world leaves the loss as it passes its last gate. If not, it is to fly on to a
     point 10 m beyond, so that speed is worth more at the last gate than at the others."""
-    height_spread: float = 1.0
+    height_spread: Annotated[float, Range(0.0, 100.0)] = 1.0
     """How far gates' heights lie apart before they are held to 0.8 to 2.2 m, as a share of what is
     usual for a difficulty: with 2 they lie about as far apart as those of circles and ellipses."""
-    gate_corners: int = 4
+    gate_corners: Annotated[int, Range(3, 64)] = 4
     """Corners of the gates' openings: 4 for squares, more for rounder gates of the same width."""
-    hairpin_share: float = 0.0
+    hairpin_share: Share = 0.0
     """Share of tracks with one or two gates that are met nearly from the side and left backwards,
     as at the apexes of the hardest ellipses."""
 
@@ -179,19 +179,19 @@ class EpisodeConfig:
 class OptimizerConfig:
     """AdamW with a cosine schedule."""
 
-    iterations: int = 2000
+    iterations: Iterations = 2000
     """Gradient steps."""
-    rate: float = 2e-3
+    rate: Annotated[float, Range(0.0, 10.0)] = 2e-3
     """Peak learning rate."""
-    rate_end: float = 1e-5
+    rate_end: Annotated[float, Range(0.0, 10.0)] = 1e-5
     """Learning rate at the end."""
-    warmup: int = 20
+    warmup: Annotated[int, Range(0, 10**9)] = 20
     """Iterations of linear warm-up."""
-    weight_decay: float = 1e-2
+    weight_decay: Annotated[float, Range(0.0, 10.0)] = 1e-2
     """AdamW's decoupled weight decay."""
-    memory: float = 0.99
+    memory: Annotated[float, Range(0.0, 1.0, below=True)] = 0.99
     """Adam's beta_2: short, because the first crashes' gradients are ten times all later ones."""
-    clip: float = 1.0
+    clip: Annotated[float, Range(0.0, 1e12)] = 1.0
     """Largest global norm of a gradient; 0 does not clip."""
 
 
@@ -211,56 +211,42 @@ class TrainConfig:
     """Worlds and horizon."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Optimiser and its schedule."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the parameters, the tracks and the randomisation."""
-    devices: int = 0
+    devices: Annotated[int, Range(0, 4096)] = 0
     """JAX devices to share the batch; 0 takes all that divide it."""
 
 
-SHARE = (0.0, 1.0)
-LIMITS = {
-    "seed": (0, 2**32 - 1),
-    "optimizer.iterations": (1, math.inf),
-    "optimizer.warmup": (0, math.inf),
-    "episode.batch": (1, math.inf),
-    "episode.steps": (1, math.inf),
-    "episode.gates": (1, 8),
-    "episode.gate_corners": (3, math.inf),
-    "episode.difficulty": SHARE,
-    "episode.easy_until": SHARE,
-    "episode.rest_share": SHARE,
-    "episode.stop_from": SHARE,
-    "episode.missed_share": SHARE,
-    "episode.sharp_share": SHARE,
-    "episode.bare_share": SHARE,
-    "episode.hairpin_share": SHARE,
-    "episode.density": (0.0, math.inf),
-    "episode.height_spread": (0.0, math.inf),
-    "episode.start_speed": (0.0, math.inf),
-    "loss.path_samples": (1, math.inf),
-    "physics.action_delay": (0.0, 2.0),
-    "physics.state_delay": (0, math.inf),
-    "physics.image_delay": (0, math.inf),
-}
-"""The least and the most that is allowed, both included unless infinite."""
+def check_decides_in_time(spec: PolicySpec, vehicle: Vehicle) -> None:
+    """Refuse a policy that decides faster than its vehicle's controller runs.
+
+    Raises:
+        ValueError: naming both rates.
+    """
+    rate, frequency = spec.rate_hz, vehicle.controller.frequency
+    if rate > frequency:
+        raise ValueError(
+            f"the policy decides at {rate:g} Hz, allowed is up to the {frequency:g} Hz of vehicle "
+            f"{vehicle.name!r}'s controller.frequency"
+        )
 
 
 def check(config: TrainConfig) -> None:
-    """Refuse settings outside their limits, before anything is compiled or written.
+    """Refuse settings outside their ranges, before anything is compiled or written.
 
     Raises:
         ValueError: naming the setting, its value and what is allowed.
     """
-    for path, (low, high) in LIMITS.items():
-        value: Any = functools.reduce(getattr, path.split("."), config)
-        ends = value if isinstance(value, tuple) else (value,)
-        allowed = f"{low:g} and more" if math.isinf(high) else f"{low:g} to {high:.10g}"
-        if not all(low <= end <= high and math.isfinite(end) for end in ends):
-            raise ValueError(f"{path} is {value}, allowed are {allowed}")
-        if list(ends) != sorted(ends):
-            raise ValueError(f"{path} is {value}; give the lower end of the range first")
+    check_ranges(config)
+    check_spec(config.spec)
+    check_image_size(config.spec)
+    if config.quadrotor is not None:
+        from eval.vehicles.vehicle_check import check_vehicle
+
+        check_vehicle(config.quadrotor.vehicle)
+        check_decides_in_time(config.spec, config.quadrotor.vehicle)
     stride, steps = config.episode.image_stride, config.episode.steps
-    if stride < 1 or steps % stride:
+    if steps % stride:
         raise ValueError(
             f"episode.image_stride is {stride}, allowed are divisors of episode.steps ({steps})"
         )

@@ -14,6 +14,7 @@ from suite.train.config import (
     PointMassConfig,
     QuadrotorConfig,
     TrainConfig,
+    check_decides_in_time,
 )
 from tracks.common.names import unknown_name
 
@@ -125,12 +126,7 @@ def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:
     Raises:
         ValueError: where the policy decides faster than the vehicle's controller runs.
     """
-    rate, frequency = config.spec.rate_hz, vehicle.controller.frequency
-    if rate > frequency:
-        raise ValueError(
-            f"the policy decides at {rate:g} Hz, allowed is up to the {frequency:g} Hz of vehicle "
-            f"{vehicle.name!r}'s controller.frequency"
-        )
+    check_decides_in_time(config.spec, vehicle)
     return replace(config, quadrotor=QuadrotorConfig(vehicle))
 
 

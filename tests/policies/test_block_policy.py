@@ -96,3 +96,22 @@ def test_a_model_that_rolls_dice_or_has_wrong_outputs_is_refused():
     ]:
         with pytest.raises(PolicyError, match=said):
             proven(dataclasses.replace(base, model=model), "here")
+
+
+@pytest.mark.parametrize("n", [3, 64])
+def test_a_memory_that_overflows_is_an_answer_of_nan_for_that_row_alone(n):
+    def model(state, image, hidden):
+        return state[:, :3], hidden * np.float32(1e30)
+
+    policy = BlockPolicy("grows", PolicySpec(), model, (2,))
+    state, image = np.ones((n, 12), np.float32), np.zeros((n, 24, 32), np.float32)
+    hidden = np.zeros((n, 2), np.float32)
+    hidden[1, 0] = 1.0
+    fresh = np.zeros(n, bool)
+    action, hidden = policy.act(hidden, state, image, fresh)
+    assert np.isfinite(action).all()
+    with np.errstate(over="ignore"):
+        action, hidden = policy.act(hidden, state, image, fresh)
+    assert np.isnan(action[1]).all() and np.isfinite(np.delete(action, 1, 0)).all()
+    action, _ = policy.act(hidden, state, image, ~fresh)
+    assert np.isfinite(action).all()

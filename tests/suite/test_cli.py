@@ -185,3 +185,74 @@ def test_info_says_versions_devices_and_machine(capfd):
     assert facts["suite"] == VERSION
     assert facts["packages"]["mujoco"].startswith("3.")
     assert facts["jax_devices"] and facts["machine"]["cores"] >= 1
+
+
+HUGE = "9" * 400
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "eval --procs -2",
+        "eval --procs 0",
+        "eval --deadline-s nan",
+        "eval --deadline-s -1",
+        "eval --deadline-s 0",
+        "eval --deadline-s 1e400",
+        "eval --trials 1000000000000000000",
+        "eval --trials 0",
+        "eval --seed 9223372036854775808",
+        "eval --seed -1",
+        f"eval --seed {HUGE}",
+        f"eval --trials {HUGE}",
+        "collect --seed 9223372036854775808",
+        "collect --trials 0",
+        "view racer --count 0",
+        f"tracks zigzag --seed {HUGE}",
+        "tracks zigzag --seed -1",
+        "import nothing.csv --rate nan",
+        "import nothing.csv --full-thrust 1e400",
+        "import nothing.csv --motor-poles 0",
+        "delta nothing --held-out 1",
+        "delta nothing --iterations -3",
+        "diagnose nothing --vehicle reference --seed -1",
+        "blind make --count -1",
+        "loop --trials 1000000000000000000",
+        f"loop --seed {HUGE}",
+        "reproduce table2 --trials 0",
+        "reproduce ideas --round-seconds nan",
+        "reproduce schemes --jobs 0",
+        f"train --iterations {HUGE}",
+        f"train --seed {HUGE}",
+        "train --set spec.rate_hz=0.0",
+        "train --set spec.rate_hz=1000",
+        "train --set spec.rate_hz=-1",
+        "train --set spec.camera.width=0",
+        "train --set spec.camera.width=33",
+        "train --set spec.camera.width=1000 spec.camera.height=1000",
+        "train --set spec.camera.range_m=0.2",
+        "train --set spec.hidden_size=0",
+        "train --set spec.hidden_size=10000000",
+        "train --set physics.drag=(2.0,1.0)",
+        "train --set physics.lag_mean=-5",
+        "train --set optimizer.rate=-1",
+        "train --set optimizer.rate=nan",
+        "train --set optimizer.memory=1.0",
+        "train --set loss.progress=1e400",
+        f"train --set loss.progress={HUGE}",
+        f"train --set seed={HUGE}",
+        "train --set devices=-1",
+        "train --set episode.batch=10000000000",
+        f"train --set episode.steps={'(' * 300}",
+        f"train --set {'x' * 5000}",
+        f"train --set loss.progress={'[' * 5000}",
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(line.split()) == 2
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1 and len(said) < 1000
+    options = [word for word in line.split() if word.startswith("--")]
+    assert any(option in said or "=" in line for option in options)
+    assert not list(tmp_path.iterdir())

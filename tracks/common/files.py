@@ -6,17 +6,25 @@ process leaves beside it starts with a dot and ends in ``.part``.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import errno
 import glob
 import json
 import math
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+PART = ".part"
+"""Ending of what is being written, or what a killed process left of it."""
+SWEPT_DEPTH = 4
+"""Folders within each other that are looked through for it."""
 
 
 @contextmanager
@@ -31,7 +39,7 @@ def replacing_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     final = Path(path)
     final.parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(prefix=f".{final.name}-", suffix=".part", dir=final.parent))
+    folder = Path(tempfile.mkdtemp(prefix=_prefix(final), suffix=PART, dir=final.parent))
     beside = folder / final.name
     try:
         yield beside
@@ -54,7 +62,7 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     final = Path(path)
     final.parent.mkdir(parents=True, exist_ok=True)
-    parent = Path(tempfile.mkdtemp(prefix=f".{final.name}-", suffix=".part", dir=final.parent))
+    parent = Path(tempfile.mkdtemp(prefix=_prefix(final), suffix=PART, dir=final.parent))
     beside = parent / final.name
     beside.mkdir()
     retired = parent / "replaced"
@@ -87,6 +95,74 @@ def recover_folder(path: str | os.PathLike[str]) -> None:
             os.replace(part / final.name, final)
             shutil.rmtree(part, ignore_errors=True)
             return
+
+
+@contextmanager
+def folder_while_used(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Make a folder and what it lies in; what nothing came into is taken away again at the end.
+
+    Raises:
+        OSError: where it cannot be made.
+    """
+    folder = Path(path)
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        for each in made:
+            with contextlib.suppress(OSError):
+                each.rmdir()
+
+
+def check_place(path: str | os.PathLike[str]) -> None:
+    """Find out whether a file can be written at `path` before the work that makes it; writes none.
+
+    Raises:
+        OSError: where it cannot.
+    """
+    final = Path(path)
+    with folder_while_used(final.parent):
+        if final.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(final))
+        os.rmdir(tempfile.mkdtemp(prefix=_prefix(final), suffix=PART, dir=final.parent))
+
+
+def sweep_parts(folder: str | os.PathLike[str]) -> list[Path]:
+    """Remove what killed processes left half-written in a folder and below, and return it.
+
+    What a process that lives is writing stays, and a whole folder that a kill between the two
+    renames of `replacing_folder` left aside is put in place. Only for who alone writes there.
+    """
+    swept = []
+    start = os.fspath(folder)
+    for place, names, _ in os.walk(start):
+        depth = os.path.relpath(place, start).count(os.sep)
+        for name in [name for name in names if name.startswith(".") and name.endswith(PART)]:
+            names.remove(name)
+            match = re.fullmatch(r"\.(.+?)-(?:(\d+)-)?[a-z0-9_]{8}\.part", name)
+            if match and not (match[2] and _is_alive(int(match[2]))):
+                recover_folder(Path(place, match[1]))
+                shutil.rmtree(Path(place, name), ignore_errors=True)
+                swept.append(Path(place, name))
+        if depth >= SWEPT_DEPTH:
+            names.clear()
+    return swept
+
+
+def _prefix(final: Path) -> str:
+    # Who writes it stands in the name, so that another process can tell whether it still does.
+    return f".{final.name}-{os.getpid()}-"
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
 
 
 def _sync(path: Path) -> None:

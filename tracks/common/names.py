@@ -5,11 +5,14 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+LONGEST = 80
+"""Characters of a name that are looked at, and shown; a file's key may be of megabytes."""
+
 
 def closest(name: str, allowed: Iterable[str]) -> str | None:
     """Return the entry of `allowed` that `name` was probably meant to be, or None."""
     lowered = {entry.lower(): entry for entry in allowed}
-    match = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.6)
+    match = difflib.get_close_matches(name[:LONGEST].lower(), lowered, n=1, cutoff=0.6)
     return lowered[match[0]] if match else None
 
 
@@ -21,4 +24,4 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> ValueError:
     allowed = list(allowed)
     guess = closest(name, allowed)
     meant = f" Did you mean {guess!r}?" if guess else ""
-    return ValueError(f"unknown {kind} {name!r}.{meant} Known: {', '.join(allowed)}.")
+    return ValueError(f"unknown {kind} {name[:LONGEST]!r}.{meant} Known: {', '.join(allowed)}.")

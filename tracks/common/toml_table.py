@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
 from tracks.common.names import closest
+from tracks.input import reading
+from tracks.input.ranges import is_finite, shown
 
-_REQUIRED: Any = object()
+REQUIRED: Any = object()
+"""In place of a default: the key must be there."""
 
 
 def read_toml(path: Path) -> Table:
@@ -22,12 +24,9 @@ def read_toml(path: Path) -> Table:
         ValueError: where there is no such file or it is no TOML, naming the file.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-        return Table(path, "", tomllib.loads(text))
+        return Table(path, "", reading.read_toml(path))
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is not TOML: {error}") from None
+        raise ValueError(f"{path}: cannot be read ({reading.reason(error)})") from None
 
 
 class Table:
@@ -42,7 +41,7 @@ class Table:
     def error(self, key: str, value: object, allowed: str) -> ValueError:
         """Return (not raise) the error for a value that is not allowed under `key`."""
         where = f"{self._place}.{key}" if self._place else key
-        return ValueError(f"{self.path}: {where} is {value!r}, allowed is {allowed}")
+        return ValueError(f"{self.path}: {where} is {shown(value)}, allowed is {allowed}")
 
     def has(self, key: str) -> bool:
         """Return whether the key is there; asking makes it known."""
@@ -53,27 +52,25 @@ class Table:
     def number(
         self,
         key: str,
-        default: float = _REQUIRED,
+        default: float = REQUIRED,
         above: float = -math.inf,
+        least: float = -math.inf,
         most: float = math.inf,
     ) -> float:
-        """Return a finite number greater than `above` and not greater than `most`."""
+        """Return a finite number greater than `above`, from `least` to `most`."""
         value = self._get(key, default, "a number")
-        good = _is_number(value) and above < value <= most
-        if not good:
-            low = "" if above == -math.inf else f" above {above:g}"
-            high = "" if most == math.inf else f" up to {most:g}"
-            raise self.error(key, value, f"a number{low}{high}")
+        if not (_is_number(value) and above < value and least <= value <= most):
+            raise self.error(key, value, "a number" + _limits(above, least, most))
         return float(value)
 
-    def whole(self, key: str, default: int = _REQUIRED, least: int = 0, most: int = 2**31) -> int:
+    def whole(self, key: str, default: int = REQUIRED, least: int = 0, most: int = 2**31) -> int:
         """Return a whole number from `least` to `most`."""
         value = self._get(key, default, "a whole number")
         if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
             raise self.error(key, value, f"a whole number from {least} to {most}")
         return value
 
-    def text(self, key: str, default: str = _REQUIRED) -> str:
+    def text(self, key: str, default: str = REQUIRED) -> str:
         """Return a text that is not empty."""
         value = self._get(key, default, "a text")
         if not isinstance(value, str) or not value:
@@ -82,36 +79,49 @@ class Table:
 
     def texts(self, key: str) -> list[str]:
         """Return a list of texts, none of them empty."""
-        value = self._get(key, _REQUIRED, "a list of texts")
+        value = self._get(key, REQUIRED, "a list of texts")
         if not isinstance(value, list) or not all(isinstance(v, str) and v for v in value):
             raise self.error(key, value, "a list of texts that are not empty")
         return value
 
     def vector(
-        self, key: str, size: int, default: Iterable[float] = _REQUIRED, above: float = -math.inf
+        self,
+        key: str,
+        size: int,
+        default: Iterable[float] = REQUIRED,
+        least: float = -math.inf,
+        most: float = math.inf,
     ) -> np.ndarray:
-        """Return `size` finite numbers, each greater than `above`."""
+        """Return `size` finite numbers, each from `least` to `most`."""
         value = self._get(key, default, f"{size} numbers")
         good = isinstance(value, list | tuple) and len(value) == size
-        if not good or not all(_is_number(entry) and entry > above for entry in value):
-            limit = "" if above == -math.inf else f", each above {above:g}"
-            raise self.error(key, value, f"a list of {size} numbers{limit}")
+        if not good or not all(_is_number(entry) and least <= entry <= most for entry in value):
+            limits = _limits(-math.inf, least, most)
+            raise self.error(key, value, f"a list of {size} numbers{limits and ', each' + limits}")
         return np.array(value, float)
 
-    def points(self, key: str, size: int, least: int) -> np.ndarray:
-        """Return at least `least` points of `size` finite numbers each, (N, size)."""
-        value = self._get(key, _REQUIRED, "a list of points")
+    def points(self, key: str, size: int, least: int, most: float = math.inf) -> np.ndarray:
+        """Return at least `least` points of `size` numbers from -`most` to `most`, (N, size)."""
+        value = self._get(key, REQUIRED, "a list of points")
         rows = value if isinstance(value, list) else []
+
+        def fits(entry: object) -> bool:
+            return _is_number(entry) and -most <= entry <= most
+
         good = len(rows) >= least and all(
-            isinstance(row, list) and len(row) == size and all(map(_is_number, row)) for row in rows
+            isinstance(row, list) and len(row) == size and all(map(fits, row)) for row in rows
         )
         if not good:
-            raise self.error(key, value, f"a list of {least} or more [{size} numbers]")
+            raise self.error(
+                key,
+                value,
+                f"a list of {least} or more [{size} numbers{_limits(-math.inf, -most, most)}]",
+            )
         return np.array(value, float)
 
     def table(self, key: str) -> Table:
         """Return a table below this one."""
-        value = self._get(key, _REQUIRED, "a table")
+        value = self._get(key, REQUIRED, "a table")
         if not isinstance(value, dict):
             raise self.error(key, value, f"a table [{key}]")
         return Table(self.path, f"{self._place}.{key}" if self._place else key, value)
@@ -131,18 +141,24 @@ class Table:
                 hint = f" Did you mean {near!r}?" if near else ""
                 where = f"in [{self._place}]" if self._place else "at the top"
                 raise ValueError(
-                    f"{self.path}: key {key!r} {where} is unknown.{hint} "
+                    f"{self.path}: key {shown(key)} {where} is unknown.{hint} "
                     f"Allowed: {', '.join(self._known)}."
                 )
 
     def _get(self, key: str, default: Any, kind: str) -> Any:
         if self.has(key):
             return self._values[key]
-        if default is _REQUIRED:
+        if default is REQUIRED:
             where = f"[{self._place}]" if self._place else "the file"
             raise ValueError(f"{self.path}: {where} has no {key!r}; add it ({kind})")
         return default
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
+
+
+def _limits(above: float, least: float, most: float) -> str:
+    low = "" if least == -math.inf else f" from {least:g}"
+    low = low if above == -math.inf else f" above {above:g}"
+    return low + ("" if most == math.inf else f" {'to' if low else 'up to'} {most:g}")

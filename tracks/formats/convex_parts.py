@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tracks.input.reading import MESH_BYTES, check_file
+
 _VOLUME_TOLERANCE = 1e-3
 """A part may miss this share of its convex hull's volume (rounding of stored corners)."""
 
@@ -19,8 +21,9 @@ def load_convex_parts(path: Path) -> list[np.ndarray]:
     # Here, so that tracks without meshes do not pay for the import.
     import trimesh
 
-    if not path.is_file():
+    if not path.exists():
         raise ValueError(f"{path}: no such mesh file")
+    check_file(path, MESH_BYTES)
     try:
         mesh = trimesh.load_mesh(path)
     except Exception as error:  # the loaders raise whatever they like on a damaged file

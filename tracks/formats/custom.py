@@ -7,12 +7,12 @@ angles in degrees; relative mesh files are looked for beside the TOML file.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 
-from tracks.common.toml_table import Table, read_toml
+from tracks.common.toml_table import REQUIRED, Table, read_toml
 from tracks.formats.convex_parts import load_convex_parts
 from tracks.geometry.gates import frame_boxes, rectangle, regular_polygon
 from tracks.geometry.rotation import quat_to_rot
@@ -20,6 +20,10 @@ from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
 from tracks.track import Track
 
 _START_BEHIND_M = 2.5
+FARTHEST_M = 1e5
+"""Of a place from the origin, along each axis: as far as a flight log may go."""
+LEAST_M, MOST_M = 1e-3, 1e5
+"""Of a length."""
 _SINGULAR = {"boxes": "box", "meshes": "mesh"}
 
 
@@ -104,10 +108,10 @@ def _columns(rows: list[tuple], shapes: list[tuple[int, ...]]) -> list[np.ndarra
 def _gates(tables: list[Table]) -> Gates:
     rows, openings = [], []
     for table in tables:
-        center, rot = table.vector("center", 3), rotation(table)
+        center, rot = _place(table, "center"), rotation(table)
         opening = _opening(table)
-        width = table.number("frame_width", 0.2, above=0)
-        depth = table.number("frame_depth", 0.05, above=0)
+        width = _length(table, "frame_width", 0.2)
+        depth = _length(table, "frame_depth", 0.05)
         table.close()
         lowest = (center[2] + opening @ rot[2, 1:]).min()
         if lowest < 0:
@@ -131,11 +135,11 @@ def _opening(table: Table) -> np.ndarray:
             "one of: width and height; radius with corners (of a regular polygon); polygon",
         )
     if given == ["width"]:
-        return rectangle(table.number("width", above=0), table.number("height", above=0))
+        return rectangle(_length(table, "width"), _length(table, "height"))
     if given == ["radius"]:
         corners = table.whole("corners", 12, least=3, most=64)
-        return regular_polygon(corners, table.number("radius", above=0))
-    return _convex(table, table.points("polygon", 2, least=3))
+        return regular_polygon(corners, _length(table, "radius"))
+    return _convex(table, table.points("polygon", 2, least=3, most=MOST_M))
 
 
 def _convex(table: Table, polygon: np.ndarray) -> np.ndarray:
@@ -172,6 +176,14 @@ def rotation(table: Table) -> np.ndarray:
     return yaw @ pitch @ roll
 
 
+def _place(table: Table, key: str, default: Iterable[float] = REQUIRED) -> np.ndarray:
+    return table.vector(key, 3, default, least=-FARTHEST_M, most=FARTHEST_M)
+
+
+def _length(table: Table, key: str, default: float = REQUIRED) -> float:
+    return table.number(key, default, least=LEAST_M, most=MOST_M)
+
+
 def _unit(table: Table, key: str, vector: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vector)
     if length < 1e-6:
@@ -186,7 +198,7 @@ def _start(top: Table, gates: Gates) -> tuple[np.ndarray, float]:
     table = top.table("start") if top.has("start") else Table(top.path, "start", {})
     if level < 1e-6 and not table.has("position"):
         raise table.error("position", None, "a position: gate 0 is flown straight up or down")
-    pos_w = table.vector("position", 3, pos_w.tolist())
+    pos_w = _place(table, "position", pos_w.tolist())
     if pos_w[2] <= 0:
         raise table.error("position", pos_w.tolist(), "a position above the ground (z > 0)")
     to_gate = gates.center_w[0] - pos_w
@@ -208,25 +220,29 @@ def _refuse_start_inside(top: Table, track: Track) -> None:
 
 
 def _box(table: Table) -> tuple:
-    return table.vector("center", 3), rotation(table), table.vector("size", 3, above=0) / 2
+    return (
+        _place(table, "center"),
+        rotation(table),
+        table.vector("size", 3, least=LEAST_M, most=MOST_M) / 2,
+    )
 
 
 def _rod(table: Table) -> tuple:
     axis = _unit(table, "axis", table.vector("axis", 3, (0.0, 0.0, 1.0)))
-    radius, length = table.number("radius", above=0), table.number("length", above=0)
-    return table.vector("center", 3), axis, radius, length / 2
+    radius, length = _length(table, "radius"), _length(table, "length")
+    return _place(table, "center"), axis, radius, length / 2
 
 
 def _sphere(table: Table) -> tuple:
-    return table.vector("center", 3), table.number("radius", above=0)
+    return _place(table, "center"), _length(table, "radius")
 
 
 def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
     meshes, labels = [], []
     for number, table in enumerate(top.tables("meshes")):
         file = top.path.parent / table.text("file")
-        position, rot = table.vector("position", 3, (0.0, 0.0, 0.0)), rotation(table)
-        scale = table.number("scale", 1.0, above=0)
+        position, rot = _place(table, "position", (0.0, 0.0, 0.0)), rotation(table)
+        scale = table.number("scale", 1.0, least=1e-6, most=1e6)
         name = names(table, "meshes", number)
         table.close()
         parts = load_convex_parts(file)

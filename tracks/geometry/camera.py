@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+
+from tracks.input.ranges import Range
 
 
 @dataclass(frozen=True)
 class Camera:
     """A forward-looking depth camera at the body's origin."""
 
-    pitch_deg: float = 15.0
+    pitch_deg: Annotated[float, Range(-90.0, 90.0)] = 15.0
     """Pitch of the optical axis above body x [deg]."""
-    fov_deg: tuple[float, float] = (78.4, 63.8)
+    fov_deg: Annotated[tuple[float, float], Range(1.0, 179.0)] = (78.4, 63.8)
     """Horizontal and vertical field of view, edge to edge [deg]."""
-    range_m: float = 10.0
+    range_m: Annotated[float, Range(0.1, 1000.0)] = 10.0
     """Depths beyond this read as this [m]."""
-    width: int = 32
+    width: Annotated[int, Range(1, 1024)] = 32
     """Pixels across."""
-    height: int = 24
+    height: Annotated[int, Range(1, 1024)] = 24
     """Pixels down."""
 
 

@@ -4,26 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
-from suite.common.choices import at_least, parse_levels
+from suite.common.choices import parse_levels
 from suite.common.work import check_jobs
 from suite.train.config import TrainConfig
+from suite.train.config import check as check_recipe
+from tracks.input.ranges import Iterations, Range, Seed, Trials, check_ranges
 
 GATES = 4
 """Of the paper's tracks in its ablation and its comparison of schemes."""
-LEAST = {
-    "trials": 1,
-    "seed": 0,
-    "iterations": 1,
-    "worlds": 1,
-    "seconds": 0.5,
-    "measurements": 1,
-    "round_trials": 1,
-    "round_seconds": 0.5,
-    "delta_iterations": 0,
-}
-"""The smallest value of options by their fields' names."""
 
 
 @dataclass(frozen=True)
@@ -34,17 +24,17 @@ class FourGates:
     """The recipe that all trainings share, but for its size, its gates and what is compared."""
     set: tuple[str, ...] = ("episode.image_stride=3",)
     """Change settings of the recipe by name."""
-    iterations: int = 200
+    iterations: Iterations = 200
     """Gradient steps, instead of the preset's."""
-    worlds: int = 48
+    worlds: Annotated[int, Range(1, 10**6)] = 48
     """Worlds in one gradient step, instead of the preset's."""
-    training_seeds: tuple[int, ...] = (0, 1, 2)
+    training_seeds: tuple[Seed, ...] = (0, 1, 2)
     """Seeds that everything is trained from."""
-    trials: int = 300
+    trials: Trials = 300
     """Unseen worlds that are flown at every measurement."""
-    seconds: float = 10.0
+    seconds: Annotated[float, Range(0.5, 3600.0)] = 10.0
     """Of a trial, from standing start."""
-    seed: int = 1000
+    seed: Seed = 1000
     """Of the unseen worlds; none of the training seeds."""
 
 
@@ -54,16 +44,12 @@ def check(config: Any) -> None:
     Raises:
         ValueError: naming the option and what is allowed.
     """
+    check_ranges(config, options=True)
     given = vars(config)
     seeds = given.get("training_seeds", (0,))
     if len(set(seeds)) < len(seeds) or not seeds:
         said = " ".join(map(str, seeds)) or "empty"
         raise ValueError(f"--training-seeds is {said}; give each once")
-    for seed in seeds:
-        at_least("--training-seeds", seed, 0)
-    for field, least in LEAST.items():
-        if given.get(field) is not None:
-            at_least(f"--{field.replace('_', '-')}", given[field], least)
     if isinstance(config, FourGates):
         _check_unseen("--seed", config.seed, seeds)
     if "round_seed" in given:
@@ -75,7 +61,6 @@ def check(config: Any) -> None:
 
 
 def _check_unseen(option: str, seed: int, training_seeds: Sequence[int]) -> None:
-    at_least(option, seed, 0)
     if seed in training_seeds:
         raise ValueError(
             f"{option} {seed} is one of --training-seeds, whose policies would have seen the "
@@ -109,7 +94,10 @@ def asked_recipe(config: Any) -> TrainConfig:
     from suite.train.presets import preset, with_iterations
 
     recipe = override(preset(config.preset), config.set)
-    return recipe if config.iterations is None else with_iterations(recipe, config.iterations)
+    if config.iterations is not None:
+        recipe = with_iterations(recipe, config.iterations)
+    check_recipe(recipe)
+    return recipe
 
 
 def four_gate_recipe(config: FourGates) -> TrainConfig:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from policies.spec import PolicySpec
 from suite.train.config import (
@@ -13,6 +14,7 @@ from suite.train.config import (
     QuadrotorConfig,
     TrainConfig,
 )
+from tracks.input.ranges import Iterations, Range, Seed, Share
 
 SHARED = ("spec", "physics", "quadrotor", "loss", "episode", "seed")
 """Settings that both trainings have."""
@@ -33,36 +35,36 @@ class PpoConfig:
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
     """Worlds and horizon; `stop_from` and `finish` are not read, since the value of what follows is
     learned."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the parameters, the tracks, the randomisation and the exploration."""
-    iterations: int = 200
+    iterations: Iterations = 200
     """Rollouts, each followed by `epochs` times `minibatches` gradient steps."""
-    discount: float = 0.97
+    discount: Share = 0.97
     """gamma of the return, per policy period [1]."""
-    trace: float = 0.95
+    trace: Share = 0.95
     """lambda of generalised advantage estimation (Schulman et al. 2016) [1]."""
-    clip: float = 0.2
+    clip: Annotated[float, Range(0.0, 10.0, above=True)] = 0.2
     """Largest change of an action's probability that is rewarded, as a ratio's distance from 1."""
-    epochs: int = 4
+    epochs: Annotated[int, Range(1, 10_000)] = 4
     """Passes of the policy over a rollout."""
-    minibatches: int = 4
+    minibatches: Annotated[int, Range(1, 10_000)] = 4
     """Gradient steps of a pass of policy or critic, each over a share of the worlds; must divide
     `episode.batch`."""
-    rate: float = 3e-3
+    rate: Annotated[float, Range(0.0, 10.0)] = 3e-3
     """Adam's learning rate of the policy at the start; it falls linearly to zero."""
-    gradient_clip: float = 1.0
+    gradient_clip: Annotated[float, Range(0.0, 1e12, above=True)] = 1.0
     """Largest global norm of the policy's gradient."""
-    entropy: float = 0.01
+    entropy: Annotated[float, Range(0.0, 1e6)] = 0.01
     """Weight of the exploration's entropy in the objective [1]."""
-    deviation: float = 2.0
+    deviation: Annotated[float, Range(1e-3, 100.0)] = 2.0
     """Standard deviation of the exploration at the start, on each axis of the action [m/s^2]."""
-    reward_scale: float = 0.01
+    reward_scale: Annotated[float, Range(0.0, 1e6, above=True)] = 0.01
     """The critic learns returns of rewards times this: numbers around one [1]."""
-    critic_size: int = 128
+    critic_size: Annotated[int, Range(1, 8192)] = 128
     """Width of the critic's two hidden layers."""
-    critic_rate: float = 1e-3
+    critic_rate: Annotated[float, Range(0.0, 10.0)] = 1e-3
     """Adam's learning rate of the critic."""
-    critic_epochs: int = 16
+    critic_epochs: Annotated[int, Range(0, 10_000)] = 16
     """Passes of the critic over a rollout; it sees no images, so they cost little."""
 
     @property

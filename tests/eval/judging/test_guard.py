@@ -75,7 +75,9 @@ def test_late_answers_are_counted_and_the_drone_flies_on():
     from eval.judging.judge import ActionLimits
 
     options = JudgeOptions(
-        slots=2, rules=Rules(time_limit_s=0.5), limits=ActionLimits(deadline_s=0.0)
+        slots=2,
+        rules=Rules(time_limit_s=0.5),
+        limits=ActionLimits(deadline_s=0.0, late_most=100),
     )
     trials = [TrialSpec("straight", 0, 0)]
     (found,) = fly(
@@ -83,3 +85,14 @@ def test_late_answers_are_counted_and_the_drone_flies_on():
     )
     assert (found.late_actions, found.ended_by) == (15, "timeout")
     assert abs(found.pos_x) < 0.01  # the action flown was the first: none
+
+
+def test_a_policy_that_is_late_all_the_time_ends_the_trials_and_not_the_run():
+    from eval.judging.judge import ActionLimits
+
+    options = JudgeOptions(slots=2, limits=ActionLimits(deadline_s=0.0, late_most=3))
+    trials = [TrialSpec("straight", 0, seed) for seed in range(5)]
+    found = fly(Pursuit(3.0), trials, VEHICLE, "mujoco", options, tracks={"straight": straight()})
+    assert [result.seed for result in found] == [0, 1, 2, 3, 4]
+    assert {(r.late_actions, r.ended_by, r.success) for r in found} == {(3, "timeout", False)}
+    assert all(r.time_s < 0.2 for r in found)

@@ -142,3 +142,11 @@ def test_nothing_is_written_that_could_not_be_read(tmp_path):
     with pytest.raises(FlightLogError, match="ending"):
         write_flight(tmp_path / "a.txt", log)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_row_that_is_no_text_is_refused(tmp_path):
+    path = write_table(tmp_path / "good.csv", columns())
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines[:5], lines[5][:60] + b"\xf0\x9f\n", *lines[6:]]))
+    with pytest.raises(FlightLogError, match="nor CSV in UTF-8"):
+        read_flight(path)

@@ -24,7 +24,9 @@ def test_a_vehicle_that_flies_passes_and_is_a_key():
 @pytest.mark.parametrize(
     ("vehicle", "message"),
     [
-        (replace(PLAIN, mass=0.0), "mass = 0.0: must be above 0 kg"),
+        (replace(PLAIN, mass=0.0), "mass = 0.0: must be from 0.0001 to 10000 kg"),
+        (replace(PLAIN, mass=1e-300), "mass = 1e-300: must be from 0.0001"),
+        (replace(PLAIN, inertia=(1e-300,) * 3), "inertia = .*must be from 1e-10"),
         (replace(PLAIN, inertia=(0.1, 0.2, 0.31)), "sum of the other two"),
         (replace(PLAIN, body=CollisionBox((0.1, 0.0, 0.1))), "body.half_size"),
         (rotors(spin=(1, 1, -1, -1)), "independently"),

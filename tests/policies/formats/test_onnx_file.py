@@ -106,8 +106,8 @@ def test_data_beside_the_file_is_read_and_outside_it_is_refused(tmp_path):
 def test_a_file_that_is_too_large_is_refused(exported, monkeypatch):
     from policies.formats import onnx_file
 
-    monkeypatch.setattr(onnx_file, "MAX_BYTES", 1000)
-    refused(exported / "tiny.onnx", "allowed are 1000")
+    monkeypatch.setattr(onnx_file, "MODEL_BYTES", 1000)
+    refused(exported / "tiny.onnx", "allowed are up to 1000")
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def edit(folder, change):
         ("camera", {"width": 34}, "camera.width is 34"),
         ("camera", {"height": 16}, "camera.height is 16"),
         ("camera", {"fov_deg": [70.0]}, r"fov_deg is \[70.0\], expected 2"),
-        ("camera", {"fov_deg": [70.0, 180.0]}, "fov_deg is 180.0"),
+        ("camera", {"fov_deg": [70.0, 180.0]}, r"fov_deg is \(70.0, 180.0\)"),
         ("camera", [1], "camera: is"),
         ("depth", {"near": 20.0}, "below camera.range_m"),
         ("depth", {"scale": float("inf")}, "scale is inf"),

@@ -2,7 +2,7 @@
 
 import pytest
 
-from suite.common.choices import at_least, parse_levels, parse_tracks
+from suite.common.choices import parse_levels, parse_tracks
 
 
 @pytest.mark.parametrize(
@@ -24,11 +24,3 @@ def test_tracks():
     assert parse_tracks("ellipse,my/course.toml") == ["ellipse", "my/course.toml"]
     with pytest.raises(ValueError, match="Did you mean 'zigzag'"):
         parse_tracks("ellipse,zigzg")
-
-
-def test_an_option_that_is_too_small_is_named():
-    at_least("--trials", 1, 1)
-    with pytest.raises(ValueError, match="--trials is 0; it must be 1 or more"):
-        at_least("--trials", 0, 1)
-    with pytest.raises(ValueError, match="nan"):
-        at_least("--limit", float("nan"), 1)

@@ -75,7 +75,7 @@ def test_a_journal_of_something_else_is_not_mixed_in(pilots, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["--trials", "0"], "--trials is 0; it must be 1 or more"),
+        (["--trials", "0"], "--trials is 0, allowed is 1 to 100000"),
         (["--seed", "-1"], "--seed is -1"),
         (["--difficulty", "10"], "level 10 is not 0 to 9"),
         (["--track", "zigzg"], "Did you mean 'zigzag'?"),
@@ -84,6 +84,7 @@ def test_a_journal_of_something_else_is_not_mixed_in(pilots, tmp_path, monkeypat
         (["--vehicle", "referense"], "Did you mean 'reference'?"),
         (["--policy", "nobody_we_know"], "nobody_we_know"),
         (["--rerun", "trials.mp4"], "must end in .rrd"),
+        (["--rerun", "/proc/nowhere/trials.rrd"], "/proc/nowhere"),
     ],
 )
 def test_what_cannot_be_used_is_said_before_the_first_flight(

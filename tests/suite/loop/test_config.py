@@ -19,7 +19,7 @@ EXAMPLE = "examples/hidden.toml"
         (["--difficulty", "10"], "level 10 is not 0 to 9"),
         (["--vehicle", "referense"], "Did you mean 'reference'?"),
         (["--trials", "0"], "--trials is 0"),
-        (["--trials", "100001"], "--trials is 100001; it must be 100000 or less"),
+        (["--trials", "100001"], "--trials is 100001, allowed is 1 to 100000"),
         (["--flights", "1", "--track", "zigzag", "--difficulty", "0"], "--flights is 1"),
         (["--iterations", "0"], "--iterations is 0"),
         (["--finetune-iterations", "0"], "--finetune-iterations is 0"),

@@ -33,14 +33,14 @@ def test_a_configuration_can_be_kept_as_json_with_every_setting():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"gate_corners": 2}, "episode.gate_corners is 2, allowed are 3 and more"),
-        ({"height_spread": -1.0}, "episode.height_spread is -1.0, allowed are 0 and more"),
+        ({"gate_corners": 2}, "episode.gate_corners is 2, allowed is 3 to 64"),
+        ({"height_spread": -1.0}, "episode.height_spread is -1.0, allowed is 0 to 100"),
         ({"height_spread": float("nan")}, "episode.height_spread is nan"),
-        ({"batch": 0}, "episode.batch is 0, allowed are 1 and more"),
-        ({"stop_from": 1.5}, "episode.stop_from is 1.5, allowed are 0 to 1"),
-        ({"gates": 9}, "episode.gates is 9, allowed are 1 to 8"),
+        ({"batch": 0}, "episode.batch is 0, allowed is 1 to 1000000"),
+        ({"stop_from": 1.5}, "episode.stop_from is 1.5, allowed is 0 to 1"),
+        ({"gates": 9}, "episode.gates is 9, allowed is 1 to 8"),
         ({"difficulty": (0.5, 0.2)}, "episode.difficulty is .*lower end of the range first"),
-        ({"physics": {"action_delay": (0.0, 3.0)}}, "physics.action_delay is .*allowed are 0 to 2"),
+        ({"physics": {"action_delay": (0.0, 3.0)}}, "physics.action_delay is .*allowed is 0 to 2"),
     ],
 )
 def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
@@ -53,7 +53,7 @@ def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
 
 @pytest.mark.parametrize("seed", [-1, 2**32])
 def test_a_seed_that_no_key_is_made_of_is_refused(seed, tmp_path):
-    with pytest.raises(ValueError, match=rf"seed is {seed}, allowed are 0 to 4294967295"):
+    with pytest.raises(ValueError, match=rf"seed is {seed}, allowed is 0 to 4294967295"):
         train(replace(small_config(), seed=seed), tmp_path / "run", Console())
 
 
@@ -62,7 +62,7 @@ def test_every_preset_is_within_the_limits(name):
     check(preset(name))
 
 
-@pytest.mark.parametrize("stride", [0, 4, 7])
+@pytest.mark.parametrize("stride", [4, 7])
 def test_a_stride_that_does_not_divide_the_steps_is_refused(stride):
     config = small_config(steps=6, image_stride=stride)
     with pytest.raises(ValueError, match=rf"image_stride is {stride}, allowed are divisors .*6"):

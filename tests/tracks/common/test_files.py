@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -100,3 +101,39 @@ def test_a_stamp_carries_version_commit_and_seed():
     keys = stamp(schema=1, seed=7)
     assert list(keys) == ["schema", "suite_version", "git_commit", "seed"]
     assert (keys["schema"], keys["seed"]) == (1, 7)
+
+
+def _part(folder, name, writer):
+    part = folder / f".{name}-{writer}abcdefg_.part"
+    part.mkdir(parents=True)
+    (part / name).write_text("half")
+    return part
+
+
+def test_what_killed_processes_left_is_swept_and_what_is_being_written_stays(tmp_path):
+    dead = _part(tmp_path, "a.json", f"{2**22 + 1}-")
+    older = _part(tmp_path / "deep" / "er", "b.json", "")
+    alive = _part(tmp_path, "c.json", f"{os.getpid()}-")
+    other = tmp_path / ".hidden.part"
+    other.mkdir()
+    assert set(files.sweep_parts(tmp_path)) == {dead, older}
+    assert alive.exists() and other.exists() and not dead.exists() and not older.exists()
+
+
+def test_a_whole_folder_that_a_kill_left_aside_is_put_in_place(tmp_path):
+    part = tmp_path / f".state-{2**22 + 1}-abcdefgh.part"
+    (part / "replaced").mkdir(parents=True)
+    (part / "state").mkdir()
+    (part / "state" / "new").touch()
+    files.sweep_parts(tmp_path)
+    assert (tmp_path / "state" / "new").exists() and not part.exists()
+
+
+def test_a_place_is_tried_before_the_work_and_left_as_it_was(tmp_path):
+    files.check_place(tmp_path / "a" / "b" / "c.rrd")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").touch()
+    for bad in (tmp_path, tmp_path / "file" / "x.rrd", tmp_path / ("y" * 300), "/proc/nowhere/x"):
+        with pytest.raises(OSError):
+            files.check_place(bad)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -76,11 +76,20 @@ BAD = {
     "missing height": ("[[gates]]\ncenter=[0,0,1]\nwidth = 1\n", r"has no 'height'"),
     "no opening": ("[[gates]]\ncenter = [0, 0, 1]\n", "allowed is one of: width and height"),
     "two openings": (GATE + "radius = 0.5\n", r"\['width', 'radius'\], allowed is one of"),
-    "not a number": (GATE.replace("width = 1.0", 'width = "1"'), "width is '1'.*a number above 0"),
+    "not a number": (
+        GATE.replace("width = 1.0", 'width = "1"'),
+        "width is '1'.*a number from 0.001",
+    ),
     "a boolean": (GATE.replace("width = 1.0", "width = true"), "width is True"),
     "nan": (GATE.replace("1.5]", "nan]"), r"gates\[0\].center.*allowed is a list of 3 numbers"),
     "two numbers": (GATE.replace(", 1.5]", "]"), "center is .0, 0.*list of 3 numbers"),
-    "negative": (GATE + "frame_width = -0.1\n", "frame_width is -0.1.*above 0"),
+    "negative": (GATE + "frame_width = -0.1\n", "frame_width is -0.1.*from 0.001"),
+    "a gate at the end of the world": (GATE.replace("1.5]", "1e300]"), "each from -100000 to"),
+    "an opening for nobody": (GATE.replace("width = 1.0", "width = 1e-300"), "width is 1e-300"),
+    "a number of hundreds of digits": (
+        GATE.replace("1.5]", "9" * 400 + "]"),
+        r"characters\), allowed is a list of 3",
+    ),
     "underground": (GATE.replace("1.5]", "0.3]"), "at least 0.20 m higher"),
     "few corners": (
         GATE.replace("width = 1.0\nheight = 1.0", "radius = 1\ncorners = 2"),

@@ -1,0 +1,1 @@
+"""Models from elsewhere in a process of their own, which can be killed."""

@@ -1,0 +1,186 @@
+"""An ONNX model that runs in a process of its own: it may loop for ever or abort, and we do not.
+
+A model from elsewhere is a program: a `Loop` of 2^62 rounds is one node, also one that is worked
+out while the file is loaded. So onnxruntime has the file in a process with limits of time and
+memory (`server.py`), and whoever does not answer in time is killed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import struct
+import subprocess
+import sys
+import time
+import weakref
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from policies.errors import PolicyError
+from policies.formats.apart.server import data_bytes
+
+LOAD_S = 60.0
+"""To start, load the model and optimise it [s]."""
+ANSWER_S = 60.0
+"""To answer for one block of rows [s]; the deadline of a judgement is shorter, and counts."""
+MEMORY_BYTES = 4 * 2**30
+"""Addresses that the process may use."""
+ANSWER_BYTES = 2**28
+"""Of one answer."""
+GRACE_S = 5.0
+"""Later than we give up, the process ends itself [s]; it may have lost us."""
+SERVER = Path(__file__).with_name("server.py")
+
+
+class Port(NamedTuple):
+    """An input or an output of a model."""
+
+    name: str
+    kind: str
+    """As onnxruntime calls it, such as tensor(float)."""
+    shape: tuple[int | None, ...]
+    """None where a size is free."""
+
+
+class Apart:
+    """A loaded model in its process, which ends with this object."""
+
+    def __init__(self, model: bytes, where: str) -> None:
+        """Start the process and load the model there.
+
+        Args:
+            model: a serialised ONNX model.
+            where: the file it came from, for messages.
+
+        Raises:
+            PolicyError: where onnxruntime refuses it, or does not come to an end with it.
+        """
+        self._where = where
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(SERVER)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            bufsize=0,
+            # Ctrl-C goes to the terminal's whole group; its end is ours to decide.
+            start_new_session=True,
+        )
+        self._end = weakref.finalize(self, _end, self._process)
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            os.set_blocking(pipe.fileno(), False)
+        limits = {
+            "memory_bytes": MEMORY_BYTES,
+            "load_s": LOAD_S + GRACE_S,
+            "answer_s": ANSWER_S + GRACE_S,
+        }
+        about, _ = self._ask({"bytes": len(model), **limits}, [model], LOAD_S, "loaded")
+        if "error" in about:
+            raise PolicyError(
+                f"{where}: onnxruntime {about['version']} cannot load it ({about['error']}); "
+                "export it for an older opset"
+            )
+        self.inputs, self.outputs = (
+            [Port(name, kind, tuple(shape)) for name, kind, shape in about[side]]
+            for side in ("inputs", "outputs")
+        )
+
+    def run(self, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
+        """Return the model's outputs, float32, for its inputs.
+
+        Raises:
+            PolicyError: where it fails, or does not come to an end; it is gone then.
+        """
+        arrays = {name: np.ascontiguousarray(value, np.float32) for name, value in feed.items()}
+        head = {"arrays": [[name, value.shape] for name, value in arrays.items()]}
+        data = [value.reshape(-1).view(np.uint8).data for value in arrays.values() if value.size]
+        found, answer = self._ask(head, data, ANSWER_S, "answered")
+        if "error" in found:
+            raise PolicyError(
+                f"{self._where}: fails while it runs ({found['error']}); export it again"
+            )
+        outputs, at = [], 0
+        for _, shape in found["arrays"]:
+            count = int(np.prod(shape, dtype=np.int64))
+            outputs.append(np.frombuffer(answer, np.float32, count, at).reshape(shape))
+            at += 4 * count
+        return outputs
+
+    def _ask(
+        self, head: dict[str, Any], data: list[Any], limit_s: float, done: str
+    ) -> tuple[dict[str, Any], bytearray]:
+        """Send a frame and return the answer's."""
+        until = time.monotonic() + limit_s
+        text = json.dumps(head).encode()
+        try:
+            for part in (struct.pack("<I", len(text)) + text, *data):
+                self._write(memoryview(part), until)
+            (length,) = struct.unpack("<I", self._read(4, until))
+            found = json.loads(self._read(length, until))
+            return found, self._read(data_bytes(found), until)
+        except TimeoutError:
+            reason = f"it was not {done} within {limit_s:g} s"
+        except (BrokenPipeError, EOFError, ValueError, MemoryError):
+            reason = _how_it_ended(self._process)
+        self._end()
+        raise PolicyError(
+            f"{self._where}: onnxruntime does not come to an end with it ({reason}); look for "
+            "loops without an end and for sizes beyond the memory, and export it again"
+        )
+
+    def _write(self, data: memoryview, until: float) -> None:
+        pipe = self._process.stdin
+        assert pipe is not None
+        while data:
+            _wait(pipe.fileno(), select.POLLOUT, until)
+            try:
+                data = data[os.write(pipe.fileno(), data) :]
+            except BlockingIOError:
+                continue
+
+    def _read(self, count: int, until: float) -> bytearray:
+        pipe = self._process.stdout
+        assert pipe is not None
+        if not 0 <= count <= ANSWER_BYTES:
+            raise ValueError(f"an answer of {count} bytes")
+        data = bytearray(count)
+        view = memoryview(data)
+        while view:
+            _wait(pipe.fileno(), select.POLLIN, until)
+            try:
+                got = os.readv(pipe.fileno(), [view])
+            except BlockingIOError:
+                continue
+            if not got:
+                raise EOFError
+            view = view[got:]
+        return data
+
+
+def _wait(handle: int, event: int, until: float) -> None:
+    poll = select.poll()
+    poll.register(handle, event)
+    left = until - time.monotonic()
+    if left <= 0 or not poll.poll(left * 1000):
+        raise TimeoutError
+
+
+def _how_it_ended(process: subprocess.Popen[bytes]) -> str:
+    try:
+        code = process.wait(1.0)
+    except subprocess.TimeoutExpired:
+        return "it answers nonsense"
+    return f"it ended by {signal.Signals(-code).name}" if code < 0 else f"it ended with {code}"
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            pipe.close()
+    process.wait()

@@ -1,0 +1,152 @@
+"""Models that do not come to an end, abort or ask for all memory end themselves and not us."""
+
+import gc
+import os
+import signal
+import subprocess
+import time
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from policies.errors import PolicyError
+from policies.formats.apart import process, server
+from policies.formats.apart.process import Apart
+from policies.policy import load_policy
+
+FLOAT = TensorProto.FLOAT
+
+
+def _proto(nodes, tensors=(), outputs=None, rows="n"):
+    inputs = [
+        helper.make_tensor_value_info("state", FLOAT, (rows, 12)),
+        helper.make_tensor_value_info("image", FLOAT, (rows, 24, 32)),
+    ]
+    outputs = outputs or [helper.make_tensor_value_info("action", FLOAT, (rows, 3))]
+    graph = helper.make_graph(nodes, "g", inputs, outputs, list(tensors))
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+W = numpy_helper.from_array(np.eye(12, 3, dtype=np.float32), "w")
+PLAIN = _proto([helper.make_node("MatMul", ["state", "w"], ["action"])], [W])
+
+
+def _endless(start, rounds="rounds"):
+    """Return nodes and tensors of a loop of 2^62 rounds over `start`, added to the action."""
+    body = helper.make_graph(
+        [
+            helper.make_node("Identity", ["go_in"], ["go_out"]),
+            helper.make_node("Sin", ["x_in"], ["x_out"]),
+        ],
+        "body",
+        [
+            helper.make_tensor_value_info("i", TensorProto.INT64, ()),
+            helper.make_tensor_value_info("go_in", TensorProto.BOOL, ()),
+            helper.make_tensor_value_info("x_in", FLOAT, None),
+        ],
+        [
+            helper.make_tensor_value_info("go_out", TensorProto.BOOL, ()),
+            helper.make_tensor_value_info("x_out", FLOAT, None),
+        ],
+    )
+    nodes = [
+        helper.make_node("MatMul", ["state", "w"], ["u"]),
+        helper.make_node("Loop", [rounds, "go", start], ["x"], body=body),
+        helper.make_node("ReduceMax", ["x"], ["most"], keepdims=0),
+        helper.make_node("Add", ["u", "most"], ["action"]),
+    ]
+    tensors = [
+        W,
+        numpy_helper.from_array(np.array(2**62, np.int64), "rounds"),
+        numpy_helper.from_array(np.array(True), "go"),
+        numpy_helper.from_array(np.ones(3, np.float32), "constant"),
+    ]
+    return _proto(nodes, tensors)
+
+
+def _save(folder, proto):
+    path = folder / "it.onnx"
+    onnx.save(proto, path)
+    return path
+
+
+@pytest.mark.parametrize("start", ["constant", "state"])
+def test_a_loop_without_an_end_is_refused_in_time(start, tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "LOAD_S", 2.0)
+    monkeypatch.setattr(process, "ANSWER_S", 1.0)
+    path = _save(tmp_path, _endless(start))
+    began = time.monotonic()
+    with pytest.raises(PolicyError, match="it.onnx: onnxruntime does not come to an end with it"):
+        load_policy(path)
+    assert time.monotonic() - began < 8.0
+
+
+def test_the_process_ends_itself_where_its_parent_is_gone(monkeypatch):
+    monkeypatch.setattr(process, "GRACE_S", -1.5)
+    monkeypatch.setattr(process, "ANSWER_S", 2.0)
+    model = Apart(_endless("state").SerializeToString(), "it")
+    with pytest.raises(PolicyError, match="it ended by SIGALRM"):
+        model.run({"state": np.ones((1, 12)), "image": np.ones((1, 24, 32))})
+
+
+@pytest.mark.parametrize("rows", [0, 10**6])
+def test_a_batch_of_none_or_of_millions_is_refused(rows, tmp_path):
+    path = _save(tmp_path, _proto(PLAIN.graph.node, [W], rows=rows))
+    with pytest.raises(PolicyError, match="allowed are batches of 1 to 4096 rows|cannot load it"):
+        load_policy(path)
+
+
+def test_a_model_that_wants_all_memory_is_refused(tmp_path):
+    """2^34 numbers, worked out of two small ones."""
+    nodes = [
+        helper.make_node("Expand", ["state", "large"], ["x"]),
+        helper.make_node("ReduceMax", ["x"], ["most"], keepdims=0),
+        helper.make_node("MatMul", ["state", "w"], ["u"]),
+        helper.make_node("Add", ["u", "most"], ["action"]),
+    ]
+    large = numpy_helper.from_array(np.array([2**24, 1, 12], np.int64), "large")
+    with pytest.raises(PolicyError, match="it.onnx: .*(fails while it runs|come to an end)"):
+        load_policy(_save(tmp_path, _proto(nodes, [W, large])))
+
+
+def test_a_model_that_fails_while_it_runs_is_one_line(tmp_path):
+    nodes = [
+        helper.make_node("Reshape", ["state", "shape"], ["x"]),
+        helper.make_node("MatMul", ["x", "w"], ["action"]),
+    ]
+    shape = numpy_helper.from_array(np.array([7, 12], np.int64), "shape")
+    with pytest.raises(PolicyError, match="it.onnx: fails while it runs") as told:
+        load_policy(_save(tmp_path, _proto(nodes, [W, shape])))
+    assert len(str(told.value).splitlines()) == 1
+
+
+def test_a_process_that_dies_is_told_of_and_one_that_is_not_needed_ends():
+    model = Apart(PLAIN.SerializeToString(), "it")
+    feed = {"state": np.ones((2, 12)), "image": np.ones((2, 24, 32))}
+    np.testing.assert_array_equal(model.run(feed)[0], np.ones((2, 3)))
+    child = model._process.pid
+    os.kill(child, signal.SIGABRT)
+    with pytest.raises(PolicyError, match="it ended by SIGABRT"):
+        model.run(feed)
+    other = Apart(PLAIN.SerializeToString(), "it")
+    child = other._process.pid
+    del other
+    gc.collect()
+    with pytest.raises(ProcessLookupError):
+        os.kill(child, 0)
+
+
+def test_frames_come_through_whole():
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as echo:
+        assert echo.stdin and echo.stdout
+        head = {"arrays": [["a", [2, 3]], ["b", [0]]], "bytes": 5}
+        server.write_frame(echo.stdin, head, np.zeros(6, np.float32), b"12345")
+        found, data = server.read_frame(echo.stdout)
+        assert (
+            found == head and len(data) == server.data_bytes(head) == 29 and data.endswith(b"12345")
+        )
+        echo.stdin.close()
+        with pytest.raises(EOFError):
+            server.read_frame(echo.stdout)

@@ -1,0 +1,63 @@
+"""A signal ends a command with 130 in seconds, also in the middle of what Python cannot stop."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+
+import pytest
+
+from suite.common.running import interrupts
+from suite.common.running.interrupts import ends_in_seconds
+
+IN_C = """
+    import ctypes, os, signal, threading
+    from suite.common.running import interrupts
+
+    # A shell that starts the tests in the background has them ignore Ctrl-C.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    interrupts.PATIENCE_S = 0.3
+    lock, mutex = ctypes.CDLL(None).pthread_mutex_lock, ctypes.create_string_buffer(64)
+    lock(mutex)
+    with interrupts.ends_in_seconds():
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.{number})).start()
+        # A wait in C that no signal cuts short, as little as it does a compiler.
+        lock(mutex)
+"""
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_what_python_cannot_stop_is_ended(number):
+    code = textwrap.dedent(IN_C).format(number=number)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=15)
+    assert done.returncode == 130 and done.stderr == interrupts.WORDS
+
+
+def test_what_python_can_stop_is_interrupted_and_cleaned_up():
+    before = signal.getsignal(signal.SIGTERM)
+    threads = threading.active_count()
+    with pytest.raises(KeyboardInterrupt), ends_in_seconds():
+        os.kill(os.getpid(), signal.SIGTERM)
+        signal.pause()
+    assert signal.getsignal(signal.SIGTERM) == before and threading.active_count() == threads
+
+
+def test_other_threads_and_ignored_signals_are_left_alone():
+    met = []
+
+    def elsewhere():
+        with ends_in_seconds():
+            met.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    assert met == [signal.getsignal(signal.SIGTERM)]
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        with ends_in_seconds():
+            os.kill(os.getpid(), signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,90 @@
+"""One writer a folder: who comes second is told who was first, and nobody waits for the dead."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from suite import cli
+from suite.common.running.lock import LOCK, one_writer, one_writer_each
+
+
+def test_the_second_is_told_who_was_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/bin/suite", "eval", "--out", "a b"])
+    with one_writer(tmp_path / "run"):
+        words = rf"run is being written by `suite eval --out 'a b'` \(pid {os.getpid()} on .*since"
+        with pytest.raises(ValueError, match=words):
+            with one_writer(tmp_path / "run"):
+                pass
+        with one_writer(tmp_path / "other"):
+            pass
+    with one_writer(tmp_path / "run"):
+        pass
+
+
+def test_a_folder_in_which_nothing_came_is_not_left(tmp_path):
+    with pytest.raises(KeyError):
+        with one_writer_each([tmp_path / "a" / "b", tmp_path / "a" / ".." / "a" / "b"]):
+            raise KeyError
+    assert not list(tmp_path.iterdir())
+    with one_writer(tmp_path / "a"):
+        (tmp_path / "a" / "result").touch()
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["result"]
+
+
+def test_a_lock_that_a_killed_command_left_is_taken_over(tmp_path):
+    (tmp_path / LOCK).write_text('{"command": "suite train", "pid": 1, "host": "x", "since": "y"}')
+    with one_writer(tmp_path):
+        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
+
+
+@pytest.mark.parametrize("text", ["", "[" * 100_000, "[]"])
+def test_a_holder_that_says_nothing_still_holds(tmp_path, text):
+    with one_writer(tmp_path):
+        (tmp_path / LOCK).write_text(text)
+        with pytest.raises(ValueError, match="being written by another command"):
+            with one_writer(tmp_path):
+                pass
+
+
+def test_a_kill_frees_the_folder_and_what_it_left_is_swept(tmp_path):
+    code = textwrap.dedent(f"""
+        import os, signal
+        from pathlib import Path
+        from suite.common.running.lock import one_writer
+        from tracks.common.files import replacing_file
+        with one_writer(Path({str(tmp_path)!r})):
+            with replacing_file({str(tmp_path / "sub" / "big.bin")!r}) as beside:
+                beside.write_bytes(b"half")
+                os.kill(os.getpid(), signal.SIGKILL)
+    """)
+    done = subprocess.run([sys.executable, "-c", code])
+    assert done.returncode == -9
+    assert (tmp_path / LOCK).exists() and len(list((tmp_path / "sub").iterdir())) == 1
+    with one_writer(tmp_path):
+        assert not list((tmp_path / "sub").iterdir())
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "train --preset small",
+        "eval --trials 1",
+        "collect",
+        "delta nothing",
+        "loop --preset small",
+        "diagnose nothing --vehicle reference",
+        "blind make --count 1",
+        "blind run",
+        "reproduce table2",
+    ],
+)
+def test_every_command_that_writes_much_asks_first(line, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with one_writer(tmp_path / "out"):
+        assert cli.main([*line.split(), "--out", "out"]) == 2
+        said = capsys.readouterr().err.strip()
+    assert "is being written by" in said and len(said.splitlines()) == 1

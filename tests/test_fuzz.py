@@ -1,0 +1,149 @@
+"""Odd inputs of every kind: each is used, or refused in a line; no traceback, no wait.
+
+At a small size with all tests; `pytest -m slow tests/test_fuzz.py` tries 10,000.
+"""
+
+import json
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import onnx
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from eval.importers.formats.table import read_map
+from eval.judging.results import Journal
+from eval.logs.flight_log import read_flight
+from eval.quadrotor.vehicle_file import load_vehicle
+from policies import shipped
+from policies.formats.onnx_file import read_checked
+from policies.formats.policy_file import load_policy_checkpoint
+from suite.common.errors import UNUSABLE, explain
+from suite.judging.replay import read_evaluation
+from suite.judging.requests import Evaluation
+from suite.train.config import check
+from suite.train.overrides import override
+from suite.train.presets import preset, with_quadrotor
+from tests.support.mutations import changes, mutated_bytes, mutated_json, mutated_toml
+from tracks.common.files import plain
+from tracks.formats.custom import load_track
+
+ROOT = Path(__file__).resolve().parents[1]
+KINDS = (
+    *("set", "vehicle", "track", "mapping", "checkpoint", "policy.onnx", "flight.parquet"),
+    *("flight.csv", "run.json", "journal"),
+)
+EACH = 1000
+"""Inputs of each kind at full size."""
+SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture]
+WITHIN_S = 10.0
+"""None takes longer."""
+MAPPING = """
+[time]
+column = "t"
+unit = "us"
+[position]
+columns = ["x", "y", "z"]
+frame = "ned"
+unit = "m"
+"""
+
+
+def answered(use, *given):
+    """Use an input, which works or is refused in a line that is for people."""
+    started = time.monotonic()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            use(*given)
+        except Exception as error:
+            told = explain(error)
+            if told is None:
+                raise
+            assert told[0] == UNUSABLE and len(told[1].splitlines()) <= 2, told
+    assert time.monotonic() - started < WITHIN_S
+
+
+def a_flight(folder, ending):
+    from eval.logs.flight_log import write_flight
+
+    log = read_flight(ROOT / "suite" / "diagnose" / "example" / "flight_1.parquet")
+    short = slice(0, 150)
+    cut = replace(
+        log, **{k: v[short] for k, v in vars(log).items() if hasattr(v, "shape") and v.ndim}
+    )
+    return write_flight(folder / f"flight{ending}", cut).read_bytes()
+
+
+def an_onnx():
+    node = onnx.helper.make_node("Identity", ["state"], ["action"])
+    info = onnx.helper.make_tensor_value_info
+    graph = onnx.helper.make_graph(
+        [node], "g", [info("state", 1, ("n", 12))], [info("action", 1, ("n", 12))]
+    )
+    return onnx.helper.make_model(graph).SerializeToString()
+
+
+def drawn_and_used(kind, folder):
+    """Return the strategy of a kind of input, and what uses one."""
+    recipe = with_quadrotor(preset("swift"), load_vehicle("racer5"))
+    odd = folder / "odd"
+
+    def filed(read, name="odd"):
+        def use(data):
+            path = folder / name
+            path.write_bytes(data)
+            read(path)
+
+        return use
+
+    if kind == "set":
+        return changes(recipe), lambda change: check(override(recipe, [change]))
+    if kind == "vehicle":
+        text = (ROOT / "examples" / "hidden.toml").read_text()
+        return mutated_toml(text), filed(load_vehicle, "odd.toml")
+    if kind == "track":
+        text = (ROOT / "tracks" / "examples" / "yard.toml").read_text()
+        return mutated_toml(text), filed(load_track, "odd.toml")
+    if kind == "mapping":
+        return mutated_toml(MAPPING), filed(read_map, "odd.toml")
+    if kind == "checkpoint":
+        source = shipped.folder("racer")
+        (folder / "weights.safetensors").write_bytes((source / "weights.safetensors").read_bytes())
+        config = json.loads((source / "config.json").read_text())
+        return mutated_json(config), filed(lambda _: load_policy_checkpoint(folder), "config.json")
+    if kind == "policy.onnx":
+        return mutated_bytes(an_onnx()), filed(read_checked, "odd.onnx")
+    if kind in ("flight.parquet", "flight.csv"):
+        ending = Path(kind).suffix
+        return mutated_bytes(a_flight(folder, ending)), filed(read_flight, f"odd{ending}")
+    if kind == "run.json":
+        record = {"config": plain(Evaluation())}
+        return mutated_json(record), filed(lambda _: read_evaluation(folder), "run.json")
+    Journal(odd, {"a": 1}).close()
+    line = odd.read_bytes() + b'{"track": "zigzag", "difficulty": 0, "seed": 0}\n'
+    return mutated_bytes(line), filed(lambda path: Journal(path, {"a": 1}).close())
+
+
+def fuzz(kind, folder, count):
+    inputs, use = drawn_and_used(kind, folder)
+
+    @settings(max_examples=count, deadline=None, suppress_health_check=SLOW)
+    @given(inputs)
+    def each(given_input):
+        answered(use, given_input)
+
+    each()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_odd_inputs_are_used_or_refused_in_a_line(kind, tmp_path):
+    fuzz(kind, tmp_path, 20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_ten_thousand_odd_inputs_are_used_or_refused_in_a_line(kind, tmp_path):
+    fuzz(kind, tmp_path, EACH)

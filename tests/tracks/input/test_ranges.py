@@ -1,0 +1,98 @@
+"""Every number of every configuration has its range, and what is outside is refused by name."""
+
+import dataclasses
+import importlib
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, get_args, get_type_hints
+
+import pytest
+
+from suite.cli import COMMANDS
+from suite.delta.fit import FitConfig
+from suite.experiments import EXPERIMENTS
+from suite.train.config import QuadrotorConfig, TrainConfig
+from suite.train.ppo.config import PpoConfig
+from tracks.input.ranges import Range, check_ranges, is_finite, ranged, shown
+
+
+@dataclass(frozen=True)
+class Inner:
+    span: Annotated[tuple[float, float], Range(0.0, 2.0, ordered=True)] = (0.0, 1.0)
+    depth: Annotated[float, Range(0.0, math.inf)] = math.inf
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner = dataclasses.field(default_factory=Inner)
+    late_s: Annotated[float, Range(0.0, 10.0, above=True)] | None = None
+    seeds: tuple[Annotated[int, Range(0, 9)], ...] = ()
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        (Outer(late_s=0.0), "^late_s is 0.0, allowed is above 0 to 10$"),
+        (Outer(late_s=math.nan), "late_s is nan"),
+        (Outer(late_s=math.inf), "late_s is inf"),
+        (Outer(late_s=10**400), r"late_s is 10{39}… \(401 characters\), allowed"),
+        (Outer(seeds=(1, 10)), r"seeds is \(1, 10\), allowed is 0 to 9"),
+        (Outer(Inner(span=(0.0, 2.5))), r"inner.span is \(0.0, 2.5\), allowed is 0 to 2"),
+        (Outer(Inner(span=(2.0, 1.0))), "inner.span is .*give the lower end"),
+        (Outer(Inner(depth=-1.0)), "inner.depth is -1.0, allowed is 0 and more, inf included"),
+    ],
+)
+def test_what_is_outside_of_its_range_is_refused_by_name(config, words):
+    check_ranges(Outer())
+    with pytest.raises(ValueError, match=words):
+        check_ranges(config)
+
+
+def test_an_option_is_called_as_it_is_written():
+    with pytest.raises(ValueError, match="^--late-s is -1.0"):
+        check_ranges(Outer(late_s=-1.0), options=True)
+
+
+def test_numbers_that_no_float_can_hold_are_shown_short():
+    assert not is_finite(10**400) and not is_finite(math.nan) and is_finite(1)
+    assert len(shown("x" * 10_000)) < 80
+
+
+def _numbers(cls: type) -> list[str]:
+    """Return the fields of a dataclass that are numbers, or tuples or options of them."""
+
+    def is_number(hint: Any) -> bool:
+        return hint in (int, float) or any(map(is_number, get_args(hint)))
+
+    return [name for name, hint in get_type_hints(cls).items() if is_number(hint)]
+
+
+def _configs() -> list[Any]:
+    modules = [f"suite.commands.{name}" for name in COMMANDS]
+    modules += [f"suite.experiments.{name}" for name in EXPERIMENTS]
+    found = [importlib.import_module(name).Config for name in modules]
+    return [*found, TrainConfig, QuadrotorConfig, PpoConfig, FitConfig]
+
+
+def _dataclasses(cls: type) -> list[type]:
+    inside = [
+        kind
+        for hint in get_type_hints(cls).values()
+        for kind in (hint, *get_args(hint))
+        if dataclasses.is_dataclass(kind) and kind.__module__.split(".")[0] != "eval"
+    ]
+    return [cls, *(below for kind in inside for below in _dataclasses(kind))]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("config", _configs(), ids=lambda c: f"{c.__module__}.{c.__name__}")
+def test_every_number_has_its_range(config):
+    for cls in _dataclasses(config):
+        hints = get_type_hints(cls, include_extras=True)
+        without = [name for name in _numbers(cls) if "Range(" not in repr(hints[name])]
+        assert not without, cls
+
+
+def test_the_defaults_are_within():
+    for config in (TrainConfig(), PpoConfig(), FitConfig()):
+        check_ranges(config)
+        assert list(ranged(config))

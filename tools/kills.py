@@ -1,0 +1,122 @@
+"""kill -9 at random moments: does the same command go on, and come to the same bits?
+
+    python tools/kills.py COUNT [COMMAND ...] [--seed N]
+
+Every command of the table below runs once without a disturbance; then COUNT times it is killed at a
+random moment of that time, and once more a shorter one after it was called again, and then left to
+end. What it wrote must be equal to the undisturbed run's, but for times and stamps. Prints a line a
+try and fails where one differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+EASY = "--track zigzag --difficulty 0"
+WORLDS = "episode.batch=8 episode.steps=30"
+COMMANDS = {
+    "train": f"train --preset small --iterations 60 --set {WORLDS}",
+    "eval": f"eval --policy racer --trials 12 {EASY}",
+    "collect": f"collect --policy racer --trials 12 {EASY}",
+    "delta": "delta FLIGHTS --iterations 60",
+    "diagnose": "diagnose suite/diagnose/example --vehicle suite/diagnose/example/vehicle.toml",
+    "loop": f"loop --preset small --iterations 6 --finetune-iterations 3 --fit-iterations 10 "
+    f"--trials 2 --flights 2 {EASY} --set {WORLDS}",
+}
+"""What is killed, without its --out; FLIGHTS is a folder of recorded ones."""
+COMPARED = ("*.safetensors", "*.parquet", "metrics.jsonl", "diagnosis.json", "flights.json")
+TIMES = ("seconds", "steps_per_s", "cold", "git_commit", "out", "collection", "source")
+"""Keys that differ between runs that are alike: times, and the folders of what a loop made."""
+
+
+def start(command: str, out: Path) -> subprocess.Popen[bytes]:
+    """Start a command with its files in `out`, two folders below that of all."""
+    words = COMMANDS[command].replace("FLIGHTS", str(out.parents[1] / "collect" / "plain")).split()
+    args = [sys.executable, "-m", "suite.cli", *words, "--out", str(out)]
+    return subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def digest(out: Path) -> str:
+    """Return what a run came to, as one number."""
+    sums = hashlib.sha256()
+    paths = {path for pattern in COMPARED for path in out.rglob(pattern)}
+    for path in sorted(paths):
+        sums.update(f"{path.relative_to(out)}\\0".encode() + _content(path))
+    return sums.hexdigest()[:16] if paths else "nothing"
+
+
+def _content(path: Path) -> bytes:
+    if path.suffix == ".parquet":
+        import pyarrow.parquet
+
+        return repr(pyarrow.parquet.ParquetFile(path).read().to_pydict()).encode()
+    if path.suffix == ".json":
+        return json.dumps(_timeless(json.loads(path.read_text()))).encode()
+    if path.suffix == ".jsonl":
+        return json.dumps([_timeless(json.loads(row)) for row in path.open()]).encode()
+    return path.read_bytes()
+
+
+def _timeless(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _timeless(entry) for key, entry in value.items() if key not in TIMES}
+    return [_timeless(entry) for entry in value] if isinstance(value, list) else value
+
+
+def finish(command: str, out: Path) -> float:
+    """Run a command to its end and return how long it took [s]."""
+    began = time.monotonic()
+    process = start(command, out)
+    _, said = process.communicate()
+    if process.returncode:
+        raise SystemExit(f"{command} ended with {process.returncode}: {said.decode()[-500:]}")
+    return time.monotonic() - began
+
+
+def main() -> int:
+    """Kill what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("count", type=int)
+    parser.add_argument("commands", nargs="*", default=list(COMMANDS), metavar="COMMAND")
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    draw, bad, tried = random.Random(asked.seed), 0, 0
+    with tempfile.TemporaryDirectory() as folder:
+        if "delta" in asked.commands and "collect" not in asked.commands:
+            finish("collect", Path(folder, "collect", "plain"))
+        # Flights first: what is fitted to them finds them.
+        for command in sorted(asked.commands, key=list(COMMANDS).index):
+            plain = Path(folder, command, "plain")
+            finish(command, plain)
+            took_s, wanted = finish(command, Path(folder, command, "warm")), digest(plain)
+            for number in range(asked.count):
+                out, moments = Path(folder, command, str(number)), []
+                for share in (1.0, 0.5):
+                    process = start(command, out)
+                    moments.append(draw.uniform(0.3, share * took_s))
+                    time.sleep(moments[-1])
+                    process.kill()
+                    process.communicate()
+                    tried += 1
+                finish(command, out)
+                same = digest(out) == wanted
+                left = sorted(path.name for path in out.rglob(".*"))
+                bad += not same or bool(left)
+                when = " and ".join(f"{moment:.1f}" for moment in moments)
+                said = ("same bits" if same else "OTHER BITS") + (f", left {left}" if left else "")
+                print(f"{command}, killed after {when} of {took_s:.1f} s: {said}", flush=True)
+    print(f"{tried} kills, {bad} runs that differ")
+    return min(bad, 1)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

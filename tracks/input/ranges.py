@@ -1,0 +1,125 @@
+"""Ranges of settings, declared beside each field and checked in one call before work begins.
+
+A field of a configuration says what it may be in its annotation:
+
+    rate: Annotated[float, Range(0.0, 10.0)] = 2e-3
+
+`check_ranges` goes through a dataclass and all dataclasses within. Where an annotation has a name
+of its own (as an option of the command line may have), the message calls the field by it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, get_args, get_type_hints
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers that are allowed; of a tuple, each of its numbers."""
+
+    low: float
+    """The least, allowed itself unless `above`."""
+    high: float
+    """The most, allowed itself unless `below`; infinity is allowed only where this is infinite."""
+    above: bool = False
+    """Whether `low` itself is refused."""
+    below: bool = False
+    """Whether `high` itself is refused."""
+    ordered: bool = False
+    """Whether a tuple's numbers may not fall: a span from its lower to its upper end."""
+
+    def holds(self, value: float) -> bool:
+        """Say whether `value` is allowed; NaN never is."""
+        over = self.low < value if self.above else self.low <= value
+        return over and (value < self.high if self.below else value <= self.high)
+
+    def __str__(self) -> str:
+        first = f"above {_number(self.low)}" if self.above else _number(self.low)
+        if math.isinf(self.high):
+            return f"{first} and more, inf included"
+        return f"{first} {'to below' if self.below else 'to'} {_number(self.high)}"
+
+
+SEED_MOST = 2**32 - 1
+Seed = Annotated[int, Range(0, SEED_MOST)]
+"""A seed."""
+Share = Annotated[float, Range(0.0, 1.0)]
+"""A share of a whole."""
+Iterations = Annotated[int, Range(1, 10**9)]
+"""How often something is repeated."""
+Trials = Annotated[int, Range(1, 100_000)]
+"""Trials, or flights, of one kind."""
+
+
+def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
+    """Refuse numbers outside of their fields' ranges.
+
+    Args:
+        config: a dataclass; dataclasses within are checked as well.
+        where: what stands before a field's path in the message.
+        options: fields are options of the command line, `deadline_s` being `--deadline-s`.
+
+    Raises:
+        ValueError: naming the field, its value and what is allowed.
+    """
+    for path, value, allowed in ranged(config):
+        name = f"--{path[-1].replace('_', '-')}" if options else where + ".".join(path)
+        ends = value if isinstance(value, tuple) else (value,)
+        if not all(allowed.holds(end) for end in ends):
+            raise ValueError(f"{name} is {shown(value)}, allowed is {allowed}")
+        if allowed.ordered and list(ends) != sorted(ends):
+            raise ValueError(f"{name} is {shown(value)}; give the lower end of the range first")
+
+
+def ranged(config: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any, Range]]:
+    """Yield (path, value, range) of every number with a range in `config` and within."""
+    for name, called, allowed in _fields(type(config)):
+        value = getattr(config, name)
+        if dataclasses.is_dataclass(value):
+            yield from ranged(value, (*path, called))
+        elif allowed is not None and value is not None:
+            yield (*path, called), value, allowed
+
+
+def is_finite(value: float) -> bool:
+    """Say whether a number is finite as a float; an int of hundreds of digits is not."""
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
+
+
+def shown(value: object) -> str:
+    """Return a value for a message, a number of hundreds of digits by its first ones."""
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:40]}… ({len(text)} characters)"
+
+
+@functools.cache
+def _fields(cls: type) -> tuple[tuple[str, str, Range | None], ...]:
+    """Return (name, what it is called, range) of the fields of a dataclass."""
+    hints = get_type_hints(cls, include_extras=True)
+    found = []
+    for field in dataclasses.fields(cls):
+        notes = list(_notes(hints[field.name]))
+        allowed = next((note for note in notes if isinstance(note, Range)), None)
+        names = (getattr(note, "name", None) for note in notes)
+        called = next((name for name in names if isinstance(name, str)), field.name)
+        found.append((field.name, called, allowed))
+    return tuple(found)
+
+
+def _notes(hint: Any) -> Iterator[Any]:
+    """Yield all that annotates a type, and the types that it is made of."""
+    yield from getattr(hint, "__metadata__", ())
+    for part in get_args(hint):
+        yield from _notes(part)
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.10g}"

@@ -1,0 +1,150 @@
+"""Files from elsewhere, read with care: their kind and size first, then JSON and TOML of any sort.
+
+A pipe, a device or a link to one would never end, a file of gigabytes fills the memory before it
+can be refused, and numbers of thousands of digits or tables within tables within tables end the
+parsers in ways of their own. What cannot be used is an `InputError` that names the file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import tomllib
+from typing import Any
+
+TEXT_BYTES = 64 * 2**20
+"""Of a JSON or TOML file."""
+MODEL_BYTES = 512 * 2**20
+"""Of a policy's file from elsewhere, external data included."""
+WEIGHTS_BYTES = 2 * 2**30
+"""Of a checkpoint's arrays: those of the widest network with its optimiser's state."""
+LOG_BYTES = 2 * 2**30
+"""Of a flight log, ours or another program's."""
+MESH_BYTES = 256 * 2**20
+"""Of a mesh file."""
+DEPTH = 64
+"""Of tables and lists within each other in a JSON or TOML file."""
+
+_KINDS = {
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFDIR: "a folder",
+}
+
+
+class InputError(ValueError):
+    """A file cannot be used; the message names it and says what is allowed."""
+
+
+def check_file(path: str | os.PathLike[str], most_bytes: int) -> None:
+    """Refuse what is no plain file (links are followed) or is too large, before it is opened.
+
+    Raises:
+        InputError: naming the file, what it is and what is allowed.
+        OSError: where there is none.
+    """
+    _check(os.fspath(path), os.stat(path), most_bytes)
+
+
+def read_bytes(path: str | os.PathLike[str], most_bytes: int = TEXT_BYTES) -> bytes:
+    """Return what a plain file holds.
+
+    Raises:
+        InputError: where it is no plain file or too large.
+        OSError: where it cannot be read.
+    """
+    # Without waiting: a pipe that nobody writes to would be waited for.
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    try:
+        _check(os.fspath(path), os.fstat(handle), most_bytes)
+        with os.fdopen(handle, "rb", closefd=False) as file:
+            data = file.read(most_bytes + 1)
+    finally:
+        os.close(handle)
+    if len(data) > most_bytes:  # files of /proc say that they are empty
+        raise _too_large(os.fspath(path), "more", most_bytes)
+    return data
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Return the value of a JSON file.
+
+    Raises:
+        InputError: where it is no plain file, too large or no JSON.
+        OSError: where it cannot be read.
+    """
+    return parse_json(read_bytes(path), os.fspath(path))
+
+
+def parse_json(text: str | bytes, where: str) -> Any:
+    """Return the value of a JSON text; `where` it is from stands in the message.
+
+    Raises:
+        InputError: where it is no JSON, or nested too deeply.
+    """
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise _too_deep(where) from None
+    except ValueError as error:
+        raise InputError(f"{where}: not JSON ({error})") from None
+    _check_depth(value, where)
+    return value
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the table of a TOML file.
+
+    Raises:
+        InputError: where it is no plain file, too large or no TOML.
+        OSError: where it cannot be read.
+    """
+    where = os.fspath(path)
+    try:
+        table = tomllib.loads(read_bytes(path).decode())
+    except RecursionError:
+        raise _too_deep(where) from None
+    except InputError:
+        raise
+    except ValueError as error:  # also a number of thousands of digits, also what is not UTF-8
+        raise InputError(f"{where}: is not TOML: {error}") from None
+    _check_depth(table, where)
+    return table
+
+
+def reason(error: OSError) -> str:
+    """Return why a file cannot be read, in the system's words."""
+    return error.strerror or str(error)
+
+
+def _check(path: str, found: os.stat_result, most_bytes: int) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        kind = _KINDS.get(stat.S_IFMT(found.st_mode), "of an unknown kind")
+        raise InputError(f"{path}: cannot be read: it is {kind}, allowed is a plain file")
+    if found.st_size > most_bytes:
+        raise _too_large(path, str(found.st_size), most_bytes)
+
+
+def _too_large(path: str, size: str, most_bytes: int) -> InputError:
+    return InputError(f"{path}: has {size} bytes, allowed are up to {most_bytes}")
+
+
+def _too_deep(where: str) -> InputError:
+    return InputError(f"{where}: tables and lists are nested deeper than the {DEPTH} allowed")
+
+
+def _check_depth(value: Any, where: str) -> None:
+    level = [value]
+    for _ in range(DEPTH):
+        inside = [each for each in level if isinstance(each, dict | list)]
+        level = [
+            below
+            for each in inside
+            for below in (each.values() if isinstance(each, dict) else each)
+        ]
+        if not level:
+            return
+    raise _too_deep(where)
