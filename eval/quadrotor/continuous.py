@@ -21,6 +21,7 @@ from eval.quadrotor.stepper import (
     Inputs,
     mass_of,
     rotor_wrench,
+    still_thrust,
     wanted_speed,
     wind_and_flow,
     wrench_on,
@@ -168,7 +169,7 @@ def step(
         acc_w, turn_b = accelerations(plant, motion, whole)
         carry = carry._replace(turn_b=turn_b)
         return carry, _euler(motion, acc_w, turn_b, length), whole.force_b / mass_of(plant)
-    thrust = rotor_wrench(plant, rotors)
+    thrust = _still(plant, rotors)
     half, air = 0.5 * length, carry.air
     guess = Wrench(thrust.force_b + air.force_b, thrust.torque_b + air.torque_b)
     middle = _midpoint(motion, *accelerations(plant, motion, guess), half)
@@ -176,9 +177,14 @@ def step(
     acc_w, turn_b = accelerations(plant, middle, whole)
     end = _midpoint(motion, acc_w, turn_b, length)
     # Rotors may have sped up within the step; the air hardly does more at its end.
-    ends = rotor_wrench(plant, steady(rotors.end))
+    ends = _still(plant, steady(rotors.end))
     acc_b = (ends.force_b + air.force_b) / mass_of(plant)
     return carry._replace(turn_b=turn_b, air=air), end, acc_b
+
+
+def _still(plant: Plant, rotors: RotorStep) -> Wrench:
+    """Return what the rotors do in still air."""
+    return rotor_wrench(plant, rotors, still_thrust(plant, rotors))
 
 
 def _air(
@@ -192,7 +198,7 @@ def _air(
             whole.force_b + mass_of(plant) * inputs.push_b[..., :3],
             whole.torque_b + plant.constants.inertia * inputs.push_b[..., 3:],
         )
-    thrust = rotor_wrench(plant, rotors)
+    thrust = _still(plant, rotors)
     return whole, Wrench(whole.force_b - thrust.force_b, whole.torque_b - thrust.torque_b)
 
 

@@ -243,11 +243,14 @@ def wind_and_flow(
     )
 
 
-def rotor_wrench(plant: Plant, rotors: RotorStep, thrust: Array | None = None) -> Wrench:
-    """Return what the rotors' `thrust` (..., 4) [N] does to the body; that in still air if None."""
+def still_thrust(plant: Plant, rotors: RotorStep) -> Array:
+    """Return the rotors' thrusts (..., 4) in still air, away from the ground [N]."""
+    return plant.constants.thrust_coefficient * rotors.mean_square
+
+
+def rotor_wrench(plant: Plant, rotors: RotorStep, thrust: Array) -> Wrench:
+    """Return what the rotors do to the body when they push with `thrust` (..., 4) [N]."""
     constants, arm = plant.constants, plant.constants.rotor_position_b
-    if thrust is None:
-        thrust = constants.thrust_coefficient * rotors.mean_square
     force_b = thrust.sum(axis=-1)[..., None] * constants.thrust_axis_b
     about_z = -(plant.nominal.spin * constants.torque_coefficient * rotors.mean_square).sum(axis=-1)
     torque_b = thrust.__array_namespace__().stack(
@@ -259,7 +262,7 @@ def rotor_wrench(plant: Plant, rotors: RotorStep, thrust: Array | None = None) -
 
 def wrench_on(plant: Plant, rotors: RotorStep, flow: Flow) -> Wrench:
     """Return what the rotors and the effects do to the body."""
-    thrust = plant.constants.thrust_coefficient * rotors.mean_square
+    thrust = still_thrust(plant, rotors)
     for name, value in in_order(plant.effects):
         change = EFFECTS[name].thrust
         thrust = thrust if change is None else change(value, flow, thrust)

@@ -49,7 +49,7 @@ def measured_noise(
 ) -> Noise:
     """Return the noise in `residual` (W, N, 19), measured - simulated in `windows`."""
     sigma, coloured = noise_of(residual, windows, limits=limits), {}
-    seen = {name: np.asarray(windows.seen)[..., at].all(axis=-1) for name, at in SLICES.items()}
+    seen = {name: np.asarray(np.all(windows.seen[..., at], axis=-1)) for name, at in SLICES.items()}
     together: dict[bytes, list[str]] = {}
     for name, channels in SLICES.items():
         if np.isfinite(sigma[channels]).all():
@@ -80,7 +80,7 @@ def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray
 
     Rows without a value stay what they are.
     """
-    seen = np.asarray(windows.seen)[..., SLICES[name]].all(axis=-1)
+    seen = np.asarray(np.all(windows.seen[..., SLICES[name]], axis=-1))
     matrix = _correlation(np.asarray(windows.row_s), *noise.coloured[name])
     both = seen[:, :, None] & seen[:, None]
     matrix = np.where(both, matrix, np.eye(matrix.shape[-1]))
