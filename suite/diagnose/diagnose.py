@@ -103,6 +103,8 @@ def _diagnose(
     if whole is None:
         raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
     warnings += notes
+    _enough(len(whole.flight), limits)  # before anything is compiled
+    say("flying the model from every stretch; its first time on a machine takes half a minute")
     begin = start_estimate(model, whole)
     linear = model.linearise(begin.theta, begin.offset, whole, None)
     good = _sound(linear, limits)
@@ -113,11 +115,7 @@ def _diagnose(
     told = information(linear, whole, model.size, limits)
     inside, names = choose_held_out(logs, whole, told, limits)
     count = int(inside.sum())
-    if count < limits.least_windows:
-        raise ValueError(
-            f"{count} stretches of 1 s to fit, at least {limits.least_windows} are needed: fly "
-            "longer"
-        )
+    _enough(count, limits)
     if count < limits.few_windows:
         warnings.append(
             f"{count} stretches of 1 s to fit: too few for a null of their own, so "
@@ -171,6 +169,19 @@ def _diagnose(
         seed=seed,
         limits=limits,
     )
+
+
+def _enough(count: int, limits: Thresholds) -> None:
+    """Refuse fewer stretches than can be fitted.
+
+    Raises:
+        ValueError: saying how many there are and have to be.
+    """
+    if count < limits.least_windows:
+        raise ValueError(
+            f"{count} stretches of 1 s to fit, at least {limits.least_windows} are needed: fly "
+            "longer"
+        )
 
 
 def _take(linear: Linearisation, chosen: np.ndarray) -> Linearisation:
