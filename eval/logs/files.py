@@ -23,6 +23,8 @@ from tracks.input.reading import LOG_BYTES, InputError, check_file
 
 METADATA = "flight"
 """Parquet metadata key and CSV column of the JSON text."""
+MOST_ROWS = 4_000_000
+"""Of a flight log: more than an hour at 1 kHz, some gigabyte in memory."""
 PARQUET_MAGIC = b"PAR1"
 NOT_CSV = "neither a Parquet file nor CSV in UTF-8"
 
@@ -89,6 +91,7 @@ def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[s
     try:
         # A single handle on the file: `read_table` would take a folder's name for a column.
         with pyarrow.parquet.ParquetFile(path) as file:
+            _check_rows(path, file.metadata.num_rows)
             table = file.read()
     except (pa.ArrowException, OSError, ValueError) as error:
         first = str(error).splitlines()[0]
@@ -102,7 +105,7 @@ def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[s
 
 def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
     names = _csv_header(path)
-    _check_utf8(path)
+    _check_text(path)
     bad_rows: list[Any] = []
 
     def remember(row: Any) -> str:
@@ -148,16 +151,26 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
     return columns, text if isinstance(text, str) else None, warnings
 
 
-def _check_utf8(path: Path) -> None:
-    """Refuse other bytes than UTF-8: pyarrow trips over them in a row that it tells of."""
+def _check_rows(path: Path, rows: int) -> None:
+    """Refuse more rows than fit, before they are read."""
+    if rows > MOST_ROWS:
+        reason = f"{rows:,} rows; at most {MOST_ROWS:,}: cut it into flights, or log less often"
+        raise FlightLogError(str(path), None, None, reason)
+
+
+def _check_text(path: Path) -> None:
+    """Refuse other bytes than UTF-8, which pyarrow trips over in a row that it tells of."""
+    lines = 0
     decode = codecs.getincrementaldecoder("utf-8")().decode
     try:
         with path.open("rb") as file:
             while part := file.read(2**20):
                 decode(part)
+                lines += part.count(b"\n")
         decode(b"", True)
     except UnicodeDecodeError:
         raise FlightLogError(str(path), None, None, NOT_CSV) from None
+    _check_rows(path, lines)
 
 
 def _csv_header(path: Path) -> list[str]:

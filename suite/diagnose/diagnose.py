@@ -103,6 +103,8 @@ def _diagnose(
     if whole is None:
         raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
     warnings += notes
+    _enough(len(whole.flight), limits)  # before anything is compiled
+    say("flying the model from every stretch; its first time on a machine takes half a minute")
     begin = start_estimate(model, whole)
     linear = model.linearise(begin.theta, begin.offset, whole, None)
     good = _sound(linear, limits)
@@ -113,11 +115,7 @@ def _diagnose(
     told = information(linear, whole, model.size, limits)
     inside, names = choose_held_out(logs, whole, told, limits)
     count = int(inside.sum())
-    if count < limits.least_windows:
-        raise ValueError(
-            f"{count} stretches of 1 s to fit, at least {limits.least_windows} are needed: fly "
-            "longer"
-        )
+    _enough(count, limits)
     if count < limits.few_windows:
         warnings.append(
             f"{count} stretches of 1 s to fit: too few for a null of their own, so "
@@ -137,6 +135,8 @@ def _diagnose(
         if worse(before, after, limits=limits):
             warnings.append("what was found on the fitted flights does not hold on held-out ones")
             found, after = _without_names(model, found), before
+    found, after, without, gone = _confirmed(model, found, held, (before, after), limits)
+    warnings += [f"{label}: withdrawn, held-out flights are no better for it" for label in gone]
     residual, turbulence = _left_over(model, found, seed, limits)
     if turbulence and found.named and not worse(after, before, limits=limits):
         # Wind that lasts from one stretch to the next looks like many a steady number.
@@ -156,7 +156,7 @@ def _diagnose(
         vehicle=_with_effects(vehicle, model, found, turbulence),
         before=before,
         after=after,
-        without=_without_each(model, found, held, limits),
+        without={candidate.label: without[candidate.label] for candidate in found.candidates},
         control=_control(model, found, held, limits) if found.named else None,
         residual=residual,
         turbulence=turbulence,
@@ -171,6 +171,19 @@ def _diagnose(
         seed=seed,
         limits=limits,
     )
+
+
+def _enough(count: int, limits: Thresholds) -> None:
+    """Refuse fewer stretches than can be fitted.
+
+    Raises:
+        ValueError: saying how many there are and have to be.
+    """
+    if count < limits.least_windows:
+        raise ValueError(
+            f"{count} stretches of 1 s to fit, at least {limits.least_windows} are needed: fly "
+            "longer"
+        )
 
 
 def _take(linear: Linearisation, chosen: np.ndarray) -> Linearisation:
@@ -246,6 +259,47 @@ def _held_out(
     assert many is not None
     inside = np.isin(many.flight, apart.flight) & (many.start_s >= apart.start_s.min() - 1e-6)
     return take(many, inside)
+
+
+def _confirmed(
+    model: RolloutModel,
+    found: SearchResult,
+    held: FlightWindows,
+    gaps: tuple[Gap, Gap],
+    limits: Thresholds,
+) -> tuple[SearchResult, Gap, dict[str, Gap], list[str]]:
+    """Return `found` with those names alone that lower the gap on held-out flights.
+
+    `gaps` are those before and after it was found.
+
+    Returns:
+        What stays, its gap, the gaps without each of its names, and the labels of what went.
+    """
+    (before, after), gone = gaps, list[str]()
+    while found.named:
+        without = _without_each(model, found, held, limits)
+        label = min(without, key=lambda name: float(without[name].energy.sum()))
+        if without[label].energy.sum() > after.energy.sum():
+            return found, after, without, gone
+        gone.append(label)
+        kept = tuple(one for one in found.named if one.candidate.label != label)
+        if not kept:
+            return _without_names(model, found), before, {}, gone
+        indices = indices_of([one.candidate for one in kept])
+        theta = model.space.array("start")
+        theta[indices] = found.estimate.theta[indices]
+        start = Estimate(theta, found.estimate.offset)
+        best, last = fit(model, found.windows, found.whitening, start, indices, limits=limits)
+        nothing = found.explained + float(found.equations.chi2.sum())
+        found = replace(
+            found,
+            named=kept,
+            estimate=best,
+            equations=last,
+            explained=nothing - float(last.chi2.sum()),
+        )
+        after = measure(model, best.theta, held, found.noise, limits)
+    return found, after, {}, gone
 
 
 def _without_each(

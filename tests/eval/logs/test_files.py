@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from eval.logs import files
 from eval.logs.columns import GROUPS
 from eval.logs.flight_log import (
     FlightLog,
@@ -108,7 +109,7 @@ def test_files_that_are_no_logs_are_refused(tmp_path):
         "text.parquet": (b"hello", "not a Parquet"),
         "binary.csv": (bytes(range(256)), "neither a Parquet file nor CSV"),
         "semicolons.csv": (text.replace(",", ";").encode(), "commas"),
-        "header.csv": (lines[0].encode() + b"\n", "no rows"),
+        "header.csv": (lines[0].encode() + b"\n", "no whole rows"),
         "word.csv": (text.replace(lines[5].split(",")[0], "oops", 1).encode(), "oops"),
         "short.csv": ("\n".join([*lines[:3], "1,2", *lines[3:]]).encode(), "row 3: 2 values"),
         "twice.csv": (text.replace('"pos_y"', '"pos_x"').encode(), "twice"),
@@ -149,4 +150,15 @@ def test_a_row_that_is_no_text_is_refused(tmp_path):
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join([*lines[:5], lines[5][:60] + b"\xf0\x9f\n", *lines[6:]]))
     with pytest.raises(FlightLogError, match="nor CSV in UTF-8"):
+        read_flight(path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_log_of_too_many_rows_is_refused_unread(tmp_path, kind, monkeypatch):
+    monkeypatch.setattr(files, "MOST_ROWS", 149)
+    path = tmp_path / f"long.{kind}"
+    write_table(path, columns(150))
+    read = pyarrow.csv if kind == "csv" else pyarrow.parquet.ParquetFile
+    monkeypatch.setattr(read, "read_csv" if kind == "csv" else "read", None)
+    with pytest.raises(FlightLogError, match="rows; at most 149"):
         read_flight(path)
