@@ -255,6 +255,13 @@ ALIKE = {
 """What half a minute of flight may leave open."""
 
 
+OF_EACH_KIND = (
+    "linear_drag", "inflow", "ground_effect", "constant_wind", "gusts", "motor_lag", "command_delay",
+    "com_offset", "weak_motor", "rate_gain", "gyro_bias", "clock_offset",
+)  # fmt: skip
+"""One at least of every way in which an effect acts; the others are run with `-m slow`."""
+
+
 @pytest.fixture(scope="module")
 def ways():
     return ordinary_flights(np.random.default_rng(5), duration_s=5.5)
@@ -264,7 +271,10 @@ def test_no_effect_is_forgotten():
     assert set(HIDDEN) == set(EFFECTS)
 
 
-@pytest.mark.parametrize("name", HIDDEN)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n in OF_EACH_KIND else pytest.mark.slow) for n in HIDDEN],
+)
 def test_an_effect_is_named_alone(name, ways):
     truth = with_effects(GIVEN, **{**DRAG, name: HIDDEN[name]})
     rng = np.random.default_rng(list(EFFECTS).index(name))
