@@ -256,8 +256,8 @@ ALIKE = {
 
 
 OF_EACH_KIND = (
-    "linear_drag", "inflow", "ground_effect", "constant_wind", "gusts", "motor_lag", "command_delay",
-    "com_offset", "weak_motor", "rate_gain", "gyro_bias", "clock_offset",
+    "linear_drag", "inflow", "ground_effect", "constant_wind", "gusts", "motor_lag",
+    "command_delay", "com_offset", "weak_motor", "rate_gain", "gyro_bias", "clock_offset",
 )  # fmt: skip
 """One at least of every way in which an effect acts; the others are run with `-m slow`."""
 
