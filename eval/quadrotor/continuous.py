@@ -14,16 +14,18 @@ from typing import Any, NamedTuple
 
 from eval.effects.interface import Array
 from eval.quadrotor.plant import Command, Motion, Plant, Wrench
-from eval.quadrotor.rigid_body import accelerations
+from eval.quadrotor.rigid_body import accelerations, euler_move
 from eval.quadrotor.rotors import RotorStep, follow, steady
 from eval.quadrotor.stepper import (
     Feedback,
     Inputs,
+    from_start,
     mass_of,
     rotor_wrench,
     still_thrust,
     wanted_speed,
     wind_and_flow,
+    with_push,
     wrench_on,
 )
 from tracks.geometry.rotation import exp_rot
@@ -105,7 +107,9 @@ def fly(
     start = Carry(rotor_speed, rotor_speed, still, none)
     # What the air does at the start, so that the first step is as good as the others.
     first = jax.tree.map(lambda given: given[0], inputs)._replace(push_b=None)
-    start = start._replace(air=_air(plant, motion, steady(rotor_speed), first, start_s)[1])
+    held = steady(rotor_speed)
+    whole = _wrench(plant, motion, held, first, start_s)
+    start = start._replace(air=_beside(whole, _still(plant, held)))
 
     def one(carry: Any, row: tuple[Array, Steps, Inputs]) -> tuple[Any, Any]:
         (now, motion, time_s, remembered), (index, span, given) = carry, row
@@ -119,11 +123,7 @@ def fly(
     begin = (start, motion, start_s, None if feedback is None else feedback.start)
     rows = (jnp.arange(len(steps.length_s)), steps, inputs)
     _, (motions, speeds, acc_b) = jax.lax.scan(one, begin, rows)
-    motions, speeds = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None], rest]),
-        (motion, rotor_speed),
-        (motions, speeds),
-    )
+    motions, speeds = from_start((motion, rotor_speed), (motions, speeds))
     return Flight(motions, speeds, acc_b)
 
 
@@ -165,15 +165,16 @@ def step(
         carry, rotors = turn_rotors(plant, carry, span)
     length = span.length_s[..., None]
     if integrator == "euler":
-        whole, _ = _air(plant, motion, rotors, inputs, time_s)
+        whole = _wrench(plant, motion, rotors, inputs, time_s)
         acc_w, turn_b = accelerations(plant, motion, whole)
         carry = carry._replace(turn_b=turn_b)
-        return carry, _euler(motion, acc_w, turn_b, length), whole.force_b / mass_of(plant)
+        return carry, euler_move(motion, acc_w, turn_b, length), whole.force_b / mass_of(plant)
     thrust = _still(plant, rotors)
     half, air = 0.5 * length, carry.air
     guess = Wrench(thrust.force_b + air.force_b, thrust.torque_b + air.torque_b)
     middle = _midpoint(motion, *accelerations(plant, motion, guess), half)
-    whole, air = _air(plant, middle, rotors, inputs, time_s + 0.5 * span.length_s)
+    whole = _wrench(plant, middle, rotors, inputs, time_s + 0.5 * span.length_s)
+    air = _beside(whole, thrust)
     acc_w, turn_b = accelerations(plant, middle, whole)
     end = _midpoint(motion, acc_w, turn_b, length)
     # Rotors may have sped up within the step; the air hardly does more at its end.
@@ -187,19 +188,17 @@ def _still(plant: Plant, rotors: RotorStep) -> Wrench:
     return rotor_wrench(plant, rotors, still_thrust(plant, rotors))
 
 
-def _air(
+def _wrench(
     plant: Plant, motion: Motion, rotors: RotorStep, inputs: Inputs, time_s: Array
-) -> tuple[Wrench, Wrench]:
-    """Return the whole wrench, and what of it is not the rotors' own thrust."""
+) -> Wrench:
+    """Return all that acts on the body."""
     _, flow = wind_and_flow(plant, {}, motion, rotors, inputs, time_s)
-    whole = wrench_on(plant, rotors, flow)
-    if inputs.push_b is not None:
-        whole = Wrench(
-            whole.force_b + mass_of(plant) * inputs.push_b[..., :3],
-            whole.torque_b + plant.constants.inertia * inputs.push_b[..., 3:],
-        )
-    thrust = _still(plant, rotors)
-    return whole, Wrench(whole.force_b - thrust.force_b, whole.torque_b - thrust.torque_b)
+    return with_push(plant, wrench_on(plant, rotors, flow), inputs.push_b)
+
+
+def _beside(whole: Wrench, thrust: Wrench) -> Wrench:
+    """Return what of the `whole` is not the rotors' own `thrust`."""
+    return Wrench(whole.force_b - thrust.force_b, whole.torque_b - thrust.torque_b)
 
 
 def _midpoint(motion: Motion, acc_w: Array, turn_b: Array, length: Array) -> Motion:
@@ -213,10 +212,3 @@ def _midpoint(motion: Motion, acc_w: Array, turn_b: Array, length: Array) -> Mot
         motion.vel_w + length * acc_w,
         rate_b,
     )
-
-
-def _euler(motion: Motion, acc_w: Array, turn_b: Array, length: Array) -> Motion:
-    """Return the motion after `length` (..., 1) [s] as MuJoCo's Euler step leaves it."""
-    vel_w, rate_b = motion.vel_w + length * acc_w, motion.rate_b + length * turn_b
-    rot_w = motion.rot_w.__array_namespace__().matmul(motion.rot_w, exp_rot(length * rate_b))
-    return Motion(motion.pos_w + length * vel_w, rot_w, vel_w, rate_b)

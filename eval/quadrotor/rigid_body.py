@@ -17,14 +17,18 @@ def accelerations(plant: Plant, motion: Motion, wrench: Wrench) -> tuple[Array, 
 
 
 def euler_step(plant: Plant, motion: Motion, wrench: Wrench) -> Motion:
-    """Return the motion after `plant.dt` under a held wrench (semi-implicit Euler, order 1).
+    """Return the motion after `plant.dt` under a held wrench (`euler_move`)."""
+    return euler_move(motion, *accelerations(plant, motion, wrench), plant.dt)
+
+
+def euler_move(motion: Motion, acc_w: Array, turn_b: Array, dt: Array) -> Motion:
+    """Return the motion after `dt` (..., 1) [s] under accelerations (semi-implicit Euler, order 1).
 
     Velocities are stepped first, and the new ones carry position and attitude: the attitude
     along the exact rotation of the new body rate.
     """
     xp = motion.rot_w.__array_namespace__()
-    acc_w, turn_b = accelerations(plant, motion, wrench)
-    vel_w = motion.vel_w + plant.dt * acc_w
-    rate_b = motion.rate_b + plant.dt * turn_b
-    rot_w = xp.matmul(motion.rot_w, exp_rot(plant.dt * rate_b))
-    return Motion(motion.pos_w + plant.dt * vel_w, rot_w, vel_w, rate_b)
+    vel_w = motion.vel_w + dt * acc_w
+    rate_b = motion.rate_b + dt * turn_b
+    rot_w = xp.matmul(motion.rot_w, exp_rot(dt * rate_b))
+    return Motion(motion.pos_w + dt * vel_w, rot_w, vel_w, rate_b)

@@ -136,13 +136,7 @@ def plant_step(
         assert inputs.command is not None, "neither a command nor rotor speeds are given"
         state, rotors = rotor_step(plant, state, inputs.command, motion.rate_b)
     winds, flow = wind_and_flow(plant, state.wind, motion, rotors, inputs, time_s)
-    wrench = wrench_on(plant, rotors, flow)
-    if inputs.push_b is not None:
-        constants, push_b = plant.constants, inputs.push_b
-        wrench = Wrench(
-            wrench.force_b + mass_of(plant) * push_b[..., :3],
-            wrench.torque_b + constants.inertia * push_b[..., 3:],
-        )
+    wrench = with_push(plant, wrench_on(plant, rotors, flow), inputs.push_b)
     return state._replace(wind=winds), wrench
 
 
@@ -194,12 +188,26 @@ def rollout(
 
     begin = (start, motion, None if feedback is None else feedback.start)
     (last, _, _), (motions, speeds, acc_b) = jax.lax.scan(one, begin, (steps, inputs))
-    motions, speeds = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None], rest]),
-        (motion, start.rotor_speed),
-        (motions, speeds),
-    )
+    motions, speeds = from_start((motion, start.rotor_speed), (motions, speeds))
     return Rollout(motions, speeds, acc_b, last)
+
+
+def from_start(start: Any, rest: Any) -> Any:
+    """Return a pytree's values at the start (...) with the T that followed, (T + 1, ...)."""
+    import jax
+    import jax.numpy as jnp
+
+    return jax.tree.map(lambda first, then: jnp.concatenate([first[None], then]), start, rest)
+
+
+def with_push(plant: Plant, wrench: Wrench, push_b: Array | None) -> Wrench:
+    """Return `wrench` with what `Inputs.push_b` adds to it, if anything."""
+    if push_b is None:
+        return wrench
+    return Wrench(
+        wrench.force_b + mass_of(plant) * push_b[..., :3],
+        wrench.torque_b + plant.constants.inertia * push_b[..., 3:],
+    )
 
 
 def mass_of(plant: Plant) -> Array:

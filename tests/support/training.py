@@ -1,5 +1,7 @@
 """A trainer small enough for tests: few worlds, few steps, a narrow network, gate frames only."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,11 +15,29 @@ from suite.train.config import (
     PointMassConfig,
     TrainConfig,
 )
+from suite.train.rollout import make_rollout
 from suite.train.worlds import Worlds, sample_worlds
 from tracks.geometry.camera import Camera
 from tracks.geometry.scene import Boxes, Rods, Scene, Spheres
 
 SPEC = PolicySpec(camera=Camera(width=20, height=20), hidden_size=8)
+KEY = jax.random.key(5)
+
+
+def blind(params, image):
+    """Return embeddings of nothing, for tests that are not about images."""
+    return jnp.zeros((image.shape[0], SPEC.hidden_size))
+
+
+def loss_of(config, encode=blind):
+    """Return loss(params, worlds, delta, field_gain) of the plain loop with `encode` inside."""
+
+    def loss(params, worlds, delta=None, field_gain=0.0):
+        weighted = replace(config, loss=replace(config.loss, field_gain=field_gain))
+        embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
+        return make_rollout(weighted)(params, embedding_shift, worlds, KEY, encode, delta)[0]
+
+    return loss
 
 
 def small_config(batch=4, steps=6, physics=None, loss=None, optimizer=None, **episode):

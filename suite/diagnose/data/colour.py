@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from suite.diagnose.data.noise import noise_of
-from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.data.noise import noise_of, typical_variance
+from suite.diagnose.data.windows import CHANNELS, SLICES, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 TRIED = ((0.6, 0.02), (0.6, 0.08), (0.95, 0.02), (0.95, 0.08), (0.95, 0.2))
@@ -55,13 +55,13 @@ def measured_noise(
         if np.isfinite(sigma[channels]).all():
             together.setdefault(seen[name].tobytes(), []).append(name)
     for names in together.values():
-        channels = np.concatenate([np.arange(19)[SLICES[name]] for name in names])
+        channels = np.concatenate([np.arange(CHANNELS)[SLICES[name]] for name in names])
         stretches = _stretches(residual[..., channels], windows, seen[names[0]], limits)
         if stretches is None:
             continue
         tried = [(pair, _likelihood(stretches, *pair)) for pair in ((0.0, 1.0), *TRIED)]
         for name in names:
-            at = np.isin(channels, np.arange(19)[SLICES[name]])
+            at = np.isin(channels, np.arange(CHANNELS)[SLICES[name]])
             (_, white), *others = [(pair, float(likely[at].sum())) for pair, likely in tried]
             start, best = max(others, key=lambda one: one[1])
             if best - white < limits.colour_gain:
@@ -69,9 +69,8 @@ def measured_noise(
             own = stretches._replace(values=stretches.values[..., at])
             coloured[name] = _likeliest(own, start)
             energy, freedom, _ = _beside_polynomial(own, *coloured[name])
-            # The median of chi-square over n is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
-            level = np.median(energy / freedom, axis=0) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
-            sigma[SLICES[name]] = np.maximum(np.sqrt(level), sigma[SLICES[name]])
+            level = np.sqrt(typical_variance(energy, freedom))
+            sigma[SLICES[name]] = np.maximum(level, sigma[SLICES[name]])
     return Noise(sigma, coloured)
 
 

@@ -58,9 +58,17 @@ def noise_of(
     for c in range(CHANNELS):
         if power[c]:
             n = np.array(freedom[c])
-            # The median of chi-square over n is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
-            sigma[c] = np.sqrt(np.median(np.array(power[c]) / n / (1.0 - 2.0 / (9.0 * n)) ** 3))
+            sigma[c] = np.sqrt(typical_variance(np.array(power[c]), n))
     return np.maximum(sigma, np.repeat(limits.least_noise, [3, 3, 3, 3, 3, 4]))
+
+
+def typical_variance(energy: np.ndarray, freedom: np.ndarray | int) -> np.ndarray:
+    """Return the variance of noise whose `energy` (V, ...) has so many degrees of freedom.
+
+    It is that of the median, so that a few bad blocks do not decide: the median of chi-square over
+    n is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
+    """
+    return np.median(energy / freedom / (1.0 - 2.0 / (9.0 * freedom)) ** 3, axis=0)
 
 
 def _powers(time_s: np.ndarray, degree: int) -> np.ndarray:

@@ -112,12 +112,12 @@ def conditions_of(
     """Return what each of W rollouts flew through, (W,) by the names of `UNITS`."""
     early = np.asarray(windows.command_s)
     early = (early > -1e-9) & (early < limits.thrust_mean_s)
-    thrust = _mean_of(np.asarray(windows.command)[..., 0], early)
+    thrust = _mean(np.where(early, np.asarray(windows.command)[..., 0], np.nan).T)
     speed = np.asarray(windows.rotor_speed)
     if speed.any():
         early = np.asarray(windows.edge_s)[:, -speed.shape[1] - 1 : -1] < limits.thrust_mean_s
         force = vehicle.rotors.thrust_coefficient * (speed**2).sum(axis=-1)
-        thrust = _mean_of(force, early) / vehicle.mass
+        thrust = _mean(np.where(early, force, np.nan).T) / vehicle.mass
     return {
         "speed": np.linalg.norm(windows.vel_w, axis=-1),
         "height": np.asarray(windows.pos_w)[:, 2],
@@ -125,11 +125,6 @@ def conditions_of(
         "thrust": thrust,
         "time in flight": np.asarray(windows.start_s),
     }
-
-
-def _mean_of(values: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """Return the means (W,) of what is `counted` (W, K) of `values` (W, K)."""
-    return np.where(counted, values, 0.0).sum(axis=1) / np.maximum(counted.sum(axis=1), 1)
 
 
 def binned(found: Disagreement, over: np.ndarray, condition: str) -> tuple[np.ndarray, np.ndarray]:

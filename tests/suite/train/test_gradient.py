@@ -11,32 +11,14 @@ import pytest
 
 from policies.networks import network
 from suite.train.gradient import encoder_gradient, make_gradient
-from suite.train.rollout import make_rollout
 from tests.support.training import (
-    SPEC,
+    KEY,
     boxes_worlds,
     fresh_params,
     largest_difference,
+    loss_of,
     small_config,
 )
-
-KEY = jax.random.key(5)
-
-
-def blind(params, image):
-    """Return embeddings of nothing, for tests that are not about images."""
-    return jnp.zeros((image.shape[0], SPEC.hidden_size))
-
-
-def loss_of(config, encode=blind):
-    """Return loss(params, worlds, delta, field_gain) of the plain loop with `encode` inside."""
-
-    def loss(params, worlds, delta=None, field_gain=0.0):
-        weighted = replace(config, loss=replace(config.loss, field_gain=field_gain))
-        embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
-        return make_rollout(weighted)(params, embedding_shift, worlds, KEY, encode, delta)[0]
-
-    return loss
 
 
 @pytest.fixture(scope="module")

@@ -18,33 +18,19 @@ from suite.train.losses import UNIT_FIELD
 from suite.train.rollout import make_rollout, view_in
 from suite.train.step import target_gate
 from tests.support.training import (
+    KEY,
     SPEC,
+    blind,
     boxes_worlds,
     doubled,
     fresh_params,
     largest_difference,
+    loss_of,
     small_config,
 )
 from tracks.geometry.field import attractive_field, magnetic_field
 
 TILTED = Rotation.from_euler("ZYX", [0.7, -0.3, 0.2]).as_matrix()
-KEY = jax.random.key(5)
-
-
-def blind(params, image):
-    """Return embeddings of nothing, for tests that are not about images."""
-    return jnp.zeros((image.shape[0], SPEC.hidden_size))
-
-
-def loss_of(config, encode=blind):
-    """Return loss(params, worlds, delta, field_gain) of the plain loop with `encode` inside."""
-
-    def loss(params, worlds, delta=None, field_gain=0.0):
-        weighted = replace(config, loss=replace(config.loss, field_gain=field_gain))
-        embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
-        return make_rollout(weighted)(params, embedding_shift, worlds, KEY, encode, delta)[0]
-
-    return loss
 
 
 CONFIG = small_config(batch=3, steps=4)

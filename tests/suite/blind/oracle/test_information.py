@@ -5,20 +5,14 @@ import pytest
 
 from eval.effects import EFFECTS
 from suite.blind.oracle.information import Column, columns_of, detectable, information, left_over
-from suite.blind.oracle.strength import given_vehicle
 from suite.blind.oracle.stretches import cut
 from suite.diagnose.plans.sensors import SENSORS
-from suite.diagnose.plans.simulate import fly
-from suite.diagnose.plans.trajectory import Trajectory
-
-EIGHT = Trajectory("figure_eight", duration_s=2.5, speed=4.0, size=2.0, turn="wobble")
-CIRCLE = Trajectory("circle", duration_s=2.5, speed=3.0, size=3.0)
-BARE = given_vehicle("bare")
+from tests.support.ways import BARE, bare_flights
 
 
 @pytest.fixture(scope="module")
 def flights():
-    return fly(BARE, BARE, [EIGHT, CIRCLE])
+    return bare_flights()
 
 
 def test_information_grows_with_flights_and_knows_hand_worked_parts(flights):

@@ -3,18 +3,12 @@
 import numpy as np
 import pytest
 
-from suite.blind.oracle.strength import given_vehicle
-from suite.diagnose.plans.simulate import fly
-from suite.diagnose.plans.trajectory import Trajectory
-
-EIGHT = Trajectory("figure_eight", duration_s=2.5, speed=4.0, size=2.0, turn="wobble")
-CIRCLE = Trajectory("circle", duration_s=2.5, speed=3.0, size=3.0)
-BARE = given_vehicle("bare")
+from tests.support.ways import CIRCLE, EIGHT, bare_flights
 
 
 @pytest.fixture(scope="module")
 def flights():
-    return fly(BARE, BARE, [EIGHT, CIRCLE])
+    return bare_flights()
 
 
 def test_the_pilot_stays_on_the_trajectory(flights):

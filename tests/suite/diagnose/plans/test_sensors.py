@@ -1,30 +1,16 @@
 """Logs of simulated flights: their noise, what they leave out, and their faults."""
 
-from dataclasses import replace
-from types import MappingProxyType
-
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS
-from suite.blind.oracle.strength import given_vehicle
 from suite.diagnose.plans.sensors import SENSORS, log_of
 from suite.diagnose.plans.simulate import fly
-from suite.diagnose.plans.trajectory import Trajectory
-
-EIGHT = Trajectory("figure_eight", duration_s=2.5, speed=4.0, size=2.0, turn="wobble")
-CIRCLE = Trajectory("circle", duration_s=2.5, speed=3.0, size=3.0)
-BARE = given_vehicle("bare")
-
-
-def having(vehicle=BARE, **effects):
-    values = {name: EFFECTS[name].values(*numbers) for name, numbers in effects.items()}
-    return replace(vehicle, effects=MappingProxyType({**vehicle.effects, **values}))
+from tests.support.ways import BARE, EIGHT, bare_flights, having
 
 
 @pytest.fixture(scope="module")
 def flights():
-    return fly(BARE, BARE, [EIGHT, CIRCLE])
+    return bare_flights()
 
 
 def test_noise_is_as_stated(flights):

@@ -1,19 +1,15 @@
 """Trajectories flown in MuJoCo: what is recorded, and what cannot be flown."""
 
-from dataclasses import replace
-from types import MappingProxyType
-
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS
 from eval.quadrotor.plant import Wrench, make_plant
 from eval.quadrotor.rigid_body import accelerations
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
-from suite.blind.oracle.strength import given_vehicle
 from suite.diagnose.plans.simulate import FULL_V, FlightFailed, fly
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tests.support.ways import BARE, CIRCLE, EIGHT, bare_flights, having
 
 WAYS = [Trajectory("figure_eight", 1.5, speed=2.0), Trajectory("hover", 1.0)]
 VEHICLE = with_effects(with_lag(PLAIN, 0.03), linear_drag=((0.3, 0.3, 0.1),))
@@ -58,19 +54,9 @@ def test_a_rate_must_divide_the_rate_loops():
         fly(PLAIN, VEHICLE, WAYS, rate_hz=130.0)
 
 
-EIGHT = Trajectory("figure_eight", duration_s=2.5, speed=4.0, size=2.0, turn="wobble")
-CIRCLE = Trajectory("circle", duration_s=2.5, speed=3.0, size=3.0)
-BARE = given_vehicle("bare")
-
-
-def having(vehicle=BARE, **effects):
-    values = {name: EFFECTS[name].values(*numbers) for name, numbers in effects.items()}
-    return replace(vehicle, effects=MappingProxyType({**vehicle.effects, **values}))
-
-
 @pytest.fixture(scope="module")
 def flights():
-    return fly(BARE, BARE, [EIGHT, CIRCLE])
+    return bare_flights()
 
 
 def test_a_flight_that_cannot_be_flown_is_refused():

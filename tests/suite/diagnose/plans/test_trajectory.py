@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-from suite.blind.oracle.strength import given_vehicle
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import KINDS, Trajectory
-
-EIGHT = Trajectory("figure_eight", duration_s=2.5, speed=4.0, size=2.0, turn="wobble")
-CIRCLE = Trajectory("circle", duration_s=2.5, speed=3.0, size=3.0)
-BARE = given_vehicle("bare")
+from tests.support.ways import BARE, CIRCLE, EIGHT
 
 
 @pytest.mark.parametrize("kind", KINDS)
