@@ -50,12 +50,15 @@ class Thresholds:
     """The same for rotor speeds that are an input, which change faster."""
     noise_degree: int = 3
     """Degree of that polynomial."""
-    colour_degree: int = 5
-    """Degree of the polynomial that is taken off a second before its noise gets a colour."""
-    colour_gain: float = 12.0
+    colour_degree: int = 3
+    """Degree of the polynomial that is taken off a second before its noise gets a colour: what
+    errors of its start make of it."""
+    colour_gain: float = 3.0
     """Rise of the log-likelihood below which noise is taken for white [1]."""
-    colour_windows: int = 24
-    """Stretches, at most, that the colour is measured on."""
+    drift_gain: float = 3.0
+    """Rise of the log-likelihood below which there is no error of the model beside noise [1]."""
+    colour_aside: float = 3.0
+    """Rows up to which a stretch's rows may be off the others' times."""
     least_noise: tuple[float, ...] = (1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2)
     """Noise below is rounding and the model's steps; pose [m, rad], velocity [m/s], rates [rad/s],
     accelerometer [m/s^2], rotor speed [rad/s]."""

@@ -84,7 +84,7 @@ def information(
     limits: Thresholds = THRESHOLDS,
 ) -> np.ndarray:
     """Return what each window tells of each of the first `directions`, (W, K)."""
-    noise = measured_noise(linear.residual, windows, limits)
+    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
     return np.einsum("wkk->wk", normal_equations_of(whitening, linear, directions).hessian)
 

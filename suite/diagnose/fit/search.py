@@ -187,13 +187,21 @@ def trusted(
     return windows._replace(seen=seen)
 
 
-def _look(task: _Task, estimate: Estimate, known: Linearisation | None = None) -> _Look:
-    """Return the slopes of all windows at `estimate`, which `known` saves."""
+def _look(
+    task: _Task,
+    estimate: Estimate,
+    known: Linearisation | None = None,
+    noise: Noise | None = None,
+) -> _Look:
+    """Return the slopes of all windows at `estimate`, which `known` saves, as `noise` does its own.
+
+    Noise is measured best where the model fits best.
+    """
     model, limits = task.model, task.limits
     linear = known
     if linear is None:
         linear = model.linearise(estimate.theta, estimate.offset, task.windows, None)
-    noise = measured_noise(linear.residual, task.windows, limits)
+    noise = noise or measured_noise(linear.residual, linear.start_slope, task.windows, limits)
     view = trusted(task.windows, linear.residual, limits)
     whitening = make_whitening(linear, noise, view, limits)
     equations = normal_equations_of(whitening, linear, model.size)
@@ -241,7 +249,7 @@ def _settle(
             break
         estimate, _ = task.fit(look, estimate, indices_of(before))
         for place in range(len(named)):
-            named, estimate = _judge_rivals(task, named, place, estimate)
+            named, estimate = _judge_rivals(task, named, place, estimate, look.noise)
         needed = [n for n in named if n.p_value <= task.limits.name_p_value]
         if [n.candidate for n in needed] == before:
             break
@@ -255,7 +263,7 @@ def _settle(
 
 
 def _judge_rivals(
-    task: _Task, named: list[NamedEffect], place: int, estimate: Estimate
+    task: _Task, named: list[NamedEffect], place: int, estimate: Estimate, noise: Noise
 ) -> tuple[list[NamedEffect], Estimate]:
     """Weigh the name at `place` when added last; a better rival takes its place."""
     model, limits, one = task.model, task.limits, named[place]
@@ -263,7 +271,7 @@ def _judge_rivals(
     theta, own = estimate.theta.copy(), list(one.candidate.indices)
     theta[own] = model.space.array("start")[own]
     without = Estimate(theta, estimate.offset)
-    look = _look(task, without)
+    look = _look(task, without, noise=noise)
     at = indices_of(others)
     scores = {s.candidate: s for s in task.score(look.equations, theta, at)}
     if one.candidate in scores:
