@@ -150,7 +150,7 @@ class Thresholds:
     """Slow errors above their expectation by this factor are no noise [1]."""
     structure_rotor_input: float = 1.3
     """The same where measured rotor speeds are the input: their noise is known less well [1]."""
-    unexplained_share: float = 0.5
+    unexplained_share: float = 0.7
     """Where more of the gap is left, what was named does not explain it [1]."""
     wind_lengths_m: tuple[float, float, int] = (0.5, 40.0, 25)
     """Shortest and longest length of turbulence that is tried [m], and how many."""

@@ -9,7 +9,7 @@ that is white in force and torque, so that it is not taken for noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,8 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 TIMES_S = tuple(np.geomspace(0.012, 0.2, 8).tolist())
 """Times T that are tried [s]; what lasts longer goes with a window's start, which is free."""
+LEFT_S = tuple(np.geomspace(0.03, 1.0, 6).tolist())
+"""The same where all that is left is taken for noise [s]."""
 DRIFTS = (0.0, *np.logspace(-3.0, 5.0, 17).tolist())
 """How fast a model's error may grow: its variance after a second, over the noise's."""
 ESTIMATED = ("position", "attitude", "velocity")
@@ -103,6 +105,36 @@ def measured_noise(
             channels = SLICES[name].stop - SLICES[name].start
             sigma[SLICES[name]] = np.sqrt(typical_variance(energy.reshape(-1, channels), freedom))
             coloured[name] = (process.share, process.lasts_s)
+    return Noise(sigma, coloured)
+
+
+def left_as_noise(
+    residual: np.ndarray,
+    start_slope: np.ndarray,
+    windows: FlightWindows,
+    limits: Thresholds = THRESHOLDS,
+) -> Noise:
+    """Return the noise that all of a residual would be, the model's error with it.
+
+    Where the best model is off by more than noise, this is how far its error may carry what is
+    fitted. The arguments are those of `measured_noise`.
+    """
+    sigma = noise_of(residual, windows, limits=limits)
+    residual = _freed(residual, start_slope, np.where(windows.seen, 1.0 / sigma, 0.0))
+    coloured = {}
+    for name, channels in SLICES.items():
+        stretches = None
+        if np.isfinite(sigma[channels]).all():
+            stretches = _stretches(residual[..., channels], windows, name, limits)
+        if stretches is None:
+            continue
+        rows = len(stretches.time_s)
+        bare = stretches._replace(powers=np.zeros((rows, 0)), drift=np.zeros((rows, rows)))
+        process, _ = max(_by_time(bare, limits, LEFT_S), key=lambda one: one[1])
+        energy, freedom, _ = _beside_polynomial(bare, process)
+        width = channels.stop - channels.start
+        sigma[channels] = np.sqrt((energy.reshape(-1, width) / freedom).mean(axis=0))
+        coloured[name] = (process.share, process.lasts_s)
     return Noise(sigma, coloured)
 
 
@@ -200,8 +232,10 @@ def _likelihood(stretches: _Stretches, process: _Process) -> float:
     return -float((spread + size).sum())
 
 
-def _by_time(stretches: _Stretches, limits: Thresholds) -> list[tuple[_Process, float]]:
-    """Return for each of `TIMES_S` the likeliest process, and its gain over white noise.
+def _by_time(
+    stretches: _Stretches, limits: Thresholds, times_s: Sequence[float] = TIMES_S
+) -> list[tuple[_Process, float]]:
+    """Return for each of `times_s` the likeliest process, and its gain over white noise.
 
     What noise explains nearly as well as a drift beside it is noise.
     """
@@ -213,10 +247,10 @@ def _by_time(stretches: _Stretches, limits: Thresholds) -> list[tuple[_Process, 
     drifts = DRIFTS if stretches.drift.any() else (0.0,)
     white = max((_Process(0.0, 1.0, drift) for drift in drifts), key=likely)
     nothing, found = likely(white), []
-    for lasts_s in TIMES_S:
+    for lasts_s in times_s:
         alone = minimize_scalar(
             lambda share, t=lasts_s: -likely(_Process(share, t, 0.0)),
-            bounds=(0.0, 0.99),
+            bounds=(0.0, 0.999),
             method="bounded",
             options={"xatol": 0.01},
         )
