@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.data.colour import ESTIMATED, Noise, colour_filter, measured_noise
+from suite.diagnose.data.colour import (
+    ESTIMATED,
+    Noise,
+    colour_filter,
+    left_as_noise,
+    measured_noise,
+)
 from suite.diagnose.data.windows import SLICES, cut
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
@@ -82,3 +88,16 @@ def test_the_filter_makes_rows_independent(windows):
     neighbours = (white[:, 1:] * white[:, :-1]).mean() / (white**2).mean()
     assert abs(neighbours) < 0.03 < (values[:, 1:] * values[:, :-1]).mean()
     assert abs((white**2).mean() - 1.0) < 0.05
+
+
+def test_all_that_is_left_counts_as_noise_where_the_model_is_off(windows):
+    rng = np.random.default_rng(5)
+    residual = noise_like(windows, 0.0, 1.0, rng)
+    swing = np.sin(6.0 * windows.row_s[..., None] + rng.uniform(0.0, 6.0, (len(residual), 1, 3)))
+    residual[..., SLICES["velocity"]] += 8.0 * swing
+    nothing = np.zeros((*residual.shape, 12))
+    noise = left_as_noise(residual, nothing, windows)
+    np.testing.assert_allclose(noise.sigma[SLICES["velocity"]], 8.0 / np.sqrt(2.0), rtol=0.3)
+    share, lasts_s = noise.coloured["velocity"]
+    assert share > 0.95 and lasts_s > 0.1
+    np.testing.assert_allclose(noise.sigma[SLICES["position"]], 1.0, rtol=0.1)
