@@ -10,7 +10,7 @@ import numpy as np
 from eval.effects import EFFECTS
 from suite.diagnose.data.kinematics import Kinematics
 from suite.diagnose.data.windows import STATE_GROUPS
-from suite.diagnose.fit.search import NamedEffect
+from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.plans.separating import advice
 from suite.diagnose.verdict.black_box import BlackBoxComparison
 from suite.diagnose.verdict.checks import Checks

@@ -15,6 +15,7 @@ import numpy as np
 from suite.common.errors import WorkFailed
 from suite.diagnose.data.colour import measured_noise
 from suite.diagnose.data.noise import noise_of
+from suite.diagnose.fit.look import trusted
 from suite.diagnose.fit.model import RolloutModel
 from suite.diagnose.fit.normal_equations import (
     NormalEquations,
@@ -22,7 +23,6 @@ from suite.diagnose.fit.normal_equations import (
     half_widths95,
     start_estimate,
 )
-from suite.diagnose.fit.search import trusted
 from suite.diagnose.fit.whitening import make_whitening
 from suite.experiments.bench.compare import Comparison, Figure, in_turn
 from suite.experiments.bench.rigid_body import Task, make_task

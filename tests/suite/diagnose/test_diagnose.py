@@ -18,7 +18,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
 from suite.common.report import html
 from suite.diagnose.diagnose import _confirmed, diagnose
-from suite.diagnose.fit.search import NamedEffect
+from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.plans.sensors import SENSORS, log_of
 from suite.diagnose.plans.simulate import fly as fly_ways
 from suite.diagnose.plans.trajectory import ordinary_flights

@@ -6,11 +6,13 @@ import pytest
 from eval.effects import EFFECTS
 from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.windows import cut
+from suite.diagnose.fit.look import trusted
 from suite.diagnose.fit.model import BATCH, DIRECTIONS, RolloutModel, batches
 from suite.diagnose.fit.normal_equations import normal_equations_of, start_estimate
 from suite.diagnose.fit.parameters import candidates, effects_at, indices_of, make_space
+from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.fit.rollout import KNOTS, STATE
-from suite.diagnose.fit.search import NamedEffect, search, trusted
+from suite.diagnose.fit.search import search
 from suite.diagnose.fit.whitening import (
     make_whitening,
     orthonormal,

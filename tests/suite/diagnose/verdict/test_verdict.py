@@ -39,7 +39,8 @@ def searched(slow=1.0, named=()) -> Any:
 
 def scores(before, after):
     """Gaps whose energy above the noise floor is `before` and `after`."""
-    return tuple(Gap(np.full(8, 1.0 + above), np.zeros(8), {}) for above in (before, after))
+    one, two = (Gap(np.full(8, 1.0 + above), np.zeros(8), {}) for above in (before, after))
+    return one, two
 
 
 SAME = scores(0.0, 0.0)

@@ -1,0 +1,129 @@
+"""What the search sees at one estimate: slopes along all numbers, and how to weigh them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from suite.diagnose.data.colour import Noise, left_as_noise, measured_noise
+from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.fit.model import Linearisation, RolloutModel
+from suite.diagnose.fit.normal_equations import (
+    Estimate,
+    NormalEquations,
+    fit,
+    normal_equations_of,
+)
+from suite.diagnose.fit.parameters import Candidate, indices_of
+from suite.diagnose.fit.permutation import CandidateScore, score_candidates
+from suite.diagnose.fit.whitening import Whitening, make_whitening
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+
+
+class SearchTask(NamedTuple):
+    """What a search is given."""
+
+    model: RolloutModel
+    windows: FlightWindows
+    """At full length."""
+    among: Sequence[Candidate]
+    fold: np.ndarray
+    """(W,) windows of one number are left out together."""
+    say: Callable[[str], None]
+    seed: int
+    limits: Thresholds
+
+    def score(
+        self, equations: NormalEquations, theta: np.ndarray, named: Sequence[int]
+    ) -> list[CandidateScore]:
+        """Return the scores of what is not among the numbers `named`, best first."""
+        left = [c for c in self.among if not set(c.indices) & set(named)]
+        return score_candidates(
+            equations, theta, self.model.space, named, left, self.fold, self.seed, self.limits
+        )
+
+    def fit(
+        self, look: Look, start: Estimate, indices: list[int], known: Linearisation | None = None
+    ) -> tuple[Estimate, NormalEquations]:
+        """Fit the numbers at `indices` to what can be trusted."""
+        windows, whitening = look.windows, look.whitening
+        return fit(self.model, windows, whitening, start, indices, known=known, limits=self.limits)
+
+
+class Look(NamedTuple):
+    """The slopes along everything at one estimate, and how to weigh them."""
+
+    linear: Linearisation
+    windows: FlightWindows
+    """As long as these slopes can be trusted."""
+    whitening: Whitening
+    equations: NormalEquations
+    noise: Noise
+    off: bool = False
+    """Whether all that the model leaves is taken for noise."""
+
+
+def look_at(
+    task: SearchTask,
+    estimate: Estimate,
+    known: Linearisation | None = None,
+    noise: Noise | None = None,
+) -> Look:
+    """Return the slopes of all windows at `estimate`, which `known` saves, as `noise` does its own.
+
+    Noise is measured best where the model fits best.
+    """
+    model, limits = task.model, task.limits
+    linear = known
+    if linear is None:
+        linear = model.linearise(estimate.theta, estimate.offset, task.windows, None)
+    noise = noise or measured_noise(linear.residual, linear.start_slope, task.windows, limits)
+    view = trusted(task.windows, linear.residual, limits)
+    whitening = make_whitening(linear, noise, view, limits)
+    equations = normal_equations_of(whitening, linear, model.size)
+    return Look(linear, view, whitening, equations, noise)
+
+
+def is_off(task: SearchTask, look: Look, chosen: Sequence[Candidate], estimate: Estimate) -> bool:
+    """Return whether what is `chosen` leaves more than noise in the windows of `look`."""
+    _, equations = task.fit(look, estimate, indices_of(chosen))
+    expected = look.whitening.slow_freedom.sum()
+    return bool(equations.slow_energy.sum() > task.limits.structure_rotor_input * expected)
+
+
+def look_at_misfit(
+    task: SearchTask, look: Look, chosen: Sequence[Candidate], estimate: Estimate
+) -> Look:
+    """Return the slopes at the best fit of what is `chosen`, weighed by what that leaves."""
+    estimate, _ = task.fit(look, estimate, indices_of(chosen))
+    linear = task.model.linearise(estimate.theta, estimate.offset, task.windows, None)
+    noise = left_as_noise(linear.residual, linear.start_slope, look.windows, task.limits)
+    whitening = make_whitening(linear, noise, look.windows, task.limits)
+    equations = normal_equations_of(whitening, linear, task.model.size)
+    return Look(linear, look.windows, whitening, equations, noise, off=True)
+
+
+def trusted(
+    windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
+) -> FlightWindows:
+    """Return `windows`, each up to where the model has not left the flight by too much.
+
+    Beyond, slopes taken where the model is say nothing of where the flight was: it may have turned
+    over, or sunk below the ground. What is named brings the model back, and the next look is
+    longer. `residual` is (W, N, 19).
+    """
+    error = np.abs(residual)
+    height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
+    lost = (error[..., SLICES["position"]].max(axis=-1) > limits.trusted_m) | (
+        error[..., SLICES["attitude"]].max(axis=-1) > limits.trusted_rad
+    )
+    lost |= (error[..., 2] > limits.trusted_height_share * height) & (height > 0.0)
+    row_s = np.asarray(windows.row_s)
+    until_s = np.full(len(row_s), limits.trusted_horizons_s[-1])
+    for horizon in reversed(limits.trusted_horizons_s):
+        there = ~(lost & (row_s <= horizon)).any(axis=1)
+        until_s = np.where(there, horizon, until_s)
+    seen = np.asarray(windows.seen) & (row_s <= until_s[:, None] + 1e-9)[..., None]
+    return windows._replace(seen=seen)

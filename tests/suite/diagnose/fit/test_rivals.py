@@ -1,0 +1,43 @@
+"""A name that one flight alone carries is no name where the model is off."""
+
+import numpy as np
+
+from suite.diagnose.fit.normal_equations import NormalEquations
+from suite.diagnose.fit.parameters import make_space
+from suite.diagnose.fit.rivals import chi2_fall, flights_agree, gains_by_flight
+from tests.support.vehicles import PLAIN
+
+FLIGHT = np.repeat(np.arange(4), 6)
+
+
+def made_equations(space, sizes, rng):
+    """24 windows of four flights, in each of which the first number has another of `sizes`."""
+    step = space.array("step")
+    slope = rng.standard_normal((24, 40, len(step))) / step
+    residual = 0.1 * rng.standard_normal((24, 40))
+    residual += np.array(sizes)[FLIGHT][:, None] * slope[..., 0] * step[0]
+    turned = np.swapaxes(slope, 1, 2)
+    return NormalEquations(
+        turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1), np.zeros(0)
+    )
+
+
+def gains_of(sizes):
+    space = make_space(PLAIN)
+    theta = 0.5 * (space.array("low") + space.array("high"))
+    made = made_equations(space, sizes, np.random.default_rng(0))
+    assert chi2_fall(made, theta, space, [0]) > 10.0
+    assert chi2_fall(made, theta, space, []) == 0.0
+    return gains_by_flight(made, theta, space, [1], [0], FLIGHT)
+
+
+def test_what_all_flights_have_is_agreed_on():
+    gains = gains_of([0.3, 0.25, 0.35, 0.3])
+    assert (gains > 0.0).all() and flights_agree(gains)
+
+
+def test_what_flights_contradict_is_not():
+    gains = gains_of([1.5, -0.4, -0.4, 0.3])
+    assert not flights_agree(gains)
+    assert not flights_agree(np.array([100.0, 0.5, 0.2, -3.0]))
+    assert flights_agree(np.array([5.0, -1.0]))
