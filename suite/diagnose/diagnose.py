@@ -23,18 +23,17 @@ from suite.diagnose.data.input_source import (
 from suite.diagnose.data.windows import FlightWindows, cut, take
 from suite.diagnose.fit.model import Linearisation, RolloutModel
 from suite.diagnose.fit.normal_equations import (
-    Estimate,
-    fit,
     half_widths95,
     information,
     start_estimate,
 )
-from suite.diagnose.fit.parameters import candidates, indices_of, make_space
+from suite.diagnose.fit.parameters import candidates, make_space
 from suite.diagnose.fit.permutation import folds_of
-from suite.diagnose.fit.search import SearchResult, refitted, search
+from suite.diagnose.fit.search import SearchResult, search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.confirmation import confirmed, control, without_names
 from suite.diagnose.verdict.diagnosis import Diagnosis
-from suite.diagnose.verdict.gap import Gap, measure, worse
+from suite.diagnose.verdict.gap import measure, worse
 from suite.diagnose.verdict.residual_structure import (
     ResidualStructure,
     disturbance_equations,
@@ -134,13 +133,13 @@ def _diagnose(
         after = measure(model, found.estimate.theta, held, found.noise, limits)
         if worse(before, after, limits=limits):
             warnings.append("what was found on the fitted flights does not hold on held-out ones")
-            found, after = _without_names(model, found), before
-    found, after, without, gone = _confirmed(model, found, held, (before, after), limits)
+            found, after = without_names(model, found), before
+    found, after, without, gone = confirmed(model, found, held, (before, after), limits)
     warnings += [f"{label}: withdrawn, held-out flights are no better for it" for label in gone]
     residual, turbulence = _left_over(model, found, seed, limits)
     if turbulence and found.named and not worse(after, before, limits=limits):
         # Wind that lasts from one stretch to the next looks like many a steady number.
-        found, after = _without_names(model, found), before
+        found, after = without_names(model, found), before
         residual, turbulence = _left_over(model, found, seed, limits)
     verdict = verdict_on(found, residual, (before, after), rotor_input, limits)
     if turbulence:
@@ -148,7 +147,7 @@ def _diagnose(
     if verdict.label == "unknown" and found.named:
         labels = ", ".join(candidate.label for candidate in found.candidates)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
-        found, after = _without_names(model, found), before
+        found, after = without_names(model, found), before
     return Diagnosis(
         verdict=verdict,
         search=found,
@@ -157,7 +156,7 @@ def _diagnose(
         before=before,
         after=after,
         without={candidate.label: without[candidate.label] for candidate in found.candidates},
-        control=_control(model, found, held, limits) if found.named else None,
+        control=control(model, found, held, limits) if found.named else None,
         residual=residual,
         turbulence=turbulence,
         logs=logs,
@@ -209,11 +208,6 @@ def _left_over(
     return residual, turbulence
 
 
-def _without_names(model: RolloutModel, found: SearchResult) -> SearchResult:
-    """Return `found` with nothing named, at the numbers of the vehicle file."""
-    return replace(found, named=(), estimate=start_estimate(model, found.windows), explained=0.0)
-
-
 def _late(found: Diagnosis) -> dict[str, float]:
     """Return by name how much later than they were poses are logged [s], of what was named."""
     values = found.model.space.effects(found.search.estimate.theta)
@@ -259,78 +253,6 @@ def _held_out(
     assert many is not None
     inside = np.isin(many.flight, apart.flight) & (many.start_s >= apart.start_s.min() - 1e-6)
     return take(many, inside)
-
-
-def _confirmed(
-    model: RolloutModel,
-    found: SearchResult,
-    held: FlightWindows,
-    gaps: tuple[Gap, Gap],
-    limits: Thresholds,
-) -> tuple[SearchResult, Gap, dict[str, Gap], list[str]]:
-    """Return `found` with those names alone that lower the gap on held-out flights.
-
-    `gaps` are those before and after it was found.
-
-    Returns:
-        What stays, its gap, the gaps without each of its names, and the labels of what went.
-    """
-    (before, after), gone = gaps, list[str]()
-    while found.named:
-        without = _without_each(model, found, held, limits)
-        label = min(without, key=lambda name: float(without[name].energy.sum()))
-        if without[label].energy.sum() > after.energy.sum():
-            return found, after, without, gone
-        gone.append(label)
-        kept = tuple(one for one in found.named if one.candidate.label != label)
-        if not kept:
-            return _without_names(model, found), before, {}, gone
-        found = refitted(model, found, kept, limits)
-        after = measure(model, found.estimate.theta, held, found.noise, limits)
-    return found, after, {}, gone
-
-
-def _without_each(
-    model: RolloutModel, found: SearchResult, held: FlightWindows, limits: Thresholds
-) -> dict[str, Gap]:
-    """Return by label of each name the gap where all others are fitted without it."""
-    start, gaps = model.space.array("start"), {}
-    for one in found.candidates:
-        others = [candidate for candidate in found.candidates if candidate is not one]
-        theta = start
-        if others:
-            theta = found.estimate.theta.copy()
-            theta[list(one.indices)] = start[list(one.indices)]
-            without = Estimate(theta, found.estimate.offset)
-            theta = _refit(model, found, without, indices_of(others), limits)
-        gaps[one.label] = measure(model, theta, held, found.noise, limits)
-    return gaps
-
-
-def _control(
-    model: RolloutModel, found: SearchResult, held: FlightWindows, limits: Thresholds
-) -> tuple[str, Gap] | None:
-    """Return the best effect that is neither named nor a rival, fitted alone, and its gap."""
-    taken = {candidate.name for candidate in found.candidates}
-    taken |= {rival for one in found.named for rival in one.rivals}
-    wrong = next((s.candidate for s in found.first if s.candidate.name not in taken), None)
-    if wrong is None:
-        return None
-    start = start_estimate(model, found.windows)
-    theta = _refit(model, found, start, list(wrong.indices), limits)
-    return wrong.label, measure(model, theta, held, found.noise, limits)
-
-
-def _refit(
-    model: RolloutModel,
-    found: SearchResult,
-    start: Estimate,
-    indices: list[int],
-    limits: Thresholds,
-) -> np.ndarray:
-    """Return the numbers (P,) where those at `indices` are fitted to what was searched."""
-    best, _ = fit(model, found.windows, found.judging, start, indices, limits=limits)
-    return best.theta
 
 
 def _with_effects(

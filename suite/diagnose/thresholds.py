@@ -128,6 +128,9 @@ class Thresholds:
     """From one start to the next of the rollouts that measure the gap [s]."""
     doubt_chi2: float = 25.0
     """Rise of chi-square on held-out flights from which a name is doubted (five sigma)."""
+    shown_chi2: float = 9.0
+    """Fall of chi-square on held-out flights that is expected of a name at its fitted size, from
+    which it is withdrawn where none comes (three sigma)."""
     cells: int = 4
     """Places along x and y between which a force that hangs on the place is drawn."""
     pieces: int = 5

@@ -17,7 +17,7 @@ from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
 from suite.common.report import html
-from suite.diagnose.diagnose import _confirmed, diagnose
+from suite.diagnose.diagnose import diagnose
 from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.plans.sensors import SENSORS, log_of
 from suite.diagnose.plans.simulate import fly as fly_ways
@@ -26,6 +26,7 @@ from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.checks import run_checks
+from suite.diagnose.verdict.confirmation import confirmed
 from suite.diagnose.verdict.gap import measure
 from tests.support.broken_logs import BREAKAGES
 from tests.support.diagnosis_flights import fly
@@ -67,7 +68,7 @@ def test_a_name_that_held_out_flights_do_not_want_is_withdrawn(drag):
     )
     held, limits = drag.held_windows, drag.limits
     after = measure(model, theta, held, found.noise, limits)
-    kept, gap, without, gone = _confirmed(model, spoilt, held, (drag.before, after), limits)
+    kept, gap, without, gone = confirmed(model, spoilt, held, (drag.before, after), limits)
     assert gone == ["torque_trim"] and gap.rms < after.rms
     assert [one.label for one in kept.candidates] == [one.label for one in found.candidates]
     assert set(without) == {one.label for one in found.candidates}

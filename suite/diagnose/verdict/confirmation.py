@@ -1,0 +1,124 @@
+"""Names held against flights that took no part: what they do not want is withdrawn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from suite.diagnose.data.windows import FlightWindows
+from suite.diagnose.fit.model import RolloutModel
+from suite.diagnose.fit.normal_equations import (
+    Estimate,
+    fit,
+    normal_equations_of,
+    start_estimate,
+)
+from suite.diagnose.fit.parameters import Candidate, indices_of
+from suite.diagnose.fit.search import SearchResult, refitted
+from suite.diagnose.fit.whitening import make_whitening
+from suite.diagnose.thresholds import Thresholds
+from suite.diagnose.verdict.gap import HEADLINE_S, Gap, measure, true_starts
+
+
+def confirmed(
+    model: RolloutModel,
+    found: SearchResult,
+    held: FlightWindows,
+    gaps: tuple[Gap, Gap],
+    limits: Thresholds,
+) -> tuple[SearchResult, Gap, dict[str, Gap], list[str]]:
+    """Return `found` without the names that do not lower the gap on held-out flights.
+
+    A name stays where these flights could not show it, as those that keep off the ground cannot
+    show its effect. `gaps` are those before and after it was found.
+
+    Returns:
+        What stays, its gap, the gaps without each of its names, and the labels of what went.
+    """
+    (before, after), gone = gaps, list[str]()
+    while found.named:
+        without = _without_each(model, found, held, limits)
+        doubted = [
+            one
+            for one in found.candidates
+            if without[one.label].energy.sum() <= after.energy.sum()
+            and _shown(model, found, one, held, limits)
+        ]
+        if not doubted:
+            return found, after, without, gone
+        label = min((one.label for one in doubted), key=lambda k: float(without[k].energy.sum()))
+        gone.append(label)
+        kept = tuple(one for one in found.named if one.candidate.label != label)
+        if not kept:
+            return without_names(model, found), before, {}, gone
+        found = refitted(model, found, kept, limits)
+        after = measure(model, found.estimate.theta, held, found.noise, limits)
+    return found, after, {}, gone
+
+
+def without_names(model: RolloutModel, found: SearchResult) -> SearchResult:
+    """Return `found` with nothing named, at the numbers of the vehicle file."""
+    return replace(found, named=(), estimate=start_estimate(model, found.windows), explained=0.0)
+
+
+def control(
+    model: RolloutModel, found: SearchResult, held: FlightWindows, limits: Thresholds
+) -> tuple[str, Gap] | None:
+    """Return the best effect that is neither named nor a rival, fitted alone, and its gap."""
+    taken = {candidate.name for candidate in found.candidates}
+    taken |= {rival for one in found.named for rival in one.rivals}
+    wrong = next((s.candidate for s in found.first if s.candidate.name not in taken), None)
+    if wrong is None:
+        return None
+    start = start_estimate(model, found.windows)
+    theta = _refit(model, found, start, list(wrong.indices), limits)
+    return wrong.label, measure(model, theta, held, found.noise, limits)
+
+
+def _shown(
+    model: RolloutModel,
+    found: SearchResult,
+    one: Candidate,
+    held: FlightWindows,
+    limits: Thresholds,
+) -> bool:
+    """Return whether held-out flights would show the effect at the size that was fitted."""
+    theta, own = found.estimate.theta, list(one.indices)
+    offset = true_starts(model, theta, held)
+    linear = model.linearise(theta, offset, held, [*own, *model.starts])
+    whitening = make_whitening(linear, found.noise, held, limits)
+    hessian = normal_equations_of(whitening, linear, len(own)).hessian.sum(axis=0)
+    moved = theta[own] - model.space.array("start")[own]
+    # Windows overlap: each row of the log counts this often.
+    expected = moved @ hessian @ moved * limits.gap_stride_s / HEADLINE_S
+    return bool(expected > limits.shown_chi2)
+
+
+def _without_each(
+    model: RolloutModel, found: SearchResult, held: FlightWindows, limits: Thresholds
+) -> dict[str, Gap]:
+    """Return by label of each name the gap where all others are fitted without it."""
+    start, gaps = model.space.array("start"), {}
+    for one in found.candidates:
+        others = [candidate for candidate in found.candidates if candidate is not one]
+        theta = start
+        if others:
+            theta = found.estimate.theta.copy()
+            theta[list(one.indices)] = start[list(one.indices)]
+            without = Estimate(theta, found.estimate.offset)
+            theta = _refit(model, found, without, indices_of(others), limits)
+        gaps[one.label] = measure(model, theta, held, found.noise, limits)
+    return gaps
+
+
+def _refit(
+    model: RolloutModel,
+    found: SearchResult,
+    start: Estimate,
+    indices: list[int],
+    limits: Thresholds,
+) -> np.ndarray:
+    """Return the numbers (P,) where those at `indices` are fitted to what was searched."""
+    best, _ = fit(model, found.windows, found.judging, start, indices, limits=limits)
+    return best.theta
