@@ -18,7 +18,6 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
 from suite.common.report import html
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.plans.sensors import SENSORS, log_of
 from suite.diagnose.plans.simulate import fly as fly_ways
 from suite.diagnose.plans.trajectory import ordinary_flights
@@ -26,8 +25,6 @@ from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.checks import run_checks
-from suite.diagnose.verdict.confirmation import confirmed
-from suite.diagnose.verdict.gap import measure
 from tests.support.broken_logs import BREAKAGES
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
@@ -53,26 +50,6 @@ def within(entry, truth):
     low, high = value.reshape(-1, 2).T
     middle, half = (low + high) / 2, (high - low) / 2
     return np.all(np.abs(np.atleast_1d(truth) - middle) < 2 * half + 1e-12)
-
-
-def test_a_name_that_held_out_flights_do_not_want_is_withdrawn(drag):
-    """A torque that is not there, put beside the drag that is."""
-    found, model = drag.search, drag.model
-    other = next(s.candidate for s in found.first if s.candidate.name == "torque_trim")
-    theta = found.estimate.theta.copy()
-    theta[list(other.indices)] += 0.2 * model.space.array("step")[list(other.indices)]
-    spoilt = replace(
-        found,
-        named=(*found.named, NamedEffect(other, 0.001, 20.0)),
-        estimate=replace(found.estimate, theta=theta),
-    )
-    held, limits = drag.held_windows, drag.limits
-    after = measure(model, theta, held, found.noise, limits)
-    kept, gap, without, gone = confirmed(model, spoilt, held, (drag.before, after), limits)
-    assert gone == ["torque_trim"] and gap.rms < after.rms
-    assert [one.label for one in kept.candidates] == [one.label for one in found.candidates]
-    assert set(without) == {one.label for one in found.candidates}
-    np.testing.assert_allclose(kept.estimate.theta[kept.indices], theta[kept.indices], rtol=0.05)
 
 
 def test_flights_of_the_vehicle_itself_have_no_gap():

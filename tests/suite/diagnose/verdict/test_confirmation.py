@@ -1,0 +1,40 @@
+"""Held-out flights have a say in every name that they could show."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from suite.diagnose.fit.rivals import NamedEffect
+from suite.diagnose.verdict.confirmation import confirmed
+from suite.diagnose.verdict.gap import measure
+
+
+def spoilt(drag, steps):
+    """What was found, and a torque that is not there beside the drag that is."""
+    found, space = drag.search, drag.model.space
+    other = next(s.candidate for s in found.first if s.candidate.name == "torque_trim")
+    theta, at = found.estimate.theta.copy(), list(other.indices)
+    theta[at] += steps * space.array("step")[at]
+    named = (*found.named, NamedEffect(other, 0.001, 20.0))
+    return replace(found, named=named, estimate=replace(found.estimate, theta=theta))
+
+
+def judged(drag, found):
+    held, limits = drag.held_windows, drag.limits
+    after = measure(drag.model, found.estimate.theta, held, found.noise, limits)
+    return after, confirmed(drag.model, found, held, (drag.before, after), limits)
+
+
+def test_a_name_that_held_out_flights_do_not_want_is_withdrawn(drag):
+    found = spoilt(drag, 0.2)
+    after, (kept, gap, without, gone) = judged(drag, found)
+    assert gone == ["torque_trim"] and gap.rms < after.rms
+    assert [one.label for one in kept.candidates] == [one.label for one in drag.search.candidates]
+    assert set(without) == {one.label for one in drag.search.candidates}
+    theta = found.estimate.theta
+    np.testing.assert_allclose(kept.estimate.theta[kept.indices], theta[kept.indices], rtol=0.05)
+
+
+def test_one_that_they_could_not_show_stays(drag):
+    _, (kept, _, _, gone) = judged(drag, spoilt(drag, 1e-4))
+    assert gone == [] and "torque_trim" in [one.label for one in kept.candidates]
