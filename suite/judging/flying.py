@@ -56,7 +56,10 @@ def policy_digest(name_or_path: str) -> str:
     path = shipped.locate(name_or_path)
     files = [path]
     if path.is_dir():
-        files = [file for file in (path / CONFIG, path / WEIGHTS) if file.is_file()]
+        names = (CONFIG, WEIGHTS) if (path / CONFIG).exists() else ("policy.h", "policy.c")
+        files = [path / name for name in names if (path / name).is_file()]
+    elif path.suffix == ".c":
+        files = [path.with_name("policy.h"), path]
     elif path.suffix == ".onnx":
         from policies.formats.onnx_file import files_of
 
