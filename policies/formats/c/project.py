@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -84,7 +85,7 @@ def native_answers(
     params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
 ) -> np.ndarray:
     """Return the JAX policy's actions (T, 3), its memory cleared where an observation is fresh."""
-    policy = native_policy(params, spec, "policy")
+    policy = dataclasses.replace(native_policy(params, spec, "policy"), block=1, rows=1)
     hidden, actions = policy.start(1), []
     for state, image, fresh in zip(*observed, strict=True):
         action, hidden = policy.act(hidden, state[None], image[None], np.array([fresh]))
