@@ -6,14 +6,17 @@ import io
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from policies import shipped
 from policies.errors import PolicyError
-from policies.formats.c.forward import Observed
 from policies.formats.embedded_spec import KEY, embed
 from policies.formats.policy_file import PolicyCheckpoint, load_policy_checkpoint
 from tracks.common.files import replacing_file
 from tracks.common.names import unknown_name
+
+if TYPE_CHECKING:
+    from policies.formats.c.forward import Observed
 
 
 def export_policy(
