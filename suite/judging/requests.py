@@ -38,6 +38,8 @@ class Evaluation:
     trials in the air, as out of time [s]."""
     trust: bool = False
     """Also load policy files that can run code on this machine."""
+    monitor: bool = False
+    """Fly every policy a second time with the safety monitor around it, on the same trials."""
 
 
 @dataclass(frozen=True)
