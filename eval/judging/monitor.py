@@ -101,8 +101,8 @@ def seen_of(spec: PolicySpec, state: np.ndarray, image: np.ndarray) -> Seen:
     metres = metres.reshape(len(metres), -1)
     points_b = _rays(camera) * metres[..., None]
     hit = metres < 0.99 * camera.range_m
-    parts = (np.asarray(state[:, k : k + 3], float) for k in (0, 3, 9))
-    return Seen(*parts, points_b, hit)
+    vel_b, up_b, last_b = (np.asarray(state[:, k : k + 3], float) for k in (0, 3, 9))
+    return Seen(vel_b, up_b, last_b, points_b, hit)
 
 
 def _rays(camera: Camera) -> np.ndarray:

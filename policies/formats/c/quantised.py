@@ -49,7 +49,7 @@ def input_ranges(
 ) -> dict[str, tuple[float, float]]:
     """Return the smallest and largest input of each large layer over observations."""
     weights = matrices(params, spec)
-    ranges = dict.fromkeys(LAYERS, (0.0, 0.0))
+    ranges: dict[str, tuple[float, float]] = dict.fromkeys(LAYERS, (0.0, 0.0))
 
     def layer(name: str, x: np.ndarray) -> np.ndarray:
         low, high = ranges[name]

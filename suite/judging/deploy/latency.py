@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import time
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from policies.formats.c.c_file import CPolicy
 from policies.formats.policy_file import PolicyCheckpoint
 from policies.spec import PolicySpec
 
-Step = Callable[[], object]
-"""Makes one step with memory on the inputs that it was built with."""
+Step = Callable[[], Any]
+"""Makes one step with memory on the inputs that it was built with; may return the action (1, 3)."""
 BLOCK = 100
 """Steps of one engine before the next has its turn."""
 WARM = 10
@@ -53,15 +53,15 @@ def _timing(seconds: np.ndarray) -> Timing:
 def c_step(policy: CPolicy) -> Step:
     """Return a step of a policy.c."""
     state, image = _inputs(policy.spec)
-    memory, action = policy.start(1), np.zeros(3, np.float32)
+    memory, action = policy.start(1), np.zeros((1, 3), np.float32)
     held = (memory, state, image, action)
     policy.library.policy_reset(ctypes.c_void_p(memory.ctypes.data))
     pointers = [ctypes.c_void_p(x.ctypes.data) for x in held]
     function = policy.library.policy_step
 
-    def step() -> tuple[np.ndarray, ...]:
+    def step() -> np.ndarray:
         function(*pointers)
-        return held
+        return held[-1]
 
     return step
 
@@ -85,7 +85,7 @@ def onnx_steps(checkpoint: PolicyCheckpoint) -> tuple[Step, Step]:
     for name, value in (("action", np.zeros((1, 3), np.float32)), ("hidden_next", hidden)):
         binding.bind_ortvalue_output(name, onnxruntime.OrtValue.ortvalue_from_numpy(value))
 
-    def usual() -> object:
+    def usual() -> Any:
         action, feed["hidden"] = session.run(None, feed)
         return action
 
@@ -102,7 +102,7 @@ def torch_step(checkpoint: PolicyCheckpoint) -> Step:
     state, image = map(torch.from_numpy, _inputs(checkpoint.spec))
     memory = [torch.zeros(1, checkpoint.spec.hidden_size)]
 
-    def step() -> object:
+    def step() -> Any:
         with torch.inference_mode():
             action, memory[0] = twin(state, image, memory[0])
         return action

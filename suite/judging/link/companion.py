@@ -163,8 +163,9 @@ class Companion:
 
     def _count_gates(self, state: State) -> None:
         if self._last is not None:
-            gate = (x[self.gate] for x in (self._gates[0], self._gates[1], self._gates[2]))
-            self.gate += bool(crossing(*gate, self._last.pos_w, state.pos_w)[0])
+            center_w, rot_w, opening_g = (x[self.gate] for x in self._gates[:3])
+            passed, _ = crossing(center_w, rot_w, opening_g, self._last.pos_w, state.pos_w)
+            self.gate += bool(passed)
         self._last = state
 
     def _fly(self, state: State) -> list[bytes]:
@@ -206,9 +207,11 @@ class Companion:
             _row(self._gates, min(self.gate + 1, count - 1)),
             depth[None],
         )
-        seen = observe(self._policy.spec, view, self._action_b)
-        inputs = [x.astype(np.float32) for x in seen]
-        answer, self._hidden = self._policy.act(self._hidden, *inputs, np.array([self._fresh]))
+        state_b, image = (
+            np.asarray(x, np.float32) for x in observe(self._policy.spec, view, self._action_b)
+        )
+        fresh = np.array([self._fresh])
+        answer, self._hidden = self._policy.act(self._hidden, state_b, image, fresh)
         took_s = self._clock() - self._heard_at
         limits = ActionLimits(deadline_s=self._limits.deadline_s)
         guarded = guard_action(limits, answer, self._action_b, took_s, self._policy.name)

@@ -61,6 +61,8 @@ def test_a_lost_image_is_the_one_before_and_the_state_comes_all_the_same():
 class Watcher(Pursuit):
     """Keeps what it was given."""
 
+    given: list
+
     def act(self, hidden, state, image, fresh):
         self.given.append((state.copy(), image.copy()))
         return super().act(hidden, state, image, fresh)

@@ -69,7 +69,7 @@ def test_how_near_a_path_comes_is_worked_out():
 def test_a_way_out_is_taken_at_the_last_moment_and_not_before():
     """Towards a wall as wide as the image: from afar the policy has its will, near it has not."""
     will = np.zeros((1, 3))
-    taken_at = None
+    taken_at, action, view = None, will, seen()
     for depth_m in np.arange(6.0, 0.3, -0.1):
         view = seen(vel_b=(4.0, 0.0, 0.0), depth_m=depth_m)
         action, taken = last_moment(LIMITS, will, view, PERIOD_S)

@@ -27,7 +27,7 @@ def checked(folder, *flags, name="check"):
     """Compile main.c and policy.c strictly and run them; the finished process."""
     files = [str(folder / file) for file in ("main.c", "policy.c")]
     program = folder / name
-    command = [*find_compiler(), *STRICT, *flags, *files, "-o", str(program), "-lm"]
+    command = [*(find_compiler() or ()), *STRICT, *flags, *files, "-o", str(program), "-lm"]
     made = subprocess.run(command, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr[:2000]
     return subprocess.run([program], capture_output=True, text=True, check=False)
@@ -79,8 +79,8 @@ def test_a_row_stands_alone_and_a_fresh_one_has_no_memory(exports):
     alone = answers(policy, observed)
     hidden = policy.start(3)
     for k, (state, image, _) in enumerate(zip(*observed, strict=True)):
-        given = [np.stack([np.zeros_like(x), x, x[::-1]]) for x in (state, image)]
-        action, hidden = policy.act(hidden, *given, np.full(3, k == 0))
+        states, images = (np.stack([np.zeros_like(x), x, x[::-1]]) for x in (state, image))
+        action, hidden = policy.act(hidden, states, images, np.full(3, k == 0))
         assert action[1].tobytes() == alone[k].tobytes()
     again = Observed(*(np.concatenate([x, x]) for x in observed))
     assert answers(policy, again)[6:].tobytes() == alone.tobytes()
@@ -92,9 +92,9 @@ def test_what_is_not_finite_is_answered_with_nan_and_forgotten(exports):
     before, none = policy.start(1), np.zeros(1, bool)
     for bad in (np.nan, np.inf):
         for which in (0, 1):
-            given = [state[:1].copy(), image[:1].copy()]
-            given[which].ravel()[-1] = bad
-            action, after = policy.act(before, *given, none)
+            one, picture = state[:1].copy(), image[:1].copy()
+            (one, picture)[which].ravel()[-1] = bad
+            action, after = policy.act(before, one, picture, none)
             assert np.isnan(action).all() and (after == before).all()
 
 
