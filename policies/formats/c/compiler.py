@@ -49,6 +49,9 @@ def source_files(policy_c: Path) -> list[Path]:
 def compiled_library(policy_c: Path) -> Path:
     """Return the shared library of a policy.c, compiled now or found in the cache.
 
+    The two files are what the cache knows it by: a header of their own that they include may change
+    unseen.
+
     Raises:
         PolicyError: where there is no compiler, or it refuses the file.
     """
@@ -84,7 +87,8 @@ def _cache() -> Path:
 
 def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
     policy_c, _, library_c = files
-    ends = [f"-I{policy_c.resolve().parent}", str(policy_c), str(library_c), "-o", str(out), "-lm"]
+    source = policy_c.resolve()
+    ends = [f"-I{source.parent}", str(source), str(library_c), "-o", str(out), "-lm"]
     message = ""
     for flags in ((*FLAGS, *HERE), FLAGS):
         try:

@@ -69,7 +69,8 @@ def test_how_near_a_path_comes_is_worked_out():
 def test_a_way_out_is_taken_at_the_last_moment_and_not_before():
     """Towards a wall as wide as the image: from afar the policy has its will, near it has not."""
     will = np.zeros((1, 3))
-    taken_at, action, view = None, will, seen()
+    taken_at, action, view, blocked = None, will, seen(), 0
+    times = np.linspace(0.025, LIMITS.horizon_s, 24)
     for depth_m in np.arange(6.0, 0.3, -0.1):
         view = seen(vel_b=(4.0, 0.0, 0.0), depth_m=depth_m)
         action, taken = last_moment(LIMITS, will, view, PERIOD_S)
@@ -77,6 +78,9 @@ def test_a_way_out_is_taken_at_the_last_moment_and_not_before():
             taken_at = depth_m
             break
         assert (action == will).all()
+        ahead = clearance(LIMITS, view, will, None, times, PERIOD_S)
+        blocked += bool(ahead[0] < LIMITS.clearance_m)
+    assert blocked >= 3  # its path is blocked and there is time yet
     assert taken_at is not None and 0.6 < taken_at < 2.5
     assert any((action == way).all() for way in ways_out(LIMITS, view))
     assert action[0, 0] < 0 or action[0, 2] > 0
