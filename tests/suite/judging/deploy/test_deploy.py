@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from eval.worlds.trial import TrialSpec
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import find_compiler
 from policies.formats.c.project import drawn
@@ -87,7 +86,19 @@ def test_what_a_policy_is_given_on_flights_is_kept(monkeypatch):
     assert len(heard.state) == len(heard.image) == len(heard.fresh)
     # It falls: every flight starts at rest, and sinks from then on.
     assert (heard.state[heard.fresh, :3] == 0).all() and (heard.state[~heard.fresh, 2] < 0).all()
-    assert TrialSpec("zigzag", 0, observed.SEED)
+
+
+def test_rows_in_which_nothing_flies_are_no_observations():
+    listener = observed.Listener(Steady())
+    hidden = listener.start(2)
+    for k, flying in enumerate(((1, 1), (1, 0), (1, 0))):
+        state = np.full((2, 12), float(k + 1)) * np.array(flying)[:, None]
+        fresh = np.array([k == 0, k == 0])
+        _, hidden = listener.act(hidden, state, np.zeros((2, 24, 32)), fresh)
+    heard = listener.heard()
+    # Flight after flight: three steps of the first, one of the second.
+    assert heard.state[:, 0].tolist() == [1.0, 2.0, 3.0, 1.0]
+    assert heard.fresh.tolist() == [True, False, False, True]
 
 
 @needs_cc
