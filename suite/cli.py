@@ -119,14 +119,18 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 def _run(name: str, args: list[str]) -> int:
     from suite.common.compiled import keep_compiled
     from suite.common.console import Console, stdout_kept_clean
-    from suite.common.running.lock import one_writer_each
-    from tracks.input.ranges import check_ranges
+    from suite.common.running.threads import one_thread_a_product
 
     keep_compiled()
+    one_thread_a_product()
     try:
         command, config = parse(name, args)
     except SystemExit as stop:
         return int(stop.code or 0)
+
+    from suite.common.running.lock import one_writer_each
+    from tracks.input.ranges import check_ranges
+
     with stdout_kept_clean() if config.json else nullcontext():
         check_ranges(config, options=True)
         folders = command.written(config) if hasattr(command, "written") else []

@@ -31,7 +31,7 @@ from suite.diagnose.fit.normal_equations import (
 )
 from suite.diagnose.fit.parameters import candidates, indices_of, make_space
 from suite.diagnose.fit.permutation import folds_of
-from suite.diagnose.fit.search import SearchResult, search
+from suite.diagnose.fit.search import SearchResult, refitted, search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap, measure, worse
@@ -41,7 +41,7 @@ from suite.diagnose.verdict.residual_structure import (
     residual_structure,
 )
 from suite.diagnose.verdict.turbulence import Turbulence, find_turbulence
-from suite.diagnose.verdict.verdict import Verdict, verdict_on
+from suite.diagnose.verdict.verdict import Verdict, share_left, verdict_on
 
 
 def diagnose(
@@ -142,9 +142,9 @@ def _diagnose(
         # Wind that lasts from one stretch to the next looks like many a steady number.
         found, after = _without_names(model, found), before
         residual, turbulence = _left_over(model, found, seed, limits)
-    verdict = verdict_on(found, residual, rotor_input, limits)
+    verdict = verdict_on(found, residual, (before, after), rotor_input, limits)
     if turbulence:
-        verdict = Verdict("named")
+        verdict = Verdict("named", share_left(before, after))
     if verdict.label == "unknown" and found.named:
         labels = ", ".join(candidate.label for candidate in found.candidates)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
@@ -152,7 +152,7 @@ def _diagnose(
     return Diagnosis(
         verdict=verdict,
         search=found,
-        half_widths=half_widths95(found.equations),
+        half_widths=half_widths95(found.judged, found.windows.flight if found.off else None),
         vehicle=_with_effects(vehicle, model, found, turbulence),
         before=before,
         after=after,
@@ -285,20 +285,8 @@ def _confirmed(
         kept = tuple(one for one in found.named if one.candidate.label != label)
         if not kept:
             return _without_names(model, found), before, {}, gone
-        indices = indices_of([one.candidate for one in kept])
-        theta = model.space.array("start")
-        theta[indices] = found.estimate.theta[indices]
-        start = Estimate(theta, found.estimate.offset)
-        best, last = fit(model, found.windows, found.whitening, start, indices, limits=limits)
-        nothing = found.explained + float(found.equations.chi2.sum())
-        found = replace(
-            found,
-            named=kept,
-            estimate=best,
-            equations=last,
-            explained=nothing - float(last.chi2.sum()),
-        )
-        after = measure(model, best.theta, held, found.noise, limits)
+        found = refitted(model, found, kept, limits)
+        after = measure(model, found.estimate.theta, held, found.noise, limits)
     return found, after, {}, gone
 
 
@@ -341,7 +329,7 @@ def _refit(
     limits: Thresholds,
 ) -> np.ndarray:
     """Return the numbers (P,) where those at `indices` are fitted to what was searched."""
-    best, _ = fit(model, found.windows, found.whitening, start, indices, limits=limits)
+    best, _ = fit(model, found.windows, found.judging, start, indices, limits=limits)
     return best.theta
 
 

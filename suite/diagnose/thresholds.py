@@ -50,12 +50,15 @@ class Thresholds:
     """The same for rotor speeds that are an input, which change faster."""
     noise_degree: int = 3
     """Degree of that polynomial."""
-    colour_degree: int = 5
-    """Degree of the polynomial that is taken off a second before its noise gets a colour."""
-    colour_gain: float = 12.0
+    colour_degree: int = 3
+    """Degree of the polynomial that is taken off a second before its noise gets a colour: what
+    errors of its start make of it."""
+    colour_gain: float = 3.0
     """Rise of the log-likelihood below which noise is taken for white [1]."""
-    colour_windows: int = 24
-    """Stretches, at most, that the colour is measured on."""
+    drift_gain: float = 3.0
+    """Rise of the log-likelihood below which there is no error of the model beside noise [1]."""
+    colour_aside: float = 3.0
+    """Rows up to which a stretch's rows may be off the others' times."""
     least_noise: tuple[float, ...] = (1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2)
     """Noise below is rounding and the model's steps; pose [m, rad], velocity [m/s], rates [rad/s],
     accelerometer [m/s^2], rotor speed [rad/s]."""
@@ -147,7 +150,7 @@ class Thresholds:
     """Slow errors above their expectation by this factor are no noise [1]."""
     structure_rotor_input: float = 1.3
     """The same where measured rotor speeds are the input: their noise is known less well [1]."""
-    unexplained_share: float = 0.5
+    unexplained_share: float = 0.7
     """Where more of the gap is left, what was named does not explain it [1]."""
     wind_lengths_m: tuple[float, float, int] = (0.5, 40.0, 25)
     """Shortest and longest length of turbulence that is tried [m], and how many."""

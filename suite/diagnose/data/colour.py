@@ -2,23 +2,34 @@
 
 Each group of channels has white noise and noise of a first-order Gauss-Markov process, that decays
 as exp(-t / T). How much of it there is, and T, maximise the likelihood of what is left of every
-window when a polynomial is taken off it (restricted likelihood; Patterson & Thompson 1971), so
-that a model's slow error is not taken for noise.
+window when a polynomial is taken off it (restricted likelihood; Patterson & Thompson 1971). A
+model's error adds up along a window, where noise does not: beside the noise there may be an error
+that is white in force and torque, so that it is not taken for noise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize, minimize_scalar
 
 from suite.diagnose.data.noise import noise_of, typical_variance
-from suite.diagnose.data.windows import CHANNELS, SLICES, FlightWindows
+from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
-TRIED = ((0.6, 0.02), (0.6, 0.08), (0.95, 0.02), (0.95, 0.08), (0.95, 0.2))
-"""Shares and times T [s] of which the likeliest is where the search for a colour begins."""
+TIMES_S = tuple(np.geomspace(0.012, 0.2, 8).tolist())
+"""Times T that are tried [s]; what lasts longer goes with a window's start, which is free."""
+LEFT_S = tuple(np.geomspace(0.03, 1.0, 6).tolist())
+"""The same where all that is left is taken for noise [s]."""
+DRIFTS = (0.0, *np.logspace(-3.0, 5.0, 17).tolist())
+"""How fast a model's error may grow: its variance after a second, over the noise's."""
+ESTIMATED = ("position", "attitude", "velocity")
+"""One estimator makes these groups: their errors last equally long."""
+INTEGRATED = {"position": 2, "attitude": 2, "velocity": 1, "rates": 1}
+"""By group, how often a force or torque is integrated to move it; other groups follow at once."""
 LEAST_ROWS = 30
 """A window with fewer rows says nothing of colours."""
 
@@ -34,43 +45,96 @@ class Noise(NamedTuple):
 
 
 class _Stretches(NamedTuple):
-    """Rows of channels that were seen together, the same number N each of V windows."""
+    """Rows of a group of channels in V windows, N of each, at about the same times in all."""
 
     time_s: np.ndarray
-    """(V, N) [s]."""
+    """(N,) [s]."""
     values: np.ndarray
-    """(V, N, C)."""
+    """(N, V * C)."""
     powers: np.ndarray
-    """(V, N, P) the polynomial."""
+    """(N, P) the polynomial."""
+    drift: np.ndarray
+    """(N, N) covariance of a model's error, 1 after a second."""
+
+
+class _Process(NamedTuple):
+    """Noise of unit variance, and a model's error beside it."""
+
+    share: float
+    """Of the noise, that is coloured."""
+    lasts_s: float
+    """T [s]."""
+    drift: float
+    """Variance of the model's error after a second."""
 
 
 def measured_noise(
-    residual: np.ndarray, windows: FlightWindows, limits: Thresholds = THRESHOLDS
+    residual: np.ndarray,
+    start_slope: np.ndarray,
+    windows: FlightWindows,
+    limits: Thresholds = THRESHOLDS,
 ) -> Noise:
-    """Return the noise in `residual` (W, N, 19), measured - simulated in `windows`."""
-    sigma, coloured = noise_of(residual, windows, limits=limits), {}
-    seen = {name: np.asarray(np.all(windows.seen[..., at], axis=-1)) for name, at in SLICES.items()}
-    together: dict[bytes, list[str]] = {}
+    """Return the noise in residuals.
+
+    Args:
+        residual: (W, N, 19) measured - simulated.
+        start_slope: (W, N, 19, F) of the simulated values along each window's start.
+        windows: W of them.
+        limits: from where on noise has a colour.
+    """
+    sigma = noise_of(residual, windows, limits=limits)
+    residual = _freed(residual, start_slope, np.where(windows.seen, 1.0 / sigma, 0.0))
+    sigma, parts = noise_of(residual, windows, limits=limits), dict[str, _Stretches]()
     for name, channels in SLICES.items():
         if np.isfinite(sigma[channels]).all():
-            together.setdefault(seen[name].tobytes(), []).append(name)
-    for names in together.values():
-        channels = np.concatenate([np.arange(CHANNELS)[SLICES[name]] for name in names])
-        stretches = _stretches(residual[..., channels], windows, seen[names[0]], limits)
+            stretches = _stretches(residual[..., channels], windows, name, limits)
+            if stretches is not None:
+                parts[name] = stretches
+    tried = {name: _by_time(stretches, limits) for name, stretches in parts.items()}
+    coloured = {}
+    for names in (
+        [n for n in ESTIMATED if n in parts],
+        *([n] for n in parts if n not in ESTIMATED),
+    ):
+        gains = np.sum([[gain for _, gain in tried[name]] for name in names], axis=0)
+        if not names or gains.max() < limits.colour_gain:
+            continue
+        for name in names:
+            process, _ = tried[name][int(gains.argmax())]
+            energy, freedom, _ = _beside_polynomial(parts[name], process)
+            channels = SLICES[name].stop - SLICES[name].start
+            sigma[SLICES[name]] = np.sqrt(typical_variance(energy.reshape(-1, channels), freedom))
+            coloured[name] = (process.share, process.lasts_s)
+    return Noise(sigma, coloured)
+
+
+def left_as_noise(
+    residual: np.ndarray,
+    start_slope: np.ndarray,
+    windows: FlightWindows,
+    limits: Thresholds = THRESHOLDS,
+) -> Noise:
+    """Return the noise that all of a residual would be, the model's error with it.
+
+    Where the best model is off by more than noise, this is how far its error may carry what is
+    fitted. The arguments are those of `measured_noise`.
+    """
+    sigma = noise_of(residual, windows, limits=limits)
+    residual = _freed(residual, start_slope, np.where(windows.seen, 1.0 / sigma, 0.0))
+    coloured = {}
+    for name, channels in SLICES.items():
+        stretches = None
+        if np.isfinite(sigma[channels]).all():
+            stretches = _stretches(residual[..., channels], windows, name, limits)
         if stretches is None:
             continue
-        tried = [(pair, _likelihood(stretches, *pair)) for pair in ((0.0, 1.0), *TRIED)]
-        for name in names:
-            at = np.isin(channels, np.arange(CHANNELS)[SLICES[name]])
-            (_, white), *others = [(pair, float(likely[at].sum())) for pair, likely in tried]
-            start, best = max(others, key=lambda one: one[1])
-            if best - white < limits.colour_gain:
-                continue
-            own = stretches._replace(values=stretches.values[..., at])
-            coloured[name] = _likeliest(own, start)
-            energy, freedom, _ = _beside_polynomial(own, *coloured[name])
-            level = np.sqrt(typical_variance(energy, freedom))
-            sigma[SLICES[name]] = np.maximum(level, sigma[SLICES[name]])
+        rows = len(stretches.time_s)
+        bare = stretches._replace(powers=np.zeros((rows, 0)), drift=np.zeros((rows, rows)))
+        process, _ = max(_by_time(bare, limits, LEFT_S), key=lambda one: one[1])
+        energy, freedom, _ = _beside_polynomial(bare, process)
+        width = channels.stop - channels.start
+        sigma[channels] = np.sqrt((energy.reshape(-1, width) / freedom).mean(axis=0))
+        coloured[name] = (process.share, process.lasts_s)
     return Noise(sigma, coloured)
 
 
@@ -87,69 +151,128 @@ def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray
 
 
 def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray:
-    """Return the correlation (V, N, N) of noise at times (V, N)."""
-    apart = np.abs(time_s[:, :, None] - time_s[:, None])
-    return (1.0 - share) * np.eye(time_s.shape[1]) + share * np.exp(-apart / lasts_s)
+    """Return the correlation (..., N, N) of noise at times (..., N)."""
+    apart = np.abs(time_s[..., :, None] - time_s[..., None, :])
+    return (1.0 - share) * np.eye(time_s.shape[-1]) + share * np.exp(-apart / lasts_s)
+
+
+def _freed(residual: np.ndarray, slope: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return `residual` (W, N, 19) without what errors of each window's start explain.
+
+    `slope` (W, N, 19, F) is along the start, `weight` (W, N, 19) of each value.
+    """
+    rows = (slope * np.nan_to_num(weight)[..., None]).reshape(len(slope), -1, slope.shape[-1])
+    white = (residual * np.nan_to_num(weight)).reshape(len(slope), -1, 1)
+    turned = np.swapaxes(rows, 1, 2)
+    size = np.sqrt(np.einsum("wfm,wmf->wf", turned, rows))[:, :, None] + 1e-30
+    gram = (turned / size) @ (rows / np.swapaxes(size, 1, 2)) + 1e-9 * np.eye(slope.shape[-1])
+    moved = np.linalg.solve(gram, (turned / size) @ white) / size
+    return residual - (slope @ moved[:, None])[..., 0]
 
 
 def _stretches(
-    values: np.ndarray, windows: FlightWindows, seen: np.ndarray, limits: Thresholds
+    values: np.ndarray, windows: FlightWindows, name: str, limits: Thresholds
 ) -> _Stretches | None:
-    """Return the rows of `values` (W, N, C) that were `seen` (W, N); None where too few are."""
+    """Return the rows of `values` (W, N, C) of the group `name`; None where too few were seen."""
+    seen = np.asarray(np.all(windows.seen[..., SLICES[name]], axis=-1))
     count = seen.sum(axis=1)
     if not len(count) or count.max() < LEAST_ROWS:
         return None
     rows = int(np.quantile(count[count >= LEAST_ROWS], 0.1))
     chosen = np.flatnonzero(count >= rows)
-    chosen = chosen[:: -(-len(chosen) // limits.colour_windows)]
     first = np.argsort(~seen[chosen], axis=1, kind="stable")[:, :rows]
-    time_s = np.take_along_axis(np.asarray(windows.row_s)[chosen], first, axis=1)
-    span = time_s - time_s.mean(axis=1, keepdims=True)
-    span = span / np.abs(span).max(axis=1, keepdims=True)
-    powers = span[..., None] ** np.arange(limits.colour_degree + 1)
-    return _Stretches(time_s, np.take_along_axis(values[chosen], first[..., None], axis=1), powers)
+    times_s = np.take_along_axis(np.asarray(windows.row_s)[chosen], first, axis=1)
+    time_s = np.median(times_s, axis=0)
+    # What a lost row or jitter moves by a few rows has the same colour; a hole is another thing.
+    near = np.abs(times_s - time_s).max(axis=1) <= limits.colour_aside * np.diff(time_s).mean()
+    stacked = np.take_along_axis(values[chosen], first[..., None], axis=1)[near]
+    if not len(stacked):
+        return None
+    span = (time_s - time_s.mean()) / (time_s[-1] - time_s[0])
+    return _Stretches(
+        time_s,
+        np.moveaxis(stacked, 1, 0).reshape(rows, -1),
+        span[:, None] ** np.arange(limits.colour_degree + 1),
+        _drift(time_s - time_s[0], INTEGRATED.get(name, 0)),
+    )
 
 
-def _beside_polynomial(
-    stretches: _Stretches, share: float, lasts_s: float
-) -> tuple[np.ndarray, int, np.ndarray]:
-    """Return the energy (V, C) beside the polynomial, its freedom, and log-determinants (V,).
+def _drift(time_s: np.ndarray, integrated: int) -> np.ndarray:
+    """Return the covariance (N, N) of white noise integrated so often, 1 after a second."""
+    early, late = np.minimum.outer(time_s, time_s), np.maximum.outer(time_s, time_s)
+    if integrated == 2:
+        return 0.5 * early**2 * (3.0 * late - early)
+    return early if integrated == 1 else np.zeros_like(early)
 
-    Rows are whitened by the colour first.
+
+def _beside_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
+    """Return the energy (V * C,) beside the polynomial, its freedom, and half a log-determinant.
+
+    Rows are whitened by `process` first.
     """
-    lower = np.linalg.cholesky(_correlation(stretches.time_s, share, lasts_s))
-    over = np.linalg.solve(lower, np.concatenate([stretches.powers, stretches.values], axis=-1))
-    degree = stretches.powers.shape[-1]
-    powers, values = over[..., :degree], over[..., degree:]
-    turned = np.swapaxes(powers, 1, 2)
-    gram, along = turned @ powers, turned @ values
-    energy = (values**2).sum(axis=1) - (along * np.linalg.solve(gram, along)).sum(axis=1)
-    spread = np.log(np.einsum("vii->vi", lower)).sum(axis=1)
-    return energy, values.shape[1] - degree, spread + 0.5 * np.linalg.slogdet(gram)[1]
+    matrix = _correlation(stretches.time_s, process.share, process.lasts_s)
+    lower = np.linalg.cholesky(matrix + process.drift * stretches.drift)
+    both = np.concatenate([stretches.powers, stretches.values], axis=1)
+    over = solve_triangular(lower, both, lower=True, check_finite=False)
+    degree = stretches.powers.shape[1]
+    basis, upper = np.linalg.qr(over[:, :degree])
+    values = over[:, degree:]
+    energy = (values**2).sum(axis=0) - ((basis.T @ values) ** 2).sum(axis=0)
+    spread = np.log(np.diag(lower)).sum() + np.log(np.abs(np.diag(upper))).sum()
+    return energy, len(values) - degree, float(spread)
 
 
-def _likelihood(stretches: _Stretches, share: float, lasts_s: float) -> np.ndarray:
-    """Return the restricted log-likelihood (C,) of a colour.
+def _likelihood(stretches: _Stretches, process: _Process) -> float:
+    """Return the restricted log-likelihood of `process`.
 
     Every stretch has a size of noise of its own, so that a few bad ones do not decide.
     """
-    energy, freedom, spread = _beside_polynomial(stretches, share, lasts_s)
+    energy, freedom, spread = _beside_polynomial(stretches, process)
     size = 0.5 * freedom * np.log(np.maximum(energy, 1e-300))
-    return -(spread[:, None] + size).sum(axis=0)
+    return -float((spread + size).sum())
 
 
-def _likeliest(stretches: _Stretches, start: tuple[float, float]) -> tuple[float, float]:
-    """Return (share, T) of the likeliest colour, from `start` on."""
+def _by_time(
+    stretches: _Stretches, limits: Thresholds, times_s: Sequence[float] = TIMES_S
+) -> list[tuple[_Process, float]]:
+    """Return for each of `times_s` the likeliest process, and its gain over white noise.
 
-    def pair(x: np.ndarray) -> tuple[float, float]:
-        return float(1.0 / (1.0 + np.exp(-x[0]))), float(np.exp(np.clip(x[1], -6.0, 0.0)))
+    What noise explains nearly as well as a drift beside it is noise.
+    """
 
-    begin = np.array([np.log(start[0] / (1.0 - start[0])), np.log(start[1])])
-    options = {"maxfev": 40, "xatol": 0.05, "fatol": 0.2}
+    def likely(process: _Process) -> float:
+        beside = limits.drift_gain if process.drift else 0.0
+        return _likelihood(stretches, process) - beside
+
+    drifts = DRIFTS if stretches.drift.any() else (0.0,)
+    white = max((_Process(0.0, 1.0, drift) for drift in drifts), key=likely)
+    nothing, found = likely(white), []
+    for lasts_s in times_s:
+        alone = minimize_scalar(
+            lambda share, t=lasts_s: -likely(_Process(share, t, 0.0)),
+            bounds=(0.0, 0.999),
+            method="bounded",
+            options={"xatol": 0.01},
+        )
+        best = _Process(float(alone.x), lasts_s, 0.0)
+        if white.drift:
+            best = max(best, _with_drift(likely, best, white.drift), key=likely)
+        found.append((best, likely(best) - nothing))
+    return found
+
+
+def _with_drift(likely: Callable[[_Process], float], begin: _Process, drift: float) -> _Process:
+    """Return the likeliest process that lasts as long as `begin` and has a drift near `drift`."""
+
+    def process_at(x: np.ndarray) -> _Process:
+        share = float(1.0 / (1.0 + np.exp(-x[0])))
+        return begin._replace(share=share, drift=float(np.exp(np.clip(x[1], -12.0, 14.0))))
+
+    share = np.clip(begin.share, 0.01, 0.99)
     best = minimize(
-        lambda x: -_likelihood(stretches, *pair(x)).sum(),
-        begin,
+        lambda x: -likely(process_at(x)),
+        np.array([np.log(share / (1.0 - share)), np.log(drift)]),
         method="Nelder-Mead",
-        options=options,
+        options={"maxfev": 30, "xatol": 0.05, "fatol": 0.1},
     )
-    return pair(best.x)
+    return process_at(best.x)

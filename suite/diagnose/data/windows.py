@@ -25,12 +25,13 @@ HISTORY_S = 0.1
 """Commands before a window that a delay may reach [s]."""
 BURN_IN_S = 0.2
 """Before a window: the rotors follow the commands at the measured rates [s]."""
-STEPS = 64
-"""A window has a multiple of so many steps, those over of no length, so that shapes are few."""
-BURN_IN_STEPS = 16
+STEPS = (512, 704)
+"""A window has one of these numbers of steps, those over of no length, so that shapes are few: a
+second of steps of 2 ms, and of rows between which they have to be shorter."""
+BURN_IN_STEPS = (144,)
 """The same of the burn-in."""
-COMMANDS = 64
-"""The same of its commands."""
+COMMANDS = (192, 1536)
+"""The same of its commands: rows of 100 Hz, and of 1,000 Hz."""
 ROWS = 101
 """Measured rows in a window; a log that has more of them is thinned."""
 CHANNELS = 19
@@ -195,8 +196,10 @@ def _drive(log: FlightLog, first: int, vehicle: Vehicle, longest_s: float) -> _D
 def _of_one_shape(drives: Sequence[_Drive]) -> list[_Drive]:
     """Return `drives` with as many steps and commands each, so that few shapes are compiled."""
 
-    def most(counts: Iterable[int], multiple: int) -> int:
-        return -(-max(counts) // multiple) * multiple
+    def most(counts: Iterable[int], sizes: Sequence[int]) -> int:
+        count = max(counts)
+        fitting = [size for size in sizes if size >= count]
+        return fitting[0] if fitting else -(-count // sizes[0]) * sizes[0]
 
     burn_in = most((len(d.burn_in.look_s) for d in drives), BURN_IN_STEPS)
     steps = most((len(d.window.look_s) for d in drives), STEPS)

@@ -36,6 +36,12 @@ class Linearisation(NamedTuple):
     offset: np.ndarray
     """(W, F) of what is free in each window, where the residuals were taken."""
 
+    @property
+    def start_slope(self) -> np.ndarray:
+        """(W, N, 19, 12) along each window's start; for slopes whose last F are what is free."""
+        size = self.offset.shape[1]
+        return self.slope[..., self.slope.shape[-1] - size :][..., :STATE]
+
 
 class KnotResponse(NamedTuple):
     """What a disturbance at each knot of W windows does, and where the model is then."""

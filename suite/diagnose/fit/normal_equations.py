@@ -84,7 +84,7 @@ def information(
     limits: Thresholds = THRESHOLDS,
 ) -> np.ndarray:
     """Return what each window tells of each of the first `directions`, (W, K)."""
-    noise = measured_noise(linear.residual, windows, limits)
+    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
     return np.einsum("wkk->wk", normal_equations_of(whitening, linear, directions).hessian)
 
@@ -186,12 +186,14 @@ def fit(
     return best, equations
 
 
-def half_widths95(equations: NormalEquations) -> np.ndarray:
+def half_widths95(equations: NormalEquations, flight: np.ndarray | None = None) -> np.ndarray:
     """Return half-widths (K,) of 95 % intervals at the fit whose normal equations these are.
 
-    The larger of two covariances counts: that of the measurement noise (Gauss-Newton), and the
-    one in which each window's slope is one draw (the block sandwich; Liang and Zeger 1986), which
-    holds where errors within a window are not independent.
+    The largest of these counts: by the covariance of the noise (Gauss-Newton), and by the one in
+    which each window's slope is one draw (the block sandwich; Liang and Zeger 1986), which holds
+    where errors within a window are not independent. With `flight` (W,), the number of each
+    window's flight, one in which each flight is one draw: a model's error comes back in every
+    window of a flight.
     """
     count, size = equations.gradient.shape
     if not size:
@@ -199,8 +201,16 @@ def half_widths95(equations: NormalEquations) -> np.ndarray:
     hessian = equations.hessian.sum(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     inverse = np.linalg.pinv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
-    centred = equations.gradient - equations.gradient.mean(axis=0)
+
+    def by_draws(gradient: np.ndarray, freedom: int) -> np.ndarray:
+        centred = gradient - gradient.mean(axis=0)
+        blocks = inverse @ (centred.T @ centred * len(gradient) / freedom) @ inverse
+        return np.sqrt(np.maximum(np.diag(blocks), 0.0)) * float(student.ppf(0.975, freedom))
+
     freedom = max(count - size, 2)
-    blocks = inverse @ (centred.T @ centred * count / freedom) @ inverse
-    variance = np.maximum(np.diag(inverse), np.diag(blocks))
-    return np.sqrt(np.maximum(variance, 0.0)) * float(student.ppf(0.975, freedom))
+    widths = np.sqrt(np.maximum(np.diag(inverse), 0.0)) * float(student.ppf(0.975, freedom))
+    widths = np.maximum(widths, by_draws(equations.gradient, freedom))
+    if flight is not None and len(np.unique(flight)) > 2:
+        flights = [equations.gradient[flight == one].sum(axis=0) for one in np.unique(flight)]
+        widths = np.maximum(widths, by_draws(np.array(flights), len(flights) - 1))
+    return widths

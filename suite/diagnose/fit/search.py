@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.colour import Noise, measured_noise
+from suite.diagnose.data.colour import Noise, left_as_noise, measured_noise
 from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.fit.model import Linearisation, RolloutModel
 from suite.diagnose.fit.normal_equations import (
@@ -56,10 +56,20 @@ class SearchResult:
     noise: Noise
     """Measured beside what was found."""
     whitening: Whitening
+    judging: Whitening
+    """By which names, rivals and intervals were judged: where the model leaves more than noise, the
+    noise is what it leaves."""
+    judged: NormalEquations
+    """As `equations`, by `judging`."""
     first: list[CandidateScore]
     """Scores of all candidates before anything was named, best first."""
     explained: float
     """Fall of chi-square that the named effects bring."""
+
+    @property
+    def off(self) -> bool:
+        """Whether the model leaves more than noise, by which then everything is judged."""
+        return self.judging is not self.whitening
 
     @property
     def sigma(self) -> np.ndarray:
@@ -150,17 +160,46 @@ def search(
         item, estimate = _best_of_short_list(task, look, estimate, chosen, scores)
         named.append(NamedEffect(item.candidate, item.p_value, item.gain))
     named, estimate = _settle(task, look, named, estimate)
+    judge = look
+    if _off(task, look, named, estimate):
+        say("the model leaves more than noise: names are judged by what it leaves")
+        judge = _judge(task, look, named, estimate)
+        named, estimate = _settle(task, judge, named, estimate)
     indices = indices_of([n.candidate for n in named])
     rounds = limits.last_rounds if indices else 0
-    weighed = look.windows, look.whitening
-    estimate, last = fit(model, *weighed, estimate, indices, rounds, limits=limits)
+    weighed = look.windows, judge.whitening
+    estimate, judged = fit(model, *weighed, estimate, indices, rounds, limits=limits)
+    last = judged
+    if judge is not look:
+        estimate, last = fit(model, look.windows, look.whitening, estimate, indices, 0)
     nothing = last
     if indices:
         _, nothing = task.fit(look, start_estimate(model, look.windows), [])
     explained = float(nothing.chi2.sum() - last.chi2.sum())
     return SearchResult(
-        tuple(named), look.windows, estimate, last, look.noise, look.whitening, first, explained
-    )
+        tuple(named), look.windows, estimate, last, look.noise, look.whitening, judge.whitening,
+        judged, first, explained,
+    )  # fmt: skip
+
+
+def refitted(
+    model: RolloutModel,
+    found: SearchResult,
+    named: tuple[NamedEffect, ...],
+    limits: Thresholds = THRESHOLDS,
+) -> SearchResult:
+    """Return `found` with those of its names alone that are in `named`, at least one."""
+    indices = indices_of([one.candidate for one in named])
+    theta = model.space.array("start")
+    theta[indices] = found.estimate.theta[indices]
+    start, windows = Estimate(theta, found.estimate.offset), found.windows
+    best, judged = fit(model, windows, found.judging, start, indices, limits=limits)
+    _, last = fit(model, windows, found.whitening, best, indices, 0)
+    nothing = found.explained + float(found.equations.chi2.sum())
+    return replace(
+        found, named=named, estimate=best, equations=last, judged=judged,
+        explained=nothing - float(last.chi2.sum()),
+    )  # fmt: skip
 
 
 def trusted(
@@ -187,17 +226,43 @@ def trusted(
     return windows._replace(seen=seen)
 
 
-def _look(task: _Task, estimate: Estimate, known: Linearisation | None = None) -> _Look:
-    """Return the slopes of all windows at `estimate`, which `known` saves."""
+def _look(
+    task: _Task,
+    estimate: Estimate,
+    known: Linearisation | None = None,
+    noise: Noise | None = None,
+) -> _Look:
+    """Return the slopes of all windows at `estimate`, which `known` saves, as `noise` does its own.
+
+    Noise is measured best where the model fits best.
+    """
     model, limits = task.model, task.limits
     linear = known
     if linear is None:
         linear = model.linearise(estimate.theta, estimate.offset, task.windows, None)
-    noise = measured_noise(linear.residual, task.windows, limits)
+    noise = noise or measured_noise(linear.residual, linear.start_slope, task.windows, limits)
     view = trusted(task.windows, linear.residual, limits)
     whitening = make_whitening(linear, noise, view, limits)
     equations = normal_equations_of(whitening, linear, model.size)
     return _Look(linear, view, whitening, equations, noise)
+
+
+def _off(task: _Task, look: _Look, named: Sequence[NamedEffect], estimate: Estimate) -> bool:
+    """Return whether what is `named` leaves more than noise in the windows of `look`."""
+    indices = indices_of([n.candidate for n in named])
+    _, equations = task.fit(look, estimate, indices)
+    expected = look.whitening.slow_freedom.sum()
+    return bool(equations.slow_energy.sum() > task.limits.structure_rotor_input * expected)
+
+
+def _judge(task: _Task, look: _Look, named: Sequence[NamedEffect], estimate: Estimate) -> _Look:
+    """Return the slopes at the best fit of what is `named`, weighed by what that leaves."""
+    estimate, _ = task.fit(look, estimate, indices_of([n.candidate for n in named]))
+    linear = task.model.linearise(estimate.theta, estimate.offset, task.windows, None)
+    noise = left_as_noise(linear.residual, linear.start_slope, look.windows, task.limits)
+    whitening = make_whitening(linear, noise, look.windows, task.limits)
+    equations = normal_equations_of(whitening, linear, task.model.size)
+    return _Look(linear, look.windows, whitening, equations, noise)
 
 
 def _best_of_short_list(
@@ -241,7 +306,7 @@ def _settle(
             break
         estimate, _ = task.fit(look, estimate, indices_of(before))
         for place in range(len(named)):
-            named, estimate = _judge_rivals(task, named, place, estimate)
+            named, estimate = _judge_rivals(task, named, place, estimate, look.noise)
         needed = [n for n in named if n.p_value <= task.limits.name_p_value]
         if [n.candidate for n in needed] == before:
             break
@@ -255,7 +320,7 @@ def _settle(
 
 
 def _judge_rivals(
-    task: _Task, named: list[NamedEffect], place: int, estimate: Estimate
+    task: _Task, named: list[NamedEffect], place: int, estimate: Estimate, noise: Noise
 ) -> tuple[list[NamedEffect], Estimate]:
     """Weigh the name at `place` when added last; a better rival takes its place."""
     model, limits, one = task.model, task.limits, named[place]
@@ -263,7 +328,7 @@ def _judge_rivals(
     theta, own = estimate.theta.copy(), list(one.candidate.indices)
     theta[own] = model.space.array("start")[own]
     without = Estimate(theta, estimate.offset)
-    look = _look(task, without)
+    look = _look(task, without, noise=noise)
     at = indices_of(others)
     scores = {s.candidate: s for s in task.score(look.equations, theta, at)}
     if one.candidate in scores:

@@ -9,6 +9,7 @@ import numpy as np
 from suite.diagnose.data.windows import STATE_GROUPS
 from suite.diagnose.fit.search import SearchResult
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.gap import Gap
 from suite.diagnose.verdict.residual_structure import ResidualStructure
 
 
@@ -18,7 +19,8 @@ class Verdict(NamedTuple):
     label: str
     """no_gap, named, partly or unknown."""
     share_left: float = 0.0
-    """Structured residual over the structured gap before."""
+    """What is left of the gap on held-out flights, see `share_left`: 1 where nothing is
+    named, 0 where there is none."""
     where: str | None = None
     """What the residual goes with, in words."""
 
@@ -26,10 +28,14 @@ class Verdict(NamedTuple):
 def verdict_on(
     found: SearchResult,
     residual: ResidualStructure,
+    gaps: tuple[Gap, Gap],
     rotor_input: bool,
     limits: Thresholds = THRESHOLDS,
 ) -> Verdict:
-    """Return the verdict on what was found and on the structure in what it leaves over."""
+    """Return the verdict on what was found and on the structure in what it leaves over.
+
+    `gaps` are those before and after it was found.
+    """
     slow, expected = found.equations.slow_energy, found.whitening.slow_freedom
     shape = residual.shapes[0] if residual.shapes else None
     if shape is not None and shape.p_value > limits.shape_p_value:
@@ -41,15 +47,20 @@ def verdict_on(
     ]
     loud = limits.structure_rotor_input if rotor_input else limits.structure
     if not (shape or coloured or slow.sum() / expected.sum() > loud):
-        return Verdict("named" if found.named else "no_gap")
-    left = max(float((slow - expected).sum()), shape.gain if shape else 0.0, 1.0)
-    share = left / (left + max(found.explained, 0.0)) if found.named else 1.0
+        return Verdict("named", share_left(*gaps)) if found.named else Verdict("no_gap")
+    share = share_left(*gaps) if found.named else 1.0
     where = [shape.label] if shape else []
     if coloured:
         where.append("a changing " + ", ".join(coloured))
     partly = found.named and share <= limits.unexplained_share
     where = "; ".join(where) or _loudest(slow.sum(axis=0), expected.sum(axis=0))
     return Verdict("partly" if partly else "unknown", share, where)
+
+
+def share_left(before: Gap, after: Gap) -> float:
+    """Return how much of the gap above the noise floor is left, 0 to 1."""
+    left = max(after.rms - 1.0, 0.0)
+    return left / max(before.rms - 1.0, left, 1e-9)
 
 
 def _loudest(slow: np.ndarray, expected: np.ndarray) -> str:

@@ -57,7 +57,7 @@ class QuadrotorState(NamedTuple):
     """(B,) since the start [s]."""
 
 
-class Grid(NamedTuple):
+class Substeps(NamedTuple):
     """How a policy period is cut."""
 
     attitude: int
@@ -73,11 +73,11 @@ def whole_steps(steps: float) -> int:
     return max(1, round(steps - 1e-6))
 
 
-def grid(config: QuadrotorConfig, period_s: float) -> Grid:
-    """Return the grid nearest to the configured frequencies for a policy period."""
+def substeps(config: QuadrotorConfig, period_s: float) -> Substeps:
+    """Return the steps nearest to the configured frequencies for a policy period."""
     attitude_steps = whole_steps(period_s * config.attitude_hz)
     physics = whole_steps(period_s * config.physics_hz / attitude_steps)
-    return Grid(attitude_steps, physics, period_s / (attitude_steps * physics))
+    return Substeps(attitude_steps, physics, period_s / (attitude_steps * physics))
 
 
 def draw_effects(
@@ -155,7 +155,7 @@ def start_state(
 def fly_period(
     vehicle: Vehicle,
     plant: Plant,
-    cut: Grid,
+    cut: Substeps,
     body: QuadrotorState,
     action_b: jax.Array,
     heading: Callable[[jax.Array, jax.Array], jax.Array],
@@ -224,7 +224,7 @@ def quadrotor_dynamics(
         period_s: the policy's [s].
         gradient_decay: rate at which gradients of the motion fade back in time [1/s].
     """
-    cut = grid(config, period_s)
+    cut = substeps(config, period_s)
     left = float(np.exp(-gradient_decay * period_s))
     turn_s = cut.physics * cut.dt
 

@@ -3,12 +3,18 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.data.colour import Noise, colour_filter, measured_noise
+from suite.diagnose.data.colour import (
+    ESTIMATED,
+    Noise,
+    colour_filter,
+    left_as_noise,
+    measured_noise,
+)
 from suite.diagnose.data.windows import SLICES, cut
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
 
-GROUP = "velocity"
+GROUP = "attitude"
 
 
 @pytest.fixture(scope="module")
@@ -18,38 +24,60 @@ def windows():
     return found
 
 
-def noise_like(windows, share, lasts_s, rng):
-    """White noise of 1 in every channel, that of `GROUP` with a Gauss-Markov part."""
+def measured(residual, windows):
+    """The noise where nothing hangs on the start."""
+    return measured_noise(residual, np.zeros((*residual.shape, 12)), windows)
+
+
+def noise_like(windows, share, lasts_s, rng, group=GROUP):
+    """White noise of 1 in every channel, that of `group` with a Gauss-Markov part."""
     values = rng.standard_normal(windows.seen.shape)
-    shape = values[..., SLICES[GROUP]].shape
+    shape = values[..., SLICES[group]].shape
     slow = np.zeros(shape)
     slow[:, 0] = rng.standard_normal((shape[0], 3))
     keeps = np.exp(-np.diff(windows.row_s, axis=1) / lasts_s)[..., None]
     for row in range(1, shape[1]):
         fresh = np.sqrt(1.0 - keeps[:, row - 1] ** 2) * rng.standard_normal((shape[0], 3))
         slow[:, row] = keeps[:, row - 1] * slow[:, row - 1] + fresh
-    mixed = np.sqrt(1.0 - share) * values[..., SLICES[GROUP]] + np.sqrt(share) * slow
-    values[..., SLICES[GROUP]] = mixed
+    mixed = np.sqrt(1.0 - share) * values[..., SLICES[group]] + np.sqrt(share) * slow
+    values[..., SLICES[group]] = mixed
     return np.where(windows.seen, values, 0.0)
 
 
-@pytest.mark.parametrize(("share", "lasts_s"), [(0.85, 0.02), (0.7, 0.06), (0.9, 0.1)])
-def test_a_colour_is_found_where_it_is(windows, share, lasts_s):
-    noise = measured_noise(noise_like(windows, share, lasts_s, np.random.default_rng(0)), windows)
-    assert set(noise.coloured) == {GROUP}
-    found_share, found_s = noise.coloured[GROUP]
-    # A polynomial is off, so that long memories are known worse than how fast they begin.
-    assert 0.6 < (found_share / found_s) / (share / lasts_s) < 1.6
-    assert abs(found_share - share) < 0.2
-    np.testing.assert_allclose(noise.sigma[SLICES[GROUP]], 1.0, rtol=0.3)
-    np.testing.assert_allclose(noise.sigma[SLICES["position"]], 1.0, rtol=0.1)
+@pytest.mark.parametrize(
+    ("group", "share", "lasts_s"),
+    [("velocity", 0.85, 0.02), ("attitude", 0.7, 0.06), ("position", 0.9, 0.1),
+     ("position", 0.3, 0.05)],
+)  # fmt: skip
+def test_a_colour_is_found_where_it_is(windows, group, share, lasts_s):
+    values = noise_like(windows, share, lasts_s, np.random.default_rng(0), group)
+    noise = measured(values, windows)
+    assert group in noise.coloured
+    found_share, found_s = noise.coloured[group]
+    # What counts is how much of it there is at frequencies of a second.
+    assert 0.6 < (found_share * found_s) / (share * lasts_s) < 1.6
+    for name, (other_share, _) in noise.coloured.items():
+        assert name == group or other_share < 0.1
+    np.testing.assert_allclose(noise.sigma[SLICES[group]], 1.0, rtol=0.3)
+    np.testing.assert_allclose(noise.sigma[SLICES["rates"]], 1.0, rtol=0.1)
+
+
+def test_one_estimators_groups_speak_for_each_other(windows):
+    rng = np.random.default_rng(3)
+    weak = noise_like(windows, 0.02, 0.05, rng, "velocity")
+    pose = SLICES["position"]
+    weak[..., pose] = noise_like(windows, 0.9, 0.05, rng, "position")[..., pose]
+    coloured = measured(weak, windows).coloured
+    assert set(coloured) == set(ESTIMATED)
+    assert coloured["velocity"][1] == coloured["position"][1] == pytest.approx(0.05, rel=0.4)
+    assert coloured["velocity"][0] < 0.1
 
 
 def test_white_noise_and_a_slow_error_of_the_model_have_none(windows):
     residual = noise_like(windows, 0.0, 1.0, np.random.default_rng(1))
-    assert measured_noise(residual, windows).coloured == {}
+    assert measured(residual, windows).coloured == {}
     bent = residual + 5.0 * (windows.row_s**2)[..., None] * windows.seen
-    assert measured_noise(bent, windows).coloured == {}
+    assert measured(bent, windows).coloured == {}
 
 
 def test_the_filter_makes_rows_independent(windows):
@@ -60,3 +88,16 @@ def test_the_filter_makes_rows_independent(windows):
     neighbours = (white[:, 1:] * white[:, :-1]).mean() / (white**2).mean()
     assert abs(neighbours) < 0.03 < (values[:, 1:] * values[:, :-1]).mean()
     assert abs((white**2).mean() - 1.0) < 0.05
+
+
+def test_all_that_is_left_counts_as_noise_where_the_model_is_off(windows):
+    rng = np.random.default_rng(5)
+    residual = noise_like(windows, 0.0, 1.0, rng)
+    swing = np.sin(6.0 * windows.row_s[..., None] + rng.uniform(0.0, 6.0, (len(residual), 1, 3)))
+    residual[..., SLICES["velocity"]] += 8.0 * swing
+    nothing = np.zeros((*residual.shape, 12))
+    noise = left_as_noise(residual, nothing, windows)
+    np.testing.assert_allclose(noise.sigma[SLICES["velocity"]], 8.0 / np.sqrt(2.0), rtol=0.3)
+    share, lasts_s = noise.coloured["velocity"]
+    assert share > 0.95 and lasts_s > 0.1
+    np.testing.assert_allclose(noise.sigma[SLICES["position"]], 1.0, rtol=0.1)

@@ -18,7 +18,7 @@ def test_windows_hold_the_rows_and_commands_of_their_time():
     burn_in = windows.burn_in_rate_b.shape[1]
     np.testing.assert_allclose(windows.edge_s[:, [0, burn_in, -1]], [[-BURN_IN_S, 0, LENGTH_S]] * 3)
     steps = windows.rotor_speed.shape[1]
-    assert steps % STEPS == 0 and windows.edge_s.shape[1] == burn_in + steps + 1
+    assert steps == STEPS[0] and windows.edge_s.shape[1] == burn_in + steps + 1
     assert np.diff(windows.edge_s).min() >= 0.0
     row = int(np.searchsorted(log.time_s, windows.start_s[1] - 1e-9))
     np.testing.assert_array_equal(windows.pos_w[1], log.pos_w[row])
@@ -30,6 +30,26 @@ def test_windows_hold_the_rows_and_commands_of_their_time():
     np.testing.assert_allclose(np.diff(windows.command_sum[1, now : now + 2], axis=0)[0], held)
     chosen = take(windows, windows.start_s > 1.0)
     np.testing.assert_array_equal(chosen.pos_w, windows.pos_w[1:])
+
+
+def test_few_shapes_hold_rows_of_every_rate():
+    log = fly(PLAIN, 0, duration_s=2.0)
+    shapes = {}
+    for rate_hz in (50.0, 97.0, 140.0, 250.0, 310.0, 400.0, 990.0):
+        rows = np.arange(0.0, 1.9, 1.0 / rate_hz)
+        near = np.clip(np.searchsorted(log.time_s, rows), 0, len(log.time_s) - 1)
+        arrays = {name: value[near] for name, value in vars(log).items()
+                  if isinstance(value, np.ndarray) and len(value) == len(log.time_s)}  # fmt: skip
+        windows, _ = cut([replace(log, **{**arrays, "time_s": rows})], PLAIN, False)
+        assert windows is not None
+        shape = (windows.edge_s.shape[1], windows.command_s.shape[1])
+        shapes.setdefault(shape, []).append(rate_hz)
+    assert shapes == {
+        (144 + 512 + 1, 192): [50.0, 97.0],
+        (144 + 704 + 1, 192): [140.0],
+        (144 + 512 + 1, 1536): [250.0, 400.0, 990.0],
+        (144 + 704 + 1, 1536): [310.0],
+    }
 
 
 def test_what_is_an_input_or_derived_is_no_measurement():

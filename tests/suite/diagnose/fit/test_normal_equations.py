@@ -61,3 +61,18 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
         inside.extend(np.abs(best - [0.3, -0.2]) < half)
     # Of 200, 190 are expected inside; fewer than 180 come with a chance of 0.1 %.
     assert sum(inside) >= 180
+
+
+def test_intervals_know_that_an_error_comes_back_in_every_window_of_a_flight():
+    rng, inside = np.random.default_rng(2), {"windows": [], "flights": []}
+    flight = np.repeat(np.arange(6), 8)
+    for _ in range(100):
+        slope = rng.standard_normal((6, 1, 20, 2)) + 0.3 * rng.standard_normal((6, 8, 20, 2))
+        residual = rng.standard_normal((6, 1, 20, 1)) + 0.1 * rng.standard_normal((6, 8, 20, 1))
+        hessian, gradient = products(slope.reshape(48, 20, 2), residual.reshape(48, 20, 1))
+        best = np.linalg.solve(hessian.sum(0), gradient.sum(0))
+        left = NormalEquations(hessian, gradient - hessian @ best, np.zeros(48), np.zeros(0))
+        inside["windows"].extend(np.abs(best) < half_widths95(left))
+        inside["flights"].extend(np.abs(best) < half_widths95(left, flight))
+    assert np.mean(inside["windows"]) < 0.7
+    assert np.mean(inside["flights"]) > 0.88

@@ -21,22 +21,28 @@ from suite.diagnose.verdict.residual_structure import (
 )
 from suite.diagnose.verdict.shapes import shape_library
 from suite.diagnose.verdict.turbulence import _likelihood, find_turbulence
-from suite.diagnose.verdict.verdict import Verdict, verdict_on
+from suite.diagnose.verdict.verdict import Verdict, share_left, verdict_on
 
 
 def gap(energy):
     return Gap(np.asarray(energy) / 10.0, np.asarray(energy), {})
 
 
-def searched(slow=1.0, named=(), explained=0.0) -> Any:
+def searched(slow=1.0, named=()) -> Any:
     """As much of a search's result as a verdict needs: 10 windows of slow errors."""
     whitening = SimpleNamespace(slow_freedom=np.full((10, STATE), 5.0))
     energy = np.full((10, STATE), 5.0)
     energy[:, 6] *= slow
     equations = SimpleNamespace(slow_energy=energy)
-    return SimpleNamespace(
-        named=named, whitening=whitening, equations=equations, explained=explained
-    )
+    return SimpleNamespace(named=named, whitening=whitening, equations=equations)
+
+
+def scores(before, after):
+    """Gaps whose energy above the noise floor is `before` and `after`."""
+    return tuple(Gap(np.full(8, 1.0 + above), np.zeros(8), {}) for above in (before, after))
+
+
+SAME = scores(0.0, 0.0)
 
 
 def left(p_value=0.5, coloured=0.5, gain=1.0):
@@ -45,32 +51,41 @@ def left(p_value=0.5, coloured=0.5, gain=1.0):
 
 
 def test_noise_alone_is_no_gap_and_a_name_without_structure_is_named():
-    assert verdict_on(searched(), left(), False) == Verdict("no_gap")
-    assert verdict_on(searched(named=("drag",)), left(), False) == Verdict("named")
+    assert verdict_on(searched(), left(), SAME, False) == Verdict("no_gap")
+    assert verdict_on(searched(named=("drag",)), left(), SAME, False) == Verdict("named")
 
 
 def test_structure_is_told_by_what_it_goes_with():
-    shaped = verdict_on(searched(), left(p_value=1e-4), False)
+    shaped = verdict_on(searched(), left(p_value=1e-4), SAME, False)
     assert shaped == Verdict("unknown", 1.0, "force with the speed")
-    coloured = verdict_on(searched(), left(coloured=1e-6), False)
+    coloured = verdict_on(searched(), left(coloured=1e-6), SAME, False)
     assert coloured.where == "a changing " + ", ".join(AXES)
-    loud = verdict_on(searched(slow=10.0), left(), False)
+    loud = verdict_on(searched(slow=10.0), left(), SAME, False)
     assert loud.label == "unknown" and loud.where == "errors of velocity x"
 
 
 def test_what_explains_most_is_named_in_part():
-    found = searched(named=("drag",), explained=1000.0)
-    verdict = verdict_on(found, left(p_value=1e-4, gain=100.0), False)
-    assert verdict.label == "partly" and verdict.share_left == pytest.approx(1 / 11)
-    assert verdict_on(found, left(p_value=1e-4, gain=2000.0), False).label == "unknown"
+    found, seen = searched(named=("drag",)), left(p_value=1e-4)
+    verdict = verdict_on(found, seen, scores(11.0, 1.0), False)
+    assert verdict.label == "partly" and verdict.share_left == pytest.approx(
+        (2**0.5 - 1.0) / (12**0.5 - 1.0)
+    )
+    assert verdict_on(found, seen, scores(11.0, 9.0), False).label == "unknown"
+
+
+def test_the_share_that_is_left_is_that_of_the_gaps():
+    before, after = scores(24.0, 6.0)
+    assert (before.rms, after.rms) == (5.0, pytest.approx(np.sqrt(7.0)))
+    assert share_left(before, after) == pytest.approx((7**0.5 - 1.0) / 4.0)
+    assert share_left(after, before) == 1.0 and share_left(*scores(3.0, -0.1)) == 0.0
 
 
 def test_rotor_speeds_as_input_may_be_noisier():
     quiet = searched(slow=3.0)
-    assert verdict_on(quiet, left(coloured=1e-6), True) == Verdict("no_gap")
-    assert verdict_on(quiet, left(), False).label == "unknown"
+    assert verdict_on(quiet, left(coloured=1e-6), SAME, True) == Verdict("no_gap")
+    assert verdict_on(quiet, left(), SAME, False).label == "unknown"
     strict = replace(THRESHOLDS, structure_rotor_input=1.1)
-    assert verdict_on(quiet, left(), True, strict).label == "unknown"
+    assert verdict_on(quiet, left(), SAME, True, strict).label == "unknown"
 
 
 def test_a_gaps_interval_holds_it_and_a_rise_is_seen():

@@ -15,7 +15,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from suite.commands.train import Config, resolve
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
-from suite.train.dynamics.quadrotor import QuadrotorParams, grid, quadrotor_dynamics
+from suite.train.dynamics.quadrotor import QuadrotorParams, quadrotor_dynamics, substeps
 from suite.train.gradient import make_gradient
 from suite.train.rollout import make_rollout
 from suite.train.worlds import sample_worlds
@@ -111,7 +111,7 @@ def fly_judge(vehicle, actions, rate_hz):
 def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(float64, vehicle):
     """At 20 Hz a period is 5 steps of the judge's attitude loop, 25 of its physics."""
     config = QuadrotorConfig(vehicle, physics_hz=500.0, **ALIKE)
-    assert grid(config, 0.05) == (5, 5, 0.002)
+    assert substeps(config, 0.05) == (5, 5, 0.002)
     actions = lively_actions(40)
     ours, judged = fly_trainer(config, actions, 20.0), fly_judge(vehicle, actions, 20.0)
     assert np.ptp(judged[0], axis=0).max() > 1.0 and judged[1][..., 2, 2].min() < 0.95
@@ -124,7 +124,7 @@ def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(floa
 def test_training_steps_stay_near_the_judges(float64, vehicle):
     """At 15 Hz with 250 Hz physics: 7 steps of 9.5 ms for the judge's 6 or 7 of 10 ms."""
     config = QuadrotorConfig(vehicle, **ALIKE)
-    cut = grid(config, 1 / 15)
+    cut = substeps(config, 1 / 15)
     assert cut[:2] == (7, 2) and cut.dt == pytest.approx(1 / 15 / 14)
     actions = lively_actions(15)
     ours, judged = fly_trainer(config, actions, 15.0), fly_judge(vehicle, actions, 15.0)

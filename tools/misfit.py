@@ -1,0 +1,138 @@
+"""A model that is wrong by design: does the diagnosis still say the truth about a drag?
+
+    python tools/misfit.py COUNT [SEED]
+
+Every case hides a linear drag and, beside it, a force that goes with the place in a way that no
+effect describes, so strong that the flights are 20 times the noise off a model that has the drag.
+Prints a line a case, then how many 95 % intervals of the drag hold the truth and how many cases
+have a false name.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from eval.judging.statistics import wilson
+from eval.logs.flight_log import FlightLog
+from eval.quadrotor.plant import Motion, Wrench
+from eval.vehicles.vehicle import Vehicle, with_effects
+from suite.blind.cases import CONTINUOUS, Case
+from suite.blind.outside import Law, Push
+from suite.blind.simulators import simulator_for
+from suite.common.compiled import keep_compiled
+from suite.common.running.threads import one_thread_a_product
+from suite.diagnose.data.colour import Noise, measured_noise
+from suite.diagnose.data.windows import cut
+from suite.diagnose.diagnose import diagnose
+from suite.diagnose.fit.model import RolloutModel
+from suite.diagnose.fit.normal_equations import start_estimate
+from suite.diagnose.fit.parameters import make_space
+from suite.diagnose.plans.simulate import FlightFailed
+from suite.diagnose.plans.trajectory import ordinary_flights
+from suite.diagnose.report.diagnosis_json import diagnosis_json
+from suite.diagnose.verdict.gap import gap_of
+
+OFF = 20.0
+"""How far flights are off a model that has the drag, in units of noise."""
+DRAG = "linear_drag"
+WAVES = 3
+"""Of the force along each axis of the world."""
+LENGTH_M = (3.0, 10.0)
+"""Shortest and longest of them [m]."""
+FIRST = 0.3
+"""The force's root mean square that is tried first [m/s^2]."""
+TRIES = 8
+"""Draws until one can be flown."""
+
+
+def force_law(rng: np.random.Generator) -> Law:
+    """Return a smooth force over the place with a root mean square of `strength` an axis."""
+    way = rng.standard_normal((3, WAVES, 3))
+    length_m = rng.uniform(*LENGTH_M, (3, WAVES, 1))
+    way *= 2.0 * np.pi / length_m / np.linalg.norm(way, axis=-1, keepdims=True)
+    phase = rng.uniform(0.0, 2.0 * np.pi, (3, WAVES))
+    size = rng.standard_normal((3, WAVES))
+    size *= np.sqrt(2.0 / (size**2).sum(axis=1, keepdims=True))
+
+    def law(strength: float, mass: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
+        along = np.einsum("akw,nw->nak", way, motion.pos_w)
+        return strength * (size * np.sin(along + phase)).sum(axis=-1)
+
+    return law
+
+
+def gap_with(
+    logs: Sequence[FlightLog], vehicle: Vehicle, noise: Noise | None
+) -> tuple[float, Noise]:
+    """Return how far `logs` are off `vehicle`, in units of `noise` or else their own; and it."""
+    windows, _ = cut(logs, vehicle, rotor_input=False)
+    assert windows is not None
+    model = RolloutModel(vehicle, make_space(vehicle), rotor_input=False, voltage=False)
+    begin = start_estimate(model, windows)
+    linear = model.linearise(begin.theta, begin.offset, windows, model.starts)
+    noise = noise or measured_noise(linear.residual, linear.start_slope, windows)
+    return gap_of(linear, windows, noise).rms, noise
+
+
+def one(seed: list[int]) -> tuple[list[bool], list[str], str]:
+    """Return whether the drag's intervals hold it, the false names, and a line for people.
+
+    Raises:
+        FlightFailed: where this draw cannot be flown.
+    """
+    rng = np.random.default_rng(seed)
+    case = Case("outside", (), 0.0, "bare", "capture", (0, 0), simulator=CONTINUOUS)
+    simulator = simulator_for(case, rng)
+    drag = rng.uniform(0.15, 0.6, 3) * [1.0, 1.0, 0.5]
+    truth = with_effects(simulator.given, {DRAG: EFFECTS[DRAG].values(tuple(drag.tolist()))})
+    ways, law, chance = ordinary_flights(rng), force_law(rng), int(rng.integers(2**32))
+
+    def logs(strength: float) -> tuple[FlightLog, ...]:
+        again = np.random.default_rng(chance)
+        extra = Push(strength, truth.mass, law)
+        return simulator.fly(truth, ways, again, extra).logs(again)
+
+    _, noise = gap_with(logs(0.0), truth, None)
+    strength = FIRST * OFF / gap_with(logs(FIRST), truth, noise)[0]
+    flown = logs(strength)
+    off, _ = gap_with(flown, truth, noise)
+    found = diagnosis_json(diagnose(flown, simulator.given))
+    held, false = list[bool](), list[str]()
+    for effect in found["effects"]:
+        if DRAG not in (effect["name"], *effect["alternatives"]):
+            false.append(effect["name"])
+        if effect["name"] == DRAG:
+            bounds = effect["parameters"]["coefficient"]["ci95"]
+            held = [bool(b and b[0] <= x <= b[1]) for b, x in zip(bounds, drag, strict=True)]
+    names = [effect["name"] for effect in found["effects"]]
+    gap = found["gap"]
+    line = f"{found['verdict']} {names}, drag held {held}, off by {off:.1f}"
+    return held, false, f"{line}, gap {gap['before']:.1f} -> {gap['after']:.1f}"
+
+
+def main(count: int, seed: int) -> int:
+    """Try `count` cases and return the exit code."""
+    keep_compiled()
+    held, false = list[bool](), 0
+    for number in range(count):
+        for attempt in range(TRIES):
+            try:
+                inside, wrong, line = one([seed, number, attempt])
+            except FlightFailed:
+                continue
+            held, false = [*held, *inside], false + bool(wrong)
+            print(f"{number}: {line}", flush=True)
+            break
+    print(f"intervals of a named drag that hold it: {sum(held)} of {len(held)}", end=" ")
+    print(f"({wilson(sum(held), max(len(held), 1))})" if held else "")
+    print(f"cases with a false name: {false} of {count} ({wilson(false, count)})")
+    return 0 if sum(held) >= 0.85 * len(held) and false <= 0.1 * count else 1
+
+
+if __name__ == "__main__":
+    one_thread_a_product()
+    raise SystemExit(main(int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0))
