@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
-
-from eval.quadrotor.vehicle_file import load_vehicle  # noqa: E402
-from eval.worlds.trial import TrialSpec, track_of  # noqa: E402
-from suite.judging.link.companion import Companion  # noqa: E402
-from suite.judging.link.messages import State, Wire, image_packets  # noqa: E402
-from tests.support.pilots import Pursuit  # noqa: E402
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import TrialSpec, track_of
+from suite.judging.link.companion import Companion
+from suite.judging.link.messages import State, Wire, image_packets
+from tests.support.pilots import Pursuit
 
 TRIAL = TrialSpec("zigzag", 0, 0)
 

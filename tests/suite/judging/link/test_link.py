@@ -32,6 +32,8 @@ from suite.judging.link.watchdog import Limits
 from tests.support.pilots import Pursuit, Steady
 from tracks.geometry.rotation import quat_to_rot
 
+pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
+
 
 def test_frames_are_one_half_turn_about_x():
     rng = np.random.default_rng(0)
