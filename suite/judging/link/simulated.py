@@ -88,7 +88,7 @@ class SimulatedVehicle:
         count = np.array([len(gates.center_w)], np.int32)
         self._course = Course(Gates(*(x[None] for x in gates)), count)
         self._progress = start_progress(motion.pos_w)
-        self._eye, self._image_every = Eye(camera), max(1, round(1 / (image_hz * self.dt)))
+        self._eye, self._steps_an_image = Eye(camera), 1 / (image_hz * self.dt)
         self._command: Command | None = None
         self._heard_step = self._ticks = 0
         self.images = 0
@@ -134,7 +134,7 @@ class SimulatedVehicle:
 
     def _measured(self, motion: Motion, clock_s: float) -> list[bytes]:
         sent = []
-        if self._ticks % self._image_every == 0:
+        if self._ticks >= round(self.images * self._steps_an_image):
             depth = self._eye.image(self._model, self._data, motion.pos_w[0], motion.rot_w[0])
             packets = image_packets(depth, self._eye.camera.range_m)
             sent += [self._wire.encoded(packet) for packet in packets]

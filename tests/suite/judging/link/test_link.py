@@ -236,6 +236,8 @@ def test_both_ends_agree_on_the_flight(flown, tmp_path):
     assert np.mean([row.decided for row in rows]) == pytest.approx(0.3, abs=0.02)
     found = delays(rows, 0.02)
     assert found["deadlines_missed"] == 0 and found["state_age_ms"]["max"] < 3.0
+    # The camera keeps time with the decisions: no image waits for a whole period.
+    assert found["image_age_ms"]["max"] <= 10.0 + 1e-6
     name = write_log(companion, sim.result("pursuit")._asdict(), tmp_path)
     log = read_flight(tmp_path / name)
     assert log.about["handed_over"] is None and log.about["events"]
