@@ -19,8 +19,9 @@ SUFFIXES = {
     ".onnx": "ONNX",
     ".pt2": "torch exported program, needs trust",
     ".pt": "TorchScript, needs trust",
+    ".c": "C with policy.h beside it, needs trust and a C compiler",
 }
-"""Kinds of policy file by suffix; a folder is a checkpoint of ours."""
+"""Kinds of policy file by suffix; a folder is a checkpoint of ours, or holds policy.c."""
 
 
 class Policy(Protocol):
@@ -63,9 +64,9 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
 
     Args:
         name_or_path: the name of a shipped policy, a checkpoint's folder, or a file: .onnx, .pt2
-            (torch exported program), .pt (TorchScript).
-        trust: also load what can run code on this machine while it is being loaded: .pt2 and .pt.
-            Checkpoints of ours and ONNX of standard operators need none.
+            (torch exported program), .pt (TorchScript), policy.c or its folder.
+        trust: also load what can run code on this machine: .pt2, .pt and .c. Checkpoints of ours
+            and ONNX of standard operators need none.
 
     Raises:
         PolicyError: for an unknown name, or a file that cannot be used or is not safe; the message
@@ -77,6 +78,10 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
 
         return load_native(shipped.folder(text), text)
     path = Path(name_or_path)
+    if path.suffix == ".c" and path.is_file() or _holds_c(path):
+        from policies.formats.c.c_file import load_c
+
+        return load_c(path, trust)
     if path.is_dir():
         from policies.native import load_native
 
@@ -101,6 +106,10 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
     raise PolicyError(
         f"{path}: not a policy file; allowed are a checkpoint's folder, {kinds}; {hint}"
     )
+
+
+def _holds_c(path: Path) -> bool:
+    return (path / "policy.c").is_file() and not (path / "config.json").exists()
 
 
 def _missing(text: str, path: Path) -> PolicyError:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from eval.judging.ages import Delays
 from eval.judging.guard import ActionLimits, guard_action
 from eval.judging.recorder import Recorder
 from eval.judging.sensors import SensorNoise, Sensors, check_noise
@@ -205,6 +206,9 @@ class _Slots:
         self._recorder = Recorder(n, task.record.depth) if task.record else None
         noise, range_m = task.options.noise, policy.spec.camera.range_m
         self._sensors = None if noise.is_none else Sensors(noise, n, rate, range_m)
+        self._delays = None
+        if noise.is_late:
+            self._delays = Delays(noise, n, self._steps_a_decision, world.dt)
 
     def run(self, share: Sequence[Numbered]) -> Iterator[Ended]:
         """Fly the numbered trials; every slot takes the next one when its own has ended."""
@@ -241,6 +245,8 @@ class _Slots:
             track = track_of(self._task.tracks, trial)
             if self._sensors:
                 self._sensors.start(slot, trial, len(track.scene.gates.center_w))
+            if self._delays:
+                self._delays.start(slot, trial)
             entries.append((slot, track, trial))
         if entries:
             self._world.load(entries)
@@ -249,6 +255,8 @@ class _Slots:
         """Ask the policy once and fly its answers until its next decision."""
         spec, flying = self._policy.spec, self._index >= 0
         seen = self._world.view(flying)
+        if self._delays:
+            seen = self._delays.see(seen, self._fresh, flying)
         if self._sensors:
             seen = self._sensors.see(seen, self._world.progress.gates, flying)
         state, image = observe(spec, seen, self._action_b)
@@ -269,8 +277,20 @@ class _Slots:
         next_at = np.rint((self._decision + 1) * self._steps_a_decision)
         steps = (next_at - np.rint(self._decision * self._steps_a_decision)).astype(int)
         self._decision += 1
-        rows = self._world.advance(self._action_b, np.where(flying, steps, 0), bool(self._recorder))
-        for row in rows:
+        self._fly_steps(np.where(flying, steps, 0), flying)
+
+    def _fly_steps(self, steps: np.ndarray, flying: np.ndarray) -> None:
+        """Fly the actions for each slot's physics steps (N,); take views that will be old."""
+        done = np.zeros_like(steps)
+        for pause, aged in self._delays.pauses if self._delays else ():
+            part = np.minimum(steps, pause)
+            self._advance(part - done)
+            done = part
+            aged.take(self._world.view(flying))
+        self._advance(steps - done)
+
+    def _advance(self, steps: np.ndarray) -> None:
+        for row in self._world.advance(self._action_b, steps, bool(self._recorder)):
             if self._recorder:
                 self._recorder.add(row)
 

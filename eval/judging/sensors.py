@@ -38,10 +38,21 @@ class SensorNoise:
     """Of the estimated attitude, about each body axis [rad]."""
     correlation_s: float = 0.5
     """Time over which errors of the estimated state change; 0: they are white [s]."""
+    state_age_s: float = 0.0
+    """How old the state is at the decision (`eval/judging/ages.py`) [s]."""
+    image_age_s: float = 0.0
+    """How old the image is at the decision [s]."""
+    image_loss: float = 0.0
+    """Share of the images that do not come; the one before is seen again [1]."""
+
+    @property
+    def is_late(self) -> bool:
+        """Say whether anything is old or lost."""
+        return bool(self.state_age_s or self.image_age_s or self.image_loss)
 
     @property
     def is_none(self) -> bool:
-        """Say whether nothing is added."""
+        """Say whether nothing is added; ages and losses add nothing."""
         return not (self.inverse_depth or self.gate_m or self.of_state)
 
     @property
@@ -58,6 +69,8 @@ def check_noise(noise: SensorNoise) -> None:
     """
     for field in fields(noise):
         value = getattr(noise, field.name)
+        if field.name == "image_loss" and value > 1:
+            raise ValueError(f"sensor noise image_loss is {value!r}; allowed are shares, 0 to 1")
         if not (math.isfinite(value) and value >= 0):
             raise ValueError(
                 f"sensor noise {field.name} is {value!r}; allowed are finite numbers, 0 or more"

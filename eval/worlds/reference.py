@@ -47,7 +47,12 @@ def fly_trial(
         rows: of the policy's inputs; all but the first are zero. The rows of a call to the policy
             are as many as in the batched worlds, since some policies answer otherwise then.
         noise: what is wrong with the policy's observation.
+
+    Raises:
+        ValueError: for observations that are old or lost, which this world has not.
     """
+    if noise and noise.is_late:
+        raise ValueError("world 'reference' shows nothing late; fly in 'mujoco', which flies alike")
     rules, limits = rules or Rules(), limits or ActionLimits()
     autopilot = make_autopilot(vehicle)
     dt, spec = autopilot.dt, policy.spec

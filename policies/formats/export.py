@@ -1,4 +1,4 @@
-"""Our policy written for other programs: torch exported program (.pt2) and ONNX."""
+"""Our policy written for other programs: torch exported program (.pt2), ONNX and C."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import io
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from policies import shipped
 from policies.errors import PolicyError
@@ -14,24 +15,74 @@ from policies.formats.policy_file import PolicyCheckpoint, load_policy_checkpoin
 from tracks.common.files import replacing_file
 from tracks.common.names import unknown_name
 
+if TYPE_CHECKING:
+    from policies.formats.c.forward import Observed
+
 
 def export_policy(
-    name_or_folder: str | Path, out: Path, formats: Iterable[str] = ("torch", "onnx")
+    name_or_folder: str | Path,
+    out: Path,
+    formats: Iterable[str] = ("torch", "onnx"),
+    dtype: str = "float32",
+    observed: Observed | None = None,
 ) -> list[Path]:
-    """Write a policy of ours as torch program and ONNX; `load_policy` reads both (.pt2 with trust).
+    """Write a policy of ours for other programs; `load_policy` reads all (with trust .pt2 and C).
 
     Args:
         name_or_folder: a shipped policy's name or a checkpoint's folder.
-        out: the folder that the files go to, as NAME.pt2 and NAME.onnx.
-        formats: which of "torch" and "onnx".
+        out: the folder that the files go to: NAME.pt2, NAME.onnx; for C policy.h, policy.c and what
+            checks them.
+        formats: which of `FORMATS`.
+        dtype: of the weights of C, "float32" or "int8".
+        observed: what the policy was given in flights, by which int8 scales its activations.
 
     Returns:
         The files' paths.
 
     Raises:
-        PolicyError: where the checkpoint cannot be used.
-        ValueError: for an unknown format.
+        PolicyError: where the checkpoint cannot be used, or int8 has no observations.
+        ValueError: for an unknown format or type, or a type that the format has not.
         OSError: where the disk refuses; no half file is left.
+    """
+    chosen = list(formats)
+    check_formats(chosen, dtype)
+    name, checkpoint = exported_checkpoint(name_or_folder)
+    label = embed(checkpoint.spec, name, checkpoint.config["seed"])
+    written = []
+    for wanted in chosen:
+        if wanted == "c":
+            from policies.formats.c.project import c_project
+
+            texts = c_project(checkpoint, name, dtype, observed).files
+            files = {file: text.encode() for file, text in texts.items()}
+        else:
+            suffix, write = _WRITERS[wanted]
+            files = {f"{name}{suffix}": write(checkpoint, label)}
+        for file, data in files.items():
+            with replacing_file(out / file) as beside:
+                beside.write_bytes(data)
+            written.append(out / file)
+    return written
+
+
+def check_formats(formats: Iterable[str], dtype: str = "float32") -> None:
+    """Refuse what cannot be written.
+
+    Raises:
+        ValueError: for an unknown format or type, or a type that the format has not.
+    """
+    for wanted in formats:
+        if wanted not in FORMATS:
+            raise unknown_name("format", wanted, FORMATS)
+        if dtype != "float32" and wanted != "c":
+            raise ValueError(f"format {wanted} is float32 alone; {dtype} goes with --format c")
+
+
+def exported_checkpoint(name_or_folder: str | Path) -> tuple[str, PolicyCheckpoint]:
+    """Return the name and the checkpoint of a policy of ours.
+
+    Raises:
+        PolicyError: where it is none, or cannot be used.
     """
     folder = shipped.locate(name_or_folder)
     if not folder.is_dir():
@@ -39,22 +90,7 @@ def export_policy(
             f"{name_or_folder}: not a shipped policy ({', '.join(shipped.names()) or 'none'}) and "
             "not a checkpoint's folder; only policies of ours can be exported"
         )
-    chosen = list(formats)
-    for wanted in chosen:
-        if wanted not in _WRITERS:
-            raise unknown_name("format", wanted, _WRITERS)
-    checkpoint = load_policy_checkpoint(folder)
-    name = folder.resolve().name
-    label = embed(checkpoint.spec, name, checkpoint.config["seed"])
-    written = []
-    for wanted in chosen:
-        suffix, write = _WRITERS[wanted]
-        path = out / f"{name}{suffix}"
-        data = write(checkpoint, label)
-        with replacing_file(path) as beside:
-            beside.write_bytes(data)
-        written.append(path)
-    return written
+    return folder.resolve().name, load_policy_checkpoint(folder)
 
 
 def torch_program(checkpoint: PolicyCheckpoint, label: str) -> bytes:
@@ -91,3 +127,5 @@ _WRITERS: dict[str, tuple[str, Callable[[PolicyCheckpoint, str], bytes]]] = {
     "torch": (".pt2", torch_program),
     "onnx": (".onnx", onnx_file),
 }
+FORMATS = (*_WRITERS, "c")
+"""Names of formats."""

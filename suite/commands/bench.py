@@ -11,6 +11,7 @@ import tyro
 from suite.common.console import Console
 from suite.experiments.bench import BENCHES
 from tracks.common.files import plain
+from tracks.common.grid import rich_table
 from tracks.common.names import unknown_name
 
 
@@ -42,10 +43,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     bench = importlib.import_module(f"suite.experiments.bench.{config.name}")
     result = bench.run()
     answer = {**plain(result), "ratio": result.ratio, "warnings": [*busy, *result.warnings]}
+    del answer["grid"]
     for side, figure in (("ours", result.ours), ("baseline", result.baseline)):
         console.say(f"{side:<9} {figure.value:.4g} {figure.unit}")
     console.say(f"ratio     {result.ratio:.2f} (above 1: ours is faster)")
-    for name, value in answer["details"].items():
+    if result.grid:
+        console.show(rich_table(result.grid))
+    for name, value in ({} if result.grid else answer["details"]).items():
         console.say(f"{name}: {value}")
     for warning in answer["warnings"]:
         console.note(f"warning: {warning}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -13,12 +13,19 @@ from suite.common.console import Console, size
 
 @dataclass(frozen=True)
 class Config:
-    """Write a policy of ours as torch exported program (.pt2) and ONNX (.onnx)."""
+    """Write a policy of ours as torch program (.pt2), ONNX (.onnx) and C (policy.h, policy.c)."""
 
-    policy: tyro.conf.Positional[str] = ""
+    name: tyro.conf.Positional[str] = ""
     """A shipped policy's name or a checkpoint's folder; by default the shipped policy."""
-    formats: tuple[str, ...] = ("torch", "onnx")
-    """Which of torch and onnx."""
+    policy: str = ""
+    """The same as an option."""
+    formats: Annotated[tuple[str, ...], tyro.conf.arg(name="format", aliases=["--formats"])] = (
+        "torch",
+        "onnx",
+    )
+    """Which of torch, onnx and c."""
+    dtype: str = "float32"
+    """Of the weights in C: float32 or int8."""
     out: Path = Path("runs/export")
     """Folder for the files."""
     json: bool = False
@@ -29,12 +36,15 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Write the files and say where they are.
 
     Raises:
-        ValueError: where the policy is not ours or a format is unknown.
+        ValueError: where the policy is not ours, or a format or type is unknown.
     """
-    from policies.formats.export import export_policy
+    from suite.judging.deploy.exporting import export
     from suite.judging.flying import default_policy
 
-    written = export_policy(config.policy or default_policy(), config.out, config.formats)
-    for path in written:
+    if config.name and config.policy and config.name != config.policy:
+        raise ValueError(f"--policy {config.policy}: {config.name} was asked for, too; give one")
+    asked = config.policy or config.name or default_policy()
+    answer = export(asked, config.out, config.formats, config.dtype, console)
+    for path in answer["written"]:
         console.say(f"written: {path} ({size(path.stat().st_size)})")
-    return {"written": written}
+    return answer

@@ -14,6 +14,7 @@ from suite.judging.flying import (
     default_policy,
     flying_needs,
     labels,
+    load_flier,
     options_for,
     read_course,
     who_flies,
@@ -41,12 +42,14 @@ def evaluate(evaluation: Evaluation, out: Path, console: Console) -> dict[str, A
     """
     from eval.judging.results import write_results
     from eval.judging.tables import grids, markdown_table, summarise
-    from policies.policy import load_policy
 
     course, out = read_course(evaluation), Path(out)
-    asked = evaluation.policies or (default_policy(),)
-    policies = [load_policy(name, evaluation.trust) for name in asked]
+    asked = tuple(evaluation.policies or (default_policy(),))
+    policies = [load_flier(name, evaluation.trust, False) for name in asked]
     called = labels(asked, [policy.name for policy in policies])
+    if evaluation.monitor:
+        policies += [load_flier(name, evaluation.trust, True) for name in asked]
+        called, asked = [*called, *(f"{label}+monitor" for label in called)], asked * 2
     count = len(course.trials)
     processes = options_for(count, evaluation.processes, evaluation.world).processes or 1
     what = f"{count * len(asked)} trials in the {evaluation.world} world"

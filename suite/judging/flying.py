@@ -56,7 +56,10 @@ def policy_digest(name_or_path: str) -> str:
     path = shipped.locate(name_or_path)
     files = [path]
     if path.is_dir():
-        files = [file for file in (path / CONFIG, path / WEIGHTS) if file.is_file()]
+        names = (CONFIG, WEIGHTS) if (path / CONFIG).exists() else ("policy.h", "policy.c")
+        files = [path / name for name in names if (path / name).is_file()]
+    elif path.suffix == ".c":
+        files = [path.with_name("policy.h"), path]
     elif path.suffix == ".onnx":
         from policies.formats.onnx_file import files_of
 
@@ -174,9 +177,23 @@ def who_flies(
     policy: Policy, name_or_path: str, trust: bool, processes: int | None
 ) -> Policy | Callable[[], Policy]:
     """Return the loaded policy, or for several processes how each of them loads its own."""
+    from eval.judging.monitor import Monitored
+
+    monitored = isinstance(policy, Monitored)
+    return policy if processes == 1 else partial(load_flier, name_or_path, trust, monitored)
+
+
+def load_flier(name_or_path: str, trust: bool, monitored: bool) -> Policy:
+    """Return a policy to fly, with the safety monitor around it where it is asked for.
+
+    Raises:
+        PolicyError: where it cannot be loaded.
+    """
+    from eval.judging.monitor import Monitored
     from policies.policy import load_policy
 
-    return policy if processes == 1 else partial(load_policy, name_or_path, trust)
+    policy = load_policy(name_or_path, trust)
+    return Monitored(policy) if monitored else policy
 
 
 def about_policy(name_or_path: str, policy: Policy) -> dict[str, Any]:

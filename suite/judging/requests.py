@@ -17,8 +17,8 @@ class Evaluation:
     policies: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="policy")
     ] = ()
-    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2 or .pt file; may be given
-    several times. Without it the shipped policy flies."""
+    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2, .pt or .c file; may be
+    given several times. Without it the shipped policy flies."""
     track: str = "all"
     """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
     difficulty: str = "0"
@@ -38,6 +38,8 @@ class Evaluation:
     trials in the air, as out of time [s]."""
     trust: bool = False
     """Also load policy files that can run code on this machine."""
+    monitor: bool = False
+    """Fly every policy a second time with the safety monitor around it, on the same trials."""
 
 
 @dataclass(frozen=True)

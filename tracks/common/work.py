@@ -76,7 +76,7 @@ def work_off(
             for result in work(piece):
                 keep(number, result)
         return
-    _let_views_travel()
+    let_views_travel()
     try:
         ForkingPickler.dumps((work, pieces))
     except Exception as error:
@@ -160,7 +160,7 @@ def _work_on(
 
 def _start(cores: list[int]) -> None:
     """Make this process a worker."""
-    _let_views_travel()
+    let_views_travel()
     # An interrupt from the keyboard goes to every process of the group; the first one decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if cores:
@@ -176,7 +176,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _let_views_travel() -> None:
+def let_views_travel() -> None:
     """Let read-only views of dicts be pickled; a vehicle's effects are one."""
     copyreg.pickle(MappingProxyType, _reduce_view)
 

@@ -8,18 +8,22 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from tracks.common.grid import Grid
+
 BUSY_SHARE = 0.15
 """Share of the processor that others may use before a benchmark is not to be trusted [1]."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A measured rate: more is better."""
+    """A measured rate, of which more is better, or a time."""
 
     value: float
     """The figure, in `unit`."""
     unit: str
     """Such as "gradient steps/s"."""
+    less_is_better: bool = False
+    """Whether it is a time."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +40,14 @@ class Comparison:
     """Why the figures may not be trusted; empty on a free machine."""
     details: dict[str, Any] = field(default_factory=dict)
     """Whatever else the benchmark measured."""
+    grid: Grid | None = None
+    """The details as a table for people; without one they are shown line by line."""
 
     @property
     def ratio(self) -> float:
         """How many times as fast ours is (above 1: faster)."""
-        return self.ours.value / self.baseline.value
+        ratio = self.ours.value / self.baseline.value
+        return 1 / ratio if self.ours.less_is_better else ratio
 
 
 def in_turn(

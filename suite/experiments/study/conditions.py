@@ -128,9 +128,9 @@ def _windy(vehicle: Vehicle, speed: float) -> tuple[Vehicle, SensorNoise]:
     return with_effect(vehicle, wind.name, wind.values(velocity)), SensorNoise()
 
 
-def _sensing(field: str) -> Callable[..., tuple[Vehicle, SensorNoise]]:
+def _sensing(field: str, scale: float = 1.0) -> Callable[..., tuple[Vehicle, SensorNoise]]:
     def make(vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorNoise]:
-        return vehicle, replace(SensorNoise(), **{field: size})
+        return vehicle, replace(SensorNoise(), **{field: scale * size})
 
     return make
 
@@ -167,5 +167,11 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
               _sensing("inverse_depth")),
         Sweep("gate-pose error", "standard deviation per axis [m]", (0, 0.05, 0.1, 0.2, 0.3),
               _sensing("gate_m")),
+        Sweep("age of the state", "age at the decision [ms]", (0, 20, 40, 60, 80, 100),
+              _sensing("state_age_s", 1e-3)),
+        Sweep("age of the image", "age at the decision [ms]", (0, 20, 40, 60, 80, 100),
+              _sensing("image_age_s", 1e-3)),
+        Sweep("lost images", "share of the images [%]", (0, 10, 30, 50, 80),
+              _sensing("image_loss", 1e-2)),
         Sweep("state-estimation noise", "times 3 cm, 0.1 m/s, 1 deg", (0, 1, 2, 4, 8), _estimating),
     ]  # fmt: skip

@@ -9,6 +9,7 @@ import eval.judging.judge
 import eval.logs.flight_log
 from eval.judging.results import read_trials
 from suite import cli
+from suite.judging.flying import load_flier, who_flies
 
 
 def _eval(out, *args):
@@ -96,3 +97,13 @@ def test_what_cannot_be_used_is_said_before_the_first_flight(
     said = capsys.readouterr().err
     assert words in said and "Traceback" not in said
     assert len(said.strip().splitlines()) == 1
+
+
+def test_with_a_monitor_each_policy_flies_twice_on_the_same_trials(pilots, tmp_path):
+    asked = ["--policy", pilots["diver"], "--monitor", "--track", "zigzag", "--trials", "1"]
+    assert _eval(tmp_path / "out", *asked) == 0
+    table = (tmp_path / "out" / "table.md").read_text()
+    assert "| diver | zigzag" in table and "| diver+monitor | zigzag" in table
+    loaded = load_flier(pilots["diver"], False, True)
+    make = who_flies(loaded, pilots["diver"], False, 2)
+    assert callable(make) and make().name == "diver+monitor"

@@ -1,0 +1,201 @@
+"""A monitor around any policy: limits, and a last-moment way out where nothing else is left.
+
+It sees what the policy sees and shares nothing with it. Limits on tilt and speed bend an action;
+the way out replaces it, and only where it must: paths of the next moments are laid through the
+points of the depth image, one for each way out (stop, climb, to either side, back and up), begun
+now and begun one decision later. While a way out is still clear one decision later, the policy has
+its will.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from policies.policy import Hidden, Policy
+from policies.spec import PolicySpec
+from tracks.geometry.camera import Camera, pixel_rays_b
+from tracks.input.ranges import Range
+
+SAMPLES = 24
+"""Places at which a path is looked at: 13 cm apart at 5 m/s."""
+
+
+@dataclass(frozen=True)
+class MonitorLimits:
+    """What a monitored policy may do."""
+
+    tilt_deg: Annotated[float, Range(1.0, 89.0)] = 75.0
+    """Largest tilt that an action may ask for [deg]."""
+    speed: Annotated[float, Range(0.1, 100.0)] = 12.0
+    """Above this an action may not speed up [m/s]."""
+    clearance_m: Annotated[float, Range(0.0, 10.0)] = 0.15
+    """A path nearer than this to a point of the image is no way [m]."""
+    way_out: Annotated[float, Range(0.1, 100.0)] = 12.0
+    """Acceleration of a way out [m/s^2]."""
+    lag_s: Annotated[float, Range(0.0, 1.0)] = 0.1
+    """Until then the last action still acts [s]."""
+    horizon_s: Annotated[float, Range(0.05, 5.0)] = 0.6
+    """How far ahead paths are laid [s]."""
+
+
+class Seen(NamedTuple):
+    """What the monitor makes of observations of N rows."""
+
+    vel_b: np.ndarray
+    """(N, 3) [m/s]."""
+    up_b: np.ndarray
+    """(N, 3) the world's z axis in body axes."""
+    last_b: np.ndarray
+    """(N, 3) the last action [m/s^2]."""
+    points_b: np.ndarray
+    """(N, P, 3) what the camera sees, body axes [m]."""
+    hit: np.ndarray
+    """(N, P) bool: whether there is something at that point."""
+
+
+@dataclass
+class Monitored:
+    """A `Policy` with a monitor around it; `interventions` counts the ways out taken."""
+
+    policy: Policy
+    """Who decides."""
+    limits: MonitorLimits = MonitorLimits()
+    """What it may do."""
+    interventions: int = field(default=0, compare=False)
+    """Ways out taken so far, over all rows."""
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        return f"{self.policy.name}+monitor"
+
+    @property
+    def spec(self) -> PolicySpec:
+        """The policy's own."""
+        return self.policy.spec
+
+    def start(self, n: int) -> Hidden:
+        """Return the policy's memory of n trials."""
+        return self.policy.start(n)
+
+    def act(
+        self, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
+    ) -> tuple[np.ndarray, Hidden]:
+        """Return the policy's actions, bent or replaced where they must be."""
+        action, hidden = self.policy.act(hidden, state, image, fresh)
+        seen = seen_of(self.spec, state, image)
+        bent = limited(self.limits, np.asarray(action, float), seen)
+        found, taken = last_moment(self.limits, bent, seen, 1.0 / self.spec.rate_hz)
+        self.interventions += int(taken.sum())
+        return found.astype(np.float32), hidden
+
+
+def seen_of(spec: PolicySpec, state: np.ndarray, image: np.ndarray) -> Seen:
+    """Return what an observation says of speed, attitude and surroundings."""
+    depth, camera = spec.depth, spec.camera
+    metres = depth.scale / np.maximum(np.asarray(image, float) + depth.offset, 1e-3)
+    metres = metres.reshape(len(metres), -1)
+    points_b = _rays(camera) * metres[..., None]
+    hit = metres < 0.99 * camera.range_m
+    vel_b, up_b, last_b = (np.asarray(state[:, k : k + 3], float) for k in (0, 3, 9))
+    return Seen(vel_b, up_b, last_b, points_b, hit)
+
+
+def _rays(camera: Camera) -> np.ndarray:
+    return np.asarray(pixel_rays_b(camera), float).reshape(-1, 3)
+
+
+def limited(limits: MonitorLimits, action_b: np.ndarray, seen: Seen) -> np.ndarray:
+    """Return actions (N, 3) within the limits of tilt and speed."""
+    speed = np.linalg.norm(seen.vel_b, axis=-1, keepdims=True)
+    ahead = seen.vel_b / np.maximum(speed, 1e-6)
+    along = (action_b * ahead).sum(-1, keepdims=True)
+    action_b = np.where((speed > limits.speed) & (along > 0), action_b - along * ahead, action_b)
+    force_b = action_b + GRAVITY * seen.up_b
+    lift = (force_b * seen.up_b).sum(-1, keepdims=True)
+    aside = force_b - lift * seen.up_b
+    most = np.tan(np.radians(limits.tilt_deg)) * np.maximum(lift, 1.0)
+    size = np.linalg.norm(aside, axis=-1, keepdims=True)
+    aside *= np.minimum(1.0, most / np.maximum(size, 1e-6))
+    return lift * seen.up_b + aside - GRAVITY * seen.up_b
+
+
+def ways_out(limits: MonitorLimits, seen: Seen) -> np.ndarray:
+    """Return the actions (K, N, 3) of the ways out: stop, climb, left, right, back and up."""
+    speed = np.linalg.norm(seen.vel_b, axis=-1, keepdims=True)
+    back = -seen.vel_b / np.maximum(speed, 0.5)
+    left = np.cross(seen.up_b, -back)
+    left /= np.maximum(np.linalg.norm(left, axis=-1, keepdims=True), 1e-6)
+    sum_ = back + seen.up_b
+    both = sum_ / np.maximum(np.linalg.norm(sum_, axis=-1, keepdims=True), 1e-6)
+    return limits.way_out * np.stack([back, seen.up_b, left, -left, both])
+
+
+def last_moment(
+    limits: MonitorLimits, action_b: np.ndarray, seen: Seen, period_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the actions (N, 3) to fly, and which of them are ways out (N,) bool.
+
+    A way out is taken where the policy's path is blocked, every way out would be blocked if it
+    began one decision later, and one that begins now is not, or clears more.
+    """
+    times = np.linspace(0.025, limits.horizon_s, SAMPLES)
+    ahead = clearance(limits, seen, action_b, None, times, period_s)
+    taken = np.zeros(len(action_b), bool)
+    rows = np.flatnonzero(ahead < limits.clearance_m)
+    if not len(rows):
+        return action_b, taken
+    part, wanted = Seen(*(x[rows] for x in seen)), action_b[rows]
+    ways = ways_out(limits, part)
+    later = np.stack([clearance(limits, part, wanted, way, times, period_s) for way in ways])
+    now = np.stack([clearance(limits, part, way, None, times, period_s) for way in ways])
+    best = now.argmax(0)
+    pick = np.arange(len(rows))
+    lost = (later < limits.clearance_m).all(0)
+    better = now[best, pick] > np.maximum(ahead[rows], later.max(0))
+    go = lost & better
+    out = action_b.copy()
+    out[rows[go]] = ways[best, pick][go]
+    taken[rows[go]] = True
+    return out, taken
+
+
+def clearance(
+    limits: MonitorLimits,
+    seen: Seen,
+    first_b: np.ndarray,
+    then_b: np.ndarray | None,
+    times: np.ndarray,
+    period_s: float,
+) -> np.ndarray:
+    """Return how near (N,) a path comes to what the camera sees [m].
+
+    Args:
+        limits: its lag counts.
+        seen: of N rows.
+        first_b: (N, 3) the action from now on [m/s^2].
+        then_b: (N, 3) the one after a period, or None for none.
+        times: (T,) at which the path is looked at [s].
+        period_s: between decisions [s].
+    """
+    path = seen.vel_b[:, None] * times[:, None]
+    path += _moved(seen.last_b, times, 0.0) - _moved(seen.last_b, times, limits.lag_s)
+    path += _moved(first_b, times, limits.lag_s)
+    if then_b is not None:
+        path += _moved(then_b - first_b, times, limits.lag_s + period_s)
+    squared = (
+        (path**2).sum(-1)[:, :, None]
+        + (seen.points_b**2).sum(-1)[:, None, :]
+        - 2.0 * path @ seen.points_b.swapaxes(1, 2)
+    )
+    nearest = np.where(seen.hit[:, None, :], squared, np.inf).min((1, 2))
+    return np.sqrt(np.maximum(nearest, 0.0))
+
+
+def _moved(action_b: np.ndarray, times: np.ndarray, since_s: float) -> np.ndarray:
+    """Return how far (N, T, 3) an acceleration since `since_s` has moved the body [m]."""
+    return 0.5 * action_b[:, None] * np.maximum(times - since_s, 0.0)[:, None] ** 2

@@ -1,0 +1,1 @@
+"""Our policies as C99: written, compiled, loaded and checked."""

@@ -1,0 +1,114 @@
+"""policy.c as a shared library, compiled for this machine and kept in the user's cache."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+from policies.errors import PolicyError
+from policies.formats.c.source import TEMPLATES
+from tracks.common.files import replacing_file
+from tracks.input.reading import MODEL_BYTES, InputError, read_bytes
+
+FLAGS = ("-std=c99", "-O3", "-ffp-contract=fast", "-fPIC", "-shared")
+HERE = ("-march=native",)
+"""For this machine's own processor, left out where the compiler does not know it."""
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+"""What policy.c of ours compiles under without a word."""
+COMPILE_S = 600.0
+"""A compiler that takes longer is ended [s]."""
+
+
+def find_compiler() -> list[str] | None:
+    """Return the C compiler's command: what CC says, or cc; None where there is none."""
+    words = shlex.split(os.environ.get("CC", "cc")) or ["cc"]
+    return words if shutil.which(words[0]) else None
+
+
+def source_files(policy_c: Path) -> list[Path]:
+    """Return policy.c and the policy.h beside it.
+
+    Raises:
+        PolicyError: where one is missing.
+    """
+    files = [policy_c, policy_c.with_name("policy.h")]
+    for file in files:
+        if not file.is_file():
+            raise PolicyError(
+                f"{file}: missing; a policy in C is policy.c with policy.h beside it, as suite "
+                "export --format c writes them"
+            )
+    return files
+
+
+def compiled_library(policy_c: Path) -> Path:
+    """Return the shared library of a policy.c, compiled now or found in the cache.
+
+    The two files are what the cache knows it by: a header of their own that they include may change
+    unseen.
+
+    Raises:
+        PolicyError: where there is no compiler, or it refuses the file.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise PolicyError(
+            f"{policy_c}: a policy in C is compiled before it flies, and there is no C compiler "
+            f"({os.environ.get('CC', 'cc')!r} was looked for); install one (such as gcc), or name "
+            "it in the environment's CC"
+        )
+    files = [*source_files(policy_c), TEMPLATES / "library.c"]
+    try:
+        texts = [read_bytes(file, MODEL_BYTES) for file in files]
+    except InputError as error:
+        raise PolicyError(str(error)) from None
+    key = hashlib.sha256(repr((compiler, FLAGS, HERE, platform.machine())).encode())
+    for text in texts:
+        key.update(hashlib.sha256(text).digest())
+    library = _cache() / f"{key.hexdigest()}.so"
+    if not library.is_file():
+        with replacing_file(library) as beside:
+            _compile(compiler, files, beside)
+    return library
+
+
+def _cache() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    # A home that machines share must not hand one's instructions to another.
+    folder = Path(home) / "diffracing-suite" / "c" / (platform.node() or "here")
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    return folder
+
+
+def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
+    policy_c, _, library_c = files
+    source = policy_c.resolve()
+    ends = [f"-I{source.parent}", str(source), str(library_c), "-o", str(out), "-lm"]
+    message = ""
+    for flags in ((*FLAGS, *HERE), FLAGS):
+        try:
+            done = subprocess.run(
+                [*compiler, *flags, *ends],
+                capture_output=True,
+                timeout=COMPILE_S,
+                stdin=subprocess.DEVNULL,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise PolicyError(
+                f"{policy_c}: {compiler[0]} did not end within {COMPILE_S:g} s; compile it by hand "
+                "to see why"
+            ) from None
+        if done.returncode == 0:
+            return
+        message = message or done.stderr.decode(errors="replace").strip()
+    first = next((line for line in message.splitlines() if "error" in line), message[:300])
+    raise PolicyError(
+        f"{policy_c}: {compiler[0]} refuses it ({first[:300]}); export it again, or compile it by "
+        "hand to see all it says"
+    )

@@ -1,0 +1,96 @@
+"""The network with weights and activations of 8 bits.
+
+Weights have a scale for each output (symmetric), activations one for each layer with a zero point,
+so that their smallest and largest values measured on flights are the smallest and largest bytes.
+After Jacob et al. 2018, "Quantization and Training of Neural Networks for Efficient
+Integer-Arithmetic-Only Inference"; what follows each layer stays in floats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from policies.formats.c import forward
+from policies.formats.c.arrays import LAYERS, matrices, small_arrays
+from policies.formats.c.forward import Observed
+from policies.spec import PolicySpec
+
+
+class Quantised(NamedTuple):
+    """A layer of 8 bits: out = (bytes(x) @ weight) * scale + offset."""
+
+    weight: np.ndarray
+    """(inputs, outputs) int8 from -127 on."""
+    scale: np.ndarray
+    """(outputs,) float32, what one unit of the integer sum is worth."""
+    offset: np.ndarray
+    """(outputs,) float32, what the inputs' zero point adds to every sum, taken off."""
+    inverse: float
+    """Bytes in one unit of the input."""
+    zero: int
+    """The byte that stands for an input of 0."""
+
+
+def quantise(
+    params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
+) -> dict[str, Quantised]:
+    """Return each of `arrays.LAYERS` with 8 bits, scaled by what `observed` makes of its inputs."""
+    ranges = input_ranges(params, spec, observed)
+    return {
+        name: _quantised(weight, *ranges[name]) for name, weight in matrices(params, spec).items()
+    }
+
+
+def input_ranges(
+    params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
+) -> dict[str, tuple[float, float]]:
+    """Return the smallest and largest input of each large layer over observations."""
+    weights = matrices(params, spec)
+    ranges: dict[str, tuple[float, float]] = dict.fromkeys(LAYERS, (0.0, 0.0))
+
+    def layer(name: str, x: np.ndarray) -> np.ndarray:
+        low, high = ranges[name]
+        ranges[name] = min(low, float(x.min())), max(high, float(x.max()))
+        return x @ weights[name]
+
+    forward.actions(small_arrays(params, spec), spec, layer, observed)
+    # The memory's values lie between -1 and 1 by what they are.
+    return {**ranges, "gru_hidden": (-1.0, 1.0)}
+
+
+def _quantised(weight: np.ndarray, low: float, high: float) -> Quantised:
+    largest = np.abs(weight).max(0)
+    steps = np.where(largest > 0, largest, 1.0).astype(np.float32) / np.float32(127)
+    whole = np.rint(weight / steps).clip(-127, 127).astype(np.int8)
+    inverse = float(np.float32(255.0 / max(high - low, 1e-6)))
+    zero = int(np.clip(np.rint(-128.0 - low * inverse), -128, 127))
+    scale = (steps / np.float32(inverse)).astype(np.float32)
+    offset = (-zero * whole.sum(0, dtype=np.int64) * scale.astype(np.float64)).astype(np.float32)
+    return Quantised(whole, scale, offset, inverse, zero)
+
+
+def answers(
+    params: Mapping[str, np.ndarray],
+    spec: PolicySpec,
+    layers: Mapping[str, Quantised],
+    observed: Observed,
+) -> np.ndarray:
+    """Return the actions (T, 3) of the quantised network."""
+    small = small_arrays(params, spec)
+
+    def layer(name: str, x: np.ndarray) -> np.ndarray:
+        return products(layers[name], x)
+
+    return forward.actions(small, spec, layer, observed)
+
+
+def products(layer: Quantised, x: np.ndarray) -> np.ndarray:
+    """Return a quantised layer's outputs (..., O) for inputs (..., I)."""
+    scaled = (x.astype(np.float32) * np.float32(layer.inverse) + layer.zero).clip(-128, 127)
+    whole = np.trunc(scaled + np.copysign(0.5, scaled))
+    # Exact in doubles, and many times as fast as numpy's product of integers.
+    sums = whole.astype(np.float64) @ layer.weight.astype(np.float64)
+    return sums.astype(np.float32) * layer.scale + layer.offset

@@ -1,0 +1,198 @@
+"""policy.h and policy.c of a policy of ours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fractions import Fraction
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from policies.formats.c import arrays
+from policies.formats.c.arrays import array_text, blocked, float_text, multiply_adds, padded
+from policies.formats.c.quantised import Quantised
+from policies.formats.policy_file import PolicyCheckpoint
+from policies.networks.network import CHANNELS, LEAK, flat_features
+from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
+from tracks.common.version import VERSION
+
+TEMPLATES = Path(__file__).resolve().parent / "templates"
+TANH_TERMS = 12
+"""Of the continued fraction; with the inputs clipped to 8, within 4e-7 of tanh."""
+_OBSERVATION = (
+    ("velocity in body axes", "m/s"),
+    ("third row of R: the world's z axis in body axes, (0, 0, 1) when level", "1"),
+    ("from the drone to the centre of the next gate, in body axes", "m"),
+    ("the last action as it was flown, in the body axes of its own time; 0 at first", "m/s^2"),
+)
+_EXTRA = {
+    "second_gate": ("to the centre of the gate after the next (or the last), in body axes", "m"),
+    "gate_axis": ("the next gate's flight direction, a unit vector in body axes", "1"),
+}
+
+
+def sources(
+    checkpoint: PolicyCheckpoint, name: str, label: str, layers: Mapping[str, Quantised] | None
+) -> dict[str, str]:
+    """Return the texts of policy.h and policy.c.
+
+    Args:
+        checkpoint: the policy.
+        name: what it is called.
+        label: JSON that says where it comes from and what it expects (`embedded_spec.embed`).
+        layers: the large layers of 8 bits; None for float32.
+    """
+    definitions = _definitions(checkpoint, layers)
+    values = _values(checkpoint, name, label, layers, constant_bytes(checkpoint, layers))
+    kernels = ("head.c", definitions, "common.c", "int8.c" if layers else "float32.c")
+    body = [_filled(part, values) if part.endswith(".c") else part for part in kernels]
+    return {"policy.h": _filled("header.h", values), "policy.c": "".join(body)}
+
+
+def constants(
+    checkpoint: PolicyCheckpoint, layers: Mapping[str, Quantised] | None
+) -> dict[str, np.ndarray]:
+    """Return the arrays of policy.c by name, float32 and int8."""
+    params, spec = checkpoint.params, checkpoint.spec
+    found = small = arrays.small_arrays(params, spec)
+    if layers is None:
+        large = arrays.matrices(params, spec)
+        found = {f"{name}_weight": blocked(weight) for name, weight in large.items()}
+        return {**small, **found, "zeros": np.zeros(16, np.float32)}
+    for name, layer in layers.items():
+        found[f"{name}_weight"] = blocked(layer.weight)
+        found[f"{name}_scale"], found[f"{name}_offset"] = layer.scale, layer.offset
+    return found
+
+
+def work_sizes(spec: PolicySpec) -> tuple[int, int, int]:
+    """Return the floats of the two working arrays, and the length of the third (int8 alone)."""
+    rows, columns = spec.camera.height // 4, spec.camera.width // 4
+    first = rows * columns * CHANNELS[0]
+    second = (rows - 2) * (columns - 2) * CHANNELS[1]
+    third, wide, gates = flat_features(spec), padded(spec.hidden_size), padded(3 * spec.hidden_size)
+    return (
+        max(first, third, gates),
+        max(4 * rows * columns, second, wide),
+        max(first, second, third, wide),
+    )
+
+
+def memory_bytes(spec: PolicySpec, quantised: bool) -> int:
+    """Return the size of `policy_state`."""
+    first, second, third = work_sizes(spec)
+    floats = padded(spec.hidden_size) + padded(3 * spec.hidden_size) + first + second
+    return 4 * (floats + 1) + 2 * (third + third % 2) * quantised
+
+
+def constant_bytes(checkpoint: PolicyCheckpoint, layers: Mapping[str, Quantised] | None) -> int:
+    """Return the bytes of policy.c's constants."""
+    return sum(value.nbytes for value in constants(checkpoint, layers).values())
+
+
+def _definitions(checkpoint: PolicyCheckpoint, layers: Mapping[str, Quantised] | None) -> str:
+    texts = [array_text(name, value) for name, value in constants(checkpoint, layers).items()]
+    for name, layer in (layers or {}).items():
+        inverse = float_text(float(np.float32(layer.inverse)))
+        texts.append(f"#define {name.upper()}_INVERSE {inverse}\n")
+        texts.append(f"#define {name.upper()}_ZERO ({layer.zero})\n")
+    return "".join(texts)
+
+
+def _filled(template: str, values: Mapping[str, Any]) -> str:
+    return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(values)
+
+
+def _values(
+    checkpoint: PolicyCheckpoint,
+    name: str,
+    label: str,
+    layers: Mapping[str, Quantised] | None,
+    constant_bytes: int,
+) -> dict[str, Any]:
+    spec = checkpoint.spec
+    camera, depth = spec.camera, spec.depth
+    first, second, third = work_sizes(spec)
+    numerator, denominator = tanh_polynomials()
+    return {
+        "NAME": name.replace("*/", "* /"),
+        "VERSION": VERSION,
+        "DTYPE": "int8" if layers else "float32",
+        "WEIGHTS": sum(int(np.size(value)) for value in checkpoint.params.values()),
+        "RATE": f"{spec.rate_hz:g}",
+        "RATE_LITERAL": float_text(spec.rate_hz),
+        "OBSERVATION": _observation(spec),
+        "STATE_SIZE": spec.state_size,
+        "ACTION_SIZE": ACTION_SIZE,
+        "HEIGHT": camera.height,
+        "WIDTH": camera.width,
+        "PITCH": float_text(camera.pitch_deg),
+        "FOV_H": float_text(camera.fov_deg[0]),
+        "FOV_V": float_text(camera.fov_deg[1]),
+        "DEPTH_SCALE": float_text(depth.scale),
+        "DEPTH_NEAR": float_text(depth.near),
+        "DEPTH_FAR": float_text(camera.range_m),
+        "DEPTH_OFFSET": float_text(depth.offset),
+        "SHA256": checkpoint.config["weights"]["sha256"],
+        "JSON": _string(label),
+        "MACS": multiply_adds(spec),
+        "WEIGHT_BYTES": constant_bytes,
+        "HIDDEN": padded(spec.hidden_size),
+        "FIRST": first,
+        "SECOND": second,
+        "EXTRA_STATE": f"    short bytes[{third}];\n" if layers else "",
+        "HIDDEN_SIZE": spec.hidden_size,
+        "PADDED": padded(spec.hidden_size),
+        "GATES": padded(3 * spec.hidden_size),
+        **{f"CHANNELS{k}": channels for k, channels in enumerate(CHANNELS, 1)},
+        "LEAK": float_text(LEAK),
+        "TANH_P": _horner(numerator),
+        "TANH_Q": _horner(denominator),
+    }
+
+
+def _observation(spec: PolicySpec) -> str:
+    rows = [*_OBSERVATION, *(_EXTRA[key] for key in EXTRAS if getattr(spec, key))]
+    assert 3 * len(rows) == spec.state_size and len(_OBSERVATION) * 3 == STATE_SIZE
+    return "\n".join(
+        f" *     {3 * k}..{3 * k + 2}: {what} [{unit}]" for k, (what, unit) in enumerate(rows)
+    )
+
+
+def _string(text: str) -> str:
+    """Return text as C string literals, one a line, joined by backslashes as a macro has them."""
+    plain = text.encode("ascii", "backslashreplace").decode().replace("\\", "\\\\")
+    plain = plain.replace('"', '\\"')
+    pieces, piece = [], ""
+    for word in plain.split(" "):
+        if len(piece) + len(word) > 88:
+            pieces.append(piece)
+            piece = ""
+        piece += word + " "
+    pieces.append(piece[:-1])
+    return " \\\n".join(f'    "{piece}"' for piece in pieces)
+
+
+def tanh_polynomials(terms: int = TANH_TERMS) -> tuple[list[float], list[float]]:
+    """Return p and q, lowest power first, of tanh(x) = x p(x^2) / q(x^2).
+
+    Lambert 1768: tanh x = x / (1 + x^2 / (3 + x^2 / (5 + ...))), cut after `terms`.
+    """
+    value, below = [Fraction(2 * terms - 1)], [Fraction(1)]
+    for k in range(terms - 2, -1, -1):
+        shifted = [Fraction(0), *below]
+        size = max(len(value), len(shifted))
+        padded_value = [*value, *[Fraction(0)] * (size - len(value))]
+        shifted = [*shifted, *[Fraction(0)] * (size - len(shifted))]
+        added = [(2 * k + 1) * v + s for v, s in zip(padded_value, shifted, strict=True)]
+        value, below = added, value
+    return [float(p / value[0]) for p in below], [float(q / value[0]) for q in value]
+
+
+def _horner(coefficients: list[float]) -> str:
+    *lower, text = map(float_text, coefficients)
+    for each in reversed(lower):
+        text = f"{each} + s * ({text})"
+    return text

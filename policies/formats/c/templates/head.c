@@ -1,0 +1,25 @@
+/* $NAME, $DTYPE. See policy.h. Written by diffracing-suite $VERSION: do not edit. */
+#include <math.h>
+
+#include "policy.h"
+
+enum {
+    HEIGHT = POLICY_IMAGE_HEIGHT,
+    WIDTH = POLICY_IMAGE_WIDTH,
+    ROWS1 = HEIGHT / 4,
+    COLUMNS1 = WIDTH / 4,
+    ROWS2 = ROWS1 - 2,
+    COLUMNS2 = COLUMNS1 - 2,
+    ROWS3 = ROWS2 - 2,
+    COLUMNS3 = COLUMNS2 - 2,
+    CHANNELS1 = $CHANNELS1,
+    CHANNELS2 = $CHANNELS2,
+    CHANNELS3 = $CHANNELS3,
+    FEATURES = ROWS3 * COLUMNS3 * CHANNELS3,
+    INPUTS = POLICY_STATE_SIZE,
+    HIDDEN = $HIDDEN_SIZE, /* units */
+    PADDED = $PADDED,      /* of a layer of HIDDEN units, a multiple of BLOCK; the rest is zero */
+    GATES = $GATES,        /* of a layer of 3 HIDDEN units, likewise */
+    BLOCK = 32             /* outputs whose weights lie side by side, input after input */
+};
+

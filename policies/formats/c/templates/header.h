@@ -1,0 +1,70 @@
+/*
+ * $NAME: a drone racing policy, written by diffracing-suite $VERSION.
+ * $DTYPE, $WEIGHTS weights; the checkpoint's digest stands below.
+ *
+ * Call policy_reset once before a flight, then policy_step $RATE times a second.
+ *
+ *   observation[POLICY_STATE_SIZE], not scaled; body axes: x forward, y left, z up, origin at the
+ *   centre of mass; world: z up; R turns body into world:
+$OBSERVATION
+ *
+ *   image[POLICY_IMAGE_HEIGHT * POLICY_IMAGE_WIDTH], row by row, row 0 at the top, column 0 at the
+ *   left: a forward camera at the body's origin, pitched up by POLICY_CAMERA_PITCH_DEG, as wide and
+ *   high as POLICY_CAMERA_FOV_*_DEG says from edge to edge. A pixel is the planar depth d in metres
+ *   (along the camera's axis, not along the ray), encoded as
+ *       POLICY_DEPTH_SCALE / clip(d, POLICY_DEPTH_NEAR, POLICY_DEPTH_FAR) - POLICY_DEPTH_OFFSET
+ *   where nothing is seen d counts as POLICY_DEPTH_FAR.
+ *
+ *   action[POLICY_ACTION_SIZE]: the wanted net acceleration in current body axes [m/s^2], gravity
+ *   already taken care of: zeros keep the velocity. Of it comes the wanted specific force
+ *   f = R action + (0, 0, 9.81); the wanted body z axis is along f, the collective thrust over the
+ *   mass is max(0, f . body z), the heading follows the direction to the gate, and the body rates
+ *   are attitude gain times attitude error.
+ *
+ * Where an input is not finite the action is NaN and the memory stays: do not fly it.
+ * A step takes $MACS multiply-adds, $WEIGHT_BYTES bytes of constants, sizeof(policy_state) bytes
+ * of the caller's memory and a few hundred bytes of stack. It needs IEEE floats: no -ffast-math.
+ */
+#ifndef POLICY_H
+#define POLICY_H
+
+#define POLICY_STATE_SIZE $STATE_SIZE
+#define POLICY_IMAGE_HEIGHT $HEIGHT
+#define POLICY_IMAGE_WIDTH $WIDTH
+#define POLICY_ACTION_SIZE $ACTION_SIZE
+
+#define POLICY_RATE_HZ $RATE_LITERAL
+#define POLICY_CAMERA_PITCH_DEG $PITCH
+#define POLICY_CAMERA_FOV_H_DEG $FOV_H
+#define POLICY_CAMERA_FOV_V_DEG $FOV_V
+#define POLICY_DEPTH_SCALE $DEPTH_SCALE
+#define POLICY_DEPTH_NEAR $DEPTH_NEAR
+#define POLICY_DEPTH_FAR $DEPTH_FAR
+#define POLICY_DEPTH_OFFSET $DEPTH_OFFSET
+
+/* SHA-256 of the checkpoint's weights.safetensors, and what diffracing-suite reads back. */
+#define POLICY_CHECKPOINT_SHA256 "$SHA256"
+#define POLICY_JSON \
+$JSON
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* All that a flight remembers, and the memory that a step works in. The caller owns it. */
+typedef struct {
+    float hidden[$HIDDEN]; /* between steps: the recurrent state */
+    int odd; /* between steps: whether the number of steps so far is odd */
+    float gates[$GATES]; /* within a step, as all that follows */
+    float first[$FIRST];
+    float second[$SECOND];
+$EXTRA_STATE} policy_state;
+
+void policy_reset(policy_state *state);
+void policy_step(policy_state *state, const float *observation, const float *image, float *action);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,33 @@
+/* What diffracing-suite calls in a policy.c that it compiled; any with the same door will do. */
+#include <stddef.h>
+
+#include "policy.h"
+
+int suite_size(int which)
+{
+    const int sizes[] = {(int)sizeof(policy_state), POLICY_STATE_SIZE, POLICY_IMAGE_HEIGHT,
+                         POLICY_IMAGE_WIDTH};
+    return sizes[which];
+}
+
+const char *suite_json(void)
+{
+#ifdef POLICY_JSON
+    return POLICY_JSON;
+#else
+    return "";
+#endif
+}
+
+void suite_rows(int rows, policy_state *states, const unsigned char *fresh,
+                const float *observations, const float *images, float *actions)
+{
+    for (int k = 0; k < rows; k++) {
+        if (fresh[k]) {
+            policy_reset(states + k);
+        }
+        policy_step(states + k, observations + (size_t)k * POLICY_STATE_SIZE,
+                    images + (size_t)k * POLICY_IMAGE_HEIGHT * POLICY_IMAGE_WIDTH,
+                    actions + (size_t)k * 3);
+    }
+}

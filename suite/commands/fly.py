@@ -1,0 +1,76 @@
+"""`suite fly`: a policy in real time over MAVLink, as a companion computer flies it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from suite.common.console import Console
+from suite.judging.link.watchdog import Limits
+from suite.judging.requests import Evaluation
+from tracks.input.ranges import Seed, Trials
+
+
+@dataclass(frozen=True)
+class Config:
+    """Fly a policy in real time over MAVLink; without --link against a simulated vehicle."""
+
+    policy: str = ""
+    """A shipped policy's name, a checkpoint's folder, or a policy file; by default the shipped
+    policy."""
+    track: str = "zigzag"
+    """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
+    difficulty: str = "0"
+    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
+    trials: Trials = 1
+    """Flights on every track at every level."""
+    seed: Seed = 0
+    """Seed of the first trial."""
+    vehicle: str = "reference"
+    """A shipped vehicle's name or a vehicle file (.toml)."""
+    link: str = ""
+    """udpin:HOST:PORT or udpout:HOST:PORT of a vehicle that speaks MAVLink; one flight. Without it
+    the vehicle is simulated in real time, on this machine's loopback."""
+    confirm: bool = False
+    """I have read docs/fly.md and did what it asks for: with --link, set points leave."""
+    limits: tyro.conf.OmitArgPrefixes[Limits] = Limits()
+    """When the policy hands over."""
+    trust: bool = False
+    """Also load policy files that can run code on this machine."""
+    out: Path = Path("runs/fly")
+    """Folder for the flight logs and fly.json."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out]
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Fly as `config` says.
+
+    Raises:
+        ValueError: for anything that cannot be used, before the first flight.
+        WorkFailed: where no vehicle answered.
+    """
+    from suite.judging.link.commanded import fly_commanded
+
+    asked = Evaluation(
+        track=config.track,
+        difficulty=config.difficulty,
+        trials=config.trials,
+        seed=config.seed,
+        vehicle=config.vehicle,
+        trust=config.trust,
+    )
+    if config.link and not config.confirm:
+        raise ValueError(
+            f"--link {config.link}: set points would move a vehicle; read docs/fly.md, do what it "
+            "asks for, then give --confirm as well"
+        )
+    return fly_commanded(asked, config.policy, config.link, config.limits, config.out, console)

@@ -1,0 +1,127 @@
+"""`suite bench policy`: a step of the C export against ONNX Runtime's, each on one thread.
+
+The shipped policy is exported as C (float32 and int8), compiled for this machine and stepped one
+observation at a time with its memory, in turn with ONNX Runtime and torch, each called from Python.
+The baseline is ONNX Runtime as it is usually called, `session.run`; what is left of it with inputs
+and outputs bound to memory beforehand stands beside it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from suite.common.errors import WorkFailed
+from suite.experiments.bench.compare import Comparison, Figure
+from tracks.common.grid import Grid, table
+
+M7_HZ, M7_CYCLES = 480e6, {"C float32": 3.0, "C int8": 2.0}
+"""A Cortex-M7: clock, and the cycles of a multiply-add in plain C with the weights in memory that
+answers at once (a load of each side, the product, the loop's share) [1]. Assumed, not measured."""
+A76_HZ, A76_CYCLES = 2.4e9, {"C float32": 0.5, "C int8": 0.5}
+"""A Cortex-A76: a quarter of what two units of four lanes could do [1]. Assumed, not measured."""
+ROUNDS = 20
+
+
+def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
+    """Time single steps in turn.
+
+    Args:
+        policy: which, by name or folder; by default the shipped one.
+        rounds: blocks of 100 steps of each engine.
+
+    Raises:
+        WorkFailed: where there is no C compiler.
+    """
+    import torch
+
+    from policies.formats.c.arrays import multiply_adds
+    from policies.formats.c.compiler import find_compiler
+    from policies.formats.c.source import constant_bytes, memory_bytes
+    from policies.formats.export import exported_checkpoint
+    from suite.judging.deploy.latency import onnx_steps, time_in_turn, torch_step
+    from suite.judging.flying import default_policy
+
+    if find_compiler() is None:
+        raise WorkFailed("no C compiler (cc, or what CC names) is here; install one, such as gcc")
+    name, checkpoint = exported_checkpoint(policy or default_policy())
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            steps, layers = _c_steps(name, checkpoint, Path(folder))
+            usual, bound = onnx_steps(checkpoint)
+            steps |= {"ONNX Runtime": usual, "ONNX Runtime, memory bound": bound}
+            steps["torch"] = torch_step(checkpoint)
+            times = time_in_turn(steps, rounds)
+    finally:
+        torch.set_num_threads(threads)
+    count, weights = (
+        multiply_adds(checkpoint.spec),
+        sum(x.nbytes for x in checkpoint.params.values()),
+    )
+    rows: dict[str, dict[str, Any]] = {}
+    for engine, timing in times.items():
+        row: dict[str, Any] = {
+            "median_us": 1e6 * timing.median_s,
+            "p99_us": 1e6 * timing.p99_s,
+            "max_us": 1e6 * timing.max_s,
+            "multiply_adds": count,
+            "weight_bytes": weights,
+            "working_bytes": None,
+        }
+        if engine in layers:
+            quantised = layers[engine]
+            row["weight_bytes"] = constant_bytes(checkpoint, quantised)
+            row["working_bytes"] = memory_bytes(checkpoint.spec, quantised is not None)
+            row["estimate_cortex_m7_480mhz_ms"] = 1e3 * count * M7_CYCLES[engine] / M7_HZ
+            row["estimate_a76_2400mhz_ms"] = 1e3 * count * A76_CYCLES[engine] / A76_HZ
+        rows[engine] = row
+    ours, baseline = (
+        Figure(rows[engine]["median_us"], "us/step, median", less_is_better=True)
+        for engine in ("C float32", "ONNX Runtime")
+    )
+    return Comparison("policy", ours, baseline, details={"policy": name, **rows}, grid=_grid(rows))
+
+
+def _c_steps(name: str, checkpoint: Any, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the steps of both C exports, and their quantised layers, by engine."""
+    from policies.formats.c.c_file import load_c
+    from policies.formats.c.project import c_project, drawn
+    from suite.judging.deploy.latency import c_step
+
+    # How long a step takes does not hang on the scales, so no flights are flown for them.
+    observed, steps, layers = drawn(checkpoint.spec, 50), {}, {}
+    for dtype in ("float32", "int8"):
+        engine, place = f"C {dtype}", folder / dtype
+        project = c_project(checkpoint, name, dtype, observed)
+        place.mkdir()
+        for file, text in project.files.items():
+            (place / file).write_text(text, encoding="utf-8")
+        steps[engine], layers[engine] = c_step(load_c(place, trust=True)), project.layers
+    return steps, layers
+
+
+def _grid(rows: dict[str, dict[str, Any]]) -> Grid:
+    headers = (
+        "engine", "median [us]", "p99 [us]", "longest [us]", "multiply-adds", "weights [B]",
+        "working memory [B]", "Cortex-M7 480 MHz [ms], estimate", "A76 2.4 GHz [ms], estimate",
+    )  # fmt: skip
+    lines = []
+    for engine, row in rows.items():
+        texts = [f"{row[key]:.1f}" for key in ("median_us", "p99_us", "max_us")]
+        texts += [_shown(row[key]) for key in ("multiply_adds", "weight_bytes", "working_bytes")]
+        estimates = ("estimate_cortex_m7_480mhz_ms", "estimate_a76_2400mhz_ms")
+        texts += [f"{row[key]:.2f}" if key in row else "-" for key in estimates]
+        lines.append([engine, *texts])
+    m7, a76 = M7_CYCLES, A76_CYCLES
+    note = (
+        f"Estimates are multiply-adds x cycles each, assumed and not measured: Cortex-M7 "
+        f"{m7['C float32']:g} (float32) and {m7['C int8']:g} (int8), A76 {a76['C float32']:g}."
+    )
+    return table(headers, lines, note=note)
+
+
+def _shown(count: int | None) -> str:
+    return "-" if count is None else str(count)

@@ -1,0 +1,1 @@
+"""A policy leaves the house: exported, measured, and said what it is."""

@@ -1,0 +1,117 @@
+"""How long a policy thinks: single steps on one thread, engine after engine, in turn."""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from policies.formats.c.c_file import CPolicy
+from policies.formats.policy_file import PolicyCheckpoint
+from policies.spec import PolicySpec
+
+Step = Callable[[], Any]
+"""Makes one step with memory on the inputs that it was built with; may return the action (1, 3)."""
+BLOCK = 100
+"""Steps of one engine before the next has its turn."""
+WARM = 10
+"""Steps before those that count: the weights come into the processor's cache."""
+
+
+class Timing(NamedTuple):
+    """Times of single steps [s]."""
+
+    median_s: float
+    """The usual."""
+    p99_s: float
+    """One step in a hundred takes longer."""
+    max_s: float
+    """The longest: what the operating system did meanwhile is in it."""
+
+
+def time_in_turn(steps: Mapping[str, Step], rounds: int = 20) -> dict[str, Timing]:
+    """Return the times of every engine, block by block in turn."""
+    taken: dict[str, list[float]] = {name: [] for name in steps}
+    for _ in range(rounds):
+        for name, step in steps.items():
+            for _ in range(WARM):
+                step()
+            for _ in range(BLOCK):
+                started = time.perf_counter()
+                step()
+                taken[name].append(time.perf_counter() - started)
+    return {name: _timing(np.array(seconds)) for name, seconds in taken.items()}
+
+
+def _timing(seconds: np.ndarray) -> Timing:
+    return Timing(float(np.median(seconds)), float(np.quantile(seconds, 0.99)), seconds.max())
+
+
+def c_step(policy: CPolicy) -> Step:
+    """Return a step of a policy.c."""
+    state, image = _inputs(policy.spec)
+    memory, action = policy.start(1), np.zeros((1, 3), np.float32)
+    held = (memory, state, image, action)
+    policy.library.policy_reset(ctypes.c_void_p(memory.ctypes.data))
+    pointers = [ctypes.c_void_p(x.ctypes.data) for x in held]
+    function = policy.library.policy_step
+
+    def step() -> np.ndarray:
+        function(*pointers)
+        return held[-1]
+
+    return step
+
+
+def onnx_steps(checkpoint: PolicyCheckpoint) -> tuple[Step, Step]:
+    """Return a step of ONNX Runtime on one thread, called as usual and with its memory bound."""
+    import onnxruntime
+
+    from policies.formats.export import onnx_file
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    providers = ["CPUExecutionProvider"]
+    session = onnxruntime.InferenceSession(onnx_file(checkpoint, ""), options, providers=providers)
+    state, image = _inputs(checkpoint.spec)
+    hidden = np.zeros((1, checkpoint.spec.hidden_size), np.float32)
+    feed = {"state": state, "image": image, "hidden": hidden}
+    binding = session.io_binding()
+    for name, value in feed.items():
+        binding.bind_ortvalue_input(name, onnxruntime.OrtValue.ortvalue_from_numpy(value))
+    for name, value in (("action", np.zeros((1, 3), np.float32)), ("hidden_next", hidden)):
+        binding.bind_ortvalue_output(name, onnxruntime.OrtValue.ortvalue_from_numpy(value))
+
+    def usual() -> Any:
+        action, feed["hidden"] = session.run(None, feed)
+        return action
+
+    return usual, lambda: session.run_with_iobinding(binding)
+
+
+def torch_step(checkpoint: PolicyCheckpoint) -> Step:
+    """Return a step of the torch module, eager; the caller sets torch's threads."""
+    import torch
+
+    from policies.formats.torch_twin import torch_twin
+
+    twin = torch_twin(checkpoint.params, checkpoint.spec)
+    state, image = map(torch.from_numpy, _inputs(checkpoint.spec))
+    memory = [torch.zeros(1, checkpoint.spec.hidden_size)]
+
+    def step() -> Any:
+        with torch.inference_mode():
+            action, memory[0] = twin(state, image, memory[0])
+        return action
+
+    return step
+
+
+def _inputs(spec: PolicySpec) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    state = rng.normal(size=(1, spec.state_size)).astype(np.float32)
+    size = (1, spec.camera.height, spec.camera.width)
+    return state, rng.uniform(-0.3, 9.4, size).astype(np.float32)

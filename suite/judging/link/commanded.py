@@ -1,0 +1,131 @@
+"""`suite fly` from its options to its answer: simulated flights beside the judge's, or one link."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from suite.common.provenance import write_run_record
+from suite.judging.flying import Course, about_policy, default_policy, read_course
+from suite.judging.link.companion import FINISHED, Companion
+from suite.judging.link.flights import Flight, fly_link, fly_simulated, totals, write_log
+from suite.judging.link.messages import Wire, dialect
+from suite.judging.link.report import delays
+from suite.judging.link.server import COMPANION, VEHICLE
+from suite.judging.link.udp import UdpLink
+from suite.judging.link.watchdog import Limits
+from suite.judging.requests import Evaluation
+from tracks.common.files import write_json
+from tracks.common.grid import rich_table, table
+from tracks.common.provenance import stamp
+
+FLY = "fly.json"
+
+
+def fly_commanded(
+    asked: Evaluation, policy: str, link: str, limits: Limits, out: Path, console: Console
+) -> dict[str, Any]:
+    """Fly and write logs and fly.json into `out`.
+
+    Raises:
+        ValueError: for anything that cannot be used, before the first flight.
+        WorkFailed: where pymavlink is missing, or no vehicle answered.
+    """
+    from policies.policy import load_policy
+
+    dialect()
+    course = read_course(asked)
+    name = policy or default_policy()
+    loaded = load_policy(name, asked.trust)
+    out.mkdir(parents=True, exist_ok=True)
+    about = {"policy": about_policy(name, loaded), "limits": limits, "link": link or "simulated"}
+    if link:
+        found = _real(loaded, course, link, limits, out, console)
+    else:
+        flights = fly_simulated(loaded, course, limits, out, console)
+        judged = _judged(loaded, course)
+        found = {**totals(flights, limits), "judge_successes": judged}
+        found["flights"] = [flight.row for flight in flights]
+        _show(found, flights, console)
+    answer = {**stamp(1, asked.seed), **about, **found}
+    write_json(out / FLY, answer)
+    write_run_record(out, asked, asked.seed)
+    return {**answer, "out": str(out)}
+
+
+def _judged(policy: Any, course: Course) -> int:
+    from eval.judging.judge import JudgeOptions, fly
+
+    options = JudgeOptions(slots=min(16, len(course.trials)), processes=1)
+    results = fly(policy, course.trials, course.vehicle, options=options, tracks=course.tracks)
+    return sum(result.success for result in results)
+
+
+def _real(
+    policy: Any, course: Course, address: str, limits: Limits, out: Path, console: Console
+) -> dict[str, Any]:
+    from eval.worlds.trial import track_of
+    from suite.judging.link.flights import warm_up
+
+    if len(course.trials) != 1:
+        raise ValueError(
+            f"--link flies one flight, and {len(course.trials)} are asked for; give one track, "
+            "one level and --trials 1"
+        )
+    (trial,) = course.trials
+    warm_up(policy)
+    link, wire = UdpLink(address), Wire(COMPANION, VEHICLE)
+    track = track_of(course.tracks, trial)
+    companion = Companion(policy, track, course.vehicle, wire, time.monotonic, limits)
+    console.say(f"waiting for states and images on {address}; Ctrl-C hands over")
+    try:
+        fly_link(companion, link)
+    except KeyboardInterrupt:
+        companion.over = companion.over or "the operator"
+    finally:
+        link.close()
+    if not companion.rows:
+        raise WorkFailed(
+            f"{address}: no vehicle sent a state (ODOMETRY) and a depth image; see docs/fly.md"
+        )
+    row = {**trial._asdict(), "handed_over": companion.over}
+    file = write_log(companion, row, out)
+    console.say(f"handed over: {companion.over}; log: {file}")
+    return {
+        **delays(companion.rows, limits.deadline_s),
+        "gates_passed": companion.gate,
+        "success": companion.over == FINISHED,
+        "flights": [{**row, "file": file}],
+    }
+
+
+def _show(found: dict[str, Any], flights: list[Flight], console: Console) -> None:
+    headers = ("delay", "median [ms]", "p99 [ms]", "longest [ms]")
+    names = {
+        "answer_ms": "state's arrival to set point",
+        "decision_ms": "the same where the policy decided",
+        "state_age_ms": "state's stamp to set point",
+        "image_age_ms": "image's arrival to decision",
+    }
+    lines = [
+        [text, *(f"{found[key][part]:.2f}" for part in ("median", "p99", "max"))]
+        for key, text in names.items()
+        if key in found
+    ]
+    if lines:
+        console.show(rich_table(table(headers, lines)))
+    count = found["trials"]
+    console.say(
+        f"{found['successes']} of {count} finished; the judge's: {found['judge_successes']}"
+    )
+    for flight in flights:
+        if flight.row["handed_over"]:
+            console.say(f"seed {flight.row['seed']}: handed over: {flight.row['handed_over']}")
+    if found["vehicle_slips"]:
+        console.note(
+            f"warning: the simulated vehicle was late {found['vehicle_slips']} times; run again on "
+            "a free machine"
+        )

@@ -1,0 +1,230 @@
+"""The companion computer: states and images in, body rates and thrust out, and its watchdog.
+
+It knows the course, keeps its own count of gates, and is driven by what arrives: every state is
+answered with a set point at once, and where the policy's next decision is due it decides first.
+Time is handed in, so that a test can hold the clock.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from eval.judging.guard import ActionLimits, guard_action
+from eval.quadrotor.attitude import (
+    action_to_force,
+    attitude_command,
+    blend_heading,
+    level_heading,
+)
+from eval.quadrotor.autopilot import ATTITUDE_HZ
+from eval.vehicles.vehicle import Vehicle
+from policies.observation import observe, view_of
+from policies.policy import Policy
+from suite.judging.link.messages import Note, Packet, Picture, SetPoint, State, Wire
+from suite.judging.link.thrust import full_thrust
+from suite.judging.link.watchdog import Clock, ClockCheck, Limits, box_of, trouble_with_state
+from tracks.geometry.crossing import crossing
+from tracks.geometry.rotation import quat_to_rot
+from tracks.geometry.scene import Gates
+from tracks.track import Track
+
+FINISHED = "all gates passed"
+"""The reason of a hand-over that is none to worry about."""
+_SLACK_S = 1e-3
+"""A decision is due this much before its time: stamps are rounded [s]."""
+
+
+class Row(NamedTuple):
+    """What the companion knew and did at one state."""
+
+    state: State
+    thrust: float
+    """Wanted collective thrust per mass [m/s^2]."""
+    rate_b: np.ndarray
+    """(3,) wanted body rates [rad/s]."""
+    action_b: np.ndarray
+    """(3,) the policy's action in use [m/s^2]."""
+    decided: bool
+    """Whether the policy decided on this state."""
+    gate: int
+    """Number of the next gate."""
+    answered_s: float
+    """From the state's arrival to its set point [s]."""
+    state_age_s: float
+    """From the state's stamp to its set point, where both ends have one clock [s]."""
+    image_age_s: float
+    """From the image's arrival to the set point [s]."""
+
+
+class Companion:
+    """One flight of a policy on a course."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        track: Track,
+        vehicle: Vehicle,
+        wire: Wire,
+        clock: Clock,
+        limits: Limits | None = None,
+    ) -> None:
+        """Be ready to fly; the flight begins when a state and an image are there.
+
+        Args:
+            policy: who decides.
+            track: the course, in the frame of the vehicle's states.
+            vehicle: what is flown: mass, thrust, attitude gains.
+            wire: this end of the link.
+            clock: seconds that only go forward.
+            limits: of the watchdog.
+        """
+        self._policy, self._vehicle, self._wire, self._clock = policy, vehicle, wire, clock
+        self._limits = limits or Limits()
+        self._gates = track.scene.gates
+        points = np.vstack([self._gates.center_w, np.reshape(track.start_pos_w, (1, 3))])
+        self._box = box_of(points, self._limits)
+        camera = policy.spec.camera
+        self._picture = Picture(camera.height, camera.width, camera.range_m)
+        self._depth: np.ndarray | None = None
+        self._depth_at = self._heard_at = clock()
+        self._clocks = ClockCheck(self._limits)
+        self._hidden, self._fresh = policy.start(1), True
+        self._action_b, self._heading_w = np.zeros((1, 3)), np.zeros((1, 3))
+        self._begun_s, self._decisions, self._late = 0.0, 0, 0
+        self._last: State | None = None
+        self.gate = 0
+        self.late_answers = self.bad_actions = 0
+        self.over: str | None = None
+        self.rows: list[Row] = []
+        self.events: list[str] = []
+
+    @property
+    def flying(self) -> bool:
+        """Whether it has begun and not handed over."""
+        return bool(self.rows) and self.over is None
+
+    def receive(self, datagrams: list[bytes]) -> list[bytes]:
+        """Return what is to be sent, now that `datagrams` have come (or none have)."""
+        before = self._wire.broken, self._wire.foreign
+        messages = self._wire.decoded(datagrams)
+        for what, count, was in zip(
+            ("broken", "foreign"), (self._wire.broken, self._wire.foreign), before, strict=True
+        ):
+            if count > was:
+                self._event(f"{count - was} {what} messages left out")
+        out: list[bytes] = []
+        for message in messages:
+            if isinstance(message, Packet):
+                self._see(message)
+            elif isinstance(message, State):
+                self._heard_at = self._clock()
+                out += self._answer(message)
+        if self.flying and self._clock() - self._heard_at > self._limits.silence_s:
+            out += self._hand_over(f"no state for {self._limits.silence_s:g} s")
+        return out
+
+    def _event(self, text: str) -> None:
+        self.events.append(f"{self._clock():.3f}: {text}")
+
+    def _hand_over(self, reason: str) -> list[bytes]:
+        """Stop sending set points, which the vehicle's own failsafe sees, and say why."""
+        self.over = reason
+        self._event(f"handed over: {reason}")
+        return [self._wire.encoded(Note(f"policy hands over: {reason}"))]
+
+    def _see(self, packet: Packet) -> None:
+        found = self._picture.add(packet)
+        if found is not None:
+            self._depth, self._depth_at = found, self._clock()
+
+    def _answer(self, state: State) -> list[bytes]:
+        if self.over is not None:
+            return []
+        trouble = trouble_with_state(state, self._box, self._limits)
+        trouble = trouble or self._clocks.add(state.time_s, self._heard_at)
+        if trouble:
+            return self._hand_over(trouble)
+        if self._last is not None and state.time_s <= self._last.time_s:
+            return []  # overtaken on the way
+        if self._depth is None:
+            return []
+        if self.rows and self._heard_at - self._depth_at > self._limits.image_age_s:
+            return self._hand_over(f"no image for {self._limits.image_age_s:g} s")
+        if not self.rows:
+            self._begun_s = state.time_s
+            self._heading_w = level_heading(quat_to_rot(state.quat_wxyz)[None])
+            self._event("begun")
+        self._count_gates(state)
+        if self.gate == len(self._gates.center_w):
+            return self._hand_over(FINISHED)
+        return self._fly(state)
+
+    def _count_gates(self, state: State) -> None:
+        if self._last is not None:
+            center_w, rot_w, opening_g = (x[self.gate] for x in self._gates[:3])
+            passed, _ = crossing(center_w, rot_w, opening_g, self._last.pos_w, state.pos_w)
+            self.gate += bool(passed)
+        self._last = state
+
+    def _fly(self, state: State) -> list[bytes]:
+        due = self._begun_s + self._decisions / self._policy.spec.rate_hz - _SLACK_S
+        decided = state.time_s >= due
+        rot_w = quat_to_rot(state.quat_wxyz)[None]
+        image_age_s = self._clock() - self._depth_at
+        if decided:
+            self._decide(state, rot_w)
+        if self._late >= self._limits.late_most:
+            return self._hand_over(f"{self._late} late answers in a row")
+        if self.over:
+            return [self._wire.encoded(Note(f"policy hands over: {self.over}"))]
+        to_gate_w = self._gates.center_w[None, self.gate] - state.pos_w
+        self._heading_w = blend_heading(self._heading_w, to_gate_w, 1.0 / ATTITUDE_HZ)
+        force_w = action_to_force(self._action_b, rot_w)
+        command = attitude_command(self._vehicle.controller, force_w, rot_w, self._heading_w)
+        thrust, rate_b = float(command.thrust[0]), command.rate_b[0]
+        share = min(1.0, thrust / full_thrust(self._vehicle))
+        sent = self._wire.encoded(SetPoint(rate_b, share))
+        now = self._clock()
+        self.rows.append(
+            Row(
+                state, thrust, rate_b, self._action_b[0], decided, self.gate,
+                now - self._heard_at, now - state.time_s, image_age_s,
+            )
+        )  # fmt: skip
+        return [sent]
+
+    def _decide(self, state: State, rot_w: np.ndarray) -> None:
+        depth = self._depth
+        assert depth is not None
+        count = len(self._gates.center_w)
+        view = view_of(
+            state.pos_w[None],
+            rot_w,
+            state.vel_w[None],
+            _row(self._gates, self.gate),
+            _row(self._gates, min(self.gate + 1, count - 1)),
+            depth[None],
+        )
+        state_b, image = (
+            np.asarray(x, np.float32) for x in observe(self._policy.spec, view, self._action_b)
+        )
+        fresh = np.array([self._fresh])
+        answer, self._hidden = self._policy.act(self._hidden, state_b, image, fresh)
+        took_s = self._clock() - self._heard_at
+        limits = ActionLimits(deadline_s=self._limits.deadline_s)
+        guarded = guard_action(limits, answer, self._action_b, took_s, self._policy.name)
+        self._action_b, self._fresh = guarded.action_b, False
+        self._decisions += 1
+        late = bool(guarded.late[0])
+        self.late_answers += late
+        self._late = self._late + 1 if late else 0
+        if guarded.bad[0]:
+            self.bad_actions += 1
+            self.over = "the policy's answer is not finite"
+            self._event(f"handed over: {self.over}")
+
+
+def _row(gates: Gates, number: int) -> Gates:
+    return Gates(*(x[None, number] for x in gates))

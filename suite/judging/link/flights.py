@@ -1,0 +1,170 @@
+"""Flights over the link in real time: many against a simulated vehicle, or one of whoever calls."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.logs.columns import FlightLogError
+from eval.logs.flight_log import write_flight
+from eval.worlds.trial import TrialSpec, track_of
+from policies.observation import Observation
+from policies.policy import Policy
+from suite.common.console import Console
+from suite.judging.flying import Course
+from suite.judging.link.companion import FINISHED, Companion, Row
+from suite.judging.link.messages import Wire
+from suite.judging.link.report import delays, log_of
+from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S, Request, VehicleProcess
+from suite.judging.link.udp import UdpLink
+from suite.judging.link.watchdog import Limits
+from tracks.track import Track
+
+POLL_S = 0.002
+"""How often the watchdog looks where nothing comes [s]."""
+AFTER_S = 0.5
+"""A vehicle whose companion has seen the last gate says so within this [s]."""
+
+
+class Flight(NamedTuple):
+    """One flight over the link."""
+
+    row: dict[str, Any]
+    """What a table says of it."""
+    rows: list[Row]
+    """Its set points."""
+
+
+def warm_up(policy: Policy) -> None:
+    """Let a policy answer once, so that nothing is compiled in flight."""
+    spec = policy.spec
+    size = (1, spec.camera.height, spec.camera.width)
+    seen = Observation(np.zeros((1, spec.state_size), np.float32), np.zeros(size, np.float32))
+    hidden = policy.start(1)
+    for _ in range(3):
+        _, hidden = policy.act(hidden, seen.state, seen.image, np.ones(1, bool))
+
+
+def fly_simulated(
+    policy: Policy, course: Course, limits: Limits, out: Path, console: Console
+) -> list[Flight]:
+    """Fly every trial of `course` against a simulated vehicle on the loopback, in real time."""
+    warm_up(policy)
+    vehicle, flights = VehicleProcess(), []
+    try:
+        with console.progress("flights", len(course.trials)) as update:
+            for trial in course.trials:
+                track = track_of(course.tracks, trial)
+                flights.append(_one(policy, track, trial, course, limits, out, vehicle))
+                done = sum(flight.row["success"] for flight in flights)
+                update(len(flights), f"{done} of {len(flights)} finished")
+    finally:
+        vehicle.close()
+    return flights
+
+
+def _one(
+    policy: Policy,
+    track: Track,
+    trial: TrialSpec,
+    course: Course,
+    limits: Limits,
+    out: Path,
+    vehicle: VehicleProcess,
+) -> Flight:
+    link = UdpLink("udpin:127.0.0.1:0")
+    try:
+        wire = Wire(COMPANION, VEHICLE)
+        companion = Companion(policy, track, course.vehicle, wire, time.monotonic, limits)
+        address = f"udpout:127.0.0.1:{link.port}"
+        spec = policy.spec
+        vehicle.start(
+            Request(track, trial, course.vehicle, spec.camera, spec.rate_hz, address, policy.name)
+        )
+        flown = None
+        with _no_collection():
+            while flown is None and companion.over is None:
+                exchange(companion, link)
+                flown = vehicle.flown()
+        if flown is None:
+            flown = vehicle.flown(AFTER_S if companion.over == FINISHED else 0.0) or vehicle.stop()
+    finally:
+        link.close()
+    assert flown is not None
+    handed = companion.over if companion.over not in (None, FINISHED) else None
+    row = {
+        **flown.result._asdict(),
+        "handed_over": handed,
+        "vehicle_slips": flown.slips,
+        "late_actions": companion.late_answers,
+        "bad_actions": companion.bad_actions,
+        "file": write_log(companion, flown.result._asdict(), out),
+    }
+    return Flight(row, companion.rows)
+
+
+def exchange(companion: Companion, link: UdpLink) -> None:
+    """Let what has come reach the companion, and what it answers leave."""
+    link.send(companion.receive(link.receive(POLL_S)))
+
+
+def fly_link(
+    companion: Companion,
+    link: UdpLink,
+    clock: Callable[[], float] = time.monotonic,
+    wait_s: float = WAIT_S,
+) -> None:
+    """Fly a vehicle at the other end of `link` until the companion hands over.
+
+    Where no vehicle is heard of within `wait_s`, it ends as well. An interrupt hands over at once:
+    no set point is sent any more.
+    """
+    begin = clock()
+    with _no_collection():
+        while companion.over is None:
+            exchange(companion, link)
+            if not companion.rows and clock() - begin > wait_s:
+                return
+
+
+def write_log(companion: Companion, about: dict[str, Any], out: Path) -> str | None:
+    """Write a flight's log into `out` and return its name; None where it is too short for one."""
+    log = log_of(companion, about)
+    name = f"{Path(str(about['track'])).stem}-{about['difficulty']}-{about['seed']}.parquet"
+    try:
+        if log is not None:
+            write_flight(out / name, log)
+            return name
+    except FlightLogError:
+        pass
+    return None
+
+
+def totals(flights: list[Flight], limits: Limits) -> dict[str, Any]:
+    """Return what the flights came to together."""
+    rows = [row for flight in flights for row in flight.rows]
+    return {
+        "trials": len(flights),
+        "successes": sum(bool(flight.row["success"]) for flight in flights),
+        "handed_over": sum(flight.row["handed_over"] is not None for flight in flights),
+        "vehicle_slips": sum(flight.row["vehicle_slips"] for flight in flights),
+        "late_answers": sum(flight.row["late_actions"] for flight in flights),
+        **delays(rows, limits.deadline_s),
+    }
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Python's collector of garbage would stop a flight for milliseconds."""
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()

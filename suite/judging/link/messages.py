@@ -1,0 +1,216 @@
+"""What travels on the link, as MAVLink 2 of the dialect `common`, and as our own values.
+
+| what | message |
+|---|---|
+| state of the vehicle | ODOMETRY (331): LOCAL_NED, velocity and rates in BODY_FRD |
+| depth image | DATA_TRANSMISSION_HANDSHAKE (130) and ENCAPSULATED_DATA (131): a 16-bit PGM in mm |
+| body rates and thrust | SET_ATTITUDE_TARGET (82), attitude ignored, thrust 0 to 1 |
+| what happened | STATUSTEXT (253) |
+
+MAVLink has no message for depth images (OBSTACLE_DISTANCE is 72 distances in a plane). Its image
+transmission is made for small pictures, and 24 x 32 pixels fit into seven packets; a packet that
+is lost loses its image and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from suite.common.errors import WorkFailed
+from suite.judging.link.frames import turned, turned_quat
+from tracks.geometry.rotation import quat_to_rot, to_local, to_world
+
+PACKET = 253
+"""Bytes of an image in one message."""
+IGNORE_ATTITUDE = 128
+"""Bit of SET_ATTITUDE_TARGET's type mask."""
+_HEAD = b"P5\n%d %d\n65535\n"
+
+
+class State(NamedTuple):
+    """The vehicle's state as it was measured; arrays in our frames."""
+
+    time_s: float
+    """By the vehicle's clock [s]."""
+    pos_w: np.ndarray
+    """(3,) [m]."""
+    quat_wxyz: np.ndarray
+    """(4,) body to world."""
+    vel_w: np.ndarray
+    """(3,) [m/s]."""
+    rate_b: np.ndarray
+    """(3,) [rad/s]."""
+
+
+class SetPoint(NamedTuple):
+    """What the vehicle shall do until the next one."""
+
+    rate_b: np.ndarray
+    """(3,) wanted body rates [rad/s]."""
+    thrust: float
+    """Share of the largest collective thrust, 0 to 1."""
+
+
+class Note(NamedTuple):
+    """Words for the operator."""
+
+    text: str
+
+
+class Packet(NamedTuple):
+    """A part of an image: its place among `parts`, or -1 for the announcement."""
+
+    place: int
+    parts: int
+    data: bytes
+
+
+Message = State | SetPoint | Note | Packet
+
+
+def dialect() -> Any:
+    """Return pymavlink's module of the dialect.
+
+    Raises:
+        WorkFailed: where pymavlink is not installed.
+    """
+    try:
+        from pymavlink.dialects.v20 import common
+    except ImportError as error:
+        raise WorkFailed(
+            "MAVLink needs the package pymavlink: pip install 'diffracing-suite[mavlink]'"
+        ) from error
+    return common
+
+
+class Wire:
+    """One end of a link: our values to bytes, bytes to our values.
+
+    What comes from another system, is cut off or is none of ours is left out and counted: `foreign`
+    and `broken`.
+    """
+
+    def __init__(self, own: int, other: int) -> None:
+        """Make an end with the MAVLink system numbers of itself and of whom it listens to."""
+        self._dialect = dialect()
+        self._out = self._dialect.MAVLink(None, srcSystem=own, srcComponent=1)
+        self._own, self._other = own, other
+        self.foreign = 0
+        self.broken = 0
+
+    def encoded(self, message: Message) -> bytes:
+        """Return a message as one datagram."""
+        mav = self._out
+        if isinstance(message, State):
+            q = turned_quat(message.quat_wxyz)
+            vel = turned(to_local(quat_to_rot(message.quat_wxyz), message.vel_w))
+            made = mav.odometry_encode(
+                int(message.time_s * 1e6), 1, 12, *turned(message.pos_w), q.tolist(), *vel,
+                *turned(message.rate_b), [0.0] * 21, [0.0] * 21,
+            )  # fmt: skip
+        elif isinstance(message, SetPoint):
+            made = mav.set_attitude_target_encode(
+                0, self._other, 1, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0],
+                *turned(message.rate_b), message.thrust,
+            )  # fmt: skip
+        elif isinstance(message, Note):
+            made = mav.statustext_encode(4, message.text.encode("ascii", "replace")[:50])
+        elif message.place < 0:
+            width, height, size = np.frombuffer(message.data, np.uint16)
+            kind = self._dialect.MAVLINK_DATA_STREAM_IMG_PGM
+            numbers = (int(size), int(width), int(height), message.parts)
+            made = mav.data_transmission_handshake_encode(kind, *numbers, PACKET, 0)
+        else:
+            data = message.data.ljust(PACKET, b"\0")
+            made = mav.encapsulated_data_encode(message.place, list(data))
+        return made.pack(mav)
+
+    def decoded(self, datagrams: Iterable[bytes]) -> list[Message]:
+        """Return what arrived, in order."""
+        found: list[Message] = []
+        for datagram in datagrams:
+            # A parser of its own for each: what is cut off must not swallow what comes next.
+            parser = self._dialect.MAVLink(None)
+            parser.robust_parsing = True
+            messages = parser.parse_buffer(datagram) or []
+            self.broken += parser.buf_len() > 0
+            for message in messages:
+                if message.get_type() == "BAD_DATA":
+                    self.broken += 1
+                elif message.get_srcSystem() != self._other:
+                    self.foreign += 1
+                else:
+                    with np.errstate(invalid="ignore"):  # the watchdog finds infinities
+                        found += self._ours(message)
+        return found
+
+    def _ours(self, message: Any) -> list[Message]:
+        kind = message.get_type()
+        if kind == "ODOMETRY":
+            quat = turned_quat(message.q)
+            norm = float(np.linalg.norm(quat))
+            quat = quat / norm if np.isfinite(norm) and norm > 0.5 else np.full(4, np.nan)
+            vel_w = to_world(quat_to_rot(quat), turned([message.vx, message.vy, message.vz]))
+            rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
+            place = turned([message.x, message.y, message.z])
+            return [State(message.time_usec * 1e-6, place, quat, vel_w, turned(rates))]
+        if kind == "SET_ATTITUDE_TARGET":
+            if message.target_system != self._own:
+                self.foreign += 1
+                return []
+            rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
+            return [SetPoint(turned(rates), float(message.thrust))]
+        if kind == "STATUSTEXT":
+            return [Note(message.text)]
+        if kind == "DATA_TRANSMISSION_HANDSHAKE":
+            sizes = np.array([message.width, message.height, message.size], np.uint16)
+            return [Packet(-1, message.packets, sizes.tobytes())]
+        if kind == "ENCAPSULATED_DATA":
+            return [Packet(message.seqnr, 0, bytes(message.data))]
+        return []
+
+
+def image_packets(depth_m: np.ndarray, range_m: float) -> list[Packet]:
+    """Return a planar depth image (H, W) [m] as packets; what is at the range or beyond is 0."""
+    height, width = depth_m.shape
+    millimetres = np.where(depth_m < range_m, np.rint(depth_m * 1e3), 0).clip(0, 65535)
+    data = _HEAD % (width, height) + millimetres.astype(">u2").tobytes()
+    parts = [data[k : k + PACKET] for k in range(0, len(data), PACKET)]
+    sizes = np.array([width, height, len(data)], np.uint16)
+    first = Packet(-1, len(parts), sizes.tobytes())
+    return [first, *(Packet(k, 0, part) for k, part in enumerate(parts))]
+
+
+class Picture:
+    """Packets gathered to images."""
+
+    def __init__(self, height: int, width: int, range_m: float) -> None:
+        """Gather images of this size; what the camera does not see counts as `range_m`."""
+        self._shape, self._range_m = (height, width), range_m
+        self._head = _HEAD % (width, height)
+        self._size = len(self._head) + 2 * height * width
+        self._parts: dict[int, bytes] = {}
+        self._wanted = 0
+
+    def add(self, packet: Packet) -> np.ndarray | None:
+        """Return the depth image (H, W) [m] that this packet completes, else None."""
+        if packet.place < 0:
+            size = int(np.frombuffer(packet.data, np.uint16)[2])
+            fits = size == self._size and packet.parts == -(-self._size // PACKET)
+            self._parts, self._wanted = {}, packet.parts if fits else 0
+            return None
+        if packet.place >= self._wanted:
+            return None
+        self._parts[packet.place] = packet.data
+        if len(self._parts) < self._wanted:
+            return None
+        data = b"".join(self._parts[k] for k in range(self._wanted))[: self._size]
+        self._parts, self._wanted = {}, 0
+        if not data.startswith(self._head):
+            return None
+        millimetres = np.frombuffer(data, ">u2", offset=len(self._head)).reshape(self._shape)
+        metres = np.where(millimetres == 0, self._range_m, millimetres * 1e-3)
+        return np.minimum(metres, self._range_m)

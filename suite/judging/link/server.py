@@ -1,0 +1,119 @@
+"""A process that is the vehicle's end of the link: simulated flights in real time, on request."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from multiprocessing.connection import Connection
+from typing import NamedTuple
+
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.trial import TrialResult, TrialSpec
+from suite.common.errors import WorkFailed
+from suite.judging.link.messages import Wire
+from suite.judging.link.simulated import SimulatedVehicle
+from suite.judging.link.udp import UdpLink
+from tracks.common.work import let_views_travel
+from tracks.geometry.camera import Camera
+from tracks.track import Track
+
+VEHICLE, COMPANION = 1, 2
+"""MAVLink system numbers of the two ends."""
+WAIT_S = 30.0
+"""Without a first set point for so long the vehicle gives up [s]."""
+SLIP_S = 0.02
+"""A step that is this late moves the steps after it, instead of a burst that catches up [s]."""
+
+
+class Request(NamedTuple):
+    """A flight that the vehicle shall make."""
+
+    track: Track
+    trial: TrialSpec
+    vehicle: Vehicle
+    camera: Camera
+    image_hz: float
+    address: str
+    policy: str
+
+
+class Flown(NamedTuple):
+    """What the vehicle says of a flight."""
+
+    result: TrialResult
+    slips: int
+    """Steps that came more than `SLIP_S` late: the machine was busy."""
+
+
+class VehicleProcess:
+    """The process; `start` a flight, ask for `flown`, `stop` one that goes on."""
+
+    def __init__(self) -> None:
+        """Start it."""
+        let_views_travel()
+        context = multiprocessing.get_context("spawn")
+        self._pipe, other = context.Pipe()
+        self._process = context.Process(target=serve, args=(other,), daemon=True)
+        self._process.start()
+        other.close()
+
+    def start(self, request: Request) -> None:
+        """Let it fly."""
+        self._pipe.send(request)
+
+    def flown(self, wait_s: float = 0.0) -> Flown | None:
+        """Return what came of the flight, None while it goes on.
+
+        Raises:
+            WorkFailed: where the process has died.
+        """
+        try:
+            return self._pipe.recv() if self._pipe.poll(wait_s) else None
+        except EOFError:
+            raise WorkFailed("the simulated vehicle's process died; run again") from None
+
+    def stop(self) -> Flown | None:
+        """End the flight where it stands and return it."""
+        self._pipe.send("stop")
+        return self.flown(WAIT_S)
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.terminate()
+        self._process.join(5.0)
+        self._pipe.close()
+
+
+def serve(pipe: Connection) -> None:
+    """Be the process: fly what is asked for until the pipe closes."""
+    while True:
+        try:
+            request = pipe.recv()
+        except (EOFError, KeyboardInterrupt):
+            return
+        if isinstance(request, Request):
+            pipe.send(fly_in_real_time(request, pipe))
+
+
+def fly_in_real_time(request: Request, pipe: Connection) -> Flown:
+    """Fly one trial against the clock, until it ends or something comes by the pipe."""
+    link = UdpLink(request.address)
+    try:
+        wire = Wire(VEHICLE, COMPANION)
+        vehicle = SimulatedVehicle(
+            request.track, request.trial, request.vehicle, request.camera, request.image_hz, wire
+        )
+        begin, due, slips = time.monotonic(), time.monotonic(), 0
+        while not vehicle.over and not pipe.poll():
+            due += vehicle.dt
+            now = time.monotonic()
+            if now < due:
+                time.sleep(due - now)
+            elif now - due > SLIP_S:
+                due, slips = now, slips + 1
+            if not vehicle.begun and now - begin > WAIT_S:
+                break
+            link.send(vehicle.step(link.receive(), clock_s=due))
+    finally:
+        link.close()
+    return Flown(vehicle.result(request.policy), slips)

@@ -1,0 +1,207 @@
+"""A vehicle in MuJoCo behind a link, as a flight controller with a depth camera would be.
+
+It measures, sends, listens, and flies the set points that come; where they stop it brakes and
+hovers by itself. Until the first one it stands in the air where the trial starts. Its physics are
+the judge's, step by step.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from eval.quadrotor.attitude import action_to_force, attitude_command, level_heading
+from eval.quadrotor.autopilot import make_autopilot, start_autopilot
+from eval.quadrotor.plant import Command, Motion, uses_noise
+from eval.quadrotor.stepper import Inputs, plant_step
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
+from eval.worlds.slots import layout_of, noise_of
+from eval.worlds.trial import (
+    DIVERGED,
+    ENDINGS,
+    FINISHED,
+    FLYING,
+    Course,
+    Rules,
+    TrialResult,
+    TrialSpec,
+    has_diverged,
+    is_wrench,
+    judge_state,
+    start_progress,
+)
+from suite.judging.link.messages import SetPoint, State, Wire, image_packets
+from suite.judging.link.thrust import full_thrust
+from tracks.geometry.camera import Camera
+from tracks.geometry.rotation import to_local, to_world
+from tracks.geometry.scene import Gates
+from tracks.track import Track
+
+LOST_S = 0.2
+"""Without a set point for so long the vehicle brakes by itself [s]."""
+BRAKE = 2.0
+"""Wanted deceleration for each m/s while it does [1/s]."""
+BRAKE_MOST = 6.0
+"""[m/s^2]."""
+
+
+class SimulatedVehicle:
+    """One trial's vehicle; `step` is one physics step."""
+
+    def __init__(
+        self,
+        track: Track,
+        trial: TrialSpec,
+        vehicle: Vehicle,
+        camera: Camera,
+        image_hz: float,
+        wire: Wire,
+        rules: Rules | None = None,
+    ) -> None:
+        """Stand at the start of `track`.
+
+        Args:
+            track: the trial's.
+            trial: its seed sets the wind, where there is any.
+            vehicle: what flies.
+            camera: of the depth images.
+            image_hz: how many of them a second.
+            wire: this end of the link.
+            rules: when the trial ends.
+        """
+        self._vehicle, self._wire, self._trial = vehicle, wire, trial
+        self._rules = rules or Rules()
+        self._autopilot = make_autopilot(vehicle)
+        self.dt = self._autopilot.dt
+        self._model = compile_model(track, vehicle, self.dt, layout_of([track]).solids)
+        self._data = mujoco.MjData(self._model)
+        self._data.qpos[:] = start_state(track)
+        mujoco.mj_step1(self._model, self._data)
+        self._draws = None
+        if uses_noise(self._autopilot.plant):
+            self._draws = noise_of(trial, round(self._rules.time_limit_s / self.dt) + 2)
+        motion = motion_of(self._data)
+        first = None if self._draws is None else self._draws[:1]
+        self._plant = start_autopilot(self._autopilot, motion, first).plant
+        gates = track.scene.gates
+        count = np.array([len(gates.center_w)], np.int32)
+        self._course = Course(Gates(*(x[None] for x in gates)), count)
+        self._progress = start_progress(motion.pos_w)
+        self._eye, self._steps_an_image = Eye(camera), 1 / (image_hz * self.dt)
+        self._command: Command | None = None
+        self._heard_step = self._ticks = 0
+        self.images = 0
+
+    @property
+    def over(self) -> bool:
+        """Whether the trial has ended."""
+        return int(self._progress.ended[0]) != FLYING
+
+    @property
+    def begun(self) -> bool:
+        """Whether a set point has come."""
+        return self._command is not None
+
+    @property
+    def time_s(self) -> float:
+        """Of its own clock, from when it was switched on [s]."""
+        return self._ticks * self.dt
+
+    def step(self, datagrams: list[bytes], clock_s: float | None = None) -> list[bytes]:
+        """Fly one physics step and return what was sent before it.
+
+        Args:
+            datagrams: what has come.
+            clock_s: what stamps say; its own clock if not given [s].
+        """
+        for message in self._wire.decoded(datagrams):
+            if (
+                isinstance(message, SetPoint)
+                and np.isfinite([*message.rate_b, message.thrust]).all()
+            ):
+                thrust = np.clip(message.thrust, 0.0, 1.0) * full_thrust(self._vehicle)
+                limit = np.array(self._vehicle.controller.rate_max)
+                rate_b = np.clip(message.rate_b, -limit, limit)
+                self._command = Command(np.array([thrust]), rate_b[None])
+                self._heard_step = int(self._progress.step[0])
+        motion = motion_of(self._data)
+        sent = self._measured(motion, self.time_s if clock_s is None else clock_s)
+        self._ticks += 1
+        if self._command is not None and not self.over:
+            self._fly(motion, self._command)
+        return sent
+
+    def _measured(self, motion: Motion, clock_s: float) -> list[bytes]:
+        sent = []
+        if self._ticks >= round(self.images * self._steps_an_image):
+            depth = self._eye.image(self._model, self._data, motion.pos_w[0], motion.rot_w[0])
+            packets = image_packets(depth, self._eye.camera.range_m)
+            sent += [self._wire.encoded(packet) for packet in packets]
+            self.images += 1
+        if self._ticks % self._autopilot.attitude_every == 0:
+            quat = self._data.qpos[3:].copy()
+            state = State(clock_s, motion.pos_w[0], quat, motion.vel_w[0], motion.rate_b[0])
+            sent.append(self._wire.encoded(state))
+        return sent
+
+    def _fly(self, motion: Motion, command: Command) -> None:
+        step = int(self._progress.step[0])
+        if (step - self._heard_step) * self.dt > LOST_S:
+            command = self._braking(motion)
+        noise = None if self._draws is None else self._draws[None, step + 1]
+        plant, wrench = plant_step(
+            self._autopilot.plant,
+            self._plant,
+            motion,
+            Inputs(command, noise=noise),
+            np.array([step * self.dt]),
+        )
+        self._plant = plant
+        bad = ~is_wrench(self._rules, wrench)
+        if not bad[0]:
+            self._data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
+            self._data.qfrc_applied[3:] = wrench.torque_b[0]
+            mujoco.mj_step2(self._model, self._data)
+            mujoco.mj_step1(self._model, self._data)
+        self._progress = self._progress._replace(step=self._progress.step + 1)
+        after, contact = motion_of(self._data), np.array([self._data.ncon > 0])
+        diverged = bad | has_diverged(self._rules, after)
+        self._progress = judge_state(
+            self._rules, self._progress, self._course, self.dt, after, contact, diverged
+        )
+
+    def _braking(self, motion: Motion) -> Command:
+        wanted_w = (-BRAKE * motion.vel_w).clip(-BRAKE_MOST, BRAKE_MOST)
+        force_w = action_to_force(to_local(motion.rot_w, wanted_w), motion.rot_w)
+        heading_w = level_heading(motion.rot_w)
+        return attitude_command(self._vehicle.controller, force_w, motion.rot_w, heading_w)
+
+    def result(self, policy: str) -> TrialResult:
+        """Return how the trial went so far; one that did not end is out of time."""
+        progress = self._progress
+        ended = int(progress.ended[0])
+        how = ENDINGS[ended - 1] if ended else "timeout"
+        step = int(progress.step[0])
+        place = progress.pos_w[0]
+        return TrialResult(
+            *self._trial,
+            policy=policy,
+            vehicle=self._vehicle.name,
+            world="link",
+            success=ended == FINISHED,
+            gates_passed=int(progress.gates[0]),
+            ended_by=how,
+            collided_with=contact_name(self._model, self._data) if how == "collision" else None,
+            pos_x=float(place[0]),
+            pos_y=float(place[1]),
+            pos_z=float(place[2]),
+            time_s=step * self.dt,
+            v_max=float(progress.v_max[0]),
+            v_mean=float(progress.v_sum[0]) / max(step + (ended != DIVERGED), 1),
+            gates_8s=int(progress.gates_8s[0]),
+            gates_035=int(progress.gates_035[0]),
+            bad_actions=0,
+            limited_actions=0,
+            late_actions=0,
+        )

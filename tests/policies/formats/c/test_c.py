@@ -1,0 +1,199 @@
+"""The exported C: what it looks like, that it compiles without a word, and what it answers."""
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from policies.errors import PolicyError
+from policies.formats.c import arrays, quantised, source
+from policies.formats.c.c_file import load_c
+from policies.formats.c.compiler import STRICT, compiled_library, find_compiler
+from policies.formats.c.forward import Observed
+from policies.formats.c.project import c_project, drawn, native_answers
+from policies.policy import load_policy
+
+
+def answers(policy, observed):
+    hidden, found = policy.start(1), []
+    for state, image, fresh in zip(*observed, strict=True):
+        action, hidden = policy.act(hidden, state[None], image[None], np.array([fresh]))
+        found.append(action[0])
+    return np.array(found)
+
+
+def checked(folder, *flags, name="check"):
+    """Compile main.c and policy.c strictly and run them; the finished process."""
+    files = [str(folder / file) for file in ("main.c", "policy.c")]
+    program = folder / name
+    command = [*(find_compiler() or ()), *STRICT, *flags, *files, "-o", str(program), "-lm"]
+    made = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stderr[:2000]
+    return subprocess.run([program], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("name", ["float32", "int8", "odd"])
+def test_it_compiles_strictly_and_runs_under_the_sanitizers(exports, name):
+    flags = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    plain = ("-DPOLICY_PLAIN",) if name == "odd" else ("-march=native",)
+    done = checked(exports[name].folder, *flags, *plain)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "12 steps, 0 numbers wrong" in done.stdout
+
+
+def test_the_vectors_find_one_wrong_weight(exports, tmp_path):
+    folder = shutil.copytree(exports["odd"].folder, tmp_path / "wrong")
+    text = (folder / "policy.c").read_text()
+    at = text.index("action_weight[")
+    at = text.index("{", at) + 1
+    (folder / "policy.c").write_text(text[:at] + "9.0f +" + text[at:])
+    assert checked(folder).returncode == 1
+
+
+@pytest.mark.parametrize(("name", "steps"), [("float32", 1000), ("odd", 100)])
+def test_parity_with_jax_over_a_thousand_steps_with_memory(exports, name, steps):
+    export = exports[name]
+    observed = drawn(export.checkpoint.spec, steps, seed=9)
+    policy = load_policy(export.folder, trust=True)
+    assert policy.spec == export.checkpoint.spec
+    wanted = native_answers(export.checkpoint.params, policy.spec, observed)
+    assert np.abs(wanted).std() > 0.5
+    np.testing.assert_allclose(answers(policy, observed), wanted, atol=1e-4, rtol=0)
+
+
+def test_int8_answers_as_worked_out_and_near_the_policy(exports):
+    export = exports["int8"]
+    params, spec = export.checkpoint.params, export.checkpoint.spec
+    observed = drawn(spec, 60, seed=5)
+    found = answers(load_c(export.folder, trust=True), observed)
+    wanted = quantised.answers(params, spec, export.project.layers, observed)
+    np.testing.assert_allclose(found, wanted, atol=0.05, rtol=0)
+    native = native_answers(params, spec, observed)
+    assert np.abs(found - native).max() < 0.1 * np.abs(native).max()
+
+
+def test_a_row_stands_alone_and_a_fresh_one_has_no_memory(exports):
+    policy = load_c(exports["odd"].folder, trust=True)
+    observed = drawn(policy.spec, 6, seed=2)
+    alone = answers(policy, observed)
+    hidden = policy.start(3)
+    for k, (state, image, _) in enumerate(zip(*observed, strict=True)):
+        states, images = (np.stack([np.zeros_like(x), x, x[::-1]]) for x in (state, image))
+        action, hidden = policy.act(hidden, states, images, np.full(3, k == 0))
+        assert action[1].tobytes() == alone[k].tobytes()
+    again = Observed(*(np.concatenate([x, x]) for x in observed))
+    assert answers(policy, again)[6:].tobytes() == alone.tobytes()
+
+
+def test_what_is_not_finite_is_answered_with_nan_and_forgotten(exports):
+    policy = load_c(exports["odd"].folder, trust=True)
+    state, image, _ = drawn(policy.spec, 2)
+    before, none = policy.start(1), np.zeros(1, bool)
+    for bad in (np.nan, np.inf):
+        for which in (0, 1):
+            one, picture = state[:1].copy(), image[:1].copy()
+            (one, picture)[which].ravel()[-1] = bad
+            action, after = policy.act(before, one, picture, none)
+            assert np.isnan(action).all() and (after == before).all()
+
+
+def test_code_is_not_run_without_trust(exports):
+    with pytest.raises(PolicyError, match="pass --trust"):
+        load_policy(exports["odd"].folder / "policy.c")
+
+
+def test_what_cannot_be_compiled_is_said_in_plain_words(exports, tmp_path, monkeypatch):
+    folder = shutil.copytree(exports["odd"].folder, tmp_path / "copy")
+    (folder / "policy.c").write_text('#include "policy.h"\nvoid policy_reset(policy_state *s) {')
+    with pytest.raises(PolicyError, match="refuses it"):
+        load_c(folder, trust=True)
+    (folder / "policy.h").unlink()
+    with pytest.raises(PolicyError, match="policy.h: missing"):
+        load_c(folder, trust=True)
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(PolicyError, match="no C compiler"):
+        load_c(exports["odd"].folder, trust=True)
+
+
+FOREIGN = """
+#include "policy.h"
+static int steps;
+void policy_reset(policy_state *state) {{ state->seen = 0.0f; }}
+void policy_step(policy_state *state, const float *observation, const float *image, float *action)
+{{
+    state->seen += observation[0] + image[0] * 0.0f;
+    action[0] = action[1] = action[2] = {answer};
+    steps++;
+}}
+"""
+DOOR = """
+#define POLICY_STATE_SIZE {size}
+#define POLICY_IMAGE_HEIGHT 24
+#define POLICY_IMAGE_WIDTH 32
+typedef struct { float seen; } policy_state;
+void policy_reset(policy_state *state);
+void policy_step(policy_state *, const float *, const float *, float *);
+"""
+
+
+def test_any_c_with_this_door_flies_but_none_with_a_memory_of_its_own(tmp_path):
+    def written(answer, size=12):
+        (tmp_path / "policy.c").write_text(FOREIGN.format(answer=answer))
+        (tmp_path / "policy.h").write_text(DOOR.replace("{size}", str(size)))
+        return load_c(tmp_path, trust=True)
+
+    policy = written("state->seen")
+    assert policy.name == "policy.c"
+    assert (policy.spec.rate_hz, policy.state_bytes) == (30.0, 4)
+    with pytest.raises(PolicyError, match="belongs into policy_state"):
+        written("(float)steps")
+    with pytest.raises(PolicyError, match="expected by its POLICY_JSON"):
+        written("state->seen", size=15)
+
+
+def test_nothing_but_the_door_is_seen_from_outside(exports):
+    export = exports["int8"]
+    text = (export.folder / "policy.c").read_text()
+    assert [line for line in text.splitlines() if line.startswith("#include")] == [
+        "#include <math.h>",
+        '#include "policy.h"',
+    ]
+    names = subprocess.run(
+        ["nm", "-D", "--defined-only", compiled_library(export.folder / "policy.c")],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if names.returncode == 0:
+        found = {line.split()[-1] for line in names.stdout.splitlines() if " T " in line}
+        assert {name for name in found if not name.startswith(("suite_", "_"))} == {
+            "policy_reset",
+            "policy_step",
+        }
+    header = (export.folder / "policy.h").read_text()
+    for said in ("POLICY_STATE_SIZE 12", "POLICY_IMAGE_HEIGHT 24", "POLICY_RATE_HZ 33.0f"):
+        assert f"#define {said}" in header
+    assert export.checkpoint.config["weights"]["sha256"] in header
+
+
+def test_sizes_in_the_header_are_those_of_the_struct(exports):
+    for name, export in exports.items():
+        policy = load_c(export.folder, trust=True)
+        assert policy.state_bytes == source.memory_bytes(policy.spec, name == "int8")
+
+
+def test_tanh_and_literals_are_exact_enough():
+    p, q = (np.array(c, np.float32) for c in source.tanh_polynomials())
+    x = np.linspace(-8, 8, 10_001, dtype=np.float32)
+    value = x * np.polyval(p[::-1], x * x) / np.polyval(q[::-1], x * x)
+    assert np.abs(value - np.tanh(x.astype(float))).max() < 4e-7
+    rng = np.random.default_rng(0)
+    for value in rng.normal(size=1000).astype(np.float32) * np.float32(1e-3):
+        assert np.float32(arrays.float_text(float(value))[:-1]) == value
+
+
+def test_a_type_is_known_and_int8_needs_flights(exports):
+    checkpoint = exports["int8"].checkpoint
+    with pytest.raises(ValueError, match="unknown type 'int9'. Did you mean 'int8'"):
+        c_project(checkpoint, "tiny", "int9")
+    with pytest.raises(PolicyError, match="needs observations of flights"):
+        c_project(checkpoint, "tiny", "int8")

@@ -1,0 +1,126 @@
+"""Exports in C with their cards: what is written, how near it is, and how it is timed."""
+
+import json
+
+import numpy as np
+import pytest
+
+from policies.formats.c.c_file import load_c
+from policies.formats.c.compiler import find_compiler
+from policies.formats.c.project import drawn
+from policies.formats.policy_file import load_policy_checkpoint
+from policies.policy import load_policy
+from policies.spec import PolicySpec
+from suite import cli
+from suite.judging.deploy import card, exporting, latency, observed, parity
+from tests.support.pilots import Steady
+from tests.support.small_policy import small_checkpoint
+
+needs_cc = pytest.mark.skipif(find_compiler() is None, reason="no C compiler: cc, or what CC names")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return small_checkpoint(tmp_path_factory.mktemp("policy"))
+
+
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch, tmp_path_factory):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+@needs_cc
+def test_the_command_writes_c_and_a_card_that_says_how_near_it_is(folder, tmp_path, capsys):
+    asked = ["export", "--policy", str(folder), "--format", "c", "--out", str(tmp_path), "--json"]
+    assert cli.main(asked) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["parity"]["steps"] == 1000 and answer["parity"]["worst"] <= 1e-4
+    names = {"policy.h", "policy.c", "vectors.h", "main.c", "CMakeLists.txt", card.CARD}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    text = (tmp_path / card.CARD).read_text()
+    digest = json.loads((folder / "config.json").read_text())["weights"]["sha256"]
+    for said in ("| policy | tiny |", digest, "| licence | Apache-2.0", "Success: not known"):
+        assert said in text
+
+
+@needs_cc
+def test_int8_is_scaled_by_flights(folder, tmp_path, monkeypatch, capsys):
+    spec = load_policy_checkpoint(folder).spec
+    monkeypatch.setattr(exporting, "observed_flights", lambda policy: drawn(spec, 30, seed=3))
+    asked = ["export", str(folder), "--format", "c", "--dtype", "int8", "--out", str(tmp_path)]
+    assert cli.main(asked) == 0
+    assert "on flights" in capsys.readouterr().out
+    assert load_policy(tmp_path, trust=True).name == "tiny-int8.c"
+
+
+def test_what_cannot_be_exported_is_refused(folder, tmp_path, capsys):
+    for args, message in (
+        (["--format", "tflite"], "unknown format 'tflite'"),
+        (["--format", "onnx", "--dtype", "int8"], "float32 alone"),
+        (["--policy", "racer"], "give one"),
+    ):
+        assert cli.main(["export", str(folder), "--out", str(tmp_path), *args]) == 2
+        assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
+    found = parity.Parity(0, "", np.nan, np.nan, None)
+    text = card.card_text("racer", "racer", load_policy_checkpoint(folder), "float32", found)
+    assert "| racer | zigzag | 0 | 100 | 99 % [95, 100]" in text
+    assert "no C compiler" in text and "not measured" in text
+
+
+def test_without_a_compiler_nothing_is_measured_and_it_is_said(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    found = parity.parity(tmp_path, load_policy_checkpoint(folder), None)
+    assert found.steps == 0 and "not compared here" in found.sentence
+
+
+def test_what_a_policy_is_given_on_flights_is_kept(monkeypatch):
+    monkeypatch.setattr(observed, "TRACK", "zigzag")
+    pilot = Steady((0.0, 0.0, -8.0), spec=PolicySpec(rate_hz=10.0))
+    heard = observed.observed_flights(pilot, levels=(0, 1))
+    assert heard.fresh.sum() == 2 and heard.fresh[0]
+    assert heard.state.shape[1:] == (12,) and heard.image.shape[1:] == (24, 32)
+    assert len(heard.state) == len(heard.image) == len(heard.fresh)
+    # It falls: every flight starts at rest, and sinks from then on.
+    assert (heard.state[heard.fresh, :3] == 0).all() and (heard.state[~heard.fresh, 2] < 0).all()
+
+
+def test_rows_in_which_nothing_flies_are_no_observations():
+    listener = observed.Listener(Steady())
+    hidden = listener.start(2)
+    for k, flying in enumerate(((1, 1), (1, 0), (1, 0))):
+        state = np.full((2, 12), float(k + 1)) * np.array(flying)[:, None]
+        fresh = np.array([k == 0, k == 0])
+        _, hidden = listener.act(hidden, state, np.zeros((2, 24, 32)), fresh)
+    heard = listener.heard()
+    # Flight after flight: three steps of the first, one of the second.
+    assert heard.state[:, 0].tolist() == [1.0, 2.0, 3.0, 1.0]
+    assert heard.fresh.tolist() == [True, False, False, True]
+
+
+@needs_cc
+def test_the_engines_that_are_timed_are_one_policy(folder, tmp_path):
+    torch = pytest.importorskip("torch")
+    from policies.formats.export import export_policy
+
+    export_policy(folder, tmp_path, ["c"])
+    checkpoint = load_policy_checkpoint(folder)
+    in_c = latency.c_step(load_c(tmp_path, trust=True))
+    usual, _ = latency.onnx_steps(checkpoint)
+    in_torch = latency.torch_step(checkpoint)
+    for _ in range(3):
+        action = in_c()
+        np.testing.assert_allclose(action, np.asarray(usual()), atol=1e-4)
+        np.testing.assert_allclose(action, torch.as_tensor(in_torch()).numpy(), atol=1e-4)
+
+
+def test_engines_are_timed_in_turn(monkeypatch):
+    calls = []
+    monkeypatch.setattr(latency, "BLOCK", 2)
+    monkeypatch.setattr(latency, "WARM", 1)
+    times = latency.time_in_turn({n: lambda n=n: calls.append(n) for n in "ab"}, rounds=2)
+    assert "".join(calls) == "aaabbbaaabbb"
+    assert times["a"].median_s <= times["a"].p99_s <= times["a"].max_s
