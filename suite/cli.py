@@ -119,9 +119,11 @@ def _run(name: str, args: list[str]) -> int:
     from suite.common.compiled import keep_compiled
     from suite.common.console import Console, stdout_kept_clean
     from suite.common.running.lock import one_writer_each
+    from suite.common.running.threads import set_threads
     from tracks.input.ranges import check_ranges
 
     keep_compiled()
+    set_threads()
     try:
         command, config = parse(name, args)
     except SystemExit as stop:
