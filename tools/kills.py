@@ -3,9 +3,9 @@
     python tools/kills.py COUNT [COMMAND ...] [--seed N]
 
 Every command of the table below runs without a disturbance; then COUNT times it is killed at a
-random moment of the time that took, then up to five times more, sooner, after it was called again,
-and then left to end. What it wrote must be equal to the undisturbed run's, but for times and stamps.
-Prints a line a run and fails where one differs. Only what was killed while it ran is counted.
+random moment of the time that took, and up to five times more, sooner, after it was called again,
+and then left to end. What it wrote must be equal to the undisturbed run's, but for times and
+stamps. Prints a line a run and fails where one differs. Only what was killed while it ran counts.
 """
 
 from __future__ import annotations
