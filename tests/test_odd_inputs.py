@@ -53,6 +53,8 @@ READ = {
     "evaluation": ("run/run.json", "view run"),
 }
 """A kind of file, where one lies, and a command that reads it."""
+LOGS = ("Parquet log", "CSV log")
+"""What may be given as a folder of many."""
 
 
 def at_its_place(what, folder, monkeypatch):
@@ -67,13 +69,16 @@ def at_its_place(what, folder, monkeypatch):
     return folder / name, [*line.split(), "--out", out]
 
 
-@pytest.mark.parametrize("kind", ["pipe", "link to an endless device", "folder", "3 GB"])
-@pytest.mark.parametrize("what", READ)
+KINDS = ("pipe", "link to an endless device", "folder", "3 GB")
+ODD_FILES = [
+    (what, kind) for what in READ for kind in KINDS if what not in LOGS or kind != "folder"
+]
+
+
+@pytest.mark.parametrize(("what", "kind"), ODD_FILES)
 def test_what_is_no_file_of_a_sensible_size_is_refused_unread(
     what, kind, tmp_path, monkeypatch, capsys
 ):
-    if (what, kind) in {("CSV log", "folder"), ("Parquet log", "folder")}:
-        pytest.skip("a folder of logs")
     path, line = at_its_place(what, tmp_path, monkeypatch)
     path.unlink(missing_ok=True)
     match kind:
@@ -130,6 +135,24 @@ def test_a_vehicle_that_cannot_be_is_refused(before, after, tmp_path, monkeypatc
     Path("it.toml").write_text(VEHICLE.replace(before, after))
     said = refused(["eval", "--vehicle", "it.toml", "--trials", "1"], capsys)
     assert "it.toml" in said and after.split()[0] in said
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("1.5]", "1e300]"),
+        ("1.5]", "nan]"),
+        ("width = 1.0", "width = 1e-300"),
+        ("width = 1.0", "width = -1.0"),
+        ("width = 1.0", "width = " + "9" * 400),
+    ],
+)
+def test_a_track_that_cannot_be_is_refused(before, after, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    gate = "[[gates]]\ncenter = [0, 0, 1.5]\nwidth = 1.0\nheight = 1.0\n"
+    Path("it.toml").write_text(gate.replace(before, after))
+    assert "it.toml" in refused(["eval", "--track", "it.toml", "--trials", "1"], capsys)
+    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(
