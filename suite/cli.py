@@ -64,7 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = _dispatch(args)
             sys.stdout.flush()
             return code
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
+        # Held until the process ends: with its frames would go what XLA's threads may still use.
+        sys.last_value = error
         _complain("interrupted; what was finished is kept")
         return INTERRUPTED
     except BrokenPipeError:
