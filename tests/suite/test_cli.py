@@ -149,7 +149,7 @@ def test_what_an_interrupted_command_held_is_not_freed_before_the_process_ends(
     freed = []
 
     def run(config, console):
-        held = types.SimpleNamespace()
+        held = {"it"}
         weakref.finalize(held, freed.append, "it")
         raise KeyboardInterrupt
 
