@@ -1,7 +1,11 @@
-"""The error for a policy that cannot be used: a person's mistake, so its message is for people."""
+"""The errors of policies: a person's mistake, or a model's failure; the message is for people."""
 
 from __future__ import annotations
 
 
 class PolicyError(ValueError):
     """A policy or checkpoint is refused; the message names it, the fault and what to do next."""
+
+
+class NoAnswer(PolicyError):
+    """A policy that was loaded gave no answer: it failed, or did not come to an end in time."""

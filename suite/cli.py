@@ -65,7 +65,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = _dispatch(args)
             sys.stdout.flush()
             return code
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
+        # Held until the process ends: with its frames would go what XLA's threads may still use.
+        sys.last_value = error
         _complain("interrupted; what was finished is kept")
         return INTERRUPTED
     except BrokenPipeError:
@@ -119,9 +121,10 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 def _run(name: str, args: list[str]) -> int:
     from suite.common.compiled import keep_compiled
     from suite.common.console import Console, stdout_kept_clean
-    from suite.common.running.threads import one_thread_a_product
+    from suite.common.running.threads import one_thread_a_product, set_threads
 
     keep_compiled()
+    set_threads()
     one_thread_a_product()
     try:
         command, config = parse(name, args)

@@ -1,11 +1,15 @@
-"""A policy's output checked and limited on its way to the quadrotor."""
+"""A policy asked for its output, which is checked and limited on its way to the quadrotor."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+
+from policies.errors import NoAnswer
+from policies.policy import Hidden, Policy
 
 
 @dataclass(frozen=True)
@@ -16,11 +20,9 @@ class ActionLimits:
     """Largest |action_b| [m/s^2]; longer ones are shortened. Over the net acceleration that a
     thrust-to-weight ratio of 5 can make, so that it stops faults and not flying."""
     deadline_s: float | None = None
-    """A policy's answer for its batch that takes longer than this is late and not flown [s]; None
-    sets no deadline. With one, outcomes depend on the machine's load and do not repeat."""
-    late_most: int = 10
-    """So many answers in a row that come late end the trials in the air, as out of time: a policy
-    that is too slow would be waited for thousands of times."""
+    """An answer of the policy that takes longer than this is late: it is not flown, and ends the
+    trials that it was for as out of time [s]. None sets no deadline. With one, outcomes depend on
+    the machine's load and do not repeat."""
 
 
 class Guarded(NamedTuple):
@@ -33,7 +35,43 @@ class Guarded(NamedTuple):
     limited: np.ndarray
     """(N,) bool: shortened to the limit."""
     late: np.ndarray
-    """(N,) bool: came after the deadline, replaced by the last good action."""
+    """(N,) bool: came after the deadline or not at all, replaced by the last good action."""
+
+
+def ask(
+    limits: ActionLimits,
+    policy: Policy,
+    hidden: Hidden,
+    state: np.ndarray,
+    image: np.ndarray,
+    fresh: np.ndarray,
+    last_b: np.ndarray,
+) -> tuple[Guarded, Hidden]:
+    """Ask a policy once, wait for its answer, and return it as it may be flown, and the memory.
+
+    A policy answers for all N trials at once, so an answer that comes late, or not at all since the
+    policy fails, is late for every one of them. The memory is then what it was.
+
+    Args:
+        limits: what an action may be.
+        policy: who is asked; for its other arguments see `policies.policy.Policy.act`.
+        hidden: what it remembers.
+        state: (N, spec.state_size).
+        image: (N, height, width).
+        fresh: (N,) bool.
+        last_b: (N, 3) the action flown last, zero at the start of a trial [m/s^2].
+
+    Raises:
+        ValueError: where the answer is no array of actions.
+    """
+    asked = time.perf_counter()
+    try:
+        answer, after = policy.act(hidden, state, image, fresh)
+    except NoAnswer:
+        nothing = np.zeros(len(last_b), bool)
+        return Guarded(last_b, nothing, nothing, ~nothing), hidden
+    took_s = time.perf_counter() - asked
+    return guard_action(limits, answer, last_b, took_s, policy.name), after
 
 
 def guard_action(

@@ -7,7 +7,6 @@ is shared between trials.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from eval.judging.ages import Delays
-from eval.judging.guard import ActionLimits, guard_action
+from eval.judging.guard import ActionLimits, ask
 from eval.judging.recorder import Recorder
 from eval.judging.sensors import SensorNoise, Sensors, check_noise
 from eval.logs.flight import Flight
@@ -200,7 +199,7 @@ class _Slots:
         self._decision = np.zeros(n)
         self._action_b = np.zeros((n, 3))
         self._faults = np.zeros((n, 3), int)
-        self._late = np.zeros(n, int)  # answers in a row
+        self._late = np.zeros(n, bool)
         self._fresh = np.ones(n, bool)
         self._hidden = policy.start(n)
         self._recorder = Recorder(n, task.record.depth) if task.record else None
@@ -216,7 +215,7 @@ class _Slots:
         while waiting or (self._index >= 0).any():
             self._fill(waiting)
             self._decide_and_fly()
-            over = (self._world.progress.ended != FLYING) | self._is_given_up()
+            over = (self._world.progress.ended != FLYING) | self._late
             for slot in np.flatnonzero((self._index >= 0) & over):
                 index = int(self._index[slot])
                 result = self._result(int(slot))
@@ -227,9 +226,6 @@ class _Slots:
                 self._index[slot] = -1
                 yield index, result, flight
 
-    def _is_given_up(self) -> np.ndarray:
-        return self._late >= self._task.options.limits.late_most
-
     def _fill(self, waiting: list[Numbered]) -> None:
         entries = []
         for slot in np.flatnonzero(self._index < 0).tolist():
@@ -238,7 +234,6 @@ class _Slots:
             self._index[slot], trial = waiting.pop()
             self._trial[slot] = trial
             self._decision[slot], self._action_b[slot], self._faults[slot] = 0, 0.0, 0
-            self._late[slot] = 0
             self._fresh[slot] = True
             if self._recorder:
                 self._recorder.start(slot)
@@ -252,7 +247,7 @@ class _Slots:
             self._world.load(entries)
 
     def _decide_and_fly(self) -> None:
-        """Ask the policy once and fly its answers until its next decision."""
+        """Ask the policy once and fly its answers, but late ones, until its next decision."""
         spec, flying = self._policy.spec, self._index >= 0
         seen = self._world.view(flying)
         if self._delays:
@@ -262,15 +257,14 @@ class _Slots:
         state, image = observe(spec, seen, self._action_b)
         state = np.where(flying[:, None], state, 0).astype(np.float32)
         image = image.astype(np.float32)
-        asked = time.perf_counter()
-        answer, self._hidden = self._policy.act(self._hidden, state, image, self._fresh | ~flying)
-        took_s = time.perf_counter() - asked
-        guarded = guard_action(
-            self._task.options.limits, answer, self._action_b, took_s, self._policy.name
-        )
+        guarded, self._hidden = ask(
+            self._task.options.limits, self._policy, self._hidden, state, image,
+            self._fresh | ~flying, self._action_b,
+        )  # fmt: skip
         self._action_b = guarded.action_b
         self._faults += np.stack([guarded.bad, guarded.limited, guarded.late], axis=-1)
-        self._late = np.where(guarded.late, self._late + 1, 0)
+        self._late = guarded.late
+        flying = flying & ~guarded.late
         self._fresh[:] = False
         if self._recorder:
             self._recorder.decided(np.flatnonzero(flying), self._action_b, seen.depth_m)

@@ -58,6 +58,8 @@ class Tally(NamedTuple):
     """Median over finished trials [s]; NaN where there is none."""
     ended_by: dict[str, int]
     """How many trials ended how."""
+    late: int = 0
+    """How many of the timeouts were a policy's that answered late, or not at all."""
 
 
 class Pairing(NamedTuple):
@@ -117,6 +119,7 @@ def _cell(policy: str, track: str, difficulty: int, rows: list[TrialResult]) -> 
         median([row.v_mean for row in rows]),
         median([row.time_s for row in rows if row.success]),
         {how: n for how in ENDINGS if (n := sum(row.ended_by == how for row in rows))},
+        sum(row.late_actions for row in rows),
     )
 
 
@@ -174,6 +177,7 @@ def _cell_grid(cells: Sequence[Tally]) -> Grid:
     lines = []
     for cell in cells:
         ended = [f"{how} {n}" for how, n in cell.ended_by.items() if how != "finished"]
+        ended += [f"of these {cell.late} by a late answer"] if cell.late else []
         line = (
             cell.policy,
             cell.track,

@@ -270,8 +270,9 @@ def read_flights(paths: Iterable[str | Path]) -> tuple[list[FlightLog], list[str
             refused.append(str(error))
             warnings.append(f"not used: {error}")
     if not flights:
-        reasons = "\n".join(refused) if refused else "no file was given"
-        raise FlightLogError("flights", None, None, f"none can be used\n{reasons}")
+        reasons = refused or ["no file was given"]
+        between = "\n" if len(reasons) > 1 else ": "
+        raise FlightLogError("flights", None, None, between.join(["none can be used", *reasons]))
     return flights, warnings
 
 

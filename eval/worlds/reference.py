@@ -9,7 +9,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from eval.judging.guard import ActionLimits, guard_action
+from eval.judging.guard import ActionLimits, ask
 from eval.judging.sensors import SensorNoise, Sensors
 from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import Motion, uses_noise
@@ -43,7 +43,7 @@ def fly_trial(
         track: the trial's.
         vehicle: on what.
         rules: when a trial ends.
-        limits: what an action may be; a deadline is not looked at here.
+        limits: what an action may be.
         rows: of the policy's inputs; all but the first are zero. The rows of a call to the policy
             are as many as in the batched worlds, since some policies answer otherwise then.
         noise: what is wrong with the policy's observation.
@@ -70,7 +70,7 @@ def fly_trial(
     if noise and not noise.is_none:
         sensors = Sensors(noise, 1, spec.rate_hz, spec.camera.range_m)
         sensors.start(0, trial, count)
-    action_b, bad, limited, decisions = np.zeros((1, 3)), 0, 0, 0
+    action_b, bad, limited, late, decisions = np.zeros((1, 3)), 0, 0, 0, 0
     passed = passed_8s = passed_035 = 0
     speeds: list[float] = []
     before_w = data.qpos[:3].copy()
@@ -117,11 +117,15 @@ def fly_trial(
                 seen = sensors.see(seen, np.array([passed]), np.array([True]))
             state, image = observe(spec, seen, action_b)
             fresh = np.full(rows, decisions == 0)
-            answer, hidden = policy.act(hidden, _padded(state, rows), _padded(image, rows), fresh)
-            guarded = guard_action(limits, np.asarray(answer)[:1], action_b, 0.0, policy.name)
-            action_b = guarded.action_b
+            inputs = (_padded(x, rows) for x in (state, image))
+            last_b = np.repeat(action_b, rows, 0)
+            guarded, hidden = ask(limits, policy, hidden, *inputs, fresh, last_b)
+            action_b = guarded.action_b[:1]
             bad, limited = bad + int(guarded.bad[0]), limited + int(guarded.limited[0])
             decisions += 1
+            if guarded.late[0]:
+                ended_by, late = "timeout", 1
+                break
 
         # Fly one step.
         blow = draws[None, step + 1] if len(draws) > 1 else None
@@ -158,7 +162,7 @@ def fly_trial(
         gates_035=passed_035,
         bad_actions=bad,
         limited_actions=limited,
-        late_actions=0,
+        late_actions=late,
     )
 
 

@@ -68,7 +68,8 @@ class TrialResult(NamedTuple):
     limited_actions: int
     """Actions larger than the limit, shortened to it."""
     late_actions: int
-    """Actions that came after the deadline, where one is set; the last one was flown on."""
+    """1 where the trial ended, as out of time, by an answer that came after the deadline, where one
+    is set, or not at all; else 0."""
 
     @property
     def trial(self) -> TrialSpec:

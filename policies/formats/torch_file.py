@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from policies.block_policy import BlockPolicy, proven
-from policies.errors import PolicyError
+from policies.errors import NoAnswer, PolicyError
 from policies.formats.embedded_spec import KEY, extract
 from policies.formats.program_inputs import INPUTS, check_inputs, inputs_message
 from policies.spec import ACTION_SIZE
@@ -97,9 +97,7 @@ def _as_model(module: Callable[..., Any], path: Path, hidden_shape: tuple[int, .
                 found = module(*inputs)
             except Exception as error:  # whatever the file's own code and torch raise
                 line = (str(error).strip() or type(error).__name__).splitlines()[-1][:200]
-                raise PolicyError(
-                    f"{path}: fails while it runs ({line}); export it again"
-                ) from error
+                raise NoAnswer(f"{path}: fails while it runs ({line}); export it again") from error
         outputs = list(found) if isinstance(found, (tuple, list)) else [found]
         if len(outputs) != 1 + memory or not all(isinstance(x, torch.Tensor) for x in outputs):
             raise PolicyError(

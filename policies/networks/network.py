@@ -12,7 +12,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from policies.networks.conv import conv_valid
+from policies.networks.conv import conv_valid, patch_product
 from policies.networks.draw import uniform
 from policies.networks.gru import gru_update
 from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
@@ -104,7 +104,7 @@ def encode(params: Params, image: jax.Array) -> jax.Array:
     rows, columns = height // 4, width // 4
     patches = pooled.reshape(n, rows, 2, columns, 2).transpose(0, 1, 3, 2, 4)
     patches = patches.reshape(n, rows, columns, 4)
-    x = leaky_relu(patches @ params["conv1.weight"].reshape(4, CHANNELS[0]))
+    x = leaky_relu(patch_product(patches, params["conv1.weight"].reshape(4, CHANNELS[0])))
     x = leaky_relu(conv_valid(x, params["conv2.weight"]))
     x = leaky_relu(conv_valid(x, params["conv3.weight"]))
     return x.reshape(n, -1) @ params["image.weight"]

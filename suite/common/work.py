@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from suite.common.console import Console, Quiet, Update
 from suite.common.errors import WorkFailed
+from suite.common.running.threads import share_threads
 from tracks.common.work import WorkerDied, usable_cores, work_off
 
 Piece = TypeVar("Piece")
@@ -84,4 +85,5 @@ def all_done(
 
 
 def _silently(do: Callable[[Piece, Console], Result], piece: Piece) -> Iterator[Result]:
+    share_threads()
     yield do(piece, Silent())

@@ -20,7 +20,13 @@ from policies.networks import delta_network
 from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before, state_after
 from suite.delta.windows import refuse_none, stacked
 from suite.train.config import QuadrotorConfig
-from suite.train.dynamics.quadrotor import Grid, QuadrotorState, fly_period, plant_of, whole_steps
+from suite.train.dynamics.quadrotor import (
+    QuadrotorState,
+    Substeps,
+    fly_period,
+    plant_of,
+    whole_steps,
+)
 from tracks.geometry.rotation import to_local
 
 
@@ -51,15 +57,15 @@ class QuadrotorWindows(NamedTuple):
     """What the network saw before each window."""
 
 
-def row_grid(config: QuadrotorConfig, row_s: float) -> Grid:
+def row_substeps(config: QuadrotorConfig, row_s: float) -> Substeps:
     """Return how a row's period is cut: one step of the attitude loop."""
     physics = whole_steps(row_s * config.physics_hz)
-    return Grid(1, physics, row_s / physics)
+    return Substeps(1, physics, row_s / physics)
 
 
 def cut_quadrotor_windows(
     logs: Sequence[FlightLog], config: QuadrotorConfig, duration_s: float, stride_s: float
-) -> tuple[QuadrotorWindows, Grid]:
+) -> tuple[QuadrotorWindows, Substeps]:
     """Return windows of `duration_s`, about one every `stride_s` of every flight, and their grid.
 
     A window with a missing value or an uneven row is left out.
@@ -74,7 +80,7 @@ def cut_quadrotor_windows(
                 "needed to fit the Delta Action Model; record flights with suite collect"
             )
     row_s = float(np.median(np.concatenate([np.diff(log.time_s) for log in logs])))
-    cut = row_grid(config, row_s)
+    cut = row_substeps(config, row_s)
     plant = plant_of(config, {}, cut.dt, varies=False)
     length = plant.delay_weight.shape[-1]
     found = [
@@ -87,7 +93,7 @@ def cut_quadrotor_windows(
 
 
 def _flight_windows(
-    log: FlightLog, cut: Grid, length: int, row_s: float, duration_s: float, stride_s: float
+    log: FlightLog, cut: Substeps, length: int, row_s: float, duration_s: float, stride_s: float
 ) -> list[QuadrotorWindows]:
     action, decides = log.action_b, log.policy_step
     assert action is not None and decides is not None and log.rate_cmd_b is not None
@@ -132,7 +138,7 @@ def _flight_windows(
 
 def replay_quadrotor(
     config: QuadrotorConfig,
-    cut: Grid,
+    cut: Substeps,
     windows: QuadrotorWindows,
     delta: delta_network.Params | None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:

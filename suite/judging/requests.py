@@ -34,8 +34,8 @@ class Evaluation:
     processes: Annotated[int | None, Range(1, 256), tyro.conf.arg(name="procs")] = None
     """Processes that share the trials; by default as many cores as are worth it."""
     deadline_s: Annotated[float, Range(0.0, 3600.0, above=True)] | None = None
-    """A policy's answer for a batch that takes longer is late and not flown; ten in a row end the
-    trials in the air, as out of time [s]."""
+    """An answer of the policy that takes longer ends the trials that it was for (up to 64, which it
+    is asked about at once), as out of time [s]."""
     trust: bool = False
     """Also load policy files that can run code on this machine."""
     monitor: bool = False

@@ -30,6 +30,7 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate, announce
 from suite.common.provenance import write_run_record
+from suite.common.running.threads import threads
 from suite.train.worlds import Worlds
 from tracks.common.files import recover_folder
 
@@ -193,7 +194,7 @@ def _check_finite(iteration: int, row: dict[str, float], folder: Path) -> None:
 
 
 def _save(run: Run, state: Any) -> None:
-    described = {**run.origin, "iteration": int(state.iteration)}
+    described = {**run.origin, "iteration": int(state.iteration), "threads": threads()}
     policy = run.folder / "policy"
     save_policy(policy, state.params, run.spec, seed=run.seed, training=described)
     # The state comes last: what it says is done has its policy and its curve on the disk.
@@ -221,6 +222,13 @@ def _resume(origin: dict[str, Any], folder: Path, fresh: Any) -> Any:
         raise ValueError(
             f"{folder} holds another run (it differs in {', '.join(options + settings)}); "
             "give another --out, or remove the folder to start over"
+        )
+    before, now = theirs.get("threads", threads()), threads()
+    if (before == 1) != (now == 1):
+        raise ValueError(
+            f"{folder} was trained with {before} threads of XLA, and here are {now}: sums would "
+            f"round otherwise from here on. Set NPROC={before} in the environment to go on with "
+            "the same bits, or give another --out"
         )
     stored = load_arrays(place, kind="training")
     state = jax.tree.map(jnp.asarray, tree_from_arrays(fresh, stored.arrays, str(place)))

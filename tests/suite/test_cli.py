@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import types
+import weakref
 from dataclasses import dataclass
 
 import pytest
@@ -138,6 +139,24 @@ def test_what_a_person_may_meet_is_one_line(command, capsys, fault, code, words)
     assert cli.main(["probe", "--fault", fault]) == code
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and words in lines[0]
+
+
+def test_what_an_interrupted_command_held_is_not_freed_before_the_process_ends(
+    command, monkeypatch, capsys
+):
+    """XLA's threads may still use it."""
+    monkeypatch.setattr(sys, "last_value", None, raising=False)
+    freed = []
+
+    def run(config, console):
+        held = {"it"}
+        weakref.finalize(held, freed.append, "it")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["suite.commands.probe"], "run", run)
+    assert cli.main(["probe"]) == 130 and not freed
+    sys.last_value = None
+    assert freed == ["it"]
 
 
 def test_a_bug_keeps_its_traceback(command, capsys):

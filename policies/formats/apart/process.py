@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from policies.errors import PolicyError
+from policies.errors import NoAnswer, PolicyError
 from policies.formats.apart.server import data_bytes
 
 LOAD_S = 60.0
@@ -48,7 +48,10 @@ class Port(NamedTuple):
 
 
 class Apart:
-    """A loaded model in its process, which ends with this object."""
+    """A loaded model in its process, which ends with this object.
+
+    A process that gave no answer is killed; the next question goes to a fresh one.
+    """
 
     def __init__(self, model: bytes, where: str) -> None:
         """Start the process and load the model there.
@@ -60,7 +63,15 @@ class Apart:
         Raises:
             PolicyError: where onnxruntime refuses it, or does not come to an end with it.
         """
-        self._where = where
+        self._where, self._model = where, model
+        about = self._start()
+        self.inputs, self.outputs = (
+            [Port(name, kind, tuple(shape)) for name, kind, shape in about[side]]
+            for side in ("inputs", "outputs")
+        )
+
+    def _start(self) -> dict[str, Any]:
+        """Start the process, load the model there and return what it says of it."""
         self._process = subprocess.Popen(
             [sys.executable, "-P", str(SERVER)],
             stdin=subprocess.PIPE,
@@ -79,29 +90,29 @@ class Apart:
             "load_s": LOAD_S + GRACE_S,
             "answer_s": ANSWER_S + GRACE_S,
         }
-        about, _ = self._ask({"bytes": len(model), **limits}, [model], LOAD_S, "loaded")
+        head = {"bytes": len(self._model), **limits}
+        about, _ = self._ask(head, [self._model], LOAD_S, "loaded")
         if "error" in about:
             raise PolicyError(
-                f"{where}: onnxruntime {about['version']} cannot load it ({about['error']}); "
+                f"{self._where}: onnxruntime {about['version']} cannot load it ({about['error']}); "
                 "export it for an older opset"
             )
-        self.inputs, self.outputs = (
-            [Port(name, kind, tuple(shape)) for name, kind, shape in about[side]]
-            for side in ("inputs", "outputs")
-        )
+        return about
 
     def run(self, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
         """Return the model's outputs, float32, for its inputs.
 
         Raises:
-            PolicyError: where it fails, or does not come to an end; it is gone then.
+            NoAnswer: where it fails, or does not come to an end.
         """
+        if not self._end.alive:
+            self._start()
         arrays = {name: np.ascontiguousarray(value, np.float32) for name, value in feed.items()}
         head = {"arrays": [[name, value.shape] for name, value in arrays.items()]}
         data = [value.reshape(-1).view(np.uint8).data for value in arrays.values() if value.size]
         found, answer = self._ask(head, data, ANSWER_S, "answered")
         if "error" in found:
-            raise PolicyError(
+            raise NoAnswer(
                 f"{self._where}: fails while it runs ({found['error']}); export it again"
             )
         outputs, at = [], 0
@@ -128,7 +139,7 @@ class Apart:
         except (BrokenPipeError, EOFError, ValueError, MemoryError):
             reason = _how_it_ended(self._process)
         self._end()
-        raise PolicyError(
+        raise NoAnswer(
             f"{self._where}: onnxruntime does not come to an end with it ({reason}); look for "
             "loops without an end and for sizes beyond the memory, and export it again"
         )

@@ -5,6 +5,9 @@ one, and an interpreter that ends while XLA's threads are at work crashes (it fr
 So a thread listens beside: where the main thread has not heard of the signal in time, the process
 ends at once. That is as safe as kill -9: every file is written whole or not at all, the lock of a
 folder is the system's, and what lies about half-written is swept by the next command.
+
+What is raised within a destructor or a callback of the garbage collector goes nowhere:
+Python reports it and goes on. An interrupt that was lost so is sent again.
 """
 
 from __future__ import annotations
@@ -21,6 +24,8 @@ from typing import NoReturn
 
 from suite.common.errors import INTERRUPTED
 
+AGAIN_S = 0.05
+"""Until an interrupt that was lost is sent again [s]."""
 PATIENCE_S = 3.0
 """The main thread has this long to hear of a signal [s]."""
 WORDS = (
@@ -39,11 +44,24 @@ def ends_in_seconds() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    heard = threading.Event()
+    heard, left = threading.Event(), threading.Event()
+    report = sys.unraisablehook
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         heard.set()
         raise KeyboardInterrupt
+
+    def again() -> None:
+        if not left.is_set():
+            os.kill(os.getpid(), mine[-1])
+
+    def lost(what: sys.UnraisableHookArgs) -> None:
+        if not issubclass(what.exc_type, KeyboardInterrupt):
+            report(what)
+            return
+        timer = threading.Timer(AGAIN_S, again)
+        timer.daemon = True
+        timer.start()
 
     mine = [s for s in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(s) != signal.SIG_IGN]
     source, sink = os.pipe()
@@ -51,10 +69,13 @@ def ends_in_seconds() -> Iterator[None]:
     listener = threading.Thread(target=_listen, args=(source, mine, heard), daemon=True)
     before = {number: signal.signal(number, interrupt) for number in mine}
     fd_before = signal.set_wakeup_fd(sink, warn_on_full_buffer=False)
+    sys.unraisablehook = lost
     listener.start()
     try:
         yield
     finally:
+        left.set()
+        sys.unraisablehook = report
         signal.set_wakeup_fd(fd_before)
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -52,7 +52,8 @@ def one_writer(folder: Path) -> Iterator[None]:
 def one_writer_each(folders: list[Path]) -> Iterator[None]:
     """Be the only command that writes into any of `folders`; see `one_writer`."""
     with contextlib.ExitStack() as stack:
-        for folder in dict.fromkeys(path.resolve() for path in folders):
+        # Path.resolve raises what is no error of the system where a link leads to itself.
+        for folder in dict.fromkeys(Path(os.path.realpath(path)) for path in folders):
             stack.enter_context(one_writer(folder))
         yield
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from suite.common.running.threads import share_threads
 from suite.experiments.bench.compare import Comparison, Figure
 from suite.train.config import TrainConfig
 from suite.train.presets import preset
@@ -146,7 +147,7 @@ def run(batch: int = BATCH, steps: int = STEPS, rounds: int = ROUNDS) -> Compari
 
 @contextmanager
 def _two_cores() -> Iterator[None]:
-    """Hold the process to THREADS cores: JAX's threads follow what a process may run on."""
+    """Hold the process to THREADS cores, and JAX to as many threads."""
     import torch
 
     torch.set_num_threads(THREADS)
@@ -155,6 +156,7 @@ def _two_cores() -> Iterator[None]:
         return
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(allowed)[:THREADS])
+    share_threads()
     try:
         yield
     finally:

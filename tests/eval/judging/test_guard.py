@@ -1,14 +1,17 @@
 """A policy's output checked and limited."""
 
+import time
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from eval.judging.guard import ActionLimits, guard_action
-from eval.judging.judge import JudgeOptions, fly
+from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
+from policies.errors import NoAnswer
 from tests.support.courses import straight
 from tests.support.pilots import Pursuit
 
@@ -71,28 +74,57 @@ def test_the_trial_says_so(world):
     assert {(r.bad_actions, r.limited_actions, r.late_actions) for r in found} == {(8, 6, 0)}
 
 
-def test_late_answers_are_counted_and_the_drone_flies_on():
-    from eval.judging.judge import ActionLimits
+class Slow(Pursuit):
+    """Answers at once but for its third question, which it is asked later than `pause_s` after."""
 
+    def __init__(self, speed, pause_s, error=None):
+        super().__init__(speed)
+        self.pause_s, self.error, self.asked = pause_s, error, 0
+
+    def act(self, hidden, state, image, fresh):
+        self.asked += 1
+        if self.asked == 3:
+            time.sleep(self.pause_s)
+            if self.error:
+                raise self.error
+        return super().act(hidden, state, image, fresh)
+
+
+@pytest.mark.parametrize("world", ["mujoco", "reference"])
+@pytest.mark.parametrize(
+    ("slow", "deadline_s"),
+    [
+        (Slow(3.0, 0.3), 0.2),
+        (Slow(3.0, 0.0, NoAnswer("it.onnx: does not come to an end")), None),
+    ],
+    ids=["late", "none"],
+)
+def test_a_late_answer_ends_the_trials_that_it_was_for_and_the_run_goes_on(slow, deadline_s, world):
+    """The third of an answer for two trials; in the reference world, which has one trial, one."""
     options = JudgeOptions(
-        slots=2,
-        rules=Rules(time_limit_s=0.5),
-        limits=ActionLimits(deadline_s=0.0, late_most=100),
+        slots=2, rules=Rules(time_limit_s=0.3), limits=ActionLimits(deadline_s=deadline_s)
     )
-    trials = [TrialSpec("straight", 0, 0)]
-    (found,) = fly(
-        Pursuit(3.0), trials, VEHICLE, "mujoco", options, tracks={"straight": straight()}
-    )
-    assert (found.late_actions, found.ended_by) == (15, "timeout")
-    assert abs(found.pos_x) < 0.01  # the action flown was the first: none
-
-
-def test_a_policy_that_is_late_all_the_time_ends_the_trials_and_not_the_run():
-    from eval.judging.judge import ActionLimits
-
-    options = JudgeOptions(slots=2, limits=ActionLimits(deadline_s=0.0, late_most=3))
+    slow.asked = 0
     trials = [TrialSpec("straight", 0, seed) for seed in range(5)]
-    found = fly(Pursuit(3.0), trials, VEHICLE, "mujoco", options, tracks={"straight": straight()})
+    found = fly(slow, trials, VEHICLE, world, options, tracks={"straight": straight()})
     assert [result.seed for result in found] == [0, 1, 2, 3, 4]
-    assert {(r.late_actions, r.ended_by, r.success) for r in found} == {(3, "timeout", False)}
-    assert all(r.time_s < 0.2 for r in found)
+    concerned = 2 if world == "mujoco" else 1
+    late = [(r.late_actions, r.ended_by, r.success) for r in found]
+    assert late == [(1, "timeout", False)] * concerned + [(0, "timeout", False)] * (5 - concerned)
+    ended_s = [r.time_s for r in found]
+    # Asked at 0, 1/30 and 2/30 s: there the trial ends, and the answer is not flown.
+    assert ended_s[:concerned] == pytest.approx([2 / 30] * concerned, abs=0.002)
+    assert ended_s[concerned:] == pytest.approx([0.3] * (5 - concerned))
+
+
+def test_a_trial_whose_first_answer_is_late_ends_where_it_started():
+    options = JudgeOptions(slots=2, limits=ActionLimits(deadline_s=0.0))
+    trials = [TrialSpec("straight", 0, seed) for seed in range(5)]
+    flights = []
+    found = fly(
+        Pursuit(3.0), trials, VEHICLE, "mujoco", options,
+        lambda result, flight: flights.append(flight),
+        Record(), tracks={"straight": straight()},
+    )  # fmt: skip
+    assert {(r.late_actions, r.ended_by, r.time_s) for r in found} == {(1, "timeout", 0.0)}
+    assert [len(flight.time_s) for flight in flights] == [0] * 5

@@ -31,6 +31,17 @@ def test_cells_do_not_depend_on_what_else_is_in_the_table():
     assert alone == beside
 
 
+def test_late_answers_are_counted_beside_the_endings():
+    rows = [
+        *ROWS,
+        *(result(seed, False)._replace(ended_by="timeout", late_actions=1) for seed in (7, 8)),
+    ]
+    (cell,) = summarise(rows)["cells"]
+    assert cell.late == 2 and cell.ended_by["timeout"] >= 2
+    ended = grids({"cells": [cell], "paired": []})[0].rows[0][-1].text
+    assert ended.endswith(f"timeout {cell.ended_by['timeout']}, of these 2 by a late answer")
+
+
 def test_one_table_for_the_cells_and_one_for_the_pairs():
     (cells,) = grids(summarise(ROWS))
     assert (cells.headers, cells.note) == (HEADERS, NOTE)

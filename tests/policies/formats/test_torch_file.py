@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from policies.block_policy import BlockPolicy
-from policies.errors import PolicyError
+from policies.errors import NoAnswer, PolicyError
 from policies.formats.embedded_spec import KEY
 from policies.policy import load_policy
 
@@ -200,3 +200,24 @@ def test_a_pickled_module_is_no_torchscript_even_with_trust(tmp_path):
     torch.save({"weights": torch.zeros(1)}, tmp_path / "it.pt")
     with pytest.raises(PolicyError, match="cannot load it"):
         load_policy(tmp_path / "it.pt", trust=True)
+
+
+class Failing(torch.nn.Module):
+    """Answers, but for states that are far from those it was tried with."""
+
+    def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+        if state.max() > 1e3:
+            raise ValueError("too far")
+        return state[:, :3]
+
+
+def test_a_module_that_fails_while_it_flies_gives_no_answer_and_flies_on(tmp_path):
+    path = tmp_path / "it.pt"
+    with pytest.warns(DeprecationWarning):
+        torch.jit.save(torch.jit.script(Failing()), str(path), _extra_files={KEY: "{}"})
+    policy = load_policy(path, trust=True)
+    image, fresh = np.zeros((2, 24, 32)), np.zeros(2, bool)
+    with pytest.raises(NoAnswer, match="it.pt: fails while it runs .*too far") as told:
+        policy.act(policy.start(2), np.full((2, 12), 1e4), image, fresh)
+    assert len(str(told.value).splitlines()) == 1
+    assert policy.act(policy.start(2), np.ones((2, 12)), image, fresh)[0].all()

@@ -1,11 +1,11 @@
-"""The convolution whose gradient is matrix products, against JAX's own."""
+"""The convolutions whose gradients are matrix products, against JAX's own."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from policies.networks.conv import conv_valid
+from policies.networks.conv import conv_valid, patch_product
 
 
 def jax_own(x, kernel):
@@ -28,4 +28,18 @@ def test_value_and_gradients_are_those_of_jaxs_convolution(image, kernel):
     cotangent = jnp.asarray(rng.integers(-4, 5, value.shape), jnp.float32)
     for gradient, own in zip(back(cotangent), own_back(cotangent), strict=True):
         assert np.any(own)
+        np.testing.assert_array_equal(gradient, own)
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 12, 13])
+def test_a_product_whose_sums_are_cut_in_pieces_is_the_plain_one(count):
+    rng = np.random.default_rng(0)
+    x, weight, grad = (
+        jnp.asarray(rng.integers(-4, 5, s), jnp.float32)
+        for s in ((count, 6, 8, 4), (4, 32), (count, 6, 8, 32))
+    )
+    value, back = jax.vjp(patch_product, x, weight)
+    expected, own_back = jax.vjp(jnp.matmul, x, weight)
+    np.testing.assert_array_equal(value, expected)
+    for gradient, own in zip(back(grad), own_back(grad), strict=True):
         np.testing.assert_array_equal(gradient, own)

@@ -102,6 +102,18 @@ def test_a_number_that_is_not_finite_ends_the_run_with_the_last_good_state(tmp_p
     assert outcome.iterations == 10 and np.isfinite(outcome.last["loss"])
 
 
+def test_a_run_on_several_threads_does_not_go_on_with_one_and_goes_on_with_more(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("NPROC", "2")
+    repeat(counting(2), run_in(tmp_path), FRESH, Console())
+    monkeypatch.setenv("NPROC", "1")
+    with pytest.raises(ValueError, match=r"with 2 threads .* here are 1.* Set NPROC=2 in the env"):
+        repeat(counting(4), run_in(tmp_path), FRESH, Console())
+    monkeypatch.setenv("NPROC", "16")
+    assert repeat(counting(4), run_in(tmp_path), FRESH, Console()).iterations == 4
+
+
 def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
     repeat(counting(2), run_in(tmp_path), FRESH, Console())
     with pytest.raises(ValueError, match=r"holds another run \(it differs in seed\); give another"):

@@ -11,7 +11,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from policies.errors import PolicyError
+from policies.errors import NoAnswer, PolicyError
 from policies.formats.apart import process, server
 from policies.formats.apart.process import Apart
 from policies.policy import load_policy
@@ -136,6 +136,19 @@ def test_a_process_that_dies_is_told_of_and_one_that_is_not_needed_ends():
     gc.collect()
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)
+
+
+def test_after_a_question_without_an_answer_the_next_goes_to_a_fresh_process(monkeypatch):
+    monkeypatch.setattr(process, "ANSWER_S", 0.5)
+    model = Apart(PLAIN.SerializeToString(), "it")
+    feed = {"state": np.ones((2, 12)), "image": np.ones((2, 24, 32))}
+    stopped = model._process.pid
+    os.kill(stopped, signal.SIGSTOP)
+    with pytest.raises(NoAnswer, match="was not answered within 0.5 s"):
+        model.run(feed)
+    with pytest.raises(ProcessLookupError):
+        os.kill(stopped, 0)
+    np.testing.assert_array_equal(model.run(feed)[0], np.ones((2, 3)))
 
 
 def test_frames_come_through_whole():

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+import time
 
 import pytest
 
@@ -42,6 +43,25 @@ def test_what_python_can_stop_is_interrupted_and_cleaned_up():
         os.kill(os.getpid(), signal.SIGTERM)
         signal.pause()
     assert signal.getsignal(signal.SIGTERM) == before and threading.active_count() == threads
+
+
+class Tired:
+    """Is told to end while it is being freed, where Python has no one to raise an error to."""
+
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.1)
+
+
+def test_an_interrupt_that_python_loses_is_sent_again(capfd):
+    hook, reached = sys.unraisablehook, []
+    with pytest.raises(KeyboardInterrupt), ends_in_seconds():
+        Tired()
+        reached.append("past the lost one")
+        time.sleep(10.0)
+        reached.append("the end")
+    assert reached == ["past the lost one"] and sys.unraisablehook is hook
+    assert capfd.readouterr().err == ""
 
 
 def test_other_threads_and_ignored_signals_are_left_alone():

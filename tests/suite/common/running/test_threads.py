@@ -1,20 +1,86 @@
-"""numpy's products take one thread, unless the user said otherwise."""
+"""XLA gets a thread a core and at least two, numpy one; what a person asked for is left alone."""
 
 import os
+import subprocess
+import sys
 
 import pytest
 
 from suite.cli import main
-from suite.common.running.threads import one_thread_a_product
+from suite.common.running import threads
+from suite.common.running.threads import one_thread_a_product, set_threads, share_threads
 
 
-def test_what_a_user_set_stays():
+@pytest.mark.parametrize(("cores", "wanted"), [(1, "2"), (2, "2"), (16, "16")])
+def test_a_thread_a_core_and_at_least_two(cores, wanted, monkeypatch):
+    monkeypatch.setattr(threads, "usable_cores", lambda: cores)
+    own, asked = {}, {"NPROC": "1"}
+    for environment in (own, asked):
+        set_threads(environment)
+    assert own == {"NPROC": wanted} and asked == {"NPROC": "1"}
+    assert threads.threads(own) == int(wanted) and threads.threads({}) == cores
+
+
+def test_a_share_of_the_cores_takes_no_more_threads_than_it_needs(monkeypatch):
+    monkeypatch.setattr(threads, "usable_cores", lambda: 4)
+    for had, wanted in (("16", "4"), ("2", "2"), ("1", "1")):
+        environment = {"NPROC": had}
+        share_threads(environment)
+        assert environment == {"NPROC": wanted}
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1", "two", "1e3", "4097", "9" * 5000, "٣"])
+def test_what_is_no_number_is_refused_before_xla_ends_the_process(text):
+    with pytest.raises(ValueError, match=r"^NPROC is '.{0,40}' in the environment; allowed is 1"):
+        set_threads({"NPROC": text})
+
+
+GRADIENT = """
+import hashlib, sys
+import jax, jax.numpy as jnp, numpy as np
+from policies.networks import network
+from policies.spec import PolicySpec
+from suite.common.running.threads import set_threads
+from suite.train.gradient import encoder_gradient
+set_threads()
+rng = np.random.default_rng(0)
+images = jnp.asarray(rng.uniform(size=(640, 24, 32)), jnp.float32)
+cotangents = jnp.asarray(rng.normal(size=(640, 192)), jnp.float32)
+params = network.init(jax.random.key(0), PolicySpec())
+gradient = jax.jit(encoder_gradient)(params, images, cotangents)
+digest = hashlib.sha256()
+for name in sorted(gradient):
+    digest.update(np.asarray(gradient[name]).tobytes())
+print(digest.hexdigest())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores are chosen as on Linux")
+def test_the_encoders_gradient_has_the_same_bits_on_any_number_of_cores():
+    """One core and all, and as many threads as larger machines have."""
+    one = min(os.sched_getaffinity(0))
+    found = set()
+    for number, pinned in ((None, True), (None, False), ("8", False), ("64", False)):
+        environment = {**os.environ, **({} if number is None else {"NPROC": number})}
+        done = subprocess.run(
+            [sys.executable, "-c", GRADIENT],
+            env=environment,
+            capture_output=True,
+            check=True,
+            preexec_fn=(lambda: os.sched_setaffinity(0, [one])) if pinned else None,
+        )
+        found.add(done.stdout)
+    assert len(found) == 1
+
+
+def test_numpys_setting_of_a_user_stays():
     own = {"OMP_NUM_THREADS": "3"}
     one_thread_a_product(own)
     assert own == {"OMP_NUM_THREADS": "3"}
 
 
-def test_a_command_sets_it(monkeypatch: pytest.MonkeyPatch):
+def test_a_command_gives_numpy_one_thread(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS")

@@ -1,0 +1,233 @@
+"""What people and other programs hand over that cannot be used: exit 2, one line, nothing left.
+
+Every case is a whole command line in this process. Options and settings out of range are in
+tests/suite/test_cli.py; models that hang or abort, in tests/policies/formats/apart.
+"""
+
+import errno
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from policies import shipped
+from suite import cli
+from suite.diagnose import example
+from tests.support.mutations import DEEP
+
+VEHICLE = (Path(cli.__file__).parents[1] / "eval/vehicles/racer5.toml").read_text()
+EXAMPLE = Path(example.__file__).parent
+
+
+def refused(line, capsys):
+    """Run a command line and return the one line by which it is refused."""
+    assert cli.main(line) == 2
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1 and len(said) < 1000, said
+    return said
+
+
+def checkpoint(folder):
+    """Return a copy of a shipped policy."""
+    return Path(shutil.copytree(shipped.folder("racer"), folder / "policy"))
+
+
+READ = {
+    "weights": ("policy/weights.safetensors", "eval --policy policy --trials 1"),
+    "settings of a policy": ("policy/config.json", "eval --policy policy --trials 1"),
+    "model": ("it.onnx", "eval --policy it.onnx --trials 1"),
+    "program": ("it.pt2", "eval --policy it.pt2 --trust --trials 1"),
+    "script": ("it.pt", "eval --policy it.pt --trust --trials 1"),
+    "policy to start from": ("policy/weights.safetensors", "train --from policy"),
+    "policy to export": ("policy/config.json", "export policy"),
+    "Delta Action Model": ("policy/weights.safetensors", "train --delta policy"),
+    "vehicle": ("it.toml", "eval --vehicle it.toml --trials 1"),
+    "vehicle to train with": ("it.toml", "train --model quad --vehicle it.toml"),
+    "track": ("it.toml", "eval --track it.toml --trials 1"),
+    "Parquet log": ("it.parquet", "diagnose it.parquet --vehicle reference"),
+    "CSV log": ("it.csv", "diagnose it.csv --vehicle reference"),
+    "foreign log": ("it.ulg", "import it.ulg"),
+    "mapping": ("it.toml", "import log.csv --map it.toml"),
+    "evaluation": ("run/run.json", "view run"),
+}
+"""A kind of file, where one lies, and a command that reads it."""
+LOGS = ("Parquet log", "CSV log")
+"""What may be given as a folder of many."""
+
+
+def at_its_place(what, folder, monkeypatch):
+    """Return the path of a kind of file among all that its command needs, and the command line."""
+    name, line = READ[what]
+    monkeypatch.chdir(folder)
+    checkpoint(folder)
+    (folder / "log.csv").write_text("t,x\n0,1\n")
+    (folder / "run").mkdir()
+    (folder / "run" / "trials.parquet").touch()
+    out = "out.parquet" if line.startswith("import") else "out"
+    return folder / name, [*line.split(), "--out", out]
+
+
+KINDS = ("pipe", "link to an endless device", "folder", "3 GB")
+ODD_FILES = [
+    (what, kind) for what in READ for kind in KINDS if what not in LOGS or kind != "folder"
+]
+
+
+@pytest.mark.parametrize(("what", "kind"), ODD_FILES)
+def test_what_is_no_file_of_a_sensible_size_is_refused_unread(
+    what, kind, tmp_path, monkeypatch, capsys
+):
+    path, line = at_its_place(what, tmp_path, monkeypatch)
+    path.unlink(missing_ok=True)
+    match kind:
+        case "pipe":
+            os.mkfifo(path)
+        case "folder":
+            path.mkdir()
+        case "3 GB":
+            with path.open("wb") as file:
+                file.truncate(3 * 2**30)  # a hole: takes no room on the disk
+        case _:
+            path.symlink_to("/dev/zero")
+    said = refused(line, capsys)
+    assert path.name in said or "policy" in said
+    assert not list(tmp_path.glob("out*"))
+
+
+CONTENT = {
+    "deep": (DEEP, "x = " + DEEP),
+    "a number of hundreds of digits": ('{"schema": ' + "9" * 5000 + "}", "mass = " + "9" * 5000),
+    "a NUL in a name": ('{"a\0": 1}', 'name = "a\0b"'),
+    "no UTF-8": ('{"a": "\udcff"}', 'name = "\udcff"'),
+    "empty": ("", ""),
+}
+"""Text as JSON and as TOML."""
+
+
+@pytest.mark.parametrize("content", CONTENT)
+@pytest.mark.parametrize(
+    "what", ["settings of a policy", "vehicle", "track", "mapping", "evaluation"]
+)
+def test_text_that_is_nested_long_or_damaged_is_refused(
+    what, content, tmp_path, monkeypatch, capsys
+):
+    path, line = at_its_place(what, tmp_path, monkeypatch)
+    text = CONTENT[content][path.suffix == ".toml"]
+    path.write_text(text, encoding="utf-8", errors="surrogateescape")
+    refused(line, capsys)
+    assert not list(tmp_path.glob("out*"))
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("mass = 0.75", "mass = 1e-300"),
+        ("mass = 0.75", "mass = 1e300"),
+        ("mass = 0.75", "mass = nan"),
+        ("inertia = [0.0025, 0.0021, 0.0043]", "inertia = [1e-300, 1e-300, 1e-300]"),
+    ],
+)
+def test_a_vehicle_that_cannot_be_is_refused(before, after, tmp_path, monkeypatch, capsys):
+    assert before in VEHICLE
+    monkeypatch.chdir(tmp_path)
+    Path("it.toml").write_text(VEHICLE.replace(before, after))
+    said = refused(["eval", "--vehicle", "it.toml", "--trials", "1"], capsys)
+    assert "it.toml" in said and after.split()[0] in said
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("1.5]", "1e300]"),
+        ("1.5]", "nan]"),
+        ("width = 1.0", "width = 1e-300"),
+        ("width = 1.0", "width = -1.0"),
+        ("width = 1.0", "width = " + "9" * 400),
+    ],
+)
+def test_a_track_that_cannot_be_is_refused(before, after, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    gate = "[[gates]]\ncenter = [0, 0, 1.5]\nwidth = 1.0\nheight = 1.0\n"
+    Path("it.toml").write_text(gate.replace(before, after))
+    assert "it.toml" in refused(["eval", "--track", "it.toml", "--trials", "1"], capsys)
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("height", 4096), ("width", 0), ("width", 33), ("range_m", 0.0), ("fov_deg", [0.0, 400.0])],
+)
+def test_a_policy_with_a_camera_that_cannot_be_is_refused(
+    key, value, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    path = checkpoint(tmp_path) / "config.json"
+    settings = json.loads(path.read_text())
+    settings["spec"]["camera"][key] = value
+    if value == 4096:
+        settings["spec"]["camera"]["width"] = value
+    path.write_text(json.dumps(settings))
+    assert "policy" in refused(["eval", "--policy", "policy", "--trials", "1"], capsys)
+
+
+WRITERS = {
+    "eval": "eval --trials 1",
+    "train": "train --preset small --iterations 1",
+    "collect": "collect --trials 1",
+    "tracks": "tracks zigzag",
+    "export": "export racer --formats onnx",
+    "delta": f"delta {EXAMPLE}",
+    "diagnose": f"diagnose {EXAMPLE} --vehicle reference",
+    "loop": "loop",
+    "blind": "blind make --count 1",
+    "reproduce": "reproduce table2",
+}
+"""Commands that write into --out."""
+PLACES = {
+    "a read-only file system": "read-only/out",
+    "a file": "file",
+    "below a file": "file/out",
+    "a device": "/dev/null",
+    "a name too long": "x" * 300,
+    "a NUL": "a\0b",
+    "a link to itself": "circle",
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("command", WRITERS)
+def test_a_place_that_cannot_be_written_is_refused(command, place, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("kept")
+    Path("circle").symlink_to("circle")
+    Path("read-only").mkdir()
+    mkdir = os.mkdir
+
+    def on_read_only(path, *args, **kwargs):
+        if "read-only" in Path(os.fsdecode(path)).parts:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), os.fsdecode(path))
+        return mkdir(path, *args, **kwargs)
+
+    monkeypatch.setattr(os, "mkdir", on_read_only)
+    refused([*WRITERS[command].split(), "--out", PLACES[place]], capsys)
+    assert Path("file").read_text() == "kept"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["circle", "file", "read-only"]
+
+
+@pytest.mark.parametrize(
+    "place", ["file/it.rrd", "/dev/null/it.rrd", f"{'x' * 300}.rrd", "circle/it.rrd", "it.mp4"]
+)
+def test_a_recording_to_an_impossible_place_is_refused_before_flying(
+    place, tmp_path, monkeypatch, capsys
+):
+    def flown(*args):
+        raise AssertionError("it has flown")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("suite.judging.evaluate.evaluate", flown)
+    Path("file").write_text("kept")
+    Path("circle").symlink_to("circle")
+    refused(["eval", "--trials", "1", "--out", "out", "--rerun", place], capsys)
+    assert not list(tmp_path.glob("out*"))
