@@ -1,8 +1,8 @@
 """How many threads XLA's CPU and numpy's products of matrices work with.
 
-XLA's are as many as cores, and at least two. Its matrix products (Eigen's) are cut into other blocks
-where there is one thread than where there are several, and so add up in another order. With two
-threads on a single core too, a training comes to the same bits on any number of cores; there it
+XLA's are as many as cores, and at least two. Its matrix products (Eigen's) are cut into other
+blocks where there is one thread than where there are several, and so add up in another order. With
+two threads on a single core too, a training comes to the same bits on any number of cores; there it
 costs about a tenth of the speed. Products that several threads would cut along their sums are cut
 by us (`policies/networks/conv.py`).
 """
