@@ -1,10 +1,10 @@
 """The colour of measurement noise: a state estimator's errors last from one row to the next.
 
-Each group of channels has white noise and noise of a first-order Gauss-Markov process, that decays
-as exp(-t / T). How much of it there is, and T, maximise the likelihood of what is left of every
-window when a polynomial is taken off it (restricted likelihood; Patterson & Thompson 1971). A
-model's error adds up along a window, where noise does not: beside the noise there may be an error
-that is white in force and torque, so that it is not taken for noise.
+Position, attitude and velocity have white noise and noise of a first-order Gauss-Markov process,
+that decays as exp(-t / T). How much of it there is, and T, maximise the likelihood of what is left
+of every window when a polynomial is taken off it (restricted likelihood; Patterson & Thompson
+1971). A model's error adds up along a window, where noise does not: beside the noise there may be
+an error that is white in force and torque, so that it is not taken for noise.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ LEFT_S = tuple(np.geomspace(0.03, 1.0, 6).tolist())
 DRIFTS = (0.0, *np.logspace(-3.0, 5.0, 17).tolist())
 """How fast a model's error may grow: its variance after a second, over the noise's."""
 ESTIMATED = ("position", "attitude", "velocity")
-"""One estimator makes these groups: their errors last equally long."""
-INTEGRATED = {"position": 2, "attitude": 2, "velocity": 1, "rates": 1}
+"""One estimator makes these groups: their errors last equally long. Sensors have white noise."""
+INTEGRATED = {"position": 2, "attitude": 2, "velocity": 1}
 """By group, how often a force or torque is integrated to move it; other groups follow at once."""
 LEAST_ROWS = 30
 """A window with fewer rows says nothing of colours."""
@@ -85,26 +85,19 @@ def measured_noise(
     sigma = noise_of(residual, windows, limits=limits)
     residual = _freed(residual, start_slope, np.where(windows.seen, 1.0 / sigma, 0.0))
     sigma, parts = noise_of(residual, windows, limits=limits), dict[str, _Stretches]()
-    for name, channels in SLICES.items():
-        if np.isfinite(sigma[channels]).all():
-            stretches = _stretches(residual[..., channels], windows, name, limits)
+    for name in ESTIMATED:
+        if np.isfinite(sigma[SLICES[name]]).all():
+            stretches = _stretches(residual[..., SLICES[name]], windows, name, limits)
             if stretches is not None:
                 parts[name] = stretches
     tried = {name: _by_time(stretches, limits) for name, stretches in parts.items()}
+    gains = np.sum([[gain for _, gain in each] for each in tried.values()], axis=0)
     coloured = {}
-    for names in (
-        [n for n in ESTIMATED if n in parts],
-        *([n] for n in parts if n not in ESTIMATED),
-    ):
-        gains = np.sum([[gain for _, gain in tried[name]] for name in names], axis=0)
-        if not names or gains.max() < limits.colour_gain:
-            continue
-        for name in names:
-            process, _ = tried[name][int(gains.argmax())]
-            energy, freedom, _ = _beside_polynomial(parts[name], process)
-            channels = SLICES[name].stop - SLICES[name].start
-            sigma[SLICES[name]] = np.sqrt(typical_variance(energy.reshape(-1, channels), freedom))
-            coloured[name] = (process.share, process.lasts_s)
+    for name in parts if np.max(gains) >= limits.colour_gain else ():
+        process, _ = tried[name][int(gains.argmax())]
+        energy, freedom, _ = _beside_polynomial(parts[name], process)
+        sigma[SLICES[name]] = np.sqrt(typical_variance(energy.reshape(-1, 3), freedom))
+        coloured[name] = (process.share, process.lasts_s)
     return Noise(sigma, coloured)
 
 

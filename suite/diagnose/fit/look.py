@@ -79,8 +79,8 @@ def look_at(
     linear = known
     if linear is None:
         linear = model.linearise(estimate.theta, estimate.offset, task.windows, None)
-    noise = noise or measured_noise(linear.residual, linear.start_slope, task.windows, limits)
     view = trusted(task.windows, linear.residual, limits)
+    noise = noise or measured_noise(linear.residual, linear.start_slope, view, limits)
     whitening = make_whitening(linear, noise, view, limits)
     equations = normal_equations_of(whitening, linear, model.size)
     return Look(linear, view, whitening, equations, noise)

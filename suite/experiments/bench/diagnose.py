@@ -82,9 +82,8 @@ def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]
     while True:
         linear = model.linearise(state.theta, state.offset, task.windows, [*indices, *model.starts])
         view = trusted(task.windows, linear.residual)
-        whitening = make_whitening(
-            linear, measured_noise(linear.residual, linear.start_slope, task.windows), view
-        )
+        noise = measured_noise(linear.residual, linear.start_slope, view)
+        whitening = make_whitening(linear, noise, view)
         state, equations = fit(model, view, whitening, state, indices)
         if view.seen.sum() <= seen:
             return state.theta[indices], equations

@@ -60,7 +60,7 @@ def test_flights_of_the_vehicle_itself_have_no_gap():
 
 @pytest.mark.parametrize(
     "name",
-    ["linear_drag", "gyro_bias", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)],
+    ["linear_drag", *(pytest.param(n, marks=pytest.mark.slow) for n in ("gyro_bias", *SLOW))],
 )
 def test_an_effect_is_named_with_its_value(name):
     parameter, truth = CASES[name]
@@ -156,8 +156,15 @@ def outcome(logs, drive="commands"):
 
 @pytest.mark.parametrize(
     "breakages",
-    [BREAKAGES[first : first + 3] for first in range(0, len(BREAKAGES), 3)],
-    ids=lambda group: "-".join(breakage.__name__ for breakage in group),
+    [
+        pytest.param(
+            BREAKAGES[first : first + 3],
+            id="-".join(breakage.__name__ for breakage in BREAKAGES[first : first + 3]),
+            # One of the groups is flown in every run of the tests.
+            marks=pytest.mark.slow if first + 3 < len(BREAKAGES) else (),
+        )
+        for first in range(0, len(BREAKAGES), 3)
+    ],
 )
 def test_broken_flights_among_sound_ones(sound, breakages):
     rng = np.random.default_rng(0)
@@ -234,10 +241,9 @@ ALIKE = {
 
 
 OF_EACH_KIND = (
-    "linear_drag", "inflow", "ground_effect", "constant_wind", "gusts", "motor_lag",
-    "command_delay", "com_offset", "weak_motor", "rate_gain", "gyro_bias", "clock_offset",
+    "linear_drag", "gusts", "motor_lag", "com_offset", "rate_gain", "clock_offset",
 )  # fmt: skip
-"""One at least of every way in which an effect acts; the others are run with `-m slow`."""
+"""Of forces, chance, rotors, the body, the controller and logs one; the rest with `-m slow`."""
 
 
 @pytest.fixture(scope="module")

@@ -81,7 +81,7 @@ def test_the_control_costs_the_same_training_on_the_same_tracks(whole):
     assert not np.array_equal(first[0][2], control[0][2]), "fine-tuning sees new tracks"
 
 
-@pytest.mark.parametrize("kind", ["train", "fly"])
+@pytest.mark.parametrize("kind", ["fly", pytest.param("train", marks=pytest.mark.slow)])
 def test_a_loop_stopped_again_and_again_comes_to_the_same(
     whole, kind, tmp_path, monkeypatch, capfd
 ):

@@ -271,6 +271,7 @@ def _neutral(name):
     return neutral(EFFECTS[name], PLAIN)
 
 
+@pytest.mark.slow
 def test_the_trainers_own_method_takes_a_finite_gradient():
     config = replace(small_config(), quadrotor=QuadrotorConfig(HIDDEN))
     worlds, params = boxes_worlds(config), fresh_params()
