@@ -33,8 +33,7 @@ def _full_thrust(
         text = f"normalised; full throttle is {options.full_thrust:g} m/s^2 as told, {linear}"
         return options.full_thrust, [Finding("note", "thrust", text)]
     if options.vehicle is not None:
-        vehicle = options.vehicle
-        full = 4.0 * vehicle.rotors.thrust_max / vehicle.mass
+        full = options.vehicle.full_thrust
         text = f"normalised; full throttle is {full:.4g} m/s^2 by the vehicle file, {linear}"
         return full, [Finding("note", "thrust", text), *_hover(rows, full * throttle)]
     if "acc" in rows:

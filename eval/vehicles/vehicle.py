@@ -76,6 +76,11 @@ class Vehicle:
     effects: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     """Values (the effect's NamedTuple) by the effect's name, see `eval.effects.EFFECTS`."""
 
+    @property
+    def full_thrust(self) -> float:
+        """Nominal largest collective thrust per mass [m/s^2]; a share of it is a throttle."""
+        return 4.0 * self.rotors.thrust_max / self.mass
+
 
 def with_effects(nominal: Vehicle, effects: Mapping[str, Any]) -> Vehicle:
     """Return `nominal` with `effects`, values by name, in place of its own of these names."""

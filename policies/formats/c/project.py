@@ -16,6 +16,7 @@ from policies.formats.c.source import TEMPLATES, sources
 from policies.formats.embedded_spec import embed
 from policies.formats.policy_file import PolicyCheckpoint
 from policies.native import native_policy
+from policies.policy import Policy
 from policies.spec import PolicySpec
 from tracks.common.names import unknown_name
 
@@ -84,8 +85,13 @@ def c_project(
 def native_answers(
     params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
 ) -> np.ndarray:
-    """Return the JAX policy's actions (T, 3), its memory cleared where an observation is fresh."""
-    policy = dataclasses.replace(native_policy(params, spec, "policy"), block=1, rows=1)
+    """Return the JAX policy's actions (T, 3) for observations in turn."""
+    one = dataclasses.replace(native_policy(params, spec, "policy"), block=1, rows=1)
+    return answers_of(one, observed)
+
+
+def answers_of(policy: Policy, observed: Observed) -> np.ndarray:
+    """Return a policy's actions (T, 3), its memory cleared where an observation is fresh."""
     hidden, actions = policy.start(1), []
     for state, image, fresh in zip(*observed, strict=True):
         action, hidden = policy.act(hidden, state[None], image[None], np.array([fresh]))

@@ -9,7 +9,7 @@ an error that is white in force and torque, so that it is not taken for noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -84,12 +84,8 @@ def measured_noise(
     """
     sigma = noise_of(residual, windows, limits=limits)
     residual = _freed(residual, start_slope, np.where(windows.seen, 1.0 / sigma, 0.0))
-    sigma, parts = noise_of(residual, windows, limits=limits), dict[str, _Stretches]()
-    for name in ESTIMATED:
-        if np.isfinite(sigma[SLICES[name]]).all():
-            stretches = _stretches(residual[..., SLICES[name]], windows, name, limits)
-            if stretches is not None:
-                parts[name] = stretches
+    sigma = noise_of(residual, windows, limits=limits)
+    parts = _parts(residual, sigma, windows, ESTIMATED, limits)
     tried = {name: _by_time(stretches, limits) for name, stretches in parts.items()}
     gains = np.sum([[gain for _, gain in each] for each in tried.values()], axis=0)
     coloured = {}
@@ -115,16 +111,12 @@ def left_as_noise(
     sigma = noise_of(residual, windows, limits=limits)
     residual = _freed(residual, start_slope, np.where(windows.seen, 1.0 / sigma, 0.0))
     coloured = {}
-    for name, channels in SLICES.items():
-        stretches = None
-        if np.isfinite(sigma[channels]).all():
-            stretches = _stretches(residual[..., channels], windows, name, limits)
-        if stretches is None:
-            continue
+    for name, stretches in _parts(residual, sigma, windows, SLICES, limits).items():
         rows = len(stretches.time_s)
         bare = stretches._replace(powers=np.zeros((rows, 0)), drift=np.zeros((rows, rows)))
         process, _ = max(_by_time(bare, limits, LEFT_S), key=lambda one: one[1])
         energy, freedom, _ = _beside_polynomial(bare, process)
+        channels = SLICES[name]
         width = channels.stop - channels.start
         sigma[channels] = np.sqrt((energy.reshape(-1, width) / freedom).mean(axis=0))
         coloured[name] = (process.share, process.lasts_s)
@@ -161,6 +153,23 @@ def _freed(residual: np.ndarray, slope: np.ndarray, weight: np.ndarray) -> np.nd
     gram = (turned / size) @ (rows / np.swapaxes(size, 1, 2)) + 1e-9 * np.eye(slope.shape[-1])
     moved = np.linalg.solve(gram, (turned / size) @ white) / size
     return residual - (slope @ moved[:, None])[..., 0]
+
+
+def _parts(
+    residual: np.ndarray,
+    sigma: np.ndarray,
+    windows: FlightWindows,
+    names: Iterable[str],
+    limits: Thresholds,
+) -> dict[str, _Stretches]:
+    """Return the stretches of those groups of `names` of which enough was seen."""
+    found = {}
+    for name in names:
+        if np.isfinite(sigma[SLICES[name]]).all():
+            stretches = _stretches(residual[..., SLICES[name]], windows, name, limits)
+            if stretches is not None:
+                found[name] = stretches
+    return found
 
 
 def _stretches(
@@ -247,15 +256,22 @@ def _by_time(
             method="bounded",
             options={"xatol": 0.01},
         )
-        best = _Process(float(alone.x), lasts_s, 0.0)
+        best, most = _Process(float(alone.x), lasts_s, 0.0), -float(alone.fun)
         if white.drift:
-            best = max(best, _with_drift(likely, best, white.drift), key=likely)
-        found.append((best, likely(best) - nothing))
+            drifting, more = _with_drift(likely, best, white.drift)
+            if more > most:
+                best, most = drifting, more
+        found.append((best, most - nothing))
     return found
 
 
-def _with_drift(likely: Callable[[_Process], float], begin: _Process, drift: float) -> _Process:
-    """Return the likeliest process that lasts as long as `begin` and has a drift near `drift`."""
+def _with_drift(
+    likely: Callable[[_Process], float], begin: _Process, drift: float
+) -> tuple[_Process, float]:
+    """Return the likeliest process that lasts as long as `begin`, and how likely it is.
+
+    The search begins at `drift`.
+    """
 
     def process_at(x: np.ndarray) -> _Process:
         share = float(1.0 / (1.0 + np.exp(-x[0])))
@@ -268,4 +284,4 @@ def _with_drift(likely: Callable[[_Process], float], begin: _Process, drift: flo
         method="Nelder-Mead",
         options={"maxfev": 30, "xatol": 0.05, "fatol": 0.1},
     )
-    return process_at(best.x)
+    return process_at(best.x), -float(best.fun)

@@ -16,7 +16,7 @@ from suite.diagnose.fit.normal_equations import (
     fit,
     normal_equations_of,
 )
-from suite.diagnose.fit.parameters import Candidate, indices_of
+from suite.diagnose.fit.parameters import Candidate
 from suite.diagnose.fit.permutation import CandidateScore, score_candidates
 from suite.diagnose.fit.whitening import Whitening, make_whitening
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -86,18 +86,14 @@ def look_at(
     return Look(linear, view, whitening, equations, noise)
 
 
-def is_off(task: SearchTask, look: Look, chosen: Sequence[Candidate], estimate: Estimate) -> bool:
-    """Return whether what is `chosen` leaves more than noise in the windows of `look`."""
-    _, equations = task.fit(look, estimate, indices_of(chosen))
+def is_off(look: Look, equations: NormalEquations, limits: Thresholds) -> bool:
+    """Return whether a fit, with these `equations`, leaves more than noise in `look`'s windows."""
     expected = look.whitening.slow_freedom.sum()
-    return bool(equations.slow_energy.sum() > task.limits.structure_rotor_input * expected)
+    return bool(equations.slow_energy.sum() > limits.structure_rotor_input * expected)
 
 
-def look_at_misfit(
-    task: SearchTask, look: Look, chosen: Sequence[Candidate], estimate: Estimate
-) -> Look:
-    """Return the slopes at the best fit of what is `chosen`, weighed by what that leaves."""
-    estimate, _ = task.fit(look, estimate, indices_of(chosen))
+def look_at_misfit(task: SearchTask, look: Look, estimate: Estimate) -> Look:
+    """Return the slopes at `estimate`, the best fit, weighed by what that leaves."""
     linear = task.model.linearise(estimate.theta, estimate.offset, task.windows, None)
     noise = left_as_noise(linear.residual, linear.start_slope, look.windows, task.limits)
     whitening = make_whitening(linear, noise, look.windows, task.limits)

@@ -72,11 +72,11 @@ def _judge(
     if one.candidate in scores:
         score = scores[one.candidate]
         one = replace(one, p_value=score.p_value, gain=score.gain)
-        gains = gains_by_flight(
-            look.equations, theta, model.space, at, own, np.asarray(look.windows.flight)
-        )
-        if joint.off and not flights_agree(gains):
-            one = replace(one, p_value=1.0)
+        if joint.off:
+            flight = np.asarray(look.windows.flight)
+            gains = gains_by_flight(look.equations, theta, model.space, at, own, flight)
+            if not flights_agree(gains):
+                one = replace(one, p_value=1.0)
     left = [c for c in task.among if not set(c.indices) & set(at)]
     fallen = {c: chi2_fall(look.equations, theta, model.space, [*at, *c.indices]) for c in left}
     tried = []

@@ -104,21 +104,17 @@ def search(
         item, estimate = _best_of_short_list(task, look, estimate, chosen, scores)
         named.append(NamedEffect(item.candidate, item.p_value, item.gain))
     named, estimate = settle(task, look, named, estimate)
-    judge = look
-    chosen = [n.candidate for n in named]
-    if is_off(task, look, chosen, estimate):
+    estimate, last = _last_fit(task, look, named, estimate)
+    judge, judged = look, last
+    if is_off(look, last, limits):
         say("the model leaves more than noise: names are judged by what it leaves")
-        judge = look_at_misfit(task, look, chosen, estimate)
+        judge = look_at_misfit(task, look, estimate)
         named, estimate = settle(task, judge, named, estimate)
-    indices = indices_of([n.candidate for n in named])
-    rounds = limits.last_rounds if indices else 0
-    weighed = look.windows, judge.whitening
-    estimate, judged = fit(model, *weighed, estimate, indices, rounds, limits=limits)
-    last = judged
-    if judge is not look:
+        estimate, judged = _last_fit(task, judge, named, estimate)
+        indices = indices_of([n.candidate for n in named])
         estimate, last = fit(model, look.windows, look.whitening, estimate, indices, 0)
     nothing = last
-    if indices:
+    if named:
         _, nothing = task.fit(look, start_estimate(model, look.windows), [])
     explained = float(nothing.chi2.sum() - last.chi2.sum())
     return SearchResult(
@@ -145,6 +141,16 @@ def refitted(
         found, named=named, estimate=best, equations=last, judged=judged,
         explained=nothing - float(last.chi2.sum()),
     )  # fmt: skip
+
+
+def _last_fit(
+    task: SearchTask, look: Look, named: Sequence[NamedEffect], estimate: Estimate
+) -> tuple[Estimate, NormalEquations]:
+    """Fit all names to the end; where there is none nothing is moved."""
+    indices = indices_of([n.candidate for n in named])
+    rounds = task.limits.last_rounds if indices else 0
+    weighed = look.windows, look.whitening
+    return fit(task.model, *weighed, estimate, indices, rounds, limits=task.limits)
 
 
 def _best_of_short_list(

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from policies.errors import PolicyError
-from policies.formats.c.c_file import CPolicy, load_c
+from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import find_compiler
 from policies.formats.c.forward import Observed
-from policies.formats.c.project import drawn, native_answers
+from policies.formats.c.project import answers_of, drawn, native_answers
 from policies.formats.policy_file import PolicyCheckpoint
 from suite.judging.deploy.latency import Timing, c_step, time_in_turn
 
@@ -67,12 +67,3 @@ def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None
         raise PolicyError(f"{folder}: the compiled policy gives numbers that are not finite")
     timing = time_in_turn({"c": c_step(policy)}, rounds=5)["c"]
     return Parity(len(apart), given, float(apart.max()), float(np.median(apart)), timing)
-
-
-def answers_of(policy: CPolicy, observed: Observed) -> np.ndarray:
-    """Return a compiled policy's actions (T, 3) for observations in turn."""
-    hidden, actions = policy.start(1), []
-    for state, image, fresh in zip(*observed, strict=True):
-        action, hidden = policy.act(hidden, state[None], image[None], np.array([fresh]))
-        actions.append(action[0])
-    return np.array(actions)

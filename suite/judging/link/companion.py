@@ -23,7 +23,6 @@ from eval.vehicles.vehicle import Vehicle
 from policies.observation import observe, view_of
 from policies.policy import Policy
 from suite.judging.link.messages import Note, Packet, Picture, SetPoint, State, Wire
-from suite.judging.link.thrust import full_thrust
 from suite.judging.link.watchdog import Clock, ClockCheck, Limits, box_of, trouble_with_state
 from tracks.geometry.crossing import crossing
 from tracks.geometry.rotation import quat_to_rot
@@ -184,7 +183,8 @@ class Companion:
         force_w = action_to_force(self._action_b, rot_w)
         command = attitude_command(self._vehicle.controller, force_w, rot_w, self._heading_w)
         thrust, rate_b = float(command.thrust[0]), command.rate_b[0]
-        share = min(1.0, thrust / full_thrust(self._vehicle))
+        # A real autopilot's thrust is a share of its own; docs/fly.md says how to measure it.
+        share = min(1.0, thrust / self._vehicle.full_thrust)
         sent = self._wire.encoded(SetPoint(rate_b, share))
         now = self._clock()
         self.rows.append(

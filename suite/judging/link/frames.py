@@ -10,15 +10,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-_TURN = np.array([1.0, -1.0, -1.0])
-_TURN_QUAT = np.array([1.0, 1.0, -1.0, -1.0])
+from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN
 
 
 def turned(vector: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return a vector (3,) of one world or body frame in the other convention."""
-    return np.asarray(vector, float) * _TURN
+    return np.asarray(vector, float) * HALF_TURN
 
 
 def turned_quat(quat_wxyz: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return an attitude (4,), body to world, wxyz, in the other convention."""
-    return np.asarray(quat_wxyz, float) * _TURN_QUAT
+    return np.asarray(quat_wxyz, float) * QUAT_HALF_TURN

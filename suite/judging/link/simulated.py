@@ -32,7 +32,6 @@ from eval.worlds.trial import (
     start_progress,
 )
 from suite.judging.link.messages import SetPoint, State, Wire, image_packets
-from suite.judging.link.thrust import full_thrust
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import to_local, to_world
 from tracks.geometry.scene import Gates
@@ -120,7 +119,7 @@ class SimulatedVehicle:
                 isinstance(message, SetPoint)
                 and np.isfinite([*message.rate_b, message.thrust]).all()
             ):
-                thrust = np.clip(message.thrust, 0.0, 1.0) * full_thrust(self._vehicle)
+                thrust = np.clip(message.thrust, 0.0, 1.0) * self._vehicle.full_thrust
                 limit = np.array(self._vehicle.controller.rate_max)
                 rate_b = np.clip(message.rate_b, -limit, limit)
                 self._command = Command(np.array([thrust]), rate_b[None])

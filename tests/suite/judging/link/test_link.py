@@ -26,7 +26,6 @@ from suite.judging.link.messages import (
 )
 from suite.judging.link.report import delays
 from suite.judging.link.simulated import LOST_S, SimulatedVehicle
-from suite.judging.link.thrust import full_thrust
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
 from tests.support.pilots import Pursuit, Steady
@@ -106,7 +105,7 @@ def test_a_state_is_answered_with_body_rates_and_thrust(bench):
     assert one.tell() == []  # nothing is flown blind
     one.show()
     (point,) = one.tell(one.state(time_s=one.now + 0.001))
-    hover = 9.81 / full_thrust(load_vehicle("reference"))
+    hover = 9.81 / load_vehicle("reference").full_thrust
     assert point.thrust == pytest.approx(hover, rel=1e-3)
     assert np.abs(point.rate_b[:2]).max() < 1e-6
 
