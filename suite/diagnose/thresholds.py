@@ -120,6 +120,25 @@ class Thresholds:
     integrator_share: float = 0.6
     """Share of a physics step up to which pose and rates may be apart by integration alone [1]."""
 
+    least_flights: int = 3
+    """Flights from which their means tell how trims differ between flights."""
+    longest_memory: int = 40
+    """Neighbouring moments of a view up to which errors may hang together."""
+    view_rounds: int = 4
+    """Gauss-Newton steps of a view's fits, which are nearly linear."""
+    least_view_share: float = 0.03
+    """An effect that takes less than this share of a view's squared error is not named [1]."""
+    implausible_times: float = 3.0
+    """Beyond so many times its usual size an effect is said to be implausible [1]."""
+    hopeless_chi2: float = 10.0
+    """Squared error a row, in units of the noise, that all numbers of the catalogue together leave:
+    beyond it flights are not judged by rollouts of a second, but by their views."""
+    view_left_share: float = 0.1
+    """Share of a view's squared error that a black box may close beyond what was named, before
+    something is said to be missing [1]."""
+    view_block_s: float = 2.0
+    """Stretches of a flight that a view takes for independent [s]."""
+
     bootstrap_draws: int = 1000
     """Draws of the 95 % intervals of a gap."""
     bootstrap_block: int = 4

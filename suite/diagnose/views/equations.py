@@ -1,0 +1,129 @@
+"""A view's flights at one estimate: what is left, how it is weighed, and each flight's own say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import t as student
+
+from suite.diagnose.fit.normal_equations import NormalEquations, gauss_newton_step
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.views.model import ForceModel
+from suite.diagnose.views.view import SmoothedFlight, View, ViewData, compare
+from suite.diagnose.views.weigh import Weights, blocks_of, equations_of
+
+
+class ViewTask(NamedTuple):
+    """What a view's search is given."""
+
+    view: View
+    model: ForceModel
+    flights: Sequence[SmoothedFlight]
+    limits: Thresholds = THRESHOLDS
+
+
+class ViewEquations(NamedTuple):
+    """The normal equations of a view's blocks along all numbers, at one estimate."""
+
+    theta: np.ndarray
+    """(P,)"""
+    data: ViewData
+    weights: Weights
+    block: NormalEquations
+    """Of B blocks."""
+    flight: np.ndarray
+    """(B,) number of each block's flight."""
+
+
+def look(task: ViewTask, theta: np.ndarray, weights: Weights) -> ViewEquations:
+    """Return the equations of `task` at the numbers `theta` (P,)."""
+    data = compare(task.view, task.model, theta, task.flights)
+    block = blocks_of(data, task.limits)
+    first = np.unique(block, return_index=True)[1]
+    return ViewEquations(theta, data, weights, equations_of(data, weights, block), data.flight[first])
+
+
+def fitted(
+    task: ViewTask, begin: ViewEquations, indices: Sequence[int], rounds: int | None = None
+) -> ViewEquations:
+    """Return the equations where the numbers at `indices` fit best (Gauss-Newton, halved).
+
+    At most `rounds` steps are taken, those of the limits if not given.
+    """
+    best, at = begin, np.array(sorted(indices), dtype=int)
+    for _ in range((rounds or task.limits.view_rounds) if len(at) else 0):
+        hessian = best.block.hessian.sum(axis=0)[np.ix_(at, at)]
+        gradient = best.block.gradient.sum(axis=0)[at]
+        change, promised = gauss_newton_step(hessian, gradient, best.theta, task.model.space, at)
+        if promised < task.limits.converged:
+            break
+        share, chi2 = 1.0, float(best.block.chi2.sum())
+        while share > 0.1:
+            theta = best.theta.copy()
+            theta[at] += share * change
+            trial = look(task, theta, best.weights)
+            if float(trial.block.chi2.sum()) <= chi2:
+                break
+            share /= 2.0
+        else:
+            break
+        best = trial
+    return best
+
+
+def chi2_by_flight(
+    task: ViewTask, found: ViewEquations, indices: Sequence[int]
+) -> np.ndarray:
+    """Return the squared error (F,) of each flight under what the others fit of `indices`.
+
+    To first order about `found`, where all flights fit them. A lone flight's thirds stand for
+    flights.
+    """
+    at, flight = np.array(sorted(indices), dtype=int), _units(found)
+    hessian = found.block.hessian[:, at][:, :, at]
+    gradient, chi2 = found.block.gradient[:, at], []
+    for number in np.unique(flight):
+        inside = flight == number
+        moved = np.zeros(len(at))
+        if len(at):
+            known = hessian[~inside].sum(axis=0), gradient[~inside].sum(axis=0)
+            moved, _ = gauss_newton_step(*known, found.theta, task.model.space, at)
+        own, pull = hessian[inside].sum(axis=0), gradient[inside].sum(axis=0)
+        whole = found.block.chi2[inside].sum() - 2.0 * pull @ moved + moved @ own @ moved
+        chi2.append(float(whole))
+    return np.array(chi2)
+
+
+def half_widths(found: ViewEquations, indices: Sequence[int]) -> np.ndarray:
+    """Return half-widths (K,) of 95 % intervals of the numbers at `indices`.
+
+    The larger of two: each block of a flight is one draw, and, of three flights and more, each
+    flight is one (Liang and Zeger 1986; Student's t with a flight less).
+    """
+    at = np.array(sorted(indices), dtype=int)
+    hessian = found.block.hessian.sum(axis=0)[np.ix_(at, at)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    inverse = np.linalg.pinv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
+    gradient = found.block.gradient[:, at]
+
+    def width(draws: np.ndarray, freedom: int) -> np.ndarray:
+        centred = draws - draws.mean(axis=0)
+        whole = inverse @ (centred.T @ centred * len(draws) / freedom) @ inverse
+        return np.sqrt(np.maximum(np.diag(whole), 0.0)) * float(student.ppf(0.975, freedom))
+
+    noise = np.sqrt(np.maximum(np.diag(inverse), 0.0)) * float(student.ppf(0.975, 1000))
+    widths = np.maximum(noise, width(gradient, max(len(gradient) - len(at), 2)))
+    numbers = np.unique(found.flight)
+    if len(numbers) > 2:
+        flights = np.array([gradient[found.flight == n].sum(axis=0) for n in numbers])
+        widths = np.maximum(widths, width(flights, len(numbers) - 1))
+    return widths
+
+
+def _units(found: ViewEquations) -> np.ndarray:
+    """Return what is left out together (B,): flights, or thirds of a lone one."""
+    if len(np.unique(found.flight)) > 1:
+        return found.flight
+    return np.arange(len(found.flight)) * 3 // len(found.flight)

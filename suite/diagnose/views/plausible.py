@@ -1,0 +1,39 @@
+"""Whether a fitted effect has a size that real vehicles have."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from suite.diagnose.fit.parameters import Candidate, ParameterSpace
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+
+
+def implausible(
+    space: ParameterSpace,
+    theta: np.ndarray,
+    candidate: Candidate,
+    limits: Thresholds = THRESHOLDS,
+) -> list[str]:
+    """Return the numbers of `candidate` that are beyond their usual size at `theta` (P,), in words.
+
+    Usual is what the catalogue has as the upper usual magnitude; beyond three times that a number
+    is said to be implausible.
+    """
+    told = []
+    for index in candidate.indices:
+        entry = space.entries[index]
+        parameter = next(p for p in EFFECTS[entry.effect].parameters if p.name == entry.parameter)
+        away = abs(theta[index] - (0.0 if parameter.whole else _neutral(parameter, entry.start)))
+        if away > limits.implausible_times * parameter.typical[1]:
+            place = "" if entry.component is None else f" {entry.component + 1}"
+            told.append(
+                f"{entry.effect} {entry.parameter}{place} = {theta[index]:.3g} {parameter.unit}"
+            )
+    return told
+
+
+def _neutral(parameter: object, start: float) -> float:
+    """Return the value with which nothing acts; that of the file where it hangs on the vehicle."""
+    neutral = getattr(parameter, "neutral", start)
+    return start if callable(neutral) else float(neutral)

@@ -1,0 +1,52 @@
+"""The rotor speeds that act in a flight, from whatever its log has of them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle
+
+
+class ActingRotors(NamedTuple):
+    """Rotor speeds of a log, and what they tell."""
+
+    speed: np.ndarray
+    """(N, 4) [rad/s]."""
+    source: str
+    """For people."""
+    each: bool
+    """Whether each rotor's own is known; of a collective thrust only their sum is."""
+
+
+def acting_rotors(log: FlightLog, vehicle: Vehicle) -> ActingRotors | None:
+    """Return the speeds that turned in `log`, measured or as asked for; None where nothing says.
+
+    What was asked for is followed by the vehicle's lag.
+    """
+    if log.rotor_speed is not None:
+        return ActingRotors(log.rotor_speed, "measured rotor speeds", True)
+    if log.rotor_speed_cmd is not None:
+        return ActingRotors(_lagged(log, vehicle, log.rotor_speed_cmd), "motor commands", True)
+    if log.thrust_cmd is not None:
+        each = vehicle.mass * np.maximum(log.thrust_cmd, 0.0) / 4.0
+        speed = np.sqrt(each / vehicle.rotors.thrust_coefficient)
+        speed = np.repeat(speed[:, None], 4, axis=1)
+        return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust", False)
+    return None
+
+
+def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
+    """Return the speeds that follow `wanted` (N, 4), each held until the next row."""
+    lag = vehicle.rotors.time_constant
+    if lag <= 0.0:
+        return wanted
+    left = np.exp(-np.diff(log.time_s) / lag)[:, None]
+    speed = wanted.copy()
+    for row in range(1, len(wanted)):
+        before = speed[row - 1]
+        asked = np.where(np.isfinite(wanted[row - 1]), wanted[row - 1], before)
+        speed[row] = asked + left[row - 1] * (before - asked)
+    return np.where(np.isfinite(wanted), speed, np.nan)
