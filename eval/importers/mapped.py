@@ -142,11 +142,8 @@ def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> Non
     signals[signal] = Signal(samples.time_s[known], turned)
 
 
-def _per_mass(
-    signals: dict[str, Signal], told: Any, options: ImportOptions
-) -> list[Finding]:
-    """Divide a thrust in N by the nominal mass, in place; without a mass it stays as `cmd_force`.
-    """
+def _per_mass(signals: dict[str, Signal], told: Any, options: ImportOptions) -> list[Finding]:
+    """Divide a thrust in N by the nominal mass, in place; without a mass it stays as `cmd_force`."""
     thrust = signals.pop("cmd_thrust")
     signals[KEPT + "cmd_force"] = thrust
     mass, whose = options.mass, "as told"

@@ -62,7 +62,12 @@ AXES = {
 """Signals that may be in other axes than ours; ours first."""
 MIXERS: dict[str, np.ndarray] = {
     "crazyflie": np.array(
-        [[1.0, -0.5, 0.5, 1.0], [1.0, -0.5, -0.5, -1.0], [1.0, 0.5, -0.5, 1.0], [1.0, 0.5, 0.5, -1.0]]
+        [
+            [1.0, -0.5, 0.5, 1.0],
+            [1.0, -0.5, -0.5, -1.0],
+            [1.0, 0.5, -0.5, 1.0],
+            [1.0, 0.5, 0.5, -1.0],
+        ]
     )
 }
 """Motor command of each motor from thrust, roll, pitch and yaw (4, 4). Crazyflie: the firmware's
@@ -216,9 +221,7 @@ def _column(signal: str, table: Table) -> Column:
     if signal in ("pos", "quat", "euler", "vel") and table.has("source"):
         source = _choice(table, "source", SOURCES)
     factor = tuple(float(s) * scale * UNITS[signal][unit] for s in sign)
-    return Column(
-        tuple(names), factor, other, gravity, inverse, unit != PER_MASS, mixer, source
-    )
+    return Column(tuple(names), factor, other, gravity, inverse, unit != PER_MASS, mixer, source)
 
 
 def _choice(table: Table, key: str, allowed: tuple[str, ...]) -> str:

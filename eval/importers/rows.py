@@ -24,7 +24,10 @@ SMOOTH = ("pos", "quat", "vel")
 """Interpolated by a cubic spline, as they follow from accelerations; the others linearly."""
 SPARSE = ("pos", "quat", "vel", "rate", "acc")
 """Left empty between their samples where they are slower than the rows."""
-HELD = ("cmd_thrust", "cmd_rate", "cmd_torque", "cmd_quat", "throttle", "motor_cmd", "pwm")
+HELD = (
+    *("cmd_thrust", "cmd_rate", "cmd_torque", "cmd_quat", "throttle", "motor_cmd", "pwm"),
+    "kept:cmd_force",
+)
 """Hold their value until the next sample."""
 HOLE_S = 0.1
 HOLE_STEPS = 5.0

@@ -29,9 +29,7 @@ def thrust_command(rows: dict[str, np.ndarray], options: ImportOptions) -> list[
     return findings
 
 
-def _by_motors(
-    rows: dict[str, np.ndarray], vehicle: Vehicle, motors: MotorMap
-) -> list[Finding]:
+def _by_motors(rows: dict[str, np.ndarray], vehicle: Vehicle, motors: MotorMap) -> list[Finding]:
     """Return findings of a throttle that the vehicle's `[motors]` turn into thrust, in place."""
     voltage = rows["voltage"][:, 0] if "voltage" in rows else None
     thrust = 4.0 * motor_thrust(motors, rows["throttle"], voltage)[:, 0] / vehicle.mass

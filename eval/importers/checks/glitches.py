@@ -140,7 +140,12 @@ def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
     # At the ends and beside holes the slope is drawn from one side only.
     steps = np.diff(pos.time_s)
     holes = pos.time_s[:-1][steps > 4.0 * median_step(pos.time_s)]
-    for edge in (pos.time_s[0], pos.time_s[-1], *holes, *pos.time_s[1:][np.isin(pos.time_s[:-1], holes)]):
+    for edge in (
+        pos.time_s[0],
+        pos.time_s[-1],
+        *holes,
+        *pos.time_s[1:][np.isin(pos.time_s[:-1], holes)],
+    ):
         bad &= np.abs(vel.time_s - edge) > EDGE_S
     if not bad.any() or np.mean(bad) > 0.1:
         return vel, []

@@ -20,9 +20,7 @@ FACTORS = {
 """What rotor speeds may be too large by, in words."""
 
 
-def check_weight(
-    rows: dict[str, np.ndarray], vehicle: Vehicle | None, fix: bool
-) -> list[Finding]:
+def check_weight(rows: dict[str, np.ndarray], vehicle: Vehicle | None, fix: bool) -> list[Finding]:
     """Hold the rotors' thrust by the vehicle file against its weight; correct under `fix`.
 
     Over a whole flight the mean of the force along z in the world is the weight.

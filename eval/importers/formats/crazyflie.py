@@ -24,9 +24,9 @@ import numpy as np
 
 from eval.importers.findings import Finding
 from eval.importers.head import read_head
-from eval.importers.options import ImportOptions
 from eval.importers.mapped import recording_of
 from eval.importers.mapping import read_map
+from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError
 from tracks.common.names import closest
@@ -44,6 +44,7 @@ CODES = {"b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"} |
 DEFAULT_MAP = Path("crazyflie")
 """The shipped mapping of the firmware's log variables."""
 PACKED = "stateEstimateZ.quat"
+
 
 class Kind(NamedTuple):
     """One kind of event."""
