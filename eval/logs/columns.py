@@ -52,7 +52,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 """Columns that come together, by the name of the group."""
 NEEDED = ("time", "pos", "quat", "rate")
-"""Groups without which a log is refused that is not partial; so is one without any of `COMMANDS`."""
+"""Groups without which a whole log is refused; so is one without any of `COMMANDS`."""
 COMMANDS = (("cmd_thrust", "cmd_rate"), ("cmd_thrust", "cmd_torque"), ("motor",), ("pwm",))
 """What may drive a model: one of these must be there."""
 KNOWN = frozenset(column for group in GROUPS.values() for column in group)

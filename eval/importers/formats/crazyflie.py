@@ -8,7 +8,7 @@ the file; a Crazyflie that was switched off while logging leaves it out. Source:
 documentation of the deck and its log variables (Bitcraze).
 
 The firmware's world is z-up and its body forward-left-up. Which variable is what, in which unit
-and sign, is said by `eval/importers/maps/crazyflie.toml`.
+and sign, is said by `eval/importers/mapping/shipped/crazyflie.toml`.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ import numpy as np
 
 from eval.importers.findings import Finding
 from eval.importers.head import read_head
-from eval.importers.mapped import recording_of
-from eval.importers.mapping import read_map
+from eval.importers.mapping.apply import recording_of
+from eval.importers.mapping.file import read_map
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError

@@ -16,8 +16,8 @@ import numpy as np
 
 from eval.importers.findings import Finding
 from eval.importers.head import first_line
-from eval.importers.mapped import recording_of
-from eval.importers.mapping import LogMap, own_map, read_map
+from eval.importers.mapping.apply import recording_of
+from eval.importers.mapping.file import LogMap, own_map, read_map
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError

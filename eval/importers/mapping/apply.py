@@ -17,7 +17,7 @@ from eval.importers.frames import (
     turn,
     world_vector,
 )
-from eval.importers.mapping import MIXERS, Column, LogMap
+from eval.importers.mapping.file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
 from eval.importers.rows import measured
 from eval.importers.signals import Recording, Signal, collect
@@ -143,7 +143,7 @@ def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> Non
 
 
 def _per_mass(signals: dict[str, Signal], told: Any, options: ImportOptions) -> list[Finding]:
-    """Divide a thrust in N by the nominal mass, in place; without a mass it stays as `cmd_force`."""
+    """Divide a thrust in N by the nominal mass, in place; it is kept as `cmd_force` besides."""
     thrust = signals.pop("cmd_thrust")
     signals[KEPT + "cmd_force"] = thrust
     mass, whose = options.mass, "as told"

@@ -19,7 +19,7 @@ from eval.logs.columns import GROUPS
 from tracks.common.names import unknown_name
 from tracks.common.toml_table import Table, read_toml
 
-SHIPPED = Path(__file__).resolve().parent / "maps"
+SHIPPED = Path(__file__).resolve().parent / "shipped"
 DEG = float(np.pi / 180.0)
 RPM = float(2.0 * np.pi / 60.0)
 _LENGTH = {"m": 1.0, "cm": 0.01, "mm": 1e-3}

@@ -1,8 +1,8 @@
 """Normalised thrust (0 to 1) as thrust per mass.
 
-What full throttle gives is told by the user, or follows from the vehicle file, or is fitted to
-the accelerometer; a vehicle file with `[motors]` says it with the battery's voltage. The fit takes what a diagnosis would look for in the thrust's scale into the
-command, and says so.
+What full throttle gives is told by the user, or follows from the vehicle file (by its `[motors]`
+with the battery's voltage, where it has them), or is fitted to the accelerometer. The last takes
+what a diagnosis would look for in the thrust's scale into the command, and says so.
 """
 
 from __future__ import annotations
