@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from eval.importers.checks.airborne import airborne
 from eval.importers.checks.attitude import check_attitude
+from eval.importers.checks.delay import check_delay
+from eval.importers.checks.glitches import clean
 from eval.importers.checks.motion import (
     check_accelerometer,
     check_frames,
@@ -12,13 +15,17 @@ from eval.importers.checks.motion import (
     check_velocity,
 )
 from eval.importers.checks.units import check_units
+from eval.importers.checks.weight import check_weight
+from eval.importers.commands.motors import order_motors
+from eval.importers.commands.setpoint import rates_wanted
+from eval.importers.commands.thrust import thrust_command
 from eval.importers.findings import Finding, said
-from eval.importers.motors import order_motors
+from eval.importers.mapping.apply import KEPT
 from eval.importers.options import ImportOptions
+from eval.importers.partial import asked_of
 from eval.importers.rows import HOLE_S, HOLE_STEPS, NEEDED, own_rows, row_times, rows_at, slowest
 from eval.importers.signals import Recording, median_step
-from eval.importers.thrust import thrust_command
-from eval.logs.columns import GROUPS, FlightLogError
+from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.flight_log import FlightLog, log_from_columns
 
 SLOW_HZ = 40.0
@@ -47,26 +54,37 @@ def assemble(
 
         recording, more = with_pose(recording, options)
         findings += more
-    _need(recording)
-    recording, more = check_units(recording, options.fix)
+    _need(recording, options.partial)
+    turning = {"quat", "rate"} <= recording.signals.keys()
+    if turning:
+        recording, more = check_units(recording, options.fix)
+        findings += more
+    recording, more = clean(recording) if options.fix else (recording, [])
     findings += more
-    time_s = row_times(recording, options.rate_hz, options.start_s, options.end_s)
+    if turning and options.pose is None:
+        recording, more = check_delay(recording, options.fix)
+        findings += more
+    within, more = _flight(recording, options)
+    findings += more
+    time_s = row_times(recording, options.rate_hz, options.start_s, options.end_s, within)
     findings += _rates(recording, time_s)
     rows = rows_at(recording, time_s)
-    findings += check_attitude(rows, options.fix)
-    findings += check_velocity(rows, options.fix)
-    findings += check_frames(rows, options.fix)
-    findings += check_accelerometer(rows, options.fix)
-    findings += check_rate_command(rows, options.fix)
+    findings += _checks(rows, options.fix)
     findings += order_motors(rows, recording.motor_side, options.vehicle)
+    findings += check_weight(rows, options.vehicle, options.fix)
+    findings += rates_wanted(rows, options.vehicle)
     findings += thrust_command(rows, options)
-    findings += _pair(rows)
+    findings += _pair(rows, options.partial)
     for name, own in own_rows(recording, time_s).items():
         rows[name] = np.where(own[:, None], rows[name], np.nan)
     columns = _columns(rows)
-    if "cmd_thrust" not in columns and "motor_1" not in columns:
+    lacks = _lacks(rows)
+    if lacks == ["command"] and not options.partial:
         lines = "".join(f"\n{line}" for line in said(tuple(findings)))
-        reason = f"neither a thrust and rate command nor motor speeds could be read{lines}"
+        reason = (
+            "neither a thrust and rate command nor motor speeds nor motor commands could be read; "
+            f"--partial keeps the rest{lines}"
+        )
         raise FlightLogError(recording.name, None, None, reason)
     about = {
         **recording.about,
@@ -76,16 +94,46 @@ def assemble(
     }
     if options.vehicle is not None:
         about["vehicle"] = options.vehicle.name
+    if lacks:
+        findings.append(asked_of(rows, lacks))
+        about["partial"] = lacks
+        about["findings"] = [finding._asdict() for finding in findings]
     log = log_from_columns(columns, about, recording.name)
     return log, tuple(findings)
 
 
-def _need(recording: Recording) -> None:
+def _need(recording: Recording, partial: bool) -> None:
     missing = [TEXTS[name] for name in NEEDED if name not in recording.signals]
-    if missing:
+    if missing and not (partial and len(missing) < len(NEEDED)):
         hint = "" if missing == ["gyro"] else "; --pose FILE brings position and attitude"
-        reason = f"holds no {' and no '.join(missing)}{hint}"
+        reason = f"holds no {' and no '.join(missing)}{hint}; --partial keeps what is there"
         raise FlightLogError(recording.name, None, None, reason)
+
+
+def _flight(
+    recording: Recording, options: ImportOptions
+) -> tuple[tuple[float, float], list[Finding]]:
+    """Return the first and the last time to keep [s]; what the user cuts is not cut here."""
+    if not options.trim or (options.start_s > 0.0 and options.end_s is not None):
+        return (-np.inf, np.inf), []
+    (start, stop), findings = airborne(recording)
+    start = -np.inf if options.start_s > 0.0 else start
+    stop = np.inf if options.end_s is not None else stop
+    return (start, stop), findings
+
+
+def _checks(rows: dict[str, np.ndarray], fix: bool) -> list[Finding]:
+    """Check the rows against each other, as far as they hold what a check needs."""
+    findings: list[Finding] = []
+    if {"quat", "rate"} <= rows.keys():
+        findings += check_attitude(rows, fix)
+    if {"pos", "quat"} <= rows.keys():
+        findings += check_velocity(rows, fix)
+        findings += check_frames(rows, fix)
+        findings += check_accelerometer(rows, fix)
+    if "rate" in rows:
+        findings += check_rate_command(rows, fix)
+    return findings
 
 
 def _rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
@@ -109,13 +157,28 @@ def _rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
     return findings
 
 
-def _pair(rows: dict[str, np.ndarray]) -> list[Finding]:
-    """Leave out half a command, in place: a thrust without rates, or rates without a thrust."""
-    for one, other in (("cmd_thrust", "cmd_rate"), ("cmd_rate", "cmd_thrust")):
-        if one in rows and other not in rows:
-            del rows[one]
-            return [Finding("note", "command", f"{one} is left out, as {other} is not there")]
-    return []
+def _pair(rows: dict[str, np.ndarray], partial: bool) -> list[Finding]:
+    """Leave out half a command, in place: a thrust without rates or torques, or these without it.
+
+    A partial log keeps a thrust alone.
+    """
+    left = []
+    if "cmd_thrust" in rows and not ({"cmd_rate", "cmd_torque"} & rows.keys()) and not partial:
+        left.append("cmd_thrust")
+    for name in ("cmd_rate", "cmd_torque"):
+        if name in rows and "cmd_thrust" not in rows:
+            left.append(name)
+    for name in left:
+        del rows[name]
+    text = f"{' and '.join(left)} left out, as the other half of the command is not there"
+    return [Finding("note", "command", text)] if left else []
+
+
+def _lacks(rows: dict[str, np.ndarray]) -> list[str]:
+    """Return the groups that a flight needs and `rows` lack; `command` for all of these."""
+    lacks = [name for name in NEEDED if name not in rows]
+    driven = any(all(group in rows for group in groups) for groups in COMMANDS)
+    return lacks if driven else [*lacks, "command"]
 
 
 def _columns(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -125,4 +188,7 @@ def _columns(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             columns |= dict(zip(names, rows[group].T, strict=True))
     if "throttle" in rows:
         columns["throttle"] = rows["throttle"][:, 0]
-    return columns
+    kept = {name: value for name, value in rows.items() if name.startswith(KEPT)}
+    return columns | {
+        name.removeprefix(KEPT): value[:, 0] for name, value in kept.items() if value.shape[1] == 1
+    }

@@ -17,7 +17,8 @@ class ImportOptions:
     pose_map: Path | None = None
     """Mapping file (TOML) of `pose`; without it, its columns are named as in a flight log."""
     map: Path | None = None
-    """Mapping file (TOML): columns, units and frames of a table; topics of an MCAP file."""
+    """Mapping file (TOML), or a shipped one's name: columns, units and frames of a table or of a
+    Crazyflie's log; topics of an MCAP file."""
     vehicle: Vehicle | None = None
     """Sets the order of the motors, and scales normalised thrust to its full thrust."""
     full_thrust: float | None = None
@@ -30,5 +31,14 @@ class ImportOptions:
     """Leave out what is earlier than this after the first row [s]."""
     end_s: float | None = None
     """Leave out what is later than this after the first row [s]."""
+    source: str = ""
+    """Take the pose from `mocap` or `estimate` where a file holds both; empty: as the mapping has
+    them in order."""
+    mass: float | None = None
+    """Nominal mass [kg], to divide a thrust in N by; goes before the vehicle's."""
+    trim: bool = True
+    """Leave out the time on the ground before take-off and after landing."""
+    partial: bool = False
+    """Take a log without position, attitude, rates or commands, and keep what is there."""
     fix: bool = True
     """Correct what the evidence shows overwhelmingly; otherwise only say it."""

@@ -79,7 +79,7 @@ def with_pose(
         ValueError: for a mapping file that cannot be used.
     """
     assert options.pose is not None
-    pose = read_table(options.pose, options.pose_map)
+    pose = read_table(options.pose, options.pose_map, options)
     for name, text in (("pos", "position"), ("quat", "attitude")):
         if name not in pose.signals:
             reason = f"holds no {text}; name its columns with --pose-map"

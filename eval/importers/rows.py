@@ -17,14 +17,17 @@ from eval.importers.signals import Recording, Signal, median_step
 from eval.logs.columns import FlightLogError
 
 NEEDED = ("pos", "quat", "rate")
-"""The slowest of these sets the rows."""
+"""The slowest of these that are there sets the rows."""
 LEAST_HZ = 20.0
 """Where that is slower than this, further rows stand between its samples."""
 SMOOTH = ("pos", "quat", "vel")
 """Interpolated by a cubic spline, as they follow from accelerations; the others linearly."""
 SPARSE = ("pos", "quat", "vel", "rate", "acc")
 """Left empty between their samples where they are slower than the rows."""
-HELD = ("cmd_thrust", "cmd_rate", "throttle", "motor_cmd")
+HELD = (
+    *("cmd_thrust", "cmd_rate", "cmd_torque", "cmd_quat", "throttle", "motor_cmd", "pwm"),
+    "kept:cmd_force",
+)
 """Hold their value until the next sample."""
 HOLE_S = 0.1
 HOLE_STEPS = 5.0
@@ -33,6 +36,8 @@ HOLD_S = 0.5
 """A command is not held for longer than this (and ten of its own steps) [s]."""
 FAR_FASTER = 0.6
 """Signals whose step is below this share of a row's are smoothed."""
+LOST = 0.8
+"""A row further than this many steps from any sample of the velocity has none: it was left out."""
 SLOWER = 1.5
 """Signals whose step is above this many rows' are slower than the rows."""
 
@@ -43,7 +48,7 @@ def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
     Signals slower than the rows are interpolated here; `own_rows` tells where.
 
     Args:
-        recording: holds at least pos, quat and rate.
+        recording: holds at least one of pos, quat and rate.
         time_s: (T,) of the rows, on the recording's clock [s].
     """
     rows = {"time": time_s - time_s[0]}
@@ -52,32 +57,39 @@ def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
             rows[name] = held(samples, time_s)
         else:
             rows[name] = measured(samples, time_s, smooth=name in SMOOTH)
-    norm = np.linalg.norm(rows["quat"], axis=1, keepdims=True)
-    on_sample = np.isin(time_s, recording.signals["quat"].time_s)[:, None]
-    rows["quat"] = np.where(on_sample, rows["quat"], rows["quat"] / norm)
+    if "quat" in rows:
+        norm = np.linalg.norm(rows["quat"], axis=1, keepdims=True)
+        on_sample = np.isin(time_s, recording.signals["quat"].time_s)[:, None]
+        rows["quat"] = np.where(on_sample, rows["quat"], rows["quat"] / norm)
     return rows
 
 
 def slowest(recording: Recording) -> str:
-    """Return which of the needed signals is the slowest."""
-    return max(NEEDED, key=lambda name: median_step(recording.signals[name].time_s))
+    """Return which of the needed signals that are there is the slowest."""
+    there = [name for name in NEEDED if name in recording.signals]
+    return max(there, key=lambda name: median_step(recording.signals[name].time_s))
 
 
 def row_times(
-    recording: Recording, rate_hz: float, start_s: float, end_s: float | None
+    recording: Recording,
+    rate_hz: float,
+    start_s: float,
+    end_s: float | None,
+    within: tuple[float, float] = (-np.inf, np.inf),
 ) -> np.ndarray:
     """Return the rows' times (T,) on the recording's clock [s].
 
     Args:
-        recording: holds at least pos, quat and rate.
+        recording: holds at least one of pos, quat and rate.
         rate_hz: at most this many rows a second.
         start_s: first row, counted from where pos, quat and rate are all there [s].
         end_s: last row, in the same count, or None.
+        within: first and last time on the recording's clock [s].
 
     Raises:
         FlightLogError: where pos, quat and rate share less than two samples of time.
     """
-    needed = [recording.signals[name] for name in NEEDED]
+    needed = [recording.signals[name] for name in NEEDED if name in recording.signals]
     first = max(s.time_s[0] for s in needed)
     last = min(s.time_s[-1] for s in needed)
     stop = last if end_s is None else min(last, first + end_s)
@@ -93,7 +105,8 @@ def row_times(
         base = np.append(between[near | (share == 0.0)], base[-1])
         step /= parts
     every = max(1, int(np.ceil(1.0 / (rate_hz * step) - 0.01)))
-    time_s = base[(base >= first + start_s) & (base <= stop)][::every]
+    inside = (base >= within[0]) & (base <= within[1])
+    time_s = base[inside & (base >= first + start_s) & (base <= stop)][::every]
     if len(time_s) < 2:
         spans = ", ".join(
             f"{name} from {s.time_s[0]:.3f} to {s.time_s[-1]:.3f} s"
@@ -118,7 +131,13 @@ def own_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarra
     anchor = _nearest(time_s, recording.signals[slowest(recording)].time_s)
     for name in SPARSE:
         samples = recording.signals.get(name)
-        if samples is None or median_step(samples.time_s) <= SLOWER * row_step:
+        if samples is None:
+            continue
+        step = median_step(samples.time_s)
+        if step <= SLOWER * row_step:
+            far = np.abs(samples.time_s[_nearest(samples.time_s, time_s)] - time_s) > LOST * step
+            if name == "vel" and far.any():
+                found[name] = ~far
             continue
         row = _nearest(time_s, samples.time_s)
         close = anchor[_nearest(time_s[anchor], samples.time_s)]

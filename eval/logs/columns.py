@@ -7,13 +7,16 @@
 | `quat_w quat_x quat_y quat_z` | body to world | yes |
 | `vel_x vel_y vel_z` | m/s, world | no (derived where absent) |
 | `rate_x rate_y rate_z` | rad/s, body | yes |
-| `cmd_thrust` with `cmd_rate_x cmd_rate_y cmd_rate_z` | m/s^2, rad/s body | these or `motor_*` |
+| `cmd_thrust` with `cmd_rate_x cmd_rate_y cmd_rate_z` | m/s^2, rad/s body | these |
+| or with `cmd_torque_x cmd_torque_y cmd_torque_z` | N m, body | or these |
 | `motor_1` to `motor_4` | rad/s, measured | or these |
+| `pwm_1` to `pwm_4` | motor commands from 0 to 1 | or these |
 | `motor_cmd_1` to `motor_cmd_4` | rad/s, commanded | no |
 | `acc_x acc_y acc_z` | m/s^2, specific force, body | no |
 | `voltage` | V | no |
 
-Missing values are null or NaN. Rows are counted from 1; a CSV's header is not a row.
+Missing values are null or NaN. Rows are counted from 1; a CSV's header is not a row. A partial log
+(its metadata say so) may lack all but the time and one more group.
 """
 
 from __future__ import annotations
@@ -40,14 +43,18 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "rate": _xyz("rate"),
     "cmd_thrust": ("cmd_thrust",),
     "cmd_rate": _xyz("cmd_rate"),
+    "cmd_torque": _xyz("cmd_torque"),
     "motor": _rotors("motor"),
     "motor_cmd": _rotors("motor_cmd"),
+    "pwm": _rotors("pwm"),
     "acc": _xyz("acc"),
     "voltage": ("voltage",),
 }
 """Columns that come together, by the name of the group."""
 NEEDED = ("time", "pos", "quat", "rate")
-"""Groups without which a log is refused; so is one without `cmd_*` and without `motor_*`."""
+"""Groups without which a whole log is refused; so is one without any of `COMMANDS`."""
+COMMANDS = (("cmd_thrust", "cmd_rate"), ("cmd_thrust", "cmd_torque"), ("motor",), ("pwm",))
+"""What may drive a model: one of these must be there."""
 KNOWN = frozenset(column for group in GROUPS.values() for column in group)
 """Every column that the rules know."""
 
@@ -57,6 +64,8 @@ RATE_MAX = 200.0
 """Body rates beyond this are refused [rad/s]."""
 QUATERNION_TOLERANCE = 0.05
 """Quaternions further than this from unit norm are refused."""
+PWM_MAX = 1.05
+"""Motor commands beyond this, or below 1 less it, are refused."""
 DURATION_MIN = 1.0
 """Shorter flights are refused [s]."""
 
@@ -84,9 +93,14 @@ class FlightLogError(ValueError):
 
 
 def check_columns(
-    columns: Mapping[str, np.ndarray], name: str
+    columns: Mapping[str, np.ndarray], name: str, partial: bool = False
 ) -> tuple[dict[str, np.ndarray], np.ndarray, list[str]]:
     """Check `columns` (column name to values, one a row) by the rules of a flight log.
+
+    Args:
+        columns: by name.
+        name: the file, for messages.
+        partial: take a log that lacks position, attitude, rates or commands.
 
     Returns:
         The known columns as float64 without the rows that have no time, NaN where a value is
@@ -95,12 +109,16 @@ def check_columns(
     Raises:
         FlightLogError: where a rule is broken, naming file, column, first bad row and reason.
     """
-    present = _present_groups(columns, name)
+    needed = ("time",) if partial else NEEDED
+    present = _present_groups(columns, name, needed)
     values = {c: _numbers(columns[c], c, name) for group in present for c in GROUPS[group]}
     for column, data in values.items():
         _refuse_where(np.isinf(data), name, column, data, "infinite")
-    present = [group for group in present if _has_values(group, values, name)]
-    _need_a_command(present, columns, name)
+    present = [group for group in present if _has_values(group, values, name, needed)]
+    if not partial:
+        _need_a_command(present, columns, name)
+    elif present == ["time"]:
+        raise FlightLogError(name, None, None, "holds a time and nothing else that is known")
 
     rows = np.isfinite(values["time"])
     row_number = np.flatnonzero(rows) + 1
@@ -109,45 +127,67 @@ def check_columns(
     if not rows.all():
         warnings.append(f"{name}: {np.sum(~rows)} rows without a time are left out")
     _check_time(kept["time"], row_number, name)
-    for column in GROUPS["pos"]:
+    for column in GROUPS["pos"] if "pos" in present else ():
         bad = np.abs(kept[column]) > POSITION_MAX
         reason = "beyond 100 km; positions are in m"
         _refuse_where(bad, name, column, kept[column], reason, row_number)
-    for column in GROUPS["rate"]:
+    for column in GROUPS["rate"] if "rate" in present else ():
         bad = np.abs(kept[column]) > RATE_MAX
         reason = "beyond 200 rad/s; rates are in rad/s"
         _refuse_where(bad, name, column, kept[column], reason, row_number)
-    _check_quaternion(kept, row_number, name)
+    for column in GROUPS["pwm"] if "pwm" in present else ():
+        bad = (kept[column] > PWM_MAX) | (kept[column] < 1.0 - PWM_MAX)
+        reason = "not from 0 to 1; a motor command is a share of the full one"
+        _refuse_where(bad, name, column, kept[column], reason, row_number)
+    if "quat" in present:
+        _check_quaternion(kept, row_number, name)
     step = float(np.median(np.diff(kept["time"])))
     if step > 0.2:
         warnings.append(f"{name}: rows are {step:.3g} s apart; `time` should be in seconds")
     return kept, rows, warnings
 
 
-def _present_groups(columns: Mapping[str, np.ndarray], name: str) -> list[str]:
+def _present_groups(
+    columns: Mapping[str, np.ndarray], name: str, needed: tuple[str, ...]
+) -> list[str]:
     present = []
     for group, members in GROUPS.items():
         missing = [column for column in members if column not in columns]
         if not missing:
             present.append(group)
-        elif group in NEEDED or len(missing) < len(members):
+        elif group in needed or len(missing) < len(members):
             raise FlightLogError(
                 name, missing[0], None, "missing" + _did_you_mean(missing[0], columns)
             )
-    for one, other in (("cmd_thrust", "cmd_rate"), ("cmd_rate", "cmd_thrust")):
-        if one in present and other not in present:
-            column = GROUPS[other][0]
-            reason = f"missing; {GROUPS[one][0]} needs it{_did_you_mean(column, columns)}"
-            raise FlightLogError(name, column, None, reason)
+    if needed != ("time",):
+        _refuse_half_a_command(present, columns, name)
     if not len(columns["time"]):
         raise FlightLogError(name, None, None, "no rows; at least 1 s of flight is needed")
     return present
 
 
+def _refuse_half_a_command(
+    present: list[str], columns: Mapping[str, np.ndarray], name: str
+) -> None:
+    """Refuse a thrust without rates and without torques, and either of these without a thrust."""
+    for one, others in (
+        ("cmd_thrust", ("cmd_rate", "cmd_torque")),
+        ("cmd_rate", ("cmd_thrust",)),
+        ("cmd_torque", ("cmd_thrust",)),
+    ):
+        if one in present and not any(other in present for other in others):
+            column = GROUPS[others[0]][0]
+            reason = f"missing; {GROUPS[one][0]} needs it{_did_you_mean(column, columns)}"
+            raise FlightLogError(name, column, None, reason)
+
+
 def _need_a_command(present: list[str], columns: Mapping[str, np.ndarray], name: str) -> None:
-    if "cmd_thrust" not in present and "motor" not in present:
+    if not any(all(group in present for group in groups) for groups in COMMANDS):
         hint = _did_you_mean("cmd_thrust", columns) or _did_you_mean("motor_1", columns)
-        reason = "neither cmd_thrust with cmd_rate_x, _y, _z nor motor_1 to motor_4 is there"
+        reason = (
+            "neither cmd_thrust with cmd_rate_x, _y, _z (or cmd_torque_x, _y, _z) "
+            "nor motor_1 to motor_4 nor pwm_1 to pwm_4 is there"
+        )
         raise FlightLogError(name, None, None, reason + hint)
 
 
@@ -176,10 +216,12 @@ def _numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
     return numbers
 
 
-def _has_values(group: str, values: Mapping[str, np.ndarray], name: str) -> bool:
+def _has_values(
+    group: str, values: Mapping[str, np.ndarray], name: str, needed: tuple[str, ...]
+) -> bool:
     for column in GROUPS[group]:
         if np.isnan(values[column]).all():
-            if group in NEEDED:
+            if group in needed:
                 raise FlightLogError(name, column, 1, "missing in every row")
             return False
     return True

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.logs.columns import GROUPS, KNOWN, FlightLogError, check_columns
+from eval.logs.columns import GROUPS, KNOWN, NEEDED, FlightLogError, check_columns
 from eval.logs.files import read_columns, write_columns
 from eval.logs.flight import Flight
 from eval.logs.velocity import velocity_from_position
@@ -53,7 +53,7 @@ class FlightLog:
     thrust_cmd: np.ndarray | None = None
     """(T,) commanded collective thrust per nominal mass [m/s^2]."""
     rate_cmd_b: np.ndarray | None = None
-    """(T, 3) commanded body rates [rad/s]; there with `thrust_cmd`."""
+    """(T, 3) commanded body rates [rad/s]; there with `thrust_cmd`, unless `torque_cmd_b` is."""
     rotor_speed: np.ndarray | None = None
     """(T, 4) measured, in the vehicle file's order [rad/s]."""
     rotor_speed_cmd: np.ndarray | None = None
@@ -62,6 +62,11 @@ class FlightLog:
     """(T, 3) specific force, as an accelerometer has it [m/s^2]."""
     voltage: np.ndarray | None = None
     """(T,) battery [V]."""
+    torque_cmd_b: np.ndarray | None = None
+    """(T, 3) commanded body torques [N m]; there with `thrust_cmd`."""
+    pwm: np.ndarray | None = None
+    """(T, 4) motor commands from 0 to 1, in the vehicle file's order; its `[motors]` and the
+    voltage say what thrust they give."""
     extra: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Unknown columns by name, (T,) each, as they were in the file."""
     about: Mapping[str, Any] = field(default_factory=dict)
@@ -87,6 +92,15 @@ class FlightLog:
         return quat_to_rot(self.quat_wxyz)
 
     @property
+    def partial(self) -> tuple[str, ...]:
+        """Groups of columns that a partial log lacks of those that flights need; () for others.
+
+        Where `pos`, `quat` or `rate` is among them, that array is NaN in every row.
+        """
+        told = self.about.get("partial")
+        return tuple(str(group) for group in told) if isinstance(told, list) else ()
+
+    @property
     def whole(self) -> np.ndarray:
         """(T,) bool: rows in which nothing of the state and of the flown command is missing."""
         parts = [self.pos_w, self.quat_wxyz, self.vel_w, self.rate_b]
@@ -94,6 +108,8 @@ class FlightLog:
             parts += [self.thrust_cmd[:, None], self.rate_cmd_b]
         elif self.rotor_speed is not None:
             parts.append(self.rotor_speed)
+        elif self.pwm is not None:
+            parts.append(self.pwm)
         return np.all(np.isfinite(np.concatenate(parts, axis=1)), axis=1)
 
     @property
@@ -145,8 +161,10 @@ _FIELDS = {
     "rate": "rate_b",
     "cmd_thrust": "thrust_cmd",
     "cmd_rate": "rate_cmd_b",
+    "cmd_torque": "torque_cmd_b",
     "motor": "rotor_speed",
     "motor_cmd": "rotor_speed_cmd",
+    "pwm": "pwm",
     "acc": "acc_b",
     "voltage": "voltage",
 }
@@ -177,14 +195,19 @@ def log_from_columns(
     """Return the log that `columns` (column name to (T,) values) hold, or refuse them.
 
     Rows without a time are left out, as nothing can be known of when they were. Quaternions are
-    made unit. A missing velocity is derived (`eval/logs/velocity.py`).
+    made unit. A missing velocity is derived (`eval/logs/velocity.py`). Where `about` says
+    `partial`, what flights need and this one lacks is NaN.
 
     Raises:
         FlightLogError: where the columns break a rule; it names column, row and reason.
     """
-    checked, rows, warnings = check_columns(columns, name)
+    checked, rows, warnings = check_columns(columns, name, bool(about.get("partial")))
 
-    values: dict[str, np.ndarray] = {}
+    values: dict[str, np.ndarray] = {
+        _FIELDS[key]: np.full((len(checked["time"]), len(GROUPS[key])), np.nan)
+        for key in NEEDED
+        if key != "time"
+    }
     for key, attribute in _FIELDS.items():
         if GROUPS[key][0] in checked:
             parts = [checked[column] for column in GROUPS[key]]
@@ -217,7 +240,8 @@ def columns_from_log(log: FlightLog) -> dict[str, np.ndarray]:
     columns = {"time": np.asarray(log.time_s, dtype=np.float64)}
     for key, attribute in _FIELDS.items():
         values = getattr(log, attribute)
-        if values is None or (key == "vel" and log.velocity_derived):
+        lacks = key in log.partial or (key == "vel" and log.velocity_derived)
+        if values is None or lacks:
             continue
         parts = np.asarray(values, dtype=np.float64).reshape(len(values), -1).T
         columns |= dict(zip(GROUPS[key], parts, strict=True))
@@ -229,8 +253,8 @@ def columns_from_log(log: FlightLog) -> dict[str, np.ndarray]:
     return columns
 
 
-def read_flight(path: str | Path) -> FlightLog:
-    """Read a flight from a Parquet or CSV file.
+def read_flight(path: str | Path, partial: bool = False) -> FlightLog:
+    """Read a flight from a Parquet or CSV file; a partial one only where `partial` says so.
 
     Raises:
         FlightLogError: where the file cannot be read or breaks a rule; the message has the file,
@@ -247,11 +271,20 @@ def read_flight(path: str | Path) -> FlightLog:
             warnings.append(f"{path}: metadata `flight` is not a JSON object; ignored")
             about = {}
     log = log_from_columns(columns, about, str(path))
+    if log.partial and not partial:
+        reason = f"a partial log, without {', '.join(log.partial)}; this command needs whole ones"
+        raise FlightLogError(str(path), None, None, reason)
     return replace(log, warnings=(*warnings, *log.warnings))
 
 
-def read_flights(paths: Iterable[str | Path]) -> tuple[list[FlightLog], list[str]]:
+def read_flights(
+    paths: Iterable[str | Path], partial: bool = False
+) -> tuple[list[FlightLog], list[str]]:
     """Read many flights; a bad one is named in the warnings and the rest are used.
+
+    Args:
+        paths: of the files.
+        partial: take partial logs too.
 
     Returns:
         The flights in the order of `paths`, and the warnings of all files.
@@ -264,7 +297,7 @@ def read_flights(paths: Iterable[str | Path]) -> tuple[list[FlightLog], list[str
     refused: list[str] = []
     for path in paths:
         try:
-            flights.append(read_flight(path))
+            flights.append(read_flight(path, partial))
             warnings.extend(flights[-1].warnings)
         except FlightLogError as error:
             refused.append(str(error))
@@ -287,6 +320,6 @@ def write_flight(path: str | Path, log: FlightLog) -> Path:
         OSError: where the file cannot be written; nothing is left under its name.
     """
     columns = columns_from_log(log)
-    check_columns(columns, log.name)
+    check_columns(columns, log.name, bool(log.partial))
     about = {**log.about, **stamp(SCHEMA, log.about.get("seed"))}
     return write_columns(Path(path), columns, to_json(about))

@@ -16,7 +16,7 @@ from typing import Any
 
 from eval.effects import EFFECTS, find_effect
 from eval.effects.interface import Effect, at
-from eval.vehicles.vehicle import CollisionBox, Controller, Rotors, Vehicle
+from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
 from tracks.common.files import write_text
 from tracks.common.names import LONGEST, closest, unknown_name
@@ -28,7 +28,10 @@ from tracks.input.reading import InputError, read_toml, reason
 SCHEMA = 1
 SHIPPED = Path(__file__).resolve().parents[1] / "vehicles"
 
-KEYS = ("name", "schema", "mass", "inertia", "rotors", "controller", "body", "camera", "effects")
+KEYS = (
+    *("name", "schema", "mass", "inertia", "rotors", "controller"),
+    *("motors", "body", "camera", "effects"),
+)
 
 
 class VehicleFileError(ValueError):
@@ -92,6 +95,7 @@ def parse_vehicle(table: Mapping[str, Any]) -> Vehicle:
         controller=_controller(_section(table, "controller")),
         body=_body(_section(table, "body", needed=False)),
         camera=_camera(_section(table, "camera", needed=False)),
+        motors=_motors(_section(table, "motors")) if "motors" in table else None,
     )
     check_vehicle(vehicle)
     effects = _section(table, "effects", needed=False)
@@ -136,6 +140,7 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
             "fov_deg": list(camera.fov_deg),
             "range": camera.range_m,
         },
+        **({"motors": _plain(vars(vehicle.motors))} if vehicle.motors else {}),
         **({"effects": effects} if effects else {}),
     }
 
@@ -228,6 +233,19 @@ def _controller(table: Mapping[str, Any]) -> Controller:
         frequency=_number(where + "frequency", _required(where, table, "frequency")),
         **given,
     )
+
+
+def _motors(table: Mapping[str, Any]) -> MotorMap:
+    where = "motors."
+    _known_keys(where, table, list(MotorMap.__dataclass_fields__))
+    thrust = _numbers(where + "thrust", _required(where, table, "thrust"), 2)
+    scalars = {
+        key: _number(where + key, table[key])
+        for key in ("voltage", "voltage_exponent")
+        if key in table
+    }
+    _required(where, table, "voltage")
+    return MotorMap(thrust, **scalars)
 
 
 def _body(table: Mapping[str, Any]) -> CollisionBox:

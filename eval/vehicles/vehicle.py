@@ -53,6 +53,18 @@ class Controller:
 
 
 @dataclass(frozen=True)
+class MotorMap:
+    """What thrust a motor command gives: the vehicle file's `[motors]`; see `quadrotor.motors`."""
+
+    thrust: tuple[float, float]
+    """t1, t2 of T = t1 u + t2 u^2 [N], u the applied command."""
+    voltage: float
+    """V0, the battery's nominal voltage [V]."""
+    voltage_exponent: float = 1.0
+    """n of u = command (V / V0)^n; 0 where the firmware makes up for the battery."""
+
+
+@dataclass(frozen=True)
 class CollisionBox:
     """What collides: the vehicle file's `[body]`."""
 
@@ -73,6 +85,8 @@ class Vehicle:
     controller: Controller
     body: CollisionBox = field(default_factory=CollisionBox)
     camera: Camera = field(default_factory=Camera)
+    motors: MotorMap | None = None
+    """What motor commands give, where it is known."""
     effects: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     """Values (the effect's NamedTuple) by the effect's name, see `eval.effects.EFFECTS`."""
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.mixer import mixer_matrix
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import MotorMap, Vehicle
 
 
 def check_vehicle(vehicle: Vehicle) -> None:
@@ -41,7 +41,21 @@ def check_vehicle(vehicle: Vehicle) -> None:
     _between("camera.pitch_deg", camera.pitch_deg, -90.0, 90.0, "deg")
     _between("camera.fov_deg", camera.fov_deg, 1.0, 170.0, "deg")
     _between("camera.range", camera.range_m, 0.1, 1000.0, "m")
+    if vehicle.motors is not None:
+        _check_motors(vehicle.motors)
     _check_rotors(vehicle)
+
+
+def _check_motors(motors: MotorMap) -> None:
+    _between("motors.voltage", motors.voltage, 0.5, 1000.0, "V")
+    _between("motors.voltage_exponent", motors.voltage_exponent, 0.0, 4.0, "")
+    _between("motors.thrust", motors.thrust, -100000.0, 100000.0, "N")
+    first, second = motors.thrust
+    if first < 0.0 or first + second <= 0.0 or first + 2.0 * second < 0.0:
+        raise ValueError(
+            f"motors.thrust = {list(motors.thrust)}: t1 u + t2 u^2 must grow with the command u "
+            "from 0 to 1; t1 >= 0, t1 + t2 > 0 and t1 + 2 t2 >= 0"
+        )
 
 
 def _check_rotors(vehicle: Vehicle) -> None:

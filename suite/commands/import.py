@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -23,7 +23,10 @@ class Config:
     out: Path = Path("flight.parquet")
     """The flight log to write (.parquet or .csv)."""
     map: Path | None = None
-    """Mapping file (TOML): columns, units and frames of a table; topics of an MCAP file."""
+    """Mapping file (TOML), or nanobench, crazypad, crazyswarm2 or crazyflie, which are shipped:
+    columns, units and frames of a table or a Crazyflie's log; topics of an MCAP file."""
+    source: Literal["", "mocap", "estimate"] = ""
+    """Take the pose from here, where the file holds raw motion capture and an estimate."""
     pose: Path | None = None
     """CSV or Parquet with position and attitude from elsewhere; its clock is aligned by itself."""
     pose_map: Path | None = None
@@ -32,6 +35,8 @@ class Config:
     """A shipped vehicle's name or a vehicle file: order of the motors, full thrust."""
     full_thrust: Annotated[float, Range(0.0, 1000.0, above=True, below=True)] | None = None
     """Thrust per mass at full throttle [m/s^2], where the log has normalised thrust."""
+    mass: Annotated[float, Range(0.0, 10_000.0, above=True)] | None = None
+    """Nominal mass [kg], where the log has a thrust in N."""
     motor_poles: Annotated[int, Range(2, 1000)] = 14
     """Magnets on a motor's bell (Betaflight's eRPM)."""
     rate: Annotated[float, Range(1.0, 10_000.0)] = 250.0
@@ -40,6 +45,10 @@ class Config:
     """Leave out what is earlier [s after the first row]."""
     end: Annotated[float, Range(0.0, 1e9)] | None = None
     """Leave out what is later [s after the first row]."""
+    keep_ground: bool = False
+    """Keep the time before take-off and after landing."""
+    partial: bool = False
+    """Take a log that lacks position, attitude, rates or commands, and keep what is there."""
     no_fix: bool = False
     """Say what looks wrong, but correct nothing."""
     json: bool = False
@@ -55,7 +64,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from eval.importers import import_log
     from eval.importers.findings import said
     from eval.importers.options import ImportOptions
-    from eval.logs.flight_log import write_flight
+    from eval.logs.flight_log import columns_from_log, write_flight
     from eval.quadrotor.vehicle_file import load_vehicle
 
     _check(config)
@@ -69,6 +78,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         rate_hz=config.rate,
         start_s=config.start,
         end_s=config.end,
+        source=config.source,
+        mass=config.mass,
+        trim=not config.keep_ground,
+        partial=config.partial,
         fix=not config.no_fix,
     )
     log, findings = import_log(config.file, config.format or None, options)
@@ -85,6 +98,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         "flight": str(config.out),
         "rows": rows,
         "duration_s": log.duration_s,
+        "columns": sorted(columns_from_log(log)),
+        "partial": list(log.partial),
         "findings": [finding._asdict() for finding in findings],
     }
 

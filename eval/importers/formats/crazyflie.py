@@ -7,14 +7,15 @@ has a number, a name and its variables, named `group.name(t)` with t a type code
 the file; a Crazyflie that was switched off while logging leaves it out. Source: the firmware's
 documentation of the deck and its log variables (Bitcraze).
 
-The firmware's world is z-up and its body forward-left-up. Its gyro is in deg/s, its accelerometer
-in g, and its desired pitch rate has the sign of "nose up", against the gyro's.
+The firmware's world is z-up and its body forward-left-up. Which variable is what, in which unit
+and sign, is said by `eval/importers/mapping/shipped/crazyflie.toml`.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 from zlib import crc32
@@ -23,9 +24,12 @@ import numpy as np
 
 from eval.importers.findings import Finding
 from eval.importers.head import read_head
+from eval.importers.mapping.apply import recording_of
+from eval.importers.mapping.file import read_map
 from eval.importers.options import ImportOptions
-from eval.importers.signals import Recording, collect
+from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError
+from tracks.common.names import closest
 
 SUMMARY = "log of the Crazyflie's micro SD card deck"
 USD = b"\xbc"
@@ -37,49 +41,9 @@ CODES = {"b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"} |
     "Q": "<u8",
 }
 """Type codes of variables as numpy types."""
-MOTOR_SIDE = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""M1 to M4 (x forward, y left): front right, rear right, rear left, front left."""
-PWM = 65535.0
-RPM = 2.0 * np.pi / 60.0
-DEG = np.pi / 180.0
-XYZ = ("x", "y", "z")
-
-_READINGS: dict[str, list[tuple[tuple[str, ...], Sequence[float]]]] = {
-    "pos": [
-        (tuple(f"stateEstimate.{a}" for a in XYZ), (1.0,) * 3),
-        (tuple(f"stateEstimateZ.{a}" for a in XYZ), (1e-3,) * 3),
-        (tuple(f"locSrv.{a}" for a in XYZ), (1.0,) * 3),
-    ],
-    "quat": [
-        (tuple(f"stateEstimate.q{a}" for a in "wxyz"), (1.0,) * 4),
-        (tuple(f"locSrv.q{a}" for a in "wxyz"), (1.0,) * 4),
-    ],
-    "vel": [
-        (tuple(f"stateEstimate.v{a}" for a in XYZ), (1.0,) * 3),
-        (tuple(f"stateEstimateZ.v{a}" for a in XYZ), (1e-3,) * 3),
-    ],
-    "rate": [
-        (tuple(f"gyro.{a}" for a in XYZ), (DEG,) * 3),
-        (
-            ("stateEstimateZ.rateRoll", "stateEstimateZ.ratePitch", "stateEstimateZ.rateYaw"),
-            (1e-3, -1e-3, 1e-3),
-        ),
-    ],
-    "acc": [(tuple(f"acc.{a}" for a in XYZ), (9.81,) * 3)],
-    "cmd_rate": [
-        (
-            ("controller.rollRate", "controller.pitchRate", "controller.yawRate"),
-            (DEG, -DEG, DEG),
-        )
-    ],
-    "throttle": [
-        (("controller.cmd_thrust",), (1 / PWM,)),
-        (("stabilizer.thrust",), (1 / PWM,)),
-    ],
-    "motor": [(tuple(f"rpm.m{k}" for k in range(1, 5)), (RPM,) * 4)],
-    "voltage": [(("pm.vbat",), (1.0,)), (("pm.vbatMV",), (1e-3,))],
-}
-"""Signal -> variables and factors to our units and signs, the first that are there."""
+DEFAULT_MAP = Path("crazyflie")
+"""The shipped mapping of the firmware's log variables."""
+PACKED = "stateEstimateZ.quat"
 
 
 class Kind(NamedTuple):
@@ -104,18 +68,24 @@ def read(path: Path, options: ImportOptions) -> Recording:
     if not detect(read_head(path), options):
         raise FlightLogError(str(path), None, None, "not a uSD deck log (its first byte is not BC)")
     events, findings = decode(path.read_bytes(), str(path))
-    parts = {}
-    for name, readings in _READINGS.items():
-        for variables, factors in readings:
-            found = _find(events, variables)
-            if found is not None:
-                parts[name] = (found[0], found[1] * np.asarray(factors))
-                break
-    packed = _find(events, ("stateEstimateZ.quat",))
-    if "quat" not in parts and packed is not None:
-        parts["quat"] = (packed[0], unpack_quaternion(packed[1][:, 0]))
-    signals, more = collect(parts, str(path))
-    return Recording(str(path), signals, (*findings, *more), MOTOR_SIDE)
+    for event in events.values():
+        if PACKED in event:
+            quat = unpack_quaternion(event[PACKED])
+            event |= {f"{PACKED[:-4]}q{part}": quat[:, k] for k, part in enumerate("wxyz")}
+
+    def missing(variable: str) -> str:
+        known = sorted({v for event in events.values() for v in event} - {"timestamp"})
+        guess = closest(variable, known)
+        return "not logged" + (f"; did you mean {guess!r}?" if guess else "")
+
+    recording = recording_of(
+        path,
+        read_map(options.map or DEFAULT_MAP),
+        lambda variables: _find(events, variables),
+        missing,
+        options,
+    )
+    return replace(recording, findings=(*findings, *recording.findings))
 
 
 def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], list[Finding]]:

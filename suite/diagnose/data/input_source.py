@@ -22,7 +22,7 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str) -> bool:
     Raises:
         ValueError: for an unknown `drive`, or one that the logs do not allow.
     """
-    commands = all(log.thrust_cmd is not None for log in logs)
+    commands = all(log.thrust_cmd is not None and log.rate_cmd_b is not None for log in logs)
     motors = all(log.rotor_speed is not None for log in logs)
     if drive not in ("auto", "commands", "motors"):
         raise ValueError(f"drive = {drive!r}; allowed: auto, commands, motors")

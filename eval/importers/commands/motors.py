@@ -20,7 +20,7 @@ def order_motors(
     motor_side: Sequence[tuple[float, float]] | None,
     vehicle: Vehicle | None,
 ) -> list[Finding]:
-    """Put `motor` and `motor_cmd` of `rows` in the vehicle's order, in place.
+    """Put `motor`, `motor_cmd` and `pwm` of `rows` in the vehicle's order, in place.
 
     Args:
         rows: see `eval.importers.rows`.
@@ -28,12 +28,12 @@ def order_motors(
             vehicle's already.
         vehicle: whose order is wanted; None: that of the shipped vehicles.
     """
-    if motor_side is None or not ({"motor", "motor_cmd"} & rows.keys()):
+    if motor_side is None or not ({"motor", "motor_cmd", "pwm"} & rows.keys()):
         return []
     hubs = SHIPPED_ORDER if vehicle is None else [hub[:2] for hub in vehicle.rotors.position]
     have, wanted = _directions(motor_side), _directions(hubs)
     order = max(permutations(range(4)), key=lambda p: float(np.sum(have[list(p)] * wanted)))
-    for name in ("motor", "motor_cmd"):
+    for name in ("motor", "motor_cmd", "pwm"):
         if name in rows:
             rows[name] = rows[name][:, list(order)]
     numbers = ", ".join(str(k + 1) for k in order)

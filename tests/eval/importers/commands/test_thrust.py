@@ -1,10 +1,13 @@
 """Normalised thrust becomes thrust per mass by what is told, by the vehicle, or by what is felt."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from eval.importers.commands.thrust import thrust_command
 from eval.importers.options import ImportOptions
-from eval.importers.thrust import thrust_command
+from eval.vehicles.vehicle import MotorMap
 from tests.support.vehicles import PLAIN
 
 
@@ -50,3 +53,12 @@ def test_a_thrust_that_is_there_stays():
     found = rows() | {"cmd_thrust": np.ones((200, 1))}
     assert thrust_command(found, ImportOptions(full_thrust=20.0)) == []
     assert (found["cmd_thrust"] == 1.0).all()
+
+
+def test_a_throttle_goes_through_the_vehicles_motors_with_the_battery():
+    """u = 0.5 x 3/4: 4 x 0.159375 N over the mass; see test_motors.py."""
+    vehicle = replace(PLAIN, motors=MotorMap((0.2, 0.6), 4.0))
+    rows = {"throttle": np.full((3, 1), 0.5), "voltage": np.full((3, 1), 3.0)}
+    findings = thrust_command(rows, ImportOptions(vehicle=vehicle))
+    np.testing.assert_allclose(rows["cmd_thrust"], 4 * 0.159375 / vehicle.mass)
+    assert "with the battery's voltage" in findings[0].text

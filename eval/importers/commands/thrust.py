@@ -1,8 +1,8 @@
 """Normalised thrust (0 to 1) as thrust per mass.
 
-What full throttle gives is told by the user, or follows from the vehicle file, or is fitted to
-the accelerometer. The last takes what a diagnosis would look for in the thrust's scale into the
-command, and says so.
+What full throttle gives is told by the user, or follows from the vehicle file (by its `[motors]`
+with the battery's voltage, where it has them), or is fitted to the accelerometer. The last takes
+what a diagnosis would look for in the thrust's scale into the command, and says so.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import numpy as np
 
 from eval.importers.findings import Finding
 from eval.importers.options import ImportOptions
+from eval.quadrotor.motors import motor_thrust
+from eval.vehicles.vehicle import MotorMap, Vehicle
 
 
 def thrust_command(rows: dict[str, np.ndarray], options: ImportOptions) -> list[Finding]:
@@ -18,11 +20,23 @@ def thrust_command(rows: dict[str, np.ndarray], options: ImportOptions) -> list[
     if "cmd_thrust" in rows or "throttle" not in rows:
         return []
     throttle = rows["throttle"][:, 0]
+    if options.full_thrust is None and options.vehicle and options.vehicle.motors:
+        return _by_motors(rows, options.vehicle, options.vehicle.motors)
     full, findings = _full_thrust(rows, throttle, options)
     if full is None:
         return findings
     rows["cmd_thrust"] = full * throttle[:, None]
     return findings
+
+
+def _by_motors(rows: dict[str, np.ndarray], vehicle: Vehicle, motors: MotorMap) -> list[Finding]:
+    """Return findings of a throttle that the vehicle's `[motors]` turn into thrust, in place."""
+    voltage = rows["voltage"][:, 0] if "voltage" in rows else None
+    thrust = 4.0 * motor_thrust(motors, rows["throttle"], voltage)[:, 0] / vehicle.mass
+    rows["cmd_thrust"] = thrust[:, None]
+    with_battery = "with the battery's voltage" if voltage is not None else "without a voltage"
+    text = f"normalised; by [motors] of vehicle {vehicle.name!r}, {with_battery}"
+    return [Finding("note", "thrust", text), *_hover(rows, thrust)]
 
 
 def _full_thrust(

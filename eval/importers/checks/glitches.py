@@ -1,0 +1,154 @@
+"""Samples that no flight makes: jumps of position and speed, repeated and filled-in samples.
+
+A sample that was held or drawn between its neighbours is no measurement: it would look like less
+noise than there is. A jump would look like a blow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from eval.importers.findings import Finding
+from eval.importers.frames import conjugate, multiply, rotation_vector
+from eval.importers.rows import continuous
+from eval.importers.signals import Recording, Signal, median_step
+from eval.logs.velocity import velocity_from_position
+
+ACC_MAX = 60.0
+"""No flight changes its speed faster [m/s^2]."""
+POS_LEAST, VEL_LEAST = 0.02, 0.1
+"""Jumps below these are left alone [m, m/s]."""
+TIMES_USUAL = 8.0
+"""A velocity further from the path's slope than this many standard deviations is a glitch."""
+EDGE_S = 0.1
+"""So near to a hole or an end of the positions [s] no velocity is judged."""
+AROUND = 7
+"""Samples whose median a position is held against."""
+REPEATED = 0.02
+"""A larger share of repeated or filled-in samples is worth a word and is left out."""
+COARSE = 4.0
+"""A scale is coarse where the usual change is less than so many of its steps."""
+TEXTS = {"pos": "position", "quat": "attitude"}
+TURNING = 0.05
+"""Slower turns do not tell a filled-in attitude [rad/s]."""
+EXACT = 1e-3
+"""An attitude that turns on by exactly the same, to this share, was drawn between others."""
+
+
+def clean(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """Return the recording without glitches, and what was found; the time is in s."""
+    signals, findings = dict(recording.signals), []
+    findings += _leave_repeats(signals)
+    if "quat" in signals and len(signals["quat"].time_s) > AROUND:
+        signals["quat"], found = _without_filled_in(signals["quat"])
+        findings += found
+    if "pos" in signals and len(signals["pos"].time_s) > AROUND:
+        signals["pos"], found = _without_jumps(signals["pos"])
+        findings += found
+        if "vel" in signals and len(signals["vel"].time_s) > AROUND:
+            signals["vel"], found = _without_glitches(signals["vel"], signals["pos"])
+            findings += found
+    return replace(recording, signals=signals), findings
+
+
+def _kept(samples: Signal, good: np.ndarray) -> Signal:
+    return Signal(samples.time_s[good], samples.value[good])
+
+
+def _leave_repeats(signals: dict[str, Signal]) -> list[Finding]:
+    """Leave out poses that repeat the one before, in place; what is logged with them goes too."""
+    for name in ("quat", "pos"):
+        samples = signals.get(name)
+        if samples is None or len(samples.time_s) <= AROUND:
+            continue
+        new = np.ones(len(samples.time_s), dtype=bool)
+        new[1:] = np.any(samples.value[1:] != samples.value[:-1], axis=1)
+        share = float(np.mean(~new))
+        if share < REPEATED or _is_coarse(samples) or not _moves(samples):
+            continue
+        for other in ("pos", "quat", "vel"):
+            own = signals.get(other)
+            if own is not None and np.array_equal(own.time_s, samples.time_s):
+                signals[other] = _kept(own, new)
+        text = f"{100 * share:.0f} % of the poses repeat the one before: left out"
+        return [Finding("corrected", TEXTS[name], text)]
+    return []
+
+
+def _is_coarse(samples: Signal) -> bool:
+    """Return whether changes are a few steps of a coarse scale, as of whole millimetres."""
+    change = np.abs(np.diff(samples.value, axis=0))
+    change = change[change > 0.0]
+    if not len(change):
+        return True
+    # Rounding makes the least of all changes smaller than a step of the scale.
+    least = float(np.quantile(change, 0.02))
+    return float(np.median(change)) < COARSE * least
+
+
+def _moves(samples: Signal) -> bool:
+    """Return whether nearly every sample differs from that a second later: it does not rest."""
+    later = max(1, int(1.0 / max(median_step(samples.time_s), 1e-6)))
+    if later >= len(samples.value):
+        return False
+    return bool(np.mean(np.any(samples.value[later:] != samples.value[:-later], axis=1)) > 0.9)
+
+
+def _without_filled_in(quat: Signal) -> tuple[Signal, list[Finding]]:
+    value = continuous(quat.value / np.linalg.norm(quat.value, axis=1, keepdims=True))
+    step = np.diff(quat.time_s)[:, None]
+    rate = rotation_vector(multiply(conjugate(value[:-1]), value[1:])) / step
+    change = np.linalg.norm(rate[1:] - rate[:-1], axis=1)
+    size = np.linalg.norm(rate[1:], axis=1)
+    between = np.zeros(len(value), dtype=bool)
+    between[1:-1] = (size > TURNING) & (change < EXACT * size)
+    share = float(np.mean(between))
+    if share < REPEATED:
+        return quat, []
+    text = f"{100 * share:.0f} % of its samples are drawn between their neighbours: left out"
+    return _kept(quat, ~between), [Finding("corrected", "attitude", text)]
+
+
+def _without_jumps(pos: Signal) -> tuple[Signal, list[Finding]]:
+    half = AROUND // 2
+    padded = np.concatenate([pos.value[:1]] * half + [pos.value] + [pos.value[-1:]] * half)
+    around = np.lib.stride_tricks.sliding_window_view(padded, AROUND, axis=0)
+    reach = half * median_step(pos.time_s)
+    far = np.abs(pos.value - np.median(around, axis=-1)).max(axis=1)
+    bad = far > POS_LEAST + 0.5 * ACC_MAX * reach**2
+    bad[:half] = bad[len(bad) - half :] = False
+    if not bad.any():
+        return pos, []
+    worst = float(far[bad].max())
+    text = f"{int(bad.sum())} samples jump by up to {worst:.2g} m and back: left out"
+    return _kept(pos, ~bad), [Finding("corrected", "position", text)]
+
+
+def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
+    """Leave out velocities that the path does not bear out; a velocity in other frames stays."""
+    path = velocity_from_position(pos.time_s, pos.value)
+    slope = np.stack([np.interp(vel.time_s, pos.time_s, column) for column in path.T], axis=1)
+    off = vel.value - slope
+    usual = 1.4826 * np.median(np.abs(off - np.median(off, axis=0)), axis=0)
+    speed = float(np.sqrt(np.mean(np.sum(slope**2, axis=1))))
+    if np.linalg.norm(usual) > 0.3 * max(speed, VEL_LEAST):
+        return vel, []
+    far = np.abs(off - np.median(off, axis=0))
+    bad = np.any(far > np.maximum(TIMES_USUAL * usual, VEL_LEAST), axis=1)
+    # At the ends and beside holes the slope is drawn from one side only.
+    steps = np.diff(pos.time_s)
+    holes = pos.time_s[:-1][steps > 4.0 * median_step(pos.time_s)]
+    for edge in (
+        pos.time_s[0],
+        pos.time_s[-1],
+        *holes,
+        *pos.time_s[1:][np.isin(pos.time_s[:-1], holes)],
+    ):
+        bad &= np.abs(vel.time_s - edge) > EDGE_S
+    if not bad.any() or np.mean(bad) > 0.1:
+        return vel, []
+    worst = float(np.linalg.norm(off[bad], axis=1).max())
+    text = f"{int(bad.sum())} samples are up to {worst:.2g} m/s off the path's slope: left out"
+    return _kept(vel, ~bad), [Finding("corrected", "velocity", text)]

@@ -1,0 +1,183 @@
+"""Columns of a file as signals in our units, frames and axes, as a mapping says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eval.importers.findings import Finding
+from eval.importers.frames import (
+    attitude,
+    body_vector,
+    conjugate,
+    from_euler,
+    turn,
+    world_vector,
+)
+from eval.importers.mapping.file import MIXERS, Column, LogMap
+from eval.importers.options import ImportOptions
+from eval.importers.rows import measured
+from eval.importers.signals import Recording, Signal, collect
+from eval.logs.columns import FlightLogError
+
+GRAVITY = np.array([0.0, 0.0, 9.81])
+Part = tuple[np.ndarray, np.ndarray]
+Find = Callable[[tuple[str, ...]], Part | None]
+"""Time [s] and values (N, C) of columns, or None where one of them is not there."""
+KEPT = "kept:"
+"""Before the name of a column that is kept as it is."""
+
+
+def recording_of(
+    path: Path, mapping: LogMap, find: Find, missing: Callable[[str], str], options: ImportOptions
+) -> Recording:
+    """Return the signals of the file at `path` that `find` finds, as `mapping` says.
+
+    Args:
+        path: the file.
+        mapping: which columns are what.
+        find: gives columns.
+        missing: gives the reason to refuse a column that is not there.
+        options: `source` and the mass are used.
+
+    Raises:
+        FlightLogError: for a column that the mapping needs and the file lacks.
+    """
+    name, parts, taken = str(path), {}, {}
+    for signal, alternatives in mapping.columns.items():
+        column, part = _first(signal, alternatives, find, options.source, name)
+        if part is None:
+            if mapping.optional or signal == "time":
+                continue
+            first = next(c for c in alternatives[0].names if find((c,)) is None)
+            raise FlightLogError(name, first, None, missing(first))
+        taken[signal], parts[signal] = column, _values(part, column)
+    about, findings = _beside(path, mapping)
+    parts.pop("time", None)
+    for angles, quat in (("euler", "quat"), ("cmd_euler", "cmd_quat")):
+        if angles in parts:
+            time_s, value = parts.pop(angles)
+            parts.setdefault(quat, (time_s, from_euler(value)))
+            taken.setdefault(quat, Column((), ()))
+    parts = {signal: _turned(signal, *part, taken, mapping) for signal, part in parts.items()}
+    for column in mapping.keep:
+        part = find((column,))
+        if part is not None:
+            parts[KEPT + column] = part
+    signals, more = collect(parts, name)
+    for signal in ("vel", "rate", "acc"):
+        if signal in signals and taken[signal].other_axes:
+            _change_axes(signals, signal, taken[signal])
+    if "cmd_thrust" in signals and not taken["cmd_thrust"].per_mass:
+        findings += _per_mass(signals, about.get("mass"), options)
+    return Recording(name, signals, (*findings, *more), mapping.motor_side, about)
+
+
+def _first(
+    signal: str, alternatives: tuple[Column, ...], find: Find, source: str, name: str
+) -> tuple[Column, Part | None]:
+    """Return the first alternative that is there, those of the asked source before the others."""
+    told = [c for c in alternatives if source and c.source == source]
+    for column in (*told, *(c for c in alternatives if c not in told)):
+        part = find(column.names)
+        if part is not None:
+            if source and signal == "pos" and column.source and column.source != source:
+                reason = f"holds no position of the {source}; --source {column.source} is there"
+                raise FlightLogError(name, None, None, reason)
+            return column, part
+    return alternatives[0], None
+
+
+def _values(part: Part, column: Column) -> Part:
+    time_s, value = part
+    if column.mixer:
+        mixed = value @ MIXERS[column.mixer].T * np.asarray(column.factor)
+        return time_s, np.clip(mixed, 0.0, 1.0)  # as what drives the motors does
+    return time_s, value * np.asarray(column.factor)
+
+
+def _turned(
+    signal: str, time_s: np.ndarray, value: np.ndarray, taken: Mapping[str, Column], told: LogMap
+) -> Part:
+    """Return a signal in z-up and forward-left-up; what is in other axes stays in them."""
+    column = taken[signal]
+    in_world = signal == "pos" or (signal in ("vel", "rate", "acc") and _is_world(signal, column))
+    if signal in ("quat", "cmd_quat"):
+        quat = conjugate(value) if column.inverse else value
+        return time_s, attitude(quat, told.world, told.body)
+    if in_world:
+        return time_s, world_vector(value, told.world)
+    if signal in ("vel", "rate", "acc", "cmd_rate", "cmd_torque"):
+        return time_s, body_vector(value, told.body)
+    return time_s, value
+
+
+def _is_world(signal: str, column: Column) -> bool:
+    return column.other_axes != (signal == "vel")
+
+
+def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> None:
+    """Turn a signal into our axes by the attitude, in place; without one it is left out.
+
+    An acceleration in world axes is kept as `acc_w_x`, ... where there is no attitude.
+    """
+    samples = signals.pop(signal)
+    value = samples.value
+    if signal == "acc" and not column.gravity:
+        value = value + GRAVITY
+    if "quat" not in signals:
+        if signal == "acc":
+            for k, axis in enumerate("xyz"):
+                kept = (value - GRAVITY)[:, k : k + 1]
+                signals[f"{KEPT}acc_w_{axis}"] = Signal(samples.time_s, kept)
+        return
+    quat = measured(signals["quat"], samples.time_s, smooth=True)
+    known = np.isfinite(quat).all(axis=1)
+    unit = quat[known] / np.linalg.norm(quat[known], axis=1, keepdims=True)
+    to_world = signal == "vel"
+    turned = turn(unit if to_world else conjugate(unit), value[known])
+    signals[signal] = Signal(samples.time_s[known], turned)
+
+
+def _per_mass(signals: dict[str, Signal], told: Any, options: ImportOptions) -> list[Finding]:
+    """Divide a thrust in N by the nominal mass, in place; it is kept as `cmd_force` besides."""
+    thrust = signals.pop("cmd_thrust")
+    signals[KEPT + "cmd_force"] = thrust
+    mass, whose = options.mass, "as told"
+    if mass is None and options.vehicle is not None:
+        mass, whose = options.vehicle.mass, f"by the vehicle {options.vehicle.name!r}"
+    if mass is None and isinstance(told, float):
+        mass, whose = told, "by the file beside it"
+    if mass is None:
+        text = "is in N, and nothing says the mass: kept as cmd_force; give --mass or --vehicle"
+        return [Finding("doubt", "thrust", text)]
+    signals["cmd_thrust"] = Signal(thrust.time_s, thrust.value / mass)
+    return [Finding("note", "thrust", f"in N; divided by a mass of {mass:g} kg, {whose}")]
+
+
+def _beside(path: Path, mapping: LogMap) -> tuple[dict[str, Any], list[Finding]]:
+    """Return what the text file beside the log says: numbers and texts by key."""
+    if not mapping.beside:
+        return {}, []
+    number = "".join(c for c in path.stem if c.isdigit())
+    file = path.parent / mapping.beside.format(stem=path.stem, number=number)
+    if not file.is_file():
+        return {}, [Finding("note", "file", f"no {file.name} beside it")]
+    about: dict[str, Any] = {}
+    for line in file.read_text(encoding="utf-8", errors="replace").splitlines()[:1000]:
+        key, colon, value = line.partition(":")
+        if colon and value.strip():
+            about[key.strip()] = _number_or_text(value.strip())
+    if mapping.mass_key and isinstance(about.get(mapping.mass_key), float):
+        about["mass"] = about[mapping.mass_key]
+    return about, [Finding("note", "file", f"{file.name} is beside it; read with it")]
+
+
+def _number_or_text(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

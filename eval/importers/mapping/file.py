@@ -1,0 +1,238 @@
+"""Mapping files (TOML): which columns of a file are which signal, in which unit and frame.
+
+A table of the file is a signal; several of the same name, `[[pos]]`, are alternatives of which the
+first that is there counts. docs/import.md shows one with every key. Some come with the suite and
+are taken by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from eval.importers.checks.units import TIMES
+from eval.importers.frames import BODIES, WORLDS
+from eval.logs.columns import GROUPS
+from tracks.common.names import unknown_name
+from tracks.common.toml_table import Table, read_toml
+
+SHIPPED = Path(__file__).resolve().parent / "shipped"
+DEG = float(np.pi / 180.0)
+RPM = float(2.0 * np.pi / 60.0)
+_LENGTH = {"m": 1.0, "cm": 0.01, "mm": 1e-3}
+_TURN = {"rad/s": 1.0, "deg/s": DEG, "mrad/s": 1e-3}
+_ANGLE = {"rad": 1.0, "deg": DEG}
+_FORCE = {"m/s^2": 1.0, "g": 9.81}
+_SPEED = {"rad/s": 1.0, "rpm": RPM, "Hz": float(2.0 * np.pi)}
+_SHARE = {"1": 1.0, "%": 0.01, "65535": 1.0 / 65535.0}
+PER_MASS = "N"
+"""A unit of `cmd_thrust` that has to be divided by the mass."""
+UNITS: dict[str, dict[str, float]] = {
+    "time": TIMES,
+    "pos": _LENGTH,
+    "quat": {"1": 1.0},
+    "euler": _ANGLE,
+    "vel": {f"{unit}/s": factor for unit, factor in _LENGTH.items()},
+    "rate": _TURN,
+    "cmd_rate": _TURN,
+    "cmd_quat": {"1": 1.0},
+    "cmd_euler": _ANGLE,
+    "cmd_thrust": _FORCE | {PER_MASS: 1.0},
+    "cmd_torque": {"N m": 1.0},
+    "throttle": _SHARE,
+    "acc": _FORCE,
+    "motor": _SPEED,
+    "motor_cmd": _SPEED,
+    "pwm": _SHARE,
+    "voltage": {"V": 1.0, "mV": 1e-3},
+}
+"""Signal -> the units it may be in, and their factors; the first is the default."""
+WIDTHS = {name: len(GROUPS[name]) if name in GROUPS else 3 for name in UNITS} | {
+    "throttle": 1,
+    "cmd_quat": 4,
+}
+AXES = {
+    "vel": ("world", "body"),
+    "rate": ("body", "world"),
+    "acc": ("body", "world"),
+}
+"""Signals that may be in other axes than ours; ours first."""
+MIXERS: dict[str, np.ndarray] = {
+    "crazyflie": np.array(
+        [
+            [1.0, -0.5, 0.5, 1.0],
+            [1.0, -0.5, -0.5, -1.0],
+            [1.0, 0.5, -0.5, 1.0],
+            [1.0, 0.5, 0.5, -1.0],
+        ]
+    )
+}
+"""Motor command of each motor from thrust, roll, pitch and yaw (4, 4). Crazyflie: the firmware's
+legacy power distribution, in which roll and pitch count half."""
+SOURCES = ("mocap", "estimate")
+"""Where a pose may come from when a file holds both: raw motion capture, or a state estimator."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """Where one signal of a file is."""
+
+    names: tuple[str, ...]
+    """Columns, in our order (quaternions: wxyz); one where its cells hold lists."""
+    factor: tuple[float, ...]
+    """From the column's unit and sign to ours."""
+    other_axes: bool = False
+    """In the second of `AXES`."""
+    gravity: bool = True
+    """An acceleration in world axes is a specific force; False: the velocity's derivative."""
+    inverse: bool = False
+    """A quaternion from world to body."""
+    per_mass: bool = True
+    """False: a thrust in N."""
+    mixer: str = ""
+    """One of `MIXERS`: the columns are thrust, roll, pitch and yaw."""
+    source: str = ""
+    """One of `SOURCES`, where it is said."""
+
+
+@dataclass(frozen=True)
+class LogMap:
+    """What a mapping file says."""
+
+    columns: Mapping[str, tuple[Column, ...]] = field(default_factory=dict)
+    """Alternatives by signal."""
+    world: str = "z-up"
+    """One of `frames.WORLDS`."""
+    body: str = "flu"
+    """One of `frames.BODIES`."""
+    motor_side: tuple[tuple[float, float], ...] | None = None
+    """Where the file's motors 1 to 4 are (x forward, y left), in any unit."""
+    optional: bool = False
+    """A signal of which no alternative is there is left out; otherwise that is an error."""
+    keep: tuple[str, ...] = ()
+    """Columns that are kept as they are, where they are there."""
+    beside: str = ""
+    """A text file of `key: value` beside the log; {stem} and {number} are the log's."""
+    mass_key: str = ""
+    """The key of that file that is the mass [kg]."""
+
+
+def shipped_maps() -> list[str]:
+    """Return the names of the mappings that come with the suite."""
+    return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+
+
+def map_file(path: Path) -> Path:
+    """Return the mapping file that `path` names: a file, or a shipped one by its name.
+
+    Raises:
+        ValueError: for a name that is neither.
+    """
+    if path.suffix or len(path.parts) > 1 or path.is_file():
+        return path
+    if path.name not in shipped_maps():
+        raise unknown_name("mapping (or file)", path.name, shipped_maps())
+    return SHIPPED / f"{path.name}.toml"
+
+
+def read_map(path: Path) -> LogMap:
+    """Read a mapping file, or a shipped one by its name.
+
+    Raises:
+        ValueError: naming the file, the key, its value and what is allowed.
+    """
+    top = read_toml(map_file(path))
+    world, body, side = "z-up", "flu", None
+    if top.has("frames"):
+        frames = top.table("frames")
+        world = _choice(frames, "world", WORLDS)
+        body = _choice(frames, "body", BODIES)
+        if frames.has("motors"):
+            side = tuple((float(x), float(y)) for x, y in frames.points("motors", 2, 4))[:4]
+        frames.close()
+    columns = {}
+    for signal in UNITS:
+        if top.has(signal):
+            columns[signal] = _alternatives(signal, top)
+    beside = mass_key = ""
+    if top.has("about"):
+        about = top.table("about")
+        beside = about.text("file")
+        mass_key = about.text("mass") if about.has("mass") else ""
+        about.close()
+    optional = top.has("optional") and _choice(top, "optional", ("no", "yes")) == "yes"
+    keep = tuple(top.texts("keep")) if top.has("keep") else ()
+    top.has("topics")  # of MCAP files; see mcap.py
+    top.close()
+    return LogMap(columns, world, body, side, optional, keep, beside, mass_key)
+
+
+def own_map(columns: Mapping[str, np.ndarray]) -> LogMap:
+    """Return the mapping of a table whose columns are named as in a flight log."""
+    there = {
+        group: (Column(names, (1.0,) * len(names)),)
+        for group, names in GROUPS.items()
+        if all(name in columns for name in names)
+    }
+    if "throttle" in columns:
+        there["throttle"] = (Column(("throttle",), (1.0,)),)
+    return LogMap(there)
+
+
+def _alternatives(signal: str, top: Table) -> tuple[Column, ...]:
+    try:
+        tables = top.tables(signal)
+    except ValueError:
+        tables = [top.table(signal)]
+    columns = tuple(_column(signal, table) for table in tables)
+    for table in tables:
+        table.close()
+    return columns
+
+
+def _column(signal: str, table: Table) -> Column:
+    width = WIDTHS[signal]
+    in_cells = width == 1 or table.has("column")
+    names = [table.text("column")] if in_cells else _strings(table, width)
+    unit = _choice(table, "unit", tuple(UNITS[signal]))
+    sign = table.vector("sign", width, [1.0] * width)
+    if not np.all(np.abs(sign) == 1.0):
+        raise table.error("sign", sign.tolist(), "1 or -1 for each column")
+    scale = table.number("scale", 1.0, above=0.0)
+    inverse = other = False
+    gravity, mixer, source = True, "", ""
+    if signal in ("quat", "cmd_quat"):
+        if _choice(table, "order", ("wxyz", "xyzw")) == "xyzw":
+            order = [3, 0, 1, 2]
+            names = names if in_cells else [names[k] for k in order]
+            if in_cells:
+                names = [f"{names[0]}[{k}]" for k in order]
+            sign = sign[order]
+        inverse = _choice(table, "maps", ("body to world", "world to body")) == "world to body"
+    if signal in AXES:
+        other = _choice(table, "axes", AXES[signal]) != AXES[signal][0]
+    if signal == "acc" and other:
+        gravity = _choice(table, "gravity", ("specific force", "removed")) == "specific force"
+    if signal == "pwm" and table.has("mixer"):
+        mixer = _choice(table, "mixer", tuple(MIXERS))
+    if signal in ("pos", "quat", "euler", "vel") and table.has("source"):
+        source = _choice(table, "source", SOURCES)
+    factor = tuple(float(s) * scale * UNITS[signal][unit] for s in sign)
+    return Column(tuple(names), factor, other, gravity, inverse, unit != PER_MASS, mixer, source)
+
+
+def _choice(table: Table, key: str, allowed: tuple[str, ...]) -> str:
+    value = table.text(key, allowed[0])
+    if value not in allowed:
+        raise table.error(key, value, " or ".join(repr(choice) for choice in allowed))
+    return value
+
+
+def _strings(table: Table, width: int) -> list[str]:
+    value = table.texts("columns")
+    if len(value) != width:
+        raise table.error("columns", value, f"{width} column names")
+    return value

@@ -1,0 +1,195 @@
+"""Columns in other axes, units and shapes become ours, told by a flight that is known exactly."""
+
+import numpy as np
+import pytest
+
+from eval.importers import import_log
+from eval.importers.mapping.file import MIXERS
+from eval.importers.options import ImportOptions
+from eval.logs.columns import FlightLogError
+from tests.support import known_flight
+from tests.support.imported import near
+from tests.support.vehicles import PLAIN
+
+HEAD = """
+[time]
+column = "t"
+"""
+POSE = """
+[pos]
+column = "p"
+[quat]
+column = "q"
+order = "xyzw"
+"""
+GRAVITY = np.array([0.0, 0.0, 9.81])
+
+
+def cells(values):
+    return ["[" + " ".join(repr(float(v)) for v in row) + "]" for row in values]
+
+
+def imported(tmp_path, mapping, columns, **options):
+    """The log of a CSV with `columns` (texts) under `mapping`."""
+    rows = [",".join(columns)]
+    rows += [",".join(row) for row in zip(*columns.values(), strict=True)]
+    (tmp_path / "log7.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "map.toml").write_text(HEAD + mapping)
+    told = ImportOptions(map=tmp_path / "map.toml", **options)
+    return import_log(tmp_path / "log7.csv", "table", told)
+
+
+def parts(truth):
+    return {
+        "t": [repr(float(t)) for t in truth.time],
+        "p": cells(truth.pos),
+        "q": cells(truth.quat[:, [1, 2, 3, 0]]),
+    }
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return known_flight.fly(np.arange(0, 4, 0.005))
+
+
+def test_lists_in_cells_rates_and_accelerations_in_world_axes(tmp_path, truth):
+    acc_w = np.einsum("tij,tj->ti", truth.rot, truth.acc) - GRAVITY
+    columns = parts(truth) | {
+        "w": cells(np.einsum("tij,tj->ti", truth.rot, truth.rate)),
+        "a": cells(acc_w / 9.81),
+        "u": cells(np.full((len(truth.time), 4), 0.5) * 65535),
+    }
+    mapping = (
+        POSE
+        + """
+[rate]
+column = "w"
+axes = "world"
+[acc]
+column = "a"
+unit = "g"
+axes = "world"
+gravity = "removed"
+[pwm]
+column = "u"
+unit = "65535"
+"""
+    )
+    log, _ = imported(tmp_path, mapping, columns)
+    near(log.pos_w, truth.pos, 1e-9)
+    near(log.rate_b, truth.rate, 1e-6)
+    near(log.acc_b, truth.acc, 1e-6)
+    near(log.pwm, 0.5, 1e-12)
+
+
+def test_a_thrust_in_newton_is_divided_by_the_nominal_mass(tmp_path, truth):
+    columns = parts(truth) | {
+        "w": cells(truth.rate),
+        "f": [repr(0.5 * float(c)) for c in truth.thrust],
+        "m": cells(truth.rate * 1e-3),
+    }
+    mapping = (
+        POSE
+        + """
+[rate]
+column = "w"
+[cmd_thrust]
+column = "f"
+unit = "N"
+[cmd_torque]
+column = "m"
+[about]
+file = "info{number}.yaml"
+mass = "mass"
+"""
+    )
+    with pytest.raises(FlightLogError, match="nothing says the mass"):
+        imported(tmp_path, mapping, columns)
+    (tmp_path / "info7.yaml").write_text("motors: standard\nmass: 0.5\n")
+    log, _ = imported(tmp_path, mapping, columns)
+    near(log.thrust_cmd, truth.thrust, 1e-9)
+    near(log.torque_cmd_b, truth.rate * 1e-3, 1e-12)
+    assert log.about["motors"] == "standard"
+    log, _ = imported(tmp_path, mapping, columns, vehicle=PLAIN)
+    near(log.thrust_cmd, 0.5 * truth.thrust / PLAIN.mass, 1e-9)
+    assert log.rate_cmd_b is None
+
+
+def test_attitude_set_points_become_rates_by_the_vehicles_gains(tmp_path, truth):
+    turned = truth.quat.copy()
+    half = 0.01  # 0.02 rad about body x
+    turn = np.array([np.cos(half), np.sin(half), 0.0, 0.0])
+    w, v = turned[:, :1], turned[:, 1:]
+    wanted = np.concatenate(
+        [
+            w * turn[0] - v[:, :1] * turn[1],
+            v * turn[0] + w * turn[1:] + np.cross(v, turn[1:]),
+        ],
+        axis=1,
+    )
+    columns = parts(truth) | {
+        "w": cells(truth.rate),
+        "sp": cells(wanted),
+        "c": [repr(float(c)) for c in truth.thrust],
+    }
+    mapping = (
+        POSE
+        + """
+[rate]
+column = "w"
+[cmd_quat]
+column = "sp"
+[cmd_thrust]
+column = "c"
+"""
+    )
+    log, findings = imported(tmp_path, mapping, columns, vehicle=PLAIN)
+    gain = PLAIN.controller.attitude_gain[0]
+    near(log.rate_cmd_b, np.array([gain * 0.02, 0.0, 0.0]), 1e-6)
+    assert any(finding.subject == "set points" for finding in findings)
+
+
+def test_the_firmwares_mixer_turns_the_body_the_way_that_it_says():
+    """Roll lifts the left motors, pitch (nose up) the front ones, yaw those that turn against it.
+
+    M1 to M4 are front right, rear right, rear left, front left.
+    """
+    thrust, roll, pitch, yaw = MIXERS["crazyflie"].T
+    assert list(thrust) == [1, 1, 1, 1]
+    assert list(roll > 0) == [False, False, True, True]
+    assert list(pitch > 0) == [True, False, False, True]
+    assert list(yaw > 0) == [True, False, True, False]
+
+
+def test_a_pose_is_taken_from_where_it_is_asked(tmp_path, truth):
+    columns = parts(truth) | {"e": cells(truth.pos + 1.0), "w": cells(truth.rate)}
+    columns["u"] = cells(np.full((len(truth.time), 4), 0.5))
+    mapping = """
+[[pos]]
+column = "p"
+source = "mocap"
+[[pos]]
+column = "e"
+source = "estimate"
+[quat]
+column = "q"
+order = "xyzw"
+[rate]
+column = "w"
+[pwm]
+column = "u"
+"""
+    log, _ = imported(tmp_path, mapping, columns)
+    near(log.pos_w, truth.pos, 1e-9)
+    log, _ = imported(tmp_path, mapping, columns, source="estimate")
+    near(log.pos_w, truth.pos + 1.0, 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("cell", "reason"), [("[1 2 x]", "is not a list"), ("[1 2]", "a list of 2 numbers")]
+)
+def test_a_broken_list_is_refused_by_row(tmp_path, truth, cell, reason):
+    columns = parts(truth)
+    columns["p"][4] = cell
+    with pytest.raises(FlightLogError, match=f"column p, row 5: .*{reason}"):
+        imported(tmp_path, POSE, columns, partial=True)
