@@ -20,6 +20,9 @@ class Config:
     """Flight logs, or folders of them."""
     vehicle: str
     """The vehicle file that the simulation used, or a shipped vehicle's name."""
+    reference: tuple[Path, ...] = ()
+    """Flights of the same vehicle before what changed, or folders of them: say what has changed
+    since, beyond how those differ among themselves."""
     out: Path = Path("runs/diagnosis")
     """Folder for diagnosis.json, vehicle.toml, report.html and recording.rrd."""
     drive: Literal["auto", "commands", "motors"] = "auto"
@@ -52,7 +55,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
-    from suite.diagnose.report.diagnosis_json import components
+    from suite.diagnose.report.parameters_json import components
     from suite.diagnose.run import diagnose_files
 
     result = diagnose_files(
@@ -67,6 +70,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         fly=config.fly,
         recording=config.recording,
         seed=config.seed,
+        reference=config.reference,
     )
     console.say(f"verdict: {result['verdict']}")
     for effect in result["effects"]:
@@ -81,13 +85,15 @@ def run(config: Config, console: Console) -> dict[str, Any]:
                 console.say(f"    {label}: {value:.4g}{between}")
     gap = result["gap"]
     console.say(f"gap on held-out flights: {gap['before']:.2f} before, {gap['after']:.2f} after; "
-                "1 is the noise floor")  # fmt: skip
+                f"{gap['noise_floor']:.2g} is the noise floor")  # fmt: skip
+    if "headline" in result:
+        console.say(result["headline"])
     if result["unexplained"]["where"]:
         console.say(f"unexplained: {result['unexplained']['where']}")
     for line in result["separate_with"]:
         console.say(f"would tell {line}")
     for side in ("held_out", "outside"):
-        compared = (result["black_box"] or {}).get(side)
+        compared = (result.get("black_box") or {}).get(side)
         if compared:
             named = compared["named"]
             beside = f"{named['gap']:.2f} with the names, " if named else ""

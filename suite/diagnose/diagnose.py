@@ -21,6 +21,7 @@ from suite.diagnose.data.input_source import (
     rotors_are_input,
 )
 from suite.diagnose.data.windows import FlightWindows, cut, take
+from suite.diagnose.fit.look import least_left
 from suite.diagnose.fit.model import Linearisation, RolloutModel
 from suite.diagnose.fit.normal_equations import (
     half_widths95,
@@ -43,6 +44,10 @@ from suite.diagnose.verdict.turbulence import Turbulence, find_turbulence
 from suite.diagnose.verdict.verdict import Verdict, share_left, verdict_on
 
 
+class BeyondRollouts(Exception):
+    """Rollouts of a second leave far more than noise, whatever of the catalogue is fitted."""
+
+
 def diagnose(
     logs: Sequence[FlightLog],
     vehicle: Vehicle,
@@ -51,6 +56,7 @@ def diagnose(
     seed: int = 0,
     limits: Thresholds = THRESHOLDS,
     integrator: str = "auto",
+    or_else: bool = False,
 ) -> Diagnosis:
     """Find what explains how `logs` differ from `vehicle`.
 
@@ -64,13 +70,15 @@ def diagnose(
         limits: of every step.
         integrator: how the flights' bodies were moved: "continuous", as every real one, "euler",
             as MuJoCo's steps of the rate loop's period do it, or "auto": what the logs say.
+        or_else: end with `BeyondRollouts` where nothing in the catalogue could bring rollouts near.
 
     Raises:
+        BeyondRollouts: see `or_else`.
         ValueError: where no flight can be used, or not in the way that was asked for.
     """
     began = time.monotonic()
     moved = integrator_of(logs, integrator)
-    found = _diagnose(logs, vehicle, drive, say, seed, limits, moved)
+    found = _diagnose(logs, vehicle, drive, say, seed, limits, moved, or_else)
     if integrator == "auto" and moved == "continuous" and _looks_stepped(found, limits):
         say("pose and rates are apart by half a step: once more, as MuJoCo's Euler steps")
         stepped = _diagnose(logs, vehicle, drive, say, seed, limits, "euler")
@@ -89,6 +97,7 @@ def _diagnose(
     seed: int,
     limits: Thresholds,
     integrator: str,
+    or_else: bool = False,
 ) -> Diagnosis:
     """Return the diagnosis with bodies that `integrator` moves."""
     rotor_input, warnings = rotors_are_input(logs, drive), list[str]()
@@ -111,8 +120,10 @@ def _diagnose(
         broken = int((~good).sum())
         warnings.append(f"{broken} stretches left out: the model's flight from there diverges")
     whole, linear = take(whole, good), _take(linear, good)
+    if or_else and least_left(model, whole, linear, limits) > limits.hopeless_chi2:
+        raise BeyondRollouts
     told = information(linear, whole, model.size, limits)
-    inside, names = choose_held_out(logs, whole, told, limits)
+    inside, names = choose_held_out(logs, whole.flight, whole.start_s, told, limits)
     count = int(inside.sum())
     _enough(count, limits)
     if count < limits.few_windows:

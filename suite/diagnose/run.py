@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,12 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.report import write_report
 from suite.delta.run import flight_files
-from suite.diagnose.diagnose import diagnose
+from suite.diagnose.diagnose import BeyondRollouts, diagnose
 from suite.diagnose.plans.plan import fly_plan, write_plan_of
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.report.recording import write_rollouts
+from suite.diagnose.run_views import diagnose_views, only_views
 from suite.diagnose.verdict.black_box import compare_black_box
 from suite.diagnose.verdict.checks import run_checks
 from suite.diagnose.verdict.delta_model import BlackBoxConfig
@@ -40,6 +42,7 @@ def diagnose_files(
     fly: str | None = None,
     recording: bool = True,
     seed: int = 0,
+    reference: Sequence[Path] = (),
 ) -> dict[str, Any]:
     """Diagnose flights in files; write what was found and return what diagnosis.json holds.
 
@@ -55,16 +58,27 @@ def diagnose_files(
         fly: fly the plan in simulation with this vehicle.
         recording: write a recording for rerun.
         seed: of all draws.
+        reference: flights of the same vehicle before what changed: say what has changed since.
 
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
     vehicle = load_vehicle(vehicle_name)
     truth = None if fly is None else load_vehicle(fly)
-    logs, warnings = read_flights(flight_files(paths))
+    logs, warnings = read_flights(flight_files(paths), partial=True)
+    before, told = read_flights(flight_files(reference), partial=True) if reference else ([], [])
+    warnings = [*warnings, *told]
     for warning in warnings:
         console.note(f"warning: {warning}")
-    result = diagnose(logs, vehicle, drive, console.note, seed, integrator=integrator)
+    by_views = partial(diagnose_views, logs, before, vehicle, out, console, SCHEMA, seed, warnings)
+    if before or only_views(logs):
+        return by_views()
+    try:
+        result = diagnose(logs, vehicle, drive, console.note, seed, integrator=integrator,
+                          or_else=True)  # fmt: skip
+    except BeyondRollouts:
+        console.note("rollouts of a second leave these flights, whatever is fitted: by views")
+        return by_views()
     checks = run_checks(result)
     if compare_delta:
         with console.progress("fitting the Delta Action Model", 1.0) as show:

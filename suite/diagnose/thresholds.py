@@ -120,6 +120,13 @@ class Thresholds:
     integrator_share: float = 0.6
     """Share of a physics step up to which pose and rates may be apart by integration alone [1]."""
 
+    ground_thrust: float = 0.3
+    """Share of the weight below which rotors carry nothing: what stands still then stands on the
+    ground [1]."""
+    ground_speed: float = 0.3
+    """Speed below which a vehicle stands still [m/s]."""
+    ground_margin_s: float = 1.0
+    """Time before and after standing on the ground in which it takes off or lands [s]."""
     least_flights: int = 3
     """Flights from which their means tell how trims differ between flights."""
     longest_memory: int = 40
@@ -136,6 +143,17 @@ class Thresholds:
     view_left_share: float = 0.1
     """Share of a view's squared error that a black box may close beyond what was named, before
     something is said to be missing [1]."""
+    least_rotor_gain: float = 0.01
+    """Share of the largest gain below which rotors do nothing along an axis [1]."""
+    carried_ridge: float = 0.01
+    """How strongly what reference flights lack within a flight is held to none, a moment [1]."""
+    carried_least: float = 0.1
+    """Velocities [m/s] and accelerations [m/s^2, rad/s^2] that vary by less tell nothing of it."""
+    gain_doubt: float = 0.5
+    """Share of a change by which the vehicle file may be wrong along an axis: inertia, arms and the
+    rotors' torque are known no better where nobody identified them [1]."""
+    change_p_value: float = 0.05
+    """Chance of a false name of a change, over all candidates."""
     view_block_s: float = 2.0
     """Stretches of a flight that a view takes for independent [s]."""
 

@@ -14,6 +14,7 @@ from suite.diagnose.fit.normal_equations import (
     Estimate,
     NormalEquations,
     fit,
+    gauss_newton_step,
     normal_equations_of,
 )
 from suite.diagnose.fit.parameters import Candidate
@@ -84,6 +85,23 @@ def look_at(
     whitening = make_whitening(linear, noise, view, limits)
     equations = normal_equations_of(whitening, linear, model.size)
     return Look(linear, view, whitening, equations, noise)
+
+
+def least_left(
+    model: RolloutModel, windows: FlightWindows, linear: Linearisation, limits: Thresholds
+) -> float:
+    """Return the squared error a value, 1 of noise, that all numbers of the catalogue leave.
+
+    To first order about `linear`, the slopes of `windows` along all numbers.
+    """
+    view = trusted(windows, linear.residual, limits)
+    noise = measured_noise(linear.residual, linear.start_slope, view, limits)
+    equations = normal_equations_of(make_whitening(linear, noise, view, limits), linear, model.size)
+    hessian, gradient = equations.hessian.sum(axis=0), equations.gradient.sum(axis=0)
+    at = np.flatnonzero(np.diag(hessian) > 1e-9)
+    start, square = model.space.array("start"), hessian[np.ix_(at, at)]
+    _, fall = gauss_newton_step(square, gradient[at], start, model.space, at.tolist())
+    return (float(equations.chi2.sum()) - fall) / max(int(np.asarray(view.seen).sum()), 1)
 
 
 def is_off(look: Look, equations: NormalEquations, limits: Thresholds) -> bool:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-from eval.effects import EFFECTS
 from suite.diagnose.data.kinematics import Kinematics
 from suite.diagnose.data.windows import STATE_GROUPS
-from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.plans.separating import advice
+from suite.diagnose.report.parameters_json import parameters_json
 from suite.diagnose.verdict.black_box import BlackBoxComparison
 from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
@@ -55,6 +53,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 for horizon, table in before.table.items()
             },
         },
+        "views": ["whole"],
         "control": control
         and {
             "effect": control[0],
@@ -96,17 +95,6 @@ def checks_json(checks: Checks, seed: int) -> dict[str, Any]:
     }
 
 
-def components(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield label, value and interval of every component, None where there is none."""
-    for name, entry in parameters.items():
-        value, span, unit = entry["value"], entry["ci95"], entry["unit"]
-        if not isinstance(value, list):
-            yield f"{name} [{unit}]", value, span
-            continue
-        for k, one in enumerate(value):
-            yield f"{name} {k + 1} [{unit}]", one, span[k] if span else None
-
-
 def _effect(diagnosis: Diagnosis, name: str) -> dict[str, Any]:
     ones = [n for n in diagnosis.search.named if n.candidate.name == name]
     before, after = diagnosis.before.rms, diagnosis.after.rms
@@ -115,7 +103,13 @@ def _effect(diagnosis: Diagnosis, name: str) -> dict[str, Any]:
     return {
         "name": name,
         "alternatives": sorted({rival for n in ones for rival in n.rivals} - {name}),
-        "parameters": _parameters(diagnosis, name, ones),
+        "parameters": parameters_json(
+            diagnosis.model.space,
+            name,
+            sorted(i for n in ones for i in n.candidate.indices),
+            diagnosis.search.estimate.theta,
+            dict(zip(diagnosis.search.indices, diagnosis.half_widths.tolist(), strict=True)),
+        ),
         "gap_removed": min(max(removed, 0.0), 1.0),
         "p_value": max(n.p_value for n in ones),
     }
@@ -138,43 +132,6 @@ def _gusts(found: Turbulence | None) -> list[dict[str, Any]]:
             "p_value": float(np.exp(-found.ratio)),
         }
     ]
-
-
-def _parameters(diagnosis: Diagnosis, name: str, ones: list[NamedEffect]) -> dict[str, Any]:
-    space, search = diagnosis.model.space, diagnosis.search
-    place = {index: k for k, index in enumerate(search.indices)}
-    indices = sorted(i for n in ones for i in n.candidate.indices)
-
-    def one(index: int) -> tuple[float, list[float]]:
-        entry = space.entries[index]
-        value = float(search.estimate.theta[index])
-        width = float(diagnosis.half_widths[place[index]])
-        return value, [max(value - width, entry.low), min(value + width, entry.high)]
-
-    found: dict[str, Any] = {}
-    for parameter in EFFECTS[name].parameters:
-        if parameter.one_at_a_time:
-            values = [one(i) for i in indices]
-            which = [(space.entries[i].component or 0) + 1 for i in indices]
-            lone = len(which) == 1
-            found["index"] = {"value": which[0] if lone else which, "unit": "1", "ci95": None}
-            found[parameter.name] = {
-                "value": values[0][0] if lone else [v for v, _ in values],
-                "unit": parameter.unit,
-                "ci95": values[0][1] if lone else [c for _, c in values],
-            }
-            continue
-        at = {space.entries[i].component: i for i in indices
-              if space.entries[i].parameter == parameter.name}  # fmt: skip
-        if not at:
-            continue
-        if parameter.size:
-            parts = [one(at[k]) if k in at else (None, None) for k in range(parameter.size)]
-            value, ci = [v for v, _ in parts], [c for _, c in parts]
-        else:
-            value, ci = one(at[None])
-        found[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci}
-    return found
 
 
 def _kinematics(found: Kinematics) -> dict[str, Any]:

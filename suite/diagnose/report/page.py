@@ -10,8 +10,8 @@ from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.data.windows import UNITS
 from suite.diagnose.report.cells import cells, grid, short_name
 from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
-from suite.diagnose.report.diagnosis_json import components
 from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
+from suite.diagnose.report.parameters_json import components
 from suite.diagnose.report.result_sections import held_out_section, residual_section
 from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis

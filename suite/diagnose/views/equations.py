@@ -22,6 +22,10 @@ class ViewTask(NamedTuple):
     model: ForceModel
     flights: Sequence[SmoothedFlight]
     limits: Thresholds = THRESHOLDS
+    carried: np.ndarray | None = None
+    """(M, 3) what the model is known to lack in these flights, taken off what is left."""
+    thirds: bool = False
+    """Only the means over the thirds of each flight count, and nothing that changes within them."""
 
 
 class ViewEquations(NamedTuple):
@@ -37,12 +41,34 @@ class ViewEquations(NamedTuple):
     """(B,) number of each block's flight."""
 
 
+def left_of(task: ViewTask, theta: np.ndarray) -> ViewData:
+    """Return what `task`'s flights leave at the numbers `theta` (P,)."""
+    data = compare(task.view, task.model, theta, task.flights)
+    if task.carried is not None:
+        data = data._replace(residual=data.residual - task.carried)
+    return in_thirds(data) if task.thirds else data
+
+
+def in_thirds(data: ViewData) -> ViewData:
+    """Return the means of `data` over the thirds of each flight."""
+    parts = []
+    for number in np.unique(data.flight):
+        rows = np.flatnonzero(data.flight == number)
+        for third in np.array_split(rows, 3):
+            if len(third):
+                parts.append([field[third].mean(axis=0) for field in data])
+    flight, *others = (np.array(field) for field in zip(*parts, strict=True))
+    return ViewData(flight.astype(int), *others)
+
+
 def look(task: ViewTask, theta: np.ndarray, weights: Weights) -> ViewEquations:
     """Return the equations of `task` at the numbers `theta` (P,)."""
-    data = compare(task.view, task.model, theta, task.flights)
-    block = blocks_of(data, task.limits)
+    data = left_of(task, theta)
+    block = np.arange(len(data.flight)) if task.thirds else blocks_of(data, task.limits)
     first = np.unique(block, return_index=True)[1]
-    return ViewEquations(theta, data, weights, equations_of(data, weights, block), data.flight[first])
+    return ViewEquations(
+        theta, data, weights, equations_of(data, weights, block), data.flight[first]
+    )
 
 
 def fitted(
@@ -56,7 +82,9 @@ def fitted(
     for _ in range((rounds or task.limits.view_rounds) if len(at) else 0):
         hessian = best.block.hessian.sum(axis=0)[np.ix_(at, at)]
         gradient = best.block.gradient.sum(axis=0)[at]
-        change, promised = gauss_newton_step(hessian, gradient, best.theta, task.model.space, at)
+        change, promised = gauss_newton_step(
+            hessian, gradient, best.theta, task.model.space, at.tolist()
+        )
         if promised < task.limits.converged:
             break
         share, chi2 = 1.0, float(best.block.chi2.sum())
@@ -73,9 +101,7 @@ def fitted(
     return best
 
 
-def chi2_by_flight(
-    task: ViewTask, found: ViewEquations, indices: Sequence[int]
-) -> np.ndarray:
+def chi2_by_flight(task: ViewTask, found: ViewEquations, indices: Sequence[int]) -> np.ndarray:
     """Return the squared error (F,) of each flight under what the others fit of `indices`.
 
     To first order about `found`, where all flights fit them. A lone flight's thirds stand for
@@ -89,7 +115,7 @@ def chi2_by_flight(
         moved = np.zeros(len(at))
         if len(at):
             known = hessian[~inside].sum(axis=0), gradient[~inside].sum(axis=0)
-            moved, _ = gauss_newton_step(*known, found.theta, task.model.space, at)
+            moved, _ = gauss_newton_step(*known, found.theta, task.model.space, at.tolist())
         own, pull = hessian[inside].sum(axis=0), gradient[inside].sum(axis=0)
         whole = found.block.chi2[inside].sum() - 2.0 * pull @ moved + moved @ own @ moved
         chi2.append(float(whole))

@@ -38,16 +38,14 @@ def inputs_of(flight: SmoothedFlight) -> np.ndarray:
     return flight.form.mean @ _products(flight.rows)
 
 
-def fit_black_box(
-    inputs: np.ndarray, left: np.ndarray, flight: np.ndarray
-) -> BlackBox:
+def fit_black_box(inputs: np.ndarray, left: np.ndarray, flight: np.ndarray) -> BlackBox:
     """Return the black box that explains `left` (M, 3) best on flights left out of its fit.
 
     Means of flights are taken off both sides: they are trims. `flight` (M,) says whose each is;
     a lone flight's thirds stand for flights.
     """
     units = flight if len(np.unique(flight)) > 1 else np.arange(len(flight)) * 3 // len(flight)
-    inputs, left = _centred(inputs, flight), _centred(left, flight)
+    inputs, left = centred(inputs, flight), centred(left, flight)
     spread = np.maximum(inputs.std(axis=0), 1e-9)
     scaled = inputs / spread
 
@@ -66,18 +64,16 @@ def fit_black_box(
     every = np.ones(len(units), bool)
     columns = [solve(every, RIDGES[k])[:, axis] for axis, k in enumerate(best)]
     none = (left**2).sum(axis=0) <= np.min(errors, axis=0)  # better to say nothing at all
-    return BlackBox(
-        np.zeros(len(spread)), spread, np.where(none, 0.0, np.stack(columns, axis=1))
-    )
+    return BlackBox(np.zeros(len(spread)), spread, np.where(none, 0.0, np.stack(columns, axis=1)))
 
 
 def closed_share(left: np.ndarray, after: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the share (3,) of the variance within flights of `left` (M, 3) that is gone `after`."""
-    before = (_centred(left, flight) ** 2).sum(axis=0)
-    return 1.0 - (_centred(after, flight) ** 2).sum(axis=0) / np.maximum(before, 1e-12)
+    """Return the share (3,) of the variance of `left` (M, 3) within flights that is gone."""
+    before = (centred(left, flight) ** 2).sum(axis=0)
+    return 1.0 - (centred(after, flight) ** 2).sum(axis=0) / np.maximum(before, 1e-12)
 
 
-def _centred(values: np.ndarray, flight: np.ndarray) -> np.ndarray:
+def centred(values: np.ndarray, flight: np.ndarray) -> np.ndarray:
     """Return `values` (M, K) less the mean of each's flight."""
     values = values.copy()
     for number in np.unique(flight):

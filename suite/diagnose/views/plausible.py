@@ -33,6 +33,14 @@ def implausible(
     return told
 
 
+def usual_first(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> tuple[bool, int]:
+    """Return by what those of equal fit are ordered: the plausible, then as the catalogue has them.
+
+    `theta` (P,) is with this candidate.
+    """
+    return bool(implausible(space, theta, candidate)), list(EFFECTS).index(candidate.name)
+
+
 def _neutral(parameter: object, start: float) -> float:
     """Return the value with which nothing acts; that of the file where it hangs on the vehicle."""
     neutral = getattr(parameter, "neutral", start)

@@ -7,6 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.mixer import mix
+from eval.quadrotor.motors import motor_speed
+from eval.quadrotor.plant import nominal_quadrotor
 from eval.vehicles.vehicle import Vehicle
 
 
@@ -30,12 +33,26 @@ def acting_rotors(log: FlightLog, vehicle: Vehicle) -> ActingRotors | None:
         return ActingRotors(log.rotor_speed, "measured rotor speeds", True)
     if log.rotor_speed_cmd is not None:
         return ActingRotors(_lagged(log, vehicle, log.rotor_speed_cmd), "motor commands", True)
-    if log.thrust_cmd is not None:
-        each = vehicle.mass * np.maximum(log.thrust_cmd, 0.0) / 4.0
-        speed = np.sqrt(each / vehicle.rotors.thrust_coefficient)
-        speed = np.repeat(speed[:, None], 4, axis=1)
+    if log.pwm is not None and vehicle.motors is not None:
+        voltage = None if log.voltage is None else _filled(log.time_s, log.voltage)
+        speed = np.asarray(motor_speed(vehicle, log.pwm, voltage))
+        return ActingRotors(_lagged(log, vehicle, speed), "motor commands and battery", True)
+    if log.thrust_cmd is None:
+        return None
+    force = vehicle.mass * np.maximum(log.thrust_cmd, 0.0)
+    torque_b = np.zeros((len(force), 3)) if log.torque_cmd_b is None else log.torque_cmd_b
+    nominal, _ = nominal_quadrotor(vehicle)
+    each = mix(nominal.unmixer, nominal.thrust_max, force, torque_b)
+    speed = np.sqrt(np.maximum(each, 0.0) / vehicle.rotors.thrust_coefficient)
+    if log.torque_cmd_b is None:
         return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust", False)
-    return None
+    return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust and torques", True)
+
+
+def _filled(time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return `values` (N,) with what is missing between its neighbours; all must not be."""
+    known = np.isfinite(values)
+    return np.interp(time_s, time_s[known], values[known])
 
 
 def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
@@ -46,7 +63,7 @@ def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
     left = np.exp(-np.diff(log.time_s) / lag)[:, None]
     speed = wanted.copy()
     for row in range(1, len(wanted)):
-        before = speed[row - 1]
+        before = np.where(np.isfinite(speed[row - 1]), speed[row - 1], wanted[row])
         asked = np.where(np.isfinite(wanted[row - 1]), wanted[row - 1], before)
         speed[row] = asked + left[row - 1] * (before - asked)
     return np.where(np.isfinite(wanted), speed, np.nan)

@@ -14,17 +14,17 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from suite.diagnose.fit.parameters import Candidate, indices_of
-from suite.diagnose.fit.permutation import CandidateScore, folds_of, score_candidates
+from suite.diagnose.fit.permutation import folds_of, score_candidates
 from suite.diagnose.fit.rivals import flights_agree
 from suite.diagnose.views.equations import (
     ViewEquations,
     ViewTask,
     chi2_by_flight,
     fitted,
+    left_of,
     look,
 )
-from suite.diagnose.views.plausible import implausible
-from suite.diagnose.views.view import compare
+from suite.diagnose.views.plausible import usual_first
 from suite.diagnose.views.weigh import weights_of
 
 
@@ -75,8 +75,7 @@ def view_candidates(among: Sequence[Candidate], first: ViewEquations) -> list[Ca
 def search_view(task: ViewTask, among: Sequence[Candidate], seed: int = 0) -> ViewSearch:
     """Return which of `among` explain what `task` leaves, one after another."""
     start = task.model.space.array("start")
-    data = compare(task.view, task.model, start, task.flights)
-    first = now = look(task, start, weights_of(data, task.limits))
+    first = now = look(task, start, weights_of(left_of(task, start), task.limits))
     among = view_candidates(among, first)
     named: list[ViewName] = []
     while len(named) < task.limits.most_names:
@@ -126,15 +125,9 @@ def _next_name(
     explained = float(now.block.chi2.sum()) - least
     slack = max(min(task.limits.rival_chi2, task.limits.rival_share * explained), 0.0)
     alike = [one for one in tried if one[0] - least <= slack]
-    # Of what cannot be told apart, the plausible and the more usual (the catalogue's order) stands.
-    order = list(EFFECTS)
-
-    def rank(item: tuple[float, CandidateScore, np.ndarray, float, ViewEquations]) -> tuple:
-        _, score, _, _, then = item
-        far = implausible(task.model.space, then.theta, score.candidate)
-        return bool(far), order.index(score.candidate.name)
-
-    _, best, gains, share, then = min(alike, key=rank)
+    _, best, gains, share, then = min(
+        alike, key=lambda one: usual_first(task.model.space, one[4].theta, one[1].candidate)
+    )
     rivals = dict.fromkeys(score.candidate.name for _, score, *_ in alike)
     rivals.pop(best.candidate.name, None)
     name = ViewName(best.candidate, best.p_value, tuple(gains.tolist()), share, tuple(rivals))

@@ -30,6 +30,8 @@ class View:
     """Of the bumps that both sides are smoothed by [s]."""
     in_world: bool
     """Whether its accelerations are in world axes; they are turned into the body's."""
+    axes: tuple[int, ...] = (0, 1, 2)
+    """Of the body, along which it can be asked."""
 
 
 FORCE = View(
@@ -49,6 +51,8 @@ class ViewData(NamedTuple):
     """(M,) number of the flight."""
     middle_s: np.ndarray
     """(M,) since the first row of the flight [s]."""
+    value: np.ndarray
+    """(M, 3) the model's, body axes."""
     residual: np.ndarray
     """(M, 3) measured - model, body axes."""
     slope: np.ndarray
@@ -64,9 +68,7 @@ class SmoothedFlight(NamedTuple):
     """(M, 3) mean accelerations, axes as the view's model has them."""
 
 
-def smoothed(
-    view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS
-) -> SmoothedFlight:
+def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> SmoothedFlight:
     """Return a flight's measured side in `view`."""
     form = weak_form(rows.time_s, rows.good, view.width_s, limits.longest_hole_s)
     return SmoothedFlight(rows, form, form.change @ (rows.vel_w if view.in_world else rows.rate_b))
@@ -86,7 +88,9 @@ def compare(
         residual = flight.measured - value
         if view.in_world:
             to_body = np.swapaxes(flight.rows.rot_w[flight.form.middle_row], 1, 2)
-            residual = (to_body @ residual[..., None])[..., 0]
+            residual, value = ((to_body @ part[..., None])[..., 0] for part in (residual, value))
             slope = to_body @ slope
-        parts.append(ViewData(np.full(count, number), flight.form.middle_s, residual, slope))
+        dumb = [axis for axis in range(3) if axis not in view.axes]
+        residual[:, dumb], slope[:, dumb] = 0.0, 0.0
+        parts.append(ViewData(np.full(count, number), flight.form.middle_s, value, residual, slope))
     return ViewData(*(np.concatenate(field) for field in zip(*parts, strict=True)))

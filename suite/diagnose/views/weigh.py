@@ -32,9 +32,10 @@ def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
     flights = [data.residual[data.flight == n] for n in np.unique(data.flight)]
     inside = [f - f.mean(axis=0) for f in flights]
     count = sum(len(f) for f in inside)
-    scatter = np.sqrt(sum((f**2).sum(axis=0) for f in inside) / max(count - len(inside), 1))
+    power = np.sum([(f**2).sum(axis=0) for f in inside], axis=0)
+    scatter = np.sqrt(power / max(count - len(inside), 1))
     scatter = np.maximum(scatter, 1e-6)
-    memory = np.max([[1.0] * 3, _memory(inside, limits)], axis=0)
+    memory = np.maximum(1.0, _memory(inside, limits))
     trim = np.full(3, np.inf)
     if len(flights) >= limits.least_flights:
         means = np.array([f.mean(axis=0) for f in flights])
@@ -45,10 +46,10 @@ def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
 
 def _memory(inside: list[np.ndarray], limits: Thresholds) -> np.ndarray:
     """Return the sum of the autocorrelation (3,), up to where it has fallen to nothing."""
-    power = sum((f**2).sum(axis=0) for f in inside)
+    power = np.sum([(f**2).sum(axis=0) for f in inside], axis=0)
     total, alive = np.ones(3), np.ones(3, bool)
     for lag in range(1, limits.longest_memory):
-        product = sum((f[lag:] * f[:-lag]).sum(axis=0) for f in inside if len(f) > lag)
+        product = np.sum([(f[lag:] * f[:-lag]).sum(axis=0) for f in inside], axis=0)
         share = product / np.maximum(power, 1e-300)
         alive &= share > 0.05
         total += np.where(alive, 2.0 * share, 0.0)

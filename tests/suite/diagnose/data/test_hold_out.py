@@ -24,7 +24,7 @@ def test_a_flight_that_alone_tells_of_something_is_fitted(three):
     logs, windows = three
     told = np.ones((len(windows.flight), 2))
     told[windows.flight != 2, 1] = 1e-3
-    inside, names = choose_held_out(logs, windows, told)
+    inside, names = choose_held_out(logs, windows.flight, windows.start_s, told)
     assert names == ["flight_1"]
     assert set(windows.flight[inside]) == {0, 2}
 
@@ -33,6 +33,8 @@ def test_of_a_lone_flight_the_end_is_held_out(three):
     logs, _ = three
     windows, _ = cut(logs[:1], LAGGED, False)
     assert windows is not None
-    inside, names = choose_held_out(logs[:1], windows, np.ones((len(windows.flight), 1)))
+    inside, names = choose_held_out(
+        logs[:1], windows.flight, windows.start_s, np.ones((len(windows.flight), 1))
+    )
     assert names == ["flight_0 from 2.8 s"]
     assert inside.any() and not inside[-1]

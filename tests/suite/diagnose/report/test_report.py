@@ -13,9 +13,10 @@ from suite.diagnose.report.charts import (
     drift_chart,
     gains_chart,
 )
-from suite.diagnose.report.diagnosis_json import checks_json, components, diagnosis_json
+from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
 from suite.diagnose.report.page import page
+from suite.diagnose.report.parameters_json import components
 from suite.diagnose.report.recording import write_rollouts
 from suite.diagnose.report.result_sections import held_out_section, residual_section
 from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons

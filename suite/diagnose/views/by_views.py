@@ -1,0 +1,283 @@
+"""From real flights to what they say that a vehicle file lacks, one view at a time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.fit.parameters import ParameterSpace, candidates, make_space
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.views.equations import ViewTask, half_widths, left_of, look
+from suite.diagnose.views.flights import ViewFlights, parted, ready
+from suite.diagnose.views.judged import ViewGap, judge
+from suite.diagnose.views.model import ForceModel
+from suite.diagnose.views.plausible import implausible
+from suite.diagnose.views.reference import (
+    RotorSpread,
+    changed_task,
+    in_balance,
+    rotor_spread,
+    search_change,
+)
+from suite.diagnose.views.search import ViewName, ViewSearch, search_view
+from suite.diagnose.views.view import View
+from suite.diagnose.views.weigh import weights_of
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """What one view found."""
+
+    view: View
+    search: ViewSearch
+    held: ViewTask
+    """The flights that took no part in it."""
+    gap: ViewGap
+    names: tuple[ViewName, ...]
+    """What of the search's names stands, beside the other views'."""
+    half_width: dict[int, float]
+    """Of the 95 % interval, by the place of each named number."""
+
+
+@dataclass(frozen=True)
+class ViewsDiagnosis:
+    """What the views of real flights found."""
+
+    verdict: str
+    """no_gap, named, partly or unknown."""
+    results: tuple[ViewResult, ...]
+    """By view, in their order."""
+    space: ParameterSpace
+    flights: ViewFlights
+    held_out: list[str]
+    """Names of what took no part in finding or fitting."""
+    logs: Sequence[FlightLog]
+    nominal: Vehicle
+    vehicle: Vehicle
+    """With what was named."""
+    spread: RotorSpread | None
+    """How the reference flights differ; None without."""
+    references: tuple[str, ...]
+    """Names of the reference flights."""
+    warnings: list[str]
+    seconds: float
+    seed: int
+    limits: Thresholds
+
+    @property
+    def main(self) -> ViewResult:
+        """The view that says most: one that names something, else one where most can be said."""
+        return max(
+            self.results,
+            key=lambda one: (bool(one.names), one.gap.share(one.gap.explainable)),
+        )
+
+    @property
+    def named(self) -> list[tuple[ViewResult, ViewName]]:
+        """Every name that stands, with its view."""
+        return [(result, name) for result in self.results for name in result.names]
+
+
+def diagnose_by_views(
+    logs: Sequence[FlightLog],
+    vehicle: Vehicle,
+    references: Sequence[FlightLog] = (),
+    say: Callable[[str], None] = lambda _: None,
+    seed: int = 0,
+    limits: Thresholds = THRESHOLDS,
+) -> ViewsDiagnosis:
+    """Find what explains how `logs` differ from `vehicle`, or from `references` of it.
+
+    Args:
+        logs: flights, partial ones too; a fifth of them, at least one, is held out (of a lone
+            flight the last 30 %).
+        vehicle: what a simulation uses.
+        references: flights of the same vehicle before what changed.
+        say: told of the steps.
+        seed: of the null's draws.
+        limits: of every step.
+
+    Raises:
+        ValueError: for flights that cannot be used, or a lone reference flight.
+    """
+    began = time.monotonic()
+    flights = ready(logs, vehicle, limits)
+    space = make_space(vehicle)
+    voltage = all(log.voltage is not None for log in [*logs, *references])
+    model = ForceModel(vehicle, space, voltage)
+    among = candidates(space, voltage, ())
+    known, spread = _reference_tasks(flights, model, vehicle, references, limits)
+    say(f"views: {', '.join(view.about for view in flights.views)}; by {flights.source}")
+    held_numbers, held_names = _held(logs, flights, model, limits)
+    fitted, held = parted(flights, held_numbers, limits)
+    results = []
+    for view in flights.views:
+        task = ViewTask(view, model, fitted[view.name], limits)
+        if known and spread:
+            found = search_change(known[view.name], task.flights, spread, among)
+            balance = in_balance(known[view.name])
+            apart = changed_task(known[view.name], balance, held[view.name])
+        else:
+            found = search_view(task, among, seed)
+            apart = task._replace(flights=held[view.name])
+        gap = judge(found, apart, flights.floor[view.name])
+        widths = half_widths(found.last, found.indices) if found.named else []
+        width = dict(zip(found.indices, map(float, widths), strict=True))
+        results.append(ViewResult(view, found, apart, gap, found.named, width))
+        told = ", ".join(name.candidate.label for name in found.named) or "nothing"
+        say(f"{view.name}: {told}; {100 * gap.share(gap.closed):.0f} % of the variance closed, "
+            f"{100 * gap.share(gap.explainable):.0f} % by a black box")  # fmt: skip
+    results, warnings = _confirmed(tuple(results))
+    results, told = _one_cause(results)
+    warnings += told
+    for result in results:
+        for name in result.names:
+            far = implausible(space, result.search.last.theta, name.candidate, limits)
+            warnings += [f"implausible: {one}, beyond three times what is usual" for one in far]
+    return ViewsDiagnosis(
+        verdict=_verdict(results, limits),
+        results=results,
+        space=space,
+        flights=flights,
+        held_out=held_names,
+        logs=logs,
+        nominal=vehicle,
+        vehicle=_with_names(vehicle, space, results),
+        spread=spread,
+        references=tuple(log.name for log in references),
+        warnings=warnings,
+        seconds=time.monotonic() - began,
+        seed=seed,
+        limits=limits,
+    )
+
+
+def _reference_tasks(
+    flights: ViewFlights,
+    model: ForceModel,
+    vehicle: Vehicle,
+    references: Sequence[FlightLog],
+    limits: Thresholds,
+) -> tuple[dict[str, ViewTask], RotorSpread | None]:
+    """Return the reference flights' task by view, and how they differ."""
+    if not references:
+        return {}, None
+    if len(references) < 2:
+        raise ValueError(
+            f"--reference has {len(references)} flight; at least 2 are needed, better 3: how "
+            "flights of one vehicle differ is taken from them"
+        )
+    before = ready(references, vehicle, limits)
+    if before.views != flights.views or before.source != flights.source:
+        raise ValueError(
+            f"the reference flights are driven by {before.source} and allow "
+            f"{', '.join(view.name for view in before.views)}, the others by {flights.source} and "
+            f"{', '.join(view.name for view in flights.views)}: log both alike"
+        )
+    tasks = {
+        view.name: ViewTask(view, model, before.smoothed[view.name], limits)
+        for view in flights.views
+    }
+    return tasks, rotor_spread(list(tasks.values()))
+
+
+def _held(
+    logs: Sequence[FlightLog], flights: ViewFlights, model: ForceModel, limits: Thresholds
+) -> tuple[list[int], list[str]]:
+    """Return the numbers and the names of the flights that are held out."""
+    view = flights.views[0]
+    task = ViewTask(view, model, flights.smoothed[view.name], limits)
+    start = model.space.array("start")
+    first = look(task, start, weights_of(left_of(task, start), limits))
+    told = np.einsum("bkk->bk", first.block.hessian)
+    _, names = choose_held_out(logs, first.flight, np.zeros(len(told)), told, limits)
+    return [k for k, log in enumerate(logs) if log.name in names], names
+
+
+def _confirmed(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...], list[str]]:
+    """Return the results without names that make held-out flights worse, and warnings of them."""
+    kept, warnings = [], []
+    for one in results:
+        gap = one.gap
+        if one.names and gap.rms(gap.after) >= gap.rms(gap.before):
+            labels = ", ".join(name.candidate.label for name in one.names)
+            warnings.append(f"{labels}: withdrawn, held-out flights are no better for it")
+            nothing = replace(one.search, named=(), last=one.search.first)
+            gap = judge(nothing, one.held, gap.floor)
+            one = replace(one, search=nothing, gap=gap, names=(), half_width={})
+        kept.append(one)
+    return tuple(kept), warnings
+
+
+def _one_cause(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...], list[str]]:
+    """Return the results with one cause where one view's name could stand for another's.
+
+    Of a candidate that two views name the one that knows its size better stands.
+    """
+    kept, told = list(results), list[str]()
+    for i, one in enumerate(kept):
+        for j, other in enumerate(kept):
+            if i == j:
+                continue
+            names = {name.candidate.name for name in other.names}
+            stays = []
+            for name in kept[i].names:
+                same = [n for n in other.names if n.candidate == name.candidate]
+                if same and _relative(other, name) < _relative(one, name):
+                    told.append(f"{name.candidate.label}: named by {one.view.name} as well")
+                elif not same and set(name.rivals) & names:
+                    cause = ", ".join(sorted(set(name.rivals) & names))
+                    told.append(
+                        f"{one.view.name}: {name.candidate.label} cannot be told from {cause}, "
+                        f"which {other.view.name} names"
+                    )
+                else:
+                    stays.append(name)
+            kept[i] = replace(kept[i], names=tuple(stays))
+    return tuple(kept), told
+
+
+def _relative(result: ViewResult, name: ViewName) -> float:
+    """Return the width of a name's numbers over their size."""
+    at = list(name.candidate.indices)
+    away = np.abs(result.search.last.theta[at] - result.search.first.theta[at])
+    return float(np.mean([result.half_width[i] for i in at]) / max(away.mean(), 1e-12))
+
+
+def _verdict(results: Sequence[ViewResult], limits: Thresholds) -> str:
+    """Return what is said of the gap: what is named is judged by the views that name something."""
+    named = [one for one in results if one.names]
+    if named:
+        left = [one.gap.share(one.gap.left) for one in named]
+        return "named" if max(left) <= limits.view_left_share else "partly"
+    could = [one.gap.share(one.gap.explainable) for one in results]
+    return "unknown" if max(could) > limits.view_left_share else "no_gap"
+
+
+def _with_names(vehicle: Vehicle, space: ParameterSpace, results: Sequence[ViewResult]) -> Vehicle:
+    """Return `vehicle` with the names of all views in place of what it has of them."""
+    theta = space.array("start")
+    names = []
+    for one in results:
+        for name in one.names:
+            at = list(name.candidate.indices)
+            theta[at] = one.search.last.theta[at]
+            names.append(name.candidate.name)
+    fitted: dict[str, Any] = space.effects(theta)
+    effects = dict(vehicle.effects)
+    for name in dict.fromkeys(names):
+        values = (np.asarray(value, dtype=float) for value in fitted[name])
+        effects[name] = type(fitted[name])(
+            *(tuple(v.tolist()) if v.ndim else float(v) for v in values)
+        )
+    ordered = {name: effects[name] for name in EFFECTS if name in effects}
+    return replace(vehicle, effects=MappingProxyType(ordered))

@@ -1,0 +1,112 @@
+"""Flights made ready for the views: completed, smoothed, parted into fitted and held-out ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.views.completed import completed
+from suite.diagnose.views.rotors import acting_rotors
+from suite.diagnose.views.rows import FlightRows, rows_of
+from suite.diagnose.views.view import FORCE, TORQUE, SmoothedFlight, View, smoothed
+
+SLOW_WIDTH_S = 1.0
+"""Width of the bumps where rates come from a path, which tells them as means over a second [s]."""
+
+
+@dataclass(frozen=True)
+class ViewFlights:
+    """Flights, ready for the views that all of them allow."""
+
+    views: tuple[View, ...]
+    """What all of them allow."""
+    names: tuple[str, ...]
+    """Of F flights."""
+    smoothed: dict[str, list[SmoothedFlight]]
+    """By view, F each."""
+    floor: dict[str, np.ndarray]
+    """By view: what the velocity's or the rates' noise makes of an acceleration, (3,)."""
+    source: str
+    """What is taken for the rotors' speeds."""
+
+
+def ready(
+    logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
+) -> ViewFlights:
+    """Return `logs` for the views that all of them allow.
+
+    Raises:
+        ValueError: where a log has nothing that turns or pushes, or none of it has a stretch.
+    """
+    rotors = [acting_rotors(log, vehicle) for log in logs]
+    for log, one in zip(logs, rotors, strict=True):
+        if one is None:
+            needs = "[motors] in the vehicle file" if log.pwm is not None else "thrust or rotors"
+            raise ValueError(f"{log.name}: nothing says how its rotors turned; it needs {needs}")
+    acting = [one for one in rotors if one is not None]
+    whole = [completed(log) for log in logs]
+    rows = [
+        rows_of(log, vehicle, one.speed, limits) for log, one in zip(whole, acting, strict=True)
+    ]
+    views = [FORCE]
+    if any("quat" in log.partial for log in logs):
+        views = [replace(FORCE, axes=(2,))]
+    if all(one.each for one in acting):
+        slow = any("rate" in log.partial for log in logs)
+        views.append(replace(TORQUE, width_s=SLOW_WIDTH_S) if slow else TORQUE)
+    parts = {view.name: [smoothed(view, one, limits) for one in rows] for view in views}
+    for number, log in enumerate(logs):
+        if not len(parts[FORCE.name][number].form.middle_s):
+            raise ValueError(
+                f"{log.name}: no stretch of {FORCE.width_s:g} s in flight without a hole"
+            )
+    return ViewFlights(
+        tuple(views),
+        tuple(log.name for log in logs),
+        parts,
+        {view.name: _floor(view, parts[view.name]) for view in views},
+        acting[0].source,
+    )
+
+
+def parted(
+    flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
+) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]]]:
+    """Return the fitted flights and the `held` ones by view; of a lone flight its first part."""
+    if len(flights.names) > 1:
+        inside = [k for k in range(len(flights.names)) if k not in held]
+        return (
+            {name: [part[k] for k in inside] for name, part in flights.smoothed.items()},
+            {name: [part[k] for k in held] for name, part in flights.smoothed.items()},
+        )
+    first, last = {}, {}
+    for view in flights.views:
+        rows = flights.smoothed[view.name][0].rows
+        early = rows.time_s <= limits.lone_fitted_share * rows.time_s[-1]
+        first[view.name] = [smoothed(view, _only(rows, early), limits)]
+        last[view.name] = [smoothed(view, _only(rows, ~early), limits)]
+    return first, last
+
+
+def _only(rows: FlightRows, chosen: np.ndarray) -> FlightRows:
+    return rows._replace(good=np.asarray(rows.good) & chosen)
+
+
+def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
+    """Return the noise (3,) of the measured accelerations, by that of neighbouring rows."""
+    power = []
+    for flight in flights:
+        series = np.asarray(flight.rows.vel_w if view.in_world else flight.rows.rate_b)
+        series = series[np.asarray(flight.rows.good)]
+        bend = series[2:] - 2.0 * series[1:-1] + series[:-2]
+        # Median, for a filter's or an estimator's steps are no noise of every row.
+        sigma = np.median(np.abs(bend), axis=0) / 0.6745 / np.sqrt(6.0)
+        gain = flight.form.change.power(2).sum(axis=1).mean()
+        power.append(sigma**2 * gain)
+    floor = np.sqrt(np.mean(power, axis=0))
+    return np.full(3, floor.mean()) if view.in_world else floor

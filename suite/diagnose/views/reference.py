@@ -1,0 +1,220 @@
+"""What has changed since other flights of a vehicle, beyond how those differ among themselves.
+
+The vehicle file need not be right: what the reference flights leave of it, on average and with the
+velocity, is carried along. How much flights of an unchanged vehicle differ is taken from them too:
+as though each rotor's thrust were off by a little of its own each time, so that few flights tell it
+along all axes at once. A change is named where it is large beside that (F test; Fisher 1925), after
+Bonferroni over all candidates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import f as fisher
+
+from suite.diagnose.fit.normal_equations import gauss_newton_step
+from suite.diagnose.fit.parameters import Candidate, indices_of
+from suite.diagnose.fit.rivals import flights_agree
+from suite.diagnose.views.equations import (
+    ViewEquations,
+    ViewTask,
+    chi2_by_flight,
+    fitted,
+    left_of,
+    look,
+)
+from suite.diagnose.views.plausible import implausible
+from suite.diagnose.views.search import ViewName, ViewSearch, view_candidates
+from suite.diagnose.views.view import SmoothedFlight, compare
+from suite.diagnose.views.weigh import Weights, weights_of
+
+
+@dataclass(frozen=True)
+class RotorSpread:
+    """How flights of one unchanged vehicle differ."""
+
+    share: float
+    """Standard deviation of a rotor's thrust from flight to flight [1]."""
+    freedom: int
+    """Degrees of freedom that it was estimated with."""
+
+
+def flown_in(task: ViewTask, theta: np.ndarray) -> np.ndarray:
+    """Return what the lack of a model may go with within a flight (M, 9), less its flights' means.
+
+    Velocity, speed times velocity, and what the model says at the numbers `theta` (P,): where it is
+    too lively, or late, the reference flights lack as much of it.
+    """
+    motion = []
+    for flight in task.flights:
+        rows = flight.rows
+        vel_b = (np.swapaxes(rows.rot_w, 1, 2) @ rows.vel_w[..., None])[..., 0]
+        speed = np.linalg.norm(vel_b, axis=1, keepdims=True)
+        motion.append(flight.form.mean @ np.concatenate([vel_b, speed * vel_b], axis=1))
+    data = compare(task.view, task.model, theta, task.flights)
+    flown = np.concatenate([np.concatenate(motion), data.value], axis=1)
+    for number in np.unique(data.flight):
+        flown[data.flight == number] -= flown[data.flight == number].mean(axis=0)
+    return flown
+
+
+def rotor_gain(task: ViewTask) -> np.ndarray:
+    """Return what a rotor's own change of thrust does along each axis (3,), all four together."""
+    space = task.model.space
+    at = [i for i, entry in enumerate(space.entries) if entry.effect == "weak_motor"]
+    slope = left_of(task, space.array("start")).slope[..., at].mean(axis=0)
+    return np.sqrt((slope**2).sum(axis=1))
+
+
+def rotor_spread(references: Sequence[ViewTask]) -> RotorSpread:
+    """Return how the flights of `references`, the same in several views, differ."""
+    square, freedom = 0.0, 0
+    for task in references:
+        data, gain = left_of(task, task.model.space.array("start")), rotor_gain(task)
+        means = np.array(
+            [data.residual[data.flight == n].mean(axis=0) for n in np.unique(data.flight)]
+        )
+        axes = gain > task.limits.least_rotor_gain * gain.max()
+        if task.view.in_world:
+            axes &= np.arange(3) == 2  # across the thrust rotors do nothing
+        away = (means - means.mean(axis=0))[:, axes] / gain[axes]
+        square += float((away**2).sum())
+        freedom += int(axes.sum()) * (len(means) - 1)
+    return RotorSpread(float(np.sqrt(square / max(freedom, 1))), freedom)
+
+
+BALANCE = {"force": (("thrust_scale",),), "torque": (("com_offset",), ("torque_trim",))}
+"""By view, the effects that are fitted to the reference flights, one group after another, so that
+changes are looked for about a vehicle that is in balance as the real one was."""
+
+
+def in_balance(reference: ViewTask) -> np.ndarray:
+    """Return the numbers (P,) with which the reference flights are in balance on average."""
+    space = reference.model.space
+    theta, weights = space.array("start"), None
+    for names in BALANCE[reference.view.name]:
+        at = [i for i, entry in enumerate(space.entries) if entry.effect in names]
+        weights = weights or weights_of(left_of(reference, theta), reference.limits)
+        weights = weights._replace(trim=np.zeros(3))  # it is the trims that are fitted
+        theta = fitted(reference, look(reference, theta, weights), at).theta
+    return theta
+
+
+def changed_task(
+    reference: ViewTask, theta: np.ndarray, flights: Sequence[SmoothedFlight]
+) -> ViewTask:
+    """Return the task of `flights` with what the reference flights lack carried along.
+
+    `theta` (P,) is what they have in balance.
+    """
+    data, flown = left_of(reference, theta), flown_in(reference, theta)
+    inside = data.residual.copy()
+    numbers = np.unique(data.flight)
+    for number in numbers:
+        inside[data.flight == number] -= inside[data.flight == number].mean(axis=0)
+    spread = np.maximum(flown.std(axis=0), reference.limits.carried_least)
+    scaled = flown / spread
+    ridge = reference.limits.carried_ridge * len(scaled) * np.eye(scaled.shape[1])
+    slope = np.linalg.solve(scaled.T @ scaled + ridge, scaled.T @ inside)
+    mean = np.mean([data.residual[data.flight == n].mean(axis=0) for n in numbers], axis=0)
+    task = reference._replace(flights=flights)
+    return task._replace(carried=flown_in(task, theta) / spread @ slope + mean)
+
+
+def search_change(
+    reference: ViewTask,
+    flights: Sequence[SmoothedFlight],
+    spread: RotorSpread,
+    among: Sequence[Candidate],
+) -> ViewSearch:
+    """Return which of `among` explain what has changed since the flights of `reference`."""
+    start = in_balance(reference)
+    task, count = changed_task(reference, start, flights), len(reference.flights)
+    gain = rotor_gain(task)
+    weights = weights_of(left_of(task, start), task.limits)
+    # What changes within a flight is the model's flaw as well as the vehicle's: means are judged.
+    third = np.unique(left_of(task, start).flight, return_counts=True)[1].mean() / 3.0
+    alone = weights.scatter * np.sqrt(weights.memory / max(third, 1.0))
+    weights = weights._replace(scatter=alone, memory=np.ones(3))
+    task = task._replace(thirds=True)
+    trim = spread.share * gain
+    if task.view.in_world:
+        trim[:2] = np.inf  # an attitude's trim, of which few flights tell too little
+    weights = weights._replace(trim=trim * np.sqrt(1.0 + 1.0 / count))
+    first = now = look(task, start, weights)
+    among = view_candidates(among, first)
+    doubted = weights._replace(trim=np.hypot(trim, task.limits.gain_doubt * _mean_change(first)))
+    named: list[ViewName] = []
+    while len(named) < task.limits.most_names:
+        found = _next_change(task, now, doubted, named, among, spread.freedom)
+        if found is None:
+            break
+        name, now = found  # what is left is no finding where a gain may be off: doubted from here
+        named.append(name)
+    return ViewSearch(task, tuple(named), first, now)
+
+
+def _mean_change(found: ViewEquations) -> np.ndarray:
+    """Return the size (3,) of what is left on average over the flights."""
+    data = found.data
+    means = [data.residual[data.flight == n].mean(axis=0) for n in np.unique(data.flight)]
+    return np.abs(np.mean(means, axis=0))
+
+
+def _next_change(
+    task: ViewTask,
+    now: ViewEquations,
+    doubted: Weights,
+    named: Sequence[ViewName],
+    among: Sequence[Candidate],
+    freedom: int,
+) -> tuple[ViewName, ViewEquations] | None:
+    """Return the change that stands out most beside `named`, and the equations with it.
+
+    Which one it is, is judged by weights that doubt the vehicle file's gains.
+    """
+    beside, space = indices_of([n.candidate for n in named]), task.model.space
+    left = [c for c in among if not set(c.indices) & set(beside)]
+    hessian, gradient = now.block.hessian.sum(axis=0), now.block.gradient.sum(axis=0)
+
+    def fall(columns: Sequence[int]) -> float:
+        at = np.array(sorted(columns), dtype=int)
+        if not len(at):
+            return 0.0
+        return gauss_newton_step(
+            hessian[np.ix_(at, at)], gradient[at], now.theta, space, at.tolist()
+        )[1]
+
+    without, tried = fall(beside), []
+    for candidate in left:
+        size = len(candidate.indices)
+        gain = fall([*beside, *candidate.indices]) - without
+        p_value = float(fisher.sf(max(gain, 0.0) / size, size, max(freedom, 1))) * len(left)
+        if p_value <= task.limits.change_p_value:
+            tried.append((gain - 2.0 * size, candidate, min(p_value, 1.0)))
+    if not tried:
+        return None
+    most = max(gain for gain, *_ in tried)
+    near = [one for one in tried if one[0] >= task.limits.near_share * most]
+    begin, fits = look(task, now.theta, doubted), []
+    each = chi2_by_flight(task, begin, beside)
+    for _, candidate, p_value in sorted(near, key=lambda one: -one[0])[: task.limits.short_list]:
+        at = [*beside, *candidate.indices]
+        then = fitted(task, begin, at)
+        if flights_agree(each - chi2_by_flight(task, then, at)):
+            cost = float(then.block.chi2.sum()) + 2.0 * len(candidate.indices)
+            fits.append((cost, candidate, p_value, then))
+    if not fits:
+        return None
+    before, least = float(begin.block.chi2.sum()), min(one[0] for one in fits)
+    alike = [one for one in fits if one[0] - least <= task.limits.rival_chi2]
+    _, best, p_value, then = min(
+        alike, key=lambda one: (bool(implausible(space, one[3].theta, one[1])), one[0])
+    )
+    rivals = dict.fromkeys(candidate.name for _, candidate, *_ in alike)
+    rivals.pop(best.name, None)
+    share = 1.0 - float(then.block.chi2.sum()) / max(before, 1e-9)
+    return ViewName(best, p_value, (), share, tuple(rivals)), then
