@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 from eval.effects.interface import Array
 from eval.quadrotor import loops
-from eval.quadrotor.plant import Command, Motion, Plant, Wrench
+from eval.quadrotor.plant import Command, Motion, Plant, Wrench, uses_rotor_acc
 from eval.quadrotor.rigid_body import accelerations, euler_move
-from eval.quadrotor.rotors import RotorStep, follow, steady
+from eval.quadrotor.rotors import RotorStep, acceleration, follow, steady
 from eval.quadrotor.stepper import (
     Feedback,
     Inputs,
@@ -188,6 +188,8 @@ def step(
 
     The arguments are those of `fly`, of one step.
     """
+    before, asked = carry.rotor_speed, None
+    length = span.length_s[..., None]
     if inputs.rotor_speed is not None:
         rotors = steady(inputs.rotor_speed)
         carry = carry._replace(rotor_speed=rotors.end)
@@ -195,9 +197,13 @@ def step(
         assert inputs.command is not None, "neither a command nor rotor speeds are given"
         carry = look(plant, carry, span, inputs.command, motion.rate_b)
         carry, rotors = turn_rotors(plant, carry, span)
-    length = span.length_s[..., None]
+        asked = carry.wanted_speed
+    rotor_acc = None
+    if uses_rotor_acc(plant):
+        lag = plant.constants.time_constant
+        rotor_acc = acceleration(before, rotors, asked, lag, length)
     if integrator == "euler":
-        whole = _wrench(plant, motion, rotors, inputs, time_s)
+        whole = _wrench(plant, motion, rotors, inputs, time_s, rotor_acc)
         acc_w, turn_b = accelerations(plant, motion, whole)
         carry = carry._replace(turn_b=turn_b)
         return carry, euler_move(motion, acc_w, turn_b, length), whole.force_b / mass_of(plant)
@@ -205,7 +211,8 @@ def step(
     half, air = 0.5 * length, carry.air
     guess = Wrench(thrust.force_b + air.force_b, thrust.torque_b + air.torque_b)
     middle = _midpoint(motion, *accelerations(plant, motion, guess), half)
-    whole = _wrench(plant, middle, rotors, inputs, time_s + 0.5 * span.length_s)
+    middle_s = time_s + 0.5 * span.length_s
+    whole = _wrench(plant, middle, rotors, inputs, middle_s, rotor_acc)
     air = _beside(whole, thrust)
     acc_w, turn_b = accelerations(plant, middle, whole)
     end = _midpoint(motion, acc_w, turn_b, length)
@@ -221,10 +228,16 @@ def _still(plant: Plant, rotors: RotorStep) -> Wrench:
 
 
 def _wrench(
-    plant: Plant, motion: Motion, rotors: RotorStep, inputs: Inputs, time_s: Array
+    plant: Plant,
+    motion: Motion,
+    rotors: RotorStep,
+    inputs: Inputs,
+    time_s: Array,
+    rotor_acc: Array | None = None,
 ) -> Wrench:
     """Return all that acts on the body."""
     _, flow = wind_and_flow(plant, {}, motion, rotors, inputs, time_s)
+    flow = flow._replace(rotor_acc=rotor_acc)
     return with_push(plant, wrench_on(plant, rotors, flow), inputs.push_b)
 
 

@@ -20,7 +20,15 @@ from eval.effects.interface import GRAVITY, Array, Flow, Gust
 from eval.quadrotor import loops
 from eval.quadrotor.delay import delayed
 from eval.quadrotor.mixer import mix, rate_torque
-from eval.quadrotor.plant import Command, Motion, Plant, Wrench, in_order, unpacked
+from eval.quadrotor.plant import (
+    Command,
+    Motion,
+    Plant,
+    Wrench,
+    in_order,
+    unpacked,
+    uses_rotor_acc,
+)
 from eval.quadrotor.rigid_body import euler_step
 from eval.quadrotor.rotors import RotorStep, follow, speed_command, steady
 from tracks.geometry.rotation import to_local
@@ -126,9 +134,7 @@ def loop_look(
     nominal = plant.nominal
     if plant.loop is not None:
         force_z, scale = nominal.mass * command.thrust, plant.constants.rate_gain
-        memory, thrust = loops.look(
-            plant.loop, memory, force_z, command.rate_b, rate_b, dt, scale
-        )
+        memory, thrust = loops.look(plant.loop, memory, force_z, command.rate_b, rate_b, dt, scale)
         return memory, speed_command(thrust, nominal.thrust_coefficient)
     torque_b = rate_torque(command.rate_b, rate_b, plant.constants.rate_gain, nominal.inertia)
     thrust = mix(nominal.unmixer, nominal.thrust_max, nominal.mass * command.thrust, torque_b)
@@ -159,6 +165,7 @@ def plant_step(
         inputs: a command or measured rotor speeds, and what else acts.
         time_s: (...,) since the start of the flight [s].
     """
+    before = state.rotor_speed
     if inputs.rotor_speed is not None:
         rotors = steady(inputs.rotor_speed)
         state = state._replace(rotor_speed=rotors.end)
@@ -166,6 +173,8 @@ def plant_step(
         assert inputs.command is not None, "neither a command nor rotor speeds are given"
         state, rotors = rotor_step(plant, state, inputs.command, motion.rate_b)
     winds, flow = wind_and_flow(plant, state.wind, motion, rotors, inputs, time_s)
+    if uses_rotor_acc(plant):
+        flow = flow._replace(rotor_acc=(rotors.end - before) / plant.dt)
     wrench = with_push(plant, wrench_on(plant, rotors, flow), inputs.push_b)
     return state._replace(wind=winds), wrench
 

@@ -96,7 +96,12 @@ def start(shape: tuple[int, ...], xp: Any) -> State:
 
 
 def look(
-    gain: Gains, state: State, throttle: Array, rate_cmd_b: Array, rate_b: Array, dt: Array,
+    gain: Gains,
+    state: State,
+    throttle: Array,
+    rate_cmd_b: Array,
+    rate_b: Array,
+    dt: Array,
     scale: Array,
 ) -> tuple[State, Array]:
     """Return the state after a look and the motor commands (..., 4) from 0 to 1.
@@ -129,6 +134,3 @@ def turning(layout: Layout, out: Array) -> Array:
     """Return what the outputs (..., 3) add to each motor (..., 4): roll and pitch count half."""
     half = 0.5 * (out[..., 0, None] * layout.roll + out[..., 1, None] * layout.pitch)
     return half + out[..., 2, None] * layout.yaw
-
-
-

@@ -126,7 +126,12 @@ def start(shape: tuple[int, ...], xp: Any) -> State:
 
 
 def look(
-    gain: Gains, state: State, throttle: Array, rate_cmd_b: Array, rate_b: Array, dt: Array,
+    gain: Gains,
+    state: State,
+    throttle: Array,
+    rate_cmd_b: Array,
+    rate_b: Array,
+    dt: Array,
     scale: Array,
 ) -> tuple[State, Array]:
     """Return the state after a look and the motor commands; see `crazyflie.look`."""
