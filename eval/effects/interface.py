@@ -70,6 +70,9 @@ class Flow(NamedTuple):
     """(...,) since the start of the flight (the first row of its log) [s]."""
     voltage_drop: Array | None
     """(...,) battery voltage at the start minus now [V]; None where there is no voltage."""
+    rotor_acc: Array | None = None
+    """(..., 4) mean change of the rotor speeds over the step [rad/s^2]; only where an effect says
+    `rotor_acc`, and None where it is not known."""
 
 
 class Gust(NamedTuple):
@@ -184,6 +187,8 @@ class Effect:
     needs: tuple[str, ...] = ()
     """What a log must have to show it: `acc_b`, or `command` for what acts between commands and
     rotor speeds."""
+    rotor_acc: bool = False
+    """Uses `Flow.rotor_acc`."""
     slow: bool = False
     """Shows over minutes of flight and hardly within seconds."""
     with_voltage: Callable[[Values, float], Values] | None = None

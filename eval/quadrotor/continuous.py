@@ -13,13 +13,15 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from eval.effects.interface import Array
-from eval.quadrotor.plant import Command, Motion, Plant, Wrench
+from eval.quadrotor import loops
+from eval.quadrotor.plant import Command, Motion, Plant, Wrench, uses_rotor_acc
 from eval.quadrotor.rigid_body import accelerations, euler_move
-from eval.quadrotor.rotors import RotorStep, follow, steady
+from eval.quadrotor.rotors import RotorStep, acceleration, follow, steady
 from eval.quadrotor.stepper import (
     Feedback,
     Inputs,
     from_start,
+    loop_look,
     mass_of,
     rotor_wrench,
     still_thrust,
@@ -62,6 +64,10 @@ class Carry(NamedTuple):
     """(..., 3) angular acceleration of the last step [rad/s^2]."""
     air: Wrench
     """(..., 3) what acted in the last step besides the rotors' own thrust."""
+    loop: Any = ()
+    """What a firmware's rate loop remembers."""
+    since_s: Any = 0.0
+    """(...,) time since its last look [s]."""
 
 
 class Flight(NamedTuple):
@@ -104,7 +110,10 @@ def fly(
 
     still = jnp.zeros_like(motion.vel_w)
     none = Wrench(still, still)
-    start = Carry(rotor_speed, rotor_speed, still, none)
+    memory = loops.start(plant.loop, rotor_speed.shape[:-1], jnp)
+    start = Carry(rotor_speed, rotor_speed, still, none, memory)
+    if plant.loop is not None:
+        start = start._replace(since_s=jnp.zeros(rotor_speed.shape[:-1]))
     # What the air does at the start, so that the first step is as good as the others.
     first = jax.tree.map(lambda given: given[0], inputs)._replace(push_b=None)
     held = steady(rotor_speed)
@@ -131,8 +140,31 @@ def look(plant: Plant, carry: Carry, span: Steps, command: Command, rate_b: Arra
     """Return `carry` after the loop has looked at `rate_b` (..., 3), where it does."""
     xp = rate_b.__array_namespace__()
     ahead_b = rate_b + span.lead_s[..., None] * carry.turn_b
+    if plant.loop is not None:
+        return _look_with_memory(plant, carry, span, command, ahead_b)
     asked = wanted_speed(plant, command, ahead_b)
     return carry._replace(wanted_speed=xp.where(span.looks[..., None], asked, carry.wanted_speed))
+
+
+def _look_with_memory(
+    plant: Plant, carry: Carry, span: Steps, command: Command, ahead_b: Array
+) -> Carry:
+    """Return `carry` after a firmware's loop has looked; looks taken together are one long one."""
+    import jax
+
+    xp = ahead_b.__array_namespace__()
+    dt = xp.maximum(carry.since_s, plant.dt)
+    memory, asked = loop_look(plant, carry.loop, command, ahead_b, dt[..., None])
+
+    def where(new: Array, old: Array) -> Array:
+        looks = span.looks.reshape(span.looks.shape + (1,) * (new.ndim - span.looks.ndim))
+        return xp.where(looks, new, old)
+
+    return carry._replace(
+        wanted_speed=where(asked, carry.wanted_speed),
+        loop=jax.tree.map(where, memory, carry.loop),
+        since_s=xp.where(span.looks, 0.0, carry.since_s) + span.length_s,
+    )
 
 
 def turn_rotors(plant: Plant, carry: Carry, span: Steps) -> tuple[Carry, RotorStep]:
@@ -156,6 +188,8 @@ def step(
 
     The arguments are those of `fly`, of one step.
     """
+    before, asked = carry.rotor_speed, None
+    length = span.length_s[..., None]
     if inputs.rotor_speed is not None:
         rotors = steady(inputs.rotor_speed)
         carry = carry._replace(rotor_speed=rotors.end)
@@ -163,9 +197,13 @@ def step(
         assert inputs.command is not None, "neither a command nor rotor speeds are given"
         carry = look(plant, carry, span, inputs.command, motion.rate_b)
         carry, rotors = turn_rotors(plant, carry, span)
-    length = span.length_s[..., None]
+        asked = carry.wanted_speed
+    rotor_acc = None
+    if uses_rotor_acc(plant):
+        lag = plant.constants.time_constant
+        rotor_acc = acceleration(before, rotors, asked, lag, length)
     if integrator == "euler":
-        whole = _wrench(plant, motion, rotors, inputs, time_s)
+        whole = _wrench(plant, motion, rotors, inputs, time_s, rotor_acc)
         acc_w, turn_b = accelerations(plant, motion, whole)
         carry = carry._replace(turn_b=turn_b)
         return carry, euler_move(motion, acc_w, turn_b, length), whole.force_b / mass_of(plant)
@@ -173,7 +211,8 @@ def step(
     half, air = 0.5 * length, carry.air
     guess = Wrench(thrust.force_b + air.force_b, thrust.torque_b + air.torque_b)
     middle = _midpoint(motion, *accelerations(plant, motion, guess), half)
-    whole = _wrench(plant, middle, rotors, inputs, time_s + 0.5 * span.length_s)
+    middle_s = time_s + 0.5 * span.length_s
+    whole = _wrench(plant, middle, rotors, inputs, middle_s, rotor_acc)
     air = _beside(whole, thrust)
     acc_w, turn_b = accelerations(plant, middle, whole)
     end = _midpoint(motion, acc_w, turn_b, length)
@@ -189,10 +228,16 @@ def _still(plant: Plant, rotors: RotorStep) -> Wrench:
 
 
 def _wrench(
-    plant: Plant, motion: Motion, rotors: RotorStep, inputs: Inputs, time_s: Array
+    plant: Plant,
+    motion: Motion,
+    rotors: RotorStep,
+    inputs: Inputs,
+    time_s: Array,
+    rotor_acc: Array | None = None,
 ) -> Wrench:
     """Return all that acts on the body."""
     _, flow = wind_and_flow(plant, {}, motion, rotors, inputs, time_s)
+    flow = flow._replace(rotor_acc=rotor_acc)
     return with_push(plant, wrench_on(plant, rotors, flow), inputs.push_b)
 
 

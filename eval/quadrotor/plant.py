@@ -14,6 +14,7 @@ import numpy as np
 from eval.effects import EFFECTS, all_values, find_effect
 from eval.effects.interface import GRAVITY, Array, Constants, as_arrays
 from eval.quadrotor.delay import delay_weight
+from eval.quadrotor.loops import NOMINAL, Loop, loop_of
 from eval.quadrotor.mixer import mixer_matrix
 from eval.vehicles.vehicle import Vehicle
 
@@ -93,6 +94,8 @@ class Plant(NamedTuple):
     """(..., L) share of each remembered command in the one that acts; L = 0 without a delay."""
     dt: Array
     """Length of a step [s]."""
+    loop: Loop | None = None
+    """A firmware's rate loop; None for the nominal one."""
 
 
 def make_plant(
@@ -116,7 +119,7 @@ def make_plant(
     """
     given = dict(vehicle.effects) if effects is None else effects
     values = {find_effect(name).name: as_arrays(value) for name, value in given.items()}
-    return assemble(*nominal_quadrotor(vehicle), values, dt, max_delay)
+    return assemble(*nominal_quadrotor(vehicle), values, dt, max_delay, loop_of(vehicle))
 
 
 def fit_plant(vehicle: Vehicle, effects: Mapping[str, Any], dt: float | None = None) -> Plant:
@@ -144,7 +147,10 @@ def nominal_quadrotor(vehicle: Vehicle) -> tuple[Nominal, Constants]:
         torque_coefficient=np.full(4, rotors.torque_coefficient),
         thrust_axis_b=np.array([0.0, 0.0, 1.0]),
         time_constant=np.asarray(rotors.time_constant),
-        rate_gain=np.asarray(vehicle.controller.rate_gain),
+        # A firmware's loop is scaled as a whole: its gains are no numbers per second.
+        rate_gain=np.asarray(vehicle.controller.rate_gain)
+        if vehicle.controller.kind == NOMINAL
+        else np.ones(3),
         delay=np.asarray(0.0),
     )
     nominal = Nominal(
@@ -168,10 +174,11 @@ def assemble(
     values: Mapping[str, Any],
     dt: float,
     max_delay: float | None = None,
+    loop: Loop | None = None,
 ) -> Plant:
     """Return the plant of a `nominal_quadrotor` with effects; every array may be traced.
 
-    The arguments are those of `make_plant`; `values` are arrays.
+    The arguments are those of `make_plant`; `values` are arrays; `loop` is the vehicle's.
     """
     for name, value in in_order(values):
         change = EFFECTS[name].constants
@@ -179,12 +186,17 @@ def assemble(
     if max_delay is None:
         max_delay = float(np.max(constants.delay))
     weight = delay_weight(constants.delay, dt, max_delay)
-    return Plant(nominal, constants, dict(values), weight, np.asarray(dt))
+    return Plant(nominal, constants, dict(values), weight, np.asarray(dt), loop)
 
 
 def uses_noise(plant: Plant) -> bool:
     """Return whether an effect of `plant` needs normal draws at every step."""
     return any(EFFECTS[name].gust is not None for name in plant.effects)
+
+
+def uses_rotor_acc(plant: Plant) -> bool:
+    """Return whether an effect of `plant` acts by the change of the rotor speeds."""
+    return any(EFFECTS[name].rotor_acc for name in plant.effects)
 
 
 def in_order(effects: Mapping[str, Any]) -> list[tuple[str, Any]]:

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 from tracks.geometry.scene import Array
 
+SHORT_S = 1e-4
+"""Changes over shorter steps are taken to last so long [s]."""
 NEGLIGIBLE = 1e-6
 """Thrusts below this are none [N]."""
 
@@ -57,6 +59,31 @@ def follow(speed: Array, command: Array, time_constant: Array, dt: Array) -> Rot
         + behind**2 * 0.5 * steps * (1.0 - left**2)
     )
     return RotorStep(command + behind * left, mean, mean_square)
+
+
+def acceleration(
+    start: Array, rotors: RotorStep, command: Array | None, time_constant: Array, dt: Array
+) -> Array:
+    """Return the mean change of the rotor speeds (..., 4) over a step [rad/s^2].
+
+    By the lag's own equation where it is longer than the step, so that a step of no length has a
+    slope as well; else what changed over the step's length.
+
+    Args:
+        start: (..., 4) at the start of the step [rad/s].
+        rotors: the step.
+        command: (..., 4) that the rotors followed [rad/s]; None: their speeds are measured.
+        time_constant: (...,) of the rotors [s].
+        dt: length of the step [s].
+    """
+    xp = start.__array_namespace__()
+    changed = (rotors.end - start) / xp.maximum(xp.asarray(dt), SHORT_S)
+    if command is None:
+        return changed
+    lag = xp.asarray(time_constant)[..., None]
+    lags = lag > dt
+    slope = (command - 0.5 * (start + rotors.end)) / xp.where(lags, lag, 1.0)
+    return xp.where(lags, slope, changed)
 
 
 def steady(speed: Array) -> RotorStep:

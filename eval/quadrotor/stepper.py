@@ -17,9 +17,18 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from eval.effects.interface import GRAVITY, Array, Flow, Gust
+from eval.quadrotor import loops
 from eval.quadrotor.delay import delayed
 from eval.quadrotor.mixer import mix, rate_torque
-from eval.quadrotor.plant import Command, Motion, Plant, Wrench, in_order, unpacked
+from eval.quadrotor.plant import (
+    Command,
+    Motion,
+    Plant,
+    Wrench,
+    in_order,
+    unpacked,
+    uses_rotor_acc,
+)
 from eval.quadrotor.rigid_body import euler_step
 from eval.quadrotor.rotors import RotorStep, follow, speed_command, steady
 from tracks.geometry.rotation import to_local
@@ -34,6 +43,8 @@ class PlantState(NamedTuple):
     """(..., 4, L) thrust and rates of the last L steps, newest first; L = 0 without a delay."""
     wind: dict[str, Array]
     """(..., 3) of each effect that makes random wind [m/s]."""
+    loop: Any = ()
+    """What a firmware's rate loop remembers; nothing for the nominal one."""
 
 
 class Inputs(NamedTuple):
@@ -94,15 +105,40 @@ def hover_state(
         if start is not None:
             wind[name] = still if noise is None else start(value, noise) + still
     speed = wanted_speed(plant, hover, still)
-    return PlantState(speed, xp.broadcast_to(hover.packed[..., None], past), wind)
+    memory = loops.start(plant.loop, batch_shape, xp)
+    return PlantState(speed, xp.broadcast_to(hover.packed[..., None], past), wind, memory)
 
 
 def wanted_speed(plant: Plant, command: Command, rate_b: Array) -> Array:
-    """Return the rotor speeds (..., 4) [rad/s] that the rate loop and the mixer ask for."""
+    """Return the rotor speeds (..., 4) [rad/s] that the rate loop and the mixer ask for.
+
+    A firmware's loop looks for the first time.
+    """
+    xp = rate_b.__array_namespace__()
+    memory = loops.start(plant.loop, rate_b.shape[:-1], xp)
+    return loop_look(plant, memory, command, rate_b, plant.dt)[1]
+
+
+def loop_look(
+    plant: Plant, memory: Any, command: Command, rate_b: Array, dt: Array
+) -> tuple[Any, Array]:
+    """Return the rate loop's memory after a look, and the rotor speeds (..., 4) it asks for.
+
+    Args:
+        plant: the plant.
+        memory: of the loop; see `PlantState.loop`.
+        command: that acts.
+        rate_b: (..., 3) [rad/s].
+        dt: (...,) time since the last look [s].
+    """
     nominal = plant.nominal
+    if plant.loop is not None:
+        force_z, scale = nominal.mass * command.thrust, plant.constants.rate_gain
+        memory, thrust = loops.look(plant.loop, memory, force_z, command.rate_b, rate_b, dt, scale)
+        return memory, speed_command(thrust, nominal.thrust_coefficient)
     torque_b = rate_torque(command.rate_b, rate_b, plant.constants.rate_gain, nominal.inertia)
     thrust = mix(nominal.unmixer, nominal.thrust_max, nominal.mass * command.thrust, torque_b)
-    return speed_command(thrust, nominal.thrust_coefficient)
+    return memory, speed_command(thrust, nominal.thrust_coefficient)
 
 
 def rotor_step(
@@ -112,9 +148,9 @@ def rotor_step(
     if plant.delay_weight.shape[-1] > 0:
         past, acting = delayed(plant.delay_weight, state.past_commands, command.packed)
         state, command = state._replace(past_commands=past), unpacked(acting)
-    wanted = wanted_speed(plant, command, rate_b)
+    memory, wanted = loop_look(plant, state.loop, command, rate_b, plant.dt)
     rotors = follow(state.rotor_speed, wanted, plant.constants.time_constant, plant.dt)
-    return state._replace(rotor_speed=rotors.end), rotors
+    return state._replace(rotor_speed=rotors.end, loop=memory), rotors
 
 
 def plant_step(
@@ -129,6 +165,7 @@ def plant_step(
         inputs: a command or measured rotor speeds, and what else acts.
         time_s: (...,) since the start of the flight [s].
     """
+    before = state.rotor_speed
     if inputs.rotor_speed is not None:
         rotors = steady(inputs.rotor_speed)
         state = state._replace(rotor_speed=rotors.end)
@@ -136,6 +173,8 @@ def plant_step(
         assert inputs.command is not None, "neither a command nor rotor speeds are given"
         state, rotors = rotor_step(plant, state, inputs.command, motion.rate_b)
     winds, flow = wind_and_flow(plant, state.wind, motion, rotors, inputs, time_s)
+    if uses_rotor_acc(plant):
+        flow = flow._replace(rotor_acc=(rotors.end - before) / plant.dt)
     wrench = with_push(plant, wrench_on(plant, rotors, flow), inputs.push_b)
     return state._replace(wind=winds), wrench
 

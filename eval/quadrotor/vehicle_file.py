@@ -16,6 +16,7 @@ from typing import Any
 
 from eval.effects import EFFECTS, find_effect
 from eval.effects.interface import Effect, at
+from eval.quadrotor.loops import KINDS, NOMINAL
 from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
 from tracks.common.files import write_text
@@ -133,7 +134,7 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
         "mass": vehicle.mass,
         "inertia": list(vehicle.inertia),
         "rotors": {**_plain(vars(vehicle.rotors)), "spin": list(vehicle.rotors.spin)},
-        "controller": _plain(vars(vehicle.controller)),
+        "controller": _controller_table(vehicle.controller),
         "body": _plain(vars(vehicle.body)),
         "camera": {
             "pitch_deg": camera.pitch_deg,
@@ -222,17 +223,57 @@ def _rotors(table: Mapping[str, Any]) -> Rotors:
 
 def _controller(table: Mapping[str, Any]) -> Controller:
     where = "controller."
-    _known_keys(where, table, list(Controller.__dataclass_fields__))
+    kind = table.get("kind", NOMINAL)
+    if kind != NOMINAL and kind not in KINDS:
+        allowed = ", ".join((NOMINAL, *KINDS))
+        raise ValueError(f"controller.kind = {shown(kind)}: allowed: {allowed}")
+    settings, own = None, set()
+    if kind != NOMINAL:
+        settings, own = _settings(kind, table)
+    known = [key for key in Controller.__dataclass_fields__ if key != "settings"]
+    _known_keys(where, {k: v for k, v in table.items() if k not in own}, [*known, *sorted(own)])
     given = {
         key: _numbers(where + key, table[key], 3)
         for key in ("attitude_gain", "rate_max")
         if key in table
     }
+    gain = (1.0, 1.0, 1.0)
+    if kind == NOMINAL or "rate_gain" in table:
+        gain = _numbers(where + "rate_gain", _required(where, table, "rate_gain"), 3)
     return Controller(
-        rate_gain=_numbers(where + "rate_gain", _required(where, table, "rate_gain"), 3),
+        rate_gain=gain,
         frequency=_number(where + "frequency", _required(where, table, "frequency")),
+        kind=kind,
+        settings=settings,
         **given,
     )
+
+
+def _settings(kind: str, table: Mapping[str, Any]) -> tuple[Any, set[str]]:
+    """Return a firmware's settings, and the keys of [controller] that are theirs."""
+    module, where, given = KINDS[kind], "controller.", table
+    keys = list(module.Settings.__dataclass_fields__)
+    own = set(keys)
+    if module.GROUP:
+        where, own = f"controller.{module.GROUP}.", {module.GROUP}
+        given = table.get(module.GROUP, {})
+        if not isinstance(given, Mapping):
+            raise ValueError(f"{where[:-1]} = {shown(given)}: must be a table [{where[:-1]}]")
+        _known_keys(where, given, keys)
+    values = {key: _number(where + key, given[key]) for key in keys if key in given}
+    for key, value in values.items():
+        low, high = module.LIMITS.get(key, (0.0, 1e6))
+        if not low <= value <= high:
+            raise ValueError(f"{where}{key} = {value:g}: must be from {low:g} to {high:g}")
+    return module.Settings(**values), own
+
+
+def _controller_table(controller: Controller) -> dict[str, Any]:
+    table = _plain({k: v for k, v in vars(controller).items() if k not in ("kind", "settings")})
+    if controller.kind == NOMINAL:
+        return table
+    settings, group = _plain(vars(controller.settings)), KINDS[controller.kind].GROUP
+    return {"kind": controller.kind, **table, **({group: settings} if group else settings)}
 
 
 def _motors(table: Mapping[str, Any]) -> MotorMap:

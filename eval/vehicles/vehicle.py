@@ -43,13 +43,17 @@ class Controller:
     """The loops that turn an attitude into rates and rates into torque."""
 
     rate_gain: Vector
-    """K of the rate loop [1/s]."""
+    """K of the rate loop [1/s]; a firmware's loop has its settings in place of it."""
     frequency: float
     """Of the rate loop, which is the physics rate too [Hz]."""
     attitude_gain: Vector = (8.0, 8.0, 4.0)
     """Body rate per attitude error [1/s]."""
     rate_max: Vector = (6.0, 6.0, 6.0)
     """Commanded body rates are clipped to this [rad/s]."""
+    kind: str = "p"
+    """The nominal rate loop `p`, or a firmware's, one of `eval.quadrotor.loops.KINDS`."""
+    settings: Any = None
+    """That firmware's settings, `Settings` of its module; None for `p`."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from eval.effects.interface import Constants
+from eval.quadrotor.loops import Loop, loop_of
 from eval.quadrotor.plant import Nominal, assemble, nominal_quadrotor
 from eval.quadrotor.stepper import Feedback
 from eval.vehicles.vehicle import Vehicle
@@ -59,6 +60,8 @@ class VehicleArrays(NamedTuple):
     constants: Constants
     base: dict[str, Any]
     """Values of every effect."""
+    loop: Loop | None = None
+    """A firmware's rate loop."""
 
 
 class RolloutModel:
@@ -84,7 +87,7 @@ class RolloutModel:
         self.starts = list(range(self.size, self.size + self.free))
         """Places of the free numbers among all directions."""
         base = {name: v for name, v in space.base.items() if not EFFECTS[name].random}
-        self.given = VehicleArrays(*nominal_quadrotor(vehicle), base)
+        self.given = VehicleArrays(*nominal_quadrotor(vehicle), base, loop_of(vehicle))
         self.dt = step_s(vehicle)
         """About the length of a step [s]."""
         self.integrator = integrator
@@ -208,7 +211,7 @@ def _flight(
         feedback: Feedback | None = None,
     ) -> tuple[Any, Flown]:
         values = effects_at(layout, given.base, theta)
-        plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0)
+        plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0, given.loop)
         flown = fly_windows(
             plant, values, rotor_input, voltage, integrator, offset, windows, push, feedback
         )

@@ -83,7 +83,7 @@ def _passed_on(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarra
     plain = np.asarray(values[steady_wind].velocity)
     motion = Motion(*(np.asarray(field) for field in knot.track))
     count = len(motion.pos_w)
-    state = PlantState(np.zeros(0), np.zeros(0), {})
+    state = PlantState(np.asarray(knot.rotor_speed), np.zeros(0), {})
     still = np.zeros(motion.pos_w.shape[:2])
     inputs = Inputs(rotor_speed=np.asarray(knot.rotor_speed), voltage_drop=still)
 

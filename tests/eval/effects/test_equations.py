@@ -247,6 +247,22 @@ def test_rotor_gyroscopic():
     near(torque, [-0.016, 0.008, 0.0])
 
 
+def test_rotor_spin_up():
+    """From a hover to 1200 and 1000 rad/s in 2 ms: 400 rad/s more counter-clockwise than clockwise.
+
+    Against 400 / 0.002 x 1e-5 = 2 N m the body turns clockwise.
+    """
+    speed = np.array([1200.0, 1000.0, 1200.0, 1000.0])
+    force, torque = added(speed=speed, rotor_spin_up=(1e-5,))
+    near(force, 0.0)
+    near(torque, [0.0, 0.0, -2.0])
+    # Rotors that are told by a command to turn as they do push nothing.
+    plant = make_plant(with_effects(rotor_spin_up=(1e-5,)), 0.002)
+    still = Motion(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    inputs = Inputs(command=Command(np.asarray(9.81), np.zeros(3)))
+    near(plant_step(plant, hover_state(plant, ()), still, inputs, 0.0)[1].torque_b, 0.0)
+
+
 def test_angular_damping():
     near(added(angular_damping=((1.0, 2.0, 0.5),))[1], [-0.0025, -0.0084, 0.001075])
 

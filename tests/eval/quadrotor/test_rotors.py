@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from eval.quadrotor.rotors import follow, speed_command
+from eval.quadrotor.rotors import acceleration, follow, speed_command
 
 
 @pytest.mark.parametrize("time_constant", [0.0, 1e-6, 0.002, 0.03, 5.0])
@@ -37,3 +37,17 @@ def test_lag_can_be_fitted_from_none():
 
 def test_speed_command_inverts_the_thrust_curve():
     np.testing.assert_allclose(speed_command(np.array([1.6, 0.0]), 1.6e-6), [1000.0, 0.0])
+
+
+def test_the_mean_acceleration_is_what_the_speed_changed_by():
+    """Also of a step of no length, where it is (command - speed) / time constant."""
+    start, command, lag = np.full(4, 900.0), np.array([1000.0, 900.0, 800.0, 950.0]), 0.03
+    rotors = follow(start, command, np.asarray(lag), np.asarray(0.002))
+    found = acceleration(start, rotors, command, np.asarray(lag), np.asarray(0.002))
+    np.testing.assert_allclose(found, (rotors.end - start) / 0.002, rtol=1e-3)
+    none = follow(start, command, np.asarray(lag), np.asarray(1e-9))
+    found = acceleration(start, none, command, np.asarray(lag), np.asarray(1e-9))
+    np.testing.assert_allclose(found, (command - start) / lag, rtol=1e-4)
+    at_once = follow(start, command, np.asarray(0.0), np.asarray(0.002))
+    found = acceleration(start, at_once, command, np.asarray(0.0), np.asarray(0.002))
+    np.testing.assert_allclose(found, (command - start) / 0.002)

@@ -223,6 +223,7 @@ HIDDEN = {
     "torque_trim": ((0.003, -0.002, 0.001),),
     "inertia_scale": ((1.15, 0.9, 1.1),),
     "rotor_gyroscopic": (2e-5,),
+    "rotor_spin_up": (5e-6,),
     "rate_gain": ((0.85, 0.9, 1.1),),
     "angular_damping": ((0.6, 0.6, 0.4),),
     "weak_motor": ((1.0, 0.94, 1.0, 1.0),),

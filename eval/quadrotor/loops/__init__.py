@@ -1,0 +1,83 @@
+"""Rate loops of flight controllers' firmwares, one file each: `[controller] kind`.
+
+A kind's module has `Settings` (its keys, as the firmware names them), `GROUP` (the table under
+`[controller]` that they stand in, "" for none), `gains`, `start` and `look`. The nominal loop, kind
+`p`, is `eval.quadrotor.mixer.rate_torque` and has no memory.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from eval.quadrotor.loops import betaflight, crazyflie, px4
+from eval.quadrotor.loops.layout import layout_of
+from eval.vehicles.vehicle import MotorMap, Vehicle
+from tracks.geometry.scene import Array
+
+NOMINAL = "p"
+KINDS: dict[str, Any] = {"betaflight": betaflight, "px4": px4, "crazyflie": crazyflie}
+"""Modules by kind; `p` besides."""
+_MODULES = {module.Gains: module for module in KINDS.values()}
+
+
+class Loop(NamedTuple):
+    """A firmware's rate loop, and what its motor commands give."""
+
+    gains: Any
+    """`Gains` of the kind's module."""
+    thrust: tuple[Array, Array]
+    """t1, t2 of T = t1 u + t2 u^2 [N], u the motor command at the nominal voltage."""
+
+
+def loop_of(vehicle: Vehicle) -> Loop | None:
+    """Return the vehicle's loop, or None for the nominal one.
+
+    Without `[motors]` a command is a share of full speed, under the Crazyflie's firmware, which
+    makes up for its motors' curve, one of full thrust.
+    """
+    controller = vehicle.controller
+    if controller.kind == NOMINAL:
+        return None
+    import numpy as np
+
+    full = vehicle.rotors.thrust_max
+    linear = controller.kind == "crazyflie"
+    motors = vehicle.motors or MotorMap((full, 0.0) if linear else (0.0, full), 1.0)
+    gains = KINDS[controller.kind].gains(controller.settings, layout_of(vehicle.rotors))
+    first, second = motors.thrust
+    return Loop(gains, (np.asarray(first), np.asarray(second)))
+
+
+def start(loop: Loop | None, shape: tuple[int, ...], xp: Any) -> Any:
+    """Return the memory of loops of this batch shape before their first look."""
+    return () if loop is None else _MODULES[type(loop.gains)].start(shape, xp)
+
+
+def look(
+    loop: Loop,
+    memory: Any,
+    force_z: Array,
+    rate_cmd_b: Array,
+    rate_b: Array,
+    dt: Array,
+    scale: Array,
+) -> tuple[Any, Array]:
+    """Return the memory after a look and the rotors' thrusts (..., 4) [N] that it asks for.
+
+    Args:
+        loop: the loop.
+        memory: from `start` or the look before.
+        force_z: (...,) wanted collective [N].
+        rate_cmd_b: (..., 3) [rad/s].
+        rate_b: (..., 3) [rad/s].
+        dt: time since the last look [s].
+        scale: (..., 3) by which the loop is stronger than nominal [1].
+    """
+    xp = rate_b.__array_namespace__()
+    first, second = loop.thrust
+    each = xp.maximum(0.25 * force_z, 0.0)
+    root = xp.sqrt(xp.maximum(first**2 + 4.0 * second * each, 1e-12))
+    throttle = xp.clip(2.0 * each / xp.maximum(first + root, 1e-6), 0.0, 1.0)
+    module = _MODULES[type(loop.gains)]
+    memory, command = module.look(loop.gains, memory, throttle, rate_cmd_b, rate_b, dt, scale)
+    return memory, first * command + second * command**2

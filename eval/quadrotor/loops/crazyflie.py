@@ -1,0 +1,136 @@
+"""The Crazyflie's rate loop: PID on deg/s with outputs in 16 bits, and its power distribution.
+
+    out = kp e + ki integral(e) + kd (-d rate/dt) + kff setpoint, within 16 bits
+    motor = thrust -+ roll/2 -+ pitch/2 -+ yaw, all in 1/65535 of a motor's full command
+
+Where a motor would pass its full command all are lowered alike: attitude before thrust. Source:
+Bitcraze's documentation of the firmware ("Controllers", "PID tuning", parameter groups `pid_rate`),
+its values for the Crazyflie 2.x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.quadrotor.loops.filters import Pair, butterworth, pick
+from eval.quadrotor.loops.layout import Layout
+from tracks.geometry.scene import Array
+
+DEG = float(180.0 / np.pi)
+FULL = 65535.0
+SIGNED = 32767.0
+GROUP = "pid_rate"
+LIMITS: dict[str, tuple[float, float]] = {}
+"""Settings that may not be any number from 0 on."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """`[controller.pid_rate]`, the firmware's parameters."""
+
+    roll_kp: float = 250.0
+    roll_ki: float = 500.0
+    roll_kd: float = 2.5
+    roll_kff: float = 0.0
+    pitch_kp: float = 250.0
+    pitch_ki: float = 500.0
+    pitch_kd: float = 2.5
+    pitch_kff: float = 0.0
+    yaw_kp: float = 120.0
+    yaw_ki: float = 16.7
+    yaw_kd: float = 0.0
+    yaw_kff: float = 0.0
+    roll_ilimit: float = 33.3
+    """Largest integral of the error [deg]; a constant of the firmware."""
+    pitch_ilimit: float = 33.3
+    yaw_ilimit: float = 166.7
+    lpf_cutoff: float = 0.0
+    """Of the derivative's second-order filter [Hz]; 0: off, as the firmware's default is."""
+
+
+class Gains(NamedTuple):
+    """The loop's numbers as arrays (3,)."""
+
+    p: Array
+    i: Array
+    d: Array
+    f: Array
+    i_limit: Array
+    cutoff_hz: Array
+    layout: Layout
+
+
+class State(NamedTuple):
+    """What the loop remembers."""
+
+    started: Array
+    """(...,) 0 before the first look."""
+    integral: Array
+    """(..., 3) [deg]."""
+    rate: Array
+    """(..., 3) of the last look [deg/s]."""
+    slope: Pair
+    """(..., 3) of the derivative's filter."""
+
+
+def gains(settings: Settings, layout: Layout) -> Gains:
+    """Return the numbers of `settings` as arrays."""
+
+    def each(key: str) -> np.ndarray:
+        return np.array([getattr(settings, f"{axis}_{key}") for axis in ("roll", "pitch", "yaw")])
+
+    return Gains(
+        *(each(key) for key in ("kp", "ki", "kd", "kff", "ilimit")),
+        cutoff_hz=np.asarray(settings.lpf_cutoff),
+        layout=layout,
+    )
+
+
+def start(shape: tuple[int, ...], xp: Any) -> State:
+    """Return the state before the first look of loops of this batch shape."""
+    still = xp.zeros((*shape, 3))
+    return State(xp.zeros(shape), still, still, Pair(still, still))
+
+
+def look(
+    gain: Gains,
+    state: State,
+    throttle: Array,
+    rate_cmd_b: Array,
+    rate_b: Array,
+    dt: Array,
+    scale: Array,
+) -> tuple[State, Array]:
+    """Return the state after a look and the motor commands (..., 4) from 0 to 1.
+
+    Args:
+        gain: the loop's numbers.
+        state: before.
+        throttle: (...,) of each motor without any turning, from 0 to 1.
+        rate_cmd_b: (..., 3) [rad/s].
+        rate_b: (..., 3) [rad/s].
+        dt: time since the last look [s].
+        scale: (..., 3) by which the outputs are stronger than nominal [1].
+    """
+    xp = rate_b.__array_namespace__()
+    wanted, rate = DEG * rate_cmd_b, DEG * rate_b
+    error = wanted - rate
+    before = pick(state.started, rate, state.rate)
+    raw = -(rate - before) / dt
+    slope, falling = butterworth(state.slope, raw, gain.cutoff_hz, dt)
+    integral = xp.clip(state.integral + error * dt, -gain.i_limit, gain.i_limit)
+    out = gain.p * error + gain.i * integral + gain.d * falling + gain.f * wanted
+    out = xp.clip(scale * out, -SIGNED, SIGNED)
+    motor = throttle[..., None] * FULL + turning(gain.layout, out)
+    over = xp.maximum(xp.max(motor, axis=-1, keepdims=True) - FULL, 0.0)
+    command = xp.clip((motor - over) / FULL, 0.0, 1.0)
+    return State(xp.ones_like(state.started), integral, rate, slope), command
+
+
+def turning(layout: Layout, out: Array) -> Array:
+    """Return what the outputs (..., 3) add to each motor (..., 4): roll and pitch count half."""
+    half = 0.5 * (out[..., 0, None] * layout.roll + out[..., 1, None] * layout.pitch)
+    return half + out[..., 2, None] * layout.yaw

@@ -1,0 +1,221 @@
+"""PX4's rate loop: PID on rad/s with normalised torques, and its sequential allocation.
+
+    torque = K (P e + I-term - D accel) + FF setpoint
+    I-term += I e (1 - (e / 400 deg/s)^2) dt, within MC_xR_INT_LIM, not further into saturation
+
+`accel` is the slope of the filtered gyro, filtered again; both are second-order low passes. A motor
+command is thrust plus 0.707 of roll and pitch plus yaw; what does not fit is taken off the thrust
+first, then off roll and pitch, then yaw is mixed with 15 % more room at the top and taken off where
+it does not fit, then thrust once more (airmode off). Source: PX4's user guide ("Multicopter PID
+Tuning Guide", "Control Allocation", the parameter reference MC_*, IMU_*, THR_MDL_FAC).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.quadrotor.loops.filters import Pair, butterworth, pick, pt1, settled
+from eval.quadrotor.loops.layout import Layout
+from tracks.geometry.scene import Array
+
+GROUP = ""
+FAST = float(np.deg2rad(400.0))
+"""Errors beyond this add nothing to the integral [rad/s]."""
+YAW_ROOM = 0.15
+"""Room above full command in which yaw is mixed."""
+SMALL = 1e-6
+LIMITS = {"THR_MDL_FAC": (0.0, 1.0)}
+"""Settings that may not be any number from 0 on."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """`[controller]`, the firmware's parameters."""
+
+    MC_ROLLRATE_K: float = 1.0
+    MC_ROLLRATE_P: float = 0.15
+    MC_ROLLRATE_I: float = 0.2
+    MC_ROLLRATE_D: float = 0.003
+    MC_ROLLRATE_FF: float = 0.0
+    MC_RR_INT_LIM: float = 0.3
+    MC_PITCHRATE_K: float = 1.0
+    MC_PITCHRATE_P: float = 0.15
+    MC_PITCHRATE_I: float = 0.2
+    MC_PITCHRATE_D: float = 0.003
+    MC_PITCHRATE_FF: float = 0.0
+    MC_PR_INT_LIM: float = 0.3
+    MC_YAWRATE_K: float = 1.0
+    MC_YAWRATE_P: float = 0.2
+    MC_YAWRATE_I: float = 0.1
+    MC_YAWRATE_D: float = 0.0
+    MC_YAWRATE_FF: float = 0.0
+    MC_YR_INT_LIM: float = 0.3
+    MC_YAW_TQ_CUTOFF: float = 0.0
+    """First-order filter of the yaw torque [Hz]; 0: off, as before v1.15."""
+    IMU_GYRO_CUTOFF: float = 40.0
+    """[Hz]."""
+    IMU_DGYRO_CUTOFF: float = 30.0
+    """[Hz]."""
+    THR_MDL_FAC: float = 0.0
+    """Relative thrust is FAC u^2 + (1 - FAC) u of the motor command u."""
+
+
+class Gains(NamedTuple):
+    """The loop's numbers as arrays (3,), plain ones (,)."""
+
+    k: Array
+    p: Array
+    i: Array
+    d: Array
+    f: Array
+    i_limit: Array
+    yaw_cutoff_hz: Array
+    gyro_cutoff_hz: Array
+    slope_cutoff_hz: Array
+    model: Array
+    layout: Layout
+
+
+class State(NamedTuple):
+    """What the loop remembers."""
+
+    started: Array
+    """(...,) 0 before the first look."""
+    integral: Array
+    """(..., 3) normalised torque."""
+    rate: Array
+    """(..., 3) filtered rate of the last look [rad/s]."""
+    gyro: Pair
+    """(..., 3) of the gyro's filter."""
+    slope: Pair
+    """(..., 3) of the slope's filter."""
+    yaw: Array
+    """(..., 1) filtered yaw torque."""
+    lost: Array
+    """(..., 3) torque asked for beyond what the last look could give."""
+
+
+def gains(settings: Settings, layout: Layout) -> Gains:
+    """Return the numbers of `settings` as arrays."""
+
+    def each(key: str) -> np.ndarray:
+        return np.array(
+            [getattr(settings, f"MC_{axis}RATE_{key}") for axis in ("ROLL", "PITCH", "YAW")]
+        )
+
+    limits = [settings.MC_RR_INT_LIM, settings.MC_PR_INT_LIM, settings.MC_YR_INT_LIM]
+    return Gains(
+        *(each(key) for key in ("K", "P", "I", "D", "FF")),
+        i_limit=np.array(limits),
+        yaw_cutoff_hz=np.asarray(settings.MC_YAW_TQ_CUTOFF),
+        gyro_cutoff_hz=np.asarray(settings.IMU_GYRO_CUTOFF),
+        slope_cutoff_hz=np.asarray(settings.IMU_DGYRO_CUTOFF),
+        model=np.asarray(settings.THR_MDL_FAC),
+        layout=layout,
+    )
+
+
+def start(shape: tuple[int, ...], xp: Any) -> State:
+    """Return the state before the first look of loops of this batch shape."""
+    still = xp.zeros((*shape, 3))
+    pair = Pair(still, still)
+    return State(xp.zeros(shape), still, still, pair, pair, xp.zeros((*shape, 1)), still)
+
+
+def look(
+    gain: Gains,
+    state: State,
+    throttle: Array,
+    rate_cmd_b: Array,
+    rate_b: Array,
+    dt: Array,
+    scale: Array,
+) -> tuple[State, Array]:
+    """Return the state after a look and the motor commands; see `crazyflie.look`."""
+    xp = rate_b.__array_namespace__()
+    rest = settled(rate_b, gain.gyro_cutoff_hz, dt)
+    gyro = Pair(*(pick(state.started, a, b) for a, b in zip(rest, state.gyro, strict=True)))
+    gyro, rate = butterworth(gyro, rate_b, gain.gyro_cutoff_hz, dt)
+    before = pick(state.started, rate, state.rate)
+    slope, accel = butterworth(state.slope, (rate - before) / dt, gain.slope_cutoff_hz, dt)
+    error = rate_cmd_b - rate
+    torque = gain.k * (gain.p * error - gain.d * accel + state.integral) + gain.f * rate_cmd_b
+    torque = scale * torque
+    # The integral that acts is that of before: it is updated after the torque is known.
+    further = xp.where(state.lost * error > 0.0, 0.0, error)
+    share = xp.maximum(1.0 - (error / FAST) ** 2, 0.0)
+    added = state.integral + share * gain.i * further * dt
+    integral = xp.clip(added, -gain.i_limit, gain.i_limit)
+    asked = torque[..., 2:]
+    yaw = pt1(pick(state.started, asked, state.yaw), asked, gain.yaw_cutoff_hz, dt)
+    torque = xp.concatenate([torque[..., :2], yaw], axis=-1)
+    thrust = gain.model * throttle**2 + (1.0 - gain.model) * throttle
+    given = allocate(gain.layout, thrust, torque)
+    lost = torque - turned(gain.layout, given)
+    lost = xp.where(xp.abs(lost) > SMALL, lost, 0.0)
+    state = State(xp.ones_like(state.started), integral, rate, gyro, slope, yaw, lost)
+    return state, signal(gain.model, xp.clip(given, 0.0, 1.0))
+
+
+def columns(layout: Layout) -> tuple[Array, Array, Array]:
+    """Return the motors' shares (4,) of a unit of roll, pitch and yaw torque."""
+    root = 2.0**-0.5
+    return root * layout.roll, root * layout.pitch, layout.yaw
+
+
+def allocate(layout: Layout, thrust: Array, torque: Array) -> Array:
+    """Return relative motor thrusts (..., 4), in [0, 1] but for what cannot be mended."""
+    xp = torque.__array_namespace__()
+    roll, pitch, yaw = columns(layout)
+    down = -xp.ones(4)
+    motor = thrust[..., None] + torque[..., 0, None] * roll + torque[..., 1, None] * pitch
+    motor = _fit(motor, down, 1.0, only_more=True)
+    motor = _fit(_fit(motor, roll, 1.0), pitch, 1.0)
+    motor = motor + torque[..., 2, None] * yaw
+    motor = _fit(motor, yaw, 1.0 + YAW_ROOM)
+    return _fit(motor, down, 1.0, only_more=True)
+
+
+def turned(layout: Layout, motor: Array) -> Array:
+    """Return the torque (..., 3) that relative motor thrusts (..., 4) give."""
+    xp = motor.__array_namespace__()
+    parts = [(motor * c).sum(axis=-1) / (c * c).sum() for c in columns(layout)]
+    return xp.stack(parts, axis=-1)
+
+
+def signal(model: Array, thrust: Array) -> Array:
+    """Return the motor commands that give relative `thrust` (..., 4) from 0 to 1."""
+    xp = thrust.__array_namespace__()
+    linear = 1.0 - model
+    root = xp.sqrt(xp.maximum(linear**2 + 4.0 * model * thrust, SMALL**2))
+    return 2.0 * thrust / (linear + root)
+
+
+def _fit(motor: Array, along: Array, top: float, only_more: bool = False) -> Array:
+    """Return the motors moved along a column so that they fit into [0, top], as far as they can.
+
+    Half a second move settles in the middle between motors that pass either end.
+    """
+    xp = motor.__array_namespace__()
+    gain = _gain(motor, along, top)
+    if only_more:
+        gain = xp.where(gain > 0.0, gain, 0.0)
+        off = gain == 0.0
+    else:
+        off = xp.zeros_like(gain, dtype=bool)
+    moved = motor + gain[..., None] * along
+    half = xp.where(off, 0.0, 0.5 * _gain(moved, along, top))
+    return moved + half[..., None] * along
+
+
+def _gain(motor: Array, along: Array, top: float) -> Array:
+    xp = motor.__array_namespace__()
+    moves = xp.abs(along) > SMALL
+    by = xp.where(moves, along, 1.0)
+    need = xp.where(motor < 0.0, -motor / by, 0.0) + xp.where(motor > top, (top - motor) / by, 0.0)
+    need = xp.where(moves, need, 0.0)
+    least = xp.minimum(xp.min(need, axis=-1), 0.0)
+    return least + xp.maximum(xp.max(need, axis=-1), 0.0)

@@ -1,0 +1,69 @@
+"""`suite identify`: the numbers of a vehicle file from flights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from suite.common.console import Console
+
+
+@dataclass(frozen=True)
+class Config:
+    """Find thrust, inertia, lag, delay, rate gains and drag of a quadrotor in its flight logs."""
+
+    flights: tyro.conf.Positional[tuple[Path, ...]]
+    """Flight logs of one vehicle, or folders of them."""
+    vehicle: str
+    """The vehicle file to start from (or a shipped vehicle's name): mass, arms, what stays."""
+    out: Path = Path("vehicle.toml")
+    """The vehicle file to write."""
+    leave: tuple[str, ...] = ()
+    """What to leave as it is: any of drag, motors, inertia, lag, loop."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out.parent]
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Identify, and say what was told and what was not.
+
+    Raises:
+        ValueError: for flights or a vehicle file that cannot be used.
+    """
+    from suite.identify.run import identify_files
+
+    if config.out.suffix.lower() != ".toml":
+        raise ValueError(f"--out is {str(config.out)!r}; its ending must be .toml")
+    result = identify_files(config.flights, config.vehicle, config.out, config.leave, console)
+    console.say(f"driven by {DRIVEN[result['drive']]}")
+    for key, entry in result["parameters"].items():
+        values, spans = entry["value"], entry["ci95"]
+        if not isinstance(values, list):
+            values, spans = [values], [spans]
+        shown = [
+            f"{v:.4g} ({s[0]:.4g} to {s[1]:.4g})" if s else f"{v:.4g} (as it was)"
+            for v, s in zip(values, spans, strict=True)
+        ]
+        console.say(f"  {key}: {', '.join(shown)} {entry['unit']}")
+    for text in result["untold"]:
+        console.say(f"  not told by these flights, {text}")
+    for warning in result["warnings"]:
+        console.say(f"warning: {warning}")
+    console.say(f"written: {config.out}")
+    return result
+
+
+DRIVEN = {
+    "rotors": "measured rotor speeds",
+    "pwm": "motor commands and the battery",
+    "torques": "commanded thrust and torques",
+    "rates": "commanded thrust and body rates",
+}

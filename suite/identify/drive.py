@@ -1,0 +1,116 @@
+"""What drove a flight, as thrusts, forces and torques on its grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from eval.vehicles.vehicle import Vehicle
+from suite.identify.grid import STEP_S, FlightGrid
+
+DRIVES = {
+    "rotors": ("rotor_speed",),
+    "pwm": ("pwm",),
+    "torques": ("thrust_cmd", "torque_cmd_b"),
+    "rates": ("thrust_cmd", "rate_cmd_b"),
+}
+"""Signals by drive; the first that all flights have counts."""
+
+
+class MotorGuess(NamedTuple):
+    """A motor's thrust [N]: `size ((1 - curve) v + curve v^2)` with `v = command / usual`.
+
+    The command is that of the voltage `volts`: `command (V / volts)^battery`.
+    """
+
+    size: float
+    curve: float
+    battery: float
+    usual: float
+    volts: float
+
+
+def drive_of(flights: Sequence[FlightGrid]) -> str:
+    """Return the name of what drives all of `flights`.
+
+    Raises:
+        ValueError: where they share nothing.
+    """
+    for name, signals in DRIVES.items():
+        if all(flight.has(*signals) for flight in flights):
+            return name
+    raise ValueError(
+        "the flights share no drive: every one needs rotor speeds, motor commands (pwm_1 to "
+        "pwm_4), or a thrust command with rates or torques"
+    )
+
+
+def delayed(values: np.ndarray, delay_s: float) -> np.ndarray:
+    """Return what held `values` (G, ...) were `delay_s` ago; before the first row, the first.
+
+    A value that holds from one grid point to the next is met half of it later.
+    """
+    steps = delay_s / STEP_S + 0.5
+    whole = int(np.floor(steps))
+    part = steps - whole
+    near, far = _shifted(values, whole), _shifted(values, whole + 1)
+    return (1.0 - part) * near + part * far
+
+
+def lagged(values: np.ndarray, lag_s: float) -> np.ndarray:
+    """Return `values` (G, C), joined by lines, behind a first-order lag."""
+    from scipy.signal import lfilter
+
+    if lag_s <= 1e-4:
+        return values
+    keep = float(np.exp(-STEP_S / lag_s))
+    whole = filled(values)
+    # The state at a grid point has seen the steps before it, each at its mean.
+    before = 0.5 * (np.concatenate([whole[:1], whole[:-1]]) + whole)
+    out = lfilter([1.0 - keep], [1.0, -keep], before, axis=0, zi=keep * whole[:1])[0]
+    return np.where(np.isfinite(values), out, np.nan)
+
+
+def motor_thrusts(
+    flight: FlightGrid, guess: MotorGuess, lag_s: float, delay_s: float
+) -> np.ndarray:
+    """Return the motors' thrusts (G, 4) [N]; the rotors' speeds lag, and thrust is their square."""
+    command = flight.known["pwm"]
+    if flight.has("voltage"):
+        ratio = np.maximum(flight.known["voltage"], 0.1) / guess.volts
+        command = command * (ratio**guess.battery)[:, None]
+    v = delayed(command, delay_s) / guess.usual
+    thrust = guess.size * ((1.0 - guess.curve) * v + guess.curve * v**2)
+    speed = lagged(np.sqrt(np.maximum(thrust, 0.0)), lag_s)
+    return speed**2
+
+
+def rotor_thrusts(flight: FlightGrid, thrust_coefficient: float) -> np.ndarray:
+    """Return the thrusts (G, 4) [N] of measured rotor speeds."""
+    return thrust_coefficient * flight.known["rotor_speed"] ** 2
+
+
+def torque_of(vehicle: Vehicle, thrust: np.ndarray) -> np.ndarray:
+    """Return the torques (G, 3) [N m] of rotor thrusts (G, 4) on the vehicle's arms."""
+    x, y, _ = np.asarray(vehicle.rotors.position).T
+    spin = np.asarray(vehicle.rotors.spin, dtype=float)
+    arm = vehicle.rotors.torque_coefficient / vehicle.rotors.thrust_coefficient
+    return np.stack([thrust @ y, -(thrust @ x), -arm * (thrust @ spin)], axis=1)
+
+
+def _shifted(values: np.ndarray, steps: int) -> np.ndarray:
+    if steps == 0:
+        return values
+    if steps > 0:
+        return np.concatenate([np.repeat(values[:1], steps, axis=0), values[:-steps]])
+    return np.concatenate([values[-steps:], np.repeat(values[-1:], -steps, axis=0)])
+
+
+def filled(values: np.ndarray) -> np.ndarray:
+    """Return `values` (G, C) with the last known in the place of NaN."""
+    good = np.isfinite(values).all(axis=1)
+    last = np.maximum.accumulate(np.where(good, np.arange(len(values)), 0))
+    first = int(np.argmax(good))
+    return np.nan_to_num(values[np.maximum(last, first)])

@@ -1,0 +1,253 @@
+"""Least squares with intervals from how parts of flights, and flights, disagree.
+
+Gauss and Newton with Huber's weights. A number's error is the sandwich of the influences of blocks
+of a flight (White 1980; blocks as neighbouring windows are not independent). Where the flights
+differ by more than their blocks explain (Cochran's Q), the flights are the units and Student's t
+their quantile. A number that the flights cannot tell is left as it was, the worst first, and the
+others are fitted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+Z95 = 1.96
+HUBER = 2.5
+RIDGE = 1e-9
+SMALL = 0.03
+"""A step below this many standard deviations of every number is the last."""
+ROUNDS = 12
+DIFFER_P = 0.05
+"""Flights differ where chance would make them do so more rarely than this."""
+FEWEST = 3
+"""Flights, to say that they differ."""
+
+
+class Unknown(NamedTuple):
+    """A number that is looked for."""
+
+    name: str
+    start: float
+    low: float
+    high: float
+    room: float
+    """It is told where its 95 % interval reaches less far than this to either side."""
+    step: float
+    """Of the finite differences."""
+
+
+class Rows(NamedTuple):
+    """Residuals of one flight: N windows in C channels."""
+
+    value: np.ndarray
+    """(N, C) what is missed."""
+    block: np.ndarray
+    """(N,) number of the block."""
+    level: np.ndarray
+    """(C,) bool: a constant of the flight is free in these channels."""
+
+
+Misses = Callable[[np.ndarray], Sequence[Rows]]
+"""From all numbers to the residuals of every flight."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What a fit found."""
+
+    unknowns: tuple[Unknown, ...]
+    value: np.ndarray
+    """(P,) of all numbers."""
+    half_width: np.ndarray
+    """(P,) of the 95 % interval; NaN where the number was left as it was."""
+    covariance: np.ndarray
+    """(P, P) behind the intervals; zero for what was left."""
+    untold: tuple[str, ...] = ()
+    """Left as they were: these flights cannot tell them."""
+    left: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """(C,) root mean square of what is left in each channel."""
+
+    def has(self, name: str) -> bool:
+        """Return whether the flights told the number."""
+        return any(u.name == name for u in self.unknowns) and name not in self.untold
+
+    def index(self, name: str) -> int:
+        """Return where the number is."""
+        return [u.name for u in self.unknowns].index(name)
+
+
+def fit(misses: Misses, unknowns: Sequence[Unknown]) -> Fitted:
+    """Return the numbers that make `misses` least, with intervals.
+
+    Raises:
+        ValueError: where there is not one window.
+    """
+    unknowns, untold = tuple(unknowns), []
+    value = np.array([unknown.start for unknown in unknowns])
+    if not sum(len(rows.value) for rows in misses(value)):
+        raise ValueError("no stretch of these flights is whole enough to compare anything in")
+    while True:
+        free = [k for k, unknown in enumerate(unknowns) if unknown.name not in untold]
+        value = _least(misses, unknowns, value, free)
+        covariance, half = _errors(misses, unknowns, value, free)
+        ratio = [half[k] / unknowns[k].room for k in free]
+        if not free or max(ratio) <= 1.0:
+            break
+        worst = free[int(np.argmax(ratio))]
+        untold.append(unknowns[worst].name)
+        value[worst] = unknowns[worst].start
+    return Fitted(
+        unknowns, value, half, covariance, tuple(untold), _left(misses, unknowns, value)
+    )
+
+
+def _levelled(rows: Rows) -> np.ndarray:
+    mean = np.median(rows.value, axis=0) if len(rows.value) else np.zeros(rows.value.shape[1])
+    return rows.value - np.where(rows.level, mean, 0.0)
+
+
+def _weights(misses: Sequence[Rows]) -> list[np.ndarray]:
+    """Return the weights (N, C) of every flight: over a channel's noise, less for what is wild."""
+    off = np.concatenate([np.abs(_levelled(rows)) for rows in misses])
+    sigma = np.maximum(1.4826 * np.median(off, axis=0), 1e-9)
+    weights = []
+    for rows in misses:
+        far = np.abs(_levelled(rows)) / sigma
+        weights.append(np.minimum(1.0, HUBER / np.maximum(far, 1e-9)) / sigma**2)
+    return weights
+
+
+def _freed(values: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Return values (N, C, ...) less their weighted mean in channels with a free constant."""
+    weight = weight.reshape(weight.shape + (1,) * (values.ndim - 2))
+    total = np.maximum(weight.sum(axis=0), 1e-12)
+    mean = (weight * values).sum(axis=0) / total
+    level = level.reshape(level.shape + (1,) * (values.ndim - 2))
+    return values - np.where(level, mean, 0.0)
+
+
+def _slopes(
+    misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray, free: Sequence[int]
+) -> list[np.ndarray]:
+    """Return the slopes (N, C, F) of every flight's residuals along the free numbers."""
+    columns: list[list[np.ndarray]] = []
+    here = misses(value)
+    for k in free:
+        # Away from the nearer limit.
+        near_top = unknowns[k].high - value[k] < unknowns[k].step
+        step = -unknowns[k].step if near_top else unknowns[k].step
+        there = value.copy()
+        there[k] += step
+        both = zip(misses(there), here, strict=True)
+        columns.append([(a.value - b.value) / step for a, b in both])
+    return [np.stack([column[f] for column in columns], axis=-1) for f in range(len(here))]
+
+
+def _least(
+    misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray, free: Sequence[int]
+) -> np.ndarray:
+    if not free:
+        return value
+    low = np.array([unknowns[k].low for k in free])
+    high = np.array([unknowns[k].high for k in free])
+    value = value.copy()
+    for _ in range(ROUNDS):
+        rows = misses(value)
+        weights = _weights(rows)
+        slopes = _slopes(misses, unknowns, value, free)
+        square, pull = _normal(rows, weights, slopes)
+        scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
+        change = -np.linalg.lstsq(square / np.outer(scale, scale), pull / scale, rcond=1e-9)[0]
+        change = change / scale
+        before = _cost(rows, weights)
+        for _ in range(8):
+            trial = value.copy()
+            trial[list(free)] = np.clip(value[list(free)] + change, low, high)
+            if _cost(misses(trial), weights) <= before * (1.0 + 1e-12):
+                break
+            change = 0.5 * change
+        else:
+            break
+        moved = np.abs(trial - value)[list(free)] * scale
+        value = trial
+        if moved.max() < SMALL:
+            break
+    return value
+
+
+def _cost(rows: Sequence[Rows], weights: Sequence[np.ndarray]) -> float:
+    return float(
+        sum(
+            (w * _freed(r.value, w, r.level) ** 2).sum()
+            for r, w in zip(rows, weights, strict=True)
+        )
+    )
+
+
+def _normal(
+    rows: Sequence[Rows], weights: Sequence[np.ndarray], slopes: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    count = slopes[0].shape[-1]
+    square, pull = np.zeros((count, count)), np.zeros(count)
+    for row, weight, slope in zip(rows, weights, slopes, strict=True):
+        off, along = _freed(row.value, weight, row.level), _freed(slope, weight, row.level)
+        square += np.einsum("nc,nci,ncj->ij", weight, along, along)
+        pull += np.einsum("nc,nci,nc->i", weight, along, off)
+    return square, pull
+
+
+def _errors(
+    misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray, free: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the covariance (P, P) and the half-widths (P,)."""
+    from scipy.stats import chi2, t
+
+    total = len(unknowns)
+    covariance, half = np.zeros((total, total)), np.full(total, np.nan)
+    if not free:
+        return covariance, half
+    rows, slopes = misses(value), _slopes(misses, unknowns, value, free)
+    weights = _weights(rows)
+    square, _ = _normal(rows, weights, slopes)
+    scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
+    # The ridge makes what cannot be told apart wide, where a pseudo-inverse would hide it.
+    ridge = RIDGE * np.eye(len(free))
+    inverse = np.linalg.inv(square / np.outer(scale, scale) + ridge) / np.outer(scale, scale)
+    by_flight = []
+    for row, weight, slope in zip(rows, weights, slopes, strict=True):
+        off, along = _freed(row.value, weight, row.level), _freed(slope, weight, row.level)
+        pulls = np.einsum("nc,nci,nc->ni", weight, along, off)
+        each = np.array([pulls[row.block == b].sum(axis=0) for b in np.unique(row.block)])
+        by_flight.append(each.reshape(-1, len(free)) @ inverse)
+    influence = np.concatenate(by_flight)
+    freedom = max(len(influence) - len(free), 1)
+    blocks = len(influence) / freedom * influence.T @ influence
+    sums = np.array([each.sum(axis=0) for each in by_flight])
+    flights = [k for k, each in enumerate(by_flight) if len(each)]
+    widest = Z95 * np.sqrt(np.maximum(np.diag(blocks), 0.0))
+    if len(flights) >= FEWEST:
+        spread = np.array([(each**2).sum(axis=0) for each in by_flight])[flights]
+        q = (sums[flights] ** 2 / np.maximum(spread, 1e-300)).sum(axis=0)
+        between = len(flights) / (len(flights) - 1) * (sums[flights] ** 2).sum(axis=0)
+        wide = float(t.ppf(0.975, len(flights) - 1)) * np.sqrt(between)
+        differ = chi2.sf(q, len(flights) - 1) < DIFFER_P
+        widest = np.where(differ, np.maximum(widest, wide), widest)
+    # No interval is narrower than white noise of this size makes it.
+    widest = np.maximum(widest, Z95 * np.sqrt(np.diag(inverse)))
+    stretch = widest / np.maximum(Z95 * np.sqrt(np.maximum(np.diag(blocks), 1e-300)), 1e-300)
+    index = np.array(free)
+    covariance[np.ix_(index, index)] = blocks * np.outer(stretch, stretch)
+    half[index] = widest
+    return covariance, half
+
+
+def _left(
+    misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray
+) -> np.ndarray:
+    rows = misses(value)
+    left = np.concatenate([_levelled(row) for row in rows])
+    return np.sqrt(np.mean(left**2, axis=0))

@@ -1,0 +1,167 @@
+"""Flights on a fine grid, and smooth windows in which their equations are compared.
+
+An equation of motion is multiplied by a smooth window and integrated (modulating functions; Shinbrot
+1957): `mean(dv/dt)` over a window `p` is `-mean over p' (v)`, so that nothing noisy is
+differentiated, and both sides are smoothed alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from eval.logs.flight_log import FlightLog
+from tracks.geometry.rotation import quat_to_rot
+
+STEP_S = 0.004
+"""Of the grid [s]."""
+MEMORY_S = 0.4
+"""What was commanded longer ago than this acts no more [s]."""
+HOLE_STEPS = 4.0
+"""Rows further apart than so many median steps are a hole, over which nothing is compared."""
+VOLTAGE_S = 0.3
+"""The voltage's noise is averaged over about this [s]."""
+
+
+class FlightGrid(NamedTuple):
+    """One flight at G times, every `STEP_S`; NaN where it is not known."""
+
+    name: str
+    time_s: np.ndarray
+    """(G,)."""
+    known: dict[str, np.ndarray]
+    """Signals (G, ...) by name: rot_w, vel_w, pos_w, rate_b, and what drives."""
+
+    def has(self, *names: str) -> bool:
+        """Return whether these signals are there."""
+        return all(name in self.known for name in names)
+
+
+class Windows(NamedTuple):
+    """K windows of one flight."""
+
+    first: np.ndarray
+    """(K,) index of each window's first grid point."""
+    weight: np.ndarray
+    """(W,) of the window; they sum to 1."""
+    slope: np.ndarray
+    """(W,) of the mean of a signal's derivative."""
+    bend: np.ndarray
+    """(W,) of the mean of its second derivative."""
+
+    @property
+    def middle(self) -> np.ndarray:
+        """(K,) index of each window's middle."""
+        return self.first + len(self.weight) // 2
+
+
+def grid_of(log: FlightLog) -> FlightGrid:
+    """Return `log` on the grid."""
+    time_s = log.time_s - log.time_s[0]
+    grid = np.arange(0.0, time_s[-1], STEP_S)
+    known: dict[str, np.ndarray] = {}
+    for name, values in (
+        ("pos_w", log.pos_w),
+        ("vel_w", None if log.velocity_derived else log.vel_w),
+        ("rate_b", log.rate_b),
+        ("rotor_speed", log.rotor_speed),
+    ):
+        if values is not None and np.isfinite(values).any():
+            known[name] = _joined(time_s, values, grid)
+    if np.isfinite(log.quat_wxyz).any():
+        known["rot_w"] = quat_to_rot(_attitude(time_s, log.quat_wxyz, grid))
+    if log.voltage is not None and np.isfinite(log.voltage).any():
+        good = np.isfinite(log.voltage)
+        volts = np.interp(grid, time_s[good], log.voltage[good])
+        known["voltage"] = _smoothed(volts, round(VOLTAGE_S / STEP_S))
+    for name, values in (
+        ("pwm", log.pwm),
+        ("thrust_cmd", log.thrust_cmd),
+        ("rate_cmd_b", log.rate_cmd_b),
+        ("torque_cmd_b", log.torque_cmd_b),
+        ("rotor_speed_cmd", log.rotor_speed_cmd),
+    ):
+        if values is not None and np.isfinite(values).any():
+            known[name] = _held(time_s, values, grid)
+    return FlightGrid(log.name, grid, known)
+
+
+def windows_of(flight: FlightGrid, width_s: float, needs: Sequence[str]) -> Windows:
+    """Return windows of `width_s` that overlap by half, in which all of `needs` is known.
+
+    They begin a while after the first row: what was asked of the rotors before it still acts then.
+    """
+    count = 2 * round(0.5 * width_s / STEP_S) + 1
+    turn = 2.0 * np.pi / (count - 1)
+    phase = turn * np.arange(count)
+    weight = 1.0 - np.cos(phase)
+    scale = 1.0 / weight.sum()
+    first = np.arange(round(MEMORY_S / STEP_S), len(flight.time_s) - count, count // 2)
+    good = np.ones(len(flight.time_s), dtype=bool)
+    for name in needs:
+        values = flight.known[name]
+        good &= np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    bad = np.concatenate([[0], np.cumsum(~good)])
+    whole = bad[first + count] == bad[first]
+    rate = turn / STEP_S
+    return Windows(
+        first[whole],
+        scale * weight,
+        -scale * rate * np.sin(phase),
+        scale * rate**2 * np.cos(phase),
+    )
+
+
+def over(windows: Windows, values: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
+    """Return the weighted sums (K, ...) of `values` (G, ...) over the windows."""
+    weight = windows.weight if weight is None else weight
+    at = windows.first[:, None] + np.arange(len(weight))
+    return np.tensordot(np.moveaxis(values[at], 1, -1), weight, axes=([-1], [0]))
+
+
+def blocks_of(flight: FlightGrid, windows: Windows, length_s: float) -> np.ndarray:
+    """Return the number of the block of `length_s` that each window's middle is in, (K,)."""
+    return (flight.time_s[windows.middle] / length_s).astype(int)
+
+
+def _joined(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    good = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    t, v = time_s[good], values[good]
+    out = np.stack([np.interp(grid, t, column) for column in v.T], axis=1)
+    out[_in_hole(t, grid)] = np.nan
+    return out
+
+
+def _attitude(time_s: np.ndarray, quat: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    good = np.isfinite(quat).all(axis=1)
+    t, q = time_s[good], quat[good]
+    flips = np.sum(q[1:] * q[:-1], axis=1) < 0
+    q = q * np.concatenate([[1.0], np.where(np.cumsum(flips) % 2, -1.0, 1.0)])[:, None]
+    out = np.stack([np.interp(grid, t, column) for column in q.T], axis=1)
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    out[_in_hole(t, grid)] = np.nan
+    return out
+
+
+def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    good = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    t = time_s[good]
+    # A grid point on a row's own stamp has that row's command, whatever was rounded.
+    at = np.searchsorted(t, grid + 1e-6, side="right") - 1
+    out = np.array(values[good][np.clip(at, 0, None)], dtype=float)
+    out[(at < 0) | _in_hole(t, grid)] = np.nan
+    return out
+
+
+def _in_hole(t: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    wide = np.diff(t) > HOLE_STEPS * float(np.median(np.diff(t)))
+    at = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
+    return wide[at] | (grid < t[0]) | (grid > t[-1])
+
+
+def _smoothed(values: np.ndarray, count: int) -> np.ndarray:
+    count = max(1, min(count, len(values) // 4)) | 1
+    padded = np.pad(values, count // 2, mode="edge")
+    return np.convolve(padded, np.full(count, 1.0 / count), mode="valid")

@@ -1,0 +1,70 @@
+"""From flight logs to a vehicle file with the numbers that they tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from eval.logs.flight_log import read_flights
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from suite.common.choices import flight_files
+from suite.common.console import Console
+from suite.common.provenance import stamp
+from suite.identify.identify import Identified, identify
+from suite.identify.numbers import as_json
+
+SCHEMA = 1
+PARTS = ("drag", "motors", "inertia", "lag", "loop")
+"""What `--leave` may name."""
+
+
+def identify_files(
+    flights: Sequence[Path], vehicle: str, out: Path, leave: Sequence[str], console: Console
+) -> dict[str, Any]:
+    """Identify a vehicle from log files, and write its file.
+
+    Args:
+        flights: logs or folders of them.
+        vehicle: file or shipped name to start from.
+        out: the vehicle file to write.
+        leave: of `PARTS`, what stays as it is.
+        console: for people.
+
+    Returns:
+        What `--json` prints.
+
+    Raises:
+        ValueError: for flights or a vehicle that cannot be used.
+    """
+    for part in leave:
+        if part not in PARTS:
+            raise ValueError(f"--leave {part!r}: allowed: {', '.join(PARTS)}")
+    start = load_vehicle(vehicle)
+    logs, warnings = read_flights(flight_files(flights))
+    console.say(f"{len(logs)} flights, {sum(log.duration_s for log in logs):.0f} s in all")
+    found = identify(logs, start, leave)
+    save_vehicle(found.vehicle, out, _head(found, vehicle))
+    return {
+        "vehicle": str(out),
+        "start": vehicle,
+        "drive": found.drive,
+        "parameters": as_json(found.numbers),
+        "untold": list(found.untold),
+        "left": found.left,
+        "flights": list(found.flights),
+        "warnings": warnings,
+        **stamp(SCHEMA, None),
+    }
+
+
+def _head(found: Identified, start: str) -> str:
+    lines = [f"From {start} by {len(found.flights)} flights ({found.drive}); 95 % intervals:"]
+    for entry in found.numbers:
+        for k, (value, span) in enumerate(zip(entry.value, entry.ci95, strict=True)):
+            part = f"[{k}]" if len(entry.value) > 1 else ""
+            if span is not None:
+                between = f"{span[0]:.4g} to {span[1]:.4g} {entry.unit}"
+                lines.append(f"{entry.key}{part} = {value:.4g}: {between}")
+    lines += [f"left as it was: {text}" for text in found.untold]
+    return "\n".join(lines)

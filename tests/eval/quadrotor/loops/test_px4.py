@@ -1,0 +1,65 @@
+"""PX4's rate loop and allocation, against numbers worked by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from eval.quadrotor.loops import px4
+from eval.quadrotor.loops.layout import layout_of
+from eval.quadrotor.vehicle_file import load_vehicle
+
+LAYOUT = layout_of(load_vehicle("crazyflie21").rotors)
+PLAIN = replace(px4.Settings(), IMU_GYRO_CUTOFF=0.0, IMU_DGYRO_CUTOFF=0.0)
+RIGHT_LEFT = np.array([-1.0, -1.0, 1.0, 1.0])
+ROOT = 2.0**-0.5
+
+
+def look(state, throttle, wanted, rate, settings=PLAIN):
+    gains = px4.gains(settings, LAYOUT)
+    return px4.look(
+        gains, state, np.asarray(throttle), np.array(wanted), np.array(rate), 0.002, np.ones(3)
+    )
+
+
+def test_three_looks_by_hand():
+    """P 0.15 x 0.1 = 0.015, times 0.707 a motor.
+
+    The integral of the first look acts in the second: 0.2 x 0.1 x 0.002 x (1 - (0.1 / 6.981317)^2)
+    = 3.999179e-5. At 0.01 rad/s P is 0.0135 and D 0.003 x 0.01 / 0.002 = 0.015.
+    """
+    state, motor = look(px4.start((), np), 0.5, [0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
+    np.testing.assert_allclose(motor, 0.5 + 0.015 * ROOT * RIGHT_LEFT, atol=1e-9)
+    np.testing.assert_allclose(state.integral[0], 3.999179e-5, rtol=1e-6)
+    state, motor = look(state, 0.5, [0.1, 0.0, 0.0], [0.01, 0.0, 0.0])
+    torque = 0.0135 + 3.999179e-5 - 0.015
+    np.testing.assert_allclose(motor, 0.5 + torque * ROOT * RIGHT_LEFT, atol=1e-9)
+
+
+def test_thrust_gives_way_to_roll_and_yaw_to_thrust():
+    """0.98 +- 0.0707: lowered by 0.0507. Full thrust with 0.1 of yaw: lowered by 0.1."""
+    given = px4.allocate(LAYOUT, np.asarray(0.98), np.array([0.1, 0.0, 0.0]))
+    np.testing.assert_allclose(given, 1.0 - 0.1 * ROOT * (1.0 - RIGHT_LEFT), atol=1e-9)
+    given = px4.allocate(LAYOUT, np.asarray(1.0), np.array([0.0, 0.0, 0.1]))
+    np.testing.assert_allclose(given, [0.8, 1.0, 0.8, 1.0], atol=1e-9)
+
+
+def test_without_airmode_no_thrust_is_added_for_roll():
+    """At 0.02 of thrust roll is taken back until the lowest motors are at zero: +-0.02."""
+    given = px4.allocate(LAYOUT, np.asarray(0.02), np.array([0.1, 0.0, 0.0]))
+    np.testing.assert_allclose(given, 0.02 + 0.02 * RIGHT_LEFT, atol=1e-9)
+
+
+def test_no_integral_into_saturation():
+    state, _ = look(px4.start((), np), 0.0, [1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    assert state.lost[0] > 0.1
+    after, _ = look(state, 0.0, [1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    np.testing.assert_allclose(after.integral, state.integral)
+
+
+def test_the_thrust_model_is_undone():
+    """0.5 u^2 + 0.5 u = 0.375 at u = 0.5."""
+    np.testing.assert_allclose(px4.signal(np.asarray(0.5), np.array([0.375, 1.0])), [0.5, 1.0])
+    _, motor = look(
+        px4.start((), np), 0.5, [0, 0, 0], [0.0, 0.0, 0.0], replace(PLAIN, THR_MDL_FAC=0.3)
+    )
+    np.testing.assert_allclose(motor, 0.5)
