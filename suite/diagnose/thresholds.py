@@ -152,7 +152,7 @@ class Thresholds:
     gain_doubt: float = 0.5
     """Share of a change by which the vehicle file may be wrong along an axis: inertia, arms and the
     rotors' torque are known no better where nobody identified them [1]."""
-    change_p_value: float = 0.05
+    change_p_value: float = 0.02
     """Chance of a false name of a change, over all candidates."""
     view_block_s: float = 2.0
     """Stretches of a flight that a view takes for independent [s]."""

@@ -100,9 +100,7 @@ def fit(misses: Misses, unknowns: Sequence[Unknown]) -> Fitted:
         worst = free[int(np.argmax(ratio))]
         untold.append(unknowns[worst].name)
         value[worst] = unknowns[worst].start
-    return Fitted(
-        unknowns, value, half, covariance, tuple(untold), _left(misses, unknowns, value)
-    )
+    return Fitted(unknowns, value, half, covariance, tuple(untold), _left(misses, unknowns, value))
 
 
 def _levelled(rows: Rows) -> np.ndarray:
@@ -182,8 +180,7 @@ def _least(
 def _cost(rows: Sequence[Rows], weights: Sequence[np.ndarray]) -> float:
     return float(
         sum(
-            (w * _freed(r.value, w, r.level) ** 2).sum()
-            for r, w in zip(rows, weights, strict=True)
+            (w * _freed(r.value, w, r.level) ** 2).sum() for r, w in zip(rows, weights, strict=True)
         )
     )
 
@@ -245,9 +242,7 @@ def _errors(
     return covariance, half
 
 
-def _left(
-    misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray
-) -> np.ndarray:
+def _left(misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray) -> np.ndarray:
     rows = misses(value)
     left = np.concatenate([_levelled(row) for row in rows])
     return np.sqrt(np.mean(left**2, axis=0))

@@ -19,7 +19,9 @@ LEVEL = np.array([True, True, False])
 """A flight's trim of the attitude is free; along z it would be the thrust."""
 
 
-def unknowns_of(drive: str, guess: MotorGuess, voltage: bool, drag: Sequence[float]) -> list[Unknown]:
+def unknowns_of(
+    drive: str, guess: MotorGuess, voltage: bool, drag: Sequence[float]
+) -> list[Unknown]:
     """Return the numbers of the force; their starts are those of the vehicle file."""
     unknowns = [Unknown("thrust", 0.0, -2.0, 2.0, 0.25, 1e-3)]
     if drive == "pwm":
@@ -63,7 +65,8 @@ def fit_force(
             force = force_of(flight, vehicle, drive, guess, told, lag_s, delay_s)
             # Along the body's axes of the window's middle, so that a channel is an axis.
             pushed = np.einsum(
-                "kji,kj->ki", flight.known["rot_w"][windows.middle],
+                "kji,kj->ki",
+                flight.known["rot_w"][windows.middle],
                 over(windows, up_w * force[:, None]),
             )
             drag = np.array([told.get(f"drag_{axis}", 0.0) for axis in "xyz"])
@@ -85,9 +88,11 @@ def force_of(
     """Return the collective thrust per mass (G,) [m/s^2] under the numbers `told`."""
     scale = float(np.exp(told.get("thrust", 0.0)))
     if drive == "pwm":
-        return scale * motor_thrusts(
-            flight, with_told(guess, told), lag_s, delay_s
-        ).sum(axis=1) / vehicle.mass
+        return (
+            scale
+            * motor_thrusts(flight, with_told(guess, told), lag_s, delay_s).sum(axis=1)
+            / vehicle.mass
+        )
     if drive == "rotors":
         thrust = rotor_thrusts(flight, vehicle.rotors.thrust_coefficient)
         return scale * thrust.sum(axis=1) / vehicle.mass

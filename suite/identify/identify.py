@@ -66,9 +66,7 @@ class Identified:
     """Names of those that were used."""
 
 
-def identify(
-    logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] = ()
-) -> Identified:
+def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] = ()) -> Identified:
     """Return the numbers of `vehicle` that `logs` tell.
 
     Args:
@@ -122,7 +120,13 @@ class _Start:
         if not unknowns:
             return
         found = force.fit_force(
-            flights, self.start, self.drive, self.guess, unknowns, self.lag_s, self.delay_s,
+            flights,
+            self.start,
+            self.drive,
+            self.guess,
+            unknowns,
+            self.lag_s,
+            self.delay_s,
             told_drag,
         )
         self.fitted["force"] = found
@@ -233,38 +237,60 @@ def motors_of(guess: MotorGuess, numbers: dict[str, float], volts: float) -> np.
     return np.array([size * first, size * second, shape.battery])
 
 
-def _of_force(
-    vehicle: Vehicle, drive: str, guess: MotorGuess, fitted: Fitted
-) -> list[Number]:
+def _of_force(vehicle: Vehicle, drive: str, guess: MotorGuess, fitted: Fitted) -> list[Number]:
     entries = []
     names = [unknown.name for unknown in fitted.unknowns]
     if "thrust" in names and drive == "pwm":
         assert vehicle.motors is not None
         volts = vehicle.motors.voltage
         entries.append(
-            number("motors.thrust", "N", fitted, lambda n: motors_of(guess, n, volts)[:2],
-                   [("thrust",)] * 2)
+            number(
+                "motors.thrust",
+                "N",
+                fitted,
+                lambda n: motors_of(guess, n, volts)[:2],
+                [("thrust",)] * 2,
+            )
         )
         entries.append(
-            number("motors.voltage_exponent", "1", fitted,
-                   lambda n: motors_of(guess, n, volts)[2:], [("battery",)])
+            number(
+                "motors.voltage_exponent",
+                "1",
+                fitted,
+                lambda n: motors_of(guess, n, volts)[2:],
+                [("battery",)],
+            )
         )
     elif "thrust" in names and drive == "rotors":
         start = vehicle.rotors.thrust_coefficient
         entries.append(
-            number("rotors.thrust_coefficient", "N/(rad/s)^2", fitted,
-                   lambda n: np.array([start * np.exp(n["thrust"])]), [("thrust",)])
+            number(
+                "rotors.thrust_coefficient",
+                "N/(rad/s)^2",
+                fitted,
+                lambda n: np.array([start * np.exp(n["thrust"])]),
+                [("thrust",)],
+            )
         )
     elif "thrust" in names:
         entries.append(
-            number("effects.thrust_scale.scale", "1", fitted,
-                   lambda n: np.array([np.exp(n["thrust"])]), [("thrust",)])
+            number(
+                "effects.thrust_scale.scale",
+                "1",
+                fitted,
+                lambda n: np.array([np.exp(n["thrust"])]),
+                [("thrust",)],
+            )
         )
     if "drag_x" in names:
         entries.append(
-            number("effects.linear_drag.coefficient", "1/s", fitted,
-                   lambda n: np.array([n[f"drag_{axis}"] for axis in "xyz"]),
-                   [(f"drag_{axis}",) for axis in "xyz"])
+            number(
+                "effects.linear_drag.coefficient",
+                "1/s",
+                fitted,
+                lambda n: np.array([n[f"drag_{axis}"] for axis in "xyz"]),
+                [(f"drag_{axis}",) for axis in "xyz"],
+            )
         )
     return entries
 
@@ -276,8 +302,13 @@ def _of_torque(
     names = [unknown.name for unknown in fitted.unknowns]
     if "inertia_x" in names:
         entries.append(
-            number("inertia", "kg m^2", fitted, lambda n: inertia_of(vehicle, dict(n)),
-                   [("inertia_x",), ("inertia_y",), ("inertia_z",)])
+            number(
+                "inertia",
+                "kg m^2",
+                fitted,
+                lambda n: inertia_of(vehicle, dict(n)),
+                [("inertia_x",), ("inertia_y",), ("inertia_z",)],
+            )
         )
     if "yaw" in names:
         # Torque per inertia is what is seen, and the inertia about z follows those about x and y.
@@ -303,15 +334,24 @@ def _of_loop(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
         )
     if "late" in names:
         entries.append(
-            number("effects.command_delay.delay", "s", fitted, lambda n: np.array([n["late"] - n.get("lag", lag_s)]),
-                   [("late",)])
+            number(
+                "effects.command_delay.delay",
+                "s",
+                fitted,
+                lambda n: np.array([n["late"] - n.get("lag", lag_s)]),
+                [("late",)],
+            )
         )
     if "gain_x" in names:
         gain = np.asarray(vehicle.controller.rate_gain)
         entries.append(
-            number("controller.rate_gain", "1/s", fitted,
-                   lambda n: gain * np.exp([n[f"gain_{axis}"] for axis in "xyz"]),
-                   [(f"gain_{axis}",) for axis in "xyz"])
+            number(
+                "controller.rate_gain",
+                "1/s",
+                fitted,
+                lambda n: gain * np.exp([n[f"gain_{axis}"] for axis in "xyz"]),
+                [(f"gain_{axis}",) for axis in "xyz"],
+            )
         )
     return entries
 
@@ -330,9 +370,7 @@ def _put(vehicle: Vehicle, entry: Number) -> Vehicle:
         if name == "command_delay" and kept[0] <= 0.0:
             return vehicle
         values = effect.values(tuple(kept) if parameter.size else kept[0])
-        return replace(
-            vehicle, effects=MappingProxyType({**vehicle.effects, name: values})
-        )
+        return replace(vehicle, effects=MappingProxyType({**vehicle.effects, name: values}))
     if not table:
         return vehicle
     part = getattr(vehicle, table)

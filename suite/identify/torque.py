@@ -151,7 +151,9 @@ def _turning(
     else:
         assert thrusts is not None
         # Measured rotor speeds are past their lag.
-        lag_s, delay_s = (0.0, 0.0) if drive == "rotors" else (told["lag"], told["late"] - told["lag"])
+        lag_s, delay_s = (
+            (0.0, 0.0) if drive == "rotors" else (told["lag"], told["late"] - told["lag"])
+        )
         thrust = thrusts(flight, lag_s, delay_s)
         torque = torque_of(vehicle, thrust) * [1.0, 1.0, np.exp(told.get("yaw", 0.0))]
     true = inertia * ratio

@@ -60,8 +60,8 @@ def headline(found: ViewsDiagnosis) -> str:
             what = "has changed" if found.references else "is missing"
             return f"Nothing that the flights agree on {what}."
         return (
-            f"No effect of the catalogue explains it; a black box closes {100 * could:.0f} % of the "
-            f"variance of the {view.name}."
+            f"No effect of the catalogue explains it; a black box closes {100 * could:.0f} % of "
+            f"the variance of the {view.name}."
         )
     names = " and ".join(
         " or ".join([name.candidate.label, *name.rivals]) for _, name in found.named
@@ -69,8 +69,8 @@ def headline(found: ViewsDiagnosis) -> str:
     since = " since the reference flights" if found.references else ""
     share = gap.share(gap.closed) / max(could, 1e-9)
     return (
-        f"{names}{since}: the {view.name} on held-out flights is {gap.rms(gap.after):.3g} instead of "
-        f"{gap.rms(gap.before):.3g} {view.unit} off; of what any model could close of its changes "
+        f"{names}{since}: the {view.name} on held-out flights is {gap.rms(gap.after):.3g} instead "
+        f"of {gap.rms(gap.before):.3g} {view.unit} off; of what any model could close of its changes "
         f"within a flight here, {100 * min(share, 1.0):.0f} %."
     )
 

@@ -22,9 +22,9 @@ STRETCH_S = 10.0
 """Length of the stretch in the picture [s]."""
 WHAT = {"force": "acceleration", "torque": "angular acceleration"}
 CHANNELS = (
-    "As given and with what was named: what the model leaves, as RMS. Noise floor: what the noise of "
-    "the measured velocities or rates alone would leave. Repeatability: how far the means of flights "
-    "of the unchanged vehicle lie apart. Named: the share of the variance within a flight that the "
+    "As given and with what was named: what the model leaves, as RMS. Noise floor: what the noise "
+    "of the measured velocities or rates alone would leave. Repeatability: how far the means of "
+    "flights of the unchanged vehicle lie apart. Named: the share of the variance within a flight that the "
     "names close; black box: what a regression without any physics closes of it, fitted to the same "
     "flights. All on flights that took no part in finding or fitting anything."
 )
@@ -157,10 +157,10 @@ def _agreement(found: ViewsDiagnosis) -> list[Part]:
             parts.append(grid(title, ["fitted flight", "gain"], rows, FLIGHTS))
     if found.spread is not None:
         parts.append(
-            f"The {len(found.references)} reference flights differ as though each rotor's thrust were "
-            f"off by {100 * found.spread.share:.1f} % from flight to flight "
-            f"({found.spread.freedom} degrees of freedom). A change is named where it stands out of "
-            "that."
+            f"The {len(found.references)} reference flights differ as though each rotor's thrust "
+            f"were off by {100 * found.spread.share:.1f} % from flight to flight "
+            f"({found.spread.freedom} degrees of freedom). A change is named where it stands out "
+            "of that."
         )
     return parts or ["Nothing was named on which flights could agree."]
 

@@ -126,6 +126,7 @@ def diagnose_by_views(
             found = search_change(known[view.name], task.flights, spread, among)
             balance = in_balance(known[view.name])
             apart = changed_task(known[view.name], balance, held[view.name])
+            apart = apart._replace(thirds=True)
         else:
             found = search_view(task, among, seed)
             apart = task._replace(flights=held[view.name])
@@ -187,7 +188,8 @@ def _reference_tasks(
         view.name: ViewTask(view, model, before.smoothed[view.name], limits)
         for view in flights.views
     }
-    return tasks, rotor_spread(list(tasks.values()))
+    after = [task._replace(flights=flights.smoothed[name]) for name, task in tasks.items()]
+    return tasks, rotor_spread([*tasks.values(), *after])
 
 
 def _held(

@@ -79,6 +79,7 @@ def fitted(
     At most `rounds` steps are taken, those of the limits if not given.
     """
     best, at = begin, np.array(sorted(indices), dtype=int)
+    low, high = (task.model.space.array(name)[at] for name in ("low", "high"))
     for _ in range((rounds or task.limits.view_rounds) if len(at) else 0):
         hessian = best.block.hessian.sum(axis=0)[np.ix_(at, at)]
         gradient = best.block.gradient.sum(axis=0)[at]
@@ -90,7 +91,7 @@ def fitted(
         share, chi2 = 1.0, float(best.block.chi2.sum())
         while share > 0.1:
             theta = best.theta.copy()
-            theta[at] += share * change
+            theta[at] = np.clip(theta[at] + share * change, low, high)
             trial = look(task, theta, best.weights)
             if float(trial.block.chi2.sum()) <= chi2:
                 break

@@ -10,6 +10,7 @@ import numpy as np
 from suite.diagnose.views.equations import ViewTask, left_of
 from suite.diagnose.views.explainable import centred, closed_share, fit_black_box, inputs_of
 from suite.diagnose.views.search import ViewSearch
+from suite.diagnose.views.view import ViewData
 
 
 class ViewGap(NamedTuple):
@@ -43,8 +44,10 @@ class ViewGap(NamedTuple):
 
 def judge(found: ViewSearch, held: ViewTask, floor: np.ndarray) -> ViewGap:
     """Return what `found` is worth on the flights of `held`; `floor` (3,) is the noise's."""
-    start, fitted = found.first.data, found.last.data
     before, after = left_of(held, found.first.theta), left_of(held, found.last.theta)
+    if held.thirds:
+        return _judge_change(found, before, after, floor)
+    start, fitted = found.first.data, found.last.data
     inside = np.concatenate([inputs_of(flight) for flight in found.task.flights])
     outside = np.concatenate([inputs_of(flight) for flight in held.flights])
     numbers = before.flight
@@ -59,16 +62,33 @@ def judge(found: ViewSearch, held: ViewTask, floor: np.ndarray) -> ViewGap:
         )
     ]
     closed, explainable, both = shares
-    trim = found.last.weights.trim
     return ViewGap(
         before=_rms(before.residual),
         after=_rms(after.residual),
         floor=floor,
-        repeatability=np.where(np.isfinite(trim), trim, np.nan),
+        repeatability=_finite(found.last.weights.trim),
         closed=closed,
         explainable=np.maximum(explainable, closed),
         left=both - closed,
         variance=(centred(before.residual, numbers) ** 2).mean(axis=0),
+    )
+
+
+def _judge_change(
+    found: ViewSearch, before: ViewData, after: ViewData, floor: np.ndarray
+) -> ViewGap:
+    """Return what the names of a change are worth: means alone count."""
+    power = (before.residual**2).mean(axis=0)
+    closed = 1.0 - (after.residual**2).mean(axis=0) / np.maximum(power, 1e-12)
+    return ViewGap(
+        before=_rms(before.residual),
+        after=_rms(after.residual),
+        floor=floor,
+        repeatability=_finite(found.first.weights.trim),
+        closed=closed,
+        explainable=np.maximum(closed, 0.0),
+        left=np.zeros(3),
+        variance=power,
     )
 
 
@@ -81,3 +101,7 @@ def gap_without(found: ViewSearch, held: ViewTask, indices: Sequence[int]) -> np
 
 def _rms(residual: np.ndarray) -> np.ndarray:
     return np.sqrt((residual**2).mean(axis=0))
+
+
+def _finite(trim: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(trim), trim, np.nan)

@@ -33,6 +33,19 @@ def implausible(
     return told
 
 
+def at_bound(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> bool:
+    """Return whether a number of `candidate` has run to an end of what is physical.
+
+    An end at which nothing acts, as that of a drag, is none.
+    """
+    at = list(candidate.indices)
+    low, high, value = space.array("low")[at], space.array("high")[at], theta[at]
+    close = 1e-6 * (high - low)
+    start = space.array("start")[at]
+    ends = ((value <= low + close) & (low != start)) | ((value >= high - close) & (high != start))
+    return bool(ends.any())
+
+
 def usual_first(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> tuple[bool, int]:
     """Return by what those of equal fit are ordered: the plausible, then as the catalogue has them.
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as fisher
 
+from eval.effects import EFFECTS
 from suite.diagnose.fit.normal_equations import gauss_newton_step
 from suite.diagnose.fit.parameters import Candidate, indices_of
 from suite.diagnose.fit.rivals import flights_agree
@@ -26,7 +27,7 @@ from suite.diagnose.views.equations import (
     left_of,
     look,
 )
-from suite.diagnose.views.plausible import implausible
+from suite.diagnose.views.plausible import at_bound, implausible
 from suite.diagnose.views.search import ViewName, ViewSearch, view_candidates
 from suite.diagnose.views.view import SmoothedFlight, compare
 from suite.diagnose.views.weigh import Weights, weights_of
@@ -69,10 +70,10 @@ def rotor_gain(task: ViewTask) -> np.ndarray:
     return np.sqrt((slope**2).sum(axis=1))
 
 
-def rotor_spread(references: Sequence[ViewTask]) -> RotorSpread:
-    """Return how the flights of `references`, the same in several views, differ."""
+def rotor_spread(sets: Sequence[ViewTask]) -> RotorSpread:
+    """Return how flights differ within each of `sets`: the reference's and the others', by view."""
     square, freedom = 0.0, 0
-    for task in references:
+    for task in sets:
         data, gain = left_of(task, task.model.space.array("start")), rotor_gain(task)
         means = np.array(
             [data.residual[data.flight == n].mean(axis=0) for n in np.unique(data.flight)]
@@ -204,15 +205,23 @@ def _next_change(
     for _, candidate, p_value in sorted(near, key=lambda one: -one[0])[: task.limits.short_list]:
         at = [*beside, *candidate.indices]
         then = fitted(task, begin, at)
-        if flights_agree(each - chi2_by_flight(task, then, at)):
+        sound = not at_bound(space, then.theta, candidate)
+        if sound and flights_agree(each - chi2_by_flight(task, then, at)):
             cost = float(then.block.chi2.sum()) + 2.0 * len(candidate.indices)
             fits.append((cost, candidate, p_value, then))
     if not fits:
         return None
     before, least = float(begin.block.chi2.sum()), min(one[0] for one in fits)
     alike = [one for one in fits if one[0] - least <= task.limits.rival_chi2]
+    # Of what explains as much: the plausible, then the fewer numbers, then the more usual.
     _, best, p_value, then = min(
-        alike, key=lambda one: (bool(implausible(space, one[3].theta, one[1])), one[0])
+        alike,
+        key=lambda one: (
+            bool(implausible(space, one[3].theta, one[1])),
+            len(one[1].indices),
+            list(EFFECTS).index(one[1].name),
+            one[0],
+        ),
     )
     rivals = dict.fromkeys(candidate.name for _, candidate, *_ in alike)
     rivals.pop(best.name, None)

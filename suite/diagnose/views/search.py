@@ -24,7 +24,7 @@ from suite.diagnose.views.equations import (
     left_of,
     look,
 )
-from suite.diagnose.views.plausible import usual_first
+from suite.diagnose.views.plausible import at_bound, usual_first
 from suite.diagnose.views.weigh import weights_of
 
 
@@ -116,6 +116,8 @@ def _next_name(
         then = fitted(task, now, at, rounds=1)
         gains = before - chi2_by_flight(task, then, at)
         share = float(gains.sum() / before.sum())
+        if at_bound(task.model.space, then.theta, score.candidate):
+            continue  # that is no fit
         if flights_agree(gains) and share >= task.limits.least_view_share:
             cost = float(then.block.chi2.sum()) + 2.0 * len(score.candidate.indices)
             tried.append((cost, score, gains, share, then))
@@ -125,13 +127,16 @@ def _next_name(
     explained = float(now.block.chi2.sum()) - least
     slack = max(min(task.limits.rival_chi2, task.limits.rival_share * explained), 0.0)
     alike = [one for one in tried if one[0] - least <= slack]
-    _, best, gains, share, then = min(
-        alike, key=lambda one: usual_first(task.model.space, one[4].theta, one[1].candidate)
-    )
-    rivals = dict.fromkeys(score.candidate.name for _, score, *_ in alike)
-    rivals.pop(best.candidate.name, None)
-    name = ViewName(best.candidate, best.p_value, tuple(gains.tolist()), share, tuple(rivals))
-    return name, fitted(task, then, [*beside, *best.candidate.indices])
+    space = task.model.space
+    alike.sort(key=lambda one: usual_first(space, one[4].theta, one[1].candidate))
+    for _, best, gains, share, then in alike:
+        last = fitted(task, then, [*beside, *best.candidate.indices])
+        if not at_bound(space, last.theta, best.candidate):
+            rivals = dict.fromkeys(score.candidate.name for _, score, *_ in alike)
+            rivals.pop(best.candidate.name, None)
+            gains = tuple(gains.tolist())
+            return ViewName(best.candidate, best.p_value, gains, share, tuple(rivals)), last
+    return None
 
 
 def _without_idle(
@@ -143,7 +148,9 @@ def _without_idle(
 ) -> tuple[list[ViewName], ViewEquations]:
     """Return the names that are still needed beside all others, weighed anew with their rivals."""
     start = task.model.space.array("start")
-    for one in list(named[:-1]):
+    for one in list(named):
+        if one is named[-1] and not at_bound(task.model.space, now.theta, one.candidate):
+            continue  # it was weighed just now
         others = [n for n in named if n is not one]
         theta = now.theta.copy()
         theta[list(one.candidate.indices)] = start[list(one.candidate.indices)]
@@ -151,7 +158,7 @@ def _without_idle(
             task, look(task, theta, now.weights), indices_of([n.candidate for n in others])
         )
         found = _next_name(task, without, others, [one.candidate], seed)
-        if found is None:
+        if found is None or at_bound(task.model.space, now.theta, one.candidate):
             named, now = others, without
         else:
             named = [replace(found[0], rivals=n.rivals) if n is one else n for n in named]
