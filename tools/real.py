@@ -24,8 +24,13 @@ from suite.cli import main
 FITTED = ("B10_lissajous_fast_rep1", "B2_circle_fast_rep2", "B3_figure8_fast_rep1",
           "B3_figure8_slow_rep2")  # fmt: skip
 """Flights of nanobench that make the vehicle file; the others are diagnosed."""
-MASSES = {"upgraded": (("log10", "log12"), ("log20", "log50", "log60", "log99", "log100", "log104",
-          "log110")), "standard": (("log150", "log155"), ("log160", "log170", "log180"))}  # fmt: skip
+MASSES = {
+    "upgraded": (
+        ("log10", "log12"),
+        ("log20", "log50", "log60", "log99", "log100", "log104", "log110"),
+    ),
+    "standard": (("log150", "log155"), ("log160", "log170", "log180")),
+}
 """Flights of crazyswarm2 by motors: reference, and those held against them."""
 
 
@@ -111,7 +116,10 @@ def changed(out: Path, references: Sequence[Path], flights: Sequence[Path]) -> s
 
 def crazypad(logs: Path, out: Path) -> list[str]:
     """Return the lines on crazypad: each condition's flights together, and each flight alone."""
-    lines = ["| logs, vehicle | condition | all flights together | each alone |", "|---|---|---|---|"]
+    lines = [
+        "| logs, vehicle | condition | all flights together | each alone |",
+        "|---|---|---|---|",
+    ]
     for kind in ("motor", "controller"):
         folder = out / kind
         flights = imported((logs / kind).iterdir(), folder / "flights", "--map", "crazypad",
@@ -124,7 +132,9 @@ def crazypad(logs: Path, out: Path) -> list[str]:
                 whole = "–" if condition == "normal_flight" else changed(
                     folder / f"{condition}__{vehicle}", normal, there)  # fmt: skip
                 alone = [changed(folder / path.stem, normal, [path]) for path in there]
-                lines.append(f"| {kind}, {vehicle} | {condition} | {whole} | {'<br>'.join(alone)} |")
+                lines.append(
+                    f"| {kind}, {vehicle} | {condition} | {whole} | {'<br>'.join(alone)} |"
+                )
     return lines
 
 

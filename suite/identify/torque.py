@@ -53,7 +53,6 @@ def fit_torque(
 ) -> Fitted:
     """Return inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
 
-
     Args:
         flights: on their grids, with body rates.
         vehicle: inertia and rotors to start from.

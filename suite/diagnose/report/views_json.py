@@ -10,8 +10,8 @@ import numpy as np
 from suite.diagnose.plans.separating import advice
 from suite.diagnose.report.parameters_json import parameters_json
 from suite.diagnose.views.by_views import ViewResult, ViewsDiagnosis
+from suite.diagnose.views.fit.search import ViewName
 from suite.diagnose.views.judged import gap_without
-from suite.diagnose.views.search import ViewName
 
 MEASURE = (
     "RMS over the axes of what the model leaves of {about} on held-out flights [{unit}], both "
@@ -70,8 +70,8 @@ def headline(found: ViewsDiagnosis) -> str:
     share = gap.share(gap.closed) / max(could, 1e-9)
     return (
         f"{names}{since}: the {view.name} on held-out flights is {gap.rms(gap.after):.3g} instead "
-        f"of {gap.rms(gap.before):.3g} {view.unit} off; of what any model could close of its changes "
-        f"within a flight here, {100 * min(share, 1.0):.0f} %."
+        f"of {gap.rms(gap.before):.3g} {view.unit} off; of what any model could close of its "
+        f"changes within a flight here, {100 * min(share, 1.0):.0f} %."
     )
 
 

@@ -15,7 +15,7 @@ from suite.diagnose.report.cells import grid, short_name
 from suite.diagnose.report.charts import AFTER, BEFORE, FLOOR
 from suite.diagnose.report.parameters_json import components
 from suite.diagnose.views.by_views import ViewsDiagnosis
-from suite.diagnose.views.equations import left_of
+from suite.diagnose.views.fit.equations import left_of
 from tracks.common.grid import Grid
 
 STRETCH_S = 10.0
@@ -24,9 +24,9 @@ WHAT = {"force": "acceleration", "torque": "angular acceleration"}
 CHANNELS = (
     "As given and with what was named: what the model leaves, as RMS. Noise floor: what the noise "
     "of the measured velocities or rates alone would leave. Repeatability: how far the means of "
-    "flights of the unchanged vehicle lie apart. Named: the share of the variance within a flight that the "
-    "names close; black box: what a regression without any physics closes of it, fitted to the same "
-    "flights. All on flights that took no part in finding or fitting anything."
+    "flights of the unchanged vehicle lie apart. Named: the share of the variance within a flight "
+    "that the names close; black box: what a regression without any physics closes of it, fitted "
+    "to the same flights. All on flights that took no part in finding or fitting anything."
 )
 FLIGHTS = (
     "The fall of the squared error of each flight under what the others' fit says, in units of "

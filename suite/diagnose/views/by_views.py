@@ -16,21 +16,21 @@ from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.hold_out import choose_held_out
 from suite.diagnose.fit.parameters import ParameterSpace, candidates, make_space
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.views.equations import ViewTask, half_widths, left_of, look
-from suite.diagnose.views.flights import ViewFlights, parted, ready
-from suite.diagnose.views.judged import ViewGap, judge
-from suite.diagnose.views.model import ForceModel
-from suite.diagnose.views.plausible import implausible
-from suite.diagnose.views.reference import (
+from suite.diagnose.views.data.flights import ViewFlights, parted, ready
+from suite.diagnose.views.data.view import View
+from suite.diagnose.views.fit.equations import ViewTask, half_widths, left_of, look
+from suite.diagnose.views.fit.model import ForceModel
+from suite.diagnose.views.fit.plausible import implausible
+from suite.diagnose.views.fit.reference import (
     RotorSpread,
     changed_task,
     in_balance,
     rotor_spread,
     search_change,
 )
-from suite.diagnose.views.search import ViewName, ViewSearch, search_view
-from suite.diagnose.views.view import View
-from suite.diagnose.views.weigh import weights_of
+from suite.diagnose.views.fit.search import ViewName, ViewSearch, search_view
+from suite.diagnose.views.fit.weigh import weights_of
+from suite.diagnose.views.judged import ViewGap, judge
 
 
 @dataclass(frozen=True)

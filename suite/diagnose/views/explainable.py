@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.views.rows import FlightRows
-from suite.diagnose.views.view import SmoothedFlight
+from suite.diagnose.views.data.rows import FlightRows
+from suite.diagnose.views.data.view import SmoothedFlight
 
 RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Weights of the coefficients' squares that are tried, against a moment's each."""

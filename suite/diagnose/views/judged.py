@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.views.equations import ViewTask, left_of
 from suite.diagnose.views.explainable import centred, closed_share, fit_black_box, inputs_of
-from suite.diagnose.views.search import ViewSearch
-from suite.diagnose.views.view import ViewData
+from suite.diagnose.views.fit.compare import ViewData
+from suite.diagnose.views.fit.equations import ViewTask, left_of
+from suite.diagnose.views.fit.search import ViewSearch
 
 
 class ViewGap(NamedTuple):

@@ -21,7 +21,7 @@ from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.fit.model import VehicleArrays
 from suite.diagnose.fit.parameters import ParameterLayout, ParameterSpace, effects_at
-from suite.diagnose.views.rows import FlightRows
+from suite.diagnose.views.data.rows import FlightRows
 
 CHUNK = 1024
 """Rows a call: one shape, compiled once."""

@@ -10,10 +10,10 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.views.completed import completed
-from suite.diagnose.views.rotors import acting_rotors
-from suite.diagnose.views.rows import FlightRows, rows_of
-from suite.diagnose.views.view import FORCE, TORQUE, SmoothedFlight, View, smoothed
+from suite.diagnose.views.data.completed import completed
+from suite.diagnose.views.data.rotors import acting_rotors
+from suite.diagnose.views.data.rows import FlightRows, rows_of
+from suite.diagnose.views.data.view import FORCE, TORQUE, SmoothedFlight, View, smoothed
 
 SLOW_WIDTH_S = 1.0
 """Width of the bumps where rates come from a path, which tells them as means over a second [s]."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from suite.diagnose.fit.normal_equations import NormalEquations
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.views.view import ViewData
+from suite.diagnose.views.fit.compare import ViewData
 
 
 class Weights(NamedTuple):

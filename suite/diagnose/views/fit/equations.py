@@ -10,9 +10,10 @@ from scipy.stats import t as student
 
 from suite.diagnose.fit.normal_equations import NormalEquations, gauss_newton_step
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.views.model import ForceModel
-from suite.diagnose.views.view import SmoothedFlight, View, ViewData, compare
-from suite.diagnose.views.weigh import Weights, blocks_of, equations_of
+from suite.diagnose.views.data.view import SmoothedFlight, View
+from suite.diagnose.views.fit.compare import ViewData, compare
+from suite.diagnose.views.fit.model import ForceModel
+from suite.diagnose.views.fit.weigh import Weights, blocks_of, equations_of
 
 
 class ViewTask(NamedTuple):

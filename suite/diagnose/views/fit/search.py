@@ -16,7 +16,7 @@ from eval.effects import EFFECTS
 from suite.diagnose.fit.parameters import Candidate, indices_of
 from suite.diagnose.fit.permutation import folds_of, score_candidates
 from suite.diagnose.fit.rivals import flights_agree
-from suite.diagnose.views.equations import (
+from suite.diagnose.views.fit.equations import (
     ViewEquations,
     ViewTask,
     chi2_by_flight,
@@ -24,8 +24,8 @@ from suite.diagnose.views.equations import (
     left_of,
     look,
 )
-from suite.diagnose.views.plausible import at_bound, usual_first
-from suite.diagnose.views.weigh import weights_of
+from suite.diagnose.views.fit.plausible import at_bound, usual_first
+from suite.diagnose.views.fit.weigh import weights_of
 
 
 @dataclass(frozen=True)

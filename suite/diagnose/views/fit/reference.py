@@ -19,7 +19,9 @@ from eval.effects import EFFECTS
 from suite.diagnose.fit.normal_equations import gauss_newton_step
 from suite.diagnose.fit.parameters import Candidate, indices_of
 from suite.diagnose.fit.rivals import flights_agree
-from suite.diagnose.views.equations import (
+from suite.diagnose.views.data.view import SmoothedFlight
+from suite.diagnose.views.fit.compare import compare
+from suite.diagnose.views.fit.equations import (
     ViewEquations,
     ViewTask,
     chi2_by_flight,
@@ -27,10 +29,9 @@ from suite.diagnose.views.equations import (
     left_of,
     look,
 )
-from suite.diagnose.views.plausible import at_bound, implausible
-from suite.diagnose.views.search import ViewName, ViewSearch, view_candidates
-from suite.diagnose.views.view import SmoothedFlight, compare
-from suite.diagnose.views.weigh import Weights, weights_of
+from suite.diagnose.views.fit.plausible import at_bound, implausible
+from suite.diagnose.views.fit.search import ViewName, ViewSearch, view_candidates
+from suite.diagnose.views.fit.weigh import Weights, weights_of
 
 
 @dataclass(frozen=True)

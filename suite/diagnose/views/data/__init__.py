@@ -1,0 +1,1 @@
+"""Real flights made ready: completed, driven, smoothed."""

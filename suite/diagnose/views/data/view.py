@@ -1,0 +1,57 @@
+"""Force and torque: what each view compares, flight by flight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.views.data.rows import FlightRows
+from suite.diagnose.views.data.weak_form import WeakForm, weak_form
+
+
+@dataclass(frozen=True)
+class View:
+    """One way to look at a flight: some equations under measurements of all else."""
+
+    name: str
+    """As in a diagnosis."""
+    about: str
+    """For people: what is compared under what."""
+    unit: str
+    """Of its three axes."""
+    columns: slice
+    """Of the model's accelerations."""
+    width_s: float
+    """Of the bumps that both sides are smoothed by [s]."""
+    in_world: bool
+    """Whether its accelerations are in world axes; they are turned into the body's."""
+    axes: tuple[int, ...] = (0, 1, 2)
+    """Of the body, along which it can be asked."""
+
+
+FORCE = View(
+    "force", "translation under the measured attitude and thrust", "m/s^2", slice(0, 3), 0.2, True
+)
+TORQUE = View(
+    "torque", "rotation under the measured rotor speeds", "rad/s^2", slice(3, 6), 0.1, False
+)
+VIEWS = (FORCE, TORQUE)
+"""In the order in which they are looked at."""
+
+
+class SmoothedFlight(NamedTuple):
+    """A flight's rows, with its measured side in one view."""
+
+    rows: FlightRows
+    form: WeakForm
+    measured: np.ndarray
+    """(M, 3) mean accelerations, axes as the view's model has them."""
+
+
+def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> SmoothedFlight:
+    """Return a flight's measured side in `view`."""
+    form = weak_form(rows.time_s, rows.good, view.width_s, limits.longest_hole_s)
+    return SmoothedFlight(rows, form, form.change @ (rows.vel_w if view.in_world else rows.rate_b))

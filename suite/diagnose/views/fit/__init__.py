@@ -1,0 +1,1 @@
+"""What flights agree on: the model on their rows, its equations, searches for names."""

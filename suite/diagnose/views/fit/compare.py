@@ -1,0 +1,48 @@
+"""How flights differ from the model at one set of numbers, moment by moment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from suite.diagnose.views.data.view import SmoothedFlight, View
+from suite.diagnose.views.fit.model import ForceModel, RowForces
+
+
+class ViewData(NamedTuple):
+    """M smoothed moments of all flights, in one view."""
+
+    flight: np.ndarray
+    """(M,) number of the flight."""
+    middle_s: np.ndarray
+    """(M,) since the first row of the flight [s]."""
+    value: np.ndarray
+    """(M, 3) the model's, body axes."""
+    residual: np.ndarray
+    """(M, 3) measured - model, body axes."""
+    slope: np.ndarray
+    """(M, 3, P) of the model along every number."""
+
+
+def compare(
+    view: View, model: ForceModel, theta: np.ndarray, flights: Sequence[SmoothedFlight]
+) -> ViewData:
+    """Return how `flights` differ from `model` at the numbers `theta` (P,)."""
+    parts = []
+    for number, flight in enumerate(flights):
+        forces: RowForces = model.at(theta, flight.rows)
+        mean, count = flight.form.mean, len(flight.form.middle_s)
+        value = mean @ forces.value[:, view.columns]
+        slope = forces.slope[:, view.columns].reshape(len(forces.slope), -1)
+        slope = (mean @ slope).reshape(count, 3, -1)
+        residual = flight.measured - value
+        if view.in_world:
+            to_body = np.swapaxes(flight.rows.rot_w[flight.form.middle_row], 1, 2)
+            residual, value = ((to_body @ part[..., None])[..., 0] for part in (residual, value))
+            slope = to_body @ slope
+        dumb = [axis for axis in range(3) if axis not in view.axes]
+        residual[:, dumb], slope[:, dumb] = 0.0, 0.0
+        parts.append(ViewData(np.full(count, number), flight.form.middle_s, value, residual, slope))
+    return ViewData(*(np.concatenate(field) for field in zip(*parts, strict=True)))

@@ -1,0 +1,123 @@
+"""What views are made of: weak accelerations, acting rotors, rows in flight, completed logs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import MotorMap
+from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.views.data.completed import completed
+from suite.diagnose.views.data.flights import parted, ready
+from suite.diagnose.views.data.rotors import acting_rotors
+from suite.diagnose.views.data.rows import rows_of
+from suite.diagnose.views.data.view import FORCE, TORQUE, smoothed
+from suite.diagnose.views.data.weak_form import weak_form
+from tests.support.real_flights import VEHICLE, flights
+
+
+def level(time_s, vel_w, **columns):
+    count = len(time_s)
+    quat = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+    still = np.zeros((count, 3))
+    return FlightLog("level", time_s, still, quat, vel_w, still, **columns)
+
+
+def hover_speed(vehicle=VEHICLE, share=1.0):
+    push = share * vehicle.mass * 9.81 / 4.0
+    return float(np.sqrt(push / vehicle.rotors.thrust_coefficient))
+
+
+def test_bumps_take_a_line_to_its_slope_whatever_the_stamps():
+    rng = np.random.default_rng(0)
+    time_s = np.sort(rng.uniform(0.0, 3.0, 400))
+    form = weak_form(time_s, np.ones(400, bool), 0.2, 0.1)
+    assert len(form.middle_s) > 20
+    assert np.allclose(form.change @ (2.5 * time_s - 1.0), 2.5)
+    assert np.allclose(form.mean @ np.full(400, -3.0), -3.0)
+
+
+def test_a_bump_sees_the_mean_of_what_the_model_is_smoothed_by():
+    time_s = np.arange(0.0, 4.0, 0.01)
+    form = weak_form(time_s, np.ones(400, bool), 0.2, 0.1)
+    velocity, acceleration = np.sin(3.0 * time_s), 3.0 * np.cos(3.0 * time_s)
+    assert np.abs(form.change @ velocity - form.mean @ acceleration).max() < 1e-3
+
+
+def test_no_bump_reaches_across_a_hole_or_a_bad_row():
+    time_s = np.arange(0.0, 4.0, 0.01)
+    good = np.ones(400, bool)
+    good[100] = False
+    time_s[300:] += 0.2
+    form = weak_form(time_s, good, 0.2, 0.1)
+    assert np.abs(form.middle_s - 1.0).min() > 0.095
+    assert np.abs(form.middle_s - 3.1).min() > 0.095
+
+
+def test_motor_commands_give_the_speeds_of_the_vehicles_map_and_lag():
+    time_s = np.arange(0.0, 2.0, 0.01)
+    pwm, volt = np.full((200, 4), 0.6), np.full(200, 3.5)
+    vehicle = replace(VEHICLE, motors=MotorMap((0.0, 8.0), 3.7, 1.0))
+    rotors = acting_rotors(level(time_s, np.zeros((200, 3)), pwm=pwm, voltage=volt), vehicle)
+    thrust = 8.0 * (0.6 * 3.5 / 3.7) ** 2
+    assert rotors is not None and rotors.each
+    assert np.allclose(rotors.speed**2 * vehicle.rotors.thrust_coefficient, thrust)
+    step = np.where(time_s[:, None] < 1.0, 0.3, 0.6) * np.ones(4)
+    still = replace(vehicle, motors=MotorMap((0.0, 8.0), 3.7, 0.0))
+    speed = acting_rotors(level(time_s, np.zeros((200, 3)), pwm=step), still).speed[:, 0]
+    after = speed[np.searchsorted(time_s, 1.0 + VEHICLE.rotors.time_constant)]
+    assert after == pytest.approx(speed[0] + (1 - np.exp(-1)) * (speed[-1] - speed[0]), rel=0.02)
+
+
+def test_a_collective_thrust_says_nothing_of_each_rotor():
+    time_s = np.arange(0.0, 2.0, 0.01)
+    log = level(time_s, np.zeros((200, 3)), thrust_cmd=np.full(200, 9.81),
+                rate_cmd_b=np.zeros((200, 3)))  # fmt: skip
+    rotors = acting_rotors(log, VEHICLE)
+    assert not rotors.each and np.allclose(rotors.speed, hover_speed())
+    assert [view.name for view in ready([log], VEHICLE).views] == ["force"]
+
+
+def test_motor_commands_without_a_map_are_refused_with_what_to_do():
+    time_s = np.arange(0.0, 2.0, 0.01)
+    log = level(time_s, np.zeros((200, 3)), pwm=np.full((200, 4), 0.5))
+    with pytest.raises(ValueError, match=r"\[motors\]"):
+        ready([log], VEHICLE)
+
+
+def test_what_stands_on_the_ground_is_no_flight():
+    time_s = np.arange(0.0, 10.0, 0.01)
+    on = (time_s < 4.0) | (time_s > 6.0)
+    speed = np.where(on, hover_speed(), 0.0)[:, None] * np.ones(4)
+    rows = rows_of(level(time_s, np.zeros((1000, 3))), VEHICLE, speed)
+    margin = THRESHOLDS.ground_margin_s
+    assert rows.good[time_s < 4.0 - margin - 0.02].all()
+    assert not rows.good[(time_s > 4.0 - margin + 0.02) & (time_s < 6.0 + margin - 0.02)].any()
+
+
+def test_a_path_says_how_a_quadrotor_leaned():
+    log = flights(1, trim=0.0)[0]
+    lacks = replace(log, quat_wxyz=np.full_like(log.quat_wxyz, np.nan),
+                    rate_b=np.full_like(log.rate_b, np.nan),
+                    about={"partial": ["quat", "rate"]})  # fmt: skip
+    whole = completed(lacks)
+    up, leaned = log.rot_w[50:-50, :, 2], whole.rot_w[50:-50, :, 2]
+    assert np.degrees(np.arccos(np.clip((up * leaned).sum(1), -1, 1))).mean() < 3.0
+    views = ready([lacks], VEHICLE).views
+    assert views[0].axes == (2,) and views[1].width_s > TORQUE.width_s
+
+
+def test_a_lone_flights_end_is_held_out():
+    both = ready(flights(1), VEHICLE)
+    fitted, held = parted(both, [])
+    last = fitted[FORCE.name][0].form.middle_s.max()
+    assert held[FORCE.name][0].form.middle_s.min() > last
+    assert last < THRESHOLDS.lone_fitted_share * 8.0
+
+
+def test_the_measured_side_of_a_view_is_a_mean_acceleration():
+    time_s = np.arange(0.0, 2.0, 0.01)
+    vel_w = np.stack([1.5 * time_s, 0.0 * time_s, -0.5 * time_s], axis=1)
+    rows = rows_of(level(time_s, vel_w), VEHICLE, np.full((200, 4), hover_speed()))
+    assert np.allclose(smoothed(FORCE, rows).measured, [1.5, 0.0, -0.5])

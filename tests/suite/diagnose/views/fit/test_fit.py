@@ -1,0 +1,162 @@
+"""The model on measured rows, weights of flights with trims, and the searches for names."""
+
+import numpy as np
+import pytest
+
+from suite.diagnose.fit.parameters import Candidate, candidates, make_space
+from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.views.data.flights import ready
+from suite.diagnose.views.data.view import FORCE, TORQUE
+from suite.diagnose.views.fit.compare import ViewData, compare
+from suite.diagnose.views.fit.equations import (
+    ViewTask,
+    chi2_by_flight,
+    half_widths,
+    in_thirds,
+    look,
+)
+from suite.diagnose.views.fit.model import ForceModel
+from suite.diagnose.views.fit.plausible import at_bound, implausible, usual_first
+from suite.diagnose.views.fit.reference import rotor_spread, search_change
+from suite.diagnose.views.fit.search import search_view
+from suite.diagnose.views.fit.weigh import Weights, blocks_of, equations_of, weighed, weights_of
+from tests.support.real_flights import VEHICLE, flights
+from tests.support.vehicles import with_effects
+
+SPACE = make_space(VEHICLE)
+DRAG = (0.4, 0.3, 0.2)
+
+
+def task_of(logs, view=FORCE, vehicle=VEHICLE):
+    model = ForceModel(vehicle, make_space(vehicle), False)
+    return ViewTask(view, model, ready(logs, vehicle).smoothed[view.name])
+
+
+@pytest.fixture(scope="module")
+def dragged():
+    return flights(4, linear_drag=(DRAG,))
+
+
+def made(rng, count=6, moments=200, trim=(0.5, 0.0, 2.0), scatter=0.3):
+    flight = np.repeat(np.arange(count), moments)
+    means = rng.standard_normal((count, 3)) * trim
+    residual = scatter * rng.standard_normal((count * moments, 3)) + means[flight]
+    middle = np.tile(np.arange(moments) * 0.1, count)
+    return ViewData(flight, middle, 0.0 * residual, residual, np.ones((len(flight), 3, 1)))
+
+
+def test_the_vehicle_itself_leaves_only_noise_and_a_drag_leaves_the_drag(dragged):
+    task = task_of(flights(1, trim=0.0))
+    data = compare(FORCE, task.model, SPACE.array("start"), task.flights)
+    assert np.abs(data.residual.mean(axis=0)).max() < 0.03
+    true = with_effects(VEHICLE, linear_drag=(DRAG,))
+    with_it, without = task_of(dragged, vehicle=true), task_of(dragged)
+    power = [
+        (compare(FORCE, t.model, t.model.space.array("start"), t.flights).residual ** 2).mean()
+        for t in (with_it, without)
+    ]
+    assert power[0] < 0.1 * power[1]
+
+
+def test_slopes_are_those_of_finite_differences():
+    task, theta = task_of(flights(1)), SPACE.array("start")
+    first = compare(FORCE, task.model, theta, task.flights)
+    for index in (0, 10, 25):
+        moved = theta.copy()
+        moved[index] += 1e-5
+        change = compare(FORCE, task.model, moved, task.flights).value - first.value
+        assert np.allclose(change / 1e-5, first.slope[..., index], atol=1e-4, rtol=1e-3)
+
+
+def test_trims_of_flights_are_told_from_scatter_within_them():
+    weights = weights_of(made(np.random.default_rng(1), count=60))
+    assert weights.scatter == pytest.approx([0.3, 0.3, 0.3], rel=0.05)
+    assert weights.trim == pytest.approx([0.5, 0.0, 2.0], abs=0.35)
+    assert np.isinf(weights_of(made(np.random.default_rng(1), count=2)).trim).all()
+
+
+def test_weighed_moments_of_flights_with_trims_are_independent_units():
+    rng = np.random.default_rng(2)
+    weights = Weights(np.full(3, 0.3), np.ones(3), np.array([0.5, 0.0, 2.0]))
+    means, within = [], []
+    for _ in range(200):
+        data = made(rng, count=1, moments=50)
+        residual, _ = weighed(data, weights)
+        means.append(residual.sum(axis=0) / np.sqrt(50))
+        within.append(residual.std(axis=0))
+    assert np.std(means, axis=0) == pytest.approx([1.0, 1.0, 1.0], rel=0.2)
+    assert np.mean(within, axis=0) == pytest.approx([1.0, 1.0, 1.0], rel=0.05)
+
+
+def test_blocks_stand_apart_and_thirds_are_means():
+    data = made(np.random.default_rng(3), count=2, moments=60)
+    block = blocks_of(data)
+    assert block.max() + 1 == 2 * 3  # 6 s in blocks of 2 s
+    weights = weights_of(data)
+    assert equations_of(data, weights, block).hessian.shape == (6, 1, 1)
+    thirds = in_thirds(data)
+    assert len(thirds.flight) == 6
+    assert np.allclose(thirds.residual[0], data.residual[:20].mean(axis=0))
+
+
+def test_a_drag_is_named_with_its_numbers_by_flights_that_agree(dragged):
+    found = search_view(task_of(dragged), candidates(SPACE, False, ()))
+    (name,) = found.named
+    assert name.candidate.name == "linear_drag" and (np.array(name.gains) > 0.0).all()
+    at = list(name.candidate.indices)
+    width = half_widths(found.last, at)
+    assert (np.abs(found.last.theta[at] - DRAG) < 2.0 * width + 0.02).all()
+    assert width[:2].max() < 0.1
+
+
+def test_trims_that_differ_from_flight_to_flight_are_no_effect():
+    logs = flights(4, seed=3)
+    for view in (FORCE, TORQUE):
+        assert search_view(task_of(logs, view), candidates(SPACE, False, ())).named == ()
+
+
+def test_a_flight_is_judged_by_what_the_others_say(dragged):
+    task = task_of(dragged)
+    drag = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "linear_drag"]
+    start = SPACE.array("start")
+    data = compare(FORCE, task.model, start, task.flights)
+    first = look(task, start, weights_of(data))
+    gains = chi2_by_flight(task, first, []) - chi2_by_flight(task, first, drag)
+    assert gains.shape == (4,) and (gains > 0.0).all()
+
+
+def changes(logs, references):
+    among, found = candidates(SPACE, False, ()), {}
+    before = [task_of(references, view) for view in (FORCE, TORQUE)]
+    after = [task_of(logs, view) for view in (FORCE, TORQUE)]
+    spread = rotor_spread([*before, *after])
+    for reference, task in zip(before, after, strict=True):
+        search = search_change(reference, task.flights, spread, among)
+        found[task.view.name] = [name.candidate.label for name in search.named]
+    return found
+
+
+def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong():
+    wrong = {"thrust_scale": (0.9,), "linear_drag": (DRAG,)}
+    references = flights(3, seed=5, speed=1.0, **wrong)
+    weak = flights(3, seed=6, speed=1.0, weak_motor=((1.0, 1.0, 0.8, 1.0),), **wrong)
+    assert "weak_motor 3" in changes(weak, references)["torque"]
+    assert changes(flights(3, seed=7, speed=1.0, **wrong), references) == {
+        "force": [],
+        "torque": [],
+    }
+
+
+def test_sizes_beyond_three_times_the_usual_are_implausible():
+    at = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "frame_tilt"]
+    tilt = Candidate("frame_tilt", tuple(at), "frame_tilt")
+    theta = SPACE.array("start")
+    assert implausible(SPACE, theta, tilt) == []
+    theta[at[0]] = 1.1 * THRESHOLDS.implausible_times * 0.035
+    assert len(implausible(SPACE, theta, tilt)) == 1
+    assert not at_bound(SPACE, theta, tilt)
+    theta[at[0]] = SPACE.array("high")[at[0]]
+    assert at_bound(SPACE, theta, tilt)
+    assert usual_first(SPACE, theta, tilt) > usual_first(SPACE, SPACE.array("start"), tilt)
+    drag = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "linear_drag"]
+    assert not at_bound(SPACE, theta, Candidate("linear_drag", tuple(drag), "linear_drag"))
