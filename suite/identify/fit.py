@@ -250,7 +250,7 @@ def _errors(
     widest = Z95 * np.sqrt(np.maximum(np.diag(blocks), 0.0))
     if len(flights) >= FEWEST:
         spread = np.array([(each**2).sum(axis=0) for each in by_flight])[flights]
-        q = (sums[flights] ** 2 / np.maximum(spread, TINY0)).sum(axis=0)
+        q = (sums[flights] ** 2 / np.maximum(spread, 1e-300)).sum(axis=0)
         between = len(flights) / (len(flights) - 1) * (sums[flights] ** 2).sum(axis=0)
         wide = float(t.ppf(0.975, len(flights) - 1)) * np.sqrt(between)
         differ = chi2.sf(q, len(flights) - 1) < DIFFER_P
@@ -260,7 +260,7 @@ def _errors(
     floor = np.array([unknowns[k].floor for k in free])
     widest = np.sqrt(widest**2 + floor**2)
     sd = np.sqrt(np.diag(blocks))
-    alike = blocks / np.maximum(np.outer(sd, sd), TINY)
+    alike = blocks / np.maximum(np.outer(sd, sd), 1e-30)
     np.fill_diagonal(alike, 1.0)
     half[told] = widest[told]
     return alike * np.outer(widest, widest) / Z95**2, half
