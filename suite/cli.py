@@ -25,6 +25,7 @@ COMMANDS: dict[str, str] = {
     "blind": "test cases with hidden effects for the diagnosis: make, run, score",
     "collect": "fly a policy and record every flight as a log",
     "diagnose": "name the physical effect that a vehicle file lacks, by flight logs",
+    "identify": "find the numbers of a vehicle file in flight logs",
     "effects": "the physical effects that a vehicle file may hold",
     "eval": "judge policies: success rates, speeds and lap times, with intervals",
     "example": "flights with a hidden effect, to try the diagnosis on",

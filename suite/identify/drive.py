@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import MotorMap, Vehicle
 from suite.identify.grid import STEP_S, FlightGrid
 
 DRIVES = {
@@ -45,6 +46,31 @@ def drive_of(flights: Sequence[FlightGrid]) -> str:
         "the flights share no drive: every one needs rotor speeds, motor commands (pwm_1 to "
         "pwm_4), or a thrust command with rates or torques"
     )
+
+
+def with_motors(flights: Sequence[FlightGrid], vehicle: Vehicle) -> Vehicle:
+    """Return the vehicle with `[motors]`: full speed at full command where it had none."""
+    if vehicle.motors is not None:
+        return vehicle
+    volts = _volts(flights, 1.0)
+    return replace(vehicle, motors=MotorMap((0.0, vehicle.rotors.thrust_max), volts))
+
+
+def _volts(flights: Sequence[FlightGrid], otherwise: float) -> float:
+    have = [f.known["voltage"] for f in flights if f.has("voltage")]
+    return float(np.nanmedian(np.concatenate(have))) if have else otherwise
+
+
+def guess_of(flights: Sequence[FlightGrid], vehicle: Vehicle) -> MotorGuess:
+    """Return the start's motors about the command and the voltage that are usual here."""
+    motors = vehicle.motors
+    assert motors is not None
+    usual = float(np.nanmedian(np.concatenate([f.known["pwm"].ravel() for f in flights])))
+    volts = _volts(flights, motors.voltage)
+    first, second = motors.thrust
+    v = usual * (volts / motors.voltage) ** motors.voltage_exponent
+    size = first * v + second * v**2
+    return MotorGuess(size, second * v**2 / size, motors.voltage_exponent, usual, volts)
 
 
 def delayed(values: np.ndarray, delay_s: float) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Least squares with intervals from how parts of flights, and flights, disagree.
 
-Gauss and Newton with Huber's weights. A number's error is the sandwich of the influences of blocks
-of a flight (White 1980; blocks as neighbouring windows are not independent). Where the flights
+Gauss and Newton with Huber's weights. A number's error is the jackknife of blocks of a
+flight (the sandwich CR3; neighbouring windows are not independent). Where the flights
 differ by more than their blocks explain (Cochran's Q), the flights are the units and Student's t
 their quantile. A number that the flights cannot tell is left as it was, the worst first, and the
 others are fitted again.
@@ -17,6 +17,10 @@ import numpy as np
 
 Z95 = 1.96
 HUBER = 2.5
+BLIND = 0.3
+"""No interval is narrower than this share of what independent windows would make of it."""
+TINY = 1e-12
+"""Information below this is none."""
 RIDGE = 1e-9
 SMALL = 0.03
 """A step below this many standard deviations of every number is the last."""
@@ -38,6 +42,9 @@ class Unknown(NamedTuple):
     """It is told where its 95 % interval reaches less far than this to either side."""
     step: float
     """Of the finite differences."""
+    floor: float = 0.0
+    """How far the method itself is off where nothing is noisy, by simulation; added to the
+    half-width in squares."""
 
 
 class Rows(NamedTuple):
@@ -65,7 +72,7 @@ class Fitted:
     half_width: np.ndarray
     """(P,) of the 95 % interval; NaN where the number was left as it was."""
     covariance: np.ndarray
-    """(P, P) behind the intervals; zero for what was left."""
+    """(P, P) behind the intervals; of what was left, the doubt about it."""
     untold: tuple[str, ...] = ()
     """Left as they were: these flights cannot tell them."""
     left: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -80,13 +87,20 @@ class Fitted:
         return [u.name for u in self.unknowns].index(name)
 
 
-def fit(misses: Misses, unknowns: Sequence[Unknown]) -> Fitted:
+def fit(misses: Misses, unknowns: Sequence[Unknown], held: Sequence[str] = ()) -> Fitted:
     """Return the numbers that make `misses` least, with intervals.
+
+    What is left as it was may be wrong by its `room`; that is part of the others' intervals.
+
+    Args:
+        misses: the residuals.
+        unknowns: the numbers.
+        held: those that are left as they are from the first.
 
     Raises:
         ValueError: where there is not one window.
     """
-    unknowns, untold = tuple(unknowns), []
+    unknowns, untold = tuple(unknowns), list(held)
     value = np.array([unknown.start for unknown in unknowns])
     if not sum(len(rows.value) for rows in misses(value)):
         raise ValueError("no stretch of these flights is whole enough to compare anything in")
@@ -158,7 +172,7 @@ def _least(
         weights = _weights(rows)
         slopes = _slopes(misses, unknowns, value, free)
         square, pull = _normal(rows, weights, slopes)
-        scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
+        scale = np.sqrt(np.maximum(np.diag(square), TINY))
         change = -np.linalg.lstsq(square / np.outer(scale, scale), pull / scale, rcond=1e-9)[0]
         change = change / scale
         before = _cost(rows, weights)
@@ -204,25 +218,33 @@ def _errors(
     from scipy.stats import chi2, t
 
     total = len(unknowns)
-    covariance, half = np.zeros((total, total)), np.full(total, np.nan)
+    half = np.full(total, np.nan)
     if not free:
-        return covariance, half
+        return np.diag([unknown.room**2 for unknown in unknowns]), half
+    told, free = list(free), range(total)
     rows, slopes = misses(value), _slopes(misses, unknowns, value, free)
     weights = _weights(rows)
     square, _ = _normal(rows, weights, slopes)
-    scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
+    doubt = np.array([0.0 if k in told else 1.0 / unknowns[k].room ** 2 for k in free])
+    square = square + np.diag(doubt)
+    scale = np.sqrt(np.maximum(np.diag(square), TINY))
     # The ridge makes what cannot be told apart wide, where a pseudo-inverse would hide it.
     ridge = RIDGE * np.eye(len(free))
     inverse = np.linalg.inv(square / np.outer(scale, scale) + ridge) / np.outer(scale, scale)
     by_flight = []
     for row, weight, slope in zip(rows, weights, slopes, strict=True):
         off, along = _freed(row.value, weight, row.level), _freed(slope, weight, row.level)
-        pulls = np.einsum("nc,nci,nc->ni", weight, along, off)
-        each = np.array([pulls[row.block == b].sum(axis=0) for b in np.unique(row.block)])
-        by_flight.append(each.reshape(-1, len(free)) @ inverse)
+        each = []
+        for number in np.unique(row.block):
+            w, a, o = (part[row.block == number] for part in (weight, along, off))
+            # What all others say of the numbers: a block with much to say fits itself.
+            others = square - np.einsum("nc,nci,ncj->ij", w, a, a)
+            others = np.linalg.inv(others / np.outer(scale, scale) + ridge)
+            others = others / np.outer(scale, scale)
+            each.append(others @ np.einsum("nc,nci,nc->i", w, a, o))
+        by_flight.append(np.array(each).reshape(-1, len(free)))
     influence = np.concatenate(by_flight)
-    freedom = max(len(influence) - len(free), 1)
-    blocks = len(influence) / freedom * influence.T @ influence
+    blocks = influence.T @ influence + inverse @ np.diag(doubt) @ inverse
     sums = np.array([each.sum(axis=0) for each in by_flight])
     flights = [k for k, each in enumerate(by_flight) if len(each)]
     widest = Z95 * np.sqrt(np.maximum(np.diag(blocks), 0.0))
@@ -233,13 +255,15 @@ def _errors(
         wide = float(t.ppf(0.975, len(flights) - 1)) * np.sqrt(between)
         differ = chi2.sf(q, len(flights) - 1) < DIFFER_P
         widest = np.where(differ, np.maximum(widest, wide), widest)
-    # No interval is narrower than white noise of this size makes it.
-    widest = np.maximum(widest, Z95 * np.sqrt(np.diag(inverse)))
-    stretch = widest / np.maximum(Z95 * np.sqrt(np.maximum(np.diag(blocks), 1e-300)), 1e-300)
-    index = np.array(free)
-    covariance[np.ix_(index, index)] = blocks * np.outer(stretch, stretch)
-    half[index] = widest
-    return covariance, half
+    # What white noise of this size makes of it: where that is far more, the equations are blind.
+    widest = np.maximum(widest, BLIND * Z95 * np.sqrt(np.diag(inverse)))
+    floor = np.array([unknowns[k].floor for k in free])
+    widest = np.sqrt(widest**2 + floor**2)
+    sd = np.sqrt(np.diag(blocks))
+    alike = blocks / np.maximum(np.outer(sd, sd), 1e-30)
+    np.fill_diagonal(alike, 1.0)
+    half[told] = widest[told]
+    return alike * np.outer(widest, widest) / Z95**2, half
 
 
 def _left(misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray) -> np.ndarray:

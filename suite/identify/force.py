@@ -23,13 +23,13 @@ def unknowns_of(
     drive: str, guess: MotorGuess, voltage: bool, drag: Sequence[float]
 ) -> list[Unknown]:
     """Return the numbers of the force; their starts are those of the vehicle file."""
-    unknowns = [Unknown("thrust", 0.0, -2.0, 2.0, 0.25, 1e-3)]
+    unknowns = [Unknown("thrust", 0.0, -2.0, 2.0, 0.25, 1e-3, 0.001)]
     if drive == "pwm":
-        unknowns.append(Unknown("curve", guess.curve, -0.3, 1.0, 0.35, 1e-2))
+        unknowns.append(Unknown("curve", guess.curve, -0.1, 1.0, 0.35, 1e-2, 0.02))
         if voltage:
-            unknowns.append(Unknown("battery", guess.battery, -0.5, 4.0, 0.6, 1e-2))
+            unknowns.append(Unknown("battery", guess.battery, 0.0, 4.0, 0.6, 1e-2, 0.02))
     for axis, start in zip("xyz", drag, strict=True):
-        unknowns.append(Unknown(f"drag_{axis}", start, -2.0, 5.0, 0.25, 1e-2))
+        unknowns.append(Unknown(f"drag_{axis}", start, -2.0, 5.0, 0.25, 1e-2, 0.004))
     return unknowns
 
 
@@ -70,7 +70,7 @@ def fit_force(
                 over(windows, up_w * force[:, None]),
             )
             drag = np.array([told.get(f"drag_{axis}", 0.0) for axis in "xyz"])
-            out.append(Rows(felt - pushed + drag_b * drag, block, LEVEL))
+            out.append(Rows(felt - pushed + drag_b @ drag, block, LEVEL))
         return out
 
     return fit(misses, unknowns)
@@ -120,7 +120,9 @@ def _prepared(flight: FlightGrid, driven: str) -> tuple:
     felt_w = acc_w + [0.0, 0.0, GRAVITY]
     felt = np.einsum("kji,kj->ki", rot_w[windows.middle], felt_w)
     vel_b = np.einsum("gji,gj->gi", rot_w, vel_w)
-    drag_b = over(windows, np.nan_to_num(vel_b))
+    # What a unit of drag along each body axis pushes, in the axes of the window's middle.
+    pulled_w = over(windows, rot_w * np.nan_to_num(vel_b)[:, None, :])
+    drag_b = np.einsum("kji,kjd->kid", rot_w[windows.middle], pulled_w)
     return windows, rot_w[:, :, 2], drag_b, felt, blocks_of(flight, windows, BLOCK_S)
 
 

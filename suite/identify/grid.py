@@ -1,7 +1,7 @@
 """Flights on a fine grid, and smooth windows in which their equations are compared.
 
-An equation of motion is multiplied by a smooth window and integrated (modulating functions; Shinbrot
-1957): `mean(dv/dt)` over a window `p` is `-mean over p' (v)`, so that nothing noisy is
+An equation of motion is multiplied by a smooth window and integrated (modulating functions;
+Shinbrot 1957): `mean(dv/dt)` over a window `p` is `-mean over p' (v)`, so that nothing noisy is
 differentiated, and both sides are smoothed alike.
 """
 
@@ -21,7 +21,7 @@ MEMORY_S = 0.4
 """What was commanded longer ago than this acts no more [s]."""
 HOLE_STEPS = 4.0
 """Rows further apart than so many median steps are a hole, over which nothing is compared."""
-VOLTAGE_S = 0.3
+VOLTAGE_S = 0.04
 """The voltage's noise is averaged over about this [s]."""
 
 
@@ -105,13 +105,12 @@ def windows_of(flight: FlightGrid, width_s: float, needs: Sequence[str]) -> Wind
         good &= np.isfinite(values.reshape(len(values), -1)).all(axis=1)
     bad = np.concatenate([[0], np.cumsum(~good)])
     whole = bad[first + count] == bad[first]
-    rate = turn / STEP_S
-    return Windows(
-        first[whole],
-        scale * weight,
-        -scale * rate * np.sin(phase),
-        scale * rate**2 * np.cos(phase),
-    )
+    # Exact on lines and parabolas, so that where a signal is adds nothing to how it bends.
+    time_s = STEP_S * (np.arange(count) - count // 2)
+    slope, bend = -np.sin(phase), np.cos(phase)
+    bend[[0, -1]] *= 0.5
+    slope, bend = slope / (slope @ time_s), 2.0 * bend / (bend @ time_s**2)
+    return Windows(first[whole], scale * weight, slope, bend)
 
 
 def over(windows: Windows, values: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:

@@ -9,6 +9,7 @@ Per axis, `lag d2w/dt2 + dw/dt + K w = K rate_cmd(t - delay)`, as the controller
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ FREE = np.array([True, True, True])
 
 def gains() -> list[Unknown]:
     """Return the loop's gains as logarithms of ratios to the start's."""
-    return [Unknown(f"gain_{axis}", 0.0, -3.0, 3.0, 0.35, 1e-2) for axis in "xyz"]
+    return [Unknown(f"gain_{axis}", 0.0, -3.0, 3.0, 0.35, 1e-2, 0.02) for axis in "xyz"]
 
 
 def fit_loop(
@@ -69,8 +70,8 @@ def followed(flight: FlightGrid, vehicle: Vehicle, told: Mapping[str, float]) ->
     out = np.empty_like(wanted)
     for k, axis in enumerate("xyz"):
         gain = vehicle.controller.rate_gain[k] * float(np.exp(told.get(f"gain_{axis}", 0.0)))
-        top, bottom, _ = cont2discrete(([gain], [lag, 1.0, gain]), STEP_S, method="foh")
-        top = top.ravel()
+        found: Any = cont2discrete(([gain], [lag, 1.0, gain]), STEP_S, method="foh")
+        top, bottom = np.ravel(found[0]), found[1]
         state = lfilter_zi(top, bottom) * wanted[0, k]
         out[:, k] = lfilter(top, bottom, wanted[:, k], zi=state)[0]
     return out

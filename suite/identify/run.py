@@ -8,9 +8,9 @@ from typing import Any
 
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
-from suite.common.choices import flight_files
 from suite.common.console import Console
 from suite.common.provenance import stamp
+from suite.delta.run import flight_files
 from suite.identify.identify import Identified, identify
 from suite.identify.numbers import as_json
 

@@ -15,8 +15,8 @@ from suite.identify.grid import FlightGrid, Windows, blocks_of, over, windows_of
 
 WIDTH_S = 0.2
 BAND = WIDTH_S / (2.0 * np.pi)
-"""Torques are compared in windows of no mean, as changes within one: what a flight asks of the motors
-slowly (trim, flapping at speed) turns nothing. Times this they are accelerations [rad/s^2]."""
+"""Torques are compared in windows of no mean, as changes within one: what a flight asks of the
+motors slowly (trim, flapping at speed) turns nothing. Times this they are accelerations."""
 SPEED_WIDTH_S = 0.16
 LEVEL = np.array([False, False, False])
 
@@ -29,17 +29,17 @@ def lag_and_delay(lag_s: float, delay_s: float) -> list[Unknown]:
 
     Slow flights tell how late it is in all, `late`, and not how much of that is the lag.
     """
-    late = Unknown("late", lag_s + delay_s, -0.02, 0.3, 0.012, 1e-3)
-    return [late, Unknown("lag", lag_s, 0.0, 0.3, 0.012, 1e-3)]
+    late = Unknown("late", lag_s + delay_s, -0.02, 0.3, 0.012, 1e-3, 0.0007)
+    return [late, Unknown("lag", lag_s, 0.0, 0.3, 0.012, 1e-3, 0.0007)]
 
 
 def unknowns_of(drive: str, lag_s: float, delay_s: float) -> list[Unknown]:
     """Return the numbers of the torque; all but lag and delay are logarithms of ratios."""
     lags = lag_and_delay(lag_s, delay_s)
-    axes = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.3, 1e-2) for a in "xy"]
+    axes = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
     if drive == "torques":
-        return [*axes, Unknown("inertia_z", 0.0, -2.0, 2.0, 0.3, 1e-2), *lags]
-    yaw = Unknown("yaw", 0.0, -2.0, 2.0, 0.3, 1e-2)
+        return [*axes, Unknown("inertia_z", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015), *lags]
+    yaw = Unknown("yaw", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015)
     return [*axes, yaw] if drive == "rotors" else [*axes, yaw, *lags]
 
 
@@ -50,6 +50,7 @@ def fit_torque(
     unknowns: Sequence[Unknown],
     thrusts: Thrusts | None,
     fixed: Mapping[str, float],
+    held: Sequence[str] = (),
 ) -> Fitted:
     """Return inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
 
@@ -60,6 +61,7 @@ def fit_torque(
         unknowns: from `unknowns_of`.
         thrusts: of the rotors, under pwm and rotors.
         fixed: numbers that are not looked for.
+        held: numbers that are left as they are, in doubt.
     """
     given, names = unknowns, [unknown.name for unknown in unknowns]
     needs = {"pwm": "pwm", "rotors": "rotor_speed", "torques": "torque_cmd_b"}[drive]
@@ -78,9 +80,9 @@ def fit_torque(
     if late:
         best = _likeliest([unknown.start for unknown in unknowns], late[0], misses, prepared)
         unknowns = [u._replace(start=best) if u.name == "late" else u for u in unknowns]
-        found = fit(misses, unknowns)
+        found = fit(misses, unknowns, held)
         return replace(found, unknowns=tuple(given))
-    return fit(misses, unknowns)
+    return fit(misses, unknowns, held)
 
 
 def _likeliest(

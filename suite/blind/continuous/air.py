@@ -37,6 +37,8 @@ class Moment(NamedTuple):
     """(N, 1) since the first row [s]."""
     fallen_v: np.ndarray
     """(N, 1) voltage of the first row less the present one [V]."""
+    spin_up: np.ndarray | float = 0.0
+    """(N, 4) change of the rotor speeds [rad/s^2]."""
 
 
 Force = Callable[[Any, Moment], np.ndarray]
@@ -108,6 +110,12 @@ def _rotor_gyroscopic(effect: Any, at: Moment) -> np.ndarray:
     return -effect.rotor_inertia * net * _times_e3(at.rate_b)
 
 
+def _rotor_spin_up(effect: Any, at: Moment) -> np.ndarray:
+    """tau_b += -J_r (sum s_i dOmega_i/dt) e3."""
+    net = (at.spin_up * at.spin * np.ones_like(at.speed)).sum(axis=1, keepdims=True)
+    return -effect.rotor_inertia * net * [0.0, 0.0, 1.0]
+
+
 def _angular_damping(effect: Any, at: Moment) -> np.ndarray:
     """tau_b += -J d w."""
     return -at.inertia * np.multiply(effect.coefficient, at.rate_b)
@@ -135,6 +143,7 @@ TORQUES: dict[str, Force] = {
     "blade_flapping": _blade_flapping,
     "torque_trim": _torque_trim,
     "rotor_gyroscopic": _rotor_gyroscopic,
+    "rotor_spin_up": _rotor_spin_up,
     "angular_damping": _angular_damping,
 }
 """By effect: (values, moment) to a torque (N, 3), body axes [N m]."""

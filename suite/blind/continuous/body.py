@@ -44,6 +44,8 @@ class Body:
         self._gyroscopic = np.array([z - y, x - z, y - x])
         self._ends = wind.now_w, wind.now_w
         self._first_drop: np.ndarray | None = None
+        self._asked: np.ndarray | None = None
+        self._jump: np.ndarray | float = 0.0
 
     @property
     def blowing(self) -> np.ndarray:
@@ -60,6 +62,20 @@ class Body:
         """Move the air on by a step."""
         if not self._wind.still:
             self._ends = self._wind.step(state[:, VEL], length_s)
+
+    def ask(self, speed: np.ndarray, wanted: np.ndarray, length_s: np.ndarray) -> None:
+        """Note what the rotors are asked for in a step of `length_s` (N, 1), from `speed` (N, 4)."""
+        if self.quadrotor.time_constant > 0.0:
+            self._asked = wanted
+        else:
+            # Rotors that follow at once do so within the step.
+            self._jump = (wanted - speed) / np.maximum(length_s, 1e-9)
+
+    def spin_up(self, speed: np.ndarray) -> np.ndarray | float:
+        """Return the change of the rotor speeds (N, 4) at `speed` (N, 4) [rad/s^2]."""
+        if self._asked is None:
+            return self._jump
+        return (self._asked - speed) / self.quadrotor.time_constant
 
     def wind_w(self, share: float) -> np.ndarray:
         """Return the wind (N, 3) at `share` of the present step [m/s]."""
@@ -82,7 +98,7 @@ class Body:
         none = self._first_drop is None
         fallen = np.zeros_like(time_s) if none else self.drop(time_s, speed) - self._first_drop
         at = Moment(q.mass, q.inertia, q.arm, q.spin, state[:, POS], rot_w, air_b,
-                    state[:, RATE], speed, time_s, fallen)  # fmt: skip
+                    state[:, RATE], speed, time_s, fallen, self.spin_up(speed))  # fmt: skip
         squared = speed * speed
         thrust = q.thrust_coefficient * squared
         for change, effect in self._thrusts:

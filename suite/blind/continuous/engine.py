@@ -130,6 +130,7 @@ def _step(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return state and rotor speeds after a step of `length` (N, 1) [s] from `begin` (N, 1) [s]."""
     lag = body.quadrotor.time_constant
+    body.ask(speed, wanted, length)
     half = 0.5 * length
     if lag > 0.0:
         behind = speed - wanted

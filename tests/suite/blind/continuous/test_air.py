@@ -118,6 +118,13 @@ def test_rotor_gyroscopic():
     np.testing.assert_allclose(torque, [[0.004, 0.008, 0.0]], atol=1e-16)
 
 
+def test_rotor_spin_up():
+    # 100 + 50 + 0 - 25 = 125 (clockwise ones count against): -2e-5 x 125
+    at = moment(spin_up=np.array([[100.0, -50.0, 0.0, 25.0]]))
+    torque = TORQUES["rotor_spin_up"](effect(rotor_inertia=2e-5), at)
+    np.testing.assert_allclose(torque, [[0.0, 0.0, -0.0025]], atol=1e-16)
+
+
 def test_angular_damping():
     # -(0.002, 0.003, 0.004) x (1, 2, 3) x (2, -1, 0.5)
     torque = TORQUES["angular_damping"](effect(coefficient=(1.0, 2.0, 3.0)), moment())

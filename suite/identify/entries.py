@@ -1,0 +1,189 @@
+"""What the fits found, as entries of a vehicle file, and a vehicle with them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from eval.effects.interface import at
+from eval.vehicles.vehicle import Vehicle
+from suite.identify import force
+from suite.identify.drive import MotorGuess
+from suite.identify.fit import Fitted
+from suite.identify.numbers import Number, number
+
+
+def inertia_of(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
+    """Return the inertia (3,); what yaws is scaled as the others where nothing tells it."""
+    x, y = (numbers.get(f"inertia_{axis}", 0.0) for axis in "xy")
+    z = numbers.get("inertia_z", 0.5 * (x + y))
+    found = np.asarray(vehicle.inertia) * np.exp([x, y, z])
+    # No body has more about one axis than about the other two together.
+    return np.minimum(found, found.sum() - found)
+
+
+def motors_of(guess: MotorGuess, numbers: Mapping[str, float], volts: float) -> np.ndarray:
+    """Return t1, t2 [N] and the exponent of `[motors]` at the nominal voltage `volts`."""
+    shape = force.with_told(guess, numbers)
+    size = shape.size * np.exp(numbers.get("thrust", 0.0))
+    per = (volts / shape.volts) ** shape.battery / shape.usual
+    first, second = (1.0 - shape.curve) * per, shape.curve * per**2
+    return np.array([size * first, size * second, shape.battery])
+
+
+def of_force(vehicle: Vehicle, drive: str, guess: MotorGuess, fitted: Fitted) -> list[Number]:
+    """Return the entries that the force tells: motors or rotors, and drag."""
+    entries = []
+    names = [unknown.name for unknown in fitted.unknowns]
+    if "thrust" in names and drive == "pwm":
+        assert vehicle.motors is not None
+        volts = vehicle.motors.voltage
+        entries.append(
+            number(
+                "motors.thrust",
+                "N",
+                fitted,
+                lambda n: motors_of(guess, n, volts)[:2],
+                [("thrust",)] * 2,
+            )
+        )
+        entries.append(
+            number(
+                "motors.voltage_exponent",
+                "1",
+                fitted,
+                lambda n: motors_of(guess, n, volts)[2:],
+                [("battery",)],
+            )
+        )
+    elif "thrust" in names and drive == "rotors":
+        start = vehicle.rotors.thrust_coefficient
+        entries.append(
+            number(
+                "rotors.thrust_coefficient",
+                "N/(rad/s)^2",
+                fitted,
+                lambda n: np.array([start * np.exp(n["thrust"])]),
+                [("thrust",)],
+            )
+        )
+    elif "thrust" in names:
+        entries.append(
+            number(
+                "effects.thrust_scale.scale",
+                "1",
+                fitted,
+                lambda n: np.array([np.exp(n["thrust"])]),
+                [("thrust",)],
+            )
+        )
+    if "drag_x" in names:
+        entries.append(
+            number(
+                "effects.linear_drag.coefficient",
+                "1/s",
+                fitted,
+                lambda n: np.array([n[f"drag_{axis}"] for axis in "xyz"]),
+                [(f"drag_{axis}",) for axis in "xyz"],
+            )
+        )
+    return entries
+
+
+def of_torque(
+    vehicle: Vehicle, drive: str, fitted: Fitted, scale: float, lag_s: float
+) -> list[Number]:
+    """Return the entries that the torque tells: inertia, yaw torque, lag and delay.
+
+    Args:
+        vehicle: the start.
+        drive: what drove the flights.
+        fitted: the torque's fit.
+        scale: logarithm of the thrust's scale, by the force.
+        lag_s: of the rotors, where the fit has none [s].
+    """
+    entries = []
+    names = [unknown.name for unknown in fitted.unknowns]
+    if "inertia_x" in names:
+        entries.append(
+            number(
+                "inertia",
+                "kg m^2",
+                fitted,
+                lambda n: inertia_of(vehicle, n),
+                [("inertia_x",), ("inertia_y",), ("inertia_z",)],
+            )
+        )
+    if "yaw" in names:
+        # Torque per inertia is what is seen, and the inertia about z follows those about x and y.
+        start = vehicle.rotors.torque_coefficient
+
+        def twist(n: Any) -> np.ndarray:
+            follows = 0.5 * (n.get("inertia_x", 0.0) + n.get("inertia_y", 0.0))
+            scaled = scale if drive == "rotors" else 0.0
+            return np.array([start * np.exp(n["yaw"] + scaled + follows)])
+
+        entries.append(
+            number("rotors.torque_coefficient", "N m/(rad/s)^2", fitted, twist, [("yaw",)])
+        )
+    return [*entries, *of_loop(vehicle, fitted, lag_s)]
+
+
+def of_loop(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
+    """Return the entries of lag, delay and rate gains, as far as the fit has them."""
+    entries = []
+    names = [unknown.name for unknown in fitted.unknowns]
+    if "lag" in names:
+        entries.append(
+            number("rotors.time_constant", "s", fitted, lambda n: np.array([n["lag"]]), [("lag",)])
+        )
+    if "late" in names:
+        entries.append(
+            number(
+                "effects.command_delay.delay",
+                "s",
+                fitted,
+                lambda n: np.array([n["late"] - n.get("lag", lag_s)]),
+                [("late",)],
+            )
+        )
+    if "gain_x" in names:
+        gain = np.asarray(vehicle.controller.rate_gain)
+        entries.append(
+            number(
+                "controller.rate_gain",
+                "1/s",
+                fitted,
+                lambda n: gain * np.exp([n[f"gain_{axis}"] for axis in "xyz"]),
+                [(f"gain_{axis}",) for axis in "xyz"],
+            )
+        )
+    return entries
+
+
+def put(vehicle: Vehicle, entry: Number) -> Vehicle:
+    """Return the vehicle with what was told of an entry; the rest of it stays."""
+    if all(span is None for span in entry.ci95):
+        return vehicle
+    value = tuple(entry.value)
+    table, _, key = entry.key.rpartition(".")
+    if table.startswith("effects."):
+        name = table.removeprefix("effects.")
+        effect = EFFECTS[name]
+        parameter = effect.parameters[0]
+        low, high = at(parameter.low, vehicle), at(parameter.high, vehicle)
+        kept = [min(max(v, low), high) for v in value]
+        if name == "command_delay" and kept[0] <= 0.0:
+            return vehicle
+        values = effect.values(tuple(kept) if parameter.size else kept[0])
+        return replace(vehicle, effects=MappingProxyType({**vehicle.effects, name: values}))
+    if not table:
+        return vehicle
+    part = getattr(vehicle, table)
+    changed = value if len(value) > 1 else entry.value[0]
+    return replace(vehicle, **{table: replace(part, **{key: changed})})

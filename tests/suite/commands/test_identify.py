@@ -1,0 +1,45 @@
+"""`suite identify` from the command line."""
+
+import json
+
+import pytest
+
+from eval.logs.flight_log import write_flight
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from suite import cli
+from tests.support import identified as known
+
+
+@pytest.fixture
+def flights(tmp_path):
+    folder = tmp_path / "flights"
+    folder.mkdir()
+    for index, log in enumerate(known.logs("rates", 0)[:2]):
+        write_flight(folder / f"{index}.parquet", log)
+    save_vehicle(known.start(), tmp_path / "start.toml")
+    return folder
+
+
+def test_a_vehicle_file_comes_out_with_what_was_told(flights, tmp_path, capsys):
+    out = tmp_path / "mine.toml"
+    line = [str(flights), "--vehicle", str(tmp_path / "start.toml"), "--out", str(out)]
+    assert cli.main(["identify", *line, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["drive"] == "rates"
+    gain = told["parameters"]["controller.rate_gain"]
+    written = load_vehicle(out)
+    assert list(written.controller.rate_gain) == gain["value"]
+    assert gain["ci95"][0][0] < gain["value"][0] < gain["ci95"][0][1]
+    assert "controller.rate_gain[0]" in out.read_text()
+    assert len(told["flights"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [(["--leave", "wings"], "--leave 'wings': allowed"), (["--out", "v.json"], "must be .toml")],
+)
+def test_what_cannot_be_used_ends_with_2(flights, tmp_path, capsys, options, reason):
+    line = [str(flights), "--vehicle", str(tmp_path / "start.toml")]
+    line += ["--out", str(tmp_path / "v.toml")] if "--out" not in options else []
+    assert cli.main(["identify", *line, *options]) == 2
+    assert reason in capsys.readouterr().err

@@ -1,0 +1,62 @@
+"""Windows are exact on lines and parabolas; commands hold, holes stay holes."""
+
+import numpy as np
+
+from eval.logs.flight_log import FlightLog
+from suite.identify.drive import delayed, lagged
+from suite.identify.grid import STEP_S, FlightGrid, grid_of, over, windows_of
+
+
+def grid(values):
+    time_s = STEP_S * np.arange(len(values))
+    return FlightGrid("made", time_s, {"x": np.asarray(values, dtype=float)[:, None]})
+
+
+def test_slope_and_bend_of_a_parabola():
+    time_s = STEP_S * np.arange(500)
+    flight = grid(3.0 + 2.0 * time_s + 5.0 * time_s**2)
+    windows = windows_of(flight, 0.2, ("x",))
+    at = time_s[windows.middle]
+    values = flight.known["x"]
+    slope = over(windows, values, windows.slope)[:, 0]
+    np.testing.assert_allclose(slope, 2.0 + 10.0 * at, rtol=1e-9)
+    np.testing.assert_allclose(over(windows, values, windows.bend), 10.0, rtol=1e-8)
+    constant = grid(np.full(500, 7.0)).known["x"]
+    np.testing.assert_allclose(over(windows, constant, windows.bend), 0.0, atol=1e-9)
+    np.testing.assert_allclose(over(windows, constant), 7.0)
+
+
+def test_no_window_lies_over_a_hole():
+    values = np.ones(500)
+    values[250] = np.nan
+    flight = grid(values)
+    for first in windows_of(flight, 0.2, ("x",)).first:
+        assert not first <= 250 < first + 51
+
+
+def test_commands_hold_until_the_next_row_and_measurements_are_joined():
+    time_s = np.arange(0.0, 2.0, 0.02)
+    step = (time_s >= 1.0).astype(float)
+    still, up = np.zeros((100, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (100, 1))
+    log = FlightLog(
+        "made",
+        time_s,
+        still,
+        up,
+        still,
+        step[:, None] * [1.0, 0.0, 0.0],
+        pwm=np.repeat(step[:, None], 4, axis=1),
+    )
+    flight = grid_of(log)
+    at = round(0.996 / STEP_S)
+    assert flight.known["pwm"][at, 0] == 0.0
+    np.testing.assert_allclose(flight.known["rate_b"][at, 0], 0.8)
+    assert not flight.has("voltage")
+
+
+def test_lag_and_delay_of_a_step():
+    """A lag of 0.05 s has made 1 - 1/e of a step after 0.05 s, here after a delay of 0.02 s."""
+    values = (STEP_S * np.arange(400) >= 0.8).astype(float)[:, None]
+    late = lagged(delayed(values, 0.02), 0.05)[:, 0]
+    reached = np.interp(0.8 + 0.07, STEP_S * np.arange(400), late)
+    np.testing.assert_allclose(reached, 1.0 - np.exp(-1.0), atol=0.003)

@@ -1,0 +1,94 @@
+"""Simulated flights whose vehicle is known exactly, logged with noise, for `suite identify`."""
+
+from dataclasses import replace
+from functools import cache
+from types import MappingProxyType
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import MotorMap
+from suite.diagnose.plans.sensors import Sensors, log_of
+from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.trajectory import Trajectory
+
+DRAG, DELAY = (0.3, 0.4, 0.2), 0.012
+MOTORS = MotorMap(thrust=(1.1, 4.4), voltage=16.0, voltage_exponent=1.2)
+SENSORS = Sensors(
+    "tracked", 250.0, pos=0.004, attitude=0.01, gyro=0.06, vel=0.1, rotor=2.0, voltage=0.02
+)
+WAYS = (
+    Trajectory("figure_eight", 8.0, 4.0, turn="sweep"),
+    Trajectory("circle", 8.0, 3.0, turn="wobble"),
+    Trajectory("climb", 8.0, 3.0, turn="wobble"),
+    Trajectory("chirp", 6.0, 0.8),
+)
+HOVER = (Trajectory("hover", 8.0), Trajectory("vertical", 8.0, 0.5))
+
+
+def vehicle():
+    """The quadrotor as its maker has it, with `[motors]`."""
+    return replace(load_vehicle("reference"), motors=MOTORS, effects=MappingProxyType({}))
+
+
+def truth():
+    """The same with drag and delay."""
+    effects = {
+        "linear_drag": EFFECTS["linear_drag"].values(DRAG),
+        "command_delay": EFFECTS["command_delay"].values(DELAY),
+    }
+    return replace(vehicle(), effects=MappingProxyType(effects))
+
+
+def start():
+    """What a newcomer would start from: the right mass and arms, and wrong numbers otherwise."""
+    nominal = vehicle()
+    x, y, z = nominal.inertia
+    return replace(
+        nominal,
+        inertia=(1.2 * x, y / 1.2, z),
+        rotors=replace(nominal.rotors, time_constant=0.02),
+        controller=replace(nominal.controller, rate_gain=(15.0, 25.0, 6.0)),
+        motors=MotorMap(thrust=(1.6, 3.0), voltage=15.0, voltage_exponent=1.0),
+    )
+
+
+@cache
+def recordings(ways=WAYS):
+    """What happened on the flights, at every step."""
+    return [fly(vehicle(), truth(), [way], rate_hz=SENSORS.rate_hz)[0] for way in ways]
+
+
+def logs(drive, seed, ways=WAYS):
+    """Their logs with noise, with what `drive` needs and no other drive."""
+    found = []
+    for index, recording in enumerate(recordings(ways)):
+        rng = np.random.default_rng((seed, index))
+        log = log_of(recording, truth(), SENSORS, rng, f"flight_{index}")
+        log = replace(log, extra={}, about={})
+        if drive != "rotors":
+            log = replace(log, rotor_speed=None)
+        if drive != "rates":
+            log = replace(log, thrust_cmd=None, rate_cmd_b=None)
+        if drive == "pwm":
+            log = replace(log, pwm=_commands(recording))
+        found.append(log)
+    return found
+
+
+def _commands(recording):
+    """The motor commands behind the rotor speeds, at the rows: undone lag, delay and map."""
+    rotors = vehicle().rotors
+    keep = np.exp(-recording.dt / rotors.time_constant)
+    speed = recording.rotor_speed
+    asked = (speed[1:] - keep * speed[:-1]) / (1.0 - keep)
+    asked = np.concatenate([asked, asked[-1:]])
+    thrust = rotors.thrust_coefficient * asked**2
+    # What acts DELAY later was commanded now, at the voltage of then.
+    first, second = MOTORS.thrust
+    applied = (-first + np.sqrt(first**2 + 4.0 * second * thrust)) / (2.0 * second)
+    share = applied / ((recording.voltage / MOTORS.voltage) ** MOTORS.voltage_exponent)[:, None]
+    late = round(DELAY / recording.dt)
+    sooner = np.concatenate([share[late:], np.repeat(share[-1:], late, axis=0)])
+    return sooner[:: recording.period]
