@@ -70,7 +70,10 @@ def diagnose_files(
     warnings = [*warnings, *told]
     for warning in warnings:
         console.note(f"warning: {warning}")
-    by_views = partial(diagnose_views, logs, before, vehicle, out, console, SCHEMA, seed, warnings)
+    asked = {"--compare-delta": compare_delta, "--plan": plan, "--fly": fly is not None}
+    unused = [f"{flag} is of rollouts: left out" for flag, given in asked.items() if given]
+    told = [*warnings, *unused]
+    by_views = partial(diagnose_views, logs, before, vehicle, out, console, SCHEMA, seed, told)
     if before or only_views(logs):
         return by_views()
     try:

@@ -1,13 +1,8 @@
 """Diagnoses by views, end to end: names, gaps, what a black box could do, reports, errors."""
 
-import json
-
 import numpy as np
 import pytest
 
-from eval.logs.flight_log import write_flight
-from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
-from suite.cli import main
 from suite.diagnose.views.by_views import diagnose_by_views
 from suite.diagnose.views.explainable import centred, closed_share, fit_black_box, inputs_of
 from suite.diagnose.views.judged import judge
@@ -52,25 +47,6 @@ def test_a_black_box_closes_what_goes_with_what_was_flown_and_no_noise(found):
     left = real - fit_black_box(inputs, real, flight).predict(inputs)
     assert closed_share(real, left, flight).min() > 0.8
     assert np.abs(centred(real, flight)[flight == 0].mean(axis=0)).max() < 1e-12
-
-
-def test_files_are_written_and_say_the_same(tmp_path, capsys):
-    save_vehicle(VEHICLE, tmp_path / "v.toml", "for a test")
-    for folder, seed, effects in (("new", 8, {"mass_offset": (0.15,)}), ("old", 9, {})):
-        (tmp_path / folder).mkdir()
-        for number, log in enumerate(flights(3, seed=seed, speed=1.0, **effects)):
-            write_flight(tmp_path / folder / f"{number}.parquet", log)
-    words = ["diagnose", str(tmp_path / "new"), "--reference", str(tmp_path / "old"), "--vehicle",
-             str(tmp_path / "v.toml"), "--out", str(tmp_path / "out"), "--json"]  # fmt: skip
-    assert main(words) == 0
-    told = json.loads(capsys.readouterr().out)
-    names = {name for e in told["effects"] for name in (e["name"], *e["alternatives"])}
-    assert "mass_offset" in names and told["views"] and len(told["reference"]) == 3
-    for axis in told["gap"]["channels"]["force"].values():
-        assert {"before", "after", "noise_floor", "repeatability"} <= set(axis)
-    assert json.loads((tmp_path / "out/diagnosis.json").read_text())["verdict"] == told["verdict"]
-    assert "data:image/png" in (tmp_path / "out/report.html").read_text()
-    assert load_vehicle(str(tmp_path / "out/vehicle.toml")).effects
 
 
 def test_a_lone_reference_flight_is_refused():

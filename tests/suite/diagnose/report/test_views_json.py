@@ -1,0 +1,25 @@
+"""What the JSON says of real flights."""
+
+import pytest
+
+from suite.diagnose.report.views_json import MEASURE, effects_json, headline, views_json
+from tracks.common.files import plain
+
+
+def test_each_view_names_its_own_effect_with_its_share(by_views):
+    effects = {effect["name"]: effect for effect in effects_json(by_views)}
+    assert effects["linear_drag"]["view"] == "force"
+    assert 0.0 < effects["linear_drag"]["gap_removed"] <= 1.0
+    span = effects["linear_drag"]["parameters"]["coefficient"]["ci95"][0]
+    assert span[0] < 0.4 < span[1]
+    assert all(effect["view"] == "torque" for n, effect in effects.items() if n != "linear_drag")
+
+
+def test_the_json_has_every_axis_and_says_nothing_twice(by_views):
+    told = plain(views_json(by_views))
+    assert set(told["gap"]["channels"]["force"]) == {"x", "y", "z"}
+    main = told["gap"]["channels"][by_views.main.view.name]
+    whole = sum(axis["before"] ** 2 for axis in main.values()) ** 0.5
+    assert told["gap"]["before"] == pytest.approx(whole)
+    assert told["gap"]["measure"].startswith(MEASURE.split("{")[0])
+    assert told["headline"] == headline(by_views) and "linear_drag" in headline(by_views)
