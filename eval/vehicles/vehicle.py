@@ -58,7 +58,7 @@ class Controller:
 
 @dataclass(frozen=True)
 class MotorMap:
-    """What thrust a motor command gives: the vehicle file's `[motors]`; see `quadrotor.motors`."""
+    """What thrust a motor command gives: the vehicle file's `[motors]`; see `vehicles.motors`."""
 
     thrust: tuple[float, float]
     """t1, t2 of T = t1 u + t2 u^2 [N], u the applied command."""

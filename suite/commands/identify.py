@@ -38,7 +38,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
-    from suite.identify.run import identify_files
+    from suite.diagnose.identify.run import identify_files
 
     if config.out.suffix.lower() != ".toml":
         raise ValueError(f"--out is {str(config.out)!r}; its ending must be .toml")

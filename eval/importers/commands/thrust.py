@@ -11,7 +11,7 @@ import numpy as np
 
 from eval.importers.findings import Finding
 from eval.importers.options import ImportOptions
-from eval.quadrotor.motors import motor_thrust
+from eval.vehicles.motors import motor_thrust
 from eval.vehicles.vehicle import MotorMap, Vehicle
 
 

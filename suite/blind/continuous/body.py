@@ -64,7 +64,7 @@ class Body:
             self._ends = self._wind.step(state[:, VEL], length_s)
 
     def ask(self, speed: np.ndarray, wanted: np.ndarray, length_s: np.ndarray) -> None:
-        """Note what the rotors are asked for in a step of `length_s` (N, 1), from `speed` (N, 4)."""
+        """Note what the rotors, at `speed` (N, 4), are asked for in a step of `length_s` (N, 1)."""
         if self.quadrotor.time_constant > 0.0:
             self._asked = wanted
         else:

@@ -1,5 +1,7 @@
 """An import as a whole: what is read can be written, and is cut where that is asked for."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from eval.logs.columns import FlightLogError
 from eval.logs.flight_log import read_flight, write_flight
 from tests.support import foreign_logs as made
 from tests.support import known_flight
-from tests.support.imported import near
+from tests.support.imported import levels, near
 
 FULL = ImportOptions(full_thrust=30.0)
 
@@ -28,3 +30,70 @@ def test_start_and_end_cut_the_flight(tmp_path):
     near(log.pos_w, known_flight.fly(log.time_s + 2.0).pos, 1e-5)
     with pytest.raises(FlightLogError, match="no time at which"):
         import_log(path, None, ImportOptions(start_s=50.0))
+
+
+LOGS = Path(__file__).resolve().parents[4] / "shared" / "real_logs"
+real = pytest.mark.skipif(not LOGS.is_dir(), reason="the logs are not on this machine")
+
+
+def read(path, name, **options):
+    return import_log(LOGS / path, None, ImportOptions(map=Path(name), **options))
+
+
+@real
+def test_nanobench_has_motor_commands_battery_and_only_the_flight():
+    log, findings = read("nanobench/B3_figure8_fast_rep1.csv", "nanobench")
+    assert log.pwm is not None
+    assert log.voltage is not None
+    assert log.acc_b is not None
+    assert 19.0 < log.duration_s < 21.0  # of 26.8 s
+    assert np.nanmin(log.pwm) > 0.3
+    assert abs(np.nanmean(log.acc_b[:, 2]) - 9.9) < 0.3
+    assert log.about["crazyflie_id"] == "CF_01"
+    assert levels(findings)["units"] == "ok"
+
+
+@real
+def test_nanobench_motors_turn_the_body_as_the_shipped_order_says():
+    """M1 and M3 turn counter-clockwise: more of them yaws the body clockwise."""
+    log, _ = read("nanobench/B8_star_fast_rep2.csv", "nanobench")
+    change = np.gradient(log.rate_b, log.time_s, axis=0)
+    one, two, three, four = log.pwm.T
+    drives = (three + four - one - two, two + three - one - four, two + four - one - three)
+    for axis, drive in enumerate(drives):
+        both = np.isfinite(drive[:-3]) & np.isfinite(change[3:, axis])
+        assert np.corrcoef(drive[:-3][both], change[3:, axis][both])[0, 1] > 0.15
+
+
+@real
+def test_nanobench_by_the_estimate_is_late_and_moved():
+    log, findings = read("nanobench/B8_star_fast_rep2.csv", "nanobench", source="estimate")
+    assert levels(findings)["pose delay"] == "corrected"
+    assert log.duration_s > 30
+
+
+@real
+@pytest.mark.parametrize(
+    ("path", "lacks"),
+    [
+        ("motor/add_weight_W3_near_M3__E9_log00", ("quat", "rate")),
+        ("controller/add_weight_W3_near_M3__E9_log01", ("quat",)),
+    ],
+)
+def test_crazypad_is_partial_and_shows_the_weight_near_rotor_3(path, lacks):
+    log, findings = read(f"crazypad/{path}", "crazypad", partial=True)
+    assert log.partial == lacks
+    assert levels(findings)["partial"] == "note"
+    mean = np.nanmean(log.pwm, axis=0)
+    assert np.argmax(mean) == 2
+    assert 20.0 < log.duration_s < 24.0
+
+
+@real
+def test_crazyswarm2_has_thrust_by_the_mass_beside_it_and_torque():
+    log, _ = read("crazyswarm2/log10", "crazyswarm2")
+    assert log.torque_cmd_b is not None
+    assert log.about["mass"] == 0.0333
+    np.testing.assert_allclose(log.thrust_cmd, log.extra["cmd_force"] / 0.0333)
+    assert 6.0 < np.nanmean(log.thrust_cmd) < 10.0
+    assert log.rate_cmd_b is None

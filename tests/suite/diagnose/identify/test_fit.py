@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from suite.identify.fit import Rows, Unknown, fit
+from suite.diagnose.identify.fit import Rows, Unknown, fit
 
 SLOPE = Unknown("slope", 0.0, -10.0, 10.0, 1.0, 1e-3)
 BLIND = Unknown("blind", 4.0, -10.0, 10.0, 1.0, 1e-3)

@@ -3,8 +3,7 @@
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from suite.identify.drive import delayed, lagged
-from suite.identify.grid import STEP_S, FlightGrid, grid_of, over, windows_of
+from suite.diagnose.identify.grid import STEP_S, FlightGrid, grid_of, over, windows_of
 
 
 def grid(values):
@@ -52,11 +51,3 @@ def test_commands_hold_until_the_next_row_and_measurements_are_joined():
     assert flight.known["pwm"][at, 0] == 0.0
     np.testing.assert_allclose(flight.known["rate_b"][at, 0], 0.8)
     assert not flight.has("voltage")
-
-
-def test_lag_and_delay_of_a_step():
-    """A lag of 0.05 s has made 1 - 1/e of a step after 0.05 s, here after a delay of 0.02 s."""
-    values = (STEP_S * np.arange(400) >= 0.8).astype(float)[:, None]
-    late = lagged(delayed(values, 0.02), 0.05)[:, 0]
-    reached = np.interp(0.8 + 0.07, STEP_S * np.arange(400), late)
-    np.testing.assert_allclose(reached, 1.0 - np.exp(-1.0), atol=0.003)

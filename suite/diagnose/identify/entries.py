@@ -12,10 +12,10 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.effects.interface import at
 from eval.vehicles.vehicle import Vehicle
-from suite.identify import force
-from suite.identify.drive import MotorGuess
-from suite.identify.fit import Fitted
-from suite.identify.numbers import Number, number
+from suite.diagnose.identify import force
+from suite.diagnose.identify.drive import MotorGuess
+from suite.diagnose.identify.fit import Fitted
+from suite.diagnose.identify.numbers import Number, number
 
 
 def inertia_of(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from suite.identify.fit import Z95, Fitted
+from suite.diagnose.identify.fit import Z95, Fitted
 
 
 class Number(NamedTuple):

@@ -14,8 +14,8 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.identify import force, loop, torque
-from suite.identify.drive import (
+from suite.diagnose.identify import force, loop, torque
+from suite.diagnose.identify.drive import (
     MotorGuess,
     drive_of,
     guess_of,
@@ -23,10 +23,10 @@ from suite.identify.drive import (
     rotor_thrusts,
     with_motors,
 )
-from suite.identify.entries import inertia_of, of_force, of_loop, of_torque, put
-from suite.identify.fit import Fitted
-from suite.identify.grid import FlightGrid, grid_of
-from suite.identify.numbers import Number, told
+from suite.diagnose.identify.entries import inertia_of, of_force, of_loop, of_torque, put
+from suite.diagnose.identify.fit import Fitted
+from suite.diagnose.identify.grid import FlightGrid, grid_of
+from suite.diagnose.identify.numbers import Number, told
 
 ROUNDS = 2
 """Force and torque in turn."""

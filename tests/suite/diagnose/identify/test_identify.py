@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from suite.identify.identify import identify
-from suite.identify.numbers import as_json
+from suite.diagnose.identify.identify import identify
+from suite.diagnose.identify.numbers import as_json
 from tests.support import identified as known
 
 TRUE = {

@@ -11,8 +11,8 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.provenance import stamp
 from suite.delta.run import flight_files
-from suite.identify.identify import Identified, identify
-from suite.identify.numbers import as_json
+from suite.diagnose.identify.identify import Identified, identify
+from suite.diagnose.identify.numbers import as_json
 
 SCHEMA = 1
 PARTS = ("drag", "motors", "inertia", "lag", "loop")

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eval.quadrotor.motors import motor_speed, motor_thrust
 from eval.quadrotor.vehicle_file import load_vehicle, parse_vehicle, vehicle_table
+from eval.vehicles.motors import motor_speed, motor_thrust
 from eval.vehicles.vehicle import MotorMap
 from tests.support.vehicles import PLAIN
 
