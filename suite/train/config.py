@@ -8,6 +8,7 @@ from typing import Annotated
 
 from eval.vehicles.vehicle import Vehicle
 from policies.spec import PolicySpec, check_image_size, check_spec
+from suite.train.dynamics.fleet import FleetConfig
 from tracks.input.ranges import Iterations, Range, Seed, Share, check_ranges
 
 
@@ -205,6 +206,8 @@ class TrainConfig:
     """Dynamics and their randomisation."""
     quadrotor: QuadrotorConfig | None = None
     """Train through this quadrotor; None: through the point mass of `physics`."""
+    fleet: FleetConfig | None = None
+    """Train through quadrotors drawn from this distribution, in the place of either."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Weights of the loss and of the field."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
@@ -245,6 +248,8 @@ def check(config: TrainConfig) -> None:
 
         check_vehicle(config.quadrotor.vehicle)
         check_decides_in_time(config.spec, config.quadrotor.vehicle)
+    if config.fleet is not None and config.quadrotor is not None:
+        raise ValueError("a run has a fleet or one vehicle's quadrotor, and this one has both")
     stride, steps = config.episode.image_stride, config.episode.steps
     if steps % stride:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What flies in a rollout: the point mass, or the quadrotor around a vehicle file."""
+"""What flies in a rollout: the point mass, the quadrotor around a vehicle file, or a fleet."""
 
 from __future__ import annotations
 
@@ -63,6 +63,11 @@ def make_dynamics(config: TrainConfig) -> Dynamics:
         period = 1.0 / config.spec.rate_hz
         start, step = quadrotor_dynamics(config.quadrotor, period, config.loss.gradient_decay)
         return Dynamics(start, step)
+    if config.fleet is not None:
+        from suite.train.dynamics.reduced import fleet_dynamics
+
+        period = 1.0 / config.spec.rate_hz
+        return Dynamics(*fleet_dynamics(config.fleet, period, config.loss.gradient_decay))
 
     def start_point(
         _: point_mass.PointMassParams, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
