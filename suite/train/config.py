@@ -124,6 +124,11 @@ class LossConfig:
     crash_depth_m: Annotated[float, Range(0.0, math.inf)] = 0.0
     """A world that gets deeper than this into a solid leaves the loss for the rest of the rollout:
     from there on its gradients say nothing about flying [m]."""
+    survival: Annotated[float, Range(0.0, 1e6)] = 0.0
+    """Price of a crash, as a weight of the progress that it costs later [s/m]; 0: none. At the
+    weight of `progress` a crash costs what the way lost is worth."""
+    survival_width_m: Annotated[float, Range(1e-3, 10.0)] = 0.04
+    """How far from contact with the body the probability to fly on begins to fall [m]."""
     path_samples: Annotated[int, Range(1, 1000)] = 4
     """Points of every step's path at which the nearest obstacle is looked up."""
 

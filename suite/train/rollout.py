@@ -30,8 +30,6 @@ from tracks.geometry.scene import Counts
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
 """Solids of each kind that a training image shows, nearest first; the judge shows all."""
-BODY_RADIUS_M = 0.08
-"""Closer than this to a surface counts as a collision in the curves [m]."""
 
 
 class RolloutCarry(NamedTuple):
@@ -53,6 +51,10 @@ class RolloutCarry(NamedTuple):
     """(B, 32) of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 while the world counts in the loss: until it crashes, stops or finishes, then 0."""
+    going: jax.Array
+    """(B,) the same but for crashes."""
+    survival: jax.Array
+    """(B,) smooth probability to have flown until now."""
 
 
 class StepRecord(NamedTuple):
@@ -176,6 +178,8 @@ def make_rollout(
             observed=observed_at_start(batch, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
+            going=jnp.ones(batch),
+            survival=jnp.ones(batch),
         )
 
         def step(
@@ -197,16 +201,20 @@ def make_rollout(
                 flown = action + correction
             _, target_w = target_gate(worlds.scene.gates, target)
             after = dynamics.step(before, worlds.constants, flown, target_w, key_now)
-            made = make_step(weights, worlds, before, after, target)
+            crashed = carry.going > carry.alive
+            made = make_step(weights, worlds, before, after, target, carry.survival, crashed)
             terms = losses.weighted(weights, made)
             passed_after = target + made.passed
-            alive = carry.alive * (made.clearance > -weights.crash_depth_m)
-            alive = alive * (number + 1 < worlds.stop)
+            goes_on = number + 1 < worlds.stop
             if config.episode.finish:
-                alive = alive * (passed_after < worlds.scene.gates.center_w.shape[1])
+                goes_on = goes_on & (passed_after < worlds.scene.gates.center_w.shape[1])
+            alive = carry.alive * (made.clearance > -weights.crash_depth_m) * goes_on
             record = StepRecord(
                 image=seen.image,
-                terms={name: term * carry.alive for name, term in terms.items()},
+                terms={
+                    name: term * (carry.going if name in losses.AFTER_CRASH else carry.alive)
+                    for name, term in terms.items()
+                },
                 speed=jnp.linalg.norm(after.vel_w, axis=-1),
                 clearance=made.clearance,
                 passed=made.passed,
@@ -224,6 +232,8 @@ def make_rollout(
                 observed=observed,
                 delta_hidden=delta_hidden,
                 alive=alive,
+                going=carry.going * goes_on,
+                survival=made.survival,
             )
             return carry, record
 
