@@ -90,7 +90,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.delta is not None:
         stored = load_delta(config.delta)
         if resolved.fleet is not None:
-            raise ValueError("--delta corrects one vehicle, and this run flies a fleet: add --model")
+            raise ValueError(
+                "--delta corrects one vehicle, and this run flies a fleet: add --model"
+            )
         dynamics = resolved.quadrotor or resolved.physics
         check_corrects(stored.config.get("fit", {}), dynamics, config.delta)
         delta = jax.tree.map(jax.numpy.asarray, stored.params)

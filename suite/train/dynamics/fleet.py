@@ -30,6 +30,9 @@ class FleetConfig:
     policy period [Hz]."""
     thrust_to_weight: Annotated[Span, Range(1.0, 100.0, ordered=True, above=True)] = (2.5, 5.0)
     """Nominal largest collective thrust over the nominal weight [1]."""
+    fault_share: Share = 0.5
+    """Share of vehicles that are not what their controller believes: mass, thrust, inertia, centre
+    of mass and trim are off in these alone."""
     mass_scale: Annotated[Span, Range(0.1, 10.0, ordered=True)] = (0.92, 1.2)
     """True mass over the nominal one: a battery or a camera that nobody told the controller of
     [1]."""
@@ -149,17 +152,22 @@ def draw_vehicles(
     def axes(level: np.ndarray, up: np.ndarray) -> np.ndarray:
         return np.stack([level, level, up], -1)
 
-    inertia = drawn(config.inertia_scale, 3)
+    faulty = rng.uniform(size=batch) < config.fault_share
+
+    def off(value: np.ndarray, neutral: float) -> np.ndarray:
+        return np.where(faulty.reshape(-1, *[1] * (value.ndim - 1)), value, neutral)
+
+    inertia = off(drawn(config.inertia_scale, 3), 1.0)
     rate_gain, attitude_gain = drawn(config.rate_gain), drawn(config.attitude_gain)
     rate_gain = axes(rate_gain, YAW_GAIN * rate_gain) / inertia
     integrates = rng.uniform(size=batch) < config.integral_share
     integral = drawn(config.integral) * integrates
-    thrust, mass = drawn(config.thrust_scale), drawn(config.mass_scale)
+    thrust, mass = off(drawn(config.thrust_scale), 1.0), off(drawn(config.mass_scale), 1.0)
     # A force F at the distance d from the centre of mass turns by m d x F / J = d x F / (m k^2).
     radius = drawn(config.gyration_m)
-    off = normal(config.com_offset_m, 2)
-    lever = np.stack([-off[:, 1], off[:, 0], np.zeros(batch)], -1) / (radius**2)[:, None]
-    trim = normal(config.trim, 3) * [1.0, 1.0, 0.2]
+    com = off(normal(config.com_offset_m, 2), 0.0)
+    lever = np.stack([-com[:, 1], com[:, 0], np.zeros(batch)], -1) / (radius**2)[:, None]
+    trim = off(normal(config.trim, 3), 0.0) * [1.0, 1.0, 0.2]
     return Vehicles(
         time_step=period_s * (1 + normal(config.time_step_std)),
         thrust_max=GRAVITY * drawn(config.thrust_to_weight),

@@ -169,7 +169,11 @@ def start(
 
 
 def fly(
-    body: ReducedState, constants: ReducedParams, action_b: jax.Array, target_w: jax.Array, dt: Array
+    body: ReducedState,
+    constants: ReducedParams,
+    action_b: jax.Array,
+    target_w: jax.Array,
+    dt: Array,
 ) -> ReducedState:
     """Return the bodies one step of `dt` (B, 1) [s] later; `acc_w` is that of the step."""
     vehicle = constants.vehicle
