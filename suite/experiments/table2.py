@@ -44,10 +44,11 @@ COLUMNS = [
 MEANINGS = (
     "Success (SR): all 8 gates in order, no contact, within 20 s; ours with its 95 % Wilson "
     "interval, the others as printed, out of 10 trials. v_max: ours is the median over a cell's "
-    "trials of each trial's largest speed before any contact, and beside it the mean over picks of "
-    "ten trials of the largest among them; the paper and the baseline flew ten trials a cell and do "
-    "not say whether theirs is a median, a mean or the largest. Simulator, vehicle and tracks are ours: the tracks "
-    "follow the baseline's rules, the numbers of the others were measured in theirs."
+    "trials of each trial's largest speed before any contact; of ten: the mean, over picks of ten "
+    "trials, of the largest among them. The paper and the baseline flew ten trials a cell and do "
+    "not say whether theirs is a median, a mean or the largest. Simulator, vehicle and tracks are "
+    "ours: the tracks follow the baseline's rules, the numbers of the others were measured in "
+    "theirs."
 )
 NO_DELTA = (
     "There is no row of ours with the Delta Action Model: neither --delta-policy nor "
