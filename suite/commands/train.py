@@ -91,7 +91,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         stored = load_delta(config.delta)
         if resolved.fleet is not None:
             raise ValueError(
-                "--delta corrects one vehicle, and this run flies a fleet: add --model"
+                "--delta corrects one vehicle's dynamics, and a fleet is many: add --model point"
             )
         dynamics = resolved.quadrotor or resolved.physics
         check_corrects(stored.config.get("fit", {}), dynamics, config.delta)
