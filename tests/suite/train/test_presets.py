@@ -1,9 +1,12 @@
 """Training runs by name."""
 
+from dataclasses import replace
+
 import pytest
 
-from suite.train.config import TrainConfig
-from suite.train.presets import PRESETS, preset
+from suite.train.config import TrainConfig, check
+from suite.train.dynamics.fleet import FleetConfig
+from suite.train.presets import PRESETS, chosen_model, preset
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -11,6 +14,20 @@ def test_presets(name):
     config = preset(name)
     assert isinstance(config, TrainConfig) and PRESETS[name].__doc__
     assert config.optimizer.iterations > 0 and config.episode.batch > 0
+
+
+def test_a_model_is_asked_for_by_name_or_the_recipes_own():
+    ace, swift = preset("ace"), preset("swift")
+    assert ace.fleet is not None and chosen_model(ace, None, None) == ace
+    assert chosen_model(ace, "point", None).fleet is None
+    assert chosen_model(swift, "fleet", None).fleet == FleetConfig()
+    quad = chosen_model(ace, "quad", "racer5")
+    assert quad.fleet is None and quad.quadrotor is not None
+    with pytest.raises(ValueError, match="a fleet has none: add --model quad"):
+        chosen_model(swift, "fleet", "racer5")
+    both = replace(quad, fleet=FleetConfig())
+    with pytest.raises(ValueError, match="this one has both"):
+        check(both)
 
 
 def test_the_papers_preset_has_the_papers_weights():
