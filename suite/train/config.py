@@ -66,6 +66,9 @@ class QuadrotorConfig:
     """Standard deviation of the true mass over worlds, as a share of the vehicle's [1]."""
     lag_spread: Share = 0.3
     """The rotors' time constant varies by up to this share of the vehicle's either way [1]."""
+    lag_spread_s: Annotated[float, Range(0.0, 0.5)] = 0.0
+    """It varies by up to this as well, and is never negative: for a vehicle whose file has none
+    [s]."""
     drag_spread: Annotated[float, Range(0.0, 100.0)] = 0.1
     """Linear drag varies by up to this on each axis either way, and is never negative [1/s]."""
     delay_spread_s: Share = 0.01
