@@ -22,10 +22,10 @@ class Config:
 
     preset: str = "racer"
     """The recipe: racer, swift (that of the policy that flies by default, with 18 numbers instead
-    of the paper's 12), ace (swift's, through a fleet of quadrotors), small, gpu or paper."""
+    of the paper's 12), small, gpu or paper."""
     model: Literal["point", "quad", "fleet"] | None = None
     """What flies in training: the point mass, the quadrotor of --vehicle with its effects, or
-    quadrotors of a class, drawn anew for every world; the preset's own if not given."""
+    quadrotors of a class, drawn anew for every world; the recipe's own if not given."""
     vehicle: str | None = None
     """With --model quad: a shipped vehicle's name or a vehicle file (.toml)."""
     out: Path = Path("runs/train")

@@ -47,12 +47,6 @@ def swift() -> TrainConfig:
     )
 
 
-def ace() -> TrainConfig:
-    """Return the recipe of `ace`: `swift`'s, through a fleet of quadrotors, for more speed."""
-    base = swift()
-    return replace(base, fleet=FleetConfig(), loss=replace(base.loss, progress=2.0, clearance=4.0))
-
-
 def paper() -> TrainConfig:
     """Return the weights of Su et al. 2026 and the simulator of Zhang et al. 2025 as printed.
 
@@ -170,7 +164,7 @@ def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) ->
     return with_quadrotor(config, load_vehicle(vehicle))
 
 
-PRESETS = {"racer": racer, "swift": swift, "ace": ace, "paper": paper, "small": small, "gpu": gpu}
+PRESETS = {"racer": racer, "swift": swift, "paper": paper, "small": small, "gpu": gpu}
 """Name -> function that returns the configuration; the docstring is its description."""
 
 

@@ -17,11 +17,13 @@ def test_presets(name):
 
 
 def test_a_model_is_asked_for_by_name_or_the_recipes_own():
-    ace, swift = preset("ace"), preset("swift")
-    assert ace.fleet is not None and chosen_model(ace, None, None) == ace
-    assert chosen_model(ace, "point", None).fleet is None
-    assert chosen_model(swift, "fleet", None).fleet == FleetConfig()
-    quad = chosen_model(ace, "quad", "racer5")
+    swift = preset("swift")
+    fleet = chosen_model(swift, "fleet", None)
+    assert fleet.fleet == FleetConfig() and chosen_model(fleet, None, None) == fleet
+    narrow = replace(swift, fleet=FleetConfig(fault_share=0.0))
+    assert chosen_model(narrow, "fleet", None) == narrow, "a recipe's own fleet"
+    assert chosen_model(fleet, "point", None) == swift == chosen_model(swift, None, None)
+    quad = chosen_model(fleet, "quad", "racer5")
     assert quad.fleet is None and quad.quadrotor is not None
     with pytest.raises(ValueError, match="a fleet has none: add --model quad"):
         chosen_model(swift, "fleet", "racer5")
