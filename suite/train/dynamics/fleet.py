@@ -11,6 +11,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from tracks.geometry.scene import Array
 from tracks.input.ranges import Range, Share
 
 Span = tuple[float, float]
@@ -95,40 +96,40 @@ class FleetConfig:
 class Vehicles(NamedTuple):
     """Quadrotors of a class as physical quantities, (B,) or (B, 3) each."""
 
-    time_step: np.ndarray
+    time_step: Array
     """(B,) the policy's period [s]."""
-    thrust_max: np.ndarray
+    thrust_max: Array
     """(B,) largest collective thrust that is asked for, per nominal mass [m/s^2]."""
-    force_scale: np.ndarray
+    force_scale: Array
     """(B,) true acceleration per nominal thrust per mass [1]."""
-    rotor_lag: np.ndarray
+    rotor_lag: Array
     """(B,) [s]."""
-    delay: np.ndarray
+    delay: Array
     """(B,) of commands [s]."""
-    rate_gain: np.ndarray
+    rate_gain: Array
     """(B, 3) true angular acceleration per rate error [1/s]."""
-    integral_gain: np.ndarray
+    integral_gain: Array
     """(B, 3) the same per integrated rate error [1/s^2]; 0: none."""
-    attitude_gain: np.ndarray
+    attitude_gain: Array
     """(B, 3) [1/s]."""
-    rate_max: np.ndarray
+    rate_max: Array
     """(B, 3) [rad/s]."""
-    turn_max: np.ndarray
+    turn_max: Array
     """(B, 3) [rad/s^2]."""
-    turn_by_thrust: np.ndarray
+    turn_by_thrust: Array
     """(B, 3) angular acceleration per thrust per mass, of a centre of mass off the thrust
     [1/m]."""
-    trim: np.ndarray
+    trim: Array
     """(B, 3) constant angular acceleration [rad/s^2]."""
-    drag: np.ndarray
+    drag: Array
     """(B, 3) linear, body axes [1/s]."""
-    quadratic: np.ndarray
+    quadratic: Array
     """(B, 3) quadratic, body axes [1/m]."""
-    wind_w: np.ndarray
+    wind_w: Array
     """(B, 3) [m/s]."""
-    state_latency: np.ndarray
+    state_latency: Array
     """(B,) [s]."""
-    image_latency: np.ndarray
+    image_latency: Array
     """(B,) [s]."""
 
 

@@ -15,13 +15,14 @@ def test_both_fleets_fly_the_same_way():
     rng = np.random.default_rng(3)
     params = reduced.draw_fleet(FleetConfig(), 1 / 15, 5, rng)
     pos_w, vel_w, target_w = (rng.normal(0, s, (5, 3)).astype(np.float32) for s in (1, 3, 9))
-    heading_w = np.tile(np.float32([0.6, 0.8, 0.0]), (5, 1))
+    heading_w = np.tile(np.array([0.6, 0.8, 0.0], np.float32), (5, 1))
     actions = rng.normal(0, 5, (6, 5, 3)).astype(np.float32)
+    goal_w = jnp.asarray(target_w)
     ours = reduced.start(params, *map(jnp.asarray, (pos_w, vel_w, heading_w)))
-    move = jax.jit(lambda body, action: reduced.step(body, params, action, target_w, 4, 0.9))
-    given, start = to_torch(params), [torch.as_tensor(x) for x in (pos_w, vel_w)]
+    move = jax.jit(lambda body, action: reduced.step(body, params, action, goal_w, 4, 0.9))
+    given = to_torch(params)
     rot_w = attitude(torch.zeros(5, 3), torch.as_tensor(heading_w))
-    theirs = torch_fleet.start(given, *start, rot_w)
+    theirs = torch_fleet.start(given, torch.as_tensor(pos_w), torch.as_tensor(vel_w), rot_w)
     for action in actions:
         ours = move(ours, action)
         theirs = torch_fleet.step(
