@@ -20,7 +20,6 @@ from policies.observation import Observation, View, observe
 from suite.train import losses
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import DynamicsState, make_dynamics
-from suite.train.dynamics.reduced import ReducedParams, ReducedState, as_seen, state_noise
 from suite.train.step import make_step, target_gate
 from suite.train.worlds import Worlds
 from tracks.geometry.camera import pixel_rays_b
@@ -104,7 +103,7 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
 
     The image has its noise, and carries no gradient to the state.
     """
-    spec, physics = config.spec, config.physics
+    spec, physics, dynamics = config.spec, config.physics, make_dynamics(config)
     rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
 
     def sight(
@@ -118,28 +117,19 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
         # iteration shares it, so that the rays stay one array.
         axis = rays.mean(0)
         wide = axis + (rays - axis) * worlds.fov_scale[0]
-        eye = seen_late(worlds, state, image=True)
+        eye = dynamics.seen(state, worlds.constants, True)
         pos_w, rot_w = jax.lax.stop_gradient((eye.pos_w, eye.rot_w))
         depth_m = depth_image(worlds.scene, pos_w, rot_w, wide, spec.camera.range_m, SEEN)
-        view = view_in(worlds, seen_late(worlds, state), target)._replace(depth_m=depth_m)
+        sensed = dynamics.seen(state, worlds.constants, False)
+        view = view_in(worlds, sensed, target)._replace(depth_m=depth_m)
         seen = observe(spec, view, last_action_b)
-        if config.fleet is not None:
+        if dynamics.noise is not None:
             noise = jax.random.normal(jax.random.fold_in(key, 2), seen.state.shape)
-            seen = seen._replace(state=seen.state + state_noise(config.fleet, spec) * noise)
+            seen = seen._replace(state=seen.state + dynamics.noise * noise)
         image = seen.image + physics.depth_noise * jax.random.normal(key, depth_m.shape)
         return seen._replace(image=image.reshape(-1, spec.camera.height, spec.camera.width))
 
     return sight
-
-
-def seen_late(worlds: Worlds, state: DynamicsState, image: bool = False) -> DynamicsState:
-    """Return what a world's sensors, or its camera, show of `state`: a fleet's are late."""
-    constants = worlds.constants
-    if not isinstance(constants, ReducedParams):
-        return state
-    assert isinstance(state, ReducedState)
-    vehicle = constants.vehicle
-    return as_seen(state, vehicle.image_latency if image else vehicle.state_latency)
 
 
 def observed_at_start(batch: int, config: TrainConfig) -> jax.Array:

@@ -299,3 +299,9 @@ def as_seen(body: ReducedState, age_s: Array) -> ReducedState:
         vel_w=body.vel_w - age * body.acc_w,
         rot_w=body.rot_w @ exp_rot(-age * body.rate_b),
     )
+
+
+def as_sensed(body: ReducedState, constants: ReducedParams, camera: bool) -> ReducedState:
+    """Return the bodies as their sensors, or their cameras, show them: late."""
+    vehicle = constants.vehicle
+    return as_seen(body, vehicle.image_latency if camera else vehicle.state_latency)
