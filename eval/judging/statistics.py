@@ -77,6 +77,19 @@ def bootstrap_mean(
     return _bootstrap(np.mean, values, seed, confidence, resamples)
 
 
+def expected_largest(values: np.ndarray, among: int) -> float | None:
+    """Return the mean of the largest of `among` of the values (n,), over all ways to pick them.
+
+    None where there are fewer values than that.
+    """
+    count = len(values)
+    if count < among:
+        return None
+    # The k-th smallest (from 0) is the largest of comb(k, among - 1) of all picks.
+    picks = [comb(k, among - 1) / comb(count, among) for k in range(count)]
+    return float(np.sort(values) @ np.array(picks))
+
+
 def _bootstrap(
     statistic: Callable[..., np.ndarray],
     values: np.ndarray,

@@ -7,11 +7,10 @@ attitude of Brescianini and D'Andrea 2018).
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Command
-from eval.vehicles.vehicle import Controller
 from tracks.geometry.rotation import cross, to_local, to_world
 from tracks.geometry.scene import Array
 
@@ -20,6 +19,20 @@ HEADING_RATE = 6.0
 LEAST_FORCE = 0.1
 """Below this wanted specific force its direction means nothing and the tilt is held [m/s^2]."""
 SMALL = 1e-6
+
+
+class AttitudeLoop(Protocol):
+    """Gains and limits of an attitude loop: those of a vehicle file, or (..., 3) arrays."""
+
+    @property
+    def attitude_gain(self) -> Any:
+        """Body rate per attitude error [1/s]."""
+        ...
+
+    @property
+    def rate_max(self) -> Any:
+        """Commanded body rates are clipped to this [rad/s]."""
+        ...
 
 
 def action_to_force(action_b: Array, rot_w: Array) -> Array:
@@ -34,7 +47,7 @@ def action_to_force(action_b: Array, rot_w: Array) -> Array:
 
 
 def attitude_command(
-    controller: Controller, force_w: Array, rot_w: Array, heading_w: Array
+    controller: AttitudeLoop, force_w: Array, rot_w: Array, heading_w: Array
 ) -> Command:
     """Return the command (CTBR) that turns body z to `force_w` and body x to `heading_w`.
 

@@ -1,4 +1,4 @@
-"""`suite train`: a policy by backpropagation through a point mass or a quadrotor."""
+"""`suite train`: a policy by backpropagation through a point mass or quadrotors."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ class Config:
     preset: str = "racer"
     """The recipe: racer, swift (that of the policy that flies by default, with 18 numbers instead
     of the paper's 12), small, gpu or paper."""
-    model: Literal["point", "quad"] = "point"
-    """What flies in training: the point mass, or the quadrotor of --vehicle with its effects."""
+    model: Literal["point", "quad", "fleet"] | None = None
+    """What flies in training: the point mass, the quadrotor of --vehicle with its effects, or
+    quadrotors of a class, drawn anew for every world; the recipe's own if not given."""
     vehicle: str | None = None
     """With --model quad: a shipped vehicle's name or a vehicle file (.toml)."""
     out: Path = Path("runs/train")
@@ -88,6 +89,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         params = fitted(params, start.spec, resolved.spec)
     if config.delta is not None:
         stored = load_delta(config.delta)
+        if resolved.fleet is not None:
+            raise ValueError(
+                "--delta corrects one vehicle's dynamics, and a fleet is many: add --model point"
+            )
         dynamics = resolved.quadrotor or resolved.physics
         check_corrects(stored.config.get("fit", {}), dynamics, config.delta)
         delta = jax.tree.map(jax.numpy.asarray, stored.params)

@@ -158,7 +158,8 @@ def resolve(
         given = load_policy_checkpoint(checkpoint_folder(policy))
         training = replace(training, spec=given.spec)
         digests["policy"] = policy_digest(policy)
-    tuning = finetune(training)
+    # A Delta Action Model corrects one vehicle's dynamics, and a fleet is many.
+    tuning = replace(finetune(training), fleet=None)
     longer = size.finetune_iterations if finetune_iterations is None else finetune_iterations
     if longer is not None:
         tuning = with_iterations(tuning, longer)

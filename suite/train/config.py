@@ -8,6 +8,7 @@ from typing import Annotated
 
 from eval.vehicles.vehicle import Vehicle
 from policies.spec import PolicySpec, check_image_size, check_spec
+from suite.train.dynamics.fleet import FleetConfig
 from tracks.input.ranges import Iterations, Range, Seed, Share, check_ranges
 
 
@@ -65,6 +66,9 @@ class QuadrotorConfig:
     """Standard deviation of the true mass over worlds, as a share of the vehicle's [1]."""
     lag_spread: Share = 0.3
     """The rotors' time constant varies by up to this share of the vehicle's either way [1]."""
+    lag_spread_s: Annotated[float, Range(0.0, 0.5)] = 0.0
+    """It varies by up to this as well, and is never negative: for a vehicle whose file has none
+    [s]."""
     drag_spread: Annotated[float, Range(0.0, 100.0)] = 0.1
     """Linear drag varies by up to this on each axis either way, and is never negative [1/s]."""
     delay_spread_s: Share = 0.01
@@ -123,6 +127,11 @@ class LossConfig:
     crash_depth_m: Annotated[float, Range(0.0, math.inf)] = 0.0
     """A world that gets deeper than this into a solid leaves the loss for the rest of the rollout:
     from there on its gradients say nothing about flying [m]."""
+    survival: Annotated[float, Range(0.0, 1e6)] = 0.0
+    """Price of a crash, as a weight of the progress that it costs later [s/m]; 0: none. At the
+    weight of `progress` a crash costs what the way lost is worth."""
+    survival_width_m: Annotated[float, Range(1e-3, 10.0)] = 0.04
+    """How far from contact with the body the probability to fly on begins to fall [m]."""
     path_samples: Annotated[int, Range(1, 1000)] = 4
     """Points of every step's path at which the nearest obstacle is looked up."""
 
@@ -205,6 +214,8 @@ class TrainConfig:
     """Dynamics and their randomisation."""
     quadrotor: QuadrotorConfig | None = None
     """Train through this quadrotor; None: through the point mass of `physics`."""
+    fleet: FleetConfig | None = None
+    """Train through quadrotors drawn from this distribution, in the place of either."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Weights of the loss and of the field."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
@@ -245,6 +256,8 @@ def check(config: TrainConfig) -> None:
 
         check_vehicle(config.quadrotor.vehicle)
         check_decides_in_time(config.spec, config.quadrotor.vehicle)
+    if config.fleet is not None and config.quadrotor is not None:
+        raise ValueError("a run has a fleet or one vehicle's quadrotor, and this one has both")
     stride, steps = config.episode.image_stride, config.episode.steps
     if steps % stride:
         raise ValueError(

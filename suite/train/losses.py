@@ -86,6 +86,16 @@ def guidance(config: LossConfig, step: Step) -> jax.Array:
     return -(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos)).sum(-1)
 
 
+def survival(_: LossConfig, step: Step) -> jax.Array:
+    """Return minus the progress that is still flown for [m/s]: speed times probability to be there.
+
+    Its gradient is that of the probability alone, so that a crash costs all the progress after it,
+    and since no progress counts as less than none, to crash never pays.
+    """
+    worth = jax.lax.stop_gradient(jnp.maximum(speed_to_goal(step), 0.0))
+    return -worth * step.survival
+
+
 LOSSES: dict[str, tuple[tuple[Term, str], ...]] = {
     "clearance": ((clearance, "clearance"),),
     "collide": ((collide, "collide"),),
@@ -97,8 +107,13 @@ LOSSES: dict[str, tuple[tuple[Term, str], ...]] = {
         (projection, "projection"),
     ),
     "guidance": ((guidance, "field_gain"),),
+    "survival": ((survival, "survival"),),
 }
 """Name in the curve -> its terms, each with the field of `LossConfig` that is its weight."""
+
+
+AFTER_CRASH = ("survival",)
+"""Names whose terms go on where a world has crashed: what would have been flown is the price."""
 
 
 def weighted(config: LossConfig, step: Step) -> dict[str, jax.Array]:

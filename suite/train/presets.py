@@ -16,6 +16,7 @@ from suite.train.config import (
     TrainConfig,
     check_decides_in_time,
 )
+from suite.train.dynamics.fleet import FleetConfig
 from tracks.common.names import unknown_name
 
 
@@ -127,15 +128,20 @@ def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:
         ValueError: where the policy decides faster than the vehicle's controller runs.
     """
     check_decides_in_time(config.spec, vehicle)
-    return replace(config, quadrotor=QuadrotorConfig(vehicle))
+    return replace(config, quadrotor=QuadrotorConfig(vehicle), fleet=None)
 
 
-def chosen_model(config: TrainConfig, model: str, vehicle: str | None) -> TrainConfig:
+def with_fleet(config: TrainConfig) -> TrainConfig:
+    """Return `config` through the class of quadrotors that `FleetConfig` draws from."""
+    return replace(config, quadrotor=None, fleet=config.fleet or FleetConfig())
+
+
+def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) -> TrainConfig:
     """Return `config` with what --model and --vehicle ask for.
 
     Args:
         config: a recipe.
-        model: "point" or "quad".
+        model: "point", "quad" or "fleet"; None: what the recipe has.
         vehicle: a vehicle file or a shipped name; with "quad" only.
 
     Raises:
@@ -143,12 +149,13 @@ def chosen_model(config: TrainConfig, model: str, vehicle: str | None) -> TrainC
     """
     from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 
-    if model == "point":
+    if model != "quad":
         if vehicle is not None:
-            raise ValueError(
-                f"--vehicle is {vehicle}, but the point mass has none: add --model quad"
-            )
-        return config
+            flown = "a fleet" if model == "fleet" else "the point mass"
+            raise ValueError(f"--vehicle is {vehicle}, but {flown} has none: add --model quad")
+        if model is None:
+            return config
+        return with_fleet(config) if model == "fleet" else replace(config, fleet=None)
     if vehicle is None:
         raise ValueError(
             "--model quad needs --vehicle: a vehicle file, or a shipped one by its name "

@@ -29,8 +29,6 @@ from tracks.geometry.scene import Counts
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
 """Solids of each kind that a training image shows, nearest first; the judge shows all."""
-BODY_RADIUS_M = 0.08
-"""Closer than this to a surface counts as a collision in the curves [m]."""
 
 
 class RolloutCarry(NamedTuple):
@@ -52,6 +50,10 @@ class RolloutCarry(NamedTuple):
     """(B, 32) of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 while the world counts in the loss: until it crashes, stops or finishes, then 0."""
+    going: jax.Array
+    """(B,) the same but for crashes."""
+    survival: jax.Array
+    """(B,) smooth probability to have flown until now."""
 
 
 class StepRecord(NamedTuple):
@@ -101,7 +103,7 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
 
     The image has its noise, and carries no gradient to the state.
     """
-    spec, physics = config.spec, config.physics
+    spec, physics, dynamics = config.spec, config.physics, make_dynamics(config)
     rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
 
     def sight(
@@ -115,10 +117,15 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
         # iteration shares it, so that the rays stay one array.
         axis = rays.mean(0)
         wide = axis + (rays - axis) * worlds.fov_scale[0]
-        pos_w, rot_w = jax.lax.stop_gradient((state.pos_w, state.rot_w))
+        eye = dynamics.seen(state, worlds.constants, True)
+        pos_w, rot_w = jax.lax.stop_gradient((eye.pos_w, eye.rot_w))
         depth_m = depth_image(worlds.scene, pos_w, rot_w, wide, spec.camera.range_m, SEEN)
-        view = view_in(worlds, state, target)._replace(depth_m=depth_m)
+        sensed = dynamics.seen(state, worlds.constants, False)
+        view = view_in(worlds, sensed, target)._replace(depth_m=depth_m)
         seen = observe(spec, view, last_action_b)
+        if dynamics.noise is not None:
+            noise = jax.random.normal(jax.random.fold_in(key, 2), seen.state.shape)
+            seen = seen._replace(state=seen.state + dynamics.noise * noise)
         image = seen.image + physics.depth_noise * jax.random.normal(key, depth_m.shape)
         return seen._replace(image=image.reshape(-1, spec.camera.height, spec.camera.width))
 
@@ -161,6 +168,8 @@ def make_rollout(
             observed=observed_at_start(batch, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
+            going=jnp.ones(batch),
+            survival=jnp.ones(batch),
         )
 
         def step(
@@ -182,16 +191,20 @@ def make_rollout(
                 flown = action + correction
             _, target_w = target_gate(worlds.scene.gates, target)
             after = dynamics.step(before, worlds.constants, flown, target_w, key_now)
-            made = make_step(weights, worlds, before, after, target)
+            crashed = carry.going > carry.alive
+            made = make_step(weights, worlds, before, after, target, carry.survival, crashed)
             terms = losses.weighted(weights, made)
             passed_after = target + made.passed
-            alive = carry.alive * (made.clearance > -weights.crash_depth_m)
-            alive = alive * (number + 1 < worlds.stop)
+            goes_on = number + 1 < worlds.stop
             if config.episode.finish:
-                alive = alive * (passed_after < worlds.scene.gates.center_w.shape[1])
+                goes_on = goes_on & (passed_after < worlds.scene.gates.center_w.shape[1])
+            alive = carry.alive * (made.clearance > -weights.crash_depth_m) * goes_on
             record = StepRecord(
                 image=seen.image,
-                terms={name: term * carry.alive for name, term in terms.items()},
+                terms={
+                    name: term * (carry.going if name in losses.AFTER_CRASH else carry.alive)
+                    for name, term in terms.items()
+                },
                 speed=jnp.linalg.norm(after.vel_w, axis=-1),
                 clearance=made.clearance,
                 passed=made.passed,
@@ -209,6 +222,8 @@ def make_rollout(
                 observed=observed,
                 delta_hidden=delta_hidden,
                 alive=alive,
+                going=carry.going * goes_on,
+                survival=made.survival,
             )
             return carry, record
 

@@ -15,6 +15,8 @@ from tracks.geometry.crossing import crossing
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Counts, Gates
 
+BODY_RADIUS_M = 0.08
+"""Closer than this to a surface is a collision [m]."""
 NEAR = Counts(boxes=8, cylinders=4, capsules=3, spheres=3)
 """Solids of each kind among which the nearest obstacle is looked for."""
 BEYOND_M = 10.0
@@ -49,6 +51,8 @@ class Step(NamedTuple):
     """(B,) bool: that gate was crossed."""
     clearance: jax.Array
     """(B,) smallest signed distance to a solid on the way [m]."""
+    survival: jax.Array
+    """(B,) probability to have flown until the step's end, a smooth one, with gradient [1]."""
 
 
 def norm(vector: jax.Array) -> jax.Array:
@@ -99,17 +103,34 @@ def gap_beyond(
     return distance + moved - config.safety_radius_m
 
 
+def flown_on(config: LossConfig, gap: jax.Array) -> jax.Array:
+    """Return the probability (B,) to fly on along a path with the gaps (B, S) [m]: logistic."""
+    beyond = gap + config.safety_radius_m - BODY_RADIUS_M
+    return jnp.exp(-jax.nn.softplus(-beyond / config.survival_width_m).mean(-1))
+
+
 def make_step(
     config: LossConfig,
     worlds: Worlds,
     before: DynamicsState,
     after: DynamicsState,
     target: jax.Array,
+    survival: jax.Array | float = 1.0,
+    crashed: jax.Array | bool = False,
 ) -> Step:
     """Return the step from `before` to `after` of worlds that have passed `target` (B,) gates.
 
     Of `config` it takes where progress is measured to and the points of the path. Gates and
     obstacles are looked up on values without gradient.
+
+    Args:
+        config: of the losses.
+        worlds: what there is.
+        before: at the step's beginning.
+        after: at its end.
+        target: (B,) gates passed.
+        survival: (B,) probability to have flown until now.
+        crashed: (B,) where a world has crashed before: no further solid makes that worse.
     """
     gates = worlds.scene.gates
     gate, _ = target_gate(gates, target)
@@ -125,16 +146,20 @@ def make_step(
     share = (jnp.arange(config.path_samples) + 1.0) / config.path_samples
     path_w = before.pos_w[:, None] + share[:, None] * (after.pos_w - before.pos_w)[:, None]
     distance, away_w = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path_w), NEAR)
+    gap = gap_beyond(config, distance, away_w, path_w)
+    if config.survival > 0.0:
+        survival = survival * jnp.where(crashed, 1.0, flown_on(config, gap))
     return Step(
         pos_w=after.pos_w,
         vel_w=after.vel_w,
         acc_w=after.acc_w,
         jerk_w=(after.acc_w - before.acc_w) / worlds.constants.time_step[:, None],
-        gap=gap_beyond(config, distance, away_w, path_w),
+        gap=gap,
         away_w=away_w,
         goal_w=goal_w,
         place_g=place_g,
         gate=gate,
         passed=passed,
         clearance=distance.min(-1),
+        survival=jnp.broadcast_to(survival, target.shape),
     )

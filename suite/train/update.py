@@ -14,7 +14,8 @@ from jax.sharding import Mesh
 from policies.networks import delta_network, network
 from suite.train.config import OptimizerConfig, TrainConfig
 from suite.train.gradient import shard_gradient
-from suite.train.rollout import BODY_RADIUS_M, StepRecord
+from suite.train.rollout import StepRecord
+from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import Worlds
 
 

@@ -126,6 +126,15 @@ def _quadrotor_constants(config: TrainConfig, iteration: int) -> dynamics.WorldP
     return QuadrotorParams(period, draw_effects(config.quadrotor, batch, rng))
 
 
+def _fleet_constants(config: TrainConfig, iteration: int) -> dynamics.WorldParams:
+    """Return the fleet of an iteration, from draws of their own: the tracks stay the same."""
+    from suite.train.dynamics.reduced import draw_fleet
+
+    assert config.fleet is not None
+    rng = np.random.default_rng([config.seed, iteration, 2])
+    return draw_fleet(config.fleet, 1.0 / config.spec.rate_hz, config.episode.batch, rng)
+
+
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     """Return the worlds of an iteration."""
     rng = np.random.default_rng([config.seed, iteration])
@@ -169,6 +178,8 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     constants = point_mass.PointMassParams(*(np.asarray(x, np.float32) for x in point))
     if config.quadrotor is not None:
         constants = _quadrotor_constants(config, iteration)
+    elif config.fleet is not None:
+        constants = _fleet_constants(config, iteration)
     return Worlds(
         scene=stack([track.scene for track in tracks], max_counts(episode.gate_corners)),
         pos_w=pos.astype(np.float32),

@@ -1,8 +1,8 @@
 """The trainer's method as a plain torch-eager loop: the baseline of `suite bench train`.
 
-Same network, point mass, losses, field, delays and noise as `suite.train` with the preset `paper`,
-one step after another with the encoder inside the loop, and backward through it. What the preset
-does not use is not here, so that a yardstick stays what it is while the trainer grows.
+Same network, point mass or fleet, losses, field, delays and noise as `suite.train` with the preset
+`paper`, one step after another with the encoder inside the loop, and backward through it. What the
+preset does not use is not here, so that a yardstick stays what it is while the trainer grows.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from policies.formats.torch_twin import torch_twin
-from suite.experiments.bench import torch_scene
+from suite.experiments.bench import torch_fleet, torch_scene
 from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
 from suite.train.dynamics.point_mass import GRAVITY, PointMassParams
+from suite.train.dynamics.reduced import ReducedParams, state_noise, steps_of
 from suite.train.losses import MAX_PULL, UNIT_FIELD
 from suite.train.presets import paper
 from suite.train.step import BEYOND_M
@@ -39,6 +41,10 @@ class TorchState(NamedTuple):
     rot_w: Tensor
     heading_w: Tensor
     commands_w: Tensor
+
+
+Body = TorchState | torch_fleet.TorchReduced
+"""What flies."""
 
 
 def to_torch(tree: Any) -> Any:
@@ -118,6 +124,8 @@ class Baseline:
         self.network = torch_twin(params, config.spec).requires_grad_(True)
         rate, decay = config.optimizer.rate, config.optimizer.weight_decay
         self.optimizer = torch.optim.AdamW(self.network.parameters(), rate, weight_decay=decay)
+        if config.fleet is not None:
+            self.noise = torch.from_numpy(np.array(state_noise(config.fleet, config.spec)))
         self.rays = torch.as_tensor(pixel_rays_b(config.spec.camera), dtype=torch.float32)
 
     def update(self, worlds: Worlds) -> float:
@@ -133,10 +141,7 @@ class Baseline:
         config, physics = self.config, self.config.physics
         count = worlds.pos_w.shape[0]
         zero = torch.zeros(count, 3)
-        body = TorchState(
-            worlds.pos_w, worlds.vel_w, zero, zero, attitude(zero, worlds.heading_w),
-            worlds.heading_w, torch.zeros(count, 2, 3),
-        )  # fmt: skip
+        body = self.start(worlds)
         camera = config.spec.camera
         images = [torch.zeros(count, camera.height, camera.width)] * physics.image_delay
         upright = torch.zeros(count, config.spec.state_size)
@@ -148,17 +153,49 @@ class Baseline:
         for _ in range(config.episode.steps):
             gate, target_w = self.target_gate(worlds.scene.gates, target)
             images.append(self.look(worlds, body))
-            seen = [to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w)]
-            numbers = [seen[0], body.rot_w[:, 2], seen[1], action]
-            states.append(torch.cat(numbers, -1))
+            now = self.seen(worlds, body)
+            seen = [to_local(now.rot_w, v) for v in (now.vel_w, target_w - now.pos_w)]
+            state = torch.cat([seen[0], now.rot_w[:, 2], seen[1], action], -1)
+            if config.fleet is not None:
+                state = state + self.noise * torch.randn_like(state)
+            states.append(state)
             action, hidden = self.network(states.pop(0), images.pop(0), hidden)
-            constants = worlds.constants
-            assert isinstance(constants, PointMassParams)  # the baseline flies the point mass alone
-            before, body = body, step(body, constants, action, target_w, config)
+            before, body = body, self.fly(worlds, body, action, target_w)
             passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
             total = total + self.judge(worlds, before, body, gate, target_w).mean()
             target = target + (passed & (target < worlds.scene.gates.center_w.shape[1]))
         return total / config.episode.steps
+
+    def start(self, worlds: Worlds) -> Body:
+        """Return the bodies at the start of a rollout."""
+        zero = torch.zeros_like(worlds.pos_w)
+        rot_w = attitude(zero, worlds.heading_w)
+        if isinstance(worlds.constants, ReducedParams):
+            return torch_fleet.start(worlds.constants, worlds.pos_w, worlds.vel_w, rot_w)
+        return TorchState(
+            worlds.pos_w, worlds.vel_w, zero, zero, rot_w,
+            worlds.heading_w, torch.zeros(len(zero), 2, 3),
+        )  # fmt: skip
+
+    def seen(self, worlds: Worlds, body: Body, image: bool = False) -> Body:
+        """Return the bodies as sensors, or the camera, show them: a fleet's are late."""
+        if not isinstance(worlds.constants, ReducedParams):
+            return body
+        assert isinstance(body, torch_fleet.TorchReduced)
+        vehicle = worlds.constants.vehicle
+        age = vehicle.image_latency if image else vehicle.state_latency
+        return torch_fleet.as_seen(body, age)
+
+    def fly(self, worlds: Worlds, body: Body, action: Tensor, target_w: Tensor) -> Body:
+        """Return the bodies one policy period later."""
+        constants, config = worlds.constants, self.config
+        if isinstance(body, TorchState):
+            assert isinstance(constants, PointMassParams)
+            return step(body, constants, action, target_w, config)
+        assert isinstance(constants, ReducedParams) and config.fleet is not None
+        steps = steps_of(config.fleet, 1.0 / config.spec.rate_hz)
+        decay = config.loss.gradient_decay
+        return torch_fleet.step(body, constants, action, target_w, steps, decay)
 
     def target_gate(self, gates: Gates, target: Tensor) -> tuple[Gates, Tensor]:
         """Return each world's current gate and the point to fly to (B, 3)."""
@@ -169,8 +206,9 @@ class Baseline:
         return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
 
     @torch.no_grad()
-    def look(self, worlds: Worlds, body: TorchState) -> Tensor:
+    def look(self, worlds: Worlds, body: Body) -> Tensor:
         """Return the encoded images (B, height, width) with their noise."""
+        body = self.seen(worlds, body, image=True)
         camera, encoding = self.config.spec.camera, self.config.spec.depth
         axis = self.rays.mean(0)
         rays = axis + (self.rays - axis) * worlds.fov_scale[0]
@@ -180,7 +218,7 @@ class Baseline:
         return image.reshape(-1, camera.height, camera.width)
 
     def judge(
-        self, worlds: Worlds, before: TorchState, body: TorchState, gate: Gates, target_w: Tensor
+        self, worlds: Worlds, before: Body, body: Body, gate: Gates, target_w: Tensor
     ) -> Tensor:
         """Return the loss of a step (B,)."""
         config = self.config.loss

@@ -1,7 +1,8 @@
 """`suite bench train`: gradient steps a second against a plain torch-eager loop.
 
 Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids at
-the preset `paper`: batch 64, 150 steps, 24x32 images, two threads.
+the preset `paper`: batch 64, 150 steps, 24x32 images, two threads. The same again through a fleet
+of quadrotors in the place of the point mass.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from suite.common.running.threads import share_threads
 from suite.experiments.bench.compare import Comparison, Figure
 from suite.train.config import TrainConfig
-from suite.train.presets import preset
+from suite.train.presets import preset, with_fleet
 from suite.train.worlds import Worlds, sample_worlds
 from tracks.geometry.scene import PARKED_Z, Counts, Gates
 
@@ -28,6 +29,7 @@ BATCH, STEPS, THREADS = 64, 150, 2
 UNTRUSTED_BELOW = 2000.0
 """A free machine of two cores makes at least this many steps a second with the baseline."""
 ROUNDS = 4
+OURS, BASELINE = "ours", "baseline"
 ENOUGH_S = 60.0
 """No further round is started after this; a free machine does all of them in that time [s]."""
 
@@ -164,29 +166,35 @@ def _two_cores() -> Iterator[None]:
 
 
 def _compare(batch: int, steps: int, rounds: int) -> Comparison:
-    config = bench_config(batch, steps)
-    worlds = bench_worlds(config)
-    sides = (_ours(config, worlds), _baseline(config, worlds))
-    taken: tuple[list[float], list[float]] = ([], [])
-    for side in sides:
+    point = bench_config(batch, steps)
+    models = {"point": point, "fleet": with_fleet(point)}
+    sides = {}
+    for model, config in models.items():
+        worlds = bench_worlds(config)
+        sides[model, OURS] = _ours(config, worlds)
+        sides[model, BASELINE] = _baseline(config, worlds)
+    taken: dict[tuple[str, str], list[float]] = {key: [] for key in sides}
+    for side in sides.values():
         side()
     machine = matrix_rate()
     until = time.perf_counter() + ENOUGH_S
     for done in range(rounds):
         if done and time.perf_counter() > until:
             break
-        for seconds, side in zip(taken, sides, strict=True):
+        for key, side in sides.items():
             started = time.perf_counter()
             side()
-            seconds.append(time.perf_counter() - started)
-    ours, baseline = (batch * steps / min(seconds) for seconds in taken)
+            taken[key].append(time.perf_counter() - started)
+    rates = {key: batch * steps / min(seconds) for key, seconds in taken.items()}
+    ours, baseline = rates["point", OURS], rates["point", BASELINE]
     warnings = ()
     if baseline < UNTRUSTED_BELOW:
         warnings = (
             f"the baseline makes {baseline:.0f} steps/s; on a free machine of two cores it makes "
             f"{UNTRUSTED_BELOW:.0f} or more: it is not to be trusted, run again on a free machine",
         )
-    work = work_per_step(config)
+    work = work_per_step(point)
+    unit = "gradient steps/s"
     details = {
         "share_of_matrix_rate": round(ours * work / machine, 4),
         "matrix_rate_gflop_s": round(machine / 1e9, 1),
@@ -194,7 +202,13 @@ def _compare(batch: int, steps: int, rounds: int) -> Comparison:
         "solids": sum(SOLIDS),
         "batch": batch,
         "steps": steps,
-        "rounds_s": {"ours": taken[0], "baseline": taken[1]},
+        "fleet": {
+            "ours": round(rates["fleet", OURS]),
+            "baseline": round(rates["fleet", BASELINE]),
+            "unit": unit,
+            "ratio": round(rates["fleet", OURS] / rates["fleet", BASELINE], 2),
+            "time_over_point_mass": round(ours / rates["fleet", OURS], 2),
+        },
+        "rounds_s": {f"{model} {side}": seconds for (model, side), seconds in taken.items()},
     }
-    unit = "gradient steps/s"
     return Comparison("train", Figure(ours, unit), Figure(baseline, unit), warnings, details)

@@ -29,7 +29,9 @@ class Goal(NamedTuple):
     v_max: float
     """What is asked: the largest printed [m/s]."""
     v_max_miss: float
-    """[m/s]."""
+    """By how much the median over trials misses it [m/s]."""
+    of_ten_miss: float | None = None
+    """By how much the mean largest of ten trials misses it; None with fewer trials [m/s]."""
 
     @property
     def met(self) -> bool:
@@ -51,7 +53,10 @@ def goals(cells: Sequence[Tally]) -> list[Goal]:
         floor = FLOORS[cell.difficulty]
         of_floor, of_speed = floor - cell.success.value, v_max - cell.v_max.value
         rates = rate, max(0.0, missed), floor, max(0.0, of_floor)
-        found.append(Goal(cell.track, cell.difficulty, *rates, v_max, max(0.0, of_speed)))
+        of_ten = cell.v_max_of_ten
+        ten_miss = None if of_ten is None else max(0.0, v_max - of_ten)
+        speed = v_max, max(0.0, of_speed), ten_miss
+        found.append(Goal(cell.track, cell.difficulty, *rates, *speed))
     return found
 
 
@@ -64,6 +69,9 @@ def verdict(found: Sequence[Goal]) -> str:
         f"{met} of {len(found)} cells meet the whole goal: {won} in success against the better of "
         f"paper and baseline, {fast} in v_max against both."
     )
+    largest = sum(goal.of_ten_miss == 0 for goal in found)
+    if not any(goal.of_ten_miss is None for goal in found):
+        text += f" If the printed v_max is the largest of ten trials, it is reached in {largest}."
     worst = max(found, key=lambda goal: goal.success_miss)
     slowest = max(found, key=lambda goal: goal.v_max_miss)
     if worst.success_miss:

@@ -18,7 +18,8 @@ import numpy as np
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import network
 from suite.train.config import TrainConfig
-from suite.train.rollout import BODY_RADIUS_M, Note, make_rollout
+from suite.train.rollout import Note, make_rollout
+from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import Worlds, sample_worlds
 
 SECONDS = 10.0

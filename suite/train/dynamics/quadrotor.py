@@ -96,10 +96,15 @@ def draw_effects(
     drag = own("linear_drag").coefficient + config.drag_spread * either_way(3)
     delay = own("command_delay").delay + config.delay_spread_s * either_way()
     wind = rng.standard_normal((batch, 3)) * np.asarray(config.wind_std)
+
+    def lag(either: np.ndarray) -> np.ndarray:
+        whole = own("motor_lag").time_constant * (1 + config.lag_spread * either)
+        return np.maximum(whole + config.lag_spread_s * either, 0.0)
+
     fields: dict[str, tuple[np.ndarray, ...]] = {
         "linear_drag": (np.maximum(drag, 0.0),),
         "constant_wind": (own("constant_wind").velocity + wind,),
-        "motor_lag": (own("motor_lag").time_constant * (1 + config.lag_spread * either_way()),),
+        "motor_lag": (lag(either_way()),),
         "command_delay": (np.clip(delay, 0.0, longest_delay(config)),),
         "mass_offset": (mass * (1 + config.mass_std * rng.standard_normal(batch)) - vehicle.mass,),
         "rate_gain": (own("rate_gain").scale * (1 + config.gain_spread * either_way(3)),),

@@ -13,8 +13,8 @@ from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import make_dynamics
 from suite.train.ppo import critic
 from suite.train.ppo.reward import RewardTerms, make_reward
-from suite.train.rollout import BODY_RADIUS_M, make_sight, observed_at_start, queue
-from suite.train.step import target_gate
+from suite.train.rollout import make_sight, observed_at_start, queue
+from suite.train.step import BODY_RADIUS_M, target_gate
 from suite.train.worlds import Worlds
 
 

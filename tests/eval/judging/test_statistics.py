@@ -1,5 +1,7 @@
 """Intervals against published numbers and against their own promise."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 
 from eval.judging.statistics import (
     bootstrap_median,
+    expected_largest,
     mcnemar_exact,
     paired_bootstrap,
     paired_success,
@@ -95,3 +98,10 @@ def test_paired_bootstrap_is_of_the_differences():
     assert found == (0.5, 0.5, 0.5)
     with pytest.raises(ValueError, match="pairs"):
         paired_bootstrap(first, first[:2])
+
+
+def test_the_expected_largest_is_that_of_all_picks():
+    values = np.array([3.0, 9.0, 1.0, 4.0, 7.0])
+    picks = [max(pick) for pick in itertools.combinations(values, 3)]
+    assert expected_largest(values, 3) == pytest.approx(np.mean(picks))
+    assert expected_largest(values, 5) == 9.0 and expected_largest(values, 6) is None

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from suite.train import losses
 from suite.train.config import LossConfig
 from suite.train.losses import MAX_PULL, weighted
-from suite.train.step import Step, gap_beyond
+from suite.train.step import Step, flown_on, gap_beyond
 from tracks.geometry.clearance import nearest_obstacle
 from tracks.geometry.field import attractive_field, magnetic_field
 from tracks.geometry.gates import round_gates, square_gates
@@ -47,6 +47,7 @@ def a_step(batch, **known):
     zero = jnp.zeros((batch, 3))
     rest = {name: zero for name in ("pos_w", "vel_w", "acc_w", "jerk_w", "goal_w", "place_g")}
     path = {"gap": jnp.ones((batch, 1)), "away_w": zero[:, None], "clearance": jnp.ones(batch)}
+    path["survival"] = jnp.ones(batch)
     gate = {"gate": unit_gate(batch), "passed": jnp.zeros(batch, bool)}
     return Step(**{**rest, **path, **gate, **known})
 
@@ -289,3 +290,24 @@ def test_the_field_is_held_near_the_wires_and_carries_no_gradient_itself():
     assert not np.any(jax.grad(of_velocity)(vel))
     bend = jax.jacrev(jax.grad(lambda p: guidance_term(config, gates, p, vel).sum()))(wire - 0.3)
     assert not np.any(bend)
+
+
+def test_a_crash_costs_the_progress_that_comes_after_it():
+    """Three steps at 2, 3 and -1 m/s, the chance of the first one on: 2 q + 3 q + 0 q."""
+    config = LossConfig(survival=0.5, safety_radius_m=0.3, survival_width_m=0.05)
+    ahead, still = jnp.asarray([[9.0, 0.0, 0.0]]), jnp.zeros((1, 3))
+
+    def loss(gap):
+        chance = flown_on(config, jnp.full((1, 2), gap))
+        speeds = (jnp.asarray([[x, 0.0, 0.0]]) for x in (2.0, 3.0, -1.0))
+        known = {"pos_w": still, "goal_w": ahead, "survival": chance}
+        steps = (a_step(1, vel_w=vel_w, **known) for vel_w in speeds)
+        return sum(weighted(config, step)["survival"][0] for step in steps)
+
+    # The body touches at a gap of 0.08 - 0.3 m: even odds.
+    assert float(loss(-0.22)) == pytest.approx(-0.5 * 5.0 * 0.5, rel=1e-4)
+    slope = jax.grad(loss)(-0.22)
+    assert float(slope) == pytest.approx(-0.5 * 5.0 * 0.5 * 0.5 / 0.05, rel=1e-4)
+    assert float(jax.grad(loss)(0.1)) > -0.1, "far away there is nothing to gain"
+    at_speed = jax.grad(lambda v: weighted(config, a_step(1, vel_w=v, goal_w=ahead))["survival"][0])
+    np.testing.assert_array_equal(at_speed(2.0 + still), 0.0, "speed is paid by `progress`")

@@ -1,9 +1,12 @@
 """Training runs by name."""
 
+from dataclasses import replace
+
 import pytest
 
-from suite.train.config import TrainConfig
-from suite.train.presets import PRESETS, preset
+from suite.train.config import TrainConfig, check
+from suite.train.dynamics.fleet import FleetConfig
+from suite.train.presets import PRESETS, chosen_model, preset
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -11,6 +14,22 @@ def test_presets(name):
     config = preset(name)
     assert isinstance(config, TrainConfig) and PRESETS[name].__doc__
     assert config.optimizer.iterations > 0 and config.episode.batch > 0
+
+
+def test_a_model_is_asked_for_by_name_or_the_recipes_own():
+    swift = preset("swift")
+    fleet = chosen_model(swift, "fleet", None)
+    assert fleet.fleet == FleetConfig() and chosen_model(fleet, None, None) == fleet
+    narrow = replace(swift, fleet=FleetConfig(fault_share=0.0))
+    assert chosen_model(narrow, "fleet", None) == narrow, "a recipe's own fleet"
+    assert chosen_model(fleet, "point", None) == swift == chosen_model(swift, None, None)
+    quad = chosen_model(fleet, "quad", "racer5")
+    assert quad.fleet is None and quad.quadrotor is not None
+    with pytest.raises(ValueError, match="a fleet has none: add --model quad"):
+        chosen_model(swift, "fleet", "racer5")
+    both = replace(quad, fleet=FleetConfig())
+    with pytest.raises(ValueError, match="this one has both"):
+        check(both)
 
 
 def test_the_papers_preset_has_the_papers_weights():

@@ -358,3 +358,23 @@ def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the
     after = np.cumsum(passed, 0) - passed > 0
     assert after.any()
     assert np.array_equal(np.asarray(records.alive) == 0, after & finish)
+
+
+def test_a_crashed_world_keeps_the_price_of_its_crash_and_nothing_else():
+    config = small_config(batch=2, steps=4, loss={"survival": 1.0})
+    worlds = boxes_worlds(config)
+    center_w = np.array(worlds.scene.boxes.center_w)
+    center_w[0, 0] = worlds.pos_w[0]  # the first world starts inside a solid
+    boxes = worlds.scene.boxes._replace(center_w=center_w)
+    worlds = worlds._replace(
+        scene=worlds.scene._replace(boxes=boxes), vel_w=worlds.heading_w * np.float32(2.0)
+    )
+    shift = jnp.zeros((4, 2, SPEC.hidden_size))
+    _, records = jax.jit(lambda p: make_rollout(config)(p, shift, worlds, KEY, blind))(
+        fresh_params()
+    )
+    np.testing.assert_array_equal(records.alive[:, 0], [1, 0, 0, 0])
+    assert np.all(np.asarray(records.terms["progress"])[1:, 0] == 0)
+    price = -np.asarray(records.terms["survival"])
+    assert np.all(price[1:, 0] > 0), "what would have been flown"
+    assert np.all(price[:, 0] < 0.5 * price[:, 1]), "its chance is gone"

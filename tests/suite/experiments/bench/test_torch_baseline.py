@@ -9,14 +9,17 @@ import pytest
 from policies.formats.torch_twin import torch_twin
 from suite.experiments.bench import train
 from suite.experiments.bench.torch_baseline import Baseline, to_torch
+from suite.train.dynamics.fleet import FleetConfig
 from suite.train.gradient import make_gradient
 from tests.support.training import fresh_params
 
+QUIET = FleetConfig(vel_noise=0.0, axis_noise=0.0, gate_noise_m=0.0)
 
-@pytest.fixture(scope="module")
-def pair():
+
+@pytest.fixture(scope="module", params=[None, QUIET], ids=["point", "fleet"])
+def pair(request):
     """Return (our gradient, our loss, the baseline after backward, its loss, config)."""
-    base = train.bench_config(6, 12)
+    base = replace(train.bench_config(6, 12), fleet=request.param)
     config = replace(base, physics=replace(base.physics, depth_noise=0.0))
     worlds, params = train.bench_worlds(config), fresh_params(config.spec)
     gradient, loss, _ = jax.jit(make_gradient(config))(params, worlds, jax.random.key(0), None)

@@ -25,3 +25,10 @@ def test_goals_by_hand():
     assert "zigzag at level 9, by 8 points; v_max misses most on circular at level 3" in text
     (perfect,) = goals([cell("ellipse", 6, 1.0, 6.4, low=0.963)])
     assert perfect.met and verdict([perfect]).startswith("1 of 1 cells meet the whole goal")
+
+
+def test_a_printed_v_max_may_be_the_largest_of_ten():
+    cells = [cell("ellipse", 6, 1.0, 6.2)._replace(v_max_of_ten=ten) for ten in (6.3, 6.2)]
+    assert [goal.of_ten_miss for goal in goals(cells)] == [0, pytest.approx(0.1)]
+    assert "largest of ten trials, it is reached in 1." in verdict(goals(cells))
+    assert "of ten" not in verdict(goals([cell("ellipse", 6, 1.0, 6.2)])), "too few trials"

@@ -14,7 +14,7 @@ from suite.experiments.study.validation import (
     scored,
     validation_worlds,
 )
-from suite.train.rollout import BODY_RADIUS_M
+from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import sample_worlds
 from tests.support.training import boxes_only, fresh_params, small_config
 from tracks.geometry.scene import Boxes, Gates

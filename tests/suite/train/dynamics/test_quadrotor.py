@@ -245,6 +245,17 @@ def test_quadrotors_vary_around_the_vehicle_and_the_tracks_stay_the_same():
     assert "com_offset" not in effects, "what does not vary stays the vehicle's"
     bare = quadrotor.draw_effects(QuadrotorConfig(PLAIN), 8, np.random.default_rng(0))
     assert np.all(bare["motor_lag"].time_constant == 0)
+    wide = QuadrotorConfig(PLAIN, lag_spread_s=0.05)
+    spread = quadrotor.draw_effects(wide, 200, np.random.default_rng(0))
+    lag = spread["motor_lag"].time_constant
+    assert lag.min() == 0 and 0.045 < lag.max() <= 0.05, "a share of no lag is none"
+    np.testing.assert_array_equal(
+        spread["rate_gain"].scale,
+        quadrotor.draw_effects(replace(wide, lag_spread_s=0.0), 200, np.random.default_rng(0))[
+            "rate_gain"
+        ].scale,
+        err_msg="the other draws stay what they are",
+    )
     assert np.all((bare["command_delay"].delay >= 0) & (bare["command_delay"].delay <= 0.01))
 
 
