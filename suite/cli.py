@@ -121,7 +121,7 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 def _run(name: str, args: list[str]) -> int:
     from suite.common.compiled import keep_compiled
     from suite.common.console import Console, stdout_kept_clean
-    from suite.common.running.threads import one_thread_a_product, set_threads
+    from tracks.common.work.threads import one_thread_a_product, set_threads
 
     keep_compiled()
     set_threads()

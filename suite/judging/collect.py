@@ -13,13 +13,14 @@ from suite.judging.flying import (
     about_policy,
     default_policy,
     flying_needs,
-    options_for,
     read_course,
     who_flies,
+    workers_for,
 )
 from suite.judging.requests import Collection
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
+from tracks.common.work import Workers
 from tracks.input.reading import read_json
 
 if TYPE_CHECKING:
@@ -30,7 +31,9 @@ LIST = "flights.json"
 """Name of the list of flights in the output folder."""
 
 
-def collect(collection: Collection, out: Path, console: Console) -> dict[str, Any]:
+def collect(
+    collection: Collection, out: Path, console: Console, workers: Workers | None = None
+) -> dict[str, Any]:
     """Fly and write a log a flight into `out`; the same call after an interruption goes on.
 
     Returns:
@@ -42,7 +45,7 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
         ValueError: for anything in `collection` that cannot be used, or where `out` holds the
             flights of another collection.
     """
-    from eval.judging.judge import Record, fly
+    from eval.judging.judge import JudgeOptions, Record, fly
     from policies.policy import load_policy
 
     course = read_course(collection)
@@ -57,9 +60,9 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
     }
     rows = _rows_there(out, plain(about))
     missing = [trial for trial in trials if trial not in rows]
-    options = options_for(len(missing), None, collection.world)
+    workers = workers_for(len(missing), workers, collection.world)
     what = f"{len(missing)} flights in the {collection.world} world"
-    announce(console, what, flying_needs(len(missing), options.processes or 1))
+    announce(console, what, flying_needs(len(missing), workers))
 
     def write_list() -> dict[str, Any]:
         flights = [rows[trial] for trial in trials if trial in rows]
@@ -79,11 +82,11 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
 
         if missing:
             fly(
-                who_flies(policy, asked, collection.trust, options.processes),
+                who_flies(policy, asked, collection.trust, workers),
                 missing,
                 course.vehicle,
                 collection.world,
-                options,
+                JudgeOptions(workers=workers),
                 keep,
                 Record(depth=False),
                 course.tracks,

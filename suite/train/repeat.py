@@ -30,9 +30,9 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate, announce
 from suite.common.provenance import write_run_record
-from suite.common.running.threads import threads
 from suite.train.worlds import Worlds
 from tracks.common.files import recover_folder
+from tracks.common.work.threads import threads
 
 SAVE_PERIOD_S = 30.0
 """Time between checkpoints [s]."""
