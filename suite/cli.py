@@ -152,8 +152,11 @@ def _complain(message: str) -> None:
 
 def entry() -> None:
     """Be the program `suite`."""
+    from suite.common.running.hosts import several
+
     code = main()
-    if code == INTERRUPTED:
+    # Whoever leaves others early would wait for them.
+    if code == INTERRUPTED or (code and several()):
         end_at_once(code)
     raise SystemExit(code)
 
