@@ -32,6 +32,8 @@ from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import JUDGED
 
 Key = TypeVar("Key", bound=Hashable)
+OPEN_FILES = 256
+"""Journals that are open at once."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,9 @@ def flown(
     Raises:
         ValueError: for a policy that cannot be loaded, before the first flight.
     """
-    about = {key: _about(order.flier) for key, order in orders.items()}
+    policies = {order.flier.policy for order in orders.values()}
+    digests = {policy: policy_digest(policy) for policy in policies}
+    about = {key: _about(order.flier, digests) for key, order in orders.items()}
     names = {key: digest(entry) for key, entry in about.items()}
     fliers = {names[key]: order.flier for key, order in orders.items()}
     wanted: dict[str, dict[TrialSpec, None]] = {name: {} for name in fliers}
@@ -94,12 +98,20 @@ def flown(
             if workers is None:
                 workers = min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
             announce(console, f"{what}: {left} trials", flying_needs(left, workers))
-            numbers, open_journals = count(total - left + 1), list(journals.values())
+            numbers, all_journals = count(total - left + 1), list(journals.values())
+            lately: dict[int, None] = {}
             with console.progress(what, total) as update:
 
                 def keep(piece: int, ended: tuple[int, TrialResult]) -> None:
                     number, result = ended
-                    open_journals[number].append(result)
+                    all_journals[number].append(result)
+                    # A sweep has more journals than a process may have files open.
+                    lately.pop(number, None)
+                    lately[number] = None
+                    if len(lately) > OPEN_FILES:
+                        oldest = next(iter(lately))
+                        all_journals[oldest].close()
+                        del lately[oldest]
                     update(next(numbers))
 
                 loaders = _loaders(fliers.values(), workers)
@@ -132,10 +144,10 @@ def trials_of(config: Any, levels: Sequence[int] | None = None) -> list[TrialSpe
     return trial_list(JUDGED, levels, config.trials, config.seed)
 
 
-def _about(flier: Flier) -> dict[str, Any]:
+def _about(flier: Flier, digests: Mapping[str, str]) -> dict[str, Any]:
     """Return all that sets the outcome of a trial besides the trial."""
     return {
-        "policy_sha256": policy_digest(flier.policy),
+        "policy_sha256": digests[flier.policy],
         "vehicle": flier.vehicle,
         "noise": flier.noise,
         "code": code_digest("tracks", "policies", "eval"),

@@ -33,7 +33,7 @@ ALONE_S = 60.0
 """A scheduler may be without workers for this long [s]."""
 AHEAD = 4
 """Pieces given to the scheduler for each worker: one is worked on, the others wait there."""
-LEAST = 16
+LEAST = 64
 """Pieces given to the scheduler at least; tiny ones would wait for the way otherwise."""
 COUNT_S = 5.0
 """Workers come and go; they are counted this often [s]."""
@@ -72,8 +72,10 @@ def share_out(
         workers = _Count(client)
 
         def fill() -> None:
-            room = max(AHEAD * workers(), LEAST) - len(in_air)
-            batch = list(islice(waiting, room)) if room > 0 else []
+            window = max(AHEAD * workers(), LEAST)
+            # Many at once cost the scheduler little more than one.
+            room = window - len(in_air) if len(in_air) <= window // 2 else 0
+            batch = list(islice(waiting, room))
             if not batch:
                 return
             numbers, packed = zip(*((n, pack(piece)) for n, piece in batch), strict=True)
