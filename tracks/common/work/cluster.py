@@ -67,6 +67,8 @@ def share_out(
     with _connected(address) as client:
         run, waiting = uuid.uuid4().hex, iter(enumerate(pieces))
         body = client.submit(_body, pack((software(), work)), key=f"suite-{run}-work")
+        # Where one machine alone held it, the scheduler would give that one most of the pieces.
+        client.replicate([body])
         in_air: dict[Any, int] = {}
         ended: SimpleQueue[Any] = SimpleQueue()
         workers = _Count(client)

@@ -122,6 +122,7 @@ def test_a_node_that_dies_costs_its_pieces_once_and_a_piece_that_kills_ends_the_
         work_off(partial(lived, str(tmp_path)), range(60), found.address, keep)
         assert results == {k: k * k for k in range(60)}
         begun = [len((tmp_path / f"{k}.begun").read_text().split()) for k in range(60)]
-        assert sum(begun) - 60 in (0, 1) and crew(found.address) == 1, "one at work when it died"
+        # What it was at, and what it had done and not handed over yet.
+        assert sum(begun) - 60 <= 3 and max(begun) <= 2 and crew(found.address) == 1
         with pytest.raises(WorkerDied, match="gave up piece 0.*same command goes on"):
             work_off(partial(gone_wrong, "kill"), [1], found.address, lambda *_: None)
