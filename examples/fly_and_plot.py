@@ -29,7 +29,7 @@ def main(folder: Path) -> None:
         load_policy("swift"),
         [trial],
         load_vehicle("reference"),  # the vehicle of the tables; no training reads it
-        options=JudgeOptions(processes=1),
+        options=JudgeOptions(workers=1),
         on_result=lambda result, flight: flights.append(flight),
         record=Record(depth=True),
     )

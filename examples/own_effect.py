@@ -54,7 +54,7 @@ def main() -> None:
             policy,
             [TrialSpec("zigzag", difficulty=0, seed=1)],
             replace(vehicle, effects=effects),
-            options=JudgeOptions(processes=1),
+            options=JudgeOptions(workers=1),
         )
         print(f"{stiffness:.1f} N/m: {result.gates_passed} gates, {result.ending}")
 

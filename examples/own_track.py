@@ -58,7 +58,7 @@ def main(folder: Path) -> None:
         load_policy("swift"),
         [TrialSpec(str(path), difficulty=0, seed=0)],
         load_vehicle("reference"),
-        options=JudgeOptions(processes=1),
+        options=JudgeOptions(workers=1),
         tracks={str(path): track},
     )
     print(f"{result.gates_passed} gates, {result.ending} after {result.time_s:.1f} s")

@@ -31,7 +31,7 @@ def main(folder: Path, iterations: int) -> None:
         load_policy(folder / "policy"),
         [TrialSpec("zigzag", difficulty=0, seed=seed) for seed in range(5)],
         load_vehicle("reference"),
-        options=JudgeOptions(processes=1),
+        options=JudgeOptions(workers=1),
     )
     for result in results:
         print(f"seed {result.seed}: {result.gates_passed} gates, {result.ending}")

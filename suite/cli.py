@@ -122,7 +122,7 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 def _run(name: str, args: list[str]) -> int:
     from suite.common.compiled import keep_compiled
     from suite.common.console import Console, stdout_kept_clean
-    from suite.common.running.threads import one_thread_a_product, set_threads
+    from tracks.common.work.threads import one_thread_a_product, set_threads
 
     keep_compiled()
     set_threads()
@@ -153,8 +153,11 @@ def _complain(message: str) -> None:
 
 def entry() -> None:
     """Be the program `suite`."""
+    from suite.common.running.hosts import several
+
     code = main()
-    if code == INTERRUPTED:
+    # Whoever leaves others early would wait for them.
+    if code == INTERRUPTED or (code and several()):
         end_at_once(code)
     raise SystemExit(code)
 

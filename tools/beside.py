@@ -18,8 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from suite.common.compiled import keep_compiled
-from suite.common.running.threads import set_threads
 from tracks.common.work import usable_cores
+from tracks.common.work.threads import set_threads
 
 BUSY = [sys.executable, "-c", "while True: pass"]
 ITERATIONS = 6

@@ -87,7 +87,7 @@ def trials(work: Path) -> dict[str, str]:
         for policy in POLICIES:
             out = work / f"eval-{world}-{policy}"
             suite("eval", "--policy", policy, "--world", world, "--difficulty", "0,9",
-                  "--trials", "20", "--procs", "1", "--out", out)  # fmt: skip
+                  "--trials", "20", "--workers", "1", "--out", out)  # fmt: skip
             digests[f"trials {world} {policy}"] = parquet_digest(out / "trials.parquet")
     return digests
 

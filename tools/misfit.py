@@ -24,7 +24,6 @@ from suite.blind.cases import CONTINUOUS, Case
 from suite.blind.outside import Law, Push
 from suite.blind.simulators import simulator_for
 from suite.common.compiled import keep_compiled
-from suite.common.running.threads import one_thread_a_product
 from suite.diagnose.data.colour import Noise, measured_noise
 from suite.diagnose.data.windows import cut
 from suite.diagnose.diagnose import diagnose
@@ -35,6 +34,7 @@ from suite.diagnose.plans.simulate import FlightFailed
 from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.gap import gap_of
+from tracks.common.work.threads import one_thread_a_product
 
 OFF = 20.0
 """How far flights are off a model that has the drag, in units of noise."""

@@ -7,10 +7,11 @@ is shared between trials.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -35,10 +36,13 @@ from eval.worlds.trial import (
 )
 from policies.observation import observe
 from policies.policy import Policy
-from tracks.common.work import usable_cores, work_off
+from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import check_family
 from tracks.track import Track
 
+MOST_A_PIECE = 256
+"""Trials; more are several pieces, where several processes share them."""
+Trial = TypeVar("Trial")
 OnResult = Callable[[TrialResult, Flight | None], None]
 """Called with each trial as it ends, in no set order; the flight where flights are recorded."""
 Numbered = tuple[int, TrialSpec]
@@ -57,14 +61,14 @@ class Record:
 
 @dataclass(frozen=True)
 class JudgeOptions:
-    """How trials are flown; `threads` and `processes` touch no outcome."""
+    """How trials are flown; `threads` and `workers` touch no outcome."""
 
     slots: int = 64
     """Trials in the air at once, and rows of every call of the policy."""
     threads: int = 1
     """Of physics and rays, in each process."""
-    processes: int | None = None
-    """Processes that share the trials; None takes one a core where there is work for them."""
+    workers: Workers | None = None
+    """Who shares the trials; None takes a process a core where there is work for them."""
     rules: Rules = field(default_factory=Rules)
     """When a trial ends."""
     limits: ActionLimits = field(default_factory=ActionLimits)
@@ -113,7 +117,7 @@ def fly(
     Raises:
         ValueError: for an unknown world or track, noise that cannot be, a policy faster than the
             physics, or a policy that returns something else than actions.
-        WorkerDied: where a process of its own died.
+        WorkerDied: where a process that works for this one died, and again at the same piece.
     """
     options = options or JudgeOptions()
     world_class(world)
@@ -128,18 +132,32 @@ def fly(
     task = Task(policy, vehicle, world, options, record, tracks or {})
     results: dict[int, TrialResult] = {}
 
-    def keep(share: int, ended: Ended) -> None:
+    def keep(piece: int, ended: Ended) -> None:
         index, result, flight = ended
-        results[index] = result
-        if on_result:
+        again, results[index] = index in results, result
+        if on_result and not again:
             on_result(result, flight)
 
-    processes = _process_count(task, len(trials))
-    numbered = list(enumerate(trials))
-    # Every k-th trial, as neighbours, which are alike, then spread over the processes.
-    shares = [numbered[k::processes] for k in range(processes)]
-    work_off(partial(fly_share, task), shares, processes, keep)
+    workers = _workers(task, len(trials))
+    # Every piece compiles an MJX world anew.
+    most = len(trials) if world == "mjx" else MOST_A_PIECE
+    shares = pieces_of(list(enumerate(trials)), crew(workers), most)
+    work_off(partial(fly_share, task), shares, workers, keep)
     return [results[index] for index in range(len(trials))]
+
+
+def pieces_of(
+    trials: Sequence[Trial], processes: int, most: int = MOST_A_PIECE
+) -> list[Sequence[Trial]]:
+    """Cut trials into pieces of at most `most`, as many for each of so many processes.
+
+    A process that dies costs its piece; at the end of each the policy's rows fly empty.
+    """
+    if processes == 1:
+        return [trials] if trials else []
+    pieces = min(len(trials), processes * math.ceil(len(trials) / (most * processes)))
+    # Every k-th trial, as neighbours, which are alike, then spread over the pieces.
+    return [trials[k::pieces] for k in range(pieces)]
 
 
 def _is_policy(policy: object) -> bool:
@@ -147,9 +165,12 @@ def _is_policy(policy: object) -> bool:
     return hasattr(policy, "act") and not isinstance(policy, type)
 
 
-def _process_count(task: Task, trials: int) -> int:
-    if task.options.processes is not None:
-        return max(1, min(task.options.processes, trials))
+def _workers(task: Task, trials: int) -> Workers:
+    asked = task.options.workers
+    if isinstance(asked, int):
+        return max(1, min(asked, trials))
+    if asked is not None:
+        return asked
     # A process takes seconds to start, and a policy object may not be of the kind that travels.
     if task.world == "mjx" or _is_policy(task.policy) or trials < 4 * task.options.slots:
         return 1

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -132,12 +133,12 @@ class Journal:
         if self.path.exists():
             keep = self._read(about)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._file: TextIO = open(self.path, "r+" if keep else "w", encoding="utf-8")
-        if keep:
-            self._file.seek(keep)
-            self._file.truncate()
-        else:
-            self._write({"about": about})
+        with open(self.path, "r+" if keep else "w", encoding="utf-8") as file:
+            if keep:
+                file.truncate(keep)
+            else:
+                file.write(to_json({"about": about}) + "\n")
+        self._file: TextIO | None = None
 
     def _read(self, about: dict[str, Any]) -> int:
         """Fill `done`; return how many bytes of the file are whole lines."""
@@ -163,13 +164,12 @@ class Journal:
             keep += len(line)
         return keep
 
-    def _write(self, entry: dict[str, Any]) -> None:
-        self._file.write(to_json(entry) + "\n")
-        self._file.flush()
-
     def append(self, result: TrialResult) -> None:
         """Add a finished trial; it is with the operating system when this returns."""
-        self._write(result._asdict())
+        if self._file is None:
+            self._file = open(self.path, "a", encoding="utf-8")
+        self._file.write(to_json(result._asdict()) + "\n")
+        self._file.flush()
         self.done[result.trial] = result
 
     def missing(self, trials: Iterable[TrialSpec]) -> list[TrialSpec]:
@@ -177,8 +177,10 @@ class Journal:
         return [trial for trial in trials if trial not in self.done]
 
     def close(self) -> None:
-        """Close the file; it stays where it is."""
-        self._file.close()
+        """Close the file, which stays where it is; `append` opens it again."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
     def __enter__(self) -> Journal:
         return self
@@ -199,4 +201,6 @@ def _result(entry: Any) -> TrialResult:
     for name, kind in TrialResult.__annotations__.items():
         if kind == "float" and values[name] is None:  # JSON has no NaN
             values[name] = math.nan
+        elif isinstance(values[name], str):  # a million trials have a handful of words
+            values[name] = sys.intern(values[name])
     return TrialResult(**values)

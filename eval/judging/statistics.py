@@ -11,6 +11,8 @@ import numpy as np
 
 CONFIDENCE = 0.95
 """Of every interval in tables and result files."""
+AT_ONCE = 10_000_000
+"""Draws of a bootstrap that are held at once."""
 
 
 class Interval(NamedTuple):
@@ -100,8 +102,14 @@ def _bootstrap(
     values = np.asarray(values, float)
     if not len(values):
         return Interval(float("nan"), float("nan"), float("nan"))
-    draws = np.random.default_rng(seed).integers(0, len(values), (resamples, len(values)))
-    found = statistic(values[draws], axis=1)
+    rng, rows = np.random.default_rng(seed), max(1, AT_ONCE // len(values))
+    found = np.concatenate(
+        [
+            statistic(values[rng.integers(0, len(values), (count, len(values)))], axis=1)
+            for count in [rows] * (resamples // rows) + [resamples % rows]
+            if count
+        ]
+    )
     low, high = np.quantile(found, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Interval(float(statistic(values)), float(low), float(high))
 

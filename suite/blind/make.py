@@ -8,19 +8,21 @@ hidden; `OUT/manifest.json`, the hashes of all of them.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import save_vehicle
-from suite.blind.build import build
-from suite.blind.cases import DRAWERS, MUJOCO
+from suite.blind.build import Built, build
+from suite.blind.cases import DRAWERS, MUJOCO, Case
 from suite.blind.oracle.strength import TABLE
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from tracks.common.files import replacing_folder, write_json
 from tracks.common.provenance import stamp
+from tracks.common.work import Workers, work_off
 from tracks.input.reading import read_json
 
 SCHEMA = 1
@@ -39,7 +41,12 @@ class Manifest:
 
 
 def make_set(
-    out: Path, seed: int, count: int | None, console: Console, simulator: str = MUJOCO
+    out: Path,
+    seed: int,
+    count: int | None,
+    console: Console,
+    simulator: str = MUJOCO,
+    workers: Workers | None = None,
 ) -> Manifest:
     """Make the cases that `out` does not have yet, and the manifest.
 
@@ -49,6 +56,7 @@ def make_set(
         count: about how many cases; all if None.
         console: for progress.
         simulator: who flies them, one of `DRAWERS`; all but `mujoco` have smaller sets.
+        workers: who makes cases; this process if None.
 
     Raises:
         ValueError: where `out` holds a set of another seed, count, simulator or table of strengths.
@@ -56,23 +64,28 @@ def make_set(
     about = {"seed": seed, "count": count, "simulator": simulator, "strengths": _hash(TABLE)}
     _same_set(out, about)
     cases = DRAWERS[simulator](seed, count)
-    failed: dict[str, str] = {}
+    missing = {
+        name: case
+        for name, case in cases.items()
+        if not ((out / "cases" / name).is_dir() and (out / "answers" / f"{name}.json").is_file())
+    }
+    names, failed = list(missing), dict[str, str]()
     with console.progress("cases", len(cases)) as update:
-        for done, (name, case) in enumerate(cases.items()):
-            folder, answer = out / "cases" / name, out / "answers" / f"{name}.json"
-            if not (folder.is_dir() and answer.is_file()):
-                try:
-                    built = build(case)
-                except WorkFailed as error:
-                    failed[name] = str(error)
-                    continue
-                # The answer first: a case that is there has one.
-                write_json(answer, {**stamp(SCHEMA, seed), **built.answer})
-                with replacing_folder(folder) as beside:
-                    save_vehicle(built.nominal, beside / "vehicle.toml")
-                    for log in built.logs:
-                        write_flight(beside / f"{log.name}.parquet", log)
-            update(done + 1, name)
+
+        def keep(number: int, built: Built | str) -> None:
+            name = names[number]
+            if isinstance(built, str):
+                failed[name] = built
+                return
+            # The answer first: a case that is there has one.
+            write_json(out / "answers" / f"{name}.json", {**stamp(SCHEMA, seed), **built.answer})
+            with replacing_folder(out / "cases" / name) as beside:
+                save_vehicle(built.nominal, beside / "vehicle.toml")
+                for log in built.logs:
+                    write_flight(beside / f"{log.name}.parquet", log)
+            update(len(cases) - len(names) + number + 1, name)
+
+        work_off(_build, missing.values(), workers or 1, keep)
     made = [name for name in cases if name not in failed]
     manifest = Manifest(
         {
@@ -80,12 +93,20 @@ def make_set(
             for name in made
         },
         {name: _hash(out / "answers" / f"{name}.json") for name in made},
-        {name: "not made" for name in failed},
+        {name: "not made" for name in cases if name in failed},
     )
     write_json(out / "manifest.json", {**stamp(SCHEMA, seed), **asdict(manifest)})
     # The reasons say what was hidden.
-    write_json(out / "answers" / "failed.json", failed)
+    write_json(out / "answers" / "failed.json", {n: failed[n] for n in cases if n in failed})
     return manifest
+
+
+def _build(case: Case) -> Iterator[Built | str]:
+    """Yield a case as it is written, or why it cannot be made."""
+    try:
+        yield build(case)
+    except WorkFailed as error:
+        yield str(error)
 
 
 def load_manifest(out: Path) -> Manifest:

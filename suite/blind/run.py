@@ -1,16 +1,20 @@
-"""A diagnosis run over the cases of a set, one after another in this process."""
+"""A diagnosis run over the cases of a set."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from suite.blind.make import load_manifest
 from suite.common.console import Console
 from suite.common.errors import INTERRUPTED, WorkFailed
+from suite.common.running.apart import Job
+from suite.common.work import all_done
 from tracks.common.files import write_json
+from tracks.common.work import Workers
 
 Diagnose = Callable[[Sequence[Path], Path, Path], None]
 """Takes flight logs, the vehicle file and an output folder, and writes `diagnosis.json` there."""
@@ -18,24 +22,40 @@ CRASHED = 500
 """Characters of an error that are kept."""
 
 
-def run_set(out: Path, diagnose: Diagnose, console: Console, into: Path | None = None) -> int:
+def run_set(
+    out: Path,
+    diagnose: Diagnose,
+    console: Console,
+    into: Path | None = None,
+    workers: Workers | None = None,
+) -> int:
     """Diagnose every case that was not diagnosed yet; return how many there are now.
 
     Results go to `into` (OUT/results if not given), one folder a case, with `seconds.json`
     beside `diagnosis.json`. A case that fails gets `error.json` and is tried again next time.
+    `workers` diagnose several at once; None is this process.
     """
     results = into or out / "results"
     names = list(load_manifest(out).cases)
+    jobs = [
+        Job(name, results / name, out / "cases" / name)
+        for name in names
+        if not (results / name / "seconds.json").is_file()
+    ]
     with console.progress("diagnoses", len(names)) as update:
-        for done, name in enumerate(names):
-            folder, case = results / name, out / "cases" / name
-            if not (folder / "seconds.json").is_file():
-                _one(diagnose, case, folder)
-            update(done + 1, name)
+        if workers is None or workers == 1:
+            for done, job in enumerate(jobs, len(names) - len(jobs)):
+                _one(diagnose, job, console)
+                update(done + 1, job.task)
+        else:
+            all_done(partial(_one, diagnose), jobs, workers, console, "diagnoses")
     return sum((results / name / "seconds.json").is_file() for name in names)
 
 
-def _one(diagnose: Diagnose, case: Path, folder: Path) -> None:
+def _one(diagnose: Diagnose, job: Job, console: Console) -> None:
+    del console
+    case, folder = job.reads, job.folder
+    assert case is not None
     flights = sorted(case.glob("flight_*.parquet"), key=lambda path: int(path.stem.split("_")[1]))
     error = folder / "error.json"
     start = time.perf_counter()

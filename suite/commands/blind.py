@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
+from suite.common.work import WorkersOption, asked_workers
 from tracks.input.ranges import Range, Seed
 
 if TYPE_CHECKING:
@@ -35,6 +36,9 @@ class Config:
     engine in continuous time that shares no code with the model that fits, 60."""
     effects: tuple[str, ...] = ()
     """For plan: names that your data could not tell apart."""
+    workers: WorkersOption = None
+    """For make and run, who shares the cases: N processes of this machine, or ADDRESS, a cluster's.
+    Without it they are done one after the other."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -50,6 +54,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for a folder that holds another set, or names that are not in the catalogue.
     """
+    workers = asked_workers(config.workers, whole_cores=True)
     if config.what == "plan":
         return _plan(config, console)
     if config.what == "strengths":
@@ -59,7 +64,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         from suite.blind.make import make_set
 
         seed = SETS[config.set] if config.seed is None else config.seed
-        made = make_set(config.out, seed, config.count, console, config.simulator)
+        made = make_set(config.out, seed, config.count, console, config.simulator, workers)
         return _made(made, config, console)
     if config.what == "run":
         from suite.blind.run import by_command, run_set
@@ -67,7 +72,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
         if "diagnose" not in COMMANDS:
             raise ValueError("this version has no `suite diagnose`; run_set takes any function")
-        done = run_set(config.out, by_command, console)
+        done = run_set(config.out, by_command, console, workers=workers)
         console.say(f"{done} cases diagnosed; score them with `suite blind score`")
         return {"diagnosed": done, "out": str(config.out)}
     from suite.blind.score import report, score_set, shares

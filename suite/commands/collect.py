@@ -9,6 +9,7 @@ from typing import Any
 import tyro
 
 from suite.common.console import Console
+from suite.common.work import WorkersOption, asked_workers
 from suite.judging.requests import Collection
 
 
@@ -20,6 +21,9 @@ class Config:
     """What is flown."""
     out: Path = Path("runs/flights")
     """Folder for the flights, and for flights.json, which lists them."""
+    workers: WorkersOption = None
+    """Who shares the trials: N processes of this machine, or ADDRESS, a cluster's.
+    By default as many cores as are worth it."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -37,4 +41,4 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """
     from suite.judging.collect import collect
 
-    return collect(config.flown, config.out, console)
+    return collect(config.flown, config.out, console, asked_workers(config.workers))

@@ -9,6 +9,7 @@ from typing import Any
 import tyro
 
 from suite.common.console import Console
+from suite.common.work import WorkersOption, asked_workers
 from suite.judging.requests import Evaluation
 from tracks.common.files import check_place
 
@@ -23,6 +24,9 @@ class Config:
     """Folder for trials.parquet, table.md, summary.json and run.json."""
     rerun: Path | None = None
     """Also write a rerun recording (.rrd) of the first trial of every track and level."""
+    workers: WorkersOption = None
+    """Who shares the trials: N processes of this machine, or ADDRESS, a cluster's.
+    By default as many cores as are worth it."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -44,7 +48,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError(f"--rerun {config.rerun}: a recording's name must end in .rrd")
     if config.rerun:
         check_place(config.rerun)
-    answer = evaluate(config.flown, config.out, console)
+    answer = evaluate(config.flown, config.out, console, asked_workers(config.workers))
     if config.rerun:
         from suite.judging.replay import record_first_trials
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from suite.common.console import Console
+from suite.common.work import WorkersOption, asked_workers
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials
 
 
@@ -46,6 +47,9 @@ class Config:
     """Change settings of the recipe by name, such as loss.progress=0.4 episode.batch=128."""
     out: Path = Path("runs/loop")
     """Folder of the loop; a loop that stands there is gone on with."""
+    workers: WorkersOption = None
+    """Who shares the flights and the fine-tunings: N processes of this machine, or ADDRESS, a
+    cluster's. Without it as many processes fly as are worth it, and one fine-tunes."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -64,6 +68,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.loop.config import resolve
     from suite.loop.run import run_loop
 
+    workers = asked_workers(config.workers, whole_cores=True)
     resolved = resolve(
         recipe=config.preset,
         world=config.world,
@@ -79,4 +84,4 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         fit_iterations=config.fit_iterations,
         changes=config.set,
     )
-    return run_loop(resolved, config.out, console)
+    return run_loop(resolved, config.out, console, workers)

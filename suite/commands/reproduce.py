@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 import tyro
 
 from suite.common.console import Console
+from suite.common.work import WorkersOption, asked_workers
 from suite.experiments import EXPERIMENTS
 
 if TYPE_CHECKING:
@@ -40,6 +41,9 @@ class Config:
     """Folder of the document; docs/results in a checkout is where the published ones are."""
     cache: Path = Path("runs/reproduce/cache")
     """Folder of finished trials and trainings, shared by all documents."""
+    workers: WorkersOption = None
+    """Trainings and flights at once: N processes of this machine, each with its own share of the
+    cores, or ADDRESS, a cluster's. Without it one training after the other."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -58,8 +62,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.experiments.pages.document import Place, write_document
     from suite.experiments.study.options import check
 
+    workers = asked_workers(config.workers, whole_cores=True)
     check(config.experiment)
-    place, module = Place(config.out, config.cache), type(config.experiment).__module__
+    place, module = Place(config.out, config.cache, workers), type(config.experiment).__module__
     name, document = module.rpartition(".")[2], importlib.import_module(module).document
     report, numbers = document(config.experiment, place, console)
     return write_document(place, name, config.experiment, report, numbers, console)

@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
+from suite.common.running.hosts import Joined, join, member
+from suite.common.work import Silent
 from suite.train.config import TrainConfig, check
 from suite.train.overrides import override
 from suite.train.presets import chosen_model, preset, with_iterations
@@ -41,13 +43,15 @@ class Config:
     """Train under this frozen Delta Action Model (a checkpoint of `suite delta`)."""
     set: tuple[str, ...] = ()
     """Change settings by name, such as loss.progress=0.4 episode.batch=128."""
+    joined: tyro.conf.OmitArgPrefixes[Joined] = Joined()
+    """Several processes, for devices of several hosts."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
 
 def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [config.out]
+    """Return the folders that the command writes into: of several processes the first."""
+    return [config.out] if member(config.joined).number == 0 else []
 
 
 def resolve(config: Config) -> TrainConfig:
@@ -72,6 +76,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for options that cannot be used or do not go together.
     """
+    one = member(config.joined)
+    join(one)
+    if one.number:
+        console = Silent()
+
     import jax
 
     from policies.formats.delta_file import load_delta
@@ -97,6 +106,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         check_corrects(stored.config.get("fit", {}), dynamics, config.delta)
         delta = jax.tree.map(jax.numpy.asarray, stored.params)
     outcome = train(resolved, config.out, console, params, delta)
+    if one.number:
+        return {"process": one.number, "processes": one.count, "iterations": outcome.iterations}
     last = outcome.last
     console.say(
         f"{outcome.iterations} iterations; at the end {last['gates']:.2f} gates a rollout, "

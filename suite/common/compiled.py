@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 
 FOLDER = "diffracing-suite"
@@ -25,10 +25,15 @@ def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
             JAX_COMPILATION_CACHE_DIR that is there, also an empty one, is left as it is.
     """
     values = os.environ if environment is None else environment
-    home = values.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     # A home that machines share must not hand one's instructions to another.
-    folder = Path(home) / FOLDER / "jax" / (platform.node() or "here")
+    folder = home(values) / "jax" / (platform.node() or "here")
     values.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
     # XLA complains of its own tuning hints, which are no processor feature, at every program that
     # it loads; what goes wrong in earnest is raised as an exception.
     values.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+def home(environment: Mapping[str, str] | None = None) -> Path:
+    """Return our own folder in the user's cache."""
+    values = os.environ if environment is None else environment
+    return Path(values.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")) / FOLDER

@@ -1,19 +1,24 @@
-"""Long pieces of work side by side in processes, each on its own share of the cores."""
+"""Long pieces of work side by side: what `--workers` means, and folders that are their product."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import TypeVar
+from typing import Annotated, Any, TypeVar
+
+import tyro
 
 from suite.common.console import Console, Quiet, Update
 from suite.common.errors import WorkFailed
-from suite.common.running.threads import share_threads
-from tracks.common.work import WorkerDied, usable_cores, work_off
+from suite.common.running.apart import Job, do_apart, fill, parcels
+from tracks.common.work import WorkerDied, Workers, read_workers, usable_cores, work_off
+from tracks.common.work.threads import share_threads
 
-Piece = TypeVar("Piece")
 Result = TypeVar("Result")
+
+WorkersOption = Annotated[str | None, tyro.conf.arg(metavar="N|ADDRESS")]
+"""As a command's option; `asked_workers` reads it."""
 
 
 class Silent(Quiet):
@@ -32,58 +37,80 @@ class Silent(Quiet):
         yield update
 
 
-def check_jobs(jobs: int) -> None:
-    """Refuse a number of processes that would share cores.
+def asked_workers(text: str | None, whole_cores: bool = False) -> Workers | None:
+    """Return what `--workers` says, None where it was not given.
+
+    Args:
+        text: the option.
+        whole_cores: refuse more processes of this machine than it has cores, as work that takes
+            all of its share would only wait for another's.
 
     Raises:
         ValueError: naming the option and what is allowed.
     """
-    cores = usable_cores()
-    if not 1 <= jobs <= cores:
-        raise ValueError(f"--jobs is {jobs}; allowed is 1 to {cores}, the cores there are")
+    workers, cores = read_workers(text), usable_cores()
+    if whole_cores and isinstance(workers, int) and workers > cores:
+        raise ValueError(
+            f"--workers is {workers}; allowed is 1 to {cores}, the cores there are, or the address "
+            "of a cluster's scheduler"
+        )
+    return workers
 
 
 def all_done(
-    do: Callable[[Piece, Console], Result],
-    pieces: Sequence[Piece],
-    jobs: int,
+    do: Callable[[Job, Console], Result],
+    jobs: Sequence[Job],
+    workers: Workers | None,
     console: Console,
     what: str,
 ) -> list[Result]:
-    """Return do(piece, console) of every piece, in order.
+    """Return do(job, console) of every job, in order, with its folder as `do` leaves it.
 
     Args:
         do: a function at the top of a module, or a `functools.partial` of one. It keeps what it
-            has finished, so that an interrupted call can be made again.
-        pieces: picklable.
-        jobs: processes at a time; 1 works in this one, on all cores. More are pinned to as many
-            cores each, and none to another's.
-        console: told how many are done; `do` gets it where jobs is 1, and a silent one elsewhere.
-        what: the pieces are, in a few words.
+            has finished in the job's folder, so that an interrupted call can be made again. What
+            it returns names no path.
+        jobs: what to do.
+        workers: who; None or 1 is this process, on all cores. Several of this machine are pinned to
+            as many cores each, and none to another's; a cluster's get folders by content.
+        console: told how many are done; `do` gets it in this process, and a silent one elsewhere.
+        what: the jobs are, in a few words.
 
     Raises:
-        WorkFailed: where a process dies.
+        WorkFailed: where a process dies, and another one at the same job.
+        ValueError: where there is no cluster that can work for us.
         Exception: what `do` raises.
     """
-    if jobs == 1:
-        return [do(piece, console) for piece in pieces]
+    if workers is None or workers == 1:
+        return [do(job, console) for job in jobs]
     found: dict[int, Result] = {}
-    with console.progress(what, len(pieces)) as update:
+    with console.progress(what, len(jobs)) as update:
 
-        def keep(number: int, result: Result) -> None:
+        def keep(number: int, result: Any) -> None:
+            if isinstance(workers, str):
+                result, files = result
+                fill(jobs[number].folder, files)
             found[number] = result
             update(len(found))
 
         try:
-            work_off(partial(_silently, do), pieces, jobs, keep, pinned=True)
+            if isinstance(workers, str):
+                work = partial(do_apart, partial(_silently, do))
+                work_off(work, parcels(jobs), workers, keep)
+            else:
+                work_off(partial(_yielded, do), jobs, workers, keep, pinned=True)
         except WorkerDied as error:
             raise WorkFailed(
                 f"{what}: a process ended badly, what the others finished is kept; the same "
-                f"command goes on, with --jobs 1 in one process. It said: {error}"
+                f"command goes on, with --workers 1 in one process. It said: {error}"
             ) from error
-    return [found[number] for number in range(len(pieces))]
+    return [found[number] for number in range(len(jobs))]
 
 
-def _silently(do: Callable[[Piece, Console], Result], piece: Piece) -> Iterator[Result]:
+def _silently(do: Callable[[Job, Console], Result], job: Job) -> Result:
     share_threads()
-    yield do(piece, Silent())
+    return do(job, Silent())
+
+
+def _yielded(do: Callable[[Job, Console], Result], job: Job) -> Iterator[Result]:
+    yield _silently(do, job)

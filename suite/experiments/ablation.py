@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from suite.experiments.pages.tables import every_training
 from suite.experiments.study import options, training
 from suite.experiments.study.summary import Summary, summaries
 from tracks.common.grid import Grid, table
-from tracks.input.ranges import Range
 
 PROGRESS = (0.4, 0.8, 1.6, 3.2)
 """lambda_p of L_p. The paper has the field at the first alone; here it is on and off at each and at
@@ -60,8 +59,6 @@ class Config(options.FourGates):
 
     only: tuple[str, ...] = ()
     """Settings, such as "field 0.4"; all if none is named."""
-    jobs: Annotated[int, Range(1, 256)] = 1
-    """Trainings at once, each in a process with its own share of the cores."""
 
 
 def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
@@ -70,8 +67,8 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
 
     chosen = settings(config)
     looks = training.Looks(0, config.trials, config.seed, config.seconds)
-    study = training.Study(chosen, config.training_seeds, config.jobs, looks)
-    runs = training.trained(study, place.cache, console)
+    study = training.Study(chosen, config.training_seeds, looks)
+    runs = training.trained(study, place.cache, console, place.workers)
     rows, recipe = summaries(chosen, runs), chosen[0].recipe
     whole = {row.key: row.at[-1] for row in rows if row.at}
     steps = config.iterations * recipe.episode.batch * recipe.episode.steps
@@ -83,8 +80,8 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         facts={
             "recipe": f"{options.recipe_words(config)} episode.gates={recipe.episode.gates}",
             "a training": f"{config.iterations} gradient steps of {recipe.episode.batch} worlds x "
-            f"{recipe.episode.steps} steps, {steps:,} in all; {each} (median), {config.jobs} at a "
-            "time",
+            f"{recipe.episode.steps} steps, {steps:,} in all; {each} (median), at once "
+            f"{place.at_once}",
             "training seeds": " ".join(map(str, config.training_seeds)),
             "trained at commit": training.commits(runs),
             "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",

@@ -77,8 +77,6 @@ class Config:
     """A shipped vehicle's name or a vehicle file (.toml)."""
     only: tuple[str, ...] = ()
     """Rows besides the recipe's; all if none is named."""
-    jobs: Annotated[int, Range(1, 256)] = 1
-    """Trainings at once, each in a process with its own share of the cores."""
 
 
 class Compared(NamedTuple):
@@ -119,10 +117,14 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     looks = training.Looks(0, config.round_trials, config.round_seed, config.round_seconds)
     plain, turned = ([row for row in asked if is_round(row) is wanted] for wanted in (False, True))
     studies = [
-        training.Study(plain, seeds, config.jobs, by_seed=True),
-        training.Study(turned, seeds, config.jobs, looks),
+        training.Study(plain, seeds, by_seed=True),
+        training.Study(turned, seeds, looks),
     ]
-    runs = [run for study in studies for run in training.trained(study, place.cache, console)]
+    runs = [
+        run
+        for study in studies
+        for run in training.trained(study, place.cache, console, place.workers)
+    ]
     failures = _failures(runs)
     judged, rounds = ([r for r in study.rows if r.key not in failures] for study in studies)
     made = {(run.row, run.seed): run for run in runs}
@@ -131,7 +133,9 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         for row in judged
         for seed in seeds
     }
-    flights = judging.flown(orders, place.cache, console, f"judging {len(orders)} trainings")
+    flights = judging.flown(
+        orders, place.cache, console, f"judging {len(orders)} trainings", place.workers
+    )
     base = _won([flights[RECIPE, seed] for seed in seeds])
     rows = [
         compared(
@@ -160,7 +164,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
             f"{options.judged_seeds(config)}: {len(trials)} a training",
             "worlds with round gates": f"{config.round_trials}, seed {config.round_seed}, "
             f"{config.round_seconds:g} s each",
-            "trainings at once": f"{config.jobs}, each on its own share of the cores",
+            "trainings at once": place.at_once,
             "vehicle": config.vehicle,
             **{f"left out, {key}": said for key, said in failures.items()},
         },

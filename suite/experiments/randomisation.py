@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from suite.experiments.study.disturbed import Tested
 from suite.experiments.study.intervals import Gap, nested
 from suite.train.config import PointMassConfig, TrainConfig
 from tracks.common.grid import Grid, table
-from tracks.input.ranges import Iterations, Range, Seed, Trials
+from tracks.input.ranges import Iterations, Seed, Trials
 
 FIXED, RANDOMISED = "fixed", "randomised"
 ALL = "all disturbances"
@@ -57,8 +57,6 @@ class Config:
     """What is disturbed: a shipped vehicle's name or a vehicle file (.toml)."""
     only: tuple[str, ...] = ()
     """Only these sweeps, by name; by default all."""
-    jobs: Annotated[int, Range(1, 256)] = 1
-    """Trainings at once, each in a process with its own share of the cores."""
 
 
 class Compared(NamedTuple):
@@ -82,14 +80,14 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         training.Row(RANDOMISED, "the recipe's dynamics", recipe),
     ]
     runs = training.trained(
-        training.Study(rows, seeds, config.jobs, may_diverge=False), place.cache, console
+        training.Study(rows, seeds, may_diverge=False), place.cache, console, place.workers
     )
     shares = {seed: trials[part :: len(seeds)] for part, seed in enumerate(seeds)}
     fliers = {
         row.key: [(run.policy, shares[run.seed]) for run in runs if run.row == row.key]
         for row in rows
     }
-    _, grown = disturbed.flown_under([], sweeps, fliers, place.cache, console)
+    _, grown = disturbed.flown_under([], sweeps, fliers, place.cache, console, place.workers)
     base = next(iter(grown.values()))[0]
     worse = {sweep.name: points[1:] for sweep, points in grown.items()}
     worse[ALL] = [point for points in worse.values() for point in points]

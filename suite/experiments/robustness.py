@@ -18,7 +18,8 @@ from suite.experiments.pages.tables import condition_grid
 from suite.experiments.study import disturbed, judging, options
 from suite.experiments.study.conditions import STATE_UNIT, Condition, log_faults
 from suite.experiments.study.disturbed import Grown, Tested
-from suite.judging.flying import default_policy, labels, policy_digest
+from suite.judging.content import policy_digest
+from suite.judging.flying import default_policy, labels
 from tracks.input.ranges import Seed, Trials
 
 UNDISTURBED = "undisturbed"
@@ -73,7 +74,9 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     alone, sweeps = disturbed.asked_conditions(vehicle, config.only)
     base, trials = Condition(UNDISTURBED, 0.0, "", vehicle), judging.trials_of(config)
     fliers = {name: [(policy, trials)] for name, policy in zip(names, asked, strict=True)}
-    effects, grown = disturbed.flown_under([base, *alone], sweeps, fliers, place.cache, console)
+    effects, grown = disturbed.flown_under(
+        [base, *alone], sweeps, fliers, place.cache, console, place.workers
+    )
     report = Report(
         title="Robustness: what the policy survives",
         lead=_lead(names[0], effects, grown),

@@ -68,17 +68,14 @@ class Config(options.FourGates):
     """About how many a training has; their time is no part of the curves."""
     only: tuple[str, ...] = ()
     """Schemes: ppo, ours, projection; all if none is named."""
-    jobs: Annotated[int, Range(1, 256)] = 1
-    """Trainings at once, each in a process with its own share of the cores; the curves over time
-    are those of such a share."""
 
 
 def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
     """Return the page and its numbers; train what is missing."""
     chosen = schemes(config)
     looks = training.Looks(config.measurements, config.trials, config.seed, config.seconds)
-    study = training.Study(chosen, config.training_seeds, config.jobs, looks, by_seed=True)
-    runs = training.trained(study, place.cache, console)
+    study = training.Study(chosen, config.training_seeds, looks, by_seed=True)
+    runs = training.trained(study, place.cache, console, place.workers)
     rows, episode = summaries(chosen, runs), chosen[0].recipe.episode
     compiling = {
         row.key: float(np.mean([run.compile_s for run in runs if run.row == row.key]))
@@ -94,7 +91,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
             "training seeds": " ".join(map(str, config.training_seeds)),
             "trained at commit": training.commits(runs),
             "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
-            "trainings at once": f"{config.jobs}, each on its own share of the cores",
+            "trainings at once": place.at_once,
         },
         sections=[
             Section("Learning curves", _curves([row for row in rows if row.at], compiling)),

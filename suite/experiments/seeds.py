@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,9 +17,10 @@ from suite.common.report import Picture, Report, Section
 from suite.experiments.pages.document import Place
 from suite.experiments.pages.tables import every_cell
 from suite.experiments.study import judging, options, training
-from suite.judging.flying import labels, policy_digest
+from suite.judging.content import policy_digest
+from suite.judging.flying import labels
 from tracks.common.grid import Grid, table
-from tracks.input.ranges import Iterations, Range, Seed, Trials
+from tracks.input.ranges import Iterations, Seed, Trials
 
 LEVELS = (0, 3, 6, 9)
 """The levels of the paper's table."""
@@ -53,8 +54,6 @@ class Config:
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
-    jobs: Annotated[int, Range(1, 256)] = 1
-    """Without --policies: trainings at once, each in a process with its own share of the cores."""
 
 
 class Repeats(NamedTuple):
@@ -78,7 +77,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     trials = judging.trials_of(config, LEVELS)
     orders = {n: judging.Order(judging.Flier(p, vehicle), trials) for n, p in policies.items()}
     what = f"judging {len(policies)} training seeds"
-    _, cells = judging.judged_cells(orders, place.cache, console, what)
+    _, cells = judging.judged_cells(orders, place.cache, console, what, place.workers)
     found = repeats(cells)
     everything = [cell for some in cells.values() for cell in some]
     low, high = min(found.mean_success.values()), max(found.mean_success.values())
@@ -115,8 +114,8 @@ def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:
     """Return the policies by what the tables call them; missing ones are trained."""
     if not config.policies:
         row = training.Row("recipe", "the recipe", options.asked_recipe(config))
-        study = training.Study([row], config.training_seeds, config.jobs, may_diverge=False)
-        runs = training.trained(study, place.cache, console)
+        study = training.Study([row], config.training_seeds, may_diverge=False)
+        runs = training.trained(study, place.cache, console, place.workers)
         return {f"seed {run.seed}": run.policy for run in runs}
     inside = [Path(path, "policy") for path in config.policies]
     chosen = [

@@ -21,7 +21,8 @@ from suite.experiments.pages.paper import sim_to_sim
 from suite.experiments.pages.tables import every_cell
 from suite.experiments.study import judging, options
 from suite.experiments.study.cache import code_digest, digest
-from suite.judging.flying import default_policy, policy_digest
+from suite.judging.content import policy_digest
+from suite.judging.flying import default_policy
 from suite.loop import compare
 from tracks.common.grid import Grid, table
 from tracks.families import JUDGED
@@ -108,7 +109,9 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         )
         for v in variants
     }
-    results, cells = judging.judged_cells(orders, place.cache, console, "judging all levels")
+    results, cells = judging.judged_cells(
+        orders, place.cache, console, "judging all levels", place.workers
+    )
     lines = _merit(results)
     everything = [cell for some in cells.values() for cell in some]
     report = Report(
@@ -152,7 +155,7 @@ def variants_of(config: Config, place: Place, console: Console) -> list[TablePol
 
         loop = loop_config(config, policy)
         folder = place.cache / "loops" / digest([loop, code_digest(*LOOP_ROOMS)])
-        run_loop(loop, folder, Quiet())
+        run_loop(loop, folder, Quiet(), place.workers)
         chosen[WITH] = str(folder / "tuned-with" / "policy")
         chosen[CONTROL] = str(folder / "tuned-without" / "policy")
     made = f"{policy}, fine-tuned by suite loop in {config.delta_iterations} gradient steps"

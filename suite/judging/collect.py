@@ -10,27 +10,35 @@ from suite.common.console import Console
 from suite.common.estimate import announce
 from suite.common.provenance import write_run_record
 from suite.judging.flying import (
+    Course,
     about_policy,
     default_policy,
     flying_needs,
-    options_for,
     read_course,
     who_flies,
+    workers_for,
 )
 from suite.judging.requests import Collection
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
+from tracks.common.work import Workers
 from tracks.input.reading import read_json
 
 if TYPE_CHECKING:
+    from eval.judging.results import Journal
     from eval.logs.flight import Flight
     from eval.worlds.trial import TrialResult, TrialSpec
+    from policies.policy import Policy
 
 LIST = "flights.json"
 """Name of the list of flights in the output folder."""
+JOURNAL = "journal.jsonl"
+"""Name of the file there that each flight is noted in as it ends, until the list is whole."""
 
 
-def collect(collection: Collection, out: Path, console: Console) -> dict[str, Any]:
+def collect(
+    collection: Collection, out: Path, console: Console, workers: Workers | None = None
+) -> dict[str, Any]:
     """Fly and write a log a flight into `out`; the same call after an interruption goes on.
 
     Returns:
@@ -42,11 +50,10 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
         ValueError: for anything in `collection` that cannot be used, or where `out` holds the
             flights of another collection.
     """
-    from eval.judging.judge import Record, fly
+    from eval.judging.results import Journal
     from policies.policy import load_policy
 
     course = read_course(collection)
-    trials = course.trials
     asked = collection.policy or default_policy()
     policy = load_policy(asked, collection.trust)
     out = Path(out)
@@ -56,39 +63,11 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
         "vehicle": course.vehicle,
     }
     rows = _rows_there(out, plain(about))
-    missing = [trial for trial in trials if trial not in rows]
-    options = options_for(len(missing), None, collection.world)
-    what = f"{len(missing)} flights in the {collection.world} world"
-    announce(console, what, flying_needs(len(missing), options.processes or 1))
-
-    def write_list() -> dict[str, Any]:
-        flights = [rows[trial] for trial in trials if trial in rows]
-        found = {**stamp(1, collection.seed), **about, "flights": flights}
-        write_json(out / LIST, found)
-        return found
-
-    with console.progress("flights", len(trials)) as update:
-
-        def keep(result: TrialResult, flight: Flight | None) -> None:
-            name = None
-            if flight is not None and result.time_s >= DURATION_MIN:
-                name = _write_log(out, result, flight, console)
-            rows[result.trial] = {"file": name, **result._asdict()}
-            write_list()
-            update(len(rows), result.ended_by)
-
-        if missing:
-            fly(
-                who_flies(policy, asked, collection.trust, options.processes),
-                missing,
-                course.vehicle,
-                collection.world,
-                options,
-                keep,
-                Record(depth=False),
-                course.tracks,
-            )
-    found = write_list()
+    with Journal(out / JOURNAL, about) as journal:
+        rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
+        _fly_missing(collection, course, policy, out, rows, journal, console, workers)
+        found = _write_list(out, about, course, rows)
+    (out / JOURNAL).unlink()
     write_run_record(out, collection, collection.seed)
     logs = [row for row in rows.values() if row["file"]]
     seconds = sum(row["time_s"] for row in logs)
@@ -101,12 +80,81 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
     return {**found, "out": str(out)}
 
 
+Row = dict[str, Any]
+"""A flight in the list."""
+
+
+def _fly_missing(
+    collection: Collection,
+    course: Course,
+    policy: Policy,
+    out: Path,
+    rows: dict[TrialSpec, Row],
+    journal: Journal,
+    console: Console,
+    workers: Workers | None,
+) -> None:
+    """Fly what `rows` lacks; write each log and note the flight as it ends."""
+    from eval.judging.judge import JudgeOptions, Record, fly
+
+    missing = [trial for trial in course.trials if trial not in rows]
+    workers = workers_for(len(missing), workers, collection.world)
+    what = f"{len(missing)} flights in the {collection.world} world"
+    announce(console, what, flying_needs(len(missing), workers))
+    asked = collection.policy or default_policy()
+    with console.progress("flights", len(course.trials)) as update:
+
+        def keep(result: TrialResult, flight: Flight | None) -> None:
+            name = None
+            if flight is not None and result.time_s >= DURATION_MIN:
+                name = _write_log(out, result, flight, console)
+            rows[result.trial] = {"file": name, **result._asdict()}
+            journal.append(result)
+            update(len(rows), result.ended_by)
+
+        if missing:
+            fly(
+                who_flies(policy, asked, collection.trust, workers),
+                missing,
+                course.vehicle,
+                collection.world,
+                JudgeOptions(workers=workers),
+                keep,
+                Record(depth=False),
+                course.tracks,
+            )
+
+
+def _write_list(
+    out: Path, about: dict[str, Any], course: Course, rows: dict[TrialSpec, Row]
+) -> dict[str, Any]:
+    """Write the list of flights, in the order of the trials, and return it."""
+    flights = [rows[trial] for trial in course.trials]
+    found = {**stamp(1, about["collection"].seed), **about, "flights": flights}
+    write_json(out / LIST, found)
+    return found
+
+
+def _row(out: Path, result: TrialResult) -> Row | None:
+    """Return the row of a flight that was noted; None where its log is not there."""
+    name = None
+    if result.time_s >= DURATION_MIN:
+        name = _log_name(result)
+        if not (out / name).is_file():
+            return None
+    return {"file": name, **result._asdict()}
+
+
+def _log_name(result: TrialResult) -> str:
+    return f"{Path(result.track).stem}-{result.difficulty}-{result.seed}.parquet"
+
+
 def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console) -> str | None:
     """Return the name of the log that was written, None with a warning where it is refused."""
     from eval.logs.columns import FlightLogError
     from eval.logs.flight_log import log_from_flight, write_flight
 
-    name = f"{Path(result.track).stem}-{result.difficulty}-{result.seed}.parquet"
+    name = _log_name(result)
     try:
         write_flight(out / name, log_from_flight(flight, name))
     except FlightLogError as error:
@@ -115,8 +163,8 @@ def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console)
     return name
 
 
-def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, dict[str, Any]]:
-    """Return the rows of an earlier, interrupted call of the same collection."""
+def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, Row]:
+    """Return the rows of an earlier call of the same collection."""
     from eval.worlds.trial import TrialSpec
 
     path = out / LIST

@@ -15,24 +15,27 @@ from suite.judging.flying import (
     flying_needs,
     labels,
     load_flier,
-    options_for,
     read_course,
     who_flies,
+    workers_for,
 )
 from suite.judging.requests import Evaluation
 from tracks.common.grid import rich_table
 from tracks.common.provenance import stamp
+from tracks.common.work import Workers
 
 if TYPE_CHECKING:
     from eval.worlds.trial import TrialResult
     from policies.policy import Policy
 
 
-def evaluate(evaluation: Evaluation, out: Path, console: Console) -> dict[str, Any]:
+def evaluate(
+    evaluation: Evaluation, out: Path, console: Console, workers: Workers | None = None
+) -> dict[str, Any]:
     """Fly all trials and write trials.parquet, table.md, summary.json and run.json into `out`.
 
     Each trial is kept in a journal as it ends: the same call after an interruption flies the
-    rest. The journals go when the tables are written.
+    rest, by the same `workers` or others. The journals go when the tables are written.
 
     Returns:
         The summary: `cells` and `paired` of `eval.judging.tables.summarise`, and what was judged.
@@ -51,15 +54,15 @@ def evaluate(evaluation: Evaluation, out: Path, console: Console) -> dict[str, A
         policies += [load_flier(name, evaluation.trust, True) for name in asked]
         called, asked = [*called, *(f"{label}+monitor" for label in called)], asked * 2
     count = len(course.trials)
-    processes = options_for(count, evaluation.processes, evaluation.world).processes or 1
+    workers = workers_for(count, workers, evaluation.world)
     what = f"{count * len(asked)} trials in the {evaluation.world} world"
-    announce(console, what, flying_needs(count * len(asked), processes))
+    announce(console, what, flying_needs(count * len(asked), workers))
     results: list[TrialResult] = []
     journals: list[Path] = []
     for number, (name, policy, label) in enumerate(zip(asked, policies, called, strict=True)):
         journals.append(out / f"journal-{number}.jsonl")
         flier = name, policy, label
-        results += _fly_one(evaluation, course, flier, journals[-1], console)
+        results += _fly_one(evaluation, course, flier, workers, journals[-1], console)
     summary = {
         **summarise(results),
         "judged": evaluation,
@@ -85,14 +88,13 @@ def _fly_one(
     evaluation: Evaluation,
     course: Course,
     flier: tuple[str, Policy, str],
+    workers: Workers,
     journal_path: Path,
     console: Console,
 ) -> list[TrialResult]:
     """Return the results of one policy (asked for as, itself, called) in the trials' order."""
-    from dataclasses import replace
-
     from eval.judging.guard import ActionLimits
-    from eval.judging.judge import fly
+    from eval.judging.judge import JudgeOptions, fly
     from eval.judging.results import Journal
 
     name, policy, label = flier
@@ -104,8 +106,7 @@ def _fly_one(
         "deadline_s": evaluation.deadline_s,
         "tracks": course.tracks,
     }
-    options = options_for(len(course.trials), evaluation.processes, evaluation.world)
-    options = replace(options, limits=ActionLimits(deadline_s=evaluation.deadline_s))
+    options = JudgeOptions(workers=workers, limits=ActionLimits(deadline_s=evaluation.deadline_s))
     with Journal(journal_path, about) as journal:
         missing = journal.missing(course.trials)
         if len(missing) < len(course.trials):
@@ -119,7 +120,7 @@ def _fly_one(
                 update(done, f"{share:.0%} success")
 
             fly(
-                who_flies(policy, name, evaluation.trust, options.processes),
+                who_flies(policy, name, evaluation.trust, workers),
                 missing,
                 course.vehicle,
                 evaluation.world,

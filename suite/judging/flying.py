@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -10,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.common.estimate import Estimate
+from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.requests import Collection, Evaluation
-from tracks.common.work import usable_cores
+from tracks.common.work import Workers, crew, usable_cores
 from tracks.input.ranges import check_ranges
 
 if TYPE_CHECKING:
-    from eval.judging.judge import JudgeOptions
     from eval.vehicles.vehicle import Vehicle
     from eval.worlds.trial import TrialSpec
     from policies.policy import Policy
@@ -43,31 +42,6 @@ def default_policy() -> str:
     if not names:
         raise ValueError("no policy is shipped with this version; give one with --policy")
     return shipped.DEFAULT if shipped.DEFAULT in names else names[0]
-
-
-def policy_digest(name_or_path: str) -> str:
-    """Return the SHA-256 of a policy's files, or of what flies of its folder, as hex.
-
-    A card or a curve beside it may change and the policy be the same.
-    """
-    from policies import shipped
-    from policies.formats.checkpoint import CONFIG, WEIGHTS
-
-    path = shipped.locate(name_or_path)
-    files = [path]
-    if path.is_dir():
-        names = (CONFIG, WEIGHTS) if (path / CONFIG).exists() else ("policy.h", "policy.c")
-        files = [path / name for name in names if (path / name).is_file()]
-    elif path.suffix == ".c":
-        files = [path.with_name("policy.h"), path]
-    elif path.suffix == ".onnx":
-        from policies.formats.onnx_file import files_of
-
-        files = files_of(path)
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.name.encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
 
 
 def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
@@ -146,10 +120,16 @@ def read_course(wanted: Evaluation | Collection) -> Course:
     return Course(trials, custom_tracks(names), load_vehicle(wanted.vehicle))
 
 
-def flying_needs(trials: int, processes: int) -> Estimate:
-    """Return about how long `trials` take in MuJoCo, and their memory."""
+def flying_needs(trials: int, workers: Workers) -> Estimate:
+    """Return about how long `trials` take in MuJoCo, and their memory.
+
+    Raises:
+        ValueError: where `workers` is a cluster that cannot work for us.
+    """
+    processes = crew(workers)
     seconds = START_SECONDS + trials * SECONDS_A_TRIAL / processes
-    return Estimate(seconds, processes * PROCESS_BYTES)
+    # Of this machine: a cluster's is not ours to count.
+    return Estimate(seconds, PROCESS_BYTES * (workers if isinstance(workers, int) else 1))
 
 
 def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
@@ -163,24 +143,39 @@ def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
     return {name: load_track(name) for name in names if is_track_file(name)}
 
 
-def options_for(trials: int, processes: int | None, world: str) -> JudgeOptions:
-    """Return how `trials` are flown; `processes` None takes what is worth it."""
-    from eval.judging.judge import JudgeOptions
-
-    if processes is None:
-        worth = max(1, trials // TRIALS_A_PROCESS)
-        processes = 1 if world == "mjx" else min(usable_cores(), worth)
-    return JudgeOptions(processes=processes)
+def workers_for(trials: int, asked: Workers | None, world: str) -> Workers:
+    """Return who flies `trials` where `asked` workers were given; None takes what is worth it."""
+    if asked is not None:
+        return asked
+    worth = max(1, trials // TRIALS_A_PROCESS)
+    return 1 if world == "mjx" else min(usable_cores(), worth)
 
 
 def who_flies(
-    policy: Policy, name_or_path: str, trust: bool, processes: int | None
+    policy: Policy, name_or_path: str, trust: bool, workers: Workers
 ) -> Policy | Callable[[], Policy]:
-    """Return the loaded policy, or for several processes how each of them loads its own."""
+    """Return the loaded policy, or for several processes how each of them loads its own.
+
+    Those of this machine read it where it is, those of a cluster are given its content.
+    """
     from eval.judging.monitor import Monitored
 
     monitored = isinstance(policy, Monitored)
-    return policy if processes == 1 else partial(load_flier, name_or_path, trust, monitored)
+    if workers == 1:
+        return policy
+    if isinstance(workers, int):
+        return partial(load_flier, name_or_path, trust, monitored)
+    return partial(_flier_of, PolicyContent.of(name_or_path, trust), monitored)
+
+
+def _flier_of(content: PolicyContent, monitored: bool) -> Policy:
+    return _monitored(content()) if monitored else content()
+
+
+def _monitored(policy: Policy) -> Policy:
+    from eval.judging.monitor import Monitored
+
+    return Monitored(policy)
 
 
 def load_flier(name_or_path: str, trust: bool, monitored: bool) -> Policy:
@@ -189,11 +184,10 @@ def load_flier(name_or_path: str, trust: bool, monitored: bool) -> Policy:
     Raises:
         PolicyError: where it cannot be loaded.
     """
-    from eval.judging.monitor import Monitored
     from policies.policy import load_policy
 
     policy = load_policy(name_or_path, trust)
-    return Monitored(policy) if monitored else policy
+    return _monitored(policy) if monitored else policy
 
 
 def about_policy(name_or_path: str, policy: Policy) -> dict[str, Any]:

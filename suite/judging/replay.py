@@ -84,7 +84,7 @@ def fly_again(
         trials,
         load_vehicle(evaluation.vehicle),
         evaluation.world,
-        JudgeOptions(processes=1, limits=ActionLimits(deadline_s=evaluation.deadline_s)),
+        JudgeOptions(workers=1, limits=ActionLimits(deadline_s=evaluation.deadline_s)),
         keep,
         Record(depth=True),
         tracks,

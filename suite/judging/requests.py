@@ -31,8 +31,6 @@ class Evaluation:
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str = "mujoco"
     """mujoco (fast on CPUs), mjx (for GPUs) or reference (slow and simple)."""
-    processes: Annotated[int | None, Range(1, 256), tyro.conf.arg(name="procs")] = None
-    """Processes that share the trials; by default as many cores as are worth it."""
     deadline_s: Annotated[float, Range(0.0, 3600.0, above=True)] | None = None
     """An answer of the policy that takes longer ends the trials that it was for (up to 64, which it
     is asked about at once), as out of time [s]."""

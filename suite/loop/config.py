@@ -128,7 +128,8 @@ def resolve(
     """
     from eval.quadrotor.vehicle_file import load_vehicle
     from policies.formats.policy_file import load_policy_checkpoint
-    from suite.judging.flying import checkpoint_folder, default_policy, policy_digest
+    from suite.judging.content import policy_digest
+    from suite.judging.flying import checkpoint_folder, default_policy
 
     training = replace(preset(recipe), seed=seed)
     sizes = SIZES if world is None else HIDDEN_SIZES

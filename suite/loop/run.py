@@ -19,17 +19,21 @@ from suite.loop.work import LoopRun, plan
 from tracks.common.files import plain, write_json, write_text
 from tracks.common.grid import markdown, rich_table
 from tracks.common.provenance import stamp
+from tracks.common.work import Workers
 
 FILES = ("table.md", "report.html", "recording.rrd")
 
 
-def run_loop(config: LoopConfig, out: Path, console: Console) -> dict[str, Any]:
+def run_loop(
+    config: LoopConfig, out: Path, console: Console, workers: Workers | None = None
+) -> dict[str, Any]:
     """Run the loop, or what is left of it, and print what it showed.
 
     Args:
         config: the whole loop.
         out: its folder; one with a loop of the same configuration is gone on with.
         console: where progress and results go.
+        workers: who shares the flights and the fine-tunings; no part of what the loop is.
 
     Returns:
         What loop.json holds, and `out`.
@@ -40,7 +44,9 @@ def run_loop(config: LoopConfig, out: Path, console: Console) -> dict[str, Any]:
             used, or the diagnosis names nothing to correct.
     """
     hidden = isinstance(config, HiddenLoopConfig)
-    run = LoopRun((hidden_effect if hidden else delta_action).LOOP, config, Path(out), console)
+    run = LoopRun(
+        (hidden_effect if hidden else delta_action).LOOP, config, Path(out), console, workers
+    )
     claim(run.out, config, config.seed)
     seconds = do_stages(run.out, plan(run), console, f"the loop, to {run.out}")
     return _conclude(run, seconds)

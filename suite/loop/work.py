@@ -7,10 +7,11 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from eval.judging.results import read_trials
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -21,11 +22,13 @@ from suite.common.choices import parse_levels
 from suite.common.console import Console, Quiet
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate
-from suite.common.stages import Stage
+from suite.common.running.apart import Job
+from suite.common.stages import Stage, is_done
+from suite.common.work import all_done
 from suite.delta.run import fit_delta, fitting_estimate
 from suite.judging.collect import collect
 from suite.judging.evaluate import evaluate
-from suite.judging.flying import checkpoint_folder, flying_needs, options_for
+from suite.judging.flying import checkpoint_folder, flying_needs, workers_for
 from suite.judging.replay import drone_of, first_trials, fly_again
 from suite.judging.requests import Collection, Evaluation
 from suite.loop.compare import BEFORE
@@ -35,6 +38,7 @@ from suite.loop.variants import DeltaModel, Loop, Variant
 from suite.train import run as training
 from suite.train.config import TrainConfig
 from tracks.common.files import replacing_folder, write_json
+from tracks.common.work import Workers
 
 DIAGNOSED_S = 80.0
 """The diagnosis gets about this much flight, of all tracks and levels in turn [s]."""
@@ -61,6 +65,9 @@ class LoopRun:
     """The folder."""
     console: Console
     """Where progress goes."""
+    workers: Workers | None = None
+    """Who shares the flights and the fine-tunings; None flies in as many processes as are worth it
+    and fine-tunes one policy after the other."""
 
     @property
     def logs(self) -> Path:
@@ -116,9 +123,9 @@ def _begin(run: LoopRun) -> Stage:
     return Stage("given", f"taking {given} instead of training", Estimate(0, 0), copy)
 
 
-def _flying(trials: int) -> Estimate:
+def _flying(run: LoopRun, trials: int) -> Estimate:
     """Return about how long `trials` take in MuJoCo, and their memory."""
-    return flying_needs(trials, options_for(trials, None, "mujoco").processes or 1)
+    return flying_needs(trials, workers_for(trials, run.workers, "mujoco"))
 
 
 def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
@@ -135,7 +142,7 @@ def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
 
 def _judge(run: LoopRun, variant: Variant) -> Stage:
     def work(folder: Path) -> None:
-        evaluate(_evaluation(run, variant), folder, Quiet())
+        evaluate(_evaluation(run, variant), folder, Quiet(), run.workers)
 
     def tell(folder: Path) -> None:
         rows = read_trials(folder / "trials.parquet")
@@ -144,7 +151,7 @@ def _judge(run: LoopRun, variant: Variant) -> Stage:
         words = f"{won:.0%} of {len(rows)} trials succeed, {gates:.1f} gates on average"
         run.console.note(f"    {words}")
 
-    needs = _flying(run.config.trials * run.config.cells)
+    needs = _flying(run, run.config.trials * run.config.cells)
     return Stage(f"eval-{variant.name}", variant.judged, needs, work, tell)
 
 
@@ -162,8 +169,8 @@ def _record(run: LoopRun) -> Stage:
     return Stage(
         "flights",
         "recording flights on other seeds",
-        _flying(config.flights * config.cells),
-        lambda folder: collect(collection, folder, Quiet()),
+        _flying(run, config.flights * config.cells),
+        lambda folder: collect(collection, folder, Quiet(), run.workers),
     )
 
 
@@ -250,21 +257,47 @@ def _fit(run: LoopRun, model: DeltaModel) -> Stage:
     return Stage(model.folder, model.words, needs, work, tell)
 
 
+class Tuning(NamedTuple):
+    """A fine-tuning, by content."""
+
+    config: TrainConfig
+    start: Mapping[str, np.ndarray]
+    """Where it starts."""
+    delta: Mapping[str, np.ndarray] | None
+    """The Delta Action network that corrects what it goes through."""
+
+
 def _tune(run: LoopRun, variant: Variant) -> Stage:
+    """Fine-tune a policy; the first of such stages fine-tunes those of all where several work."""
+
     def work(folder: Path) -> None:
-        tuning, first = run.tuning(variant.diagnosed), replace(variant, tuned=None)
-        stored = load_policy_checkpoint(run.policy(first))
-        start = fitted(jax.tree.map(jnp.asarray, stored.params), stored.spec, tuning.spec)
-        delta = None
-        if variant.delta is not None:
-            model = load_delta(run.out / variant.delta / "delta").params
-            delta = jax.tree.map(jnp.asarray, model)
-        training.train(tuning, folder, run.console, start, delta)
+        several = run.workers is not None and run.workers != 1
+        later = [v for v in run.loop.variants if v.tuned is not None] if several else [variant]
+        jobs = [Job(_tuning(run, each), run.out / f"tuned-{each.name}") for each in later]
+        jobs = [job for job in jobs if not is_done(job.folder)]
+        all_done(_tune_one, jobs, run.workers, run.console, "fine-tuning")
 
     point = training.estimate(replace(run.config.tuning, quadrotor=None))
     cost = 1.0 if run.config.tuning.quadrotor is None else QUADROTOR_COST
     needs = Estimate(cost * point.seconds, point.memory_bytes)
     return Stage(f"tuned-{variant.name}", f"fine-tuning {variant.tuned}", needs, work)
+
+
+def _tuning(run: LoopRun, variant: Variant) -> Tuning:
+    """Return what a variant is fine-tuned from and through."""
+    tuning, first = run.tuning(variant.diagnosed), replace(variant, tuned=None)
+    stored = load_policy_checkpoint(run.policy(first))
+    start = fitted(jax.tree.map(jnp.asarray, stored.params), stored.spec, tuning.spec)
+    delta = None
+    if variant.delta is not None:
+        delta = load_delta(run.out / variant.delta / "delta").params
+    return Tuning(tuning, jax.tree.map(np.asarray, start), delta)
+
+
+def _tune_one(job: Job, console: Console) -> None:
+    tuning: Tuning = job.task
+    start, delta = jax.tree.map(jnp.asarray, (tuning.start, tuning.delta))
+    training.train(tuning.config, job.folder, console, start, delta)
 
 
 def _replay(run: LoopRun) -> Stage:
@@ -293,4 +326,4 @@ def _replay(run: LoopRun) -> Stage:
         write_recording(folder.parent / "recording.rrd", pairs, drone)
 
     words = "flying a few trials again for the recording and the pictures"
-    return Stage("replays", words, _flying(12), work)
+    return Stage("replays", words, _flying(run, 12), work)

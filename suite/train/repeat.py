@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,9 +31,10 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate, announce
 from suite.common.provenance import write_run_record
-from suite.common.running.threads import threads
+from suite.common.running import hosts
 from suite.train.worlds import Worlds
 from tracks.common.files import recover_folder
+from tracks.common.work.threads import threads
 
 SAVE_PERIOD_S = 30.0
 """Time between checkpoints [s]."""
@@ -106,13 +108,20 @@ def repeat(
 ) -> Outcome:
     """Repeat a method's update from the folder's state, or the `fresh` one, to its end.
 
+    Of several processes the first reads and writes the folder, and hands the others its state.
+
     Raises:
         ValueError: where the folder holds another run.
-        WorkFailed: where a number of the curve stops being finite.
+        WorkFailed: where a number of the curve stops being finite, or another process is gone.
     """
     folder = run.folder
-    state = jax.device_put(_resume(run.origin, folder, fresh), run.place)
+    if hosts.writes():
+        fresh = _resume(run.origin, folder, fresh)
+    state = jax.device_put(hosts.from_the_first(fresh), run.place)
     done = int(state.iteration)
+    if not hosts.writes():
+        state = _iterate(method, run, state, console, None) if done < method.iterations else state
+        return Outcome(folder / "policy", int(state.iteration), {})
     if done < method.iterations or _is_missing(watch, folder, done, method.iterations):
         announce(console, f"training to {folder}", method.estimate)
         if done < method.iterations:
@@ -132,6 +141,8 @@ def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watc
     update, worlds = method.make_update(), method.worlds(first)
 
     def save() -> None:
+        if not hosts.writes():
+            return
         curve.append(run.folder, rows)
         if watched:
             curve.append(run.folder, watched, curve.WATCHED)
@@ -150,10 +161,11 @@ def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watc
                 look()
             for iteration in range(first, total):
                 started = time.monotonic()
-                after, numbers = update(state, worlds)
-                # The device works meanwhile: prepare the next iteration's worlds.
-                worlds = method.worlds(iteration + 1)
-                row = {key: float(value) for key, value in numbers.items()}
+                with _others_there(iteration, run.folder):
+                    after, numbers = update(state, worlds)
+                    # The device works meanwhile: prepare the next iteration's worlds.
+                    worlds = method.worlds(iteration + 1)
+                    row = {key: float(value) for key, value in numbers.items()}
                 _check_finite(iteration, row, run.folder)
                 seconds = time.monotonic() - started
                 speed = method.frames / seconds
@@ -170,6 +182,21 @@ def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watc
     finally:
         save()
     return state
+
+
+@contextmanager
+def _others_there(iteration: int, folder: Path) -> Iterator[None]:
+    """Say what to do where another process of the training is gone."""
+    try:
+        yield
+    except Exception as error:
+        if not hosts.is_gone(error):
+            raise
+        raise WorkFailed(
+            f"another process of this training is gone, at iteration {iteration} "
+            f"({str(error).splitlines()[0][:120]}). Give the same command on every host again: it "
+            f"goes on from what the first one saved in {folder}"
+        ) from error
 
 
 def _is_due(watch: Watch, done: int, total: int) -> bool:

@@ -18,12 +18,14 @@ from jax.sharding import NamedSharding, PartitionSpec
 from policies.networks import delta_network, network
 from suite.common.console import Console
 from suite.common.estimate import Estimate
+from suite.common.running import hosts
 from suite.train.config import TrainConfig, check
 from suite.train.repeat import Method, Outcome, Run, Watch, flight_note, repeat
-from suite.train.update import device_mesh, make_update, start_state
+from suite.train.update import device_mesh, make_update, shared_out, start_state
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
 from tracks.common.work import usable_cores
+from tracks.common.work.threads import threads
 
 STEPS_PER_CORE_S = 5000.0
 """Gradient steps a second that one processor core makes, for the estimate."""
@@ -71,21 +73,23 @@ def train(
         console: where progress goes.
         params: start from these instead of fresh ones.
         delta: a frozen Delta Action network to train under.
-        watch: measures the policy on the way.
+        watch: measures the policy on the way; in one process alone.
 
     Raises:
-        ValueError: for settings that cannot be used, and where the folder holds a run
-            of another configuration, start or delta.
-        WorkFailed: where the loss or the parameters stop being finite.
+        ValueError: for settings that cannot be used, where the folder holds a run of another
+            configuration, start or delta, and where processes were asked for different ones.
+        WorkFailed: where the loss or the parameters stop being finite, or another process is gone.
     """
     check(config)
     mesh = device_mesh(config)
     origin = {"config": plain(config), "from": _digest(params), "delta": _digest(delta)}
+    hosts.agree({"the configuration": origin["config"], "--from": origin["from"],
+                 "--delta": origin["delta"], "threads": threads() > 1})  # fmt: skip
     method = Method(
         iterations=config.optimizer.iterations,
         frames=config.episode.batch * config.episode.steps,
         estimate=estimate(config),
-        worlds=lambda iteration: sample_worlds(config, iteration),
+        worlds=lambda iteration: shared_out(sample_worlds(config, iteration), mesh),
         make_update=lambda: make_update(config, mesh, delta),
         note=functools.partial(flight_note, "loss"),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple, cast
 
@@ -9,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from policies.networks import delta_network, network
+from suite.common.running import hosts
 from suite.train.config import OptimizerConfig, TrainConfig
 from suite.train.gradient import shard_gradient
 from suite.train.rollout import StepRecord
@@ -62,9 +64,27 @@ def device_mesh(config: TrainConfig) -> Mesh:
     count = config.devices or max(n for n in range(1, len(have) + 1) if batch % n == 0)
     if not 0 < count <= len(have):
         raise ValueError(f"devices is {count}, allowed is 0 (all) to {len(have)}")
+    if hosts.several() and count < len(have):
+        raise ValueError(
+            f"episode.batch is {batch}, and devices {config.devices}: the {len(have)} devices of "
+            f"all {jax.process_count()} processes must divide the one, and the other be 0"
+        )
     if batch % count:
         raise ValueError(f"episode.batch is {batch}, not a multiple of the {count} devices")
     return Mesh(np.array(have[:count]), ("worlds",))
+
+
+def shared_out(worlds: Worlds, mesh: Mesh) -> Worlds:
+    """Return worlds with each process's part on its devices; as they are in one process alone."""
+    if not hosts.several():
+        return worlds
+    place = NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
+
+    def part(leaf: np.ndarray) -> jax.Array:
+        leaf = np.asarray(leaf, jax.dtypes.canonicalize_dtype(leaf.dtype))
+        return jax.make_array_from_callback(leaf.shape, place, lambda index: leaf[index])
+
+    return jax.tree.map(part, worlds)
 
 
 def curve_numbers(
@@ -114,7 +134,10 @@ def make_update(
     gradient_of = shard_gradient(config, mesh)
     seed = jax.random.key(np.uint32(config.seed))
 
-    @jax.jit
+    # The first process saves what all of them hold.
+    held = NamedSharding(mesh, PartitionSpec()) if hosts.several() else None
+
+    @functools.partial(jax.jit, out_shardings=held)
     def update(state: TrainState, worlds: Worlds) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(seed, state.iteration)
         worlds = worlds._replace(hidden=state.hidden * worlds.remembers[:, None])

@@ -240,7 +240,7 @@ HUGE = "9" * 400
         f"loop --seed {HUGE}",
         "reproduce table2 --trials 0",
         "reproduce ideas --round-seconds nan",
-        "reproduce schemes --jobs 0",
+        "reproduce schemes --workers 0",
         f"train --iterations {HUGE}",
         f"train --seed {HUGE}",
         "train --set spec.rate_hz=0.0",

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from suite.common.running.threads import share_threads
 from suite.experiments.bench.compare import Comparison, Figure
 from suite.train.config import TrainConfig
 from suite.train.presets import preset, with_fleet
 from suite.train.worlds import Worlds, sample_worlds
+from tracks.common.work.threads import share_threads
 from tracks.geometry.scene import PARKED_Z, Counts, Gates
 
 SOLIDS = Counts(boxes=44, cylinders=8, capsules=6, spheres=6)

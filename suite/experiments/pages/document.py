@@ -15,6 +15,7 @@ from suite.common.report import Details, Links, Part, Picture, Report
 from tracks.common.files import plain, replacing_file, write_json, write_text
 from tracks.common.grid import Grid, markdown
 from tracks.common.provenance import stamp
+from tracks.common.work import Workers
 
 SCHEMA = 1
 """Version of NAME.json."""
@@ -22,12 +23,21 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Place:
-    """Where an experiment's files go."""
+    """Where an experiment's files go, and who works on it."""
 
     out: Path
     """Folder of the documents."""
     cache: Path
     """Folder of what was computed before, by any experiment."""
+    workers: Workers | None = None
+    """Who trains and flies; None trains one after the other, and flies in processes."""
+
+    @property
+    def at_once(self) -> str:
+        """Trainings at once, in words."""
+        if isinstance(self.workers, str):
+            return "as many as the cluster has workers"
+        return f"{self.workers or 1}, each on its own share of the cores"
 
 
 def write_document(

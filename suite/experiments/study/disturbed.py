@@ -21,6 +21,7 @@ from suite.experiments.study.conditions import (
 )
 from suite.experiments.study.judging import Flier, Order, flown
 from tracks.common.names import unknown_name
+from tracks.common.work import Workers
 
 
 class Tested(NamedTuple):
@@ -73,6 +74,7 @@ def flown_under(
     fliers: Mapping[str, Flights],
     cache: Path,
     console: Console,
+    workers: Workers | None = None,
 ) -> tuple[list[Tested], Grown]:
     """Return conditions, and those of sweeps, with every policy's trials under them.
 
@@ -82,6 +84,7 @@ def flown_under(
         fliers: by what tables call them; several policies under one name fly one after the other.
         cache: folder of the flights.
         console: where progress goes.
+        workers: who flies; None takes as many processes of this machine as are worth it.
     """
     conditions = [*alone, *(point for points in grown.values() for point in points)]
     orders = {
@@ -90,7 +93,7 @@ def flown_under(
         for at, condition in enumerate(conditions)
         for part, (policy, trials) in enumerate(parts)
     }
-    rows = flown(orders, cache, console, "flying under disturbances")
+    rows = flown(orders, cache, console, "flying under disturbances", workers)
     tested = [
         Tested(
             condition,

@@ -6,15 +6,16 @@ cache, and each trial goes there as it ends; documents that share flights share 
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from eval.judging.judge import JudgeOptions, Task, fly_share
+from eval.judging.judge import MOST_A_PIECE, JudgeOptions, Task, fly_share
 from eval.judging.results import Journal
 from eval.judging.sensors import SensorNoise
 from eval.judging.tables import Tally, summarise
@@ -25,11 +26,14 @@ from suite.common.choices import parse_levels
 from suite.common.console import Console
 from suite.common.estimate import announce
 from suite.experiments.study.cache import code_digest, digest, engines
-from suite.judging.flying import TRIALS_A_PROCESS, flying_needs, policy_digest, trial_list
-from tracks.common.work import usable_cores, work_off
+from suite.judging.content import PolicyContent, policy_digest
+from suite.judging.flying import TRIALS_A_PROCESS, flying_needs, trial_list
+from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import JUDGED
 
 Key = TypeVar("Key", bound=Hashable)
+OPEN_FILES = 256
+"""Journals that are open at once."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,11 @@ class Order:
 
 
 def flown(
-    orders: Mapping[Key, Order], cache: Path, console: Console, what: str
+    orders: Mapping[Key, Order],
+    cache: Path,
+    console: Console,
+    what: str,
+    workers: Workers | None = None,
 ) -> dict[Key, list[TrialResult]]:
     """Return the results of every order; those not in `cache` are flown first.
 
@@ -64,11 +72,14 @@ def flown(
         cache: folder of the journals.
         console: where progress goes.
         what: a few words on what is flown.
+        workers: who flies; None takes as many processes of this machine as are worth it.
 
     Raises:
         ValueError: for a policy that cannot be loaded, before the first flight.
     """
-    about = {key: _about(order.flier) for key, order in orders.items()}
+    policies = {order.flier.policy for order in orders.values()}
+    digests = {policy: policy_digest(policy) for policy in policies}
+    about = {key: _about(order.flier, digests) for key, order in orders.items()}
     names = {key: digest(entry) for key, entry in about.items()}
     fliers = {names[key]: order.flier for key, order in orders.items()}
     wanted: dict[str, dict[TrialSpec, None]] = {name: {} for name in fliers}
@@ -84,20 +95,28 @@ def flown(
         if left < total:
             console.note(f"{what}: {total - left} of {total} trials were flown before")
         if left:
-            processes = min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
-            announce(console, f"{what}: {left} trials", flying_needs(left, processes))
-            numbers, open_journals = count(total - left + 1), list(journals.values())
+            if workers is None:
+                workers = min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
+            announce(console, f"{what}: {left} trials", flying_needs(left, workers))
+            numbers, all_journals = count(total - left + 1), list(journals.values())
+            lately: dict[int, None] = {}
             with console.progress(what, total) as update:
 
                 def keep(piece: int, ended: tuple[int, TrialResult]) -> None:
                     number, result = ended
-                    open_journals[number].append(result)
+                    all_journals[number].append(result)
+                    # A sweep has more journals than a process may have files open.
+                    lately.pop(number, None)
+                    lately[number] = None
+                    if len(lately) > OPEN_FILES:
+                        oldest = next(iter(lately))
+                        all_journals[oldest].close()
+                        del lately[oldest]
                     update(next(numbers))
 
-                shares = _shares(missing, processes)
-                pieces = [shares[k::processes] for k in range(processes)]
-                work = partial(_fly_shares, list(fliers.values()))
-                work_off(work, pieces, processes, keep)
+                loaders = _loaders(fliers.values(), workers)
+                pieces = _pieces(list(fliers.values()), missing, crew(workers))
+                work_off(partial(_fly_piece, loaders), pieces, workers, keep)
     return {
         key: [journals[names[key]].done[trial] for trial in order.trials]
         for key, order in orders.items()
@@ -105,10 +124,14 @@ def flown(
 
 
 def judged_cells(
-    orders: Mapping[str, Order], cache: Path, console: Console, what: str
+    orders: Mapping[str, Order],
+    cache: Path,
+    console: Console,
+    what: str,
+    workers: Workers | None = None,
 ) -> tuple[dict[str, list[TrialResult]], dict[str, list[Tally]]]:
     """Return results and their cells, as `flown` does, by what tables call the policies."""
-    results = flown(orders, cache, console, what)
+    results = flown(orders, cache, console, what, workers)
     return results, {
         name: summarise([row._replace(policy=name) for row in rows])["cells"]
         for name, rows in results.items()
@@ -121,10 +144,10 @@ def trials_of(config: Any, levels: Sequence[int] | None = None) -> list[TrialSpe
     return trial_list(JUDGED, levels, config.trials, config.seed)
 
 
-def _about(flier: Flier) -> dict[str, Any]:
+def _about(flier: Flier, digests: Mapping[str, str]) -> dict[str, Any]:
     """Return all that sets the outcome of a trial besides the trial."""
     return {
-        "policy_sha256": policy_digest(flier.policy),
+        "policy_sha256": digests[flier.policy],
         "vehicle": flier.vehicle,
         "noise": flier.noise,
         "code": code_digest("tracks", "policies", "eval"),
@@ -132,29 +155,53 @@ def _about(flier: Flier) -> dict[str, Any]:
     }
 
 
-Share = tuple[int, list[TrialSpec]]
-"""Trials of one flier, by its number."""
+Loaders = dict[str, Callable[[], Policy]]
+"""How each policy is loaded where it flies, by what fliers call it."""
 
 
-def _shares(missing: Sequence[list[TrialSpec]], processes: int) -> list[Share]:
-    """Cut each flier's trials into pieces that are worth a process of their own."""
-    shares = []
-    for number, trials in enumerate(missing):
-        pieces = max(1, min(processes, len(trials) // TRIALS_A_PROCESS))
-        shares += [(number, trials[k::pieces]) for k in range(pieces) if trials]
-    return shares
+class Share(NamedTuple):
+    """Trials of one flier."""
+
+    number: int
+    """Of the flier."""
+    flier: Flier
+    trials: Sequence[TrialSpec]
 
 
-def _fly_shares(
-    fliers: Sequence[Flier], shares: Sequence[Share]
-) -> Iterator[tuple[int, TrialResult]]:
+def _loaders(fliers: Iterable[Flier], workers: Workers) -> Loaders:
+    """Return how policies are loaded: by name on this machine, by content on others."""
+    names = {flier.policy for flier in fliers}
+    if isinstance(workers, int):
+        return {name: partial(load_policy, name) for name in names}
+    return {name: PolicyContent.of(name) for name in names}
+
+
+def _pieces(
+    fliers: Sequence[Flier], missing: Sequence[Sequence[TrialSpec]], processes: int
+) -> list[list[Share]]:
+    """Cut the trials of all fliers into pieces for so many processes, each of about as many."""
+    total = sum(map(len, missing))
+    most = total if processes == 1 else min(MOST_A_PIECE, math.ceil(total / processes))
+    pieces: list[list[Share]] = [[]]
+    held = 0
+    for number, (flier, trials) in enumerate(zip(fliers, missing, strict=True)):
+        cut = math.ceil(len(trials) / most) if trials else 0
+        for part in (trials[k::cut] for k in range(cut)):
+            if held and held + len(part) > most:
+                pieces.append([])
+                held = 0
+            pieces[-1].append(Share(number, flier, part))
+            held += len(part)
+    return pieces
+
+
+def _fly_piece(loaders: Loaders, piece: Sequence[Share]) -> Iterator[tuple[int, TrialResult]]:
     """Yield (number of the flier, result) of trials flown here; each policy is loaded once."""
     loaded: dict[str, Policy] = {}
-    for number, trials in shares:
-        flier = fliers[number]
+    for number, flier, trials in piece:
         if flier.policy not in loaded:
-            loaded[flier.policy] = load_policy(flier.policy)
-        options = JudgeOptions(processes=1, noise=flier.noise)
+            loaded[flier.policy] = loaders[flier.policy]()
+        options = JudgeOptions(workers=1, noise=flier.noise)
         task = Task(loaded[flier.policy], flier.vehicle, options=options)
         for _, result, _ in fly_share(task, list(enumerate(trials))):
             yield number, result

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 from suite.common.choices import parse_levels
-from suite.common.work import check_jobs
 from suite.train.config import TrainConfig
 from suite.train.config import check as check_recipe
 from tracks.input.ranges import Iterations, Range, Seed, Trials, check_ranges
@@ -54,8 +53,6 @@ def check(config: Any) -> None:
         _check_unseen("--seed", config.seed, seeds)
     if "round_seed" in given:
         _check_unseen("--round-seed", given["round_seed"], seeds)
-    if "jobs" in given:
-        check_jobs(given["jobs"])
     if "difficulty" in given:
         parse_levels(given["difficulty"])
 

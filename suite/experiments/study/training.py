@@ -19,11 +19,13 @@ from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate, announce
+from suite.common.running.apart import Job
 from suite.common.work import all_done
 from suite.experiments.study.cache import digest
 from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig
 from tracks.common.names import unknown_name
+from tracks.common.work import Workers
 
 if TYPE_CHECKING:
     from suite.train.rollout import Note
@@ -81,8 +83,6 @@ class Study:
 
     rows: Sequence[Row]
     seeds: Sequence[int]
-    jobs: int
-    """Trainings at once, each in a process with its own share of the cores."""
     looks: Looks | None = None
     """Flights in unseen worlds of the training's dynamics; None flies none."""
     by_seed: bool = False
@@ -110,8 +110,25 @@ def asked_rows(rows: Sequence[Row], only: Sequence[str], what: str) -> list[Row]
     return [row for row in rows if not only or row.key in only]
 
 
-def trained(study: Study, cache: Path, console: Console) -> list[Trained]:
+class Ended(NamedTuple):
+    """How a training ended; all else stands in its folder."""
+
+    diverged: str
+    """As `Trained` has it."""
+    points: list[dict[str, float]]
+    """What was measured of the finished policy alone."""
+
+
+def trained(
+    study: Study, cache: Path, console: Console, workers: Workers | None = None
+) -> list[Trained]:
     """Return every training of `study`; it is done, or gone on with, where missing.
+
+    Args:
+        study: what is trained.
+        cache: where trainings are found again.
+        console: where progress goes.
+        workers: who trains; None or 1 does one training after the other on all cores.
 
     Raises:
         WorkFailed: where one diverges that may not.
@@ -123,31 +140,40 @@ def trained(study: Study, cache: Path, console: Console) -> list[Trained]:
     if not pieces:
         return []
     needs = [ppo_estimate(c) if isinstance(c, PpoConfig) else estimate(c) for _, c in pieces]
-    memory = study.jobs * max(need.memory_bytes for need in needs)
+    memory = max(need.memory_bytes for need in needs)
+    memory *= workers if isinstance(workers, int) else 1
     whole = Estimate(sum(need.seconds for need in needs), memory)
     announce(console, f"{len(pieces)} trainings, less those that are there", whole)
-    do = functools.partial(train_one, cache=cache, looks=study.looks, may_diverge=study.may_diverge)
-    return all_done(do, pieces, study.jobs, console, "training")
+    do = functools.partial(train_one, looks=study.looks, may_diverge=study.may_diverge)
+    jobs = [Job(piece, cache / _place_of(piece, study.looks)) for piece in pieces]
+    ended = all_done(do, jobs, workers, console, "training")
+    return [_read(job, end) for job, end in zip(jobs, ended, strict=True)]
+
+
+def _place_of(piece: tuple[str, Any], looks: Looks | None) -> Path:
+    """Return the folder of a training within the cache."""
+    key, config = piece
+    if looks and looks.measurements:
+        return Path("schemes", digest([key, config, looks]))
+    return Path("trainings", digest(config))
 
 
 def train_one(
-    piece: tuple[str, Any],
-    console: Console,
-    cache: Path,
-    looks: Looks | None = None,
-    may_diverge: bool = False,
-) -> Trained:
-    """Train one of `Study.pieces`, or find it, and look at it as `looks` says."""
+    job: Job, console: Console, looks: Looks | None = None, may_diverge: bool = False
+) -> Ended:
+    """Train one of `Study.pieces` in the job's folder, or find it, and look at it as `looks` says.
+
+    Raises:
+        WorkFailed: where it diverges and may not.
+    """
     from suite.experiments.study.validation import make_validation, stored_params
     from suite.train.ppo.run import train_ppo
     from suite.train.repeat import Watch
     from suite.train.run import train
 
-    key, config = piece
+    (key, config), folder, watch = job.task, job.folder, None
     is_ppo, diverged = isinstance(config, PpoConfig), ""
-    folder, watch = cache / "trainings" / digest(config), None
     if looks and looks.measurements:
-        folder = cache / "schemes" / digest([key, config, looks])
         shared, iterations = (
             (config.shared, config.iterations) if is_ppo else (config, config.optimizer.iterations)
         )
@@ -160,18 +186,24 @@ def train_one(
             raise
         diverged = str(failure)
         console.note(f"{key}, seed {config.seed}: {diverged}")
-    policy = folder / "policy"
-    points, compile_s = curve_of(folder, config.episode.batch * config.episode.steps)
+    points = []
     if looks and not (watch or diverged):
-        found = make_validation(config, *looks[1:])(stored_params(policy))
+        found = make_validation(config, *looks[1:])(stored_params(folder / "policy"))
         points = [found]
         console.note(
             f"{key}, seed {config.seed}: success cross {found['success_cross']:.0%}, "
             f"success rate {found['success_rate']:.0%}, v_max {found['v_max']:.1f} m/s"
         )
-    seconds = sum(row["seconds"] for row in curve.read(folder) if not row["cold"])
+    return Ended(diverged, points)
+
+
+def _read(job: Job, ended: Ended) -> Trained:
+    """Return a training from its folder."""
+    (key, config), policy = job.task, job.folder / "policy"
+    points, compile_s = curve_of(job.folder, config.episode.batch * config.episode.steps)
+    seconds = sum(row["seconds"] for row in curve.read(job.folder) if not row["cold"])
     about = (str(policy), seconds, compile_s, commit_of(policy))
-    return Trained(key, config.seed, *about, diverged, points)
+    return Trained(key, config.seed, *about, ended.diverged, ended.points or points)
 
 
 def rewarded(config: TrainConfig) -> Note:

@@ -63,6 +63,6 @@ def observed_flights(
     """Return what `policy` is given on one flight of a random track at each level."""
     listener = Listener(policy)
     trials = [TrialSpec(TRACK, level, SEED + k) for k, level in enumerate(levels)]
-    options = JudgeOptions(slots=len(trials), processes=1)
+    options = JudgeOptions(slots=len(trials), workers=1)
     fly(listener, trials, load_vehicle(vehicle), options=options)
     return listener.heard()

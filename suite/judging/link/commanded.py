@@ -59,7 +59,7 @@ def fly_commanded(
 def _judged(policy: Any, course: Course) -> int:
     from eval.judging.judge import JudgeOptions, fly
 
-    options = JudgeOptions(slots=min(16, len(course.trials)), processes=1)
+    options = JudgeOptions(slots=min(16, len(course.trials)), workers=1)
     results = fly(policy, course.trials, course.vehicle, options=options, tracks=course.tracks)
     return sum(result.success for result in results)
 

@@ -13,7 +13,7 @@ from suite.common.errors import WorkFailed
 from suite.judging.link.messages import Wire
 from suite.judging.link.simulated import SimulatedVehicle
 from suite.judging.link.udp import UdpLink
-from tracks.common.work import let_views_travel
+from tracks.common.work.travel import let_views_travel
 from tracks.geometry.camera import Camera
 from tracks.track import Track
 

@@ -87,7 +87,7 @@ class Watcher(Pursuit):
 def given(noise, trials=TRIALS[:1], slots=1):
     pilot = Watcher(spec=PolicySpec(rate_hz=25.0))
     pilot.given = []
-    options = JudgeOptions(slots=slots, processes=1, rules=RULES, noise=noise)
+    options = JudgeOptions(slots=slots, workers=1, rules=RULES, noise=noise)
     results = fly(pilot, trials, VEHICLE, options=options)
     return results, pilot.given
 

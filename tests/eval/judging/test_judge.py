@@ -68,10 +68,10 @@ class Interrupt:
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-def test_interrupt_keeps_what_was_finished_and_the_rest_is_flown_later(tmp_path, processes):
+@pytest.mark.parametrize("workers", [1, 2])
+def test_interrupt_keeps_what_was_finished_and_the_rest_is_flown_later(tmp_path, workers):
     trials = [TrialSpec("zigzag", 3, seed) for seed in range(6)]
-    options = JudgeOptions(slots=2, rules=SHORT, processes=processes)
+    options = JudgeOptions(slots=2, rules=SHORT, workers=workers)
     expected = fly(Pursuit(), trials, VEHICLE, options=JudgeOptions(rules=SHORT))
     path, about = tmp_path / "journal", {"policy": "pursuit"}
     with Journal(path, about) as journal, pytest.raises(KeyboardInterrupt):
@@ -88,7 +88,7 @@ def test_a_policy_that_cannot_travel_is_refused_with_what_to_do():
     policy = Pursuit()
     setattr(policy, "unpicklable", lambda: None)  # noqa: B010
     with pytest.raises(ValueError, match="functools.partial"):
-        fly(policy, [TrialSpec("zigzag", 0, 0)] * 2, VEHICLE, options=JudgeOptions(processes=2))
+        fly(policy, [TrialSpec("zigzag", 0, 0)] * 2, VEHICLE, options=JudgeOptions(workers=2))
 
 
 TRIALS = [
@@ -101,8 +101,8 @@ TRIALS = [
 RULES = Rules(time_limit_s=2.0)
 
 
-def results(trials, slots=64, threads=1, processes=1, policy=None):
-    options = JudgeOptions(slots, threads, processes, RULES)
+def results(trials, slots=64, threads=1, workers=1, policy=None):
+    options = JudgeOptions(slots, threads, workers, RULES)
     return fly(policy or network(), trials, VEHICLE, "mujoco", options)
 
 
@@ -151,7 +151,7 @@ def test_threads(expected):
 
 def test_processes(expected):
     policy = RandomNetwork  # made anew in each process
-    same(TRIALS[:6], results(TRIALS[:6], processes=2, policy=policy), expected)
+    same(TRIALS[:6], results(TRIALS[:6], workers=2, policy=policy), expected)
 
 
 def test_pursuit_by_a_scripted_policy_is_deterministic_too():

@@ -152,7 +152,7 @@ def test_noise_that_cannot_be_is_refused_by_name(field, value):
 
 def results(trials, noise=NOISE, slots=64, world="mujoco", **more):
     policy = RandomNetwork if more else RandomNetwork()
-    options = JudgeOptions(slots=slots, rules=RULES, noise=noise, **{"processes": 1, **more})
+    options = JudgeOptions(slots=slots, rules=RULES, noise=noise, **{"workers": 1, **more})
     return fly(policy, trials, VEHICLE, world, options)
 
 
@@ -171,7 +171,7 @@ def test_every_kind_of_noise_reaches_the_policy(noisy):
 
 def test_a_noisy_trials_outcome_is_set_by_the_trial_alone(noisy):
     order = [TRIALS[k] for k in (4, 0, 5, 2)]
-    for found in (results(order, slots=3), results(order, processes=2), results(order[::-1])[::-1]):
+    for found in (results(order, slots=3), results(order, workers=2), results(order[::-1])[::-1]):
         assert found == [noisy[trial] for trial in order]
     flown = results(TRIALS[:2], world="reference")
     assert [row._replace(world="mujoco") for row in flown] == [noisy[t] for t in TRIALS[:2]]

@@ -17,7 +17,7 @@ POSITION_TOLERANCE_M = 2e-4
 
 
 def both(trials, rules=None, record=None):
-    options = JudgeOptions(slots=12, processes=1, rules=rules or Rules())
+    options = JudgeOptions(slots=12, workers=1, rules=rules or Rules())
     found = []
     for world in ("mujoco", "mjx"):
         flights = []

@@ -1,41 +1,47 @@
-"""Pieces of work in processes: in order, pinned apart, and what is said when one dies."""
+"""Long pieces of work in processes: in order, pinned apart, and what is said when one dies."""
 
 import os
+from pathlib import Path
 
 import pytest
 
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.common.work import Silent, all_done, check_jobs
+from suite.common.running.apart import Job
+from suite.common.work import Silent, all_done, asked_workers
 from tracks.common.work import core_shares
 
 CORES = sorted(os.sched_getaffinity(0))
 
 
-def double(piece, console):
+def jobs(*tasks):
+    return [Job(task, Path("nowhere")) for task in tasks]
+
+
+def double(job, console):
     assert type(console) is Silent
-    return 2 * piece, sorted(os.sched_getaffinity(0))
+    return 2 * job.task, sorted(os.sched_getaffinity(0))
 
 
-def die(piece, console):
+def die(job, console):
     os._exit(7)
 
 
-def diverge(piece, console):
-    raise WorkFailed(f"training {piece} diverged")
+def diverge(job, console):
+    raise WorkFailed(f"training {job.task} diverged")
 
 
-def test_more_processes_than_cores_are_refused(monkeypatch):
+def test_more_processes_than_cores_are_refused_where_each_needs_some(monkeypatch):
     monkeypatch.setattr("suite.common.work.usable_cores", lambda: 2)
-    check_jobs(2)
-    for jobs in (0, 3):
-        with pytest.raises(ValueError, match=f"--jobs is {jobs}; allowed is 1 to 2"):
-            check_jobs(jobs)
+    assert asked_workers("3") == 3 and asked_workers("2", whole_cores=True) == 2
+    assert asked_workers("a:1", whole_cores=True) == "tcp://a:1"
+    with pytest.raises(ValueError, match="--workers is 3; allowed is 1 to 2"):
+        asked_workers("3", whole_cores=True)
 
 
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
-def test_pieces_come_back_in_order_from_processes_that_share_no_core():
-    found = all_done(double, [5, 6, 7], 2, Console(), "doubling")
+def test_jobs_come_back_in_order_from_processes_that_share_no_core():
+    found = all_done(double, jobs(5, 6, 7), 2, Console(), "doubling")
     assert [value for value, _ in found] == [10, 12, 14]
     assert {tuple(cores) for _, cores in found} <= set(map(tuple, core_shares(2)))
 
@@ -43,10 +49,10 @@ def test_pieces_come_back_in_order_from_processes_that_share_no_core():
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
 def test_a_process_that_dies_is_said():
     with pytest.raises(WorkFailed, match=r"dying: a process ended badly.*exit code 7"):
-        all_done(die, [1, 2], 2, Console(), "dying")
+        all_done(die, jobs(1, 2), 2, Console(), "dying")
 
 
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
 def test_work_that_fails_says_so_in_its_own_words():
     with pytest.raises(WorkFailed, match=r"^training 1 diverged$"):
-        all_done(diverge, [1], 2, Console(), "training")
+        all_done(diverge, jobs(1), 2, Console(), "training")

@@ -55,7 +55,7 @@ def logs():
         Pursuit(speed=3.0, gain=1.5, spec=spec),
         [TrialSpec(name, 0, 0) for name in tracks],
         TRUE,
-        options=JudgeOptions(slots=4, processes=1, rules=Rules(time_limit_s=3.0)),
+        options=JudgeOptions(slots=4, workers=1, rules=Rules(time_limit_s=3.0)),
         on_result=keep,
         record=Record(),
         tracks=tracks,

@@ -138,7 +138,7 @@ def test_the_field_is_compared_at_the_same_weight():
         (["--training-seeds", "1", "1"], "--training-seeds is 1 1"),
         (["--only", "field 0.41"], "Did you mean 'field 0.4'?"),
         (["--preset", "smal"], "Did you mean 'small'?"),
-        (["--jobs", "0"], "--jobs is 0"),
+        (["--workers", "0"], "--workers is '0'"),
         (["--set", "episode.batch=9"], "this experiment sets episode.batch; give --worlds"),
         (["--set", "episode.gates=6"], "this experiment sets episode.gates; all fly 4"),
         (["--set", "loss.projection=3"], "this experiment sets loss.projection; it is compared"),

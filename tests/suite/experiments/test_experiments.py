@@ -32,7 +32,7 @@ def test_an_experiment_that_does_not_exist_is_code_2(capsys):
         (["seeds", "--preset", "smal"], "Did you mean 'small'?"),
         (["seeds", "--training-seeds", "1", "1"], "--training-seeds is 1 1"),
         (["seeds", "--policies", "racer", "--trials", "0"], "--trials is 0"),
-        (["seeds", "--jobs", "0"], "--jobs is 0"),
+        (["seeds", "--workers", "0"], "--workers is '0'"),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_flown(args, words, sky, tmp_path, capsys):

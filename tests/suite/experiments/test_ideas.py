@@ -9,6 +9,7 @@ import pytest
 
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
+from suite.common.running.apart import Job
 from suite.experiments.ideas import Config, compared, ideas, is_round, lead
 from suite.experiments.study.training import Looks, train_one
 from suite.train import run as training_run
@@ -139,7 +140,7 @@ def test_round_gates_are_flown_by_the_trainers_own_code(tmp_path, monkeypatch):
 
     monkeypatch.setattr("suite.experiments.study.validation.sample_worlds", watched)
     looks = Looks(0, small.round_trials, small.round_seed, small.round_seconds)
-    (found,) = train_one((row.key, row.recipe), Console(), tmp_path, looks).points
+    (found,) = train_one(Job((row.key, row.recipe), tmp_path / "run"), Console(), looks).points
     assert set(found) > {"success_cross", "success_rate", "v_max", "gates"}
     (worlds,) = sampled
     assert worlds.scene.gates.opening_g.shape == (2, 8, 8, 2)
@@ -156,7 +157,7 @@ def test_round_gates_are_flown_by_the_trainers_own_code(tmp_path, monkeypatch):
         (["--round-trials", "0"], "--round-trials is 0"),
         (["--round-seed", "2"], "--round-seed 2 is one of --training-seeds"),
         (["--round-seed", "-1"], "--round-seed is -1"),
-        (["--jobs", "0"], "--jobs is 0"),
+        (["--workers", "0"], "--workers is '0'"),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_trained(

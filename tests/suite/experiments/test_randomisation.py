@@ -71,7 +71,7 @@ def test_a_seed_that_does_not_agree_is_no_gain():
         (["--only", "linear_drag"], "linear_drag"),
         (["--training-seeds", "1", "1"], "--training-seeds is 1 1"),
         (["--iterations", "0"], "--iterations is 0"),
-        (["--jobs", "99"], "--jobs is 99"),
+        (["--workers", "99"], "--workers is 99"),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_trained(

@@ -107,3 +107,15 @@ def test_with_a_monitor_each_policy_flies_twice_on_the_same_trials(pilots, tmp_p
     loaded = load_flier(pilots["diver"], False, True)
     make = who_flies(loaded, pilots["diver"], False, 2)
     assert callable(make) and make().name == "diver+monitor"
+
+
+@pytest.mark.slow
+def test_the_mjx_world_flies_more_trials_than_it_has_slots(pilots, tmp_path):
+    asked = ["--policy", pilots["diver"], "--track", "zigzag", "--trials", "150"]
+    assert _eval(tmp_path / "mjx", *asked, "--world", "mjx") == 0
+    assert _eval(tmp_path / "mujoco", *asked) == 0
+    ends = [
+        [row.ended_by for row in read_trials(tmp_path / world / "trials.parquet")]
+        for world in ("mjx", "mujoco")
+    ]
+    assert len(ends[0]) == 150 and ends[0] == ends[1]

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from eval.judging.results import read_trials
 from suite import cli
-from suite.judging.flying import labels, options_for, policy_digest, trial_list
+from suite.judging.flying import labels, load_flier, trial_list, who_flies, workers_for
+from tracks.common.work.travel import pack
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -34,36 +34,19 @@ def test_a_track_file_is_flown_once_a_seed(pilots, tmp_path):
 
 def test_more_trials_take_more_processes_up_to_what_there_is(monkeypatch):
     monkeypatch.setattr("suite.judging.flying.usable_cores", lambda: 4)
-    assert [options_for(n, None, "mujoco").processes for n in (1, 300, 3000)] == [1, 2, 4]
-    assert options_for(3000, None, "mjx").processes == 1
-    assert options_for(10, 3, "mujoco").processes == 3
+    assert [workers_for(n, None, "mujoco") for n in (1, 300, 3000)] == [1, 2, 4]
+    assert workers_for(3000, None, "mjx") == 1
+    assert [workers_for(10, asked, "mujoco") for asked in (3, "tcp://a:1")] == [3, "tcp://a:1"]
 
 
-def test_a_digest_changes_with_any_byte_of_what_flies_and_no_other(tmp_path):
-    folder, seen = tmp_path / "p", []
-    folder.mkdir()
-    for name, text in (("config.json", "{}"), ("config.json", "{ }"), ("weights.safetensors", "a")):
-        (folder / name).write_text(text)
-        seen.append(policy_digest(str(folder)))
-    assert len(set(seen)) == 3
-    (folder / "card.md").write_text("words")
-    assert policy_digest(str(folder)) == seen[-1]
-
-
-def test_a_digest_changes_with_weights_beside_an_onnx_file(tmp_path):
-    onnx = pytest.importorskip("onnx")
-    weights = onnx.numpy_helper.from_array(np.ones(300, np.float32), "w")
-    node = onnx.helper.make_node("Identity", ["w"], ["action"])
-    graph = onnx.helper.make_graph([node], "g", [], [], [weights])
-    path, seen = tmp_path / "it.onnx", []
-    onnx.save(
-        onnx.helper.make_model(graph), path,
-        save_as_external_data=True, location="w.bin", size_threshold=0,
-    )  # fmt: skip
-    for scale in (1, 2):
-        (tmp_path / "w.bin").write_bytes(np.full(300, scale, np.float32).tobytes())
-        seen.append(policy_digest(str(path)))
-    assert len(set(seen)) == 2
+def test_a_cluster_is_given_the_policy_and_this_machines_processes_its_name():
+    policy = load_flier("racer", False, False)
+    assert who_flies(policy, "racer", False, 1) is policy
+    here, there = (
+        who_flies(policy, "racer", False, 2),
+        who_flies(policy, "racer", False, "tcp://a:1"),
+    )
+    assert len(pack(here)) < 1000 < 100_000 < len(pack(there))
 
 
 def test_export_refuses_what_is_not_ours(tmp_path, capsys):

@@ -13,8 +13,8 @@ def asked(command: str, *args: str) -> Any:
 
 
 def test_options_of_eval_become_the_request():
-    given = asked("eval", "--policy", "racer", "--policy", "a.onnx", "--procs", "2")
-    assert (given.policies, given.processes) == (("racer", "a.onnx"), 2)
+    given = asked("eval", "--policy", "racer", "--policy", "a.onnx", "--trials", "2")
+    assert (given.policies, given.trials) == (("racer", "a.onnx"), 2)
 
 
 def test_flights_are_recorded_far_from_the_seeds_that_are_judged():

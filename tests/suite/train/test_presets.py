@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from suite import cli
 from suite.train.config import TrainConfig, check
 from suite.train.dynamics.fleet import FleetConfig
 from suite.train.presets import PRESETS, chosen_model, preset
@@ -30,6 +31,13 @@ def test_a_model_is_asked_for_by_name_or_the_recipes_own():
     both = replace(quad, fleet=FleetConfig())
     with pytest.raises(ValueError, match="this one has both"):
         check(both)
+
+
+@pytest.mark.slow
+def test_the_gpu_preset_trains_on_what_there_is_at_a_small_size(tmp_path):
+    small = ["--iterations", "2", "--set", "episode.batch=8", "episode.steps=4"]
+    assert cli.main(["train", "--preset", "gpu", *small, "--out", str(tmp_path / "run")]) == 0
+    assert len((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()) == 2
 
 
 def test_the_papers_preset_has_the_papers_weights():

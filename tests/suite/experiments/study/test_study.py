@@ -22,9 +22,9 @@ RECIPE = asked_recipe(IdeasConfig())
 
 
 def test_rows_take_turns_where_they_are_to_meet_the_same_load():
-    study = Study([Row("a", "", RECIPE), Row("b", "", RECIPE)], (4, 5), jobs=1)
+    study = Study([Row("a", "", RECIPE), Row("b", "", RECIPE)], (4, 5))
     assert [(key, c.seed) for key, c in study.pieces()] == [("a", 4), ("a", 5), ("b", 4), ("b", 5)]
-    turns = Study(study.rows, study.seeds, jobs=1, by_seed=True)
+    turns = Study(study.rows, study.seeds, by_seed=True)
     assert [(key, c.seed) for key, c in turns.pieces()] == [("a", 4), ("b", 4), ("a", 5), ("b", 5)]
 
 

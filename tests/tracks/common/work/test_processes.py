@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 
 import pytest
@@ -28,6 +29,17 @@ def gone_wrong(how, piece):
     if how == "break":
         raise ZeroDivisionError
     os.kill(os.getpid(), signal.SIGKILL) if how == "killed" else os._exit(9)
+
+
+def dies_once(folder, piece):
+    """End the process at the second result of piece 1, the first time that it is begun."""
+    time.sleep(0.3)
+    yield piece, 0
+    mark = Path(folder, str(piece))
+    if piece == 1 and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    yield piece, 1
 
 
 def where(piece):
@@ -64,6 +76,15 @@ def test_every_result_comes_with_the_number_of_its_piece(workers):
 def test_what_goes_wrong_there_is_said_here(how, error, text):
     with pytest.raises(error, match=text):
         work_off(partial(gone_wrong, how), [1, 2, 3], 2, lambda *_: None)
+    assert multiprocessing.active_children() == []
+
+
+def test_a_piece_whose_process_died_is_done_again(tmp_path):
+    found = []
+    pieces = range(4)
+    work_off(partial(dies_once, str(tmp_path)), pieces, 2, lambda *entry: found.append(entry))
+    assert set(found) == {(n, (n, k)) for n in pieces for k in (0, 1)}
+    assert found.count((1, (1, 0))) == 2 and len(found) == 9
     assert multiprocessing.active_children() == []
 
 
@@ -109,7 +130,7 @@ def test_pinned_processes_share_no_core():
 def test_processes_end_with_the_one_they_work_for(tmp_path, root):
     code = (
         "import os, signal\n"
-        "from tests.tracks.common.test_work import slow\n"
+        "from tests.tracks.common.work.test_processes import slow\n"
         "from tracks.common.work import work_off\n"
         "def keep(number, result):\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import MutableMapping
 
-from tracks.common.work import usable_cores
+from tracks.common.work.cores import usable_cores
 
 VARIABLE = "NPROC"
 """Of the environment; XLA reads it when JAX first looks for devices."""

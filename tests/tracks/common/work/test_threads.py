@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from suite.cli import main
-from suite.common.running import threads
-from suite.common.running.threads import one_thread_a_product, set_threads, share_threads
+from tracks.common.work import threads
+from tracks.common.work.threads import one_thread_a_product, set_threads, share_threads
 
 
 @pytest.mark.parametrize(("cores", "wanted"), [(1, "2"), (2, "2"), (16, "16")])
@@ -40,7 +40,7 @@ import hashlib, sys
 import jax, jax.numpy as jnp, numpy as np
 from policies.networks import network
 from policies.spec import PolicySpec
-from suite.common.running.threads import set_threads
+from tracks.common.work.threads import set_threads
 from suite.train.gradient import encoder_gradient
 set_threads()
 rng = np.random.default_rng(0)

@@ -1,0 +1,85 @@
+"""A policy as the content of its files, for machines that do not have them."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import hashlib
+import shutil
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from policies import shipped
+from policies.policy import Policy, load_policy
+
+
+def flown_files(name_or_path: str | Path) -> list[Path]:
+    """Return the files of a policy, of a folder those that fly.
+
+    A card or a curve beside them may change and the policy be the same.
+    """
+    from policies.formats.checkpoint import CONFIG, WEIGHTS
+
+    path = shipped.locate(name_or_path)
+    if path.is_dir():
+        names = (CONFIG, WEIGHTS) if (path / CONFIG).exists() else ("policy.h", "policy.c")
+        return [path / name for name in names if (path / name).is_file()]
+    if path.suffix == ".c":
+        return [path.with_name("policy.h"), path]
+    if path.suffix == ".onnx":
+        from policies.formats.onnx_file import files_of
+
+        return files_of(path)
+    return [path]
+
+
+def policy_digest(name_or_path: str | Path) -> str:
+    """Return the SHA-256 of the files of a policy that fly, as hex."""
+    digest = hashlib.sha256()
+    for file in flown_files(name_or_path):
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class PolicyContent:
+    """A policy by content; called, it returns the policy, loaded once in a process."""
+
+    name: str
+    """Of its folder, which tables may call it by."""
+    file: str
+    """Name of the file that is loaded; "" loads the folder."""
+    files: tuple[tuple[str, bytes], ...] = field(repr=False)
+    """Path within the folder, and content."""
+    trust: bool
+    """As `load_policy` has it."""
+
+    @classmethod
+    def of(cls, name_or_path: str | Path, trust: bool = False) -> PolicyContent:
+        """Return the content of a policy that can be loaded here."""
+        path = shipped.locate(name_or_path).absolute()
+        folder, file = (path, "") if path.is_dir() else (path.parent, path.name)
+        parts = ((entry.absolute(), entry.read_bytes()) for entry in flown_files(name_or_path))
+        files = tuple((str(entry.relative_to(folder)), data) for entry, data in parts)
+        return cls(folder.resolve().name, file, files, trust)
+
+    def __call__(self) -> Policy:
+        """Return the policy.
+
+        Raises:
+            PolicyError: where it cannot be loaded.
+        """
+        return _loaded(self)
+
+
+@functools.lru_cache(maxsize=4)
+def _loaded(content: PolicyContent) -> Policy:
+    """Return the policy; its files, which some kinds read again, stay as long as the process."""
+    kept = tempfile.mkdtemp(prefix="suite-policy-")
+    atexit.register(shutil.rmtree, kept, ignore_errors=True)
+    for name, data in content.files:
+        path = Path(kept, content.name, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    return load_policy(Path(kept, content.name, content.file), content.trust)

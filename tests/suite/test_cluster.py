@@ -1,0 +1,139 @@
+"""Commands on a cluster of two nodes: the same files, also where a node or the driver is killed."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+import eval.judging.judge
+import eval.judging.results
+from policies import shipped
+from suite import cli
+from suite.common.console import Console
+from suite.common.running.apart import Job
+from suite.common.work import all_done
+from tests.support.cluster import cluster
+
+TRIALS = ["--track", "zigzag", "--difficulty", "0,9", "--trials", "12"]
+FILES = ("table.md", "trials.parquet")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """The policy by path, and its table as one process makes it."""
+    folder = tmp_path_factory.mktemp("flown")
+    shutil.copytree(shipped.folder("racer"), folder / "mine")
+    args = ["eval", "--policy", str(folder / "mine"), *TRIALS]
+    assert cli.main([*args, "--workers", "1", "--out", str(folder / "one")]) == 0
+    return args, folder / "one"
+
+
+def same_table(there, here):
+    return all((there / name).read_bytes() == (here / name).read_bytes() for name in FILES)
+
+
+def lines(path):
+    return path.read_text().splitlines() if path.is_file() else []
+
+
+def when(happens, then, seconds=200):
+    """Do `then` beside as soon as `happens`."""
+
+    def wait():
+        until = time.monotonic() + seconds
+        while not happens() and time.monotonic() < until:
+            time.sleep(0.05)
+        then()
+
+    beside = threading.Thread(target=wait)
+    beside.start()
+    return beside
+
+
+def test_a_node_killed_after_a_third_leaves_the_table_as_it_is(flown, tmp_path, monkeypatch):
+    args, one = flown
+    monkeypatch.setattr(eval.judging.judge, "MOST_A_PIECE", 2)
+    out = tmp_path / "out"
+    with cluster(tmp_path) as nodes:
+        journal = out / "journal-0.jsonl"
+        beside = when(lambda: len(lines(journal)) > 8, lambda: nodes.kill(0))
+        assert cli.main([*args, "--workers", nodes.address, "--out", str(out)]) == 0
+        beside.join()
+    assert same_table(out, one)
+
+
+def test_a_driver_that_is_killed_goes_on_with_what_is_left(flown, tmp_path, root):
+    args, one = flown
+    out = tmp_path / "out"
+    code = (
+        "import eval.judging.judge as judge\n"
+        "from suite.cli import entry\n"
+        "judge.MOST_A_PIECE = 2\n"
+        "entry()\n"
+    )
+    paths = [str(root), *filter(None, [os.environ.get("PYTHONPATH")])]
+    with cluster(tmp_path) as nodes:
+        args = [*args, "--workers", nodes.address, "--out", str(out)]
+        driver = subprocess.Popen(
+            [sys.executable, "-c", code, *args], stdout=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        )  # fmt: skip
+        journal = out / "journal-0.jsonl"
+        when(lambda: len(lines(journal)) > 8, driver.kill).join()
+        assert driver.wait() == -signal.SIGKILL
+        kept = [json.loads(line) for line in lines(journal)]
+        assert 8 < len(kept) < 25
+        flown_again = []
+        append = eval.judging.results.Journal.append
+
+        def count(self, result):
+            flown_again.append(result.trial)
+            append(self, result)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(eval.judging.results.Journal, "append", count)
+            assert cli.main(args) == 0
+    assert len(flown_again) == 24 - (len(kept) - 1), "what was finished is not flown again"
+    assert same_table(out, one)
+
+
+def train_there(job, console):
+    """Train a moment in the job's folder."""
+    from suite.train.run import train
+
+    return train(job.task, job.folder, console).iterations
+
+
+@pytest.mark.slow
+def test_trainings_come_back_as_this_machine_would_have_made_them(tmp_path, monkeypatch):
+    from dataclasses import replace
+
+    from suite.train.overrides import override
+    from suite.train.presets import preset, with_iterations
+
+    recipe = override(with_iterations(preset("small"), 2), ("episode.batch=4", "episode.steps=4"))
+    configs = [replace(recipe, seed=seed) for seed in (0, 1)]
+    here = [Job(config, tmp_path / "here" / str(config.seed)) for config in configs]
+    there = [Job(config, tmp_path / "there" / str(config.seed)) for config in configs]
+    assert all_done(train_there, here, 1, Console(), "training") == [2, 2]
+    with cluster(tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache")) as nodes:
+        assert all_done(train_there, there, nodes.address, Console(), "training") == [2, 2]
+    for one, other in zip(here, there, strict=True):
+        weights = "policy/weights.safetensors"
+        assert (one.folder / weights).read_bytes() == (other.folder / weights).read_bytes()
+        assert (other.folder / "metrics.jsonl").is_file()
+
+
+def test_a_missing_extra_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    args = ["eval", *TRIALS, "--workers", "head:8786", "--out", str(tmp_path / "out")]
+    assert cli.main(args) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'diffracing-suite[cluster]'" in said and "Traceback" not in said
+    assert len(said.strip().splitlines()) == 1 and not (tmp_path / "out").exists()

@@ -1,0 +1,128 @@
+"""Pieces on a real cluster of two nodes: results by number, what goes wrong, what dies."""
+
+import os
+import signal
+import threading
+import time
+from functools import partial
+from types import MappingProxyType
+
+import pytest
+
+from tests.support.cluster import cluster
+from tracks.common.work import WorkerDied, crew, work_off
+from tracks.common.work.cluster import UnusableCluster
+from tracks.common.work.software import software
+
+
+@pytest.fixture(scope="module")
+def two_nodes(tmp_path_factory):
+    with cluster(tmp_path_factory.mktemp("cluster")) as found:
+        yield found
+
+
+def tens(table, piece):
+    time.sleep(0.05)
+    for item in piece:
+        yield item, table[0] * item, os.getpid()
+
+
+def gone_wrong(how, piece):
+    yield "before"
+    if how == "refuse":
+        raise ValueError("wrong policy file")
+    if how == "break":
+        raise ZeroDivisionError
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def lived(folder, piece):
+    """Note each begin; take a while."""
+    with open(os.path.join(folder, f"{piece}.begun"), "a") as file:
+        file.write(f"{os.getpid()}\n")
+    time.sleep(0.2)
+    yield piece * piece
+
+
+def test_results_of_all_pieces_come_with_their_numbers_from_both_nodes(two_nodes):
+    found, pieces = [], [[k, k + 1] for k in range(40)] + [[]]
+    work = partial(tens, MappingProxyType({0: 10}))
+    work_off(work, iter(pieces), two_nodes.address, lambda *entry: found.append(entry))
+    assert sorted((n, item, ten) for n, (item, ten, _) in found) == [
+        (n, item, 10 * item) for n, piece in enumerate(pieces) for item in piece
+    ]
+    assert len({pid for _, (_, _, pid) in found} - {os.getpid()}) == 2 == crew(two_nodes.address)
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "text"),
+    [
+        ("refuse", ValueError, "^wrong policy file$"),
+        ("break", ZeroDivisionError, None),
+    ],
+)
+def test_what_goes_wrong_there_is_said_here(two_nodes, how, error, text):
+    with pytest.raises(error, match=text) as caught:
+        work_off(partial(gone_wrong, how), [1, 2, 3], two_nodes.address, lambda *_: None)
+    assert "in gone_wrong" in str(caught.value.__cause__)
+
+
+def test_a_refusal_there_is_a_message_to_the_user_and_a_bug_is_none(two_nodes):
+    from suite.common.errors import explain
+
+    with pytest.raises(ValueError) as caught:
+        work_off(partial(gone_wrong, "refuse"), [1], two_nodes.address, lambda *_: None)
+    assert explain(caught.value) is None, "a test's own error is not the suite's"
+    with pytest.raises(ValueError) as caught:
+        work_off(load, ["no-such-policy"], two_nodes.address, lambda *_: None)
+    code, message = explain(caught.value)
+    assert code == 2 and "no-such-policy" in message
+
+
+def load(name):
+    from policies.policy import load_policy
+
+    yield load_policy(name)
+
+
+def test_a_machine_that_would_come_to_other_numbers_is_refused(two_nodes, monkeypatch):
+    wanted = {**software(), "mujoco": "2.0"}
+    monkeypatch.setattr("tracks.common.work.cluster.software", lambda: wanted)
+    with pytest.raises(UnusableCluster, match=r"mujoco 3\S+ there, 2\.0 here.*same versions"):
+        work_off(load, ["swift"], two_nodes.address, lambda *_: None)
+
+
+def test_an_address_that_does_not_answer_says_what_to_do(two_nodes, monkeypatch):
+    monkeypatch.setattr("tracks.common.work.cluster.ANSWER_S", 0.5)
+    with pytest.raises(UnusableCluster, match=r"--workers tcp://127\.0\.0\.1:9: .*dask scheduler"):
+        crew("tcp://127.0.0.1:9")
+
+
+def test_an_interrupt_ends_it_and_keeps_what_came(two_nodes):
+    found = []
+
+    def keep(number, result):
+        found.append(result)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        work_off(partial(tens, {0: 1}), [[k] for k in range(200)], two_nodes.address, keep)
+    assert len(found) == 1
+
+
+def test_a_node_that_dies_costs_its_pieces_once_and_a_piece_that_kills_ends_the_work(tmp_path):
+    with cluster(tmp_path) as found:
+        results = {}
+
+        def keep(number, result):
+            results[number] = result
+            if len(results) == 20:
+                threading.Thread(target=found.kill, args=[0]).start()
+
+        work_off(partial(lived, str(tmp_path)), range(60), found.address, keep)
+        assert results == {k: k * k for k in range(60)}
+        begun = [len((tmp_path / f"{k}.begun").read_text().split()) for k in range(60)]
+        # What it was at, and what it had done and not handed over yet.
+        assert sum(begun) - 60 <= 3 and max(begun) <= 2 and crew(found.address) == 1
+        with pytest.raises(WorkerDied, match="gave up piece 0.*same command goes on"):
+            work_off(partial(gone_wrong, "kill"), [1], found.address, lambda *_: None)

@@ -1,0 +1,169 @@
+"""Pieces of work shared by processes of this machine; results come as they end.
+
+It stands on `concurrent.futures`, one pool of one process each: a pool can be given its cores,
+ended at once, and begun anew where its process died.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from tracks.common.work.cores import core_shares, usable_cores
+from tracks.common.work.travel import WorkerDied, pack, unpack
+
+Piece = TypeVar("Piece")
+Result = TypeVar("Result")
+
+REPORT_S = 0.2
+"""A process hands over what has come up this often; a round trip costs it a millisecond [s]."""
+TRIES = 2
+"""A piece whose process died is begun so often in all."""
+
+
+@dataclass
+class _Asked:
+    """A piece that a process is at."""
+
+    number: int
+    packed: bytes
+    """The work and the piece, for another process where this one dies."""
+    tries: int = 1
+
+
+class _Process:
+    """A pool of one process."""
+
+    def __init__(self, cores: list[int]) -> None:
+        self._cores = cores
+        self.begin()
+
+    def begin(self) -> None:
+        """Start the process, anew where it died."""
+        before = set(multiprocessing.active_children())
+        # Spawned, as threads of JAX and MuJoCo do not survive a fork.
+        context = multiprocessing.get_context("spawn")
+        self.pool = ProcessPoolExecutor(1, context, _start, (self._cores,))
+        self.pool.submit(usable_cores)  # starts it
+        self._processes = set(multiprocessing.active_children()) - before
+
+    def end(self) -> str:
+        """End the process, and return what it ended with."""
+        for process in self._processes:
+            process.terminate()
+        self.pool.shutdown(cancel_futures=True)
+        codes = {p.exitcode for p in self._processes if p.exitcode} - {-signal.SIGTERM}
+        return ", ".join(map(str, sorted(codes))) or "unknown"
+
+
+def share_out(
+    work: Callable[[Piece], Iterable[Result]],
+    pieces: Iterable[Piece],
+    count: int,
+    keep: Callable[[int, Result], None],
+    pinned: bool,
+) -> None:
+    """Do what `tracks.common.work.work_off` says, in `count` processes of this machine."""
+    processes: list[_Process] = []
+    try:
+        for cores in core_shares(count) if pinned else [[]] * count:
+            processes.append(_Process(cores))
+        _collect(work, pieces, processes, keep)
+    finally:
+        for process in processes:
+            process.end()
+
+
+def _collect(
+    work: Callable[[Piece], Iterable[Result]],
+    pieces: Iterable[Piece],
+    processes: list[_Process],
+    keep: Callable[[int, Result], None],
+) -> None:
+    """Ask every process for results until there is no more."""
+    waiting = iter(enumerate(pieces))
+    asked: dict[Future[tuple[bytes, bool]], tuple[_Process, _Asked]] = {}
+
+    def begin(process: _Process) -> None:
+        for number, piece in waiting:
+            ask(process, _Asked(number, pack((work, piece))), anew=True)
+            return
+
+    def ask(process: _Process, entry: _Asked, anew: bool) -> None:
+        try:
+            future = process.pool.submit(_work_on, *([entry.packed] if anew else []))
+        except BrokenProcessPool:
+            again(process, entry)
+        else:
+            asked[future] = process, entry
+
+    def again(process: _Process, entry: _Asked) -> None:
+        code = process.end()
+        if entry.tries == TRIES:
+            raise WorkerDied(
+                f"a process died (exit code {code}), and so did the one that did its piece again; "
+                "out of memory? Work with fewer processes."
+            )
+        process.begin()
+        entry.tries += 1
+        ask(process, entry, anew=True)
+
+    for process in processes:
+        begin(process)
+    while asked:
+        for future in wait(asked, return_when=FIRST_COMPLETED).done:
+            process, entry = asked.pop(future)
+            try:
+                results, more = future.result()
+            except BrokenProcessPool:
+                again(process, entry)
+                continue
+            if more:
+                ask(process, entry, anew=False)
+            else:
+                begin(process)
+            for result in unpack(results):
+                keep(entry.number, result)
+
+
+_results: Iterator[Any] = iter(())
+"""In a process that works for another one: what is left of its piece."""
+
+
+def _work_on(packed: bytes | None = None) -> tuple[bytes, bool]:
+    """Return the next results of the piece, of a new one where it is given; more to come?"""
+    global _results
+    if packed is not None:
+        work, piece = unpack(packed)
+        _results = iter(work(piece))
+    found, until = [], time.monotonic() + REPORT_S
+    for result in _results:
+        found.append(result)
+        if time.monotonic() > until:
+            return pack(found), True
+    return pack(found), False
+
+
+def _start(cores: list[int]) -> None:
+    """Make this process a worker."""
+    # An interrupt from the keyboard goes to every process of the group; the first one decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if cores:
+        # Before JAX makes its threads: there will be as many as cores.
+        os.sched_setaffinity(0, cores)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
