@@ -91,11 +91,13 @@ def join(one: Member) -> None:
     import jax
 
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    found = (one.coordinator, one.count, one.number) if one.coordinator else ()
+    given = one.coordinator is not None
     try:
         jax.distributed.initialize(
-            *found,
-            cluster_detection_method="deactivate" if found else None,
+            one.coordinator,
+            one.count if given else None,
+            one.number if given else None,
+            cluster_detection_method="deactivate" if given else None,
             initialization_timeout=COME_S,
             heartbeat_timeout_seconds=SILENT_S,
         )
