@@ -107,7 +107,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         delta = jax.tree.map(jax.numpy.asarray, stored.params)
     outcome = train(resolved, config.out, console, params, delta)
     if one.number:
-        return {"process": one.number, "processes": one.count, "iterations": outcome.iterations}
+        return {"process": one.number, "processes": one.of, "iterations": outcome.iterations}
     last = outcome.last
     console.say(
         f"{outcome.iterations} iterations; at the end {last['gates']:.2f} gates a rollout, "

@@ -45,7 +45,7 @@ class Member(NamedTuple):
     """A process among several."""
 
     number: int
-    count: int
+    of: int
     coordinator: str | None
     """None: JAX finds it in the scheduler's environment."""
 
@@ -86,22 +86,24 @@ def join(one: Member) -> None:
     Raises:
         WorkFailed: where the others do not come.
     """
-    if one.count == 1:
+    if one.of == 1:
         return
     import jax
 
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    found = (one.coordinator, one.count, one.number) if one.coordinator else ()
+    given = one.coordinator is not None
     try:
         jax.distributed.initialize(
-            *found,
-            cluster_detection_method="deactivate" if found else None,
+            one.coordinator,
+            one.of if given else None,
+            one.number if given else None,
+            cluster_detection_method="deactivate" if given else None,
             initialization_timeout=COME_S,
             heartbeat_timeout_seconds=SILENT_S,
         )
     except RuntimeError as error:
         raise WorkFailed(
-            f"process {one.number} of {one.count} did not meet the others at "
+            f"process {one.number} of {one.of} did not meet the others at "
             f"{one.coordinator or 'the coordinator that the scheduler names'} within {COME_S} s; "
             "start the same command on every host, with one --coordinator that all of them reach"
         ) from error
