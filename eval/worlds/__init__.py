@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import Progress, TrialSpec
 from policies.observation import View
 from tracks.common.registry import Registry
@@ -27,6 +28,7 @@ WORLDS: Registry[Any] = Registry(
         "mujoco": "eval.worlds.mujoco:MujocoWorld",
         "mjx": "eval.worlds.mjx:MjxWorld",
         REFERENCE: "eval.worlds.reference:fly_trial",
+        "rotorpy": "eval.worlds.other.rotorpy:RotorpyWorld",
     },
     lambda name, world: None if callable(world) else f"{world!r}; must be a class (`World`)",
 )
@@ -62,7 +64,11 @@ class World(Protocol):
     """A fixed number of slots, each flying one trial at a time.
 
     A world whose step shows in its flights has an attribute `integrator` (`"euler"`), which its
-    logs then carry together with the step; without it they count as continuous in time.
+    logs then carry together with the step; without it they count as continuous in time. One that
+    needs more than the suite installs has a static method `check()`, which raises a ValueError with
+    what to do; one that flies some vehicles otherwise than their file says has a static method
+    `differences(vehicle)`, which returns a sentence for each difference. `cost` is what a trial
+    costs over one in MuJoCo, to estimate; 1 without it.
     """
 
     name: str
@@ -100,6 +106,19 @@ def world_class(name: str) -> Any:
     """Return the class of the world `name` (for `REFERENCE` the function).
 
     Raises:
-        ValueError: where there is no such world.
+        ValueError: where there is no such world, or it lacks a package.
     """
-    return WORLDS.find(name)
+    world = WORLDS.find(name)
+    if hasattr(world, "check"):
+        world.check()
+    return world
+
+
+def differences(name: str, vehicle: Vehicle) -> list[str]:
+    """Return a sentence for everything of `vehicle` that the world `name` flies otherwise.
+
+    Raises:
+        ValueError: where there is no such world, or it lacks a package.
+    """
+    world = world_class(name)
+    return world.differences(vehicle) if hasattr(world, "differences") else []

@@ -15,6 +15,7 @@ from suite.judging.flying import (
     flying_needs,
     options_for,
     read_course,
+    say_differences,
     who_flies,
 )
 from suite.judging.requests import Collection
@@ -59,7 +60,9 @@ def collect(collection: Collection, out: Path, console: Console) -> dict[str, An
     missing = [trial for trial in trials if trial not in rows]
     options = options_for(len(missing), None, collection.world)
     what = f"{len(missing)} flights in the {collection.world} world"
-    announce(console, what, flying_needs(len(missing), options.processes or 1))
+    processes = options.processes or 1
+    announce(console, what, flying_needs(len(missing), processes, collection.world))
+    say_differences(console, collection.world, course)
 
     def write_list() -> dict[str, Any]:
         flights = [rows[trial] for trial in trials if trial in rows]

@@ -17,6 +17,7 @@ from suite.judging.flying import (
     load_flier,
     options_for,
     read_course,
+    say_differences,
     who_flies,
 )
 from suite.judging.requests import Evaluation
@@ -53,7 +54,8 @@ def evaluate(evaluation: Evaluation, out: Path, console: Console) -> dict[str, A
     count = len(course.trials)
     processes = options_for(count, evaluation.processes, evaluation.world).processes or 1
     what = f"{count * len(asked)} trials in the {evaluation.world} world"
-    announce(console, what, flying_needs(count * len(asked), processes))
+    announce(console, what, flying_needs(count * len(asked), processes, evaluation.world))
+    say_differences(console, evaluation.world, course)
     results: list[TrialResult] = []
     journals: list[Path] = []
     for number, (name, policy, label) in enumerate(zip(asked, policies, called, strict=True)):
@@ -64,6 +66,7 @@ def evaluate(evaluation: Evaluation, out: Path, console: Console) -> dict[str, A
         **summarise(results),
         "judged": evaluation,
         "policies": [about_policy(*pair) for pair in zip(asked, policies, strict=True)],
+        "flown_otherwise": course.differences,
     }
     write_results(
         out,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.choices import is_track_file, parse_levels, parse_tracks
+from suite.common.console import Console
 from suite.common.estimate import Estimate
 from suite.judging.requests import Collection, Evaluation
 from tracks.common.work import usable_cores
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 TRIALS_A_PROCESS = 128
 """Fewer trials than this are not worth another process, which takes seconds to start."""
 SECONDS_A_TRIAL = 0.15
-"""Of one core, for a trial of about 13 s on 70 solids."""
+"""Of one core in MuJoCo, for a trial of about 13 s on 70 solids."""
 START_SECONDS = 6.0
 """To import, compile the policy and the first scenes."""
 PROCESS_BYTES = 1.0e9
@@ -128,6 +129,8 @@ class Course(NamedTuple):
     """Those that come from files, by the name that trials call them."""
     vehicle: Vehicle
     """On what."""
+    differences: list[str]
+    """What of the vehicle the world flies otherwise, in sentences."""
 
 
 def read_course(wanted: Evaluation | Collection) -> Course:
@@ -137,18 +140,29 @@ def read_course(wanted: Evaluation | Collection) -> Course:
         ValueError: for an unknown world or track, too few trials, or a bad track or vehicle file.
     """
     from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.worlds import world_class
+    from eval.worlds import differences, world_class
 
     world_class(wanted.world)
     check_ranges(wanted, options=True)
     names = parse_tracks(wanted.track)
     trials = trial_list(names, parse_levels(wanted.difficulty), wanted.trials, wanted.seed)
-    return Course(trials, custom_tracks(names), load_vehicle(wanted.vehicle))
+    vehicle = load_vehicle(wanted.vehicle)
+    flown_otherwise = differences(wanted.world, vehicle)
+    return Course(trials, custom_tracks(names), vehicle, flown_otherwise)
 
 
-def flying_needs(trials: int, processes: int) -> Estimate:
-    """Return about how long `trials` take in MuJoCo, and their memory."""
-    seconds = START_SECONDS + trials * SECONDS_A_TRIAL / processes
+def say_differences(console: Console, world: str, course: Course) -> None:
+    """Tell a person what of the vehicle `world` flies otherwise than its file says."""
+    for sentence in course.differences:
+        console.note(f"{world}: {sentence}")
+
+
+def flying_needs(trials: int, processes: int, world: str = "mujoco") -> Estimate:
+    """Return about how long `trials` take in `world`, and their memory."""
+    from eval.worlds import world_class
+
+    cost = getattr(world_class(world), "cost", 1.0)
+    seconds = START_SECONDS + trials * cost * SECONDS_A_TRIAL / processes
     return Estimate(seconds, processes * PROCESS_BYTES)
 
 
