@@ -33,7 +33,8 @@ class Config:
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str | None = None
     """A vehicle file with an effect that --vehicle lacks: fly there, name the effect, fine-tune
-    through the corrected quadrotor. Without --policy the shipped one flies."""
+    through the corrected quadrotor. Without --policy the shipped one flies. Or another simulator
+    (rotorpy), which flies --vehicle, or a file as in rotorpy:FILE."""
     seed: Annotated[int, Range(0, SEED_MOST - 10**6)] = 0
     """Seed of the training and of the first trial; recorded flights begin 100,000 above."""
     iterations: Iterations | None = None

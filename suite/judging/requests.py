@@ -30,8 +30,8 @@ class Evaluation:
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str = "mujoco"
-    """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (another simulator,
-    pip install diffracing-suite[rotorpy]), or one of an installed package."""
+    """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (another
+    simulator; pip install diffracing-suite[rotorpy]), or one of an installed package."""
     processes: Annotated[int | None, Range(1, 256), tyro.conf.arg(name="procs")] = None
     """Processes that share the trials; by default as many cores as are worth it."""
     deadline_s: Annotated[float, Range(0.0, 3600.0, above=True)] | None = None

@@ -220,9 +220,7 @@ def test_a_world_of_ones_own_says_how_bodies_move_and_nothing_else(monkeypatch):
 
 
 PARITY = with_lag(
-    with_effects(
-        quadratic_drag=((0.02, 0.02, 0.06),), command_delay=(0.02,), thrust_scale=(1.05,)
-    ),
+    with_effects(quadratic_drag=((0.02, 0.02, 0.06),), command_delay=(0.02,), thrust_scale=(1.05,)),
     0.03,
 )
 """What every world can fly as its file says. (Drag and inflow of rotors would act at RotorPy's hubs
@@ -245,9 +243,9 @@ MOTIONS = {
 """Actions [m/s^2], and where the gate is that the heading follows [m]."""
 STEP_S = 0.002
 EULER_M, EULER_SPEED, EULER_QUAT = 0.010, 0.015, 0.012
-"""MuJoCo's Euler steps are of order 1: after a second of up to 1 g they are up to dt/2 g 1 s = 9.8 mm
-from continuous motion; speed and attitude go by the same step, through the loops. RotorPy's steps
-are of order 4, and nowhere near that."""
+"""MuJoCo's Euler steps are of order 1: after a second of up to 1 g they are up to dt/2 g 1 s =
+9.8 mm from continuous motion; speed and attitude go by the same step, through the loops. RotorPy's
+steps are of order 4, and nowhere near that."""
 FLOAT32_M = 5e-5
 """mjx against mujoco: rounding to single precision at positions of up to 40 m, over 500 steps."""
 
@@ -302,7 +300,9 @@ def test_what_differs_from_rotorpy_halves_with_the_step(motion, rotorpy):
     """Nothing else does: a difference of models would stay."""
 
     def apart(frequency):
-        (_, ours), (_, theirs) = (moved(world, motion, frequency) for world in ("mujoco", "rotorpy"))
+        (_, ours), (_, theirs) = (
+            moved(world, motion, frequency) for world in ("mujoco", "rotorpy")
+        )
         return np.array([
             np.linalg.norm(ours.pos_w[-1] - theirs.pos_w[-1]),
             np.linalg.norm(ours.quat_wxyz[-1] - theirs.quat_wxyz[-1]) + 1e-9,

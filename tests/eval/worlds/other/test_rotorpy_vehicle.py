@@ -1,4 +1,4 @@
-"""What RotorPy is told of a vehicle, worked by hand; and that it does with it what our file says."""
+"""What RotorPy is told of a vehicle, worked by hand; and that it does as our file says."""
 
 from dataclasses import replace
 
