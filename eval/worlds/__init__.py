@@ -64,11 +64,12 @@ class World(Protocol):
     """A fixed number of slots, each flying one trial at a time.
 
     A world whose step shows in its flights has an attribute `integrator` (`"euler"`), which its
-    logs then carry together with the step; without it they count as continuous in time. One that
-    needs more than the suite installs has a static method `check()`, which raises a ValueError with
-    what to do; one that flies some vehicles otherwise than their file says has a static method
-    `differences(vehicle)`, which returns a sentence for each difference. `cost` is what a trial
-    costs over one in MuJoCo, to estimate; 1 without it.
+    logs then carry together with the step; without it they count as continuous in time.
+
+    Static methods that it may have: `check()` raises a ValueError with what to do where a package
+    is missing; `differences(vehicle)` returns a sentence for everything that it flies otherwise
+    than the file says; `nearest(vehicle)` the vehicle whose file says best what it flies. `cost` is
+    what a trial costs over one in MuJoCo, for estimates; 1 without it.
     """
 
     name: str

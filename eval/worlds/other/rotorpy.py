@@ -77,6 +77,11 @@ class RotorpyWorld(SceneSlots):
         """Return a sentence for everything of `vehicle` that is flown otherwise, or not at all."""
         return rotorpy_vehicle.differences(vehicle, STEPS_A_LAG / vehicle.controller.frequency)
 
+    @staticmethod
+    def nearest(vehicle: Vehicle) -> Vehicle:
+        """Return the vehicle whose file says best what is flown of `vehicle`."""
+        return rotorpy_vehicle.as_flown(vehicle)
+
     def _control(
         self,
         motion: Motion,

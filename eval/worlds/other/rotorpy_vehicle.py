@@ -76,6 +76,17 @@ def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[st
     return parameters
 
 
+def as_flown(vehicle: Vehicle) -> Vehicle:
+    """Return the vehicle whose file says best what RotorPy flies of `vehicle`."""
+    known = (*ROTORPY_EFFECTS, *OUTSIDE)
+    kept = {name: value for name, value in vehicle.effects.items() if name in known}
+    if AT_HOVER in vehicle.effects:
+        told = rotorpy_parameters(vehicle)
+        for name, key in (("rotor_drag", "k_d"), ("inflow", "k_z")):
+            kept[name] = EFFECTS[name].values(told[key])
+    return replace(vehicle, name=f"{vehicle.name}, as RotorPy flies it", effects=kept)
+
+
 def differences(vehicle: Vehicle, shortest_lag_s: float) -> list[str]:
     """Return a sentence for everything of `vehicle` that RotorPy flies otherwise, or not at all.
 

@@ -42,6 +42,8 @@ class Flier:
     """On what."""
     noise: SensorNoise = field(default_factory=SensorNoise)
     """What is wrong with what it sees."""
+    world: str = "mujoco"
+    """In which world."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,7 @@ def _about(flier: Flier) -> dict[str, Any]:
         "policy_sha256": policy_digest(flier.policy),
         "vehicle": flier.vehicle,
         "noise": flier.noise,
+        "world": flier.world,
         "code": code_digest("tracks", "policies", "eval"),
         "engines": engines(),
     }
@@ -155,6 +158,6 @@ def _fly_shares(
         if flier.policy not in loaded:
             loaded[flier.policy] = load_policy(flier.policy)
         options = JudgeOptions(processes=1, noise=flier.noise)
-        task = Task(loaded[flier.policy], flier.vehicle, options=options)
+        task = Task(loaded[flier.policy], flier.vehicle, flier.world, options)
         for _, result, _ in fly_share(task, list(enumerate(trials))):
             yield number, result
