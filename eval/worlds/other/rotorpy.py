@@ -101,7 +101,8 @@ class RotorpyWorld(SceneSlots):
         qpos, qvel, speed = self._multirotor.step(
             self._qpos, self._qvel, self._loops.plant.rotor_speed, push
         )
-        fits = np.isfinite(np.concatenate([qpos, qvel, speed], axis=-1)).all(-1)
+        after = np.concatenate([qpos, qvel, speed], axis=-1)
+        fits = np.asarray(np.isfinite(after).all(-1))
         go = flying & fits
         self._qpos[go], self._qvel[go] = qpos[go], qvel[go]
         speed = np.where(go[:, None], speed, self._loops.plant.rotor_speed)

@@ -127,15 +127,16 @@ def test_a_wall_is_hit(installed):
 
 def test_wind_carries_the_vehicle_by_rotorpys_drag(installed):
     still, _ = one(Steady(), rules=Rules(time_limit_s=1.0))
-    blown = replace(VEHICLE, effects=VEHICLE.effects | with_effects(
-        constant_wind=((0.0, 4.0, 0.0),)).effects)  # fmt: skip
+    wind = with_effects(constant_wind=((0.0, 4.0, 0.0),)).effects
+    blown = replace(VEHICLE, effects={**VEHICLE.effects, **wind})
     carried, _ = one(Steady(), vehicle=blown, rules=Rules(time_limit_s=1.0))
     assert abs(still.pos_y) < 1e-6 and carried.pos_y > 0.1
 
 
 def test_outcomes_are_the_same_bits_at_any_place_in_any_batch(installed):
     policy, rules = RandomNetwork(), Rules(time_limit_s=0.6)
-    gusty = replace(VEHICLE, effects=VEHICLE.effects | with_effects(gusts=(2.0, 5.0)).effects)
+    wind = with_effects(gusts=(2.0, 5.0)).effects
+    gusty = replace(VEHICLE, effects={**VEHICLE.effects, **wind})
     trials = [TrialSpec(t, 9, seed) for t in ("zigzag", "ellipse") for seed in range(3)]
 
     def flown(order, slots):
