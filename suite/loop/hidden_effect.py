@@ -109,24 +109,29 @@ def _diagnosis(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Sectio
             cells = (effect["name"], ", ".join(effect["alternatives"]), name, value, interval)
             rows.append([Cell(text) for text in (*cells, entry["unit"])])
     headers = ["effect", "or", "parameter", "value", "95 % interval", "unit"]
-    simulated, true = load_vehicle(config.vehicle), load_vehicle(config.world)
-    more = hidden_effects(simulated, true)
-    hidden = [f"What the world's file holds and the simulation's does not: {more}."]
-    if config.simulator not in OWN:
-        otherwise = "; ".join(differences(config.simulator, true)) or "nothing"
-        if simulated == true:
-            hidden = ["The world's vehicle file is the simulation's."]
-        hidden.append(f"What {config.simulator} flies otherwise than the file says: {otherwise}.")
     return Section(
         "What the diagnosis found in the flights",
         [
             f"Verdict: {diagnosis['verdict']}. Held-out gap {gap['before']:.2f} before, "
             f"{gap['after']:.2f} after; 1 is the noise floor.",
             Grid("", headers, rows),
-            *hidden,
+            *what_is_hidden(config),
             Links([("diagnosis/report.html", "the diagnosis's own report")]),
         ],
     )
+
+
+def what_is_hidden(config: HiddenLoopConfig) -> list[str]:
+    """Return in sentences what is true of the hidden world and the simulation does not know."""
+    simulated, true = load_vehicle(config.vehicle), load_vehicle(config.world)
+    more = hidden_effects(simulated, true)
+    hidden = [f"What the world's file holds and the simulation's does not: {more}."]
+    if simulated == true:
+        hidden = ["The world's vehicle file is the simulation's."]
+    if config.simulator not in OWN:
+        otherwise = "; ".join(differences(config.simulator, true)) or "nothing"
+        hidden.append(f"What {config.simulator} flies otherwise than the file says: {otherwise}.")
+    return hidden
 
 
 def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
