@@ -43,6 +43,9 @@ class Config:
     """Gradient steps of each fine-tuning, instead of a share of the training's."""
     fit_iterations: Iterations | None = None
     """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with small."""
+    delta: bool = True
+    """With --world: fit Delta Action Models, too, and fine-tune under them. Half the time goes
+    there."""
     set: tuple[str, ...] = ()
     """Change settings of the recipe by name, such as loss.progress=0.4 episode.batch=128."""
     out: Path = Path("runs/loop")
@@ -78,6 +81,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         iterations=config.iterations,
         finetune_iterations=config.finetune_iterations,
         fit_iterations=config.fit_iterations,
+        delta=config.delta,
         changes=config.set,
     )
     return run_loop(resolved, config.out, console)

@@ -157,13 +157,17 @@ def say_differences(console: Console, world: str, course: Course) -> None:
         console.note(f"{world}: {sentence}")
 
 
-def flying_needs(trials: int, processes: int, world: str = "mujoco") -> Estimate:
+def flying_needs(trials: float, processes: int, world: str = "mujoco") -> Estimate:
     """Return about how long `trials` take in `world`, and their memory."""
+    seconds = START_SECONDS + trials * cost_of(world) * SECONDS_A_TRIAL / processes
+    return Estimate(seconds, processes * PROCESS_BYTES)
+
+
+def cost_of(world: str) -> float:
+    """Return what a trial in `world` costs over one in MuJoCo."""
     from eval.worlds import world_class
 
-    cost = getattr(world_class(world), "cost", 1.0)
-    seconds = START_SECONDS + trials * cost * SECONDS_A_TRIAL / processes
-    return Estimate(seconds, processes * PROCESS_BYTES)
+    return getattr(world_class(world), "cost", 1.0)
 
 
 def custom_tracks(names: Sequence[str]) -> dict[str, Track]:

@@ -105,6 +105,8 @@ class HiddenLoopConfig(LoopConfig):
     """What is true: a vehicle file; nothing but the flights in it is looked at."""
     simulator: str = OWN[0]
     """In which of the judge's worlds it flies."""
+    delta: bool = True
+    """Whether Delta Action Models are fitted, too, and policies fine-tuned under them."""
 
     @property
     def true_vehicle(self) -> str:
@@ -131,6 +133,7 @@ def resolve(
     iterations: int | None = None,
     finetune_iterations: int | None = None,
     fit_iterations: int | None = None,
+    delta: bool = True,
     changes: Sequence[str] = (),
 ) -> LoopConfig:
     """Return the loop that a recipe and options ask for; None takes the recipe's size.
@@ -151,6 +154,8 @@ def resolve(
         training = with_iterations(training, iterations)
     simulated = load_vehicle(vehicle)
     digests = {"vehicle": _digest(simulated)}
+    if not delta and world is None:
+        raise ValueError("--no-delta: the loop is about the Delta Action Model; give --world, too")
     if world is None:
         training = override(training, changes)
         check(training)
@@ -198,7 +203,7 @@ def resolve(
     _check_seeds(config)
     if world is None:
         return DeltaLoopConfig(training=training, **vars(config))
-    return HiddenLoopConfig(world=world, simulator=simulator, **vars(config))
+    return HiddenLoopConfig(world=world, simulator=simulator, delta=delta, **vars(config))
 
 
 def parse_world(text: str, vehicle: str) -> tuple[str, str]:

@@ -25,7 +25,13 @@ from suite.common.choices import parse_levels
 from suite.common.console import Console
 from suite.common.estimate import announce
 from suite.experiments.study.cache import code_digest, digest, engines
-from suite.judging.flying import TRIALS_A_PROCESS, flying_needs, policy_digest, trial_list
+from suite.judging.flying import (
+    TRIALS_A_PROCESS,
+    cost_of,
+    flying_needs,
+    policy_digest,
+    trial_list,
+)
 from tracks.common.work import usable_cores, work_off
 from tracks.families import JUDGED
 
@@ -87,7 +93,9 @@ def flown(
             console.note(f"{what}: {total - left} of {total} trials were flown before")
         if left:
             processes = min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
-            announce(console, f"{what}: {left} trials", flying_needs(left, processes))
+            costs = [cost_of(flier.world) for flier in fliers.values()]
+            cost = sum(c * len(trials) for c, trials in zip(costs, missing, strict=True))
+            announce(console, f"{what}: {left} trials", flying_needs(cost, processes))
             numbers, open_journals = count(total - left + 1), list(journals.values())
             with console.progress(what, total) as update:
 
