@@ -30,9 +30,11 @@ from tracks.input.ranges import Seed, Trials
 BASE = "mujoco"
 """The world that the others are held against."""
 ROUNDING = "mjx"
-"""The world that flies as the first does but for rounding to single precision, and contacts."""
+"""The world that flies as the first does but for rounding to single precision, contacts by distance
+and images by analytic rays."""
 OTHERWISE = {
-    "rounding": "it changes in mjx, too: rounding to single precision is enough",
+    "rounding": "it changes in mjx, too: single precision, contacts by distance or images by "
+    "analytic rays are enough",
     "air": "mujoco ends as the world does once its vehicle has that world's air",
     "rest": "neither: what the world has and no vehicle file of ours says, its steps among it",
 }

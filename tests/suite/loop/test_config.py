@@ -27,6 +27,7 @@ EXAMPLE = "examples/hidden.toml"
         (["--finetune-iterations", "0"], "--finetune-iterations is 0"),
         (["--fit-iterations", "0"], "--fit-iterations is 0"),
         (["--set", "loss.progres=1"], "Did you mean 'progress'?"),
+        (["--no-delta"], "--no-delta: the loop is about the Delta Action Model"),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_written(args, words, tmp_path, capsys):

@@ -174,6 +174,24 @@ def test_a_stopped_loop_comes_to_the_same(whole, kind, tmp_path, monkeypatch, ro
     assert (out / "table.md").read_text() == (again / "table.md").read_text()
 
 
+def test_without_delta_the_same_comes_of_half_the_stages(whole, tmp_path, monkeypatch, root):
+    monkeypatch.chdir(root)
+    stub, out = Stub(monkeypatch), tmp_path / "out"
+    assert cli.main(["loop", *ARGS, "--no-delta", "--out", str(out)]) == 0
+    found, other = (json.loads((f / "loop.json").read_text()) for f in (out, whole[0]))
+    assert list(found["stage_seconds"]) == [
+        name for name in STAGES if not name.endswith(("-delta", "-both", "delta-control", "named"))
+        or name in ("tuned-named", "eval-named")
+    ]  # fmt: skip
+    assert not stub.fitted and len(stub.trained) == 4
+    mine = {one["name"]: one for one in found["standings"]}
+    theirs = {one["name"]: one for one in other["standings"]}
+    assert list(mine) == ["nominal", "before", "control", "named"]
+    assert all(mine[name]["success"] == theirs[name]["success"] for name in mine)
+    assert "Delta Action Model" not in (out / "table.md").read_text()
+    assert "Delta Action Model" not in (out / "report.html").read_text()
+
+
 def test_where_nothing_is_named_the_loop_ends_and_says_so(
     whole, tmp_path, monkeypatch, root, capfd
 ):
