@@ -88,13 +88,28 @@ def autopilot_step(
         step: (N,) physics steps flown; the attitude loop runs at multiples of `attitude_every`.
         noise: (N, 3) normal draws for random wind, or None.
     """
+    state = attitude_step(autopilot, state, motion, action_b, gate_w, step)
+    inputs = Inputs(state.command, noise=noise)
+    plant, wrench = plant_step(autopilot.plant, state.plant, motion, inputs, step * autopilot.dt)
+    return packed(state._replace(plant=plant)), wrench
+
+
+def attitude_step(
+    autopilot: Autopilot,
+    state: AutopilotState,
+    motion: Motion,
+    action_b: Array,
+    gate_w: Array,
+    step: Array,
+) -> AutopilotState:
+    """Return the loops with the command that the attitude loop gives at a physics step, or holds.
+
+    The arguments are those of `autopilot_step`; the plant is left as it is.
+    """
     due = step % autopilot.attitude_every == 0
     period = autopilot.attitude_every * autopilot.dt
     heading_w = blend_heading(state.heading_w, gate_w - motion.pos_w, period)
     force_w = action_to_force(action_b, motion.rot_w)
     command = attitude_command(autopilot.controller, force_w, motion.rot_w, heading_w)
     command = select(due, command, state.command)
-    heading_w = select(due, heading_w, state.heading_w)
-    inputs = Inputs(command, noise=noise)
-    plant, wrench = plant_step(autopilot.plant, state.plant, motion, inputs, step * autopilot.dt)
-    return packed(AutopilotState(plant, command, heading_w)), wrench
+    return AutopilotState(state.plant, command, select(due, heading_w, state.heading_w))

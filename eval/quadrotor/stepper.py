@@ -145,12 +145,20 @@ def rotor_step(
     plant: Plant, state: PlantState, command: Command, rate_b: Array
 ) -> tuple[PlantState, RotorStep]:
     """Return the state after one step and what the rotors do in it, under `command`."""
+    state, wanted = rotor_command(plant, state, command, rate_b)
+    rotors = follow(state.rotor_speed, wanted, plant.constants.time_constant, plant.dt)
+    return state._replace(rotor_speed=rotors.end), rotors
+
+
+def rotor_command(
+    plant: Plant, state: PlantState, command: Command, rate_b: Array
+) -> tuple[PlantState, Array]:
+    """Return the state that remembers `command`, and the rotor speeds that are asked for now."""
     if plant.delay_weight.shape[-1] > 0:
         past, acting = delayed(plant.delay_weight, state.past_commands, command.packed)
         state, command = state._replace(past_commands=past), unpacked(acting)
     memory, wanted = loop_look(plant, state.loop, command, rate_b, plant.dt)
-    rotors = follow(state.rotor_speed, wanted, plant.constants.time_constant, plant.dt)
-    return state._replace(rotor_speed=rotors.end, loop=memory), rotors
+    return state._replace(loop=memory), wanted
 
 
 def plant_step(
@@ -267,16 +275,7 @@ def wind_and_flow(
     time_s: Array | float,
 ) -> tuple[dict[str, Array], Flow]:
     """Return the random winds of this step, after `wind`, and what the effects see of it."""
-    air_vel_w, winds = motion.vel_w, dict(wind)
-    still = air_vel_w.__array_namespace__().zeros_like(air_vel_w)
-    for name, value in in_order(plant.effects):
-        blow = EFFECTS[name].wind
-        if blow is not None:
-            before = wind.get(name, still)
-            wind_w = blow(value, Gust(before, air_vel_w, inputs.noise, plant.dt))
-            air_vel_w = air_vel_w - wind_w
-            if name in wind:
-                winds[name] = wind_w
+    winds, air_vel_w = winds_on(plant, wind, motion, inputs.noise)
     return winds, Flow(
         constants=plant.constants,
         pos_w=motion.pos_w,
@@ -288,6 +287,27 @@ def wind_and_flow(
         time_s=time_s,
         voltage_drop=inputs.voltage_drop,
     )
+
+
+def winds_on(
+    plant: Plant, wind: Mapping[str, Array], motion: Motion, noise: Array | None
+) -> tuple[dict[str, Array], Array]:
+    """Return the random winds of this step, after `wind`, and the velocity through the air.
+
+    Returns:
+        The winds by effect, and (..., 3) of the centre of mass relative to the air, in the world.
+    """
+    air_vel_w, winds = motion.vel_w, dict(wind)
+    still = air_vel_w.__array_namespace__().zeros_like(air_vel_w)
+    for name, value in in_order(plant.effects):
+        blow = EFFECTS[name].wind
+        if blow is not None:
+            before = wind.get(name, still)
+            wind_w = blow(value, Gust(before, air_vel_w, noise, plant.dt))
+            air_vel_w = air_vel_w - wind_w
+            if name in wind:
+                winds[name] = wind_w
+    return winds, air_vel_w
 
 
 def still_thrust(plant: Plant, rotors: RotorStep) -> Array:

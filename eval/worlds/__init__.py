@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import Progress, TrialSpec
 from policies.observation import View
 from tracks.common.registry import Registry
@@ -27,6 +28,7 @@ WORLDS: Registry[Any] = Registry(
         "mujoco": "eval.worlds.mujoco:MujocoWorld",
         "mjx": "eval.worlds.mjx:MjxWorld",
         REFERENCE: "eval.worlds.reference:fly_trial",
+        "rotorpy": "eval.worlds.other.rotorpy:RotorpyWorld",
     },
     lambda name, world: None if callable(world) else f"{world!r}; must be a class (`World`)",
 )
@@ -63,6 +65,11 @@ class World(Protocol):
 
     A world whose step shows in its flights has an attribute `integrator` (`"euler"`), which its
     logs then carry together with the step; without it they count as continuous in time.
+
+    Static methods that it may have: `check()` raises a ValueError with what to do where a package
+    is missing; `differences(vehicle)` returns a sentence for everything that it flies otherwise
+    than the file says; `nearest(vehicle)` the vehicle whose file says best what it flies. `cost` is
+    what a trial costs over one in MuJoCo, for estimates; 1 without it.
     """
 
     name: str
@@ -100,6 +107,19 @@ def world_class(name: str) -> Any:
     """Return the class of the world `name` (for `REFERENCE` the function).
 
     Raises:
-        ValueError: where there is no such world.
+        ValueError: where there is no such world, or it lacks a package.
     """
-    return WORLDS.find(name)
+    world = WORLDS.find(name)
+    if hasattr(world, "check"):
+        world.check()
+    return world
+
+
+def differences(name: str, vehicle: Vehicle) -> list[str]:
+    """Return a sentence for everything of `vehicle` that the world `name` flies otherwise.
+
+    Raises:
+        ValueError: where there is no such world, or it lacks a package.
+    """
+    world = world_class(name)
+    return world.differences(vehicle) if hasattr(world, "differences") else []

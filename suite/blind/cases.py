@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eval.effects import EFFECTS
+from eval.worlds.other.rotorpy_vehicle import ROTORPY_EFFECTS
 from suite.blind.oracle.strength import vehicle_names
 from suite.blind.outside import KINDS
-from suite.blind.rotorpy_flight import ROTORPY_EFFECTS
 from suite.diagnose.plans.separating import SEPARATIONS
 
 MULTIPLES = (2.0, 6.0)

@@ -1,44 +1,29 @@
 """Commanded trajectories flown in RotorPy, another simulator with equations of its own.
 
 Pilot, rate loop and mixer are ours, since they are what the vehicle file describes; rotors, air
-and rigid body are RotorPy's. Its blade flapping has the opposite sign of the catalogue's, and its
-drag and lift of a rotor go by the hub's own airspeed, which damps turning a little.
+and rigid body are RotorPy's, with the parameters of `eval.worlds.other.rotorpy_vehicle`. One flight
+is stepped after the other by RotorPy's adaptive integrator; that of the world `rotorpy` is not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from eval.effects import all_values
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
+from eval.worlds.other.rotorpy_vehicle import ROTORPY_EFFECTS, rotorpy_parameters
 from suite.diagnose.plans.pilot import Gains, steer
 from suite.diagnose.plans.simulate import FULL_V, FlightFailed, Recording
 from suite.diagnose.plans.trajectory import Reference, Trajectory
 from tracks.geometry.rotation import quat_to_rot
 
-THEIRS: Mapping[str, Callable[[Any, float], Mapping[str, float]]] = {
-    "quadratic_drag": lambda values, mass: dict(
-        zip(("c_Dx", "c_Dy", "c_Dz"), map(float, mass * values.coefficient), strict=True)
-    ),
-    "rotor_drag": lambda values, mass: {"k_d": float(values.coefficient)},
-    "inflow": lambda values, mass: {"k_z": float(values.coefficient)},
-    "translational_lift": lambda values, mass: {"k_h": 0.25 * mass * float(values.coefficient)},
-    "blade_flapping": lambda values, mass: {"k_flap": -float(values.coefficient)},
-}
-"""Our effect -> RotorPy's parameters of it, from its values and the true mass [kg]."""
-ROTORPY_EFFECTS = (
-    *THEIRS, "motor_lag", "thrust_scale", "mass_offset", "com_offset", "inertia_scale"
-)  # fmt: skip
-"""Effects that RotorPy's own equations have; the later ones change constants that it is given."""
 
-
-def rotorpy_parameters(truth: Vehicle) -> dict[str, Any]:
-    """Return RotorPy's parameters of a vehicle.
+def exact_parameters(truth: Vehicle) -> dict[str, Any]:
+    """Return RotorPy's parameters of a vehicle, all of whose effects it must have as they are.
 
     Raises:
         ValueError: for an effect that RotorPy does not have.
@@ -48,25 +33,7 @@ def rotorpy_parameters(truth: Vehicle) -> dict[str, Any]:
             raise ValueError(
                 f"effects.{name}: RotorPy does not have it; allowed: {', '.join(ROTORPY_EFFECTS)}"
             )
-    values = all_values(truth)
-    constants = make_plant(truth, 1.0 / truth.controller.frequency).constants
-    mass = float(constants.mass)
-    return {
-        "mass": mass,
-        **dict(zip(("Ixx", "Iyy", "Izz"), map(float, constants.inertia), strict=True)),
-        **dict.fromkeys(("Ixy", "Ixz", "Iyz"), 0.0),
-        "num_rotors": 4,
-        "rotor_pos": {f"r{i + 1}": hub for i, hub in enumerate(constants.rotor_position_b)},
-        # Its sign is that of the torque on the body, ours that of the rotor's turning.
-        "rotor_directions": -np.array(truth.rotors.spin),
-        "rotor_speed_min": 0.0,
-        "rotor_speed_max": truth.rotors.speed_max,
-        "k_eta": float(constants.thrust_coefficient[0]),
-        "k_m": float(constants.torque_coefficient[0]),
-        "tau_m": float(constants.time_constant),
-        "motor_noise_std": 0.0,
-        **{key: v for name, of in THEIRS.items() for key, v in of(values[name], mass).items()},
-    }
+    return rotorpy_parameters(truth)
 
 
 def fly_rotorpy(
@@ -79,7 +46,7 @@ def fly_rotorpy(
         ModuleNotFoundError: where RotorPy is not installed (extra `rotorpy`).
         ValueError: for an effect that RotorPy does not have.
     """
-    parameters = rotorpy_parameters(truth)
+    parameters = exact_parameters(truth)
     return [_one(nominal, truth, parameters, way, rate_hz) for way in trajectories]
 
 

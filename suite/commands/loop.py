@@ -34,7 +34,8 @@ class Config:
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str | None = None
     """A vehicle file with an effect that --vehicle lacks: fly there, name the effect, fine-tune
-    through the corrected quadrotor. Without --policy the shipped one flies."""
+    through the corrected quadrotor. Without --policy the shipped one flies. Or another simulator
+    (rotorpy), which flies --vehicle, or a file as in rotorpy:FILE."""
     seed: Annotated[int, Range(0, SEED_MOST - 10**6)] = 0
     """Seed of the training and of the first trial; recorded flights begin 100,000 above."""
     iterations: Iterations | None = None
@@ -43,6 +44,9 @@ class Config:
     """Gradient steps of each fine-tuning, instead of a share of the training's."""
     fit_iterations: Iterations | None = None
     """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with small."""
+    delta: bool = True
+    """With --world: fit Delta Action Models, too, and fine-tune under them. Half the time goes
+    there."""
     set: tuple[str, ...] = ()
     """Change settings of the recipe by name, such as loss.progress=0.4 episode.batch=128."""
     out: Path = Path("runs/loop")
@@ -82,6 +86,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         iterations=config.iterations,
         finetune_iterations=config.finetune_iterations,
         fit_iterations=config.fit_iterations,
+        delta=config.delta,
         changes=config.set,
     )
     return run_loop(resolved, config.out, console, workers)

@@ -27,6 +27,7 @@ PACKAGES = (
     "gymnasium",
     "trimesh",
     "torch",
+    "rotorpy",
     "onnx",
     "onnxruntime",
     "pyarrow",

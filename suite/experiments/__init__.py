@@ -14,5 +14,6 @@ EXPERIMENTS: tuple[str, ...] = (
     "ablation",
     "schemes",
     "ideas",
+    "worlds",
 )
 """Names; NAME lives in suite/experiments/NAME.py."""

@@ -15,6 +15,7 @@ from suite.judging.flying import (
     default_policy,
     flying_needs,
     read_course,
+    say_differences,
     who_flies,
     workers_for,
 )
@@ -100,7 +101,8 @@ def _fly_missing(
     missing = [trial for trial in course.trials if trial not in rows]
     workers = workers_for(len(missing), workers, collection.world)
     what = f"{len(missing)} flights in the {collection.world} world"
-    announce(console, what, flying_needs(len(missing), workers))
+    announce(console, what, flying_needs(len(missing), workers, collection.world))
+    say_differences(console, collection.world, course)
     asked = collection.policy or default_policy()
     with console.progress("flights", len(course.trials)) as update:
 

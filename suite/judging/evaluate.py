@@ -16,6 +16,7 @@ from suite.judging.flying import (
     labels,
     load_flier,
     read_course,
+    say_differences,
     who_flies,
     workers_for,
 )
@@ -56,7 +57,8 @@ def evaluate(
     count = len(course.trials)
     workers = workers_for(count, workers, evaluation.world)
     what = f"{count * len(asked)} trials in the {evaluation.world} world"
-    announce(console, what, flying_needs(count * len(asked), workers))
+    announce(console, what, flying_needs(count * len(asked), workers, evaluation.world))
+    say_differences(console, evaluation.world, course)
     results: list[TrialResult] = []
     journals: list[Path] = []
     for number, (name, policy, label) in enumerate(zip(asked, policies, called, strict=True)):
@@ -67,6 +69,7 @@ def evaluate(
         **summarise(results),
         "judged": evaluation,
         "policies": [about_policy(*pair) for pair in zip(asked, policies, strict=True)],
+        "flown_otherwise": course.differences,
     }
     write_results(
         out,

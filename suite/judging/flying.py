@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.choices import is_track_file, parse_levels, parse_tracks
+from suite.common.console import Console
 from suite.common.estimate import Estimate
 from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.requests import Collection, Evaluation
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 TRIALS_A_PROCESS = 128
 """Fewer trials than this are not worth another process, which takes seconds to start."""
 SECONDS_A_TRIAL = 0.15
-"""Of one core, for a trial of about 13 s on 70 solids."""
+"""Of one core in MuJoCo, for a trial of about 13 s on 70 solids."""
 START_SECONDS = 6.0
 """To import, compile the policy and the first scenes."""
 PROCESS_BYTES = 1.0e9
@@ -102,6 +103,8 @@ class Course(NamedTuple):
     """Those that come from files, by the name that trials call them."""
     vehicle: Vehicle
     """On what."""
+    differences: list[str]
+    """What of the vehicle the world flies otherwise, in sentences."""
 
 
 def read_course(wanted: Evaluation | Collection) -> Course:
@@ -111,25 +114,40 @@ def read_course(wanted: Evaluation | Collection) -> Course:
         ValueError: for an unknown world or track, too few trials, or a bad track or vehicle file.
     """
     from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.worlds import world_class
+    from eval.worlds import differences, world_class
 
     world_class(wanted.world)
     check_ranges(wanted, options=True)
     names = parse_tracks(wanted.track)
     trials = trial_list(names, parse_levels(wanted.difficulty), wanted.trials, wanted.seed)
-    return Course(trials, custom_tracks(names), load_vehicle(wanted.vehicle))
+    vehicle = load_vehicle(wanted.vehicle)
+    flown_otherwise = differences(wanted.world, vehicle)
+    return Course(trials, custom_tracks(names), vehicle, flown_otherwise)
 
 
-def flying_needs(trials: int, workers: Workers) -> Estimate:
-    """Return about how long `trials` take in MuJoCo, and their memory.
+def say_differences(console: Console, world: str, course: Course) -> None:
+    """Tell a person what of the vehicle `world` flies otherwise than its file says."""
+    for sentence in course.differences:
+        console.note(f"{world}: {sentence}")
+
+
+def flying_needs(trials: float, workers: Workers, world: str = "mujoco") -> Estimate:
+    """Return about how long `trials` take in `world`, and their memory.
 
     Raises:
         ValueError: where `workers` is a cluster that cannot work for us.
     """
     processes = crew(workers)
-    seconds = START_SECONDS + trials * SECONDS_A_TRIAL / processes
+    seconds = START_SECONDS + trials * cost_of(world) * SECONDS_A_TRIAL / processes
     # Of this machine: a cluster's is not ours to count.
     return Estimate(seconds, PROCESS_BYTES * (workers if isinstance(workers, int) else 1))
+
+
+def cost_of(world: str) -> float:
+    """Return what a trial in `world` costs over one in MuJoCo."""
+    from eval.worlds import world_class
+
+    return getattr(world_class(world), "cost", 1.0)
 
 
 def custom_tracks(names: Sequence[str]) -> dict[str, Track]:

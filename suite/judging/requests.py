@@ -30,7 +30,8 @@ class Evaluation:
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str = "mujoco"
-    """mujoco (fast on CPUs), mjx (for GPUs) or reference (slow and simple)."""
+    """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (another
+    simulator; pip install diffracing-suite[rotorpy]), or one of an installed package."""
     deadline_s: Annotated[float, Range(0.0, 3600.0, above=True)] | None = None
     """An answer of the policy that takes longer ends the trials that it was for (up to 64, which it
     is asked about at once), as out of time [s]."""

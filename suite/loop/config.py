@@ -17,6 +17,8 @@ from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials, check_rang
 
 RECORDED_FROM = 100_000
 """Recorded flights have seeds this far above the judged trials', so that none is both."""
+OWN = ("mujoco", "mjx")
+"""Simulators that fly a vehicle as its file says."""
 LOOP_SEEDS = Range(0, SEED_MOST - 10 * RECORDED_FROM)
 """A loop's seed: those of its fine-tunings and recorded flights are above."""
 
@@ -81,6 +83,11 @@ class LoopConfig:
         """What is judged and recorded: a shipped vehicle's name or a vehicle file."""
         return self.vehicle
 
+    @property
+    def true_simulator(self) -> str:
+        """In which of the judge's worlds the true vehicle flies."""
+        return OWN[0]
+
 
 @dataclass(frozen=True)
 class DeltaLoopConfig(LoopConfig):
@@ -96,11 +103,20 @@ class HiddenLoopConfig(LoopConfig):
 
     world: str
     """What is true: a vehicle file; nothing but the flights in it is looked at."""
+    simulator: str = OWN[0]
+    """In which of the judge's worlds it flies."""
+    delta: bool = True
+    """Whether Delta Action Models are fitted, too, and policies fine-tuned under them."""
 
     @property
     def true_vehicle(self) -> str:
         """What is judged and recorded: the hidden world's vehicle file."""
         return self.world
+
+    @property
+    def true_simulator(self) -> str:
+        """In which of the judge's worlds the true vehicle flies."""
+        return self.simulator
 
 
 def resolve(
@@ -117,6 +133,7 @@ def resolve(
     iterations: int | None = None,
     finetune_iterations: int | None = None,
     fit_iterations: int | None = None,
+    delta: bool = True,
     changes: Sequence[str] = (),
 ) -> LoopConfig:
     """Return the loop that a recipe and options ask for; None takes the recipe's size.
@@ -131,13 +148,15 @@ def resolve(
     from suite.judging.content import policy_digest
     from suite.judging.flying import checkpoint_folder, default_policy
 
-    training = replace(preset(recipe), seed=seed)
+    training, simulator = replace(preset(recipe), seed=seed), OWN[0]
     sizes = SIZES if world is None else HIDDEN_SIZES
     size = sizes.get(recipe, sizes[""])
     if iterations is not None:
         training = with_iterations(training, iterations)
     simulated = load_vehicle(vehicle)
     digests = {"vehicle": _digest(simulated)}
+    if not delta and world is None:
+        raise ValueError("--no-delta: the loop is about the Delta Action Model; give --world, too")
     if world is None:
         training = override(training, changes)
         check(training)
@@ -147,11 +166,13 @@ def resolve(
                 f"--iterations is {iterations}, but with --world nothing is trained from "
                 "scratch; say how long to fine-tune with --finetune-iterations"
             )
+        simulator, world = parse_world(world, vehicle)
         true = load_vehicle(world)
-        if simulated == true:
+        if simulated == true and simulator in OWN:
             raise ValueError(
                 f"--world {world} is the simulation's vehicle {vehicle}: nothing is hidden; give a "
-                "vehicle file with an effect more, such as examples/hidden.toml"
+                "vehicle file with an effect more, such as examples/hidden.toml, or another "
+                "simulator, such as rotorpy"
             )
         digests["world"] = _digest(true)
         policy = default_policy() if policy is None else policy
@@ -184,7 +205,27 @@ def resolve(
     _check_seeds(config)
     if world is None:
         return DeltaLoopConfig(training=training, **vars(config))
-    return HiddenLoopConfig(world=world, **vars(config))
+    return HiddenLoopConfig(world=world, simulator=simulator, delta=delta, **vars(config))
+
+
+def parse_world(text: str, vehicle: str) -> tuple[str, str]:
+    """Return the simulator and the vehicle that `--world` means.
+
+    Args:
+        text: a vehicle (in MuJoCo), SIMULATOR (the simulation's vehicle in it), or both as
+            SIMULATOR:VEHICLE.
+        vehicle: the simulation's.
+
+    Raises:
+        ValueError: where the simulator lacks a package.
+    """
+    from eval.worlds import REFERENCE, WORLDS, world_class
+
+    simulator, _, flown = text.partition(":")
+    if simulator not in WORLDS or simulator == REFERENCE:
+        return OWN[0], text
+    world_class(simulator)
+    return simulator, flown or vehicle
 
 
 def _digest(value: object) -> str:

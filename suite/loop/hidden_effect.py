@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
+from eval.worlds import differences
 from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.report import Links, Picture, Section
 from suite.loop.charts import success_chart, tuning_chart
 from suite.loop.compare import BEFORE, points, told_apart
-from suite.loop.config import HiddenLoopConfig, LoopConfig
+from suite.loop.config import OWN, HiddenLoopConfig, LoopConfig
 from suite.loop.report import errors_row
 from suite.loop.standings import Standing, cell_grid, overall_grid, standings
 from suite.loop.variants import DeltaModel, Findings, Loop, Shown, Variant
@@ -50,12 +52,13 @@ def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResu
     stand = standings(results, REFERENCES)
     told = ("verdict", "effects", "gap", "unexplained")
     return Findings(
-        verdict=verdict(stand, diagnosis, trials),
+        verdict=verdict(stand, diagnosis, trials, place(config)),
         tables=[overall_grid(stand, REFERENCES, LABELS, trials), cell_grid(stand, LABELS)],
         errors=[
             f"Delta Action Model of the {whose} quadrotor\n\n"
             + (out / f"delta-{name}" / "table.md").read_text(encoding="utf-8")
             for name, whose in MODELS.items()
+            if config.delta
         ],
         numbers={"standings": stand, "diagnosis": {key: diagnosis[key] for key in told}},
         facts={
@@ -63,14 +66,29 @@ def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResu
             "levels": config.difficulty,
             "simulation's vehicle": config.vehicle,
             "hidden world": config.world,
+            "flown in": config.simulator,
         },
         chart=Picture(success_chart(stand, LABELS), "Bars: 95 % intervals over trials."),
-        sections=[_diagnosis(config, diagnosis), _delta(out), _training(out, config)],
+        sections=[
+            _diagnosis(config, diagnosis),
+            *([_delta(out)] if config.delta else []),
+            _training(out, config),
+        ],
     )
 
 
-def verdict(stand: Sequence[Standing], diagnosis: Mapping[str, Any], trials: int) -> str:
-    """Return in a few sentences what the loop showed."""
+def place(config: HiddenLoopConfig) -> str:
+    """Return what a sentence calls the hidden world."""
+    return "the hidden world" if config.simulator in OWN else f"the world {config.simulator}"
+
+
+def verdict(
+    stand: Sequence[Standing],
+    diagnosis: Mapping[str, Any],
+    trials: int,
+    where: str = "the hidden world",
+) -> str:
+    """Return in a few sentences what the loop showed; `where` the policies were judged."""
     by_name = {one.name: one for one in stand}
     apart = {other.against: other.success for other in by_name[NAMED].differences}
 
@@ -78,13 +96,18 @@ def verdict(stand: Sequence[Standing], diagnosis: Mapping[str, Any], trials: int
         return f"{100 * by_name[name].success.value:.0f} %"
 
     back = "not to be told from" if apart[NOMINAL].high >= 0 else "below"
-    return (
-        f"In the hidden world {percent(BEFORE)} of {trials} trials succeed, in the simulation's "
+    told = (
+        f"In {where} {percent(BEFORE)} of {trials} trials succeed, in the simulation's "
         f"vehicle {percent(NOMINAL)}. The diagnosis names {named_effects(diagnosis)}. Fine-tuned "
-        f"with it, {percent(NAMED)} succeed in the hidden world: {told_apart(apart[CONTROL])} the "
+        f"with it, {percent(NAMED)} succeed there: {told_apart(apart[CONTROL])} the "
         f"same fine-tuning without it ({percent(CONTROL)}; difference {points(apart[CONTROL])}), "
-        f"and {back} the policy where nothing is hidden (difference {points(apart[NOMINAL])}). "
-        f"With the Delta Action Model instead {percent(DELTA)} succeed, with both {percent(BOTH)}."
+        f"and {back} the policy where nothing is hidden (difference {points(apart[NOMINAL])})."
+    )
+    if DELTA not in by_name:
+        return told
+    return (
+        f"{told} With the Delta Action Model instead {percent(DELTA)} succeed, "
+        f"with both {percent(BOTH)}."
     )
 
 
@@ -97,17 +120,29 @@ def _diagnosis(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Sectio
             cells = (effect["name"], ", ".join(effect["alternatives"]), name, value, interval)
             rows.append([Cell(text) for text in (*cells, entry["unit"])])
     headers = ["effect", "or", "parameter", "value", "95 % interval", "unit"]
-    hidden = hidden_effects(load_vehicle(config.vehicle), load_vehicle(config.world))
     return Section(
         "What the diagnosis found in the flights",
         [
             f"Verdict: {diagnosis['verdict']}. Held-out gap {gap['before']:.2f} before, "
             f"{gap['after']:.2f} after; 1 is the noise floor.",
             Grid("", headers, rows),
-            f"What the world's file holds and the simulation's does not: {hidden}.",
+            *what_is_hidden(config),
             Links([("diagnosis/report.html", "the diagnosis's own report")]),
         ],
     )
+
+
+def what_is_hidden(config: HiddenLoopConfig) -> list[str]:
+    """Return in sentences what is true of the hidden world and the simulation does not know."""
+    simulated, true = load_vehicle(config.vehicle), load_vehicle(config.world)
+    more = hidden_effects(simulated, true)
+    hidden = [f"What the world's file holds and the simulation's does not: {more}."]
+    if simulated == true:
+        hidden = ["The world's vehicle file is the simulation's."]
+    if config.simulator not in OWN:
+        otherwise = "; ".join(differences(config.simulator, true)) or "nothing"
+        hidden.append(f"What {config.simulator} flies otherwise than the file says: {otherwise}.")
+    return hidden
 
 
 def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
@@ -137,7 +172,8 @@ def _delta(out: Path) -> Section:
 
 
 def _training(out: Path, config: LoopConfig) -> Section:
-    tuned = (CONTROL, DELTA, NAMED, BOTH)
+    assert isinstance(config, HiddenLoopConfig)
+    tuned = (CONTROL, DELTA, NAMED, BOTH) if config.delta else (CONTROL, NAMED)
     chart = tuning_chart({LABELS[name]: curve.read(out / f"tuned-{name}") for name in tuned})
     words = (
         f"{config.tuning.optimizer.iterations} iterations each, from {config.policy}. Each curve "
@@ -212,3 +248,14 @@ LOOP = Loop(
         ("tuned-named/policy/config.json", "the policy tuned with the named effect"),
     ),
 )
+
+WITHOUT_DELTA = replace(
+    LOOP,
+    variants=[variant for variant in LOOP.variants if variant.delta is None],
+    models=(),
+    reading="The first policy flies in the simulation's vehicle and in the hidden world; the "
+    "others are fine-tuned from it, for as many iterations on the same random tracks, and fly in "
+    "the hidden world on the same trials. The control is fine-tuned through the simulation's "
+    "quadrotor as it is, the other through the quadrotor corrected by the named effect.",
+)
+"""The same without Delta Action Models, in half the time."""

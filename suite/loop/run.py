@@ -43,10 +43,10 @@ def run_loop(
         WorkFailed: where a training diverges, its policy cannot be recorded, the flights cannot be
             used, or the diagnosis names nothing to correct.
     """
-    hidden = isinstance(config, HiddenLoopConfig)
-    run = LoopRun(
-        (hidden_effect if hidden else delta_action).LOOP, config, Path(out), console, workers
-    )
+    loop = delta_action.LOOP
+    if isinstance(config, HiddenLoopConfig):
+        loop = hidden_effect.LOOP if config.delta else hidden_effect.WITHOUT_DELTA
+    run = LoopRun(loop, config, Path(out), console, workers)
     claim(run.out, config, config.seed)
     seconds = do_stages(run.out, plan(run), console, f"the loop, to {run.out}")
     return _conclude(run, seconds)

@@ -32,7 +32,7 @@ from suite.judging.flying import checkpoint_folder, flying_needs, workers_for
 from suite.judging.replay import drone_of, first_trials, fly_again
 from suite.judging.requests import Collection, Evaluation
 from suite.loop.compare import BEFORE
-from suite.loop.config import DeltaLoopConfig, LoopConfig
+from suite.loop.config import OWN, DeltaLoopConfig, LoopConfig
 from suite.loop.measured import enough, measure
 from suite.loop.variants import DeltaModel, Loop, Variant
 from suite.train import run as training
@@ -123,9 +123,9 @@ def _begin(run: LoopRun) -> Stage:
     return Stage("given", f"taking {given} instead of training", Estimate(0, 0), copy)
 
 
-def _flying(run: LoopRun, trials: int) -> Estimate:
-    """Return about how long `trials` take in MuJoCo, and their memory."""
-    return flying_needs(trials, workers_for(trials, run.workers, "mujoco"))
+def _flying(run: LoopRun, trials: int, world: str) -> Estimate:
+    """Return about how long `trials` take in `world`, and their memory."""
+    return flying_needs(trials, workers_for(trials, run.workers, world), world)
 
 
 def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
@@ -137,6 +137,7 @@ def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
         trials=config.trials,
         seed=config.seed,
         vehicle=config.vehicle if variant.simulated else config.true_vehicle,
+        world=OWN[0] if variant.simulated else config.true_simulator,
     )
 
 
@@ -151,7 +152,8 @@ def _judge(run: LoopRun, variant: Variant) -> Stage:
         words = f"{won:.0%} of {len(rows)} trials succeed, {gates:.1f} gates on average"
         run.console.note(f"    {words}")
 
-    needs = _flying(run, run.config.trials * run.config.cells)
+    judged = run.config.trials * run.config.cells
+    needs = _flying(run, judged, _evaluation(run, variant).world)
     return Stage(f"eval-{variant.name}", variant.judged, needs, work, tell)
 
 
@@ -164,12 +166,13 @@ def _record(run: LoopRun) -> Stage:
         difficulty=config.difficulty,
         trials=config.flights,
         vehicle=config.true_vehicle,
+        world=config.true_simulator,
         seed=config.recorded_from,
     )
     return Stage(
         "flights",
         "recording flights on other seeds",
-        _flying(run, config.flights * config.cells),
+        _flying(run, config.flights * config.cells, config.true_simulator),
         lambda folder: collect(collection, folder, Quiet(), run.workers),
     )
 
@@ -326,4 +329,4 @@ def _replay(run: LoopRun) -> Stage:
         write_recording(folder.parent / "recording.rrd", pairs, drone)
 
     words = "flying a few trials again for the recording and the pictures"
-    return Stage("replays", words, _flying(run, 12), work)
+    return Stage("replays", words, _flying(run, 12, evaluation.world), work)

@@ -48,6 +48,23 @@ class Steady:
         return np.tile(np.array(self.action_b, np.float32), (len(state), 1)), hidden
 
 
+@dataclass
+class Scripted:
+    """Wants one acceleration in body axes after the other, then goes on with the last."""
+
+    actions_b: np.ndarray
+    spec: PolicySpec = field(default_factory=PolicySpec)
+    name: str = "scripted"
+
+    def start(self, n):
+        return np.zeros((n, 1), np.float32)
+
+    def act(self, hidden, state, image, fresh):
+        done = np.where(fresh[:, None], np.float32(0), hidden)
+        which = np.minimum(done[:, 0].astype(int), len(self.actions_b) - 1)
+        return self.actions_b[which].astype(np.float32), done + np.float32(1)
+
+
 class RandomNetwork:
     """The CNN-GRU of the policies with random parameters, on top of a pursuit so that it flies."""
 

@@ -40,5 +40,5 @@ def code_digest(*rooms: str) -> str:
 def engines() -> dict[str, str | None]:
     """Return what else can change a number: processor, and versions of what computes."""
     versions = package_versions()
-    names = ("numpy", "jax", "jaxlib", "mujoco", "mujoco-mjx", "torch", "onnxruntime")
+    names = ("numpy", "jax", "jaxlib", "mujoco", "mujoco-mjx", "torch", "onnxruntime", "rotorpy")
     return {"processor": machine()["processor"], **{name: versions[name] for name in names}}

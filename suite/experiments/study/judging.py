@@ -27,7 +27,7 @@ from suite.common.console import Console
 from suite.common.estimate import announce
 from suite.experiments.study.cache import code_digest, digest, engines
 from suite.judging.content import PolicyContent, policy_digest
-from suite.judging.flying import TRIALS_A_PROCESS, flying_needs, trial_list
+from suite.judging.flying import TRIALS_A_PROCESS, cost_of, flying_needs, trial_list
 from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import JUDGED
 
@@ -46,6 +46,8 @@ class Flier:
     """On what."""
     noise: SensorNoise = field(default_factory=SensorNoise)
     """What is wrong with what it sees."""
+    world: str = "mujoco"
+    """In which world."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,9 @@ def flown(
         if left:
             if workers is None:
                 workers = min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
-            announce(console, f"{what}: {left} trials", flying_needs(left, workers))
+            costs = [cost_of(flier.world) for flier in fliers.values()]
+            cost = sum(c * len(trials) for c, trials in zip(costs, missing, strict=True))
+            announce(console, f"{what}: {left} trials", flying_needs(cost, workers))
             numbers, all_journals = count(total - left + 1), list(journals.values())
             lately: dict[int, None] = {}
             with console.progress(what, total) as update:
@@ -150,6 +154,7 @@ def _about(flier: Flier, digests: Mapping[str, str]) -> dict[str, Any]:
         "policy_sha256": digests[flier.policy],
         "vehicle": flier.vehicle,
         "noise": flier.noise,
+        "world": flier.world,
         "code": code_digest("tracks", "policies", "eval"),
         "engines": engines(),
     }
@@ -202,6 +207,6 @@ def _fly_piece(loaders: Loaders, piece: Sequence[Share]) -> Iterator[tuple[int, 
         if flier.policy not in loaded:
             loaded[flier.policy] = loaders[flier.policy]()
         options = JudgeOptions(workers=1, noise=flier.noise)
-        task = Task(loaded[flier.policy], flier.vehicle, options=options)
+        task = Task(loaded[flier.policy], flier.vehicle, flier.world, options)
         for _, result, _ in fly_share(task, list(enumerate(trials))):
             yield number, result

@@ -1,4 +1,4 @@
-"""Every way in which a trial ends, provoked; and every world shows what a policy asks for."""
+"""Every way in which a trial ends, provoked; what a policy is shown; and all worlds step alike."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -7,14 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval.judging.judge import JudgeOptions, fly
+from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds import WORLDS as TABLE
 from eval.worlds import mujoco as mujoco_world
 from eval.worlds import reference as reference_world
+from eval.worlds.scene_slots import TO_CONTACTS, SceneSlots
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import straight
-from tests.support.pilots import Pursuit, Steady
+from tests.support.pilots import Pursuit, Scripted, Steady
+from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tracks.geometry.camera import Camera
 
 VEHICLE = load_vehicle(Path(mujoco_world.__file__).parent.parent / "vehicles" / "reference.toml")
@@ -192,3 +195,129 @@ def test_each_comes_alone_as_well(more):
 @pytest.mark.parametrize("world", ["mujoco", "reference"])
 def test_others_are_shown_the_papers_twelve_numbers(world):
     assert shown(world).shape[1] == 12
+
+
+class Drifting(SceneSlots):
+    """A world of one's own: bodies drift along x at 2 m/s, whatever the policy wants."""
+
+    name = "drifting"
+
+    def _control(self, motion, action_b, gate_w, step, noise):
+        return self._loops, None
+
+    def _move(self, flying, motion, push):
+        self._qpos[flying, 0] += 2.0 * self.dt
+        self._qvel[flying, 0] = 2.0
+        self._batch.forward(np.flatnonzero(flying).astype(np.int32), stage=TO_CONTACTS)
+        return np.zeros_like(flying)
+
+
+def test_a_world_of_ones_own_says_how_bodies_move_and_nothing_else(monkeypatch):
+    monkeypatch.setitem(TABLE._entries, "drifting", Drifting)
+    result = one(Steady(), straight(wall_at=3.0), "drifting")
+    assert (result.collided_with, result.gates_passed, result.world) == ("the wall", 1, "drifting")
+    assert result.pos_x == pytest.approx(2.95 - 0.064, abs=0.005) and result.v_max == 2.0
+
+
+PARITY = with_lag(
+    with_effects(quadratic_drag=((0.02, 0.02, 0.06),), command_delay=(0.02,), thrust_scale=(1.05,)),
+    0.03,
+)
+"""What every world can fly as its file says. (Drag and inflow of rotors would act at RotorPy's hubs
+by the hubs' own airspeed: a difference of models, in `rotorpy_vehicle.differences`.)"""
+SECOND = np.arange(30) / 30
+TURNS = np.stack(
+    [
+        6 * np.sin(2 * np.pi * SECOND),
+        8 * np.cos(3 * np.pi * SECOND),
+        5 * np.sin(2 * np.pi * SECOND + 1),
+    ],
+    axis=-1,
+)
+MOTIONS = {
+    "hover": (np.zeros((1, 3)), (100.0, 0.0)),
+    "fall": (np.array([[0.0, 0.0, -9.81]]), (100.0, 0.0)),
+    "spin": (np.zeros((1, 3)), (-100.0, 1.0)),
+    "manoeuvre": (TURNS, (3.0, 40.0)),
+}
+"""Actions [m/s^2], and where the gate is that the heading follows [m]."""
+STEP_S = 0.002
+EULER_M, EULER_SPEED, EULER_QUAT = 0.010, 0.015, 0.012
+"""MuJoCo's Euler steps are of order 1: after a second of up to 1 g they are up to dt/2 g 1 s =
+9.8 mm from continuous motion; speed and attitude go by the same step, through the loops. RotorPy's
+steps are of order 4, and nowhere near that."""
+FLOAT32_M = 5e-5
+"""mjx against mujoco: rounding to single precision at positions of up to 40 m, over 500 steps."""
+
+
+def moved(world, motion, frequency=1 / STEP_S, vehicle=PARITY):
+    """Return what a second of `motion` in `world` comes to: the result, and the flight if any."""
+    actions, (x, y) = MOTIONS[motion]
+    track = straight((x,), height=40.0)
+    track.scene.gates.center_w[0, 1] = y
+    faster = replace(vehicle, controller=replace(vehicle.controller, frequency=frequency))
+    flights = []
+    (result,) = fly(
+        Scripted(actions),
+        [TrialSpec("straight", 0, 0)],
+        faster,
+        world,
+        JudgeOptions(slots=1, rules=Rules(time_limit_s=1.0)),
+        lambda _, flight: flights.append(flight),
+        None if world == "reference" else Record(),
+        {"straight": track},
+    )
+    assert result.ended_by == "timeout"
+    return result, flights[0]
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_mjx_and_the_reference_step_as_mujoco_does(motion):
+    result, flight = moved("mujoco", motion)
+    plain, _ = moved("reference", motion)
+    assert plain[7:16] == result[7:16]
+    _, single = moved("mjx", motion)
+    assert np.abs(single.pos_w - flight.pos_w).max() < FLOAT32_M
+    assert np.abs(single.quat_wxyz - flight.quat_wxyz).max() < 1e-5
+
+
+@pytest.fixture
+def rotorpy():
+    pytest.importorskip("rotorpy")
+    pytest.importorskip("torchdiffeq")
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_rotorpy_steps_as_mujoco_does_but_for_the_length_of_mujocos_steps(motion, rotorpy):
+    (_, ours), (_, theirs) = moved("mujoco", motion), moved("rotorpy", motion)
+    assert np.abs(ours.pos_w - theirs.pos_w).max() < EULER_M
+    assert np.abs(ours.vel_w - theirs.vel_w).max() < EULER_SPEED
+    assert np.abs(ours.quat_wxyz - theirs.quat_wxyz).max() < EULER_QUAT
+
+
+@pytest.mark.parametrize("motion", ["fall", "spin", "manoeuvre"])
+def test_what_differs_from_rotorpy_halves_with_the_step(motion, rotorpy):
+    """Nothing else does: a difference of models would stay."""
+
+    def apart(frequency):
+        (_, ours), (_, theirs) = (
+            moved(world, motion, frequency) for world in ("mujoco", "rotorpy")
+        )
+        return np.array([
+            np.linalg.norm(ours.pos_w[-1] - theirs.pos_w[-1]),
+            np.linalg.norm(ours.quat_wxyz[-1] - theirs.quat_wxyz[-1]) + 1e-9,
+        ])  # fmt: skip
+
+    position, attitude = apart(500.0) / apart(1000.0)
+    assert 1.8 < position < 2.2
+    assert 1.8 < attitude < 2.3 or motion == "fall"
+
+
+def test_rotorpy_falls_as_continuous_equations_say(rotorpy):
+    """Rotors that run down from a hover with lag tau push with g exp(-2 t / tau)."""
+    tau, end = 0.03, 1.0
+    _, flight = moved("rotorpy", "fall", vehicle=with_lag(PLAIN, tau))
+    gone = tau / 2 * (1 - math.exp(-2 * end / tau))
+    assert flight.vel_w[-1, 2] == pytest.approx(9.81 * (gone - end), abs=1e-4)
+    fallen = 9.81 * (tau / 2 * (end - gone) - end**2 / 2)
+    assert flight.pos_w[-1, 2] == pytest.approx(40.0 + fallen, abs=1e-4)

@@ -1,12 +1,22 @@
 """Who flies which trials, in how many processes, and its digest."""
 
+import json
 from pathlib import Path
 
 import pytest
 
 from eval.judging.results import read_trials
 from suite import cli
-from suite.judging.flying import labels, load_flier, trial_list, who_flies, workers_for
+from suite.judging.flying import (
+    cost_of,
+    flying_needs,
+    labels,
+    load_flier,
+    trial_list,
+    who_flies,
+    workers_for,
+)
+from tests.support.engines import STAND_IN
 from tracks.common.work.travel import pack
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -52,3 +62,24 @@ def test_a_cluster_is_given_the_policy_and_this_machines_processes_its_name():
 def test_export_refuses_what_is_not_ours(tmp_path, capsys):
     assert cli.main(["export", "nobody", "--out", str(tmp_path)]) == 2
     assert "nobody" in capsys.readouterr().err
+
+
+def test_what_a_world_flies_otherwise_is_said_once_and_written(
+    pilots, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("eval.worlds.other.rotorpy.rotorpy", lambda: STAND_IN)
+    args = ["--world", "rotorpy", "--track", "zigzag", "--trials", "2", "--policy", pilots["diver"]]
+    assert _eval(tmp_path / "out", *args) == 0
+    said = capsys.readouterr().err
+    assert said.count("rotorpy: linear_drag: RotorPy's drag goes with the rotors' speed") == 1
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [text.split(":")[0] for text in summary["flown_otherwise"]] == [
+        "linear_drag", "the rotors' drag acts at each hub, by the hub's own airspeed",
+    ]  # fmt: skip
+    assert {row.world for row in read_trials(tmp_path / "out" / "trials.parquet")} == {"rotorpy"}
+
+
+def test_a_slow_world_is_estimated_as_one():
+    assert cost_of("mujoco") == cost_of("mjx") == 1.0
+    slow, fast = flying_needs(100, 1, "rotorpy"), flying_needs(100, 1)
+    assert slow.seconds > 3 * fast.seconds

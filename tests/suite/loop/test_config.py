@@ -2,9 +2,11 @@
 
 import pytest
 
+from eval.worlds.other import rotorpy as rotorpy_world
 from suite import cli
-from suite.loop.config import DeltaLoopConfig, HiddenLoopConfig, resolve
+from suite.loop.config import DeltaLoopConfig, HiddenLoopConfig, parse_world, resolve
 from suite.train.presets import finetune, preset
+from tests.support.engines import STAND_IN
 
 EXAMPLE = "examples/hidden.toml"
 
@@ -25,6 +27,7 @@ EXAMPLE = "examples/hidden.toml"
         (["--finetune-iterations", "0"], "--finetune-iterations is 0"),
         (["--fit-iterations", "0"], "--fit-iterations is 0"),
         (["--set", "loss.progres=1"], "Did you mean 'progress'?"),
+        (["--no-delta"], "--no-delta: the loop is about the Delta Action Model"),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_written(args, words, tmp_path, capsys):
@@ -40,6 +43,8 @@ def test_what_cannot_be_used_is_said_before_anything_is_written(args, words, tmp
     [
         (["--world", "reference"], "nothing is hidden"),
         (["--world", "nowhere.toml"], "nowhere.toml: no such file"),
+        (["--world", "mjx"], "nothing is hidden"),
+        (["--world", "mujoco:nowhere.toml"], "nowhere.toml: no such file"),
         (["--world", EXAMPLE, "--iterations", "5"], "--finetune-iterations"),
         (["--world", EXAMPLE, "--policy", "nobody.onnx"], "needs a checkpoint's folder"),
         (["--world", EXAMPLE, "--track", "my.toml"], "cannot be held apart"),
@@ -79,3 +84,30 @@ def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
     assert hidden.tuning.optimizer.iterations == 200 and hidden.tuning.quadrotor is not None
     assert hidden.true_vehicle == EXAMPLE and hidden.policy == "swift"
     assert set(hidden.digests) == {"vehicle", "world", "policy"}
+
+
+@pytest.fixture
+def rotorpy(monkeypatch):
+    monkeypatch.setattr(rotorpy_world, "rotorpy", lambda: STAND_IN)
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        (EXAMPLE, ("mujoco", EXAMPLE)),
+        ("racer5", ("mujoco", "racer5")),
+        ("reference", ("mujoco", "reference")),
+        ("rotorpy", ("rotorpy", "racer5")),
+        (f"rotorpy:{EXAMPLE}", ("rotorpy", EXAMPLE)),
+        ("mjx:reference", ("mjx", "reference")),
+    ],
+)
+def test_a_world_is_a_vehicle_a_simulator_or_both(text, meant, rotorpy):
+    assert parse_world(text, "racer5") == meant
+
+
+def test_another_simulator_hides_something_in_the_same_vehicle(rotorpy):
+    config = resolve(recipe="small", world="rotorpy")
+    assert isinstance(config, HiddenLoopConfig)
+    assert (config.true_vehicle, config.true_simulator) == ("reference", "rotorpy")
+    assert resolve(recipe="small").true_simulator == "mujoco"

@@ -20,11 +20,14 @@ from policies.formats.delta_file import save_delta
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import delta_network
 from suite import cli
+from suite.common.console import Quiet
 from suite.delta.run import flight_files
 from suite.loop import work
-from suite.loop.hidden_effect import LABELS, LOOP, hidden_effects, verdict
+from suite.loop.config import resolve
+from suite.loop.hidden_effect import LABELS, LOOP, hidden_effects, place, verdict, what_is_hidden
 from suite.loop.measured import CONTACT_MARGIN_S, Noise
 from suite.loop.standings import standings
+from tests.support.engines import STAND_IN
 from tests.support.loops import Small, trial_result
 
 EXAMPLE = "examples/hidden.toml"
@@ -171,6 +174,24 @@ def test_a_stopped_loop_comes_to_the_same(whole, kind, tmp_path, monkeypatch, ro
     assert (out / "table.md").read_text() == (again / "table.md").read_text()
 
 
+def test_without_delta_the_same_comes_of_half_the_stages(whole, tmp_path, monkeypatch, root):
+    monkeypatch.chdir(root)
+    stub, out = Stub(monkeypatch), tmp_path / "out"
+    assert cli.main(["loop", *ARGS, "--no-delta", "--out", str(out)]) == 0
+    found, other = (json.loads((f / "loop.json").read_text()) for f in (out, whole[0]))
+    assert list(found["stage_seconds"]) == [
+        name for name in STAGES if not name.endswith(("-delta", "-both", "delta-control", "named"))
+        or name in ("tuned-named", "eval-named")
+    ]  # fmt: skip
+    assert not stub.fitted and len(stub.trained) == 4
+    mine = {one["name"]: one for one in found["standings"]}
+    theirs = {one["name"]: one for one in other["standings"]}
+    assert list(mine) == ["nominal", "before", "control", "named"]
+    assert all(mine[name]["success"] == theirs[name]["success"] for name in mine)
+    assert "Delta Action Model" not in (out / "table.md").read_text()
+    assert "Delta Action Model" not in (out / "report.html").read_text()
+
+
 def test_where_nothing_is_named_the_loop_ends_and_says_so(
     whole, tmp_path, monkeypatch, root, capfd
 ):
@@ -194,6 +215,23 @@ def test_the_example_hides_one_effect(root):
     assert set(true.effects) - set(simulated.effects) == {"com_offset"}
     assert hidden_effects(simulated, true) == "com_offset {'offset': (0.012, 0.0, 0.0)}"
     assert hidden_effects(true, simulated) == "no com_offset"
+
+
+def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root, tmp_path):
+    monkeypatch.chdir(root)
+    monkeypatch.setattr("eval.worlds.other.rotorpy.rotorpy", lambda: STAND_IN)
+    config = resolve(recipe="small", world="rotorpy:examples/rotorpy.toml")
+    run = work.LoopRun(LOOP, config, tmp_path, Quiet())
+    judged = [work._evaluation(run, variant) for variant in LOOP.variants]
+    assert [one.world for one in judged] == ["mujoco"] + ["rotorpy"] * 5
+    assert [one.vehicle for one in judged] == ["reference"] + ["examples/rotorpy.toml"] * 5
+    assert place(config) == "the world rotorpy"
+    told = what_is_hidden(config)
+    assert "rotor_drag {'coefficient': 7.8e-05}" in told[0] and "no linear_drag" in told[0]
+    assert "the rotors' drag acts at each hub" in told[1]
+    plain = what_is_hidden(resolve(recipe="small", world="rotorpy"))
+    assert plain[0] == "The world's vehicle file is the simulation's."
+    assert "linear_drag: RotorPy's drag goes with the rotors' speed" in plain[1]
 
 
 def test_the_verdict_says_who_is_told_from_whom():

@@ -1,0 +1,249 @@
+"""Slots of `mujoco.batch`, where MuJoCo's C engine sees and touches the scene, whoever flies in it.
+
+Every slot has its own model, padded to one layout, and its own MjData. A slot is always left with
+the contacts of its current state computed, so that a state is judged before it is flown on from.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from eval.quadrotor.autopilot import AutopilotState, make_autopilot, start_autopilot
+from eval.quadrotor.plant import Motion, uses_noise
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds import Rows
+from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
+from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
+from eval.worlds.trial import (
+    DIVERGED,
+    FLYING,
+    Progress,
+    Rules,
+    TrialSpec,
+    has_diverged,
+    judge_state,
+    next_gate,
+    start_progress,
+)
+from policies.observation import View, view_of
+from tracks.common.tree_rows import packed, select
+from tracks.geometry.camera import Camera
+from tracks.track import Track
+
+TO_CONTACTS = int(mujoco.mjtStage.mjSTAGE_VEL)
+"""The last stage of the engine that a state needs to be judged."""
+_NOTHING = int(mujoco.mjtStage.mjSTAGE_NONE)
+
+
+class SceneSlots(ABC):
+    """A `World` but for what moves the bodies; everything but the engine is numpy over all slots.
+
+    A world says with `_control` what the autopilot asks for and with `_move` where that leads.
+    """
+
+    name: str
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        camera: Camera,
+        layout: Layout,
+        rules: Rules,
+        slots: int,
+        threads: int = 1,
+    ) -> None:
+        """Make the world.
+
+        Args:
+            vehicle: what flies.
+            camera: the policy's.
+            layout: what every track that will be loaded fits into.
+            rules: when a trial ends.
+            slots: how many trials fly at once.
+            threads: for physics and rays; the outcome is the same with any number.
+        """
+        self.slots = slots
+        self._vehicle, self._layout, self._rules = vehicle, layout, rules
+        self._autopilot = make_autopilot(vehicle)
+        self.dt = self._autopilot.dt
+        self._eye = Eye(camera)
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._threads = threads
+        self._course = empty_course(slots, layout)
+        self._progress = start_progress(np.zeros((slots, 3)))
+        self._progress = self._progress._replace(ended=np.full(slots, -1, np.int32))
+        self._models: list[mujoco.MjModel] = []
+        self._noise: list[np.ndarray] | None = None
+        if uses_noise(self._autopilot.plant):
+            self._noise = [np.zeros((1, 3))] * slots
+
+    @property
+    def progress(self) -> Progress:
+        """Where the trial in each slot stands."""
+        return self._progress
+
+    def _build(self, model: mujoco.MjModel) -> None:
+        self._models = [model] * self.slots
+        self._batch = Batch(model, self.slots, self._threads, persistent=True)
+        # Live views: state in, contacts and orientation of the current state out.
+        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._applied = self._batch.bind("qfrc_applied")
+        self._contacts = self._batch.bind("ncon")
+        self._xmat = self._batch.bind("xmat")
+        # Rays want the solids' places only, and those do not move: one MjData a slot serves all.
+        self._seen = [mujoco.MjData(model)] * self.slots
+
+    def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
+        """Start trials from (slot, track, trial)."""
+        for slot, track, trial in entries:
+            model = compile_model(track, self._vehicle, self.dt, self._layout.solids)
+            if not self._models:
+                self._build(model)
+            self._models[slot] = model
+            self._seen[slot] = mujoco.MjData(model)
+            mujoco.mj_kinematics(model, self._seen[slot])
+            gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
+            for field, value in zip(self._course.gates, gates, strict=True):
+                field[slot] = value
+            self._course.count[slot] = len(track.scene.gates.center_w)
+            if self._noise is not None:
+                steps = round(self._rules.time_limit_s / self.dt) + 2
+                self._noise[slot] = noise_of(trial, steps)
+        ids = np.array([slot for slot, _, _ in entries], np.int32)
+        self._batch.set_models(self._models)
+        self._batch.reset(ids, stage=_NOTHING)
+        for slot, track, _ in entries:
+            self._qpos[slot], self._qvel[slot] = start_state(track), 0.0
+        self._batch.forward(ids, stage=TO_CONTACTS)
+
+        motion = self._motion()
+        noise = None
+        if self._noise is not None:
+            noise = np.stack([draws[0] for draws in self._noise])
+        fresh = start_autopilot(self._autopilot, motion, noise)
+        started = np.zeros(self.slots, bool)
+        started[ids] = True
+        self._loops = packed(select(started, fresh, getattr(self, "_loops", fresh)))
+        self._progress = select(started, start_progress(motion.pos_w), self._progress)
+        self._judge(started, np.zeros(self.slots, bool))
+
+    def _motion(self) -> Motion:
+        rot_w = self._xmat[:, BODY].reshape(self.slots, 3, 3).copy()
+        velocity = self._qvel.copy()
+        return Motion(self._qpos[:, :3].copy(), rot_w, velocity[:, :3], velocity[:, 3:])
+
+    def _judge(self, which: np.ndarray, bad_wrench: np.ndarray) -> None:
+        """Judge the current states of the slots in `which`."""
+        motion, contact = self._motion(), self._contacts > 0
+        diverged = bad_wrench | has_diverged(self._rules, motion)
+        with np.errstate(invalid="ignore", over="ignore"):  # of rows that have diverged
+            judged = judge_state(
+                self._rules, self._progress, self._course, self.dt, motion, contact, diverged
+            )
+        self._progress = select(which, judged, self._progress)
+
+    def collided_with(self, slot: int) -> str:
+        """Return the name of the solid that the trial in `slot` collided with."""
+        return contact_name(self._models[slot], self._batch.get_data(slot))
+
+    def view(self, wanted: np.ndarray) -> View:
+        """Return what can be observed now."""
+        motion = self._motion()
+        camera = self._eye.camera
+        depth = np.full((self.slots, camera.height, camera.width), camera.range_m)
+
+        def look(slot: int) -> None:
+            depth[slot] = self._eye.image(
+                self._models[slot], self._seen[slot], motion.pos_w[slot], motion.rot_w[slot]
+            )
+
+        slots = np.flatnonzero(wanted).tolist()
+        if self._pool is None:
+            for slot in slots:
+                look(slot)
+        else:
+            list(self._pool.map(look, slots, chunksize=8))
+        gate = next_gate(self._course, self._progress.gates)
+        after = next_gate(self._course, self._progress.gates + 1)
+        return view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, after, depth)
+
+    @abstractmethod
+    def _control(
+        self,
+        motion: Motion,
+        action_b: np.ndarray,
+        gate_w: np.ndarray,
+        step: np.ndarray,
+        noise: np.ndarray | None,
+    ) -> tuple[AutopilotState, Any]:
+        """Return the loops after a physics step, and what they ask of `_move`.
+
+        The arguments are those of `eval.quadrotor.autopilot.autopilot_step`, of all slots.
+        """
+
+    @abstractmethod
+    def _move(self, flying: np.ndarray, motion: Motion, push: Any) -> np.ndarray:
+        """Fly one physics step in the slots `flying` (N,) bool, from `motion`, under `push`.
+
+        Returns:
+            (N,) bool: slots in which no step can be taken, and which stay where they are.
+        """
+
+    def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
+        """Fly each slot's action (N, 3) for its number of physics steps (N,)."""
+        rows = []
+        for done in range(int(steps.max(initial=0))):
+            flying = (steps > done) & (self._progress.ended == FLYING)
+            if not flying.any():
+                break
+            step, motion = self._progress.step, self._motion()
+            gate_w = next_gate(self._course, self._progress.gates).center_w
+            speed_before = self._loops.plant.rotor_speed
+            draws = self._draws(step)
+            loops, push = self._control(motion, action_b, gate_w, step, draws)
+            self._loops = packed(select(flying, loops, self._loops))
+            if record:
+                due = flying & (step % self._autopilot.attitude_every == 0)
+                rows += self._rows(due, speed_before)
+            bad = self._move(flying, motion, push)
+            self._progress = self._progress._replace(step=step + flying)
+            self._judge(flying, bad)
+            if record:
+                ended = ~np.isin(self._progress.ended, (FLYING, DIVERGED))
+                rows += self._rows(flying & ended, self._loops.plant.rotor_speed)
+            lost = np.flatnonzero(flying & (self._progress.ended == DIVERGED))
+            if len(lost):  # the other slots' arithmetic shall not meet its numbers again
+                self._batch.reset(lost.astype(np.int32), stage=TO_CONTACTS)
+        return rows
+
+    def _draws(self, step: np.ndarray) -> np.ndarray | None:
+        if self._noise is None:
+            return None
+        last = [min(int(k) + 1, len(d) - 1) for k, d in zip(step, self._noise, strict=True)]
+        return np.stack([draws[k] for k, draws in zip(last, self._noise, strict=True)])
+
+    def _rows(self, due: np.ndarray, rotor_speed: np.ndarray) -> list[Rows]:
+        if not due.any():
+            return []
+        loops = self._loops
+        qpos, qvel = self._qpos.copy(), self._qvel.copy()
+        return [
+            Rows(
+                due,
+                self._progress.step * self.dt,
+                qpos[:, :3],
+                qpos[:, 3:],
+                qvel[:, :3],
+                qvel[:, 3:],
+                loops.command.thrust,
+                loops.command.rate_b,
+                rotor_speed,
+                self._progress.gates,
+            )
+        ]
