@@ -1,9 +1,12 @@
 """Flights as real ones are: rotors measured, and a trim of each flight's own."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from eval.logs.flight_log import FlightLog
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -12,8 +15,20 @@ TRIM = 0.004
 """Standard deviation of each flight's own torque trim [N m]; of its centre of mass, a fifth [m]."""
 
 
-def flights(count, seed=0, duration_s=8.0, speed=3.0, trim=1.0, **effects):
-    """Return logs of `VEHICLE` with `effects`, rotors measured, each with a trim of its own."""
+def flights(
+    count: int,
+    seed: int = 0,
+    duration_s: float = 8.0,
+    speed: float = 3.0,
+    trim: float = 1.0,
+    hidden: Mapping[str, Any] | None = None,
+    **effects: Any,
+) -> list[FlightLog]:
+    """Return logs of `VEHICLE` with effects, rotors measured, each with a trim of its own.
+
+    Effects are `hidden` by name, and what is given by keyword.
+    """
+    effects = {**(hidden or {}), **effects}
     rng, logs = np.random.default_rng(seed), []
     for number in range(count):
         own = tuple((trim * TRIM * rng.standard_normal(3)).tolist())

@@ -58,6 +58,7 @@ def test_nanobench_motors_turn_the_body_as_the_shipped_order_says():
     """M1 and M3 turn counter-clockwise: more of them yaws the body clockwise."""
     log, _ = read("nanobench/B8_star_fast_rep2.csv", "nanobench")
     change = np.gradient(log.rate_b, log.time_s, axis=0)
+    assert log.pwm is not None
     one, two, three, four = log.pwm.T
     drives = (three + four - one - two, two + three - one - four, two + four - one - three)
     for axis, drive in enumerate(drives):
@@ -84,6 +85,7 @@ def test_crazypad_is_partial_and_shows_the_weight_near_rotor_3(path, lacks):
     log, findings = read(f"crazypad/{path}", "crazypad", partial=True)
     assert log.partial == lacks
     assert levels(findings)["partial"] == "note"
+    assert log.pwm is not None
     mean = np.nanmean(log.pwm, axis=0)
     assert np.argmax(mean) == 2
     assert 20.0 < log.duration_s < 24.0
@@ -92,7 +94,7 @@ def test_crazypad_is_partial_and_shows_the_weight_near_rotor_3(path, lacks):
 @real
 def test_crazyswarm2_has_thrust_by_the_mass_beside_it_and_torque():
     log, _ = read("crazyswarm2/log10", "crazyswarm2")
-    assert log.torque_cmd_b is not None
+    assert log.torque_cmd_b is not None and log.thrust_cmd is not None
     assert log.about["mass"] == 0.0333
     np.testing.assert_allclose(log.thrust_cmd, log.extra["cmd_force"] / 0.0333)
     assert 6.0 < np.nanmean(log.thrust_cmd) < 10.0

@@ -24,7 +24,7 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
     save_vehicle(VEHICLE, tmp_path / "v.toml", "for a test")
     for folder, seed, effects in (("new", 8, {"mass_offset": (0.15,)}), ("old", 9, {})):
         (tmp_path / folder).mkdir()
-        for number, log in enumerate(flights(3, seed=seed, speed=1.0, **effects)):
+        for number, log in enumerate(flights(3, seed=seed, speed=1.0, hidden=effects)):
             write_flight(tmp_path / folder / f"{number}.parquet", log)
     words = ["diagnose", str(tmp_path / "new"), "--reference", str(tmp_path / "old"), "--plan",
              "--vehicle", str(tmp_path / "v.toml"), "--out", str(tmp_path / "out")]  # fmt: skip

@@ -8,8 +8,8 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mix
-from eval.quadrotor.motors import motor_speed
 from eval.quadrotor.plant import nominal_quadrotor
+from eval.vehicles.motors import motor_speed
 from eval.vehicles.vehicle import Vehicle
 
 

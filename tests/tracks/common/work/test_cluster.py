@@ -75,7 +75,9 @@ def test_a_refusal_there_is_a_message_to_the_user_and_a_bug_is_none(two_nodes):
     assert explain(caught.value) is None, "a test's own error is not the suite's"
     with pytest.raises(ValueError) as caught:
         work_off(load, ["no-such-policy"], two_nodes.address, lambda *_: None)
-    code, message = explain(caught.value)
+    told = explain(caught.value)
+    assert told is not None
+    code, message = told
     assert code == 2 and "no-such-policy" in message
 
 

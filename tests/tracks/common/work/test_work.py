@@ -54,10 +54,9 @@ class Stubborn(Exception):
 def test_an_error_travels_with_where_it_came_up():
     from eval.effects import find_effect
 
-    try:
+    with pytest.raises(ValueError) as caught:
         find_effect("linear_dragg")
-    except ValueError as error:
-        there = unpack(pack(failure(error)))
+    there = unpack(pack(failure(caught.value)))
     elsewhere = there._replace(
         root="/opt/suite", lines=there.lines.replace(there.root, "/opt/suite")
     )

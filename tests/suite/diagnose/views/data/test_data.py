@@ -65,7 +65,9 @@ def test_motor_commands_give_the_speeds_of_the_vehicles_map_and_lag():
     assert np.allclose(rotors.speed**2 * vehicle.rotors.thrust_coefficient, thrust)
     step = np.where(time_s[:, None] < 1.0, 0.3, 0.6) * np.ones(4)
     still = replace(vehicle, motors=MotorMap((0.0, 8.0), 3.7, 0.0))
-    speed = acting_rotors(level(time_s, np.zeros((200, 3)), pwm=step), still).speed[:, 0]
+    lagged = acting_rotors(level(time_s, np.zeros((200, 3)), pwm=step), still)
+    assert lagged is not None
+    speed = lagged.speed[:, 0]
     after = speed[np.searchsorted(time_s, 1.0 + VEHICLE.rotors.time_constant)]
     assert after == pytest.approx(speed[0] + (1 - np.exp(-1)) * (speed[-1] - speed[0]), rel=0.02)
 
@@ -75,7 +77,7 @@ def test_a_collective_thrust_says_nothing_of_each_rotor():
     log = level(time_s, np.zeros((200, 3)), thrust_cmd=np.full(200, 9.81),
                 rate_cmd_b=np.zeros((200, 3)))  # fmt: skip
     rotors = acting_rotors(log, VEHICLE)
-    assert not rotors.each and np.allclose(rotors.speed, hover_speed())
+    assert rotors is not None and not rotors.each and np.allclose(rotors.speed, hover_speed())
     assert [view.name for view in ready([log], VEHICLE).views] == ["force"]
 
 
