@@ -23,7 +23,7 @@ from suite import cli
 from suite.common.console import Quiet
 from suite.delta.run import flight_files
 from suite.loop import work
-from suite.loop.config import resolve
+from suite.loop.config import HiddenLoopConfig, resolve
 from suite.loop.hidden_effect import LABELS, LOOP, hidden_effects, place, verdict, what_is_hidden
 from suite.loop.measured import CONTACT_MARGIN_S, Noise
 from suite.loop.standings import standings
@@ -221,6 +221,7 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
     monkeypatch.chdir(root)
     monkeypatch.setattr("eval.worlds.other.rotorpy.rotorpy", lambda: STAND_IN)
     config = resolve(recipe="small", world="rotorpy:examples/rotorpy.toml")
+    assert isinstance(config, HiddenLoopConfig)
     run = work.LoopRun(LOOP, config, tmp_path, Quiet())
     judged = [work._evaluation(run, variant) for variant in LOOP.variants]
     assert [one.world for one in judged] == ["mujoco"] + ["rotorpy"] * 5
@@ -229,7 +230,9 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
     told = what_is_hidden(config)
     assert "rotor_drag {'coefficient': 7.8e-05}" in told[0] and "no linear_drag" in told[0]
     assert "the rotors' drag acts at each hub" in told[1]
-    plain = what_is_hidden(resolve(recipe="small", world="rotorpy"))
+    same = resolve(recipe="small", world="rotorpy")
+    assert isinstance(same, HiddenLoopConfig)
+    plain = what_is_hidden(same)
     assert plain[0] == "The world's vehicle file is the simulation's."
     assert "linear_drag: RotorPy's drag goes with the rotors' speed" in plain[1]
 
