@@ -230,9 +230,9 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
     told = what_is_hidden(config)
     assert "rotor_drag {'coefficient': 7.8e-05}" in told[0] and "no linear_drag" in told[0]
     assert "the rotors' drag acts at each hub" in told[1]
-    other = resolve(recipe="small", world="rotorpy")
-    assert isinstance(other, HiddenLoopConfig)
-    plain = what_is_hidden(other)
+    same = resolve(recipe="small", world="rotorpy")
+    assert isinstance(same, HiddenLoopConfig)
+    plain = what_is_hidden(same)
     assert plain[0] == "The world's vehicle file is the simulation's."
     assert "linear_drag: RotorPy's drag goes with the rotors' speed" in plain[1]
 
