@@ -145,9 +145,9 @@ def flying_needs(trials: float, workers: Workers, world: str = "mujoco") -> Esti
 
 def cost_of(world: str) -> float:
     """Return what a trial in `world` costs over one in MuJoCo."""
-    from eval.worlds import world_class
+    from eval.worlds import WORLDS
 
-    return getattr(world_class(world), "cost", 1.0)
+    return getattr(WORLDS.find(world), "cost", 1.0)
 
 
 def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
