@@ -212,8 +212,8 @@ HUGE = "9" * 400
 @pytest.mark.parametrize(
     "line",
     [
-        "eval --procs -2",
-        "eval --procs 0",
+        "eval --workers -2",
+        "eval --workers 0",
         "eval --deadline-s nan",
         "eval --deadline-s -1",
         "eval --deadline-s 0",

@@ -163,7 +163,9 @@ def shown(world, **more):
     return np.array(policy.seen)
 
 
-@pytest.mark.parametrize("world", ["mujoco", "reference", "mjx"])
+@pytest.mark.parametrize(
+    "world", ["mujoco", "reference", pytest.param("mjx", marks=pytest.mark.slow)]
+)
 def test_the_second_gate_and_the_direction_are_those_of_a_line_of_gates(world):
     """Level gates on a line: centres differ by the stretch, and the direction is along the line."""
     states = shown(world, second_gate=True, gate_axis=True)
@@ -271,7 +273,10 @@ def moved(world, motion, frequency=1 / STEP_S, vehicle=PARITY):
     return result, flights[0]
 
 
-@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize(
+    "motion",
+    [pytest.param(m, marks=() if m == "manoeuvre" else pytest.mark.slow) for m in MOTIONS],
+)
 def test_mjx_and_the_reference_step_as_mujoco_does(motion):
     result, flight = moved("mujoco", motion)
     plain, _ = moved("reference", motion)

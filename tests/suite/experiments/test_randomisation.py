@@ -24,6 +24,7 @@ def test_fixed_dynamics_are_the_middle_and_all_else_is_the_recipe():
     assert physics.depth_noise == 0 and physics.fov_scale == (1, 1)
 
 
+@pytest.mark.slow
 def test_both_settings_of_every_seed_fly_the_same_share(sky, made, tmp_path):
     args = [*ARGS, "--training-seeds", "3", "5", "--iterations", "7"]
     assert reproduce(tmp_path, *args) == 0

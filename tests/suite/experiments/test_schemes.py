@@ -31,6 +31,7 @@ def test_schemes_share_all_but_how_they_learn():
     assert isinstance(longer.recipe, PpoConfig) and longer.recipe.iterations == 7
 
 
+@pytest.mark.slow
 def test_the_comparison_from_one_command_and_again(tmp_path, monkeypatch):
     for module in ("suite.train.run", "suite.train.ppo.run", "suite.experiments.study.validation"):
         monkeypatch.setattr(f"{module}.sample_worlds", boxes_worlds)

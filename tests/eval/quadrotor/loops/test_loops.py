@@ -51,7 +51,13 @@ def test_numpy_and_jax_fly_the_same_and_follow_the_rates(kind):
     assert np.abs(rates[48]).max() < 1e-9
 
 
-@pytest.mark.parametrize("kind", loops.KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, marks=pytest.mark.slow if kind == "betaflight" else ())
+        for kind in loops.KINDS
+    ],
+)
 def test_a_batch_flies_as_each_alone_and_has_gradients(kind):
     plant = make_plant(vehicle(kind), DT)
     given = inputs(60, [1.0, 0.0, 0.0])

@@ -16,7 +16,11 @@ from tests.support.training import fresh_params
 QUIET = FleetConfig(vel_noise=0.0, axis_noise=0.0, gate_noise_m=0.0)
 
 
-@pytest.fixture(scope="module", params=[None, QUIET], ids=["point", "fleet"])
+@pytest.fixture(
+    scope="module",
+    params=[None, pytest.param(QUIET, marks=pytest.mark.slow)],
+    ids=["point", "fleet"],
+)
 def pair(request):
     """Return (our gradient, our loss, the baseline after backward, its loss, config)."""
     base = replace(train.bench_config(6, 12), fleet=request.param)

@@ -142,6 +142,7 @@ def test_a_vehicle_gives_what_its_rotors_have_and_no_more():
     assert rise == pytest.approx(13.0 - 9.81, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_the_flight():
     """With respect to the actions of 4 decisions, in double precision."""
     with jax.enable_x64(True):
