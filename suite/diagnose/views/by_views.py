@@ -126,7 +126,7 @@ def diagnose_by_views(
             found = search_change(known[view.name], task.flights, spread, among)
             balance = in_balance(known[view.name])
             apart = changed_task(known[view.name], balance, held[view.name])
-            apart = apart._replace(thirds=True)
+            apart = apart._replace(means=True)
         else:
             found = search_view(task, among, seed)
             apart = task._replace(flights=held[view.name])

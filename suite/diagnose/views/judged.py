@@ -45,7 +45,7 @@ class ViewGap(NamedTuple):
 def judge(found: ViewSearch, held: ViewTask, floor: np.ndarray) -> ViewGap:
     """Return what `found` is worth on the flights of `held`; `floor` (3,) is the noise's."""
     before, after = left_of(held, found.first.theta), left_of(held, found.last.theta)
-    if held.thirds:
+    if held.means:
         return _judge_change(found, before, after, floor)
     start, fitted = found.first.data, found.last.data
     inside = np.concatenate([inputs_of(flight) for flight in found.task.flights])

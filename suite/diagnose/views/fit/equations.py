@@ -25,8 +25,8 @@ class ViewTask(NamedTuple):
     limits: Thresholds = THRESHOLDS
     carried: np.ndarray | None = None
     """(M, 3) what the model is known to lack in these flights, taken off what is left."""
-    thirds: bool = False
-    """Only the means over the thirds of each flight count, and nothing that changes within them."""
+    means: bool = False
+    """Only the mean of each flight counts, and nothing that changes within one."""
 
 
 class ViewEquations(NamedTuple):
@@ -47,17 +47,13 @@ def left_of(task: ViewTask, theta: np.ndarray) -> ViewData:
     data = compare(task.view, task.model, theta, task.flights)
     if task.carried is not None:
         data = data._replace(residual=data.residual - task.carried)
-    return in_thirds(data) if task.thirds else data
+    return in_means(data) if task.means else data
 
 
-def in_thirds(data: ViewData) -> ViewData:
-    """Return the means of `data` over the thirds of each flight."""
-    parts = []
-    for number in np.unique(data.flight):
-        rows = np.flatnonzero(data.flight == number)
-        for third in np.array_split(rows, 3):
-            if len(third):
-                parts.append([field[third].mean(axis=0) for field in data])
+def in_means(data: ViewData) -> ViewData:
+    """Return the mean of `data` over each flight."""
+    numbers = np.unique(data.flight)
+    parts = [[field[data.flight == n].mean(axis=0) for field in data] for n in numbers]
     flight, *others = (np.array(field) for field in zip(*parts, strict=True))
     return ViewData(flight.astype(int), *others)
 
@@ -65,7 +61,7 @@ def in_thirds(data: ViewData) -> ViewData:
 def look(task: ViewTask, theta: np.ndarray, weights: Weights) -> ViewEquations:
     """Return the equations of `task` at the numbers `theta` (P,)."""
     data = left_of(task, theta)
-    block = np.arange(len(data.flight)) if task.thirds else blocks_of(data, task.limits)
+    block = np.arange(len(data.flight)) if task.means else blocks_of(data, task.limits)
     first = np.unique(block, return_index=True)[1]
     return ViewEquations(
         theta, data, weights, equations_of(data, weights, block), data.flight[first]

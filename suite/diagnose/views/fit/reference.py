@@ -138,10 +138,10 @@ def search_change(
     gain = rotor_gain(task)
     weights = weights_of(left_of(task, start), task.limits)
     # What changes within a flight is the model's flaw as well as the vehicle's: means are judged.
-    third = np.unique(left_of(task, start).flight, return_counts=True)[1].mean() / 3.0
-    alone = weights.scatter * np.sqrt(weights.memory / max(third, 1.0))
+    moments = np.unique(left_of(task, start).flight, return_counts=True)[1].mean()
+    alone = weights.scatter * np.sqrt(weights.memory / moments)
     weights = weights._replace(scatter=alone, memory=np.ones(3))
-    task = task._replace(thirds=True)
+    task = task._replace(means=True)
     trim = spread.share * gain
     if task.view.in_world:
         trim[:2] = np.inf  # an attitude's trim, of which few flights tell too little

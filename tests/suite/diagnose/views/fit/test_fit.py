@@ -12,7 +12,7 @@ from suite.diagnose.views.fit.equations import (
     ViewTask,
     chi2_by_flight,
     half_widths,
-    in_thirds,
+    in_means,
     look,
 )
 from suite.diagnose.views.fit.model import ForceModel
@@ -88,15 +88,15 @@ def test_weighed_moments_of_flights_with_trims_are_independent_units():
     assert np.mean(within, axis=0) == pytest.approx([1.0, 1.0, 1.0], rel=0.05)
 
 
-def test_blocks_stand_apart_and_thirds_are_means():
+def test_blocks_stand_apart_and_a_flight_has_one_mean():
     data = made(np.random.default_rng(3), count=2, moments=60)
     block = blocks_of(data)
     assert block.max() + 1 == 2 * 3  # 6 s in blocks of 2 s
     weights = weights_of(data)
     assert equations_of(data, weights, block).hessian.shape == (6, 1, 1)
-    thirds = in_thirds(data)
-    assert len(thirds.flight) == 6
-    assert np.allclose(thirds.residual[0], data.residual[:20].mean(axis=0))
+    means = in_means(data)
+    assert len(means.flight) == 2
+    assert np.allclose(means.residual[0], data.residual[:60].mean(axis=0))
 
 
 def test_a_drag_is_named_with_its_numbers_by_flights_that_agree(dragged):
