@@ -36,6 +36,7 @@ def test_settings_differ_in_field_and_progress_alone():
     assert len(settings(Config(preset="paper"))) == 11, "its own weight is one of the paper's"
 
 
+@pytest.mark.slow
 def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, capfd):
     args = [*TINY, "--only", "field 0.4", "normalised 6.4", "--training-seeds", "4"]
     train, made = training_run.train, []

@@ -74,6 +74,7 @@ def test_differences_and_verdicts_by_hand():
     assert "Fewer succeed with c (-100 [-100, -100])." in said and "do not tell for b." in said
 
 
+@pytest.mark.slow
 def test_the_rows_are_trained_and_judged_once(sky, made, tmp_path, monkeypatch):
     numbers = {"success_cross": 0.5, "success_rate": 1.0, "v_max": 3.0, "gates": 6.0}
     seen = []

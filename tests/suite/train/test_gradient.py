@@ -50,6 +50,7 @@ def test_the_encoders_gradient_does_not_depend_on_its_chunks(two_pass, monkeypat
     assert largest_difference(encoder_gradient(params, images, cotangents), whole) < 1e-5
 
 
+@pytest.mark.slow
 def test_the_encoders_gradient_from_every_third_image_is_right_on_average():
     """Without noise the key sets nothing but the first image: the three choices' mean is exact."""
     config = small_config(steps=6, physics={"depth_noise": 0.0})

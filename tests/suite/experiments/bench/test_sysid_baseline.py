@@ -37,6 +37,7 @@ def test_both_sides_have_the_same_residuals(both):
     np.testing.assert_allclose(theirs[seen], ours[seen], rtol=2e-3, atol=2e-2)
 
 
+@pytest.mark.slow
 def test_both_sides_find_what_was_flown(both):
     task, model, problem, _ = both
     answers = [diagnose.refit(model, task), sysid_baseline.refit(problem)]
