@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +26,7 @@ from suite.diagnose.fit.normal_equations import (
     information,
     start_estimate,
 )
-from suite.diagnose.fit.parameters import candidates, make_space
+from suite.diagnose.fit.parameters import candidates, make_space, with_fitted
 from suite.diagnose.fit.permutation import folds_of
 from suite.diagnose.fit.search import SearchResult, search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -270,15 +268,6 @@ def _with_effects(
     vehicle: Vehicle, model: RolloutModel, found: SearchResult, turbulence: Turbulence | None
 ) -> Vehicle:
     """Return `vehicle` with the named effects in place of what it has of them."""
-    fitted: dict[str, Any] = model.space.effects(found.estimate.theta)
-    effects = dict(vehicle.effects)
-    for name in {candidate.name for candidate in found.candidates}:
-        values = []
-        for value in fitted[name]:
-            array = np.asarray(value, dtype=float)
-            values.append(tuple(array.tolist()) if array.ndim else float(array))
-        effects[name] = type(fitted[name])(*values)
-    if turbulence:
-        effects[turbulence.effect] = turbulence.values
-    ordered = {name: effects[name] for name in EFFECTS if name in effects}
-    return replace(vehicle, effects=MappingProxyType(ordered))
+    names = [candidate.name for candidate in found.candidates]
+    wind = {turbulence.effect: turbulence.values} if turbulence else {}
+    return with_fitted(vehicle, model.space, found.estimate.theta, names, wind)

@@ -186,14 +186,17 @@ def fit(
     return best, equations
 
 
-def half_widths95(equations: NormalEquations, flight: np.ndarray | None = None) -> np.ndarray:
+def half_widths95(
+    equations: NormalEquations, flight: np.ndarray | None = None, noise_freedom: int | None = None
+) -> np.ndarray:
     """Return half-widths (K,) of 95 % intervals at the fit whose normal equations these are.
 
     The largest of these counts: by the covariance of the noise (Gauss-Newton), and by the one in
     which each window's slope is one draw (the block sandwich; Liang and Zeger 1986), which holds
     where errors within a window are not independent. With `flight` (W,), the number of each
     window's flight, one in which each flight is one draw: a model's error comes back in every
-    window of a flight.
+    window of a flight. The noise is known with `noise_freedom` degrees of freedom, that of the
+    windows if not given.
     """
     count, size = equations.gradient.shape
     if not size:
@@ -208,7 +211,8 @@ def half_widths95(equations: NormalEquations, flight: np.ndarray | None = None) 
         return np.sqrt(np.maximum(np.diag(blocks), 0.0)) * float(student.ppf(0.975, freedom))
 
     freedom = max(count - size, 2)
-    widths = np.sqrt(np.maximum(np.diag(inverse), 0.0)) * float(student.ppf(0.975, freedom))
+    known = float(student.ppf(0.975, noise_freedom or freedom))
+    widths = np.sqrt(np.maximum(np.diag(inverse), 0.0)) * known
     widths = np.maximum(widths, by_draws(equations.gradient, freedom))
     if flight is not None and len(np.unique(flight)) > 2:
         flights = [equations.gradient[flight == one].sum(axis=0) for one in np.unique(flight)]

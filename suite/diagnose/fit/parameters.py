@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,28 @@ def make_space(vehicle: Vehicle) -> ParameterSpace:
                     )
                 )
     return ParameterSpace(tuple(entries), base)
+
+
+def with_fitted(
+    vehicle: Vehicle,
+    space: ParameterSpace,
+    theta: np.ndarray,
+    names: Collection[str],
+    besides: Mapping[str, Any] | None = None,
+) -> Vehicle:
+    """Return `vehicle` with the effects `names` at `theta` (P,) in place of what it has of them.
+
+    `besides` are values of further effects by name.
+    """
+    fitted, effects = space.effects(theta), dict(vehicle.effects)
+    for name in set(names):
+        values = (np.asarray(value, dtype=float) for value in fitted[name])
+        effects[name] = type(fitted[name])(
+            *(tuple(v.tolist()) if v.ndim else float(v) for v in values)
+        )
+    effects |= besides or {}
+    ordered = {name: effects[name] for name in EFFECTS if name in effects}
+    return replace(vehicle, effects=MappingProxyType(ordered))
 
 
 def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> list[Candidate]:

@@ -58,7 +58,7 @@ def views_page(found: ViewsDiagnosis, told: Mapping[str, Any], toml: str) -> Rep
         title=f"Diagnosis: {told['verdict']}",
         lead=told["headline"],
         facts={
-            "flights": str(len(found.logs)),
+            "flights": str(len(found.flights.names)),
             "reference": str(len(found.references)) if found.references else "none",
             "held out": ", ".join(short_name(name) for name in gap["held_out"]),
             "rotors by": told["driven_by"],

@@ -5,16 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
-from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.hold_out import choose_held_out
-from suite.diagnose.fit.parameters import ParameterSpace, candidates, make_space
+from suite.diagnose.fit.parameters import ParameterSpace, candidates, make_space, with_fitted
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.views.data.flights import ViewFlights, parted, ready
 from suite.diagnose.views.data.view import View
@@ -24,7 +21,6 @@ from suite.diagnose.views.fit.plausible import implausible
 from suite.diagnose.views.fit.reference import (
     RotorSpread,
     changed_task,
-    in_balance,
     rotor_spread,
     search_change,
 )
@@ -60,8 +56,6 @@ class ViewsDiagnosis:
     flights: ViewFlights
     held_out: list[str]
     """Names of what took no part in finding or fitting."""
-    logs: Sequence[FlightLog]
-    nominal: Vehicle
     vehicle: Vehicle
     """With what was named."""
     spread: RotorSpread | None
@@ -70,8 +64,6 @@ class ViewsDiagnosis:
     """Names of the reference flights."""
     warnings: list[str]
     seconds: float
-    seed: int
-    limits: Thresholds
 
     @property
     def main(self) -> ViewResult:
@@ -124,8 +116,7 @@ def diagnose_by_views(
         task = ViewTask(view, model, fitted[view.name], limits)
         if known and spread:
             found = search_change(known[view.name], task.flights, spread, among)
-            balance = in_balance(known[view.name])
-            apart = changed_task(known[view.name], balance, held[view.name])
+            apart = changed_task(known[view.name], found.first.theta, held[view.name])
             apart = apart._replace(means=True)
         else:
             found = search_view(task, among, seed)
@@ -150,15 +141,11 @@ def diagnose_by_views(
         space=space,
         flights=flights,
         held_out=held_names,
-        logs=logs,
-        nominal=vehicle,
         vehicle=_with_names(vehicle, space, results),
         spread=spread,
         references=tuple(log.name for log in references),
         warnings=warnings,
         seconds=time.monotonic() - began,
-        seed=seed,
-        limits=limits,
     )
 
 
@@ -274,12 +261,4 @@ def _with_names(vehicle: Vehicle, space: ParameterSpace, results: Sequence[ViewR
             at = list(name.candidate.indices)
             theta[at] = one.search.last.theta[at]
             names.append(name.candidate.name)
-    fitted: dict[str, Any] = space.effects(theta)
-    effects = dict(vehicle.effects)
-    for name in dict.fromkeys(names):
-        values = (np.asarray(value, dtype=float) for value in fitted[name])
-        effects[name] = type(fitted[name])(
-            *(tuple(v.tolist()) if v.ndim else float(v) for v in values)
-        )
-    ordered = {name: effects[name] for name in EFFECTS if name in effects}
-    return replace(vehicle, effects=MappingProxyType(ordered))
+    return with_fitted(vehicle, space, theta, names)

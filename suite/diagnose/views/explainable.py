@@ -13,6 +13,7 @@ import numpy as np
 
 from suite.diagnose.views.data.rows import FlightRows
 from suite.diagnose.views.data.view import SmoothedFlight
+from suite.diagnose.views.fit.by_flight import centred, units_of
 
 RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Weights of the coefficients' squares that are tried, against a moment's each."""
@@ -21,16 +22,14 @@ RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 class BlackBox(NamedTuple):
     """A fitted black box."""
 
-    middle: np.ndarray
-    """(K,) means of the inputs."""
     spread: np.ndarray
-    """(K,) of them."""
+    """(K,) of the inputs."""
     weight: np.ndarray
     """(K, 3)."""
 
     def predict(self, inputs: np.ndarray) -> np.ndarray:
         """Return what it says (M, 3) for `inputs` (M, K)."""
-        return ((inputs - self.middle) / self.spread) @ self.weight
+        return (inputs / self.spread) @ self.weight
 
 
 def inputs_of(flight: SmoothedFlight) -> np.ndarray:
@@ -44,7 +43,7 @@ def fit_black_box(inputs: np.ndarray, left: np.ndarray, flight: np.ndarray) -> B
     Means of flights are taken off both sides: they are trims. `flight` (M,) says whose each is;
     a lone flight's thirds stand for flights.
     """
-    units = flight if len(np.unique(flight)) > 1 else np.arange(len(flight)) * 3 // len(flight)
+    units = units_of(flight)
     inputs, left = centred(inputs, flight), centred(left, flight)
     spread = np.maximum(inputs.std(axis=0), 1e-9)
     scaled = inputs / spread
@@ -64,7 +63,7 @@ def fit_black_box(inputs: np.ndarray, left: np.ndarray, flight: np.ndarray) -> B
     every = np.ones(len(units), bool)
     columns = [solve(every, RIDGES[k])[:, axis] for axis, k in enumerate(best)]
     none = (left**2).sum(axis=0) <= np.min(errors, axis=0)  # better to say nothing at all
-    return BlackBox(np.zeros(len(spread)), spread, np.where(none, 0.0, np.stack(columns, axis=1)))
+    return BlackBox(spread, np.where(none, 0.0, np.stack(columns, axis=1)))
 
 
 def closed_share(left: np.ndarray, after: np.ndarray, flight: np.ndarray) -> np.ndarray:
@@ -73,17 +72,9 @@ def closed_share(left: np.ndarray, after: np.ndarray, flight: np.ndarray) -> np.
     return 1.0 - (centred(after, flight) ** 2).sum(axis=0) / np.maximum(before, 1e-12)
 
 
-def centred(values: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return `values` (M, K) less the mean of each's flight."""
-    values = values.copy()
-    for number in np.unique(flight):
-        values[flight == number] -= values[flight == number].mean(axis=0)
-    return values
-
-
 def _products(rows: FlightRows) -> np.ndarray:
     """Return the inputs (N, K) on every row: what was flown, and its products by two."""
-    vel_b = (np.swapaxes(rows.rot_w, 1, 2) @ rows.vel_w[..., None])[..., 0]
+    vel_b = rows.vel_b
     push = rows.rotor_speed**2
     push = push / np.maximum(push.mean(), 1e-9)
     pairs = push @ np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [1, -1, 1, -1]]).T / 4.0

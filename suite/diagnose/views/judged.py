@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.views.explainable import centred, closed_share, fit_black_box, inputs_of
+from suite.diagnose.views.explainable import closed_share, fit_black_box, inputs_of
+from suite.diagnose.views.fit.by_flight import centred
 from suite.diagnose.views.fit.compare import ViewData
 from suite.diagnose.views.fit.equations import ViewTask, left_of
 from suite.diagnose.views.fit.search import ViewSearch

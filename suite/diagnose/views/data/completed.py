@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
+from suite.diagnose.data.resample import interpolate
 from tracks.geometry.rotation import rot_to_quat
 
 SMOOTH_S = 0.1
@@ -41,7 +42,9 @@ def completed(log: FlightLog) -> FlightLog:
 def _leaning(log: FlightLog) -> np.ndarray:
     """Return attitudes (N, 3, 3) whose z axis is along the path's acceleration less gravity."""
     step = float(np.median(np.diff(log.time_s)))
-    vel_w = np.stack([_filled(log.time_s, column) for column in log.vel_w.T], axis=1)
+    if not np.isfinite(log.vel_w).any(axis=0).all():
+        raise ValueError(f"{log.name}: no velocity and no positions to derive it from")
+    vel_w = interpolate(log.time_s, log.time_s, log.vel_w)
     smooth = gaussian_filter1d(vel_w, SMOOTH_S / step, axis=0)
     acc_w = np.gradient(smooth, log.time_s, axis=0) + [0.0, 0.0, GRAVITY]
     up = acc_w / np.linalg.norm(acc_w, axis=1, keepdims=True)
@@ -55,10 +58,3 @@ def _turning(time_s: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
     slope = np.gradient(rot_w, time_s, axis=0)
     spin = np.swapaxes(rot_w, 1, 2) @ slope
     return np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
-
-
-def _filled(time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-    known = np.isfinite(values)
-    if not known.any():
-        raise ValueError("no velocity and no positions to derive it from")
-    return np.interp(time_s, time_s[known], values[known])

@@ -11,6 +11,7 @@ from eval.quadrotor.mixer import mix
 from eval.quadrotor.plant import nominal_quadrotor
 from eval.vehicles.motors import motor_speed
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.resample import interpolate
 
 
 class ActingRotors(NamedTuple):
@@ -34,7 +35,9 @@ def acting_rotors(log: FlightLog, vehicle: Vehicle) -> ActingRotors | None:
     if log.rotor_speed_cmd is not None:
         return ActingRotors(_lagged(log, vehicle, log.rotor_speed_cmd), "motor commands", True)
     if log.pwm is not None and vehicle.motors is not None:
-        voltage = None if log.voltage is None else _filled(log.time_s, log.voltage)
+        voltage = log.voltage
+        if voltage is not None:
+            voltage = interpolate(log.time_s, log.time_s, voltage[:, None])[:, 0]
         speed = np.asarray(motor_speed(vehicle, log.pwm, voltage))
         return ActingRotors(_lagged(log, vehicle, speed), "motor commands and battery", True)
     if log.thrust_cmd is None:
@@ -47,12 +50,6 @@ def acting_rotors(log: FlightLog, vehicle: Vehicle) -> ActingRotors | None:
     if log.torque_cmd_b is None:
         return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust", False)
     return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust and torques", True)
-
-
-def _filled(time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return `values` (N,) with what is missing between its neighbours; all must not be."""
-    known = np.isfinite(values)
-    return np.interp(time_s, time_s[known], values[known])
 
 
 def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.resample import interpolate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.scene import Array
 
@@ -33,6 +34,11 @@ class FlightRows(NamedTuple):
     good: Array
     """(N,) bool: nothing is missing."""
 
+    @property
+    def vel_b(self) -> Array:
+        """(N, 3) velocity in body axes [m/s]."""
+        return (np.swapaxes(self.rot_w, 1, 2) @ self.vel_w[..., None])[..., 0]
+
 
 def rows_of(
     log: FlightLog,
@@ -56,8 +62,7 @@ def rows_of(
     good &= ~_near(log.time_s, stands, limits.ground_margin_s)
     drop = np.zeros(len(good))
     if log.voltage is not None and np.isfinite(log.voltage).any():
-        known = np.flatnonzero(np.isfinite(log.voltage))
-        now = np.interp(log.time_s, log.time_s[known], log.voltage[known])
+        now = interpolate(log.time_s, log.time_s, log.voltage[:, None])[:, 0]
         drop = now[0] - now
     pos_w, vel_w, rate_b, speed = (np.nan_to_num(part) for part in parts)
     rot_w = np.where(np.isfinite(rot_w), rot_w, np.eye(3))

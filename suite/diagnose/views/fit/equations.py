@@ -6,14 +6,21 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
 
-from suite.diagnose.fit.normal_equations import NormalEquations, gauss_newton_step
+from suite.diagnose.fit.normal_equations import (
+    NormalEquations,
+    gauss_newton_step,
+    half_widths95,
+)
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.views.data.view import SmoothedFlight, View
+from suite.diagnose.views.fit.by_flight import means_of, units_of
 from suite.diagnose.views.fit.compare import ViewData, compare
 from suite.diagnose.views.fit.model import ForceModel
 from suite.diagnose.views.fit.weigh import Weights, blocks_of, equations_of
+
+MANY = 1000
+"""Degrees of freedom of what all moments tell."""
 
 
 class ViewTask(NamedTuple):
@@ -52,9 +59,7 @@ def left_of(task: ViewTask, theta: np.ndarray) -> ViewData:
 
 def in_means(data: ViewData) -> ViewData:
     """Return the mean of `data` over each flight."""
-    numbers = np.unique(data.flight)
-    parts = [[field[data.flight == n].mean(axis=0) for field in data] for n in numbers]
-    flight, *others = (np.array(field) for field in zip(*parts, strict=True))
+    flight, *others = (means_of(field, data.flight) for field in data)
     return ViewData(flight.astype(int), *others)
 
 
@@ -105,7 +110,7 @@ def chi2_by_flight(task: ViewTask, found: ViewEquations, indices: Sequence[int])
     To first order about `found`, where all flights fit them. A lone flight's thirds stand for
     flights.
     """
-    at, flight = np.array(sorted(indices), dtype=int), _units(found)
+    at, flight = np.array(sorted(indices), dtype=int), units_of(found.flight)
     hessian = found.block.hessian[:, at][:, :, at]
     gradient, chi2 = found.block.gradient[:, at], []
     for number in np.unique(flight):
@@ -121,33 +126,11 @@ def chi2_by_flight(task: ViewTask, found: ViewEquations, indices: Sequence[int])
 
 
 def half_widths(found: ViewEquations, indices: Sequence[int]) -> np.ndarray:
-    """Return half-widths (K,) of 95 % intervals of the numbers at `indices`.
+    """Return half-widths (K,) of 95 % intervals of the numbers at `indices`, in order.
 
-    The larger of two: each block of a flight is one draw, and, of three flights and more, each
-    flight is one (Liang and Zeger 1986; Student's t with a flight less).
+    Blocks and flights are draws; the noise itself is known by all moments, which are many.
     """
     at = np.array(sorted(indices), dtype=int)
-    hessian = found.block.hessian.sum(axis=0)[np.ix_(at, at)]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    inverse = np.linalg.pinv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
-    gradient = found.block.gradient[:, at]
-
-    def width(draws: np.ndarray, freedom: int) -> np.ndarray:
-        centred = draws - draws.mean(axis=0)
-        whole = inverse @ (centred.T @ centred * len(draws) / freedom) @ inverse
-        return np.sqrt(np.maximum(np.diag(whole), 0.0)) * float(student.ppf(0.975, freedom))
-
-    noise = np.sqrt(np.maximum(np.diag(inverse), 0.0)) * float(student.ppf(0.975, 1000))
-    widths = np.maximum(noise, width(gradient, max(len(gradient) - len(at), 2)))
-    numbers = np.unique(found.flight)
-    if len(numbers) > 2:
-        flights = np.array([gradient[found.flight == n].sum(axis=0) for n in numbers])
-        widths = np.maximum(widths, width(flights, len(numbers) - 1))
-    return widths
-
-
-def _units(found: ViewEquations) -> np.ndarray:
-    """Return what is left out together (B,): flights, or thirds of a lone one."""
-    if len(np.unique(found.flight)) > 1:
-        return found.flight
-    return np.arange(len(found.flight)) * 3 // len(found.flight)
+    block = found.block
+    along = block._replace(hessian=block.hessian[:, at][:, :, at], gradient=block.gradient[:, at])
+    return half_widths95(along, found.flight, noise_freedom=MANY)

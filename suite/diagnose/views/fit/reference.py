@@ -20,6 +20,7 @@ from suite.diagnose.fit.normal_equations import gauss_newton_step
 from suite.diagnose.fit.parameters import Candidate, indices_of
 from suite.diagnose.fit.rivals import flights_agree
 from suite.diagnose.views.data.view import SmoothedFlight
+from suite.diagnose.views.fit.by_flight import centred, means_of
 from suite.diagnose.views.fit.compare import compare
 from suite.diagnose.views.fit.equations import (
     ViewEquations,
@@ -52,15 +53,12 @@ def flown_in(task: ViewTask, theta: np.ndarray) -> np.ndarray:
     """
     motion = []
     for flight in task.flights:
-        rows = flight.rows
-        vel_b = (np.swapaxes(rows.rot_w, 1, 2) @ rows.vel_w[..., None])[..., 0]
+        vel_b = flight.rows.vel_b
         speed = np.linalg.norm(vel_b, axis=1, keepdims=True)
         motion.append(flight.form.mean @ np.concatenate([vel_b, speed * vel_b], axis=1))
     data = compare(task.view, task.model, theta, task.flights)
     flown = np.concatenate([np.concatenate(motion), data.value], axis=1)
-    for number in np.unique(data.flight):
-        flown[data.flight == number] -= flown[data.flight == number].mean(axis=0)
-    return flown
+    return centred(flown, data.flight)
 
 
 def rotor_gain(task: ViewTask) -> np.ndarray:
@@ -76,9 +74,7 @@ def rotor_spread(sets: Sequence[ViewTask]) -> RotorSpread:
     square, freedom = 0.0, 0
     for task in sets:
         data, gain = left_of(task, task.model.space.array("start")), rotor_gain(task)
-        means = np.array(
-            [data.residual[data.flight == n].mean(axis=0) for n in np.unique(data.flight)]
-        )
+        means = means_of(data.residual, data.flight)
         axes = gain > task.limits.least_rotor_gain * gain.max()
         if task.view.in_world:
             axes &= np.arange(3) == 2  # across the thrust rotors do nothing
@@ -113,15 +109,12 @@ def changed_task(
     `theta` (P,) is what they have in balance.
     """
     data, flown = left_of(reference, theta), flown_in(reference, theta)
-    inside = data.residual.copy()
-    numbers = np.unique(data.flight)
-    for number in numbers:
-        inside[data.flight == number] -= inside[data.flight == number].mean(axis=0)
+    inside = centred(data.residual, data.flight)
     spread = np.maximum(flown.std(axis=0), reference.limits.carried_least)
     scaled = flown / spread
     ridge = reference.limits.carried_ridge * len(scaled) * np.eye(scaled.shape[1])
     slope = np.linalg.solve(scaled.T @ scaled + ridge, scaled.T @ inside)
-    mean = np.mean([data.residual[data.flight == n].mean(axis=0) for n in numbers], axis=0)
+    mean = means_of(data.residual, data.flight).mean(axis=0)
     task = reference._replace(flights=flights)
     return task._replace(carried=flown_in(task, theta) / spread @ slope + mean)
 
@@ -161,9 +154,7 @@ def search_change(
 
 def _mean_change(found: ViewEquations) -> np.ndarray:
     """Return the size (3,) of what is left on average over the flights."""
-    data = found.data
-    means = [data.residual[data.flight == n].mean(axis=0) for n in np.unique(data.flight)]
-    return np.abs(np.mean(means, axis=0))
+    return np.abs(means_of(found.data.residual, found.data.flight).mean(axis=0))
 
 
 def _next_change(

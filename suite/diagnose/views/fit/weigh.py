@@ -13,6 +13,7 @@ import numpy as np
 
 from suite.diagnose.fit.normal_equations import NormalEquations
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.views.fit.by_flight import means_of
 from suite.diagnose.views.fit.compare import ViewData
 
 
@@ -38,7 +39,7 @@ def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
     memory = np.maximum(1.0, _memory(inside, limits))
     trim = np.full(3, np.inf)
     if len(flights) >= limits.least_flights:
-        means = np.array([f.mean(axis=0) for f in flights])
+        means = means_of(data.residual, data.flight)
         own = np.mean([scatter**2 * memory / len(f) for f in flights], axis=0)
         trim = np.sqrt(np.maximum(means.var(axis=0, ddof=1) - own, 0.0))
     return Weights(scatter, memory, trim)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from suite.diagnose.views.by_views import diagnose_by_views
-from suite.diagnose.views.explainable import centred, closed_share, fit_black_box, inputs_of
+from suite.diagnose.views.explainable import closed_share, fit_black_box, inputs_of
+from suite.diagnose.views.fit.by_flight import centred
 from suite.diagnose.views.judged import judge
 from tests.support.real_flights import VEHICLE, flights
 

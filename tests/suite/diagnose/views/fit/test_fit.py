@@ -7,6 +7,7 @@ from suite.diagnose.fit.parameters import Candidate, candidates, make_space
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.views.data.flights import ready
 from suite.diagnose.views.data.view import FORCE, TORQUE
+from suite.diagnose.views.fit.by_flight import centred, means_of, units_of
 from suite.diagnose.views.fit.compare import ViewData, compare
 from suite.diagnose.views.fit.equations import (
     ViewTask,
@@ -97,6 +98,14 @@ def test_blocks_stand_apart_and_a_flight_has_one_mean():
     means = in_means(data)
     assert len(means.flight) == 2
     assert np.allclose(means.residual[0], data.residual[:60].mean(axis=0))
+
+
+def test_flights_have_means_and_a_lone_one_has_thirds():
+    flight, values = np.array([2, 2, 5, 5, 5]), np.array([[1.0], [3.0], [0.0], [3.0], [6.0]])
+    assert means_of(values, flight).ravel().tolist() == [2.0, 3.0]
+    assert centred(values, flight).ravel().tolist() == [-1.0, 1.0, -3.0, 0.0, 3.0]
+    assert units_of(flight).tolist() == flight.tolist()
+    assert units_of(np.zeros(6)).tolist() == [0, 0, 1, 1, 2, 2]
 
 
 def test_a_drag_is_named_with_its_numbers_by_flights_that_agree(dragged):
