@@ -54,7 +54,7 @@ def fly_rotorpy(
 class _RotorpyBodies:
     """RotorPy's multirotors under our rate loop; its logs count as continuous in time."""
 
-    integrator = None
+    integrator: str | None = None
 
     def __init__(self, nominal: Vehicle, truth: Vehicle, wanted: Reference, dt: float) -> None:
         count = wanted.yaw.shape[1]

@@ -84,7 +84,7 @@ def fly(
 class _MujocoBodies:
     """N quadrotors, each in a model of its own."""
 
-    integrator = INTEGRATOR
+    integrator: str | None = INTEGRATOR
 
     def __init__(
         self,
