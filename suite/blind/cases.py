@@ -87,7 +87,9 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
         count: about how many; all if not given.
     """
     rng = np.random.default_rng([seed, 1])
-    drawn = [("single", (name,), m) for m in MULTIPLES for name in ROTORPY_EFFECTS]
+    drawn: list[tuple[str, tuple[str, ...], float]] = [
+        ("single", (name,), m) for m in MULTIPLES for name in ROTORPY_EFFECTS
+    ]
     for _ in range(ROTORPY_FULL["pair"]):
         first, second = (str(name) for name in rng.choice(ROTORPY_EFFECTS, 2, replace=False))
         drawn.append(("pair", (first, second), MULTIPLES[1]))
