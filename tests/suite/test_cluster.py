@@ -69,6 +69,7 @@ def test_a_node_killed_after_a_third_leaves_the_table_as_it_is(flown, tmp_path, 
     assert same_table(out, one)
 
 
+@pytest.mark.slow
 def test_a_driver_that_is_killed_goes_on_with_what_is_left(flown, tmp_path, root):
     args, one = flown
     out = tmp_path / "out"
