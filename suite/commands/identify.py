@@ -66,4 +66,5 @@ DRIVEN = {
     "pwm": "motor commands and the battery",
     "torques": "commanded thrust and torques",
     "rates": "commanded thrust and body rates",
+    "thrust": "commanded thrust alone",
 }

@@ -82,13 +82,17 @@ def of_force(vehicle: Vehicle, drive: str, guess: MotorGuess, fitted: Fitted) ->
                 [("thrust",)],
             )
         )
-    if "drag_x" in names:
+    if "drag_z" in names:
+        drag = vehicle.effects.get("linear_drag")
+        begun = (0.0, 0.0, 0.0) if drag is None else drag.coefficient
         entries.append(
             number(
                 "effects.linear_drag.coefficient",
                 "1/s",
                 fitted,
-                lambda n: np.array([n[f"drag_{axis}"] for axis in "xyz"]),
+                lambda n: np.array(
+                    [n.get(f"drag_{axis}", have) for axis, have in zip("xyz", begun, strict=True)]
+                ),
                 [(f"drag_{axis}",) for axis in "xyz"],
             )
         )

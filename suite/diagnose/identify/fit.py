@@ -31,6 +31,10 @@ FEWEST = 3
 """Flights, to say that they differ."""
 
 
+class NothingWhole(ValueError):
+    """No stretch of the flights is whole enough to compare anything in."""
+
+
 class Unknown(NamedTuple):
     """A number that is looked for."""
 
@@ -98,12 +102,12 @@ def fit(misses: Misses, unknowns: Sequence[Unknown], held: Sequence[str] = ()) -
         held: those that are left as they are from the first.
 
     Raises:
-        ValueError: where there is not one window.
+        NothingWhole: where there is not one window.
     """
     unknowns, untold = tuple(unknowns), list(held)
     value = np.array([unknown.start for unknown in unknowns])
     if not sum(len(rows.value) for rows in misses(value)):
-        raise ValueError("no stretch of these flights is whole enough to compare anything in")
+        raise NothingWhole("no stretch of these flights is whole enough to compare anything in")
     while True:
         free = [k for k, unknown in enumerate(unknowns) if unknown.name not in untold]
         value = _least(misses, unknowns, value, free)
