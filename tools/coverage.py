@@ -54,8 +54,11 @@ def pulls(
         replace(log, **{name: np.full_like(getattr(log, name), np.nan) for name in lacks})
         for log in logs_of(fleet, recordings, drive, rng, Slow())
     ]
-    true, off = truths(fleet), {}
-    for entry in identify(logs, start()).numbers:
+    numbers = identify(logs, start()).numbers
+    spans = {entry.key: entry.ci95 for entry in numbers}
+    turned = [axis for axis, span in zip("xy", spans.get("inertia", ()), strict=False) if span]
+    true, off = truths(fleet, "".join(turned)), {}
+    for entry in numbers:
         for k, (value, span) in enumerate(zip(entry.value, entry.ci95, strict=True)):
             part = f"[{k}]" if len(entry.value) > 1 else ""
             if span is not None:

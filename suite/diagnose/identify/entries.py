@@ -124,11 +124,13 @@ def of_torque(
             )
         )
     if "yaw" in names:
-        # Torque per inertia is what is seen, and the inertia about z follows those about x and y.
+        # Torque per inertia is what is seen, and the inertia about z follows those about x and y
+        # as far as they were told; what stays is given, and no doubt of this number.
         start = vehicle.rotors.torque_coefficient
+        told = [name for name in ("inertia_x", "inertia_y") if fitted.has(name)]
 
         def twist(n: Any) -> np.ndarray:
-            follows = 0.5 * (n.get("inertia_x", 0.0) + n.get("inertia_y", 0.0))
+            follows = 0.5 * sum(n[name] for name in told)
             scaled = scale if drive == "rotors" else 0.0
             return np.array([start * np.exp(n["yaw"] + scaled + follows)])
 

@@ -42,7 +42,8 @@ def identify_files(
             raise ValueError(f"--leave {part!r}: allowed: {', '.join(PARTS)}")
     start = load_vehicle(vehicle)
     logs, warnings = read_flights(flight_files(flights), partial=True)
-    console.say(f"{len(logs)} flights, {sum(log.duration_s for log in logs):.0f} s in all")
+    flights_word = "flight" if len(logs) == 1 else "flights"
+    console.say(f"{len(logs)} {flights_word}, {sum(log.duration_s for log in logs):.0f} s in all")
     found = identify(logs, start, leave)
     save_vehicle(found.vehicle, out, _head(found, vehicle))
     return {

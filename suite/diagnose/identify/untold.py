@@ -26,6 +26,7 @@ WHY = {
     "gain_z": "rate_gain about z: the body hardly yaws",
 }
 """What was fitted and not told, and what the flights lack for it."""
+STILL = "no body rates and no attitude in these logs"
 
 
 def untold(fitted: Mapping[str, Fitted]) -> list[str]:
@@ -74,16 +75,14 @@ def unasked(
                 "torques; that needs motor commands, rotor speeds or commanded torques"
             )
         else:
-            lines.append(
-                "inertia and torque_coefficient: these logs have no body rates and no attitude"
-            )
+            lines.append(f"inertia and torque_coefficient: {STILL}")
     lags = any(u.name == "late" for found in fitted.values() for u in found.unknowns)
     if not lags and "lag" not in leave:
         lines.append(
             "time_constant and command_delay: measured rotor speeds are past them; that needs "
             "commanded ones (motor_cmd_1 to motor_cmd_4) beside"
             if drive == "rotors"
-            else "time_constant and command_delay: no body rates and no attitude in these logs"
+            else f"time_constant and command_delay: {STILL}"
         )
     if "loop" not in fitted and "loop" not in leave:
         lines.append(

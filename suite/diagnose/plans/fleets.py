@@ -166,15 +166,16 @@ def logs_of(
     return found
 
 
-def truths(fleet: Fleet) -> Mapping[str, tuple[float, ...]]:
+def truths(fleet: Fleet, told: str = "xy") -> Mapping[str, tuple[float, ...]]:
     """Return the true values of all that may be told, by their key in a vehicle file.
 
-    The torque coefficient is that which goes with the inertia about z that follows the others.
+    The torque coefficient is that which goes with the inertia about z that is in the file then: it
+    follows those about the axes `told`, and is the start's without.
     """
     true, begun = fleet.truth, start()
     assert true.motors is not None
     ratio = np.asarray(true.inertia) / begun.inertia
-    follows = float(np.sqrt(ratio[0] * ratio[1]) / ratio[2])
+    follows = float(np.sqrt(np.prod([ratio["xy".index(axis)] for axis in told])) / ratio[2])
     return {
         "motors.thrust": true.motors.thrust,
         "motors.voltage_exponent": (true.motors.voltage_exponent,),
