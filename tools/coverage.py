@@ -56,8 +56,8 @@ def pulls(
     ]
     numbers = identify(logs, start()).numbers
     spans = {entry.key: entry.ci95 for entry in numbers}
-    turned = [axis for axis, span in zip("xy", spans.get("inertia", ()), strict=False) if span]
-    true, off = truths(fleet, "".join(turned)), {}
+    turned = [axis for axis, span in zip("xyz", spans.get("inertia", ()), strict=False) if span]
+    true, off = truths(fleet, drive, "".join(turned)), {}
     for entry in numbers:
         for k, (value, span) in enumerate(zip(entry.value, entry.ci95, strict=True)):
             part = f"[{k}]" if len(entry.value) > 1 else ""

@@ -16,13 +16,12 @@ from suite.diagnose.identify import force
 from suite.diagnose.identify.drive import MotorGuess
 from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.numbers import Number, number
+from suite.diagnose.identify.torque import inertia_ratio
 
 
 def inertia_of(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
     """Return the inertia (3,); what yaws is scaled as the others where nothing tells it."""
-    x, y = (numbers.get(f"inertia_{axis}", 0.0) for axis in "xy")
-    z = numbers.get("inertia_z", 0.5 * (x + y))
-    found = np.asarray(vehicle.inertia) * np.exp([x, y, z])
+    found = np.asarray(vehicle.inertia) * np.exp(inertia_ratio(numbers))
     # No body has more about one axis than about the other two together.
     return np.minimum(found, found.sum() - found)
 
@@ -124,15 +123,15 @@ def of_torque(
             )
         )
     if "yaw" in names:
-        # Torque per inertia is what is seen, and the inertia about z follows those about x and y
-        # as far as they were told; what stays is given, and no doubt of this number.
+        # Torque per inertia is what is seen. The inertia about z is as far as it was told; what
+        # stays is given, and no doubt of this number.
         start = vehicle.rotors.torque_coefficient
-        told = [name for name in ("inertia_x", "inertia_y") if fitted.has(name)]
+        axes = [name for name in ("inertia_x", "inertia_y", "inertia_z") if fitted.has(name)]
 
         def twist(n: Any) -> np.ndarray:
-            follows = 0.5 * sum(n[name] for name in told)
+            inertia = inertia_ratio({name: n[name] for name in axes})[2]
             scaled = scale if drive == "rotors" else 0.0
-            return np.array([start * np.exp(n["yaw"] + scaled + follows)])
+            return np.array([start * np.exp(n["yaw"] + scaled + inertia)])
 
         entries.append(
             number("rotors.torque_coefficient", "N m/(rad/s)^2", fitted, twist, [("yaw",)])

@@ -6,7 +6,7 @@ in both. Mass is never fitted: scaling it together with inertia and thrust chang
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,7 +24,7 @@ from suite.diagnose.identify.drive import (
     with_motors,
 )
 from suite.diagnose.identify.entries import inertia_of, of_force, of_loop, of_torque, put
-from suite.diagnose.identify.fit import Fitted, NothingWhole
+from suite.diagnose.identify.fit import Fitted, NothingWhole, Unknown
 from suite.diagnose.identify.grid import FlightGrid, grid_of
 from suite.diagnose.identify.numbers import Number, told
 from suite.diagnose.identify.untold import unasked, untold
@@ -134,13 +134,13 @@ class _Start:
         self.fitted["force"] = found
         self.scale = told(found).get("thrust", 0.0)
 
-    def thrusts(self, flight: FlightGrid, lag_s: float, delay_s: float) -> np.ndarray:
-        scale = float(np.exp(self.scale))
+    def thrusts(
+        self, flight: FlightGrid, lag_s: float, delay_s: float, numbers: Mapping[str, float]
+    ) -> np.ndarray:
+        scale = float(np.exp(numbers.get("thrust", 0.0)))
         if self.drive == "rotors":
             return scale * rotor_thrusts(flight, self.start.rotors.thrust_coefficient)
-        numbers = told(self.fitted["force"]) if "force" in self.fitted else {}
-        guess = force.with_told(self.guess, numbers)
-        return scale * motor_thrusts(flight, guess, lag_s, delay_s)
+        return scale * motor_thrusts(flight, force.with_told(self.guess, numbers), lag_s, delay_s)
 
     def torque(self) -> None:
         flights = [flight for flight in self.flights if flight.has("rate_b")]
@@ -151,20 +151,25 @@ class _Start:
         unknowns = _without(unknowns, left, self.leave)
         if not unknowns:
             return
-        given = self.lags()
-        try:
-            found = torque.fit_torque(
-                flights, self.start, self.drive, unknowns, self.thrusts, given
+        given, doubted = self.lags(), None
+        if "force" in self.fitted and self.drive in KNOWN_MOTORS:
+            given |= told(self.fitted["force"])
+            doubted = self.fitted["force"].give(*torque.GIVEN)
+
+        def fitted(unknowns: Sequence[Unknown], held: Sequence[str] = ()) -> Fitted:
+            return torque.fit_torque(
+                flights, self.start, self.drive, unknowns, self.thrusts, given, held, doubted
             )
+
+        try:
+            found = fitted(unknowns)
         except NothingWhole:
             return
         if found.has("lag") and told(found)["lag"] < NO_LAG_S < self.begun_s:
             # No rotor follows at once: what blurs the commands in the log hides its lag.
             self.lag_s = self.begun_s
             unknowns = [u._replace(start=self.begun_s) if u.name == "lag" else u for u in unknowns]
-            found = torque.fit_torque(
-                flights, self.start, self.drive, unknowns, self.thrusts, given, ("lag",)
-            )
+            found = fitted(unknowns, ("lag",))
         self.keep("torque", found)
 
     def loop(self) -> None:
@@ -178,8 +183,11 @@ class _Start:
             return
         # Lag and delay of known motors are told better by the torque.
         known = "rotors" in self.fitted or self.drive == "pwm" or "lag" in self.leave
-        unknowns = [*loop.gains(), *([] if known else both)]
-        self.keep("loop", loop.fit_loop(flown, self.start, unknowns, self.lags()))
+        teller = self.fitted.get("rotors", self.fitted.get("torque"))
+        doubted = teller.give("late", "lag") if known and teller is not None else None
+        wanted = [u for u in both if not known or (doubted and u.name in doubted.names)]
+        unknowns = [*loop.gains(), *loop.couplings(self.start), *wanted]
+        self.keep("loop", loop.fit_loop(flown, self.start, unknowns, self.lags(), doubted))
 
     def lags(self) -> dict[str, float]:
         return {"lag": self.lag_s, "late": self.lag_s + self.delay_s}

@@ -17,7 +17,7 @@ WHY = {
     "drag_z": "drag along body z: too slow, or too little of it",
     "inertia_x": "inertia about x: the body hardly rolls, or the rotors' lag may be another",
     "inertia_y": "inertia about y: the body hardly pitches, or the rotors' lag may be another",
-    "inertia_z": "inertia about z: the body hardly yaws",
+    "inertia_z": "inertia about z: the body hardly yaws, or not while it rolls and pitches",
     "yaw": "torque_coefficient: the body hardly yaws",
     "lag": "time_constant of the rotors: nothing fast enough is asked of them",
     "late": "command_delay: nothing fast enough is asked of the motors",
@@ -33,7 +33,7 @@ def untold(fitted: Mapping[str, Fitted]) -> list[str]:
     """Return what no fit has told of what was looked for."""
     told = {u.name for found in fitted.values() for u in found.unknowns if found.has(u.name)}
     names = dict.fromkeys(name for found in fitted.values() for name in found.untold)
-    return [WHY[name] for name in names if name not in told]
+    return [WHY[name] for name in names if name not in told and name in WHY]
 
 
 def unasked(

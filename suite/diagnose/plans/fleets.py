@@ -146,7 +146,7 @@ def logs_of(
         if slow is not None:
             log = _erring(log, slow, rng)
         rows = slice(None, None, recording.period)
-        asked = _asked_speed(fleet.truth, recording)[rows]
+        asked = _row_means(_asked_speed(fleet.truth, recording), recording.period)
         thrust = fleet.truth.rotors.thrust_coefficient * asked**2
         if drive != "rotors":
             log = replace(log, rotor_speed=None)
@@ -154,7 +154,7 @@ def logs_of(
         if drive == "rotors":
             changed["rotor_speed_cmd"] = asked
         elif drive == "pwm":
-            changed["pwm"] = _commands(fleet.truth, recording)[rows]
+            changed["pwm"] = _row_means(_commands(fleet.truth, recording), recording.period)
         elif drive == "torques":
             changed["thrust_cmd"] = thrust.sum(axis=1) / fleet.truth.mass / fleet.scale
             changed["torque_cmd_b"] = torque_of(fleet.truth, thrust)
@@ -166,16 +166,21 @@ def logs_of(
     return found
 
 
-def truths(fleet: Fleet, told: str = "xy") -> Mapping[str, tuple[float, ...]]:
+def truths(fleet: Fleet, drive: str, told: str = "xyz") -> Mapping[str, tuple[float, ...]]:
     """Return the true values of all that may be told, by their key in a vehicle file.
 
-    The torque coefficient is that which goes with the inertia about z that is in the file then: it
-    follows those about the axes `told`, and is the start's without.
+    The torque coefficient is that which goes with what else is in the file then: the inertia about
+    z, which follows those about the axes `told` where it was not, and the thrust coefficient,
+    which only rotor speeds tell.
     """
     true, begun = fleet.truth, start()
     assert true.motors is not None
     ratio = np.asarray(true.inertia) / begun.inertia
-    follows = float(np.sqrt(np.prod([ratio["xy".index(axis)] for axis in told])) / ratio[2])
+    twist = true.rotors.torque_coefficient
+    if "z" not in told:
+        twist *= float(np.sqrt(np.prod([ratio["xy".index(axis)] for axis in told])) / ratio[2])
+    if drive != "rotors":
+        twist *= begun.rotors.thrust_coefficient / true.rotors.thrust_coefficient
     return {
         "motors.thrust": true.motors.thrust,
         "motors.voltage_exponent": (true.motors.voltage_exponent,),
@@ -184,7 +189,7 @@ def truths(fleet: Fleet, told: str = "xy") -> Mapping[str, tuple[float, ...]]:
         "effects.command_delay.delay": (true.effects[DELAY].delay,),
         "inertia": true.inertia,
         "rotors.thrust_coefficient": (true.rotors.thrust_coefficient,),
-        "rotors.torque_coefficient": (true.rotors.torque_coefficient * follows,),
+        "rotors.torque_coefficient": (twist,),
         "rotors.time_constant": (true.rotors.time_constant,),
         "controller.rate_gain": true.controller.rate_gain,
     }
@@ -211,6 +216,12 @@ def _commands(truth: Vehicle, recording: Recording) -> np.ndarray:
     volts = recording.voltage
     volts = np.concatenate([volts[late:], np.repeat(volts[-1:], late)])
     return applied / ((volts / motors.voltage) ** motors.voltage_exponent)[:, None]
+
+
+def _row_means(values: np.ndarray, period: int) -> np.ndarray:
+    """Return the means (T, 4) of `values` (K, 4) until the next row: what a row's command is."""
+    padded = np.concatenate([values, np.repeat(values[-1:], -len(values) % period, axis=0)])
+    return padded.reshape(-1, period, values.shape[1]).mean(axis=1)
 
 
 def _erring(log: FlightLog, slow: Slow, rng: np.random.Generator) -> FlightLog:
