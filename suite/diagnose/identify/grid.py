@@ -151,7 +151,7 @@ def _turning(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     rate_b = np.full((len(quat), 3), np.nan)
-    whole = np.isfinite(quat).all(axis=1)
+    whole = np.asarray(np.isfinite(quat).all(axis=1))
     rows = 1 + np.flatnonzero(whole[:-2] & whole[2:])
     if len(rows):
         before, after = (Rotation.from_quat(quat[rows + d][:, [1, 2, 3, 0]]) for d in (-1, 1))
