@@ -29,7 +29,7 @@ COMMANDS: dict[str, str] = {
     "identify": "find the numbers of a vehicle file in flight logs",
     "effects": "the physical effects that a vehicle file may hold",
     "eval": "judge policies: success rates, speeds and lap times, with intervals",
-    "example": "flights with a hidden effect, to try the diagnosis on",
+    "example": "flights with a hidden effect, or of a real quadrotor, to try the diagnosis on",
     "export": "write a policy as torch program, ONNX and C",
     "fly": "a policy in real time over MAVLink, as a companion computer flies it",
     "import": "a flight of PX4, Betaflight, a Crazyflie, ROS 2 or a table as a flight log",

@@ -1,4 +1,4 @@
-"""`suite example`: flights with a hidden effect, to see what `suite diagnose` says of them."""
+"""`suite example`: flights to try `suite diagnose` on, simulated or of a real quadrotor."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from suite.common.console import Console
 
 @dataclass(frozen=True)
 class Config:
-    """Copy three short flights and their vehicle file into a folder, to try suite diagnose on."""
+    """Copy short flights into a folder, to try suite diagnose, import and identify on."""
 
     out: Path = Path("example")
-    """Folder for flight_1.parquet to flight_3.parquet and vehicle.toml."""
+    """Folder for flight_1.parquet to flight_3.parquet and vehicle.toml, or for what is real."""
+    real: bool = False
+    """Instead: two raw logs of a real quadrotor with their mapping, licence and a README."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -25,18 +27,27 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         OSError: where the folder cannot be written.
     """
-    from importlib.resources import files
-
+    from suite.diagnose.example.real import real_files
     from tracks.common.files import replacing_file
 
     config.out.mkdir(parents=True, exist_ok=True)
-    names = []
-    for source in files("suite.diagnose.example").iterdir():
-        if source.name.endswith((".parquet", ".toml")):
-            with replacing_file(config.out / source.name) as beside:
-                beside.write_bytes(source.read_bytes())
-            names.append(source.name)
-    vehicle = config.out / "vehicle.toml"
-    console.say(f"wrote {', '.join(sorted(names))} to {config.out}")
-    console.say(f"now: suite diagnose {config.out} --vehicle {vehicle} --out runs/example")
-    return {"folder": str(config.out), "files": sorted(names)}
+    copied = real_files() if config.real else _simulated()
+    for name, whole in copied.items():
+        with replacing_file(config.out / name) as beside:
+            beside.write_bytes(whole)
+    names = sorted(copied)
+    console.say(f"wrote {', '.join(names)} to {config.out}")
+    if config.real:
+        console.say(f"now: what {config.out / 'README.md'} says, or docs/vehicle.md's walk")
+    else:
+        vehicle = config.out / "vehicle.toml"
+        console.say(f"now: suite diagnose {config.out} --vehicle {vehicle} --out runs/example")
+    return {"folder": str(config.out), "files": names}
+
+
+def _simulated() -> dict[str, bytes]:
+    from importlib.resources import files
+
+    folder = files("suite.diagnose.example").iterdir()
+    sources = [file for file in folder if file.name.endswith((".parquet", ".toml"))]
+    return {source.name: source.read_bytes() for source in sources}

@@ -46,10 +46,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     console.say(f"driven by {DRIVEN[result['drive']]}")
     for key, entry in result["parameters"].items():
         values, spans = entry["value"], entry["ci95"]
+        # What yaws follows what rolls and pitches.
+        left = "goes with the others" if key == "inertia" else "as it was"
         if not isinstance(values, list):
             values, spans = [values], [spans]
         shown = [
-            f"{v:.4g} ({s[0]:.4g} to {s[1]:.4g})" if s else f"{v:.4g} (as it was)"
+            f"{v:.4g} ({s[0]:.4g} to {s[1]:.4g})" if s else f"{v:.4g} ({left})"
             for v, s in zip(values, spans, strict=True)
         ]
         console.say(f"  {key}: {', '.join(shown)} {entry['unit']}")
@@ -66,4 +68,5 @@ DRIVEN = {
     "pwm": "motor commands and the battery",
     "torques": "commanded thrust and torques",
     "rates": "commanded thrust and body rates",
+    "thrust": "commanded thrust alone",
 }

@@ -9,8 +9,8 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap
-from suite.diagnose.plans.sensors import Sensors, log_of
-from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.fleets import Fleet, logs_of, recordings_of
+from suite.diagnose.plans.sensors import Sensors
 from suite.diagnose.plans.trajectory import Trajectory
 
 DRAG, DELAY = (0.3, 0.4, 0.2), 0.012
@@ -57,38 +57,10 @@ def start():
 @cache
 def recordings(ways=WAYS):
     """What happened on the flights, at every step."""
-    return [fly(vehicle(), truth(), [way], rate_hz=SENSORS.rate_hz)[0] for way in ways]
+    return recordings_of(Fleet(truth(), ways))
 
 
 def logs(drive, seed, ways=WAYS):
     """Their logs with noise, with what `drive` needs and no other drive."""
-    found = []
-    for index, recording in enumerate(recordings(ways)):
-        rng = np.random.default_rng((seed, index))
-        log = log_of(recording, truth(), SENSORS, rng, f"flight_{index}")
-        log = replace(log, extra={}, about={})
-        if drive != "rotors":
-            log = replace(log, rotor_speed=None)
-        if drive != "rates":
-            log = replace(log, thrust_cmd=None, rate_cmd_b=None)
-        if drive == "pwm":
-            log = replace(log, pwm=_commands(recording))
-        found.append(log)
-    return found
-
-
-def _commands(recording):
-    """The motor commands behind the rotor speeds, at the rows: undone lag, delay and map."""
-    rotors = vehicle().rotors
-    keep = np.exp(-recording.dt / rotors.time_constant)
-    speed = recording.rotor_speed
-    asked = (speed[1:] - keep * speed[:-1]) / (1.0 - keep)
-    asked = np.concatenate([asked, asked[-1:]])
-    thrust = rotors.thrust_coefficient * asked**2
-    # What acts DELAY later was commanded now, at the voltage of then.
-    first, second = MOTORS.thrust
-    applied = (-first + np.sqrt(first**2 + 4.0 * second * thrust)) / (2.0 * second)
-    share = applied / ((recording.voltage / MOTORS.voltage) ** MOTORS.voltage_exponent)[:, None]
-    late = round(DELAY / recording.dt)
-    sooner = np.concatenate([share[late:], np.repeat(share[-1:], late, axis=0)])
-    return sooner[:: recording.period]
+    fleet = Fleet(truth(), ways)
+    return logs_of(fleet, recordings(ways), drive, np.random.default_rng(seed), sensors=SENSORS)

@@ -16,6 +16,7 @@ DRIVES = {
     "pwm": ("pwm",),
     "torques": ("thrust_cmd", "torque_cmd_b"),
     "rates": ("thrust_cmd", "rate_cmd_b"),
+    "thrust": ("thrust_cmd",),
 }
 """Signals by drive; the first that all flights have counts."""
 
@@ -44,7 +45,7 @@ def drive_of(flights: Sequence[FlightGrid]) -> str:
             return name
     raise ValueError(
         "the flights share no drive: every one needs rotor speeds, motor commands (pwm_1 to "
-        "pwm_4), or a thrust command with rates or torques"
+        "pwm_4), or a thrust command; those of another kind can be identified apart"
     )
 
 

@@ -16,13 +16,12 @@ from suite.diagnose.identify import force
 from suite.diagnose.identify.drive import MotorGuess
 from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.numbers import Number, number
+from suite.diagnose.identify.torque import inertia_ratio
 
 
 def inertia_of(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
     """Return the inertia (3,); what yaws is scaled as the others where nothing tells it."""
-    x, y = (numbers.get(f"inertia_{axis}", 0.0) for axis in "xy")
-    z = numbers.get("inertia_z", 0.5 * (x + y))
-    found = np.asarray(vehicle.inertia) * np.exp([x, y, z])
+    found = np.asarray(vehicle.inertia) * np.exp(inertia_ratio(numbers))
     # No body has more about one axis than about the other two together.
     return np.minimum(found, found.sum() - found)
 
@@ -82,13 +81,17 @@ def of_force(vehicle: Vehicle, drive: str, guess: MotorGuess, fitted: Fitted) ->
                 [("thrust",)],
             )
         )
-    if "drag_x" in names:
+    if "drag_z" in names:
+        drag = vehicle.effects.get("linear_drag")
+        begun = (0.0, 0.0, 0.0) if drag is None else drag.coefficient
         entries.append(
             number(
                 "effects.linear_drag.coefficient",
                 "1/s",
                 fitted,
-                lambda n: np.array([n[f"drag_{axis}"] for axis in "xyz"]),
+                lambda n: np.array(
+                    [n.get(f"drag_{axis}", have) for axis, have in zip("xyz", begun, strict=True)]
+                ),
                 [(f"drag_{axis}",) for axis in "xyz"],
             )
         )
@@ -120,13 +123,15 @@ def of_torque(
             )
         )
     if "yaw" in names:
-        # Torque per inertia is what is seen, and the inertia about z follows those about x and y.
+        # Torque per inertia is what is seen. The inertia about z is as far as it was told; what
+        # stays is given, and no doubt of this number.
         start = vehicle.rotors.torque_coefficient
+        axes = [name for name in ("inertia_x", "inertia_y", "inertia_z") if fitted.has(name)]
 
         def twist(n: Any) -> np.ndarray:
-            follows = 0.5 * (n.get("inertia_x", 0.0) + n.get("inertia_y", 0.0))
+            inertia = inertia_ratio({name: n[name] for name in axes})[2]
             scaled = scale if drive == "rotors" else 0.0
-            return np.array([start * np.exp(n["yaw"] + scaled + follows)])
+            return np.array([start * np.exp(n["yaw"] + scaled + inertia)])
 
         entries.append(
             number("rotors.torque_coefficient", "N m/(rad/s)^2", fitted, twist, [("yaw",)])

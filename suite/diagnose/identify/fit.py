@@ -1,7 +1,8 @@
 """Least squares with intervals from how parts of flights, and flights, disagree.
 
-Gauss and Newton with Huber's weights. A number's error is the jackknife of blocks of a
-flight (the sandwich CR3; neighbouring windows are not independent). Where the flights
+Gauss and Newton with Huber's weights. A number's error is the jackknife of blocks of a flight (the
+sandwich CR3; neighbouring windows are not independent), with Student's t of so many blocks. What
+another fit gave is known no better than that fit says (Murphy and Topel 1985). Where the flights
 differ by more than their blocks explain (Cochran's Q), the flights are the units and Student's t
 their quantile. A number that the flights cannot tell is left as it was, the worst first, and the
 others are fitted again.
@@ -29,6 +30,10 @@ DIFFER_P = 0.05
 """Flights differ where chance would make them do so more rarely than this."""
 FEWEST = 3
 """Flights, to say that they differ."""
+
+
+class NothingWhole(ValueError):
+    """No stretch of the flights is whole enough to compare anything in."""
 
 
 class Unknown(NamedTuple):
@@ -62,6 +67,14 @@ Misses = Callable[[np.ndarray], Sequence[Rows]]
 """From all numbers to the residuals of every flight."""
 
 
+class Given(NamedTuple):
+    """Numbers that another fit has told; they are not looked for, and doubted as it doubts them."""
+
+    names: tuple[str, ...] = ()
+    covariance: np.ndarray = np.zeros((0, 0))
+    """Of these."""
+
+
 @dataclass(frozen=True)
 class Fitted:
     """What a fit found."""
@@ -77,17 +90,31 @@ class Fitted:
     """Left as they were: these flights cannot tell them."""
     left: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(C,) root mean square of what is left in each channel."""
+    given: tuple[str, ...] = ()
+    """Told by another fit."""
 
     def has(self, name: str) -> bool:
-        """Return whether the flights told the number."""
-        return any(u.name == name for u in self.unknowns) and name not in self.untold
+        """Return whether this fit told the number."""
+        looked_for = any(u.name == name for u in self.unknowns)
+        return looked_for and name not in (*self.untold, *self.given)
+
+    def give(self, *names: str) -> Given:
+        """Return those of `names` that are there, for a fit that is built on them."""
+        there = [k for k, unknown in enumerate(self.unknowns) if unknown.name in names]
+        told = tuple(self.unknowns[k].name for k in there)
+        return Given(told, self.covariance[np.ix_(there, there)])
 
     def index(self, name: str) -> int:
         """Return where the number is."""
         return [u.name for u in self.unknowns].index(name)
 
 
-def fit(misses: Misses, unknowns: Sequence[Unknown], held: Sequence[str] = ()) -> Fitted:
+def fit(
+    misses: Misses,
+    unknowns: Sequence[Unknown],
+    held: Sequence[str] = (),
+    given: Given | None = None,
+) -> Fitted:
     """Return the numbers that make `misses` least, with intervals.
 
     What is left as it was may be wrong by its `room`; that is part of the others' intervals.
@@ -96,25 +123,28 @@ def fit(misses: Misses, unknowns: Sequence[Unknown], held: Sequence[str] = ()) -
         misses: the residuals.
         unknowns: the numbers.
         held: those that are left as they are from the first.
+        given: those of `unknowns` that another fit has told.
 
     Raises:
-        ValueError: where there is not one window.
+        NothingWhole: where there is not one window.
     """
-    unknowns, untold = tuple(unknowns), list(held)
+    unknowns, untold, given = tuple(unknowns), list(held), given or Given()
     value = np.array([unknown.start for unknown in unknowns])
     if not sum(len(rows.value) for rows in misses(value)):
-        raise ValueError("no stretch of these flights is whole enough to compare anything in")
+        raise NothingWhole("no stretch of these flights is whole enough to compare anything in")
     while True:
-        free = [k for k, unknown in enumerate(unknowns) if unknown.name not in untold]
+        left = (*untold, *given.names)
+        free = [k for k, unknown in enumerate(unknowns) if unknown.name not in left]
         value = _least(misses, unknowns, value, free)
-        covariance, half = _errors(misses, unknowns, value, free)
+        covariance, half = _errors(misses, unknowns, value, free, given)
         ratio = [half[k] / unknowns[k].room for k in free]
         if not free or max(ratio) <= 1.0:
             break
         worst = free[int(np.argmax(ratio))]
         untold.append(unknowns[worst].name)
         value[worst] = unknowns[worst].start
-    return Fitted(unknowns, value, half, covariance, tuple(untold), _left(misses, unknowns, value))
+    misfit = _left(misses, unknowns, value)
+    return Fitted(unknowns, value, half, covariance, tuple(untold), misfit, given.names)
 
 
 def _levelled(rows: Rows) -> np.ndarray:
@@ -212,7 +242,11 @@ def _normal(
 
 
 def _errors(
-    misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray, free: Sequence[int]
+    misses: Misses,
+    unknowns: Sequence[Unknown],
+    value: np.ndarray,
+    free: Sequence[int],
+    given: Given,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the covariance (P, P) and the half-widths (P,)."""
     from scipy.stats import chi2, t
@@ -221,10 +255,14 @@ def _errors(
     half = np.full(total, np.nan)
     if not free:
         return np.diag([unknown.room**2 for unknown in unknowns]), half
-    told, free = list(free), range(total)
-    rows, slopes = misses(value), _slopes(misses, unknowns, value, free)
+    names = [unknown.name for unknown in unknowns]
+    told, taken = list(free), [names.index(name) for name in given.names]
+    free = [k for k in range(total) if k not in taken]
+    rows, slopes = misses(value), _slopes(misses, unknowns, value, range(total))
     weights = _weights(rows)
-    square, _ = _normal(rows, weights, slopes)
+    whole, _ = _normal(rows, weights, slopes)
+    square = whole[np.ix_(free, free)]
+    slopes = [slope[..., free] for slope in slopes]
     doubt = np.array([0.0 if k in told else 1.0 / unknowns[k].room ** 2 for k in free])
     square = square + np.diag(doubt)
     scale = np.sqrt(np.maximum(np.diag(square), TINY))
@@ -247,7 +285,9 @@ def _errors(
     blocks = influence.T @ influence + inverse @ np.diag(doubt) @ inverse
     sums = np.array([each.sum(axis=0) for each in by_flight])
     flights = [k for k, each in enumerate(by_flight) if len(each)]
-    widest = Z95 * np.sqrt(np.maximum(np.diag(blocks), 0.0))
+    # With few blocks their spread is itself not well known (Bell and McCaffrey 2002).
+    quantile = float(t.ppf(0.975, max(len(influence) - 1, 1)))
+    widest = quantile * np.sqrt(np.maximum(np.diag(blocks), 0.0))
     if len(flights) >= FEWEST:
         spread = np.array([(each**2).sum(axis=0) for each in by_flight])[flights]
         q = (sums[flights] ** 2 / np.maximum(spread, 1e-300)).sum(axis=0)
@@ -259,11 +299,19 @@ def _errors(
     widest = np.maximum(widest, BLIND * Z95 * np.sqrt(np.diag(inverse)))
     floor = np.array([unknowns[k].floor for k in free])
     widest = np.sqrt(widest**2 + floor**2)
+    most = np.array([np.inf if k in told else Z95 * unknowns[k].room for k in free])
+    widest = np.minimum(widest, most)
     sd = np.sqrt(np.diag(blocks))
     alike = blocks / np.maximum(np.outer(sd, sd), 1e-30)
     np.fill_diagonal(alike, 1.0)
-    half[told] = widest[told]
-    return alike * np.outer(widest, widest) / Z95**2, half
+    # What was given moves the numbers by so much.
+    follow = inverse @ whole[np.ix_(free, taken)]
+    found = alike * np.outer(widest, widest) / Z95**2 + follow @ given.covariance @ follow.T
+    covariance = np.zeros((total, total))
+    covariance[np.ix_(free, free)] = found
+    covariance[np.ix_(taken, taken)] = given.covariance
+    half[told] = Z95 * np.sqrt(np.diag(covariance)[told])
+    return covariance, half
 
 
 def _left(misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray) -> np.ndarray:

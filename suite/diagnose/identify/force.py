@@ -1,8 +1,13 @@
-"""The force on the body: thrust by what drove the motors, and drag, under the measured attitude."""
+"""The force on the body: thrust by what drove the motors, and drag, under the measured attitude.
+
+Where no flight has an attitude, thrust is along what the path's acceleration and gravity make up
+together (differential flatness; Mellinger and Kumar 2011), and only its size is asked for.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,25 +15,38 @@ from eval.effects.interface import GRAVITY
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.identify.drive import MotorGuess, delayed, lagged, motor_thrusts, rotor_thrusts
 from suite.diagnose.identify.fit import Fitted, Rows, Unknown, fit
-from suite.diagnose.identify.grid import FlightGrid, blocks_of, over, windows_of
+from suite.diagnose.identify.grid import FlightGrid, Windows, blocks_of, over, windows_of
 
 WIDTH_S = 0.4
 BLOCK_S = 2.0
-DRIVEN = {"pwm": "pwm", "rotors": "rotor_speed", "torques": "thrust_cmd", "rates": "thrust_cmd"}
+DRIVEN = {"pwm": "pwm", "rotors": "rotor_speed"}
+"""By drive, what pushes; under all others the commanded thrust."""
+SLOW = 2.0
+"""Without an attitude, windows faster than this are left out: a drag across the thrust would add to
+its size, by 0.3 % at this speed and 0.4 1/s [m/s]."""
 LEVEL = np.array([True, True, False])
 """A flight's trim of the attitude is free; along z it would be the thrust."""
 
 
 def unknowns_of(
-    drive: str, guess: MotorGuess, voltage: bool, drag: Sequence[float]
+    drive: str, guess: MotorGuess, voltage: bool, drag: Sequence[float], leaning: bool = False
 ) -> list[Unknown]:
-    """Return the numbers of the force; their starts are those of the vehicle file."""
-    unknowns = [Unknown("thrust", 0.0, -2.0, 2.0, 0.25, 1e-3, 0.001)]
+    """Return the numbers of the force; their starts are those of the vehicle file.
+
+    Args:
+        drive: one of `drive.DRIVES`.
+        guess: of the motors, where `drive` is pwm.
+        voltage: whether the flights have one.
+        drag: of the vehicle file [1/s].
+        leaning: whether no flight has an attitude.
+    """
+    floor = 0.004 if leaning else 0.001
+    unknowns = [Unknown("thrust", 0.0, -2.0, 2.0, 0.25, 1e-3, floor)]
     if drive == "pwm":
         unknowns.append(Unknown("curve", guess.curve, -0.1, 1.0, 0.35, 1e-2, 0.02))
         if voltage:
             unknowns.append(Unknown("battery", guess.battery, 0.0, 4.0, 0.6, 1e-2, 0.02))
-    for axis, start in zip("xyz", drag, strict=True):
+    for axis, start in list(zip("xyz", drag, strict=True))[2 if leaning else 0 :]:
         unknowns.append(Unknown(f"drag_{axis}", start, -2.0, 5.0, 0.25, 1e-2, 0.004))
     return unknowns
 
@@ -46,7 +64,7 @@ def fit_force(
     """Return the thrust's and the drag's numbers.
 
     Args:
-        flights: on their grids, with attitude and position.
+        flights: on their grids, with positions; all with an attitude, or none.
         vehicle: mass, rotors.
         drive: one of `drive.DRIVES`.
         guess: of the motors, where `drive` is pwm.
@@ -56,21 +74,18 @@ def fit_force(
         fixed: numbers that are not looked for.
     """
     names = [unknown.name for unknown in unknowns]
-    prepared = [_prepared(flight, DRIVEN[drive]) for flight in flights]
+    driven = DRIVEN.get(drive, "thrust_cmd")
+    prepared = [_prepared(flight, driven) for flight in flights]
 
     def misses(value: np.ndarray) -> list[Rows]:
         told = {**fixed, **dict(zip(names, value, strict=True))}
+        drag = np.array([told.get(f"drag_{axis}", 0.0) for axis in "xyz"])
         out = []
-        for flight, (windows, up_w, drag_b, felt, block) in zip(flights, prepared, strict=True):
+        for flight, known in zip(flights, prepared, strict=True):
             force = force_of(flight, vehicle, drive, guess, told, lag_s, delay_s)
-            # Along the body's axes of the window's middle, so that a channel is an axis.
-            pushed = np.einsum(
-                "kji,kj->ki",
-                flight.known["rot_w"][windows.middle],
-                over(windows, up_w * force[:, None]),
-            )
-            drag = np.array([told.get(f"drag_{axis}", 0.0) for axis in "xyz"])
-            out.append(Rows(felt - pushed + drag_b @ drag, block, LEVEL))
+            pushed = known.pushed(force)
+            level = LEVEL[-pushed.shape[1] :]
+            out.append(Rows(known.felt - pushed + known.drag_b @ drag, known.block, level))
         return out
 
     return fit(misses, unknowns)
@@ -106,24 +121,53 @@ def with_told(guess: MotorGuess, told: Mapping[str, float]) -> MotorGuess:
     return guess._replace(**shape)
 
 
-def _prepared(flight: FlightGrid, driven: str) -> tuple:
-    """Return what does not change from trial to trial: windows, and the measured sides."""
+class _Prepared(NamedTuple):
+    """What does not change from trial to trial: windows, and the measured sides."""
+
+    windows: Windows
+    up_w: np.ndarray | None
+    """(G, 3) body z; None where only the force's size is asked for."""
+    axes_w: np.ndarray
+    """(K, 3, C) the channels' axes: those of the body in the window's middle."""
+    felt: np.ndarray
+    """(K, C) specific force along them [m/s^2]."""
+    drag_b: np.ndarray
+    """(K, C, 3) what a unit of drag along each body axis pulls along them."""
+    block: np.ndarray
+    """(K,) number of the window's block."""
+
+    def pushed(self, force: np.ndarray) -> np.ndarray:
+        """Return the means (K, C) of a thrust per mass (G,) along the channels."""
+        if self.up_w is None:
+            return over(self.windows, force[:, None])
+        pushed_w = over(self.windows, self.up_w * force[:, None])
+        return np.einsum("kji,kj->ki", self.axes_w, pushed_w)
+
+
+def _prepared(flight: FlightGrid, driven: str) -> _Prepared:
     moved = "vel_w" if flight.has("vel_w") else "pos_w"
-    windows = windows_of(flight, WIDTH_S, (moved, "rot_w", driven))
-    if moved == "vel_w":
-        acc_w = over(windows, flight.known["vel_w"], windows.slope)
-        vel_w = flight.known["vel_w"]
-    else:
-        acc_w = over(windows, flight.known["pos_w"], windows.bend)
-        vel_w = _velocity(flight.known["pos_w"])
+    attitude = ("rot_w",) if flight.has("rot_w") else ()
+    windows = windows_of(flight, WIDTH_S, (moved, driven, *attitude))
+    vel_w = flight.known["vel_w"] if moved == "vel_w" else _velocity(flight.known["pos_w"])
+    if not attitude:
+        speed = over(windows, np.linalg.norm(np.nan_to_num(vel_w), axis=1)[:, None])[:, 0]
+        windows = windows._replace(first=windows.first[speed < SLOW])
+    weight = windows.slope if moved == "vel_w" else windows.bend
+    felt_w = over(windows, flight.known[moved], weight) + [0.0, 0.0, GRAVITY]
+    block = blocks_of(flight, windows, BLOCK_S)
+    if not attitude:
+        size = np.linalg.norm(felt_w, axis=1, keepdims=True)
+        up_w = felt_w / size
+        along = (over(windows, np.nan_to_num(vel_w)) * up_w).sum(axis=1)
+        drag_b = along[:, None, None] * np.array([0.0, 0.0, 1.0])
+        return _Prepared(windows, None, up_w[:, :, None], size, drag_b, block)
     rot_w = flight.known["rot_w"]
-    felt_w = acc_w + [0.0, 0.0, GRAVITY]
-    felt = np.einsum("kji,kj->ki", rot_w[windows.middle], felt_w)
+    axes_w = rot_w[windows.middle]
+    felt = np.einsum("kji,kj->ki", axes_w, felt_w)
     vel_b = np.einsum("gji,gj->gi", rot_w, vel_w)
-    # What a unit of drag along each body axis pushes, in the axes of the window's middle.
     pulled_w = over(windows, rot_w * np.nan_to_num(vel_b)[:, None, :])
-    drag_b = np.einsum("kji,kjd->kid", rot_w[windows.middle], pulled_w)
-    return windows, rot_w[:, :, 2], drag_b, felt, blocks_of(flight, windows, BLOCK_S)
+    drag_b = np.einsum("kji,kjd->kid", axes_w, pulled_w)
+    return _Prepared(windows, rot_w[:, :, 2], axes_w, felt, drag_b, block)
 
 
 def _velocity(pos_w: np.ndarray) -> np.ndarray:

@@ -72,6 +72,8 @@ def grid_of(log: FlightLog) -> FlightGrid:
             known[name] = _joined(time_s, values, grid)
     if np.isfinite(log.quat_wxyz).any():
         known["rot_w"] = quat_to_rot(_attitude(time_s, log.quat_wxyz, grid))
+        if "rate_b" not in known:
+            known["rate_b"] = _joined(time_s, _turning(time_s, log.quat_wxyz), grid)
     if log.voltage is not None and np.isfinite(log.voltage).any():
         good = np.isfinite(log.voltage)
         volts = np.interp(grid, time_s[good], log.voltage[good])
@@ -142,6 +144,20 @@ def _attitude(time_s: np.ndarray, quat: np.ndarray, grid: np.ndarray) -> np.ndar
     out /= np.linalg.norm(out, axis=1, keepdims=True)
     out[_in_hole(t, grid)] = np.nan
     return out
+
+
+def _turning(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Return the body rates (T, 3) from each row's neighbours; NaN where one is missing."""
+    from scipy.spatial.transform import Rotation
+
+    rate_b = np.full((len(quat), 3), np.nan)
+    whole = np.asarray(np.isfinite(quat).all(axis=1))
+    rows = 1 + np.flatnonzero(whole[:-2] & whole[2:])
+    if len(rows):
+        before, after = (Rotation.from_quat(quat[rows + d][:, [1, 2, 3, 0]]) for d in (-1, 1))
+        step_s = (time_s[rows + 1] - time_s[rows - 1])[:, None]
+        rate_b[rows] = (before.inv() * after).as_rotvec() / step_s
+    return rate_b
 
 
 def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:

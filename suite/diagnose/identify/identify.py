@@ -6,7 +6,7 @@ in both. Mass is never fitted: scaling it together with inertia and thrust chang
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,9 +24,10 @@ from suite.diagnose.identify.drive import (
     with_motors,
 )
 from suite.diagnose.identify.entries import inertia_of, of_force, of_loop, of_torque, put
-from suite.diagnose.identify.fit import Fitted
+from suite.diagnose.identify.fit import Fitted, NothingWhole, Unknown
 from suite.diagnose.identify.grid import FlightGrid, grid_of
 from suite.diagnose.identify.numbers import Number, told
+from suite.diagnose.identify.untold import unasked, untold
 
 ROUNDS = 2
 """Force and torque in turn."""
@@ -34,24 +35,6 @@ KNOWN_MOTORS = ("rotors", "pwm")
 """Drives under which the rotors' thrusts are known beside the commands."""
 NO_LAG_S = 0.004
 """A rotor's lag below this is not believed where the start has a longer one [s]."""
-WHY = {
-    "thrust": "thrust: too little of the force along body z is explained",
-    "curve": "curvature of the thrust curve: the motor commands hardly change",
-    "battery": "voltage_exponent: the voltage hardly changes",
-    "drag_x": "drag along body x: too slow, or too little of it",
-    "drag_y": "drag along body y: too slow, or too little of it",
-    "drag_z": "drag along body z: too slow, or too little of it",
-    "inertia_x": "inertia about x: the body hardly rolls, or the rotors' lag may be another",
-    "inertia_y": "inertia about y: the body hardly pitches, or the rotors' lag may be another",
-    "inertia_z": "inertia about z: the body hardly yaws",
-    "yaw": "torque_coefficient: the body hardly yaws",
-    "lag": "time_constant of the rotors: nothing fast enough is asked of them",
-    "late": "command_delay: nothing fast enough is asked of the motors",
-    "gain_x": "rate_gain about x: the body hardly rolls",
-    "gain_y": "rate_gain about y: the body hardly pitches",
-    "gain_z": "rate_gain about z: the body hardly yaws",
-}
-"""What was not told, and what the flights lack for it."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +48,7 @@ class Identified:
     untold: tuple[str, ...]
     """What these flights cannot tell, in words; it was left as it was."""
     drive: str
-    """What drove the flights: pwm, rotors, torques or rates."""
+    """What drove the flights: pwm, rotors, torques, rates or thrust."""
     left: dict[str, list[float]]
     """Root mean square of what is left of force per mass and angular acceleration, per axis."""
     flights: tuple[str, ...]
@@ -76,7 +59,7 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
     """Return the numbers of `vehicle` that `logs` tell.
 
     Args:
-        logs: flights of one vehicle.
+        logs: flights of one vehicle; partial ones tell what they have the columns for.
         vehicle: to start from; what cannot be told stays as it is there.
         leave: what not to fit: any of drag, motors, inertia, lag, loop.
 
@@ -93,6 +76,11 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
         state.torque()
     if drive in KNOWN_MOTORS:
         state.loop()
+    if not state.fitted and not leave:
+        raise ValueError(
+            f"{', '.join(flight.name for flight in flights)}: no stretch of a second with "
+            "positions or body rates beside what drove it; import them again and read what it says"
+        )
     return state.done()
 
 
@@ -117,55 +105,71 @@ class _Start:
         self.scale = 0.0
 
     def force(self) -> None:
-        flights = [f for f in self.flights if f.has("rot_w") and f.has("pos_w")]
+        flights = [f for f in self.flights if f.has("vel_w") or f.has("pos_w")]
+        # Where no flight has an attitude, their paths say how they leaned.
+        leaning = not any(flight.has("rot_w") for flight in flights)
+        flights = [flight for flight in flights if leaning or flight.has("rot_w")]
         if not flights:
             return
         voltage = all(flight.has("voltage") for flight in flights)
-        unknowns = force.unknowns_of(self.drive, self.guess, voltage, self.drag.tolist())
+        unknowns = force.unknowns_of(self.drive, self.guess, voltage, self.drag.tolist(), leaning)
         left = {"drag": ("drag_",), "motors": ("thrust", "curve", "battery")}
         unknowns = _without(unknowns, left, self.leave)
         told_drag = {f"drag_{a}": d for a, d in zip("xyz", self.drag, strict=True)}
         if not unknowns:
             return
-        found = force.fit_force(
-            flights,
-            self.start,
-            self.drive,
-            self.guess,
-            unknowns,
-            self.lag_s,
-            self.delay_s,
-            told_drag,
-        )
+        try:
+            found = force.fit_force(
+                flights,
+                self.start,
+                self.drive,
+                self.guess,
+                unknowns,
+                self.lag_s,
+                self.delay_s,
+                told_drag,
+            )
+        except NothingWhole:
+            return
         self.fitted["force"] = found
         self.scale = told(found).get("thrust", 0.0)
 
-    def thrusts(self, flight: FlightGrid, lag_s: float, delay_s: float) -> np.ndarray:
-        scale = float(np.exp(self.scale))
+    def thrusts(
+        self, flight: FlightGrid, lag_s: float, delay_s: float, numbers: Mapping[str, float]
+    ) -> np.ndarray:
+        scale = float(np.exp(numbers.get("thrust", 0.0)))
         if self.drive == "rotors":
             return scale * rotor_thrusts(flight, self.start.rotors.thrust_coefficient)
-        numbers = told(self.fitted["force"]) if "force" in self.fitted else {}
-        guess = force.with_told(self.guess, numbers)
-        return scale * motor_thrusts(flight, guess, lag_s, delay_s)
+        return scale * motor_thrusts(flight, force.with_told(self.guess, numbers), lag_s, delay_s)
 
     def torque(self) -> None:
         flights = [flight for flight in self.flights if flight.has("rate_b")]
-        if self.drive == "rates" or not flights:
+        if self.drive in ("rates", "thrust") or not flights:
             return
         unknowns = torque.unknowns_of(self.drive, self.lag_s, self.delay_s)
         left = {"inertia": ("inertia_", "yaw"), "lag": ("lag", "late")}
         unknowns = _without(unknowns, left, self.leave)
         if not unknowns:
             return
-        given = self.lags()
-        found = torque.fit_torque(flights, self.start, self.drive, unknowns, self.thrusts, given)
+        given, doubted = self.lags(), None
+        if "force" in self.fitted and self.drive in KNOWN_MOTORS:
+            given |= told(self.fitted["force"])
+            doubted = self.fitted["force"].give(*torque.GIVEN)
+
+        def fitted(unknowns: Sequence[Unknown], held: Sequence[str] = ()) -> Fitted:
+            return torque.fit_torque(
+                flights, self.start, self.drive, unknowns, self.thrusts, given, held, doubted
+            )
+
+        try:
+            found = fitted(unknowns)
+        except NothingWhole:
+            return
         if found.has("lag") and told(found)["lag"] < NO_LAG_S < self.begun_s:
             # No rotor follows at once: what blurs the commands in the log hides its lag.
             self.lag_s = self.begun_s
             unknowns = [u._replace(start=self.begun_s) if u.name == "lag" else u for u in unknowns]
-            found = torque.fit_torque(
-                flights, self.start, self.drive, unknowns, self.thrusts, given, ("lag",)
-            )
+            found = fitted(unknowns, ("lag",))
         self.keep("torque", found)
 
     def loop(self) -> None:
@@ -179,8 +183,11 @@ class _Start:
             return
         # Lag and delay of known motors are told better by the torque.
         known = "rotors" in self.fitted or self.drive == "pwm" or "lag" in self.leave
-        unknowns = [*loop.gains(), *([] if known else both)]
-        self.keep("loop", loop.fit_loop(flown, self.start, unknowns, self.lags()))
+        teller = self.fitted.get("rotors", self.fitted.get("torque"))
+        doubted = teller.give("late", "lag") if known and teller is not None else None
+        wanted = [u for u in both if not known or (doubted and u.name in doubted.names)]
+        unknowns = [*loop.gains(), *loop.couplings(self.start), *wanted]
+        self.keep("loop", loop.fit_loop(flown, self.start, unknowns, self.lags(), doubted))
 
     def lags(self) -> dict[str, float]:
         return {"lag": self.lag_s, "late": self.lag_s + self.delay_s}
@@ -215,21 +222,15 @@ class _Start:
             vehicle = put(vehicle, entry)
         if "torque" in self.fitted and self.drive != "rates":
             vehicle = replace(vehicle, inertia=self.inertia())
-        untold = [WHY[name] for found in self.fitted.values() for name in found.untold]
-        seen = {entry.key for entry in kept.values() if any(s is not None for s in entry.ci95)}
-        untold = [u for u in dict.fromkeys(untold) if not _told_elsewhere(u, seen)]
+        lacking = unasked(self.flights, self.start, self.drive, self.fitted, self.leave)
+        lacking = (*untold(self.fitted), *lacking)
         left = {
             name: [float(v) for v in self.fitted[name].left]
             for name in ("force", "torque")
             if name in self.fitted
         }
         names = tuple(flight.name for flight in self.flights)
-        return Identified(vehicle, tuple(kept.values()), tuple(untold), self.drive, left, names)
-
-
-def _told_elsewhere(text: str, keys: set[str]) -> bool:
-    first = text.split(":")[0].split(" ")[0]
-    return any(key.endswith(first) for key in keys)
+        return Identified(vehicle, tuple(kept.values()), lacking, self.drive, left, names)
 
 
 def _value(vehicle: Vehicle, effect: str, key: str, otherwise: Any) -> Any:

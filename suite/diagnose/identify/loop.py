@@ -2,8 +2,9 @@
 
 The loop is flown by its commands alone and compared with the gyro (output error; Ljung 1999, Sec.
 4.3): measured rates in the loop's own equation would make the gyro's noise look like slower gains.
-Per axis, `lag d2w/dt2 + dw/dt + K w = K rate_cmd(t - delay)`, as the controller makes up for
-`w x J w` and rotor speeds change by little.
+Per axis, `lag d2w/dt2 + dw/dt + K w = K rate_cmd(t - delay) + lag de/dt + e`, where `e` is what is
+missed of `w x J w`: the controller makes up for it, but by rotors that lag. It is that of the rates
+without it (one step of Picard's iteration); rotor speeds are taken to change by little.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify.drive import delayed, filled
-from suite.diagnose.identify.fit import Fitted, Rows, Unknown, fit
+from suite.diagnose.identify.drive import delayed, filled, lagged
+from suite.diagnose.identify.fit import Fitted, Given, Rows, Unknown, fit
 from suite.diagnose.identify.force import BLOCK_S
 from suite.diagnose.identify.grid import STEP_S, FlightGrid, blocks_of, over, windows_of
 
@@ -28,19 +29,32 @@ def gains() -> list[Unknown]:
     return [Unknown(f"gain_{axis}", 0.0, -3.0, 3.0, 0.35, 1e-2, 0.02) for axis in "xyz"]
 
 
+def couplings(vehicle: Vehicle) -> list[Unknown]:
+    """Return how much two axes' rates turn the third, `(J_z - J_y) / J_x` and so on.
+
+    They are of no use but for the others' sake: the inertia behind them may be wrong.
+    """
+    x, y, z = vehicle.inertia
+    starts = ((z - y) / x, (x - z) / y, (y - x) / z)
+    both = zip("xyz", starts, strict=True)
+    return [Unknown(f"coupling_{a}", start, -1.0, 1.0, 0.2, 1e-2) for a, start in both]
+
+
 def fit_loop(
     flights: Sequence[FlightGrid],
     vehicle: Vehicle,
     unknowns: Sequence[Unknown],
     fixed: Mapping[str, float],
+    doubted: Given | None = None,
 ) -> Fitted:
     """Return gains, lag and delay; a constant rate of each flight is free (bias, trim).
 
     Args:
         flights: with rates and commanded rates.
         vehicle: gains to start from, and how often the loop looks.
-        unknowns: `gains` and `torque.lag_and_delay`, or some of them.
+        unknowns: `gains`, `couplings` and `torque.lag_and_delay`, or some of them.
         fixed: the others.
+        doubted: those of `unknowns` that another fit has told.
     """
     names = [unknown.name for unknown in unknowns]
     prepared = []
@@ -56,22 +70,33 @@ def fit_loop(
             for flight, (windows, rates, block) in zip(flights, prepared, strict=True)
         ]
 
-    return fit(misses, unknowns)
+    return fit(misses, unknowns, given=doubted)
 
 
 def followed(flight: FlightGrid, vehicle: Vehicle, told: Mapping[str, float]) -> np.ndarray:
     """Return the rates (G, 3) of the loop under its commands alone [rad/s]."""
     from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
-    # The loop looks at rates that are half a period old on average; commands act at once.
+    # The loop looks at rates that are half a period old on average: exp(-half s), to second order.
     half = 0.5 / vehicle.controller.frequency
-    lag = max(told["lag"], 1e-4) + half
-    wanted = filled(delayed(flight.known["rate_cmd_b"], told["late"] - told["lag"] - half))
-    out = np.empty_like(wanted)
-    for k, axis in enumerate("xyz"):
-        gain = vehicle.controller.rate_gain[k] * float(np.exp(told.get(f"gain_{axis}", 0.0)))
-        found: Any = cont2discrete(([gain], [lag, 1.0, gain]), STEP_S, method="foh")
-        top, bottom = np.ravel(found[0]), found[1]
-        state = lfilter_zi(top, bottom) * wanted[0, k]
-        out[:, k] = lfilter(top, bottom, wanted[:, k], zi=state)[0]
-    return out
+    lag = max(told["lag"], 1e-4)
+    wanted = filled(delayed(flight.known["rate_cmd_b"], told["late"] - told["lag"]))
+    ratio = np.exp([told.get(f"gain_{axis}", 0.0) for axis in "xyz"])
+    gains = np.asarray(vehicle.controller.rate_gain) * ratio
+
+    def answer(pushes: np.ndarray, tops: Sequence[list[float]]) -> np.ndarray:
+        out = np.empty_like(pushes)
+        for k, (gain, top) in enumerate(zip(gains, tops, strict=True)):
+            bottom = [lag + 0.5 * gain * half**2, 1.0 - gain * half, gain]
+            found: Any = cont2discrete((top, bottom), STEP_S, method="foh")
+            above, below = np.ravel(found[0]), found[1]
+            state = lfilter_zi(above, below) * pushes[0, k]
+            out[:, k] = lfilter(above, below, pushes[:, k], zi=state)[0]
+        return out
+
+    linear = answer(wanted, [[gain] for gain in gains])
+    # The controller makes up for `w x J w` by rotors that lag.
+    products = linear[:, [1, 2, 0]] * linear[:, [2, 0, 1]]
+    coupled = products * [told[f"coupling_{axis}"] for axis in "xyz"]
+    push = lagged(coupled, told["lag"]) - coupled
+    return linear + answer(push, [[lag, 1.0]] * 3)

@@ -41,8 +41,8 @@ def identify_files(
         if part not in PARTS:
             raise ValueError(f"--leave {part!r}: allowed: {', '.join(PARTS)}")
     start = load_vehicle(vehicle)
-    logs, warnings = read_flights(flight_files(flights))
-    console.say(f"{len(logs)} flights, {sum(log.duration_s for log in logs):.0f} s in all")
+    logs, warnings = read_flights(flight_files(flights), partial=True)
+    console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
     found = identify(logs, start, leave)
     save_vehicle(found.vehicle, out, _head(found, vehicle))
     return {
@@ -58,8 +58,12 @@ def identify_files(
     }
 
 
+def _counted(flights: int) -> str:
+    return "1 flight" if flights == 1 else f"{flights} flights"
+
+
 def _head(found: Identified, start: str) -> str:
-    lines = [f"From {start} by {len(found.flights)} flights ({found.drive}); 95 % intervals:"]
+    lines = [f"From {start} by {_counted(len(found.flights))} ({found.drive}); 95 % intervals:"]
     for entry in found.numbers:
         for k, (value, span) in enumerate(zip(entry.value, entry.ci95, strict=True)):
             part = f"[{k}]" if len(entry.value) > 1 else ""

@@ -9,7 +9,7 @@ import numpy as np
 
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.identify.drive import delayed, lagged, torque_of
-from suite.diagnose.identify.fit import Fitted, Rows, Unknown, fit
+from suite.diagnose.identify.fit import Fitted, Given, Rows, Unknown, fit
 from suite.diagnose.identify.force import BLOCK_S
 from suite.diagnose.identify.grid import FlightGrid, Windows, blocks_of, over, windows_of
 
@@ -20,8 +20,10 @@ motors slowly (trim, flapping at speed) turns nothing. Times this they are accel
 SPEED_WIDTH_S = 0.16
 LEVEL = np.array([False, False, False])
 
-Thrusts = Callable[[FlightGrid, float, float], np.ndarray]
-"""Rotor thrusts (G, 4) [N] of a flight, behind a lag and a delay [s]."""
+Thrusts = Callable[[FlightGrid, float, float, Mapping[str, float]], np.ndarray]
+"""Rotor thrusts (G, 4) [N] of a flight, behind a lag and a delay [s], by the force's numbers."""
+GIVEN = ("thrust", "curve", "battery")
+"""The force's numbers that the torque is built on."""
 
 
 def lag_and_delay(lag_s: float, delay_s: float) -> list[Unknown]:
@@ -34,13 +36,25 @@ def lag_and_delay(lag_s: float, delay_s: float) -> list[Unknown]:
 
 
 def unknowns_of(drive: str, lag_s: float, delay_s: float) -> list[Unknown]:
-    """Return the numbers of the torque; all but lag and delay are logarithms of ratios."""
+    """Return the numbers of the torque; all but lag and delay are logarithms of ratios.
+
+    That of the inertia about z is over the other two's mean, which it follows where nothing tells
+    it; and without known torques `yaw` is of what turns the body about z, over that inertia.
+    """
     lags = lag_and_delay(lag_s, delay_s)
     axes = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
+    room = 0.5 if drive == "torques" else 0.25
+    axes.append(Unknown("inertia_z", 0.0, -1.0, 1.0, room, 1e-2, 0.015))
     if drive == "torques":
-        return [*axes, Unknown("inertia_z", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015), *lags]
+        return [*axes, *lags]
     yaw = Unknown("yaw", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015)
     return [*axes, yaw] if drive == "rotors" else [*axes, yaw, *lags]
+
+
+def inertia_ratio(numbers: Mapping[str, float]) -> np.ndarray:
+    """Return the logarithms (3,) of the inertia over the start's."""
+    x, y, z = (numbers.get(f"inertia_{axis}", 0.0) for axis in "xyz")
+    return np.array([x, y, 0.5 * (x + y) + z])
 
 
 def fit_torque(
@@ -51,6 +65,7 @@ def fit_torque(
     thrusts: Thrusts | None,
     fixed: Mapping[str, float],
     held: Sequence[str] = (),
+    doubted: Given | None = None,
 ) -> Fitted:
     """Return inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
 
@@ -62,8 +77,18 @@ def fit_torque(
         thrusts: of the rotors, under pwm and rotors.
         fixed: numbers that are not looked for.
         held: numbers that are left as they are, in doubt.
+        doubted: numbers of the force among `fixed`, with their covariance.
     """
-    given, names = unknowns, [unknown.name for unknown in unknowns]
+    doubted = doubted or Given()
+    step = {"thrust": 1e-3}
+    unknowns = [
+        *unknowns,
+        *(
+            Unknown(name, fixed[name], -9.0, 9.0, 1.0, step.get(name, 1e-2))
+            for name in doubted.names
+        ),
+    ]
+    begun, names = unknowns, [unknown.name for unknown in unknowns]
     needs = {"pwm": "pwm", "rotors": "rotor_speed", "torques": "torque_cmd_b"}[drive]
     prepared = [_prepared(flight, needs) for flight in flights]
     inertia = np.asarray(vehicle.inertia)
@@ -80,9 +105,9 @@ def fit_torque(
     if late:
         best = _likeliest([unknown.start for unknown in unknowns], late[0], misses, prepared)
         unknowns = [u._replace(start=best) if u.name == "late" else u for u in unknowns]
-        found = fit(misses, unknowns, held)
-        return replace(found, unknowns=tuple(given))
-    return fit(misses, unknowns, held)
+        found = fit(misses, unknowns, held, doubted)
+        return replace(found, unknowns=tuple(begun))
+    return fit(misses, unknowns, held, doubted)
 
 
 def _likeliest(
@@ -144,7 +169,7 @@ def _turning(
 ) -> np.ndarray:
     """Return the mean angular accelerations (K, 3) over the windows [rad/s^2]."""
     rate = flight.known["rate_b"]
-    ratio = np.exp([told.get(f"inertia_{axis}", 0.0) for axis in "xyz"])
+    true = inertia * np.exp(inertia_ratio(told))
     if drive == "torques":
         torque = lagged(
             delayed(flight.known["torque_cmd_b"], told["late"] - told["lag"]), told["lag"]
@@ -155,8 +180,8 @@ def _turning(
         lag_s, delay_s = (
             (0.0, 0.0) if drive == "rotors" else (told["lag"], told["late"] - told["lag"])
         )
-        thrust = thrusts(flight, lag_s, delay_s)
-        torque = torque_of(vehicle, thrust) * [1.0, 1.0, np.exp(told.get("yaw", 0.0))]
-    true = inertia * ratio
+        thrust = thrusts(flight, lag_s, delay_s, told)
+        turning = np.exp(told.get("yaw", 0.0)) * true[2] / inertia[2]
+        torque = torque_of(vehicle, thrust) * [1.0, 1.0, turning]
     acceleration = (torque - np.cross(rate, true * rate)) / true
     return BAND * over(windows, acceleration, windows.slope)

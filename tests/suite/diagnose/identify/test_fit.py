@@ -1,8 +1,9 @@
 """The fit: known slopes come back, blind numbers stay, flights that differ widen the intervals."""
 
 import numpy as np
+import pytest
 
-from suite.diagnose.identify.fit import Rows, Unknown, fit
+from suite.diagnose.identify.fit import Given, NothingWhole, Rows, Unknown, fit
 
 SLOPE = Unknown("slope", 0.0, -10.0, 10.0, 1.0, 1e-3)
 BLIND = Unknown("blind", 4.0, -10.0, 10.0, 1.0, 1e-3)
@@ -49,3 +50,35 @@ def test_intervals_hold_the_truth_nineteen_times_in_twenty():
         for found in (fit(flights([2.0] * 4, count=100, seed=k), [SLOPE]) for k in range(100))
     ]
     assert 0.90 <= np.mean(inside) <= 0.99
+
+
+def test_what_is_given_widens_what_hangs_on_it():
+    """`y = (slope + given) x`: the slope is off by as much as what was given, and by no less."""
+    misses = flights([2.0] * 4)
+
+    def both(value):
+        return misses(np.array([value[0] + value[1]]))
+
+    given = Given(("given",), np.array([[0.1**2]]))
+    found = fit(both, [SLOPE, Unknown("given", 0.5, -9.0, 9.0, 1.0, 1e-3)], given=given)
+    alone = fit(misses, [SLOPE])
+    np.testing.assert_allclose(found.value, [1.5, 0.5], atol=0.02)
+    wanted = np.hypot(alone.half_width[0], 1.96 * 0.1)
+    np.testing.assert_allclose(found.half_width[0], wanted, rtol=1e-6)
+    assert np.isnan(found.half_width[1]) and not found.has("given") and found.untold == ()
+    np.testing.assert_allclose(found.give("given", "none").covariance, [[0.01]])
+
+
+def test_intervals_of_few_blocks_are_as_much_wider_as_students_t():
+    few, many = (
+        [fit(flights([2.0], count=count, seed=k), [SLOPE]).half_width[0] for k in range(60)]
+        for count in (40, 4000)
+    )
+    # 4 blocks of 10 rows: t(3) = 3.18 in place of 1.96; the jackknife itself is a bit wider still.
+    ratio = np.sqrt(np.mean(np.square(few)) * 40) / np.sqrt(np.mean(np.square(many)) * 4000)
+    assert 1.6 < ratio < 3.0
+
+
+def test_nothing_to_compare_is_said():
+    with pytest.raises(NothingWhole):
+        fit(flights([2.0], count=0), [SLOPE])

@@ -51,3 +51,15 @@ def test_commands_hold_until_the_next_row_and_measurements_are_joined():
     assert flight.known["pwm"][at, 0] == 0.0
     np.testing.assert_allclose(flight.known["rate_b"][at, 0], 0.8)
     assert not flight.has("voltage")
+
+
+def test_rates_that_are_not_logged_come_of_the_attitude():
+    time_s = np.arange(0.0, 2.0, 0.01)
+    half = 0.5 * 0.8 * time_s
+    quat = np.stack([np.cos(half), np.sin(half), 0 * half, 0 * half], axis=1)
+    still, none = np.zeros((200, 3)), np.full((200, 3), np.nan)
+    log = FlightLog("made", time_s, still, quat, still, none, pwm=np.zeros((200, 4)))
+    rate_b = grid_of(log).known["rate_b"]
+    known = np.isfinite(rate_b).all(axis=1)
+    assert known[10:-10].all()
+    np.testing.assert_allclose(rate_b[known], np.tile([0.8, 0.0, 0.0], (known.sum(), 1)), atol=1e-9)

@@ -1,8 +1,12 @@
 """Numbers of a known vehicle come back from its flights, each within its interval."""
 
+import importlib.util
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from eval.judging.statistics import wilson
 from suite.diagnose.identify.identify import identify
 from suite.diagnose.identify.numbers import as_json
 from tests.support import identified as known
@@ -36,7 +40,9 @@ def pulls(found):
     return off
 
 
-@pytest.mark.parametrize(("drive", "least"), [("rates", 9), ("pwm", 8), ("rotors", 5)])
+@pytest.mark.parametrize(
+    ("drive", "least"), [("rates", 9), ("pwm", 8), ("rotors", 7), ("torques", 7)]
+)
 def test_what_flights_tell_is_near_the_truth(drive, least):
     found = identify(known.logs(drive, 0), known.start())
     off = pulls(found)
@@ -45,15 +51,40 @@ def test_what_flights_tell_is_near_the_truth(drive, least):
     assert np.max(np.abs(list(off.values()))) < 2.5
 
 
+@pytest.fixture(scope="module")
+def coverage(root):
+    """`tools/coverage.py`."""
+    spec = importlib.util.spec_from_file_location("coverage", root / "tools" / "coverage.py")
+    assert spec and spec.loader
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    return tool
+
+
+@pytest.fixture(scope="module")
+def fleet(coverage):
+    """A vehicle of drawn numbers, and its flights."""
+    return coverage.flown(0, 1)
+
+
+def test_drawn_numbers_come_back_within_their_intervals(coverage, fleet):
+    off = []
+    for case in coverage.CASES:
+        found = coverage.pulls(*fleet, case, np.random.default_rng(0))
+        assert len(found) >= 3, case
+        off += [pull for pull, _ in found.values()]
+    assert np.sqrt(np.mean(np.square(off))) < 0.75
+    assert np.max(np.abs(off)) < 2.5
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("drive", ["rates", "pwm", "rotors"])
-def test_intervals_hold_the_truth_as_often_as_they_say(drive):
-    inside = []
-    for seed in range(1, 25):
-        found = identify(known.logs(drive, seed), known.start())
-        inside += [abs(pull) < 1.0 for pull in pulls(found).values()]
-    assert len(inside) > 100
-    assert 0.90 <= np.mean(inside) <= 0.985
+def test_intervals_of_every_number_hold_the_truth_as_often_as_they_say(coverage):
+    found = coverage.found(40, 0, list(coverage.CASES), "")
+    assert len(found) > 40
+    for (case, key), rows in found.items():
+        held = sum(abs(pull) < 1.0 for _, pull, _ in rows)
+        _, low, high = wilson(held, len(rows))
+        assert low <= 0.98 and high >= 0.90, (case, key, held, len(rows))
 
 
 def test_a_hover_tells_thrust_and_says_what_it_cannot():
@@ -70,3 +101,48 @@ def test_what_is_left_alone_stays():
     found = identify(known.logs("rates", 0), begun, leave=("drag", "loop"))
     assert "linear_drag" not in found.vehicle.effects
     assert found.vehicle.controller == begun.controller
+
+
+def without(logs, *fields):
+    """The logs without these, as a partial log has them."""
+    return [
+        replace(log, **{name: np.full_like(getattr(log, name), np.nan) for name in fields})
+        for log in logs
+    ]
+
+
+def test_without_an_attitude_the_thrust_is_told_and_the_drag_is_said_to_need_one():
+    logs = without(known.logs("pwm", 0, known.HOVER), "quat_wxyz")
+    found = identify(logs, known.start())
+    off = pulls(found)
+    assert {key for key, _ in off} >= {"motors.thrust"}
+    assert np.max(np.abs(list(off.values()))) < 2.0
+    assert any(line.startswith("drag along body x and y: without") for line in found.untold)
+    assert found.vehicle.effects["linear_drag"].coefficient[:2] == (0.0, 0.0)
+
+
+def test_without_attitude_and_rates_what_turns_is_said_to_be_untold():
+    logs = without(known.logs("pwm", 0, known.HOVER), "quat_wxyz", "rate_b")
+    found = identify(logs, known.start())
+    assert "motors.thrust" in as_json(found.numbers)
+    words = " ".join(found.untold)
+    assert "inertia and torque_coefficient: no body rates" in words
+    assert "time_constant and command_delay: no body rates" in words
+    assert found.vehicle.inertia == known.start().inertia
+
+
+def test_without_rates_the_attitude_tells_the_inertia(coverage, fleet):
+    off = coverage.pulls(*fleet, "pwm without rates", np.random.default_rng(0))
+    assert "inertia[0]" in off and "inertia[1]" in off
+
+
+def test_without_positions_the_rates_tell_what_turns():
+    found = identify(without(known.logs("pwm", 0), "pos_w", "vel_w"), known.start())
+    assert "rotors.torque_coefficient" in as_json(found.numbers)
+    assert any(line.startswith("thrust and drag: these logs have no") for line in found.untold)
+
+
+def test_flights_that_hold_nothing_are_refused_with_what_they_lack():
+    logs = without(known.logs("pwm", 0), "pos_w", "vel_w", "quat_wxyz", "rate_b")
+    with pytest.raises(ValueError, match="flight_0, .*: no stretch of a second with positions"):
+        identify(logs, known.start())

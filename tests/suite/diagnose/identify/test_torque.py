@@ -5,14 +5,14 @@ import pytest
 
 from suite.diagnose.identify.drive import delayed, lagged
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
-from suite.diagnose.identify.torque import fit_rotor_lag, lag_and_delay, unknowns_of
+from suite.diagnose.identify.torque import fit_rotor_lag, inertia_ratio, lag_and_delay, unknowns_of
 
 
 @pytest.mark.parametrize(
     ("drive", "names"),
     [
-        ("rotors", ["inertia_x", "inertia_y", "yaw"]),
-        ("pwm", ["inertia_x", "inertia_y", "yaw", "late", "lag"]),
+        ("rotors", ["inertia_x", "inertia_y", "inertia_z", "yaw"]),
+        ("pwm", ["inertia_x", "inertia_y", "inertia_z", "yaw", "late", "lag"]),
         ("torques", ["inertia_x", "inertia_y", "inertia_z", "late", "lag"]),
     ],
 )
@@ -29,3 +29,9 @@ def test_rotors_behind_their_commands_tell_lag_and_delay():
     found = fit_rotor_lag([flight], lag_and_delay(0.02, 0.0))
     late, lag = found.value
     np.testing.assert_allclose([late - lag, lag], [0.012, 0.04], atol=0.001)
+
+
+def test_the_inertia_about_z_follows_the_others_but_for_its_own_ratio():
+    np.testing.assert_allclose(inertia_ratio({"inertia_x": 0.2}), [0.2, 0.0, 0.1])
+    told = {"inertia_x": 0.2, "inertia_y": 0.4, "inertia_z": -0.1}
+    np.testing.assert_allclose(inertia_ratio(told), [0.2, 0.4, 0.2])
