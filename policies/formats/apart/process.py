@@ -8,6 +8,8 @@ killed. That is for what goes wrong: a torch file is code and may do more, with 
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import select
@@ -33,6 +35,8 @@ MEMORY_BYTES = 4 * 2**30
 """Addresses that the process may use beside those of the engine itself."""
 ANSWER_BYTES = 2**28
 """Of one answer."""
+PIPE_BYTES = 2**20
+"""Of a pipe between the two; the most that Linux gives to everybody."""
 GRACE_S = 5.0
 """Later than we give up, the process ends itself [s]; it may have lost us."""
 SERVER = Path(__file__).with_name("server.py")
@@ -98,6 +102,7 @@ class Apart:
         for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None
             os.set_blocking(pipe.fileno(), False)
+            _widen(pipe.fileno())
         limits = {
             "memory_bytes": MEMORY_BYTES,
             "load_s": LOAD_S + GRACE_S,
@@ -185,6 +190,13 @@ class Apart:
                 raise EOFError
             view = view[got:]
         return data
+
+
+def _widen(handle: int) -> None:
+    """Let a pipe hold a block of rows, where the system can: in small pieces it takes turns."""
+    if hasattr(fcntl, "F_SETPIPE_SZ"):
+        with contextlib.suppress(OSError):
+            fcntl.fcntl(handle, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
 
 def _wait(handle: int, event: int, until: float) -> None:

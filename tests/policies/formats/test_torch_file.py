@@ -65,16 +65,10 @@ def test_without_trust_nothing_of_a_file_reaches_torch(exported, tmp_path):
     [
         (lambda files: files.pop(PROGRAM), "cannot load it"),
         (lambda files: files.pop("data/weights/weight_0"), "cannot load it"),
-        (lambda files: files.update({PROGRAM: b"{"}), "cannot load it"),
         (lambda files: files.update({PROGRAM: b"{}"}), "cannot load it"),
         (lambda files: files.update({WEIGHTS: b'{"config": []}'}), "cannot load it"),
         (lambda files: files.update({"data/weights/weight_0": b"abc"}), "cannot load it"),
         (lambda files: files.update({"extra/policy.json": b"{"}), "policy.json: not JSON"),
-        (lambda files: files.update({"extra/policy.json": b'{"schema": 9}'}), "schema 1"),
-        (
-            lambda files: files.update({"extra/policy.json": b'{"spec": {"rate": 1}}'}),
-            "unknown key 'rate'",
-        ),
     ],
 )
 def test_a_damaged_archive_is_refused(exported, tmp_path, change, said):
@@ -175,7 +169,6 @@ class TooFew(torch.nn.Module):
         (TooMany(), [(2, 12), (2, 24, 32)], "gives 2 outputs"),
         (TooFew(), [(2, 12), (2, 24, 32), (2, 4)], "gives 1 outputs"),
         (Reactive(), [(2, 13), (2, 24, 32)], r"'state' has shape .*13.*expected \(batch, 12\)"),
-        (Reactive(), [(2, 12), (2, 32, 24)], r"expected \(batch, 24, 32\)"),
     ],
 )
 def test_a_program_that_does_not_fit_is_told_what_does(tmp_path, module, shapes, said):
