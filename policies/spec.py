@@ -20,6 +20,8 @@ ACTION_SIZE = 3
 """Numbers in an action: wanted net acceleration in current body axes [m/s^2]."""
 
 
+CHANNEL_BLOCK = 32
+"""Channels come in such blocks from the second convolution on, as the C export lays weights out."""
 PIXELS_MOST = 640 * 480
 """Pixels of an image: those of the usual depth cameras at full size. 64 trials' images of this size
 and what they are made with fit into 2 GB."""
@@ -49,6 +51,8 @@ class PolicySpec:
     """How a depth becomes an input."""
     hidden_size: Annotated[int, Range(1, 4096)] = 192
     """Width of the embeddings and of the recurrent state."""
+    channels: Annotated[tuple[int, int, int], Range(2, 1024)] = (32, 64, 128)
+    """Output channels of the three convolutions: an even number, then multiples of 32 twice."""
     second_gate: bool = False
     """Whether the state goes on with the centre of the gate after the next one, in body axes."""
     gate_axis: bool = False
@@ -84,12 +88,18 @@ def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
         )
 
 
-def check_image_size(spec: PolicySpec) -> None:
-    """Refuse an image that our network cannot take.
+def check_network(spec: PolicySpec) -> None:
+    """Refuse an image that our network cannot take, and channels that it cannot have.
 
     Raises:
-        ValueError: naming the side, its pixels and what is allowed.
+        ValueError: naming the side and its pixels, or the channels, and what is allowed.
     """
+    first, *others = spec.channels
+    if first % 2 or any(count % CHANNEL_BLOCK for count in others):
+        raise ValueError(
+            f"spec.channels is {spec.channels}, allowed are an even number and two multiples of "
+            f"{CHANNEL_BLOCK}"
+        )
     for side, pixels in (("width", spec.camera.width), ("height", spec.camera.height)):
         if pixels % 4 or pixels < 20:
             raise ValueError(

@@ -1,47 +1,111 @@
 """States and images that are old when a policy decides, and images that never come.
 
 Views are taken between decisions, at the physics step that lies an age before the decision that
-will see them, and kept until then. At a trial's start, before anything is old enough, the policy
-sees the start.
+will see them, and kept until then. Ages may jitter: each decision then has an age of its own, drawn
+from the trial's seed. At a trial's start, before anything is old enough, the policy sees the start.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from eval.judging.sensors import SensorNoise
-from eval.worlds.slots import LOSSES, generator_of
+from eval.worlds.slots import IMAGE_AGES, LOSSES, STATE_AGES, generator_of
 from eval.worlds.trial import TrialSpec
 from policies.observation import View
 from tracks.common.tree_rows import select
 
 
+class Due(NamedTuple):
+    """Views to be taken before the next decision, for one decision that will see them."""
+
+    pause: np.ndarray
+    """(N,) physics steps after the last decision."""
+    rows: np.ndarray
+    """(N,) bool: slots in which that is so."""
+    place: int
+    """Among the views that are kept."""
+
+
+class Moment(NamedTuple):
+    """A time between two decisions at which views are taken."""
+
+    pause: np.ndarray
+    """(N,) physics steps after the last decision, never less than the moment's before."""
+    images: np.ndarray
+    """(N,) bool: slots whose image is looked at."""
+    taken: list[tuple[Aged, Due]]
+    """What the view is for, `Due.rows` being the slots that are at their pause."""
+
+
 class Aged:
     """Views of N slots that are seen one age after they were taken."""
 
-    def __init__(self, age_s: float, period_steps: float, dt: float) -> None:
-        """Make it for an age [s], the physics steps between decisions and their length [s]."""
-        steps = age_s / dt
-        self.periods = math.ceil(steps / period_steps - 1e-9)
-        """Decisions from the one before a view is taken to the one that sees it."""
-        self.pause = round(self.periods * period_steps - steps)
-        """Physics steps from a decision to the next view."""
-        self._kept: list[Any] = []
+    def __init__(
+        self, age_s: float, jitter: float, slots: int, period_steps: float, dt: float
+    ) -> None:
+        """Make it for an age.
 
-    def see(self, now: View, fresh: np.ndarray) -> View:
-        """Return what is old enough at a decision, for rows that are `fresh` (N,) what is now."""
-        if not self.periods:
+        Args:
+            age_s: the mean [s].
+            jitter: each decision's age is up to this share of the mean more or less, evenly [1].
+            slots: how many.
+            period_steps: physics steps between decisions.
+            dt: their length [s].
+        """
+        self._mean, self._jitter, self._period = age_s / dt, jitter, period_steps
+        longest = self._mean * (1.0 + jitter)
+        self.ahead = math.ceil(longest / period_steps - 1e-9)
+        """Decisions from the one before a view is taken to the one that sees it, at most."""
+        self._draws = [np.random.default_rng(0)] * slots
+        self._ages = np.full((self.ahead, slots), self._mean)
+        self._kept: list[View] = []
+
+    def start(self, slot: int, draws: np.random.Generator) -> None:
+        """Begin in `slot` a trial whose ages come from `draws`."""
+        self._draws[slot] = draws
+
+    def see(self, now: View, fresh: np.ndarray, flying: np.ndarray) -> View:
+        """Return what is old enough at a decision.
+
+        Args:
+            now: what an ideal policy would see.
+            fresh: (N,) bool, slots whose trial begins: they see what is now.
+            flying: (N,) bool, the slots that fly.
+        """
+        if not self.ahead:
             return now
-        kept = self._kept or [now] * self.periods
-        oldest, *self._kept = (select(fresh, now, view) for view in kept)
+        if self._jitter:
+            self._draw(fresh, flying)
+        kept = self._kept or [now] * self.ahead
+        oldest, *rest = (select(fresh, now, view) for view in kept)
+        self._kept = [*rest, now]
         return oldest
 
-    def take(self, view: View) -> None:
+    def _draw(self, fresh: np.ndarray, flying: np.ndarray) -> None:
+        """Draw the age at the last of the decisions ahead, of slots that are fresh at all."""
+        self._ages = np.roll(self._ages, -1, axis=0)
+        for slot in np.flatnonzero(flying).tolist():
+            count = self.ahead if fresh[slot] else 1
+            share = self._jitter * self._draws[slot].uniform(-1.0, 1.0, count)
+            self._ages[-count:, slot] = self._mean * (1.0 + share)
+
+    def due(self) -> Iterator[Due]:
+        """Yield what is to be taken before the next decision."""
+        periods = np.maximum(np.ceil(self._ages / self._period - 1e-9), 1)
+        for place, ages in enumerate(self._ages):
+            rows = periods[place] == place + 1
+            if rows.any():
+                pause = np.rint((place + 1) * self._period - ages).astype(int)
+                yield Due(np.where(rows, pause, 0), rows, place)
+
+    def take(self, due: Due, view: View) -> None:
         """Keep what is seen now."""
-        self._kept.append(view)
+        self._kept[due.place] = select(due.rows, view, self._kept[due.place])
 
 
 class Delays:
@@ -50,30 +114,22 @@ class Delays:
     def __init__(self, noise: SensorNoise, slots: int, period_steps: float, dt: float) -> None:
         """Make it for `noise` and the physics steps between decisions and their length [s]."""
         self._loss = noise.image_loss
-        self.state = Aged(noise.state_age_s, period_steps, dt)
-        self.image = Aged(noise.image_age_s, period_steps, dt)
+        self.state, self.image = (
+            Aged(age_s, noise.age_jitter, slots, period_steps, dt)
+            for age_s in (noise.state_age_s, noise.image_age_s)
+        )
         self._draws = [np.random.default_rng(0)] * slots
         self._shown: np.ndarray | None = None
-
-    @property
-    def pauses(self) -> list[tuple[int, Aged]]:
-        """When to take a view after a decision [physics steps], and for which."""
-        used = [(aged.pause, aged) for aged in (self.state, self.image) if aged.periods]
-        return sorted(used, key=lambda pair: pair[0])
 
     def start(self, slot: int, trial: TrialSpec) -> None:
         """Begin `trial` in `slot`."""
         self._draws[slot] = generator_of(trial, LOSSES)
+        self.state.start(slot, generator_of(trial, STATE_AGES))
+        self.image.start(slot, generator_of(trial, IMAGE_AGES))
 
     def see(self, now: View, fresh: np.ndarray, flying: np.ndarray) -> View:
-        """Return what there is to see at a decision.
-
-        Args:
-            now: what an ideal policy would see.
-            fresh: (N,) bool, slots whose trial begins.
-            flying: (N,) bool, the slots that fly.
-        """
-        depth_m = self.image.see(now, fresh).depth_m
+        """Return what there is to see at a decision; see `Aged.see`."""
+        depth_m = self.image.see(now, fresh, flying).depth_m
         if self._loss:
             lost = np.zeros(len(fresh), bool)
             for slot in np.flatnonzero(flying).tolist():
@@ -81,4 +137,18 @@ class Delays:
             before = depth_m if self._shown is None else self._shown
             depth_m = np.where((lost & ~fresh)[:, None, None], before, depth_m)
             self._shown = depth_m
-        return self.state.see(now, fresh)._replace(depth_m=depth_m)
+        return self.state.see(now, fresh, flying)._replace(depth_m=depth_m)
+
+    def moments(self) -> Iterator[Moment]:
+        """Yield when views are taken before the next decision, each slot's in turn."""
+        whose = [(aged, due) for aged in (self.state, self.image) for due in aged.due()]
+        if not whose:
+            return
+        pauses = np.array([due.pause for _, due in whose])
+        for turn in np.argsort(pauses, axis=0, kind="stable"):
+            taken = [(aged, due._replace(rows=due.rows & (turn == number)))
+                     for number, (aged, due) in enumerate(whose)]  # fmt: skip
+            nobody = np.zeros(len(turn), bool)
+            images = [due.rows for aged, due in taken if aged is self.image]
+            pause = np.take_along_axis(pauses, turn[None], axis=0)[0]
+            yield Moment(pause, np.any([nobody, *images], axis=0), taken)

@@ -297,11 +297,13 @@ class _Slots:
     def _fly_steps(self, steps: np.ndarray, flying: np.ndarray) -> None:
         """Fly the actions for each slot's physics steps (N,); take views that will be old."""
         done = np.zeros_like(steps)
-        for pause, aged in self._delays.pauses if self._delays else ():
-            part = np.minimum(steps, pause)
+        for moment in self._delays.moments() if self._delays else ():
+            part = np.minimum(steps, moment.pause)
             self._advance(part - done)
             done = part
-            aged.take(self._world.view(flying))
+            view = self._world.view(moment.images & flying)
+            for aged, due in moment.taken:
+                aged.take(due, view)
         self._advance(steps - done)
 
     def _advance(self, steps: np.ndarray) -> None:

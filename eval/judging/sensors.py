@@ -42,6 +42,9 @@ class SensorNoise:
     """How old the state is at the decision (`eval/judging/ages.py`) [s]."""
     image_age_s: float = 0.0
     """How old the image is at the decision [s]."""
+    age_jitter: float = 0.0
+    """Both ages are means then: each decision's is drawn evenly from up to this share less to as
+    much more, that of the state and that of the image apart [1]."""
     image_loss: float = 0.0
     """Share of the images that do not come; the one before is seen again [1]."""
 
@@ -61,6 +64,9 @@ class SensorNoise:
         return bool(self.pos_m or self.vel or self.attitude_rad)
 
 
+_SHARES = ("image_loss", "age_jitter")
+
+
 def check_noise(noise: SensorNoise) -> None:
     """Refuse noise that cannot be.
 
@@ -69,8 +75,8 @@ def check_noise(noise: SensorNoise) -> None:
     """
     for field in fields(noise):
         value = getattr(noise, field.name)
-        if field.name == "image_loss" and value > 1:
-            raise ValueError(f"sensor noise image_loss is {value!r}; allowed are shares, 0 to 1")
+        if field.name in _SHARES and value > 1:
+            raise ValueError(f"sensor noise {field.name} is {value!r}; allowed are shares, 0 to 1")
         if not (math.isfinite(value) and value >= 0):
             raise ValueError(
                 f"sensor noise {field.name} is {value!r}; allowed are finite numbers, 0 or more"

@@ -57,7 +57,7 @@ def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
     return Gates(*(field[index] for field in gates._replace(opening_g=opening)))
 
 
-GUSTS, PIXELS, GATES, STATE, LOSSES = range(1, 6)
+GUSTS, PIXELS, GATES, STATE, LOSSES, STATE_AGES, IMAGE_AGES = range(1, 8)
 """What a trial's random numbers are for; each use has a stream of its own."""
 
 

@@ -29,7 +29,7 @@ def load_onnx(path: Path) -> BlockPolicy:
     proto = read_checked(path)
     text = next((entry.value for entry in proto.metadata_props if entry.key == KEY), None)
     spec = extract(text, str(path))
-    loaded = Apart(proto.SerializeToString(), str(path))
+    loaded = Apart(proto.SerializeToString(), str(path), "onnx")
     for value in (*loaded.inputs, *loaded.outputs):
         if value.kind != "tensor(float)":
             raise PolicyError(f"{path}: {value.name!r} is {value.kind}, expected tensor(float)")

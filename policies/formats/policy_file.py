@@ -12,7 +12,7 @@ import numpy as np
 from policies.errors import PolicyError
 from policies.formats.checkpoint import CONFIG, WEIGHTS, check_shapes, load_arrays, save_arrays
 from policies.formats.spec_json import spec_from_json, spec_to_json
-from policies.spec import PolicySpec, check_image_size
+from policies.spec import PolicySpec, check_network
 
 KIND = "policy"
 
@@ -75,14 +75,14 @@ def expected_shapes(spec: PolicySpec, where: str) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the network's parameters for a spec.
 
     Raises:
-        PolicyError: where the camera's image is not one that the network can take.
+        PolicyError: where no network of ours has such an image or such channels.
     """
     import jax
 
     from policies.networks import network
 
     try:
-        check_image_size(spec)
+        check_network(spec)
     except ValueError as error:
         raise PolicyError(f"{where}: {error}") from None
     shapes = jax.eval_shape(lambda key: network.init(key, spec), jax.random.key(0))

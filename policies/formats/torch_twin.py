@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from policies.networks.layouts import image_weight, kernel_oihw, rows_are_outputs
-from policies.networks.network import CHANNELS, LEAK, flat_features
+from policies.networks.network import LEAK, flat_features
 from policies.spec import ACTION_SIZE, PolicySpec
 
 CONVOLUTIONS = ("conv1", "conv2", "conv3")
@@ -22,10 +22,11 @@ class TorchTwin(nn.Module):
     def __init__(self, spec: PolicySpec) -> None:
         """Make the layers; `load_params` fills them."""
         super().__init__()
+        first, second, third = spec.channels
         self.pool = nn.MaxPool2d(2)
-        self.conv1 = nn.Conv2d(1, CHANNELS[0], 2, stride=2, bias=False)
-        self.conv2 = nn.Conv2d(CHANNELS[0], CHANNELS[1], 3, bias=False)
-        self.conv3 = nn.Conv2d(CHANNELS[1], CHANNELS[2], 3, bias=False)
+        self.conv1 = nn.Conv2d(1, first, 2, stride=2, bias=False)
+        self.conv2 = nn.Conv2d(first, second, 3, bias=False)
+        self.conv3 = nn.Conv2d(second, third, 3, bias=False)
         self.image = nn.Linear(flat_features(spec), spec.hidden_size, bias=False)
         self.state = nn.Linear(spec.state_size, spec.hidden_size)
         self.gru = nn.GRUCell(spec.hidden_size, spec.hidden_size)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from policies.networks.network import CHANNELS
 from policies.spec import PolicySpec
 
 
@@ -23,5 +22,5 @@ def kernel_oihw(kernel: np.ndarray) -> np.ndarray:
 def image_weight(params: Mapping[str, np.ndarray], spec: PolicySpec) -> np.ndarray:
     """Return the image's embedding (hidden, features) for features flattened channels first."""
     rows, columns = spec.camera.height // 4 - 4, spec.camera.width // 4 - 4
-    weight = np.asarray(params["image.weight"]).reshape(rows, columns, CHANNELS[2], -1)
+    weight = np.asarray(params["image.weight"]).reshape(rows, columns, spec.channels[2], -1)
     return rows_are_outputs(weight.transpose(2, 0, 1, 3).reshape(-1, weight.shape[-1]))

@@ -21,8 +21,6 @@ Params = dict[str, jax.Array]
 
 LEAK = 0.05
 """Slope of the LeakyReLU for negative inputs."""
-CHANNELS = (32, 64, 128)
-"""Output channels of the three convolutions."""
 
 
 def leaky_relu(x: jax.Array) -> jax.Array:
@@ -33,7 +31,7 @@ def leaky_relu(x: jax.Array) -> jax.Array:
 def flat_features(spec: PolicySpec) -> int:
     """Return how many features leave the last convolution, flattened height x width x channel."""
     rows, columns = spec.camera.height // 4 - 4, spec.camera.width // 4 - 4
-    return rows * columns * CHANNELS[2]
+    return rows * columns * spec.channels[2]
 
 
 def init(key: jax.Array, spec: PolicySpec) -> Params:
@@ -48,11 +46,11 @@ def init(key: jax.Array, spec: PolicySpec) -> Params:
 
 @jax.jit(static_argnames="spec")
 def _drawn(key: jax.Array, spec: PolicySpec) -> Params:
-    hidden = spec.hidden_size
+    hidden, (first, second, third) = spec.hidden_size, spec.channels
     fan = {
-        "conv1.weight": ((2, 2, 1, CHANNELS[0]), 4),
-        "conv2.weight": ((3, 3, CHANNELS[0], CHANNELS[1]), 9 * CHANNELS[0]),
-        "conv3.weight": ((3, 3, CHANNELS[1], CHANNELS[2]), 9 * CHANNELS[1]),
+        "conv1.weight": ((2, 2, 1, first), 4),
+        "conv2.weight": ((3, 3, first, second), 9 * first),
+        "conv3.weight": ((3, 3, second, third), 9 * second),
         "image.weight": ((flat_features(spec), hidden), flat_features(spec)),
         "state.weight": ((spec.state_size, hidden), spec.state_size),
         "state.bias": ((hidden,), spec.state_size),
@@ -104,7 +102,7 @@ def encode(params: Params, image: jax.Array) -> jax.Array:
     rows, columns = height // 4, width // 4
     patches = pooled.reshape(n, rows, 2, columns, 2).transpose(0, 1, 3, 2, 4)
     patches = patches.reshape(n, rows, columns, 4)
-    x = leaky_relu(patch_product(patches, params["conv1.weight"].reshape(4, CHANNELS[0])))
+    x = leaky_relu(patch_product(patches, params["conv1.weight"].reshape(4, -1)))
     x = leaky_relu(conv_valid(x, params["conv2.weight"]))
     x = leaky_relu(conv_valid(x, params["conv3.weight"]))
     return x.reshape(n, -1) @ params["image.weight"]

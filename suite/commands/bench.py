@@ -21,6 +21,9 @@ class Config:
 
     name: tyro.conf.Positional[str] = ""
     """Which benchmark."""
+    policy: str | None = None
+    """Of the benchmark `policy`: a shipped policy's name or a checkpoint's folder; by default the
+    shipped policy."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -29,7 +32,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Run the benchmark `config.name`, both sides in turn, and show figures and ratio.
 
     Raises:
-        ValueError: for a name that is not in the table.
+        ValueError: for a name that is not in the table, or a policy where none is timed.
     """
     if not config.name:
         for name, summary in BENCHES.items():
@@ -37,11 +40,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         return {"benches": BENCHES}
     if config.name not in BENCHES:
         raise unknown_name("benchmark", config.name, BENCHES)
+    if config.policy is not None and config.name != "policy":
+        raise ValueError(f"--policy is {config.policy}, but {config.name} times none: leave it out")
     from suite.experiments.bench.compare import load_warnings
 
     busy = load_warnings()
     bench = importlib.import_module(f"suite.experiments.bench.{config.name}")
-    result = bench.run()
+    result = bench.run() if config.policy is None else bench.run(config.policy)
     answer = {**plain(result), "ratio": result.ratio, "warnings": [*busy, *result.warnings]}
     del answer["grid"]
     for side, figure in (("ours", result.ours), ("baseline", result.baseline)):

@@ -39,8 +39,9 @@ OF_SWEEPS = (
     "gate is shown elsewhere, the same for the whole trial. State estimate: position "
     f"{STATE_UNIT.pos_m:g} m, velocity {STATE_UNIT.vel:g} m/s, attitude 1 deg, each axis, times "
     f"the factor, changing over {STATE_UNIT.correlation_s:g} s. Ages: the state, or the image, "
-    "that the policy decides on is so old; a lost image is replaced by the one before. The wind "
-    "blows along (-0.6, 0.8, 0)."
+    "that the policy decides on is so old; a jittering age is drawn anew for each decision, evenly "
+    "from 0 to twice its mean, that of the state and that of the image apart; a lost image is "
+    "replaced by the one before. The wind blows along (-0.6, 0.8, 0)."
 )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from eval.vehicles.vehicle import Vehicle
-from policies.spec import PolicySpec, check_image_size, check_spec
+from policies.spec import PolicySpec, check_network, check_spec
 from suite.train.dynamics.fleet import FleetConfig
 from tracks.input.ranges import Iterations, Range, Seed, Share, check_ranges
 
@@ -250,7 +250,7 @@ def check(config: TrainConfig) -> None:
     """
     check_ranges(config)
     check_spec(config.spec)
-    check_image_size(config.spec)
+    check_network(config.spec)
     if config.quadrotor is not None:
         from eval.vehicles.vehicle_check import check_vehicle
 

@@ -45,7 +45,7 @@ def test_training_and_flying_our_policy_needs_jax_and_numpy_only(checkpoint, tmp
 
 
 def test_the_blocker_blocks():
-    assert "torch is blocked" in run(BLOCK + "import policies.formats.torch_file").stderr
+    assert "torch is blocked" in run(BLOCK + "import policies.formats.torch_twin").stderr
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,15 @@
-"""An ONNX model that runs in a process of its own: it may loop for ever or abort, and we do not.
+"""A model that runs in a process of its own: it may loop for ever or abort, and we do not.
 
-A model from elsewhere is a program: a `Loop` of 2^62 rounds is one node, also one that is worked
-out while the file is loaded. So onnxruntime has the file in a process with limits of time and
-memory (`server.py`), and whoever does not answer in time is killed.
+A model from elsewhere is a program: a `Loop` of 2^62 rounds is one node of ONNX, also one that is
+worked out while the file is loaded; TorchScript has `while`. So onnxruntime and torch have the file
+in a process with limits of time and memory (`server.py`), and whoever does not answer in time is
+killed. That is for what goes wrong: a torch file is code and may do more, with trust and without.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import select
@@ -22,19 +25,28 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from policies.errors import NoAnswer, PolicyError
-from policies.formats.apart.server import data_bytes
+from policies.formats.apart.server import KINDS, data_bytes
 
 LOAD_S = 60.0
 """To start, load the model and optimise it [s]."""
 ANSWER_S = 60.0
 """To answer for one block of rows [s]; the deadline of a judgement is shorter, and counts."""
 MEMORY_BYTES = 4 * 2**30
-"""Addresses that the process may use."""
+"""Addresses that the process may use beside those of the engine itself."""
 ANSWER_BYTES = 2**28
 """Of one answer."""
+PIPE_BYTES = 2**20
+"""Of a pipe between the two; the most that Linux gives to everybody."""
 GRACE_S = 5.0
 """Later than we give up, the process ends itself [s]; it may have lost us."""
 SERVER = Path(__file__).with_name("server.py")
+
+
+REMEDIES = {
+    "onnxruntime": "export it for an older opset",
+    "torch": "export it again with this version of torch",
+}
+"""What to do where an engine refuses a model."""
 
 
 class Port(NamedTuple):
@@ -42,9 +54,9 @@ class Port(NamedTuple):
 
     name: str
     kind: str
-    """As onnxruntime calls it, such as tensor(float)."""
+    """As onnxruntime calls it, such as tensor(float); torch does not say."""
     shape: tuple[int | None, ...]
-    """None where a size is free."""
+    """None where a size is free; of TorchScript not known."""
 
 
 class Apart:
@@ -53,20 +65,25 @@ class Apart:
     A process that gave no answer is killed; the next question goes to a fresh one.
     """
 
-    def __init__(self, model: bytes, where: str) -> None:
+    def __init__(self, model: bytes, where: str, kind: str, label: str = "") -> None:
         """Start the process and load the model there.
 
         Args:
-            model: a serialised ONNX model.
+            model: a serialised model.
             where: the file it came from, for messages.
+            kind: one of `server.KINDS`.
+            label: name of a text that a torch file carries.
 
         Raises:
-            PolicyError: where onnxruntime refuses it, or does not come to an end with it.
+            PolicyError: where the engine refuses it, or does not come to an end with it.
         """
         self._where, self._model = where, model
+        self._engine, self._kind, self._wanted = KINDS[kind][0], kind, label
         about = self._start()
+        self.label = about.get("label", "")
+        """The text that was asked for; empty where there is none."""
         self.inputs, self.outputs = (
-            [Port(name, kind, tuple(shape)) for name, kind, shape in about[side]]
+            [Port(name, number, tuple(shape)) for name, number, shape in about[side]]
             for side in ("inputs", "outputs")
         )
 
@@ -85,22 +102,23 @@ class Apart:
         for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None
             os.set_blocking(pipe.fileno(), False)
+            _widen(pipe.fileno())
         limits = {
             "memory_bytes": MEMORY_BYTES,
             "load_s": LOAD_S + GRACE_S,
             "answer_s": ANSWER_S + GRACE_S,
         }
-        head = {"bytes": len(self._model), **limits}
+        head = {"bytes": len(self._model), "kind": self._kind, "label": self._wanted, **limits}
         about, _ = self._ask(head, [self._model], LOAD_S, "loaded")
         if "error" in about:
             raise PolicyError(
-                f"{self._where}: onnxruntime {about['version']} cannot load it ({about['error']}); "
-                "export it for an older opset"
+                f"{self._where}: {self._engine} {about['version']} cannot load it "
+                f"({about['error']}); {REMEDIES[self._engine]}"
             )
         return about
 
     def run(self, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
-        """Return the model's outputs, float32, for its inputs.
+        """Return the model's outputs, float32, for its inputs, which are in its order.
 
         Raises:
             NoAnswer: where it fails, or does not come to an end.
@@ -140,8 +158,9 @@ class Apart:
             reason = _how_it_ended(self._process)
         self._end()
         raise NoAnswer(
-            f"{self._where}: onnxruntime does not come to an end with it ({reason}); look for "
-            "loops without an end and for sizes beyond the memory, and export it again"
+            f"{self._where}: {self._engine} does not come to an end with it "
+            f"({reason}); look for loops without an end and for sizes beyond the memory, and "
+            "export it again"
         )
 
     def _write(self, data: memoryview, until: float) -> None:
@@ -171,6 +190,13 @@ class Apart:
                 raise EOFError
             view = view[got:]
         return data
+
+
+def _widen(handle: int) -> None:
+    """Let a pipe hold a block of rows, where the system can: in small pieces it takes turns."""
+    if hasattr(fcntl, "F_SETPIPE_SZ"):
+        with contextlib.suppress(OSError):
+            fcntl.fcntl(handle, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
 
 def _wait(handle: int, event: int, until: float) -> None:

@@ -1,15 +1,18 @@
-"""The program that runs one ONNX model: frames come on standard input, answers go to the output.
+"""The program that runs one model from elsewhere: ONNX, a torch exported program, TorchScript.
 
-It imports nothing of ours and is run by its path. A frame is four bytes of length, a JSON object of
-that length, and the bytes of the float32 arrays whose names and shapes it lists under "arrays"
-(bytes as they are under "bytes"). The first frame holds the model and the limits; each other one,
-the inputs of one call. An answer has "error" instead of arrays where onnxruntime refuses.
+It imports nothing of ours and is run by its path. Frames come on standard input, answers go to the
+output. A frame is four bytes of length, a JSON object of that length, and the bytes of the float32
+arrays whose names and shapes it lists under "arrays" (bytes as they are under "bytes"). The first
+frame holds the model, its kind and the limits; each other one, the inputs of one call, in the
+model's order. An answer has "error" instead of arrays where the model cannot be loaded or fails.
 
 The alarm clock ends it where a call lasts too long, whether or not its parent still lives.
 """
 
 from __future__ import annotations
 
+import importlib
+import io
 import json
 import math
 import os
@@ -17,7 +20,13 @@ import resource
 import signal
 import struct
 import sys
+from collections.abc import Callable
 from typing import IO, Any
+
+Run = Callable[[dict[str, Any]], list[Any]]
+"""Inputs by name to the outputs, float32 arrays all."""
+Loaded = tuple[dict[str, Any], Run]
+"""What there is to say of a model, and the model."""
 
 
 def write_frame(file: IO[bytes], head: dict[str, Any], *data: Any) -> None:
@@ -56,63 +65,136 @@ def _exactly(file: IO[bytes], count: int) -> bytearray:
     return data
 
 
-def serve(source: IO[bytes], answers: IO[bytes]) -> None:
-    """Load the model of the first frame and answer until the parent closes the input."""
-    head, model = read_frame(source)
-    resource.setrlimit(resource.RLIMIT_AS, (head["memory_bytes"],) * 2)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.setitimer(signal.ITIMER_REAL, head["load_s"])
-    import numpy as np
-    import onnxruntime
-
+def load_onnx(onnxruntime: Any, model: bytes, label: str) -> Loaded:
+    """Load an ONNX model; its label is read by who sent it."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
     options.log_severity_level = 4
-    try:
-        session = onnxruntime.InferenceSession(
-            bytes(model), options, providers=["CPUExecutionProvider"]
-        )
-    except Exception as error:  # onnxruntime's own exceptions share no public base
-        write_frame(answers, {"error": _first_line(error), "version": onnxruntime.__version__})
-        return
-    del model
+    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     about = {
         side: [[value.name, value.type, [_size(n) for n in value.shape or ()]] for value in values]
         for side, values in (("inputs", session.get_inputs()), ("outputs", session.get_outputs()))
     }
+    wanted = [name for name, _, _ in about["outputs"]]
+    return about, lambda feed: session.run(wanted, feed)
+
+
+def load_program(torch: Any, model: bytes, label: str) -> Loaded:
+    """Load a torch exported program and the text that it carries under `label`."""
+    extra = {label: ""}
+    program = torch.export.load(io.BytesIO(model), extra_files=extra)
+    values = {node.name: node.meta.get("val") for node in program.graph.nodes}
+    inputs = []
+    for name in map(str, program.graph_signature.user_inputs):
+        shape = getattr(values.get(name), "shape", ())
+        inputs.append([name, "", [_size(n) for n in shape]])
+    about = {"inputs": inputs, "outputs": [], "label": extra[label]}
+    return about, _torch_run(torch, program.module(check_guards=False))
+
+
+def load_script(torch: Any, model: bytes, label: str) -> Loaded:
+    """Load TorchScript and the text that it carries under `label`; shapes are not known."""
+    extra = {label: ""}
+    module = torch.jit.load(io.BytesIO(model), map_location="cpu", _extra_files=extra).eval()
+    inputs = [[argument.name, "", []] for argument in module.forward.schema.arguments[1:]]
+    text = extra[label]
+    text = text.decode(errors="replace") if isinstance(text, bytes) else text
+    return {"inputs": inputs, "outputs": [], "label": text}, _torch_run(torch, module)
+
+
+def _torch_run(torch: Any, module: Callable[..., Any]) -> Run:
+    # Sums are split by threads, so a fixed number of them keeps a policy's answers the same.
+    torch.set_num_threads(1)
+
+    def run(feed: dict[str, Any]) -> list[Any]:
+        # A tensor of torch's own lies as its kernels like it, whatever stood before it in a frame.
+        inputs = [torch.from_numpy(value).clone() for value in feed.values()]
+        with torch.inference_mode():
+            try:
+                found = module(*inputs)
+            except Exception as error:  # whatever the file's own code and torch raise
+                raise RuntimeError(_lines(error)[-1]) from error
+        outputs = list(found) if isinstance(found, (tuple, list)) else [found]
+        for number, value in enumerate(outputs):
+            if getattr(value, "dtype", None) is not torch.float32:
+                kind = getattr(value, "dtype", type(value).__name__)
+                raise TypeError(f"output {number} is {kind}, expected a tensor of float32")
+        return [value.numpy() for value in outputs]
+
+    return run
+
+
+KINDS: dict[str, tuple[str, Callable[[Any, bytes, str], Loaded]]] = {
+    "onnx": ("onnxruntime", load_onnx),
+    "program": ("torch", load_program),
+    "script": ("torch", load_script),
+}
+"""The module that runs a kind of model, and how it is loaded."""
+
+
+def serve(source: IO[bytes], answers: IO[bytes]) -> None:
+    """Load the model of the first frame and answer until the parent closes the input."""
+    head, model = read_frame(source)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.setitimer(signal.ITIMER_REAL, head["load_s"])
+    name, load = KINDS[head["kind"]]
+    engine = importlib.import_module(name)
+    # The engine's own libraries are not the model's: torch's alone may be gigabytes of addresses.
+    resource.setrlimit(resource.RLIMIT_AS, (_addresses() + head["memory_bytes"],) * 2)
+    try:
+        about, run = load(engine, bytes(model), head["label"])
+    except Exception as error:  # onnxruntime's own exceptions share no public base
+        write_frame(answers, {"error": _lines(error)[0], "version": engine.__version__})
+        return
+    del model
     signal.setitimer(signal.ITIMER_REAL, 0)
     write_frame(answers, about)
-    wanted = [name for name, _, _ in about["outputs"]]
+    _answer(source, answers, run, head["answer_s"])
+
+
+def _answer(source: IO[bytes], answers: IO[bytes], run: Run, answer_s: float) -> None:
+    import numpy as np
+
     while True:
         try:
             asked, data = read_frame(source)
         except EOFError:
             return
-        signal.setitimer(signal.ITIMER_REAL, head["answer_s"])
+        signal.setitimer(signal.ITIMER_REAL, answer_s)
         feed, at = {}, 0
         for name, shape in asked["arrays"]:
             count = math.prod(shape)
             feed[name] = np.frombuffer(data, np.float32, count, at).reshape(shape)
             at += 4 * count
         try:
-            found = [np.ascontiguousarray(value) for value in session.run(wanted, feed)]
+            found = [np.ascontiguousarray(value) for value in run(feed)]
         except Exception as error:
-            write_frame(answers, {"error": _first_line(error)})
+            write_frame(answers, {"error": _lines(error)[0]})
             continue
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
-        shapes = [[name, list(v.shape)] for name, v in zip(wanted, found, strict=True)]
+        shapes = [[str(number), list(value.shape)] for number, value in enumerate(found)]
         write_frame(answers, {"arrays": shapes}, *found)
+
+
+def _addresses() -> int:
+    """Return the bytes of addresses that this process uses, 0 where the system does not say."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[0]) * resource.getpagesize()
+    except OSError:
+        return 0
 
 
 def _size(size: Any) -> int | None:
     return size if isinstance(size, int) else None
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+def _lines(error: Exception) -> list[str]:
+    text = str(error).strip() or type(error).__name__
+    return [line[:200] for line in text.splitlines()]
 
 
 if __name__ == "__main__":

@@ -10,10 +10,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from policies.networks.network import CHANNELS
-from policies.spec import PolicySpec
+from policies.spec import CHANNEL_BLOCK, PolicySpec
 
-BLOCK = 32
+BLOCK = CHANNEL_BLOCK
 """Outputs of a block."""
 LAYERS = ("conv2", "conv3", "image", "gru_input", "gru_hidden")
 """Those with nearly all weights; the others stay floats whatever the type."""
@@ -29,8 +28,8 @@ def matrices(params: Mapping[str, np.ndarray], spec: PolicySpec) -> dict[str, np
     wide, gates = padded(spec.hidden_size), padded(3 * spec.hidden_size)
     plain = {name: np.asarray(value, np.float32) for name, value in params.items()}
     return {
-        "conv2": plain["conv2.weight"].reshape(-1, CHANNELS[1]),
-        "conv3": plain["conv3.weight"].reshape(-1, CHANNELS[2]),
+        "conv2": plain["conv2.weight"].reshape(-1, spec.channels[1]),
+        "conv3": plain["conv3.weight"].reshape(-1, spec.channels[2]),
         "image": fill(plain["image.weight"], len(plain["image.weight"]), wide),
         "gru_input": fill(plain["gru.weight_input"], wide, gates),
         "gru_hidden": fill(plain["gru.weight_hidden"], wide, gates),
@@ -42,7 +41,7 @@ def small_arrays(params: Mapping[str, np.ndarray], spec: PolicySpec) -> dict[str
     wide, gates = padded(spec.hidden_size), padded(3 * spec.hidden_size)
     plain = {name: np.asarray(value, np.float32) for name, value in params.items()}
     return {
-        "conv1_weight": plain["conv1.weight"].reshape(4, CHANNELS[0]),
+        "conv1_weight": plain["conv1.weight"].reshape(4, -1),
         "state_weight": fill(plain["state.weight"], spec.state_size, wide),
         "state_bias": fill(plain["state.bias"][None], 1, wide),
         "gru_input_bias": fill(plain["gru.bias_input"][None], 1, gates),
@@ -86,7 +85,7 @@ def float_text(value: float) -> str:
 def multiply_adds(spec: PolicySpec) -> int:
     """Return the multiply-adds of one step, the filled-up rows left out."""
     rows, columns, hidden = spec.camera.height // 4, spec.camera.width // 4, spec.hidden_size
-    first, second, third = CHANNELS
+    first, second, third = spec.channels
     count = rows * columns * 4 * first
     count += (rows - 2) * (columns - 2) * 9 * first * second
     count += (rows - 4) * (columns - 4) * third * (9 * second + hidden)

@@ -14,7 +14,7 @@ from policies.formats.c import arrays
 from policies.formats.c.arrays import array_text, blocked, float_text, multiply_adds, padded
 from policies.formats.c.quantised import Quantised
 from policies.formats.policy_file import PolicyCheckpoint
-from policies.networks.network import CHANNELS, LEAK, flat_features
+from policies.networks.network import LEAK, flat_features
 from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
 from tracks.common.version import VERSION
 
@@ -70,8 +70,8 @@ def constants(
 def work_sizes(spec: PolicySpec) -> tuple[int, int, int]:
     """Return the floats of the two working arrays, and the length of the third (int8 alone)."""
     rows, columns = spec.camera.height // 4, spec.camera.width // 4
-    first = rows * columns * CHANNELS[0]
-    second = (rows - 2) * (columns - 2) * CHANNELS[1]
+    first = rows * columns * spec.channels[0]
+    second = (rows - 2) * (columns - 2) * spec.channels[1]
     third, wide, gates = flat_features(spec), padded(spec.hidden_size), padded(3 * spec.hidden_size)
     return (
         max(first, third, gates),
@@ -146,7 +146,7 @@ def _values(
         "HIDDEN_SIZE": spec.hidden_size,
         "PADDED": padded(spec.hidden_size),
         "GATES": padded(3 * spec.hidden_size),
-        **{f"CHANNELS{k}": channels for k, channels in enumerate(CHANNELS, 1)},
+        **{f"CHANNELS{k}": channels for k, channels in enumerate(spec.channels, 1)},
         "LEAK": float_text(LEAK),
         "TANH_P": _horner(numerator),
         "TANH_Q": _horner(denominator),

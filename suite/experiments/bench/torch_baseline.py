@@ -27,7 +27,7 @@ from suite.train.worlds import Worlds
 from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.scene import Gates
 
-SIZES = ("camera", "hidden_size")
+SIZES = ("camera", "hidden_size", "channels")
 """What may differ from the preset: the network's and the image's size."""
 
 

@@ -83,12 +83,12 @@ def work_per_step(config: TrainConfig) -> float:
     forward once and backward once. Rays, distances and dynamics are not counted, so the share of
     the machine's rate is a lower bound.
     """
-    from policies.networks.network import CHANNELS, flat_features
+    from policies.networks.network import flat_features
     from policies.spec import ACTION_SIZE
 
     spec = config.spec
     rows, columns, hidden = spec.camera.height // 4, spec.camera.width // 4, spec.hidden_size
-    first, second, third = CHANNELS
+    first, second, third = spec.channels
     encoder = rows * columns * 4 * first
     encoder += (rows - 2) * (columns - 2) * 9 * first * second
     encoder += (rows - 4) * (columns - 4) * 9 * second * third

@@ -100,8 +100,8 @@ def effects_chart(entries: Sequence[Tested]) -> bytes:
 
 def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
     """Return success against the size of each disturbance, a panel each."""
-    columns, names = min(4, len(grown)), list(next(iter(grown.values()))[0].results)
-    rows = -(-len(grown) // columns)
+    names, rows = list(next(iter(grown.values()))[0].results), -(-len(grown) // 4)
+    columns = -(-len(grown) // rows)
     figure = Figure(figsize=(10.4, 0.5 + 2.5 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels[len(grown) :]:

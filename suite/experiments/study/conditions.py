@@ -145,6 +145,14 @@ def _estimating(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorNoise]:
     )
 
 
+def _late(jitter: float) -> Callable[..., tuple[Vehicle, SensorNoise]]:
+    def make(vehicle: Vehicle, age_ms: float) -> tuple[Vehicle, SensorNoise]:
+        age_s = 1e-3 * age_ms
+        return vehicle, SensorNoise(state_age_s=age_s, image_age_s=age_s, age_jitter=jitter)
+
+    return make
+
+
 def sweeps(vehicle: Vehicle) -> list[Sweep]:
     """Return the sweeps from what `vehicle` is."""
     lag = 1e3 * _own(vehicle, "motor_lag").time_constant
@@ -171,6 +179,9 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
               _sensing("state_age_s", 1e-3)),
         Sweep("age of the image", "age at the decision [ms]", (0, 20, 40, 60, 80, 100),
               _sensing("image_age_s", 1e-3)),
+        Sweep("age of both", "age at the decision [ms]", (0, 20, 40, 60, 80, 100), _late(0.0)),
+        Sweep("jittering age of both", "mean age at the decision [ms]", (0, 20, 40, 60, 80, 100),
+              _late(1.0)),
         Sweep("lost images", "share of the images [%]", (0, 10, 30, 50, 80),
               _sensing("image_loss", 1e-2)),
         Sweep("state-estimation noise", "times 3 cm, 0.1 m/s, 1 deg", (0, 1, 2, 4, 8), _estimating),

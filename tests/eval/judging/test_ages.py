@@ -1,5 +1,7 @@
 """States and images that are old at the decision, and images that never come."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -17,35 +19,85 @@ TRIALS = [TrialSpec("zigzag", 0, seed) for seed in range(3)]
 RULES = Rules(time_limit_s=1.5)
 
 
+DT, PERIOD_S = 0.002, 0.066
+STEPS = PERIOD_S / DT
+
+
 def seen_at(time_s, n=2):
-    """A view whose numbers are the time at which it was taken."""
-    at = np.full((n, 3), float(time_s))
-    return View(at, np.zeros((n, 3, 3)), at, at, at, at, np.full((n, 2, 2), float(time_s)))
+    """A view whose numbers are the time at which it was taken, (n,) or one for all."""
+    time_s = np.broadcast_to(np.asarray(time_s, float), (n,))
+    at = np.repeat(time_s[:, None], 3, axis=1)
+    image = np.repeat(at[:, :, None], 3, axis=2)
+    return View(at, np.zeros((n, 3, 3)), at, at, at, at, image)
+
+
+def ages_seen(noise, trials, decisions):
+    """Ages (decisions, 2, N) of state and image at each decision, as a judge would take them."""
+    n = len(trials)
+    delays = Delays(noise, n, STEPS, DT)
+    for slot, trial in enumerate(trials):
+        delays.start(slot, trial)
+    found = []
+    for k in range(decisions):
+        now = k * PERIOD_S
+        shown = delays.see(seen_at(now, n), np.full(n, k == 0), np.ones(n, bool))
+        found.append([now - shown.pos_w[:, 0], now - shown.depth_m[:, 0, 0]])
+        clock = np.zeros(n, int)
+        for moment in delays.moments():
+            assert (moment.pause >= clock).all() and (moment.pause <= STEPS).all()
+            clock = moment.pause
+            # Where no image is wanted there is none.
+            view = seen_at(now + clock * DT, n)
+            blank = np.where(moment.images[:, None, None], view.depth_m, np.nan)
+            for aged, due in moment.taken:
+                aged.take(due, view._replace(depth_m=blank))
+    return np.array(found)
 
 
 @pytest.mark.parametrize("age_s", [0.0, 0.01, 0.05, 0.066, 0.1, 0.2])
 def test_what_is_seen_has_the_age_that_is_asked_for(age_s):
-    dt, period = 0.002, 0.066 / 0.002
-    aged, fresh = Aged(age_s, period, dt), np.ones(2, bool)
-    for k in range(20):
-        now = 0.066 * k
-        shown = aged.see(seen_at(now), fresh)
-        fresh = np.zeros(2, bool)
-        if k >= 6:
-            assert shown.pos_w == pytest.approx(now - age_s, abs=1e-9)
-        if aged.periods:
-            aged.take(seen_at(now + aged.pause * dt))
-    again = aged.see(seen_at(99.0), np.array([False, True]))
-    assert (
-        (again.pos_w[1] == 99.0).all() and (again.pos_w[0] < 99.0 - age_s + 1e-9).all() or not age_s
-    )
+    for noise, which in (
+        (SensorNoise(state_age_s=age_s), [0]),
+        (SensorNoise(image_age_s=age_s), [1]),
+        (SensorNoise(state_age_s=age_s, image_age_s=age_s), [0, 1]),
+    ):
+        found = ages_seen(noise, TRIALS, 20)
+        assert (found[0] == 0).all(), "at the start what is seen is the start"
+        assert found[6:, which] == pytest.approx(age_s, abs=1e-9)
+        others = [k for k in (0, 1) if k not in which]
+        assert not found[:, others].any()
+
+
+def test_a_fresh_trial_sees_its_own_start_while_the_others_go_on():
+    aged, none = Aged(0.1, 0.5, 2, STEPS, DT), np.zeros(2, bool)
+    for k in range(4):
+        aged.see(seen_at(k), none | (k == 0), ~none)
+        for due in aged.due():
+            aged.take(due, seen_at(k + 0.5))
+    again = aged.see(seen_at(99.0), np.array([False, True]), ~none)
+    assert (again.pos_w[1] == 99.0).all() and (again.pos_w[0] < 4.0).all()
+
+
+@pytest.mark.parametrize(("age_s", "jitter"), [(0.05, 1.0), (0.1, 0.4), (0.02, 1.0)])
+def test_ages_that_jitter_have_the_mean_and_the_spread_that_are_asked_for(age_s, jitter):
+    noise = SensorNoise(state_age_s=age_s, image_age_s=age_s, age_jitter=jitter)
+    found = ages_seen(noise, TRIALS, 600)[6:]
+    spread = jitter * age_s
+    assert found.min() >= age_s - spread - DT / 2 - 1e-9
+    assert found.max() <= age_s + spread + DT / 2 + 1e-9
+    assert found.mean() == pytest.approx(age_s, abs=0.1 * spread)
+    assert found.std() == pytest.approx(spread / np.sqrt(3), rel=0.1)
+    state, image = found[:, 0].ravel(), found[:, 1].ravel()
+    assert abs(np.corrcoef(state, image)[0, 1]) < 0.1, "that of the state says nothing of the other"
+    turned = ages_seen(noise, TRIALS[::-1], 600)[6:]
+    assert np.array_equal(turned[:, :, ::-1], found), "they are set by the trial"
 
 
 def test_a_lost_image_is_the_one_before_and_the_state_comes_all_the_same():
     delays, fly_all = Delays(SensorNoise(image_loss=0.4), 2, 33.0, 0.002), np.ones(2, bool)
     for slot, trial in enumerate(TRIALS[:2]):
         delays.start(slot, trial)
-    assert delays.pauses == []
+    assert list(delays.moments()) == []
     repeats, before = 0, None
     for k in range(500):
         shown = delays.see(seen_at(k), np.full(2, k == 0), fly_all)
@@ -111,9 +163,18 @@ def test_a_late_trials_outcome_is_set_by_the_trial_alone():
     assert together == [given(noise, [trial])[0][0] for trial in TRIALS]
 
 
+def test_so_is_one_whose_ages_jitter():
+    steady = SensorNoise(state_age_s=0.05, image_age_s=0.05)
+    noise = replace(steady, age_jitter=1.0)
+    together, _ = given(noise, TRIALS, slots=2)
+    assert together != given(steady, TRIALS, slots=2)[0]
+    assert together == [given(noise, [trial])[0][0] for trial in TRIALS]
+
+
 def test_what_cannot_be_is_refused():
-    with pytest.raises(ValueError, match="image_loss is 1.5; allowed are shares"):
-        given(SensorNoise(image_loss=1.5))
+    for name in ("image_loss", "age_jitter"):
+        with pytest.raises(ValueError, match=f"{name} is 1.5; allowed are shares"):
+            given(SensorNoise(**{name: 1.5}))
     with pytest.raises(ValueError, match="shows nothing late"):
         options = JudgeOptions(noise=SensorNoise(state_age_s=0.1))
         fly(Pursuit(), TRIALS[:1], VEHICLE, "reference", options)

@@ -29,6 +29,7 @@ def test_a_file_that_says_nothing_has_the_default_spec(text):
         ("[]", "expected an object with schema 1"),
         ('{"schema": 2}', "update the suite"),
         ('{"spec": {"rate_hz": -1}}', "spec: rate_hz is -1"),
+        ('{"spec": {"rate": 1}}', "unknown key 'rate'"),
     ],
 )
 def test_a_damaged_one_is_refused(text, said):

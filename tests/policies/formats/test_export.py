@@ -78,10 +78,13 @@ def test_exporting_again_replaces_the_file(tmp_path, checkpoint):
     assert [p.name for p in tmp_path.iterdir()] == ["tiny.onnx"]
 
 
-@pytest.mark.parametrize("extras", [{"second_gate"}, {"second_gate", "gate_axis"}])
-def test_policies_that_see_more_are_one_policy_as_well(tmp_path, extras):
-    spec = replace(SPEC, **dict.fromkeys(extras, True))
-    folder = save_policy(tmp_path / "more", lively(spec, 3), spec, seed=1)
+@pytest.mark.parametrize(
+    "changes",
+    [{"second_gate": True}, {"second_gate": True, "gate_axis": True}, {"channels": (6, 64, 32)}],
+)
+def test_policies_of_other_inputs_and_sizes_are_one_policy_as_well(tmp_path, changes):
+    spec = replace(SPEC, **changes)
+    folder = save_policy(tmp_path / "other", lively(spec, 3), spec, seed=1)
     ours = load_policy(folder)
     assert ours.spec == spec
     expected = rollout(ours, 70, 5)

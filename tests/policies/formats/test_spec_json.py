@@ -21,6 +21,7 @@ from tracks.geometry.camera import Camera
         camera=st.builds(Camera, pitch_deg=st.floats(-90, 90), range_m=st.floats(5, 1000)),
         depth=st.builds(DepthEncoding, scale=st.floats(0.01, 100), near=st.floats(0.01, 4)),
         hidden_size=st.integers(1, 1000),
+        channels=st.tuples(*[st.integers(2, 1024)] * 3),
     )
 )
 def test_a_spec_survives_json(spec):
@@ -33,9 +34,9 @@ def test_keys_left_out_of_a_spec_take_the_default():
     )
 
 
-def test_a_checkpoint_without_the_key_sees_one_gate():
+def test_a_checkpoint_without_the_keys_sees_one_gate_with_the_usual_channels():
     stored = spec_to_json(SPEC)
-    del stored["second_gate"], stored["gate_axis"]
+    del stored["second_gate"], stored["gate_axis"], stored["channels"]
     assert spec_from_json(stored, "here") == SPEC
 
 

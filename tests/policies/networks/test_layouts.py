@@ -3,7 +3,6 @@
 import numpy as np
 
 from policies.networks.layouts import image_weight, kernel_oihw, rows_are_outputs
-from policies.networks.network import CHANNELS
 from policies.spec import PolicySpec
 from tracks.geometry.camera import Camera
 
@@ -22,10 +21,10 @@ def test_a_kernel_has_its_channels_first():
 
 
 def test_features_of_an_image_are_told_channel_by_channel():
-    spec = PolicySpec(camera=Camera(width=28, height=24), hidden_size=2)
+    spec = PolicySpec(camera=Camera(width=28, height=24), hidden_size=2, channels=(2, 32, 64))
     rows, columns = 24 // 4 - 4, 28 // 4 - 4
-    number = np.arange(rows * columns * CHANNELS[2])
+    number = np.arange(rows * columns * 64)
     found = image_weight({"image.weight": np.stack([number, -number], 1)}, spec)
     # Ours runs over rows, columns and then channels; torch's over channels first.
-    expected = number.reshape(rows * columns, CHANNELS[2]).T.ravel()
+    expected = number.reshape(rows * columns, 64).T.ravel()
     np.testing.assert_array_equal(found, [expected, -expected])

@@ -87,9 +87,21 @@ def test_a_policy_that_sees_more_is_refused(seen, spec, key):
         network.fitted(params, seen, spec)
 
 
+def test_channels_and_hidden_size_decide_how_many_weights_there_are():
+    small = PolicySpec(hidden_size=96, channels=(16, 32, 32), second_gate=True, gate_axis=True)
+    params = network.init(jax.random.key(0), small)
+    convolutions = 4 * 16 + 9 * 16 * 32 + 9 * 32 * 32
+    dense = (2 * 4 * 32) * 96 + (18 + 1) * 96 + 6 * 96 * 96 + 6 * 96 + 96 * 3
+    assert sum(value.size for value in params.values()) == convolutions + dense == 96_448
+    states, images = jnp.ones((5, 18)), jnp.ones((5, 24, 32))
+    action, hidden = network.step(params, jnp.zeros((5, 96)), states, images)
+    assert action.shape == (5, 3) and hidden.shape == (5, 96)
+
+
 def test_a_policy_of_another_size_or_rate_is_refused():
     params = network.init(jax.random.key(5), SMALL)
     for changed, words in (({"hidden_size": 32}, "hidden_size 64, and this run 32"),
+                           ({"channels": (16, 32, 32)}, r"channels .*128\), and this run \(16"),
                            ({"rate_hz": 60.0}, "rate_hz .*, and this run 60.0")):  # fmt: skip
         with pytest.raises(ValueError, match=words):
             network.fitted(params, SMALL, replace(SMALL, **changed))

@@ -86,7 +86,7 @@ def test_a_loop_without_an_end_is_refused_in_time(start, tmp_path, monkeypatch):
 def test_the_process_ends_itself_where_its_parent_is_gone(monkeypatch):
     monkeypatch.setattr(process, "GRACE_S", -1.5)
     monkeypatch.setattr(process, "ANSWER_S", 2.0)
-    model = Apart(_endless("state").SerializeToString(), "it")
+    model = Apart(_endless("state").SerializeToString(), "it", "onnx")
     with pytest.raises(PolicyError, match="it ended by SIGALRM"):
         model.run({"state": np.ones((1, 12)), "image": np.ones((1, 24, 32))})
 
@@ -123,14 +123,14 @@ def test_a_model_that_fails_while_it_runs_is_one_line(tmp_path):
 
 
 def test_a_process_that_dies_is_told_of_and_one_that_is_not_needed_ends():
-    model = Apart(PLAIN.SerializeToString(), "it")
+    model = Apart(PLAIN.SerializeToString(), "it", "onnx")
     feed = {"state": np.ones((2, 12)), "image": np.ones((2, 24, 32))}
     np.testing.assert_array_equal(model.run(feed)[0], np.ones((2, 3)))
     child = model._process.pid
     os.kill(child, signal.SIGABRT)
     with pytest.raises(PolicyError, match="it ended by SIGABRT"):
         model.run(feed)
-    other = Apart(PLAIN.SerializeToString(), "it")
+    other = Apart(PLAIN.SerializeToString(), "it", "onnx")
     child = other._process.pid
     del other
     gc.collect()
@@ -140,7 +140,7 @@ def test_a_process_that_dies_is_told_of_and_one_that_is_not_needed_ends():
 
 def test_after_a_question_without_an_answer_the_next_goes_to_a_fresh_process(monkeypatch):
     monkeypatch.setattr(process, "ANSWER_S", 0.5)
-    model = Apart(PLAIN.SerializeToString(), "it")
+    model = Apart(PLAIN.SerializeToString(), "it", "onnx")
     feed = {"state": np.ones((2, 12)), "image": np.ones((2, 24, 32))}
     stopped = model._process.pid
     os.kill(stopped, signal.SIGSTOP)

@@ -11,7 +11,13 @@ from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from tests.policies.conftest import SPEC, lively
 from tracks.geometry.camera import Camera
 
-ODD = replace(SPEC, camera=Camera(width=36, height=20), hidden_size=50, gate_axis=True)
+ODD = replace(
+    SPEC,
+    camera=Camera(width=36, height=20),
+    hidden_size=50,
+    channels=(6, 96, 32),
+    gate_axis=True,
+)
 """Sizes that fill no block and no group of four pixels."""
 
 
@@ -29,13 +35,14 @@ def own_cache(monkeypatch, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def exports(tmp_path_factory, checkpoint):
-    """Folder, project and checkpoint by name: float32, int8, and float32 of odd sizes."""
+    """Folder, project and checkpoint by name: float32, int8, and both of odd sizes."""
     odd = save_policy(tmp_path_factory.mktemp("odd") / "odd", lively(ODD, 4), ODD, seed=1)
     made = {}
     for name, source, dtype in (
         ("float32", checkpoint, "float32"),
         ("int8", checkpoint, "int8"),
         ("odd", odd, "float32"),
+        ("odd8", odd, "int8"),
     ):
         stored = load_policy_checkpoint(source)
         project = c_project(stored, source.name, dtype, drawn(stored.spec, 40, seed=5))

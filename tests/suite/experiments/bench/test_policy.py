@@ -1,6 +1,7 @@
 """The benchmark of a policy's step, on a small policy."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -15,9 +16,10 @@ from tests.support.small_policy import small_checkpoint
 def test_every_engine_is_timed_and_the_ratio_is_of_the_times(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder, run = str(small_checkpoint(tmp_path)), policy.run
-    monkeypatch.setattr(policy, "run", lambda: run(folder, rounds=1))
-    assert cli.main(["bench", "policy", "--json"]) == 0
+    monkeypatch.setattr(policy, "run", lambda asked: run(asked, rounds=1))
+    assert cli.main(["bench", "policy", "--policy", folder, "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
+    assert answer["details"]["policy"] == Path(folder).name
     ours, baseline = answer["ours"]["value"], answer["baseline"]["value"]
     assert answer["ratio"] == pytest.approx(baseline / ours)
     rows = {name: row for name, row in answer["details"].items() if isinstance(row, dict)}

@@ -57,6 +57,10 @@ def test_sweeps_begin_at_the_vehicle_as_it_is_and_grow():
     assert drag.effects["quadratic_drag"].coefficient == pytest.approx((0.04, 0.04, 0.16))
     late, _ = named["latency"].make(VEHICLE, 80)
     assert late.effects["command_delay"].delay == pytest.approx(0.08)
+    _, noise = named["jittering age of both"].make(VEHICLE, 40)
+    assert noise == SensorNoise(state_age_s=0.04, image_age_s=0.04, age_jitter=1.0)
+    _, noise = named["age of both"].make(VEHICLE, 60)
+    assert noise == SensorNoise(state_age_s=0.06, image_age_s=0.06)
     _, noise = named["state-estimation noise"].make(VEHICLE, 2)
     assert (noise.pos_m, noise.vel) == pytest.approx((0.06, 0.2))
     assert noise.attitude_rad == pytest.approx(np.radians(2)) and noise.correlation_s == 0.5
