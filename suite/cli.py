@@ -3,7 +3,8 @@
 A command is a module with `Config`, a frozen dataclass that becomes its options (one docstring
 line under each field is its help), and `run(config, console)`, which does the work and returns
 what --json prints; where it has `written(config)`, no other command writes into these folders
-meanwhile. See docs/commands.md for how to add one.
+meanwhile, and where it has `config_type(args)`, its options go by what it is called with. See
+docs/commands.md for how to add one.
 """
 
 from __future__ import annotations
@@ -115,7 +116,8 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 
     command = importlib.import_module(f"suite.commands.{name}")
     plain_flags = (tyro.conf.FlagCreatePairsOff,)
-    config = tyro.cli(command.Config, prog=f"suite {name}", args=args, config=plain_flags)
+    options = command.config_type(args) if hasattr(command, "config_type") else command.Config
+    config = tyro.cli(options, prog=f"suite {name}", args=args, config=plain_flags)
     return command, config
 
 

@@ -30,7 +30,7 @@ from suite.diagnose.diagnose import diagnose
 from suite.diagnose.fit.model import RolloutModel
 from suite.diagnose.fit.normal_equations import start_estimate
 from suite.diagnose.fit.parameters import make_space
-from suite.diagnose.plans.simulate import FlightFailed
+from suite.diagnose.plans.follow import FlightFailed
 from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.gap import gap_of

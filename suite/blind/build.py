@@ -39,9 +39,10 @@ from suite.blind.oracle.stretches import (
 from suite.blind.outside import KINDS, make_outside
 from suite.blind.simulators import Flights, Simulator, simulator_for
 from suite.common.errors import WorkFailed
+from suite.diagnose.plans.follow import FlightFailed, Recording
 from suite.diagnose.plans.sensors import SENSORS, Sensors
 from suite.diagnose.plans.separating import SEPARATIONS
-from suite.diagnose.plans.simulate import FALL_V_PER_S, FlightFailed, Recording, fly
+from suite.diagnose.plans.simulate import FALL_V_PER_S, fly
 from suite.diagnose.plans.trajectory import Trajectory, long_flights, ordinary_flights
 
 TRIES = 6
@@ -86,7 +87,7 @@ class _Unsuitable(Exception):
 def _attempt(case: Case, rng: np.random.Generator) -> Built:
     ways, sensors = _trajectories(case, rng), SENSORS[case.sensors]
     simulator = simulator_for(case, rng)
-    nominal, ways = simulator.judged, ways[: simulator.most]
+    nominal = simulator.judged
     if case.kind == "outside":
         return _outside(case, simulator, sensors, ways, rng)
     changes, multiples, effects = {}, {}, {}

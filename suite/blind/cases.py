@@ -19,8 +19,8 @@ FULL = {"null": 100, "outside": 40, "pair": 20, "blurred": 15, "separated": 15}
 """Cases of a full set besides the single effects."""
 SETS = {"tuning": 1_000_000, "published": 2_000_000}
 """Seeds of the two sets; the published one is run once."""
-ROTORPY_NULLS = 10
-"""Cases of its set that hide nothing."""
+ROTORPY_FULL = {"null": 24, "pair": 16}
+"""Cases of the set that RotorPy flies besides the single effects."""
 CONTINUOUS_FULL = {"null": 24, "single": 22, "pair": 10, "outside": 4}
 """Cases of the set that is flown in continuous time."""
 TOO_ROUGH = "hysteresis"
@@ -80,21 +80,25 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 
 
 def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
-    """Return the smaller set that RotorPy flies: its effects at both multiples, and nulls.
+    """Return the set that RotorPy flies: its effects at both multiples, pairs of them, and nulls.
 
     Args:
         seed: of the set.
         count: about how many; all if not given.
     """
     rng = np.random.default_rng([seed, 1])
-    singles = [((name,), multiple) for multiple in MULTIPLES for name in ROTORPY_EFFECTS]
-    everything: list[tuple[tuple[str, ...], float]] = [*singles, *([((), 0.0)] * ROTORPY_NULLS)]
-    order = rng.permutation(len(everything))[: count or len(everything)]
+    drawn: list[tuple[str, tuple[str, ...], float]] = [
+        ("single", (name,), m) for m in MULTIPLES for name in ROTORPY_EFFECTS
+    ]
+    for _ in range(ROTORPY_FULL["pair"]):
+        first, second = (str(name) for name in rng.choice(ROTORPY_EFFECTS, 2, replace=False))
+        drawn.append(("pair", (first, second), MULTIPLES[1]))
+    drawn += [("null", (), 0.0)] * ROTORPY_FULL["null"]
     cases = {}
-    for i, index in enumerate(order):
-        hidden, multiple = everything[index]
+    for i, index in enumerate(rng.permutation(len(drawn))[: count or len(drawn)]):
+        kind, hidden, multiple = drawn[index]
         sensors = str(rng.choice(["capture", "estimator", "full"]))
-        kind, number = ("single" if hidden else "null"), (seed, 50_000 + int(index))
+        number = (seed, 50_000 + int(index))
         cases[f"case_{i + 1:03d}"] = Case(
             kind, hidden, multiple, "bare", sensors, number, simulator=ROTORPY
         )

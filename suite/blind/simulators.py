@@ -21,12 +21,10 @@ from suite.blind.continuous_flight import (
 )
 from suite.blind.oracle.strength import given_vehicle
 from suite.blind.rotorpy_flight import fly_rotorpy
+from suite.diagnose.plans.follow import Recording
 from suite.diagnose.plans.sensors import SENSORS, log_of
-from suite.diagnose.plans.simulate import Extra, Recording, fly
+from suite.diagnose.plans.simulate import Extra, fly
 from suite.diagnose.plans.trajectory import Trajectory
-
-ROTORPY_FLIGHTS = 4
-"""Of the ordinary flights, for RotorPy is slow; its table of strengths has one more."""
 
 
 class Flights(NamedTuple):
@@ -61,8 +59,6 @@ class Simulator:
     judged: Vehicle
     """The same at the rate of the recordings' grid, for what works on that."""
     fly: Fly
-    most: int | None = None
-    """Flights of a case; all if None."""
     conditions: dict[str, Any] = field(default_factory=dict)
     """Under which it is flown and logged, for the answer."""
 
@@ -92,8 +88,7 @@ def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
         return Flights(flown, logs)
 
     if case.simulator != CONTINUOUS:
-        most = ROTORPY_FLIGHTS if case.simulator == ROTORPY else None
-        return Simulator(given, given, on_grid, most)
+        return Simulator(given, given, on_grid)
 
     conditions = draw_conditions(rng)
     looped = with_loop(given, conditions.loop_hz)

@@ -32,8 +32,8 @@ class Config:
     count: Annotated[int, Range(1, 100_000)] | None = None
     """About how many cases, every kind with its share; all 242 if not given."""
     simulator: Literal["mujoco", "rotorpy", "continuous"] = "mujoco"
-    """Who flies the cases: rotorpy (pip install diffracing-suite[rotorpy]) makes 30, continuous, an
-    engine in continuous time that shares no code with the model that fits, 60."""
+    """Who flies the cases: rotorpy (pip install diffracing-suite[rotorpy]) and continuous, an
+    engine in continuous time that shares no code with the model that fits, make 60."""
     effects: tuple[str, ...] = ()
     """For plan: names that your data could not tell apart."""
     workers: WorkersOption = None

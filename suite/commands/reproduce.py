@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Union
+from typing import Annotated, Any, Generic, TypeVar, Union
 
 import tyro
 
@@ -13,23 +14,16 @@ from suite.common.console import Console
 from suite.common.work import WorkersOption, asked_workers
 from suite.experiments import EXPERIMENTS
 
-if TYPE_CHECKING:
-    Experiment = Any
-else:
-    Experiment = Union[  # noqa: UP007  (made from the table)
-        tuple(
-            Annotated[
-                importlib.import_module(f"suite.experiments.{name}").Config,
-                tyro.conf.subcommand(name),
-            ]
-            for name in EXPERIMENTS
-        )
-    ]
+Experiment = TypeVar("Experiment")
 
 
-@tyro.conf.configure(tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
 @dataclass(frozen=True)
-class Config:
+class Unread:
+    """Stands for the options of an experiment that a command line does not name."""
+
+
+@dataclass(frozen=True)
+class Config(Generic[Experiment]):
     """Make one of the documents of docs/results; the same command again goes on where it stopped.
 
     NAME.md, its figures and NAME.json with the numbers go to --out.
@@ -48,12 +42,34 @@ class Config:
     """Print one JSON object to standard output and nothing else."""
 
 
-def written(config: Config) -> list[Path]:
+def config_type(args: Sequence[str]) -> Any:
+    """Return what `args` are read into: the options of the experiments they name, and no others.
+
+    An experiment brings what it needs with it, which takes longer than to read a command line.
+    """
+    kinds = [
+        _options(name) if name in args else _summary(name, summary)
+        for name, summary in EXPERIMENTS.items()
+    ]
+    asked = Config[Union[tuple(kinds)]]  # noqa: UP007  (made from the table)
+    return Annotated[asked, tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes]
+
+
+def _options(name: str) -> Any:
+    config = importlib.import_module(f"suite.experiments.{name}").Config
+    return Annotated[config, tyro.conf.subcommand(name)]
+
+
+def _summary(name: str, summary: str) -> Any:
+    return Annotated[Unread, tyro.conf.subcommand(name, description=summary)]
+
+
+def written(config: Config[Any]) -> list[Path]:
     """Return the folders that the command writes into."""
     return [config.out, config.cache]
 
 
-def run(config: Config, console: Console) -> dict[str, Any]:
+def run(config: Config[Any], console: Console) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write its document.
 
     Raises:

@@ -6,14 +6,14 @@ table below. Checks of options that many have, training, judging and writing are
 `pages/`.
 """
 
-EXPERIMENTS: tuple[str, ...] = (
-    "table2",
-    "robustness",
-    "randomisation",
-    "seeds",
-    "ablation",
-    "schemes",
-    "ideas",
-    "worlds",
-)
-"""Names; NAME lives in suite/experiments/NAME.py."""
+EXPERIMENTS: dict[str, str] = {
+    "table2": "a policy on three tracks at all ten levels, beside the paper and the baseline",
+    "robustness": "policies under every physical effect and under growing disturbances",
+    "randomisation": "one recipe with randomised dynamics and with fixed ones, disturbed",
+    "seeds": "the policies of several training seeds on the same trials, and their median",
+    "ablation": "trainings with the vector field and without it, flown on unseen worlds",
+    "schemes": "PPO, our method, and it without the field, measured as they learn",
+    "ideas": "a recipe and variants of it with one change each, judged in pairs",
+    "worlds": "the shipped policies on the same trials in every world, side by side",
+}
+"""Name -> one-line summary; NAME lives in suite/experiments/NAME.py."""

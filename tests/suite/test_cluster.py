@@ -1,5 +1,6 @@
 """Commands on a cluster of two nodes: the same files, also where a node or the driver is killed."""
 
+import importlib.util
 import json
 import os
 import shutil
@@ -68,6 +69,7 @@ def test_a_node_killed_after_a_third_leaves_the_table_as_it_is(flown, tmp_path, 
     assert same_table(out, one)
 
 
+@pytest.mark.slow
 def test_a_driver_that_is_killed_goes_on_with_what_is_left(flown, tmp_path, root):
     args, one = flown
     out = tmp_path / "out"
@@ -103,6 +105,14 @@ def test_a_driver_that_is_killed_goes_on_with_what_is_left(flown, tmp_path, root
     assert same_table(out, one)
 
 
+def tool(root, name):
+    """Return a program of tools/ as a module."""
+    spec = importlib.util.spec_from_file_location(name, root / "tools" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def train_there(job, console):
     """Train a moment in the job's folder."""
     from suite.train.run import train
@@ -128,6 +138,34 @@ def test_trainings_come_back_as_this_machine_would_have_made_them(tmp_path, monk
         weights = "policy/weights.safetensors"
         assert (one.folder / weights).read_bytes() == (other.folder / weights).read_bytes()
         assert (other.folder / "metrics.jsonl").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [
+        "collect --policy racer --track zigzag --difficulty 0 --trials 6",
+        "reproduce seeds --policies racer swift --trials 2",
+        "loop --preset small --iterations 4 --finetune-iterations 2 --fit-iterations 4 --trials 2 "
+        "--flights 2 --track zigzag --difficulty 0 --set episode.batch=4 episode.steps=20",
+        "blind make --simulator continuous --seed 5 --count 2",
+    ],
+    ids=lambda command: command.split()[0],
+)
+def test_a_command_comes_to_the_same_on_a_cluster(command, tmp_path, root):
+    digest = tool(root, "kills").digest
+    here, there = tmp_path / "here", tmp_path / "there"
+    again = ["blind run"] if command.startswith("blind") else []
+    with cluster(tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache")) as nodes:
+        for words in (command, *again):
+            for out, workers in ((here, "1"), (there, nodes.address)):
+                cache = ["--cache", str(out / "cache")] if command.startswith("reproduce") else []
+                args = [*words.split(), *cache, "--out", str(out), "--workers", workers]
+                assert cli.main(args) == 0
+    assert digest(here) == digest(there) != "nothing"
+    pages = [path.relative_to(here) for path in here.glob("seeds.md")]
+    assert all((here / page).read_bytes() == (there / page).read_bytes() for page in pages)
+    assert bool(pages) == command.startswith("reproduce")
 
 
 def test_a_missing_extra_is_one_line(tmp_path, monkeypatch, capsys):

@@ -10,6 +10,8 @@ by all rows at once, so that a trial would hang on those beside it.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +25,7 @@ from eval.worlds.scene_slots import TO_CONTACTS, SceneSlots
 from eval.worlds.slots import Layout
 from eval.worlds.trial import Rules
 from tracks.geometry.camera import Camera
+from tracks.geometry.rotation import quat_to_rot, to_local
 
 STEPS_A_LAG = 1.0
 """The rotors' time constant is no shorter than so many steps: RotorPy divides by it, and its
@@ -125,7 +128,7 @@ class Multirotor:
 
         theirs, cpu = rotorpy(), torch.device("cpu")
         told = rotorpy_vehicle.rotorpy_parameters(vehicle, STEPS_A_LAG * dt)
-        self._dt, self._rows = dt, torch.arange(count)
+        self._dt, self._rows, self._mass = dt, torch.arange(count), told["mass"]
         start = {"x": torch.zeros(count, 3, dtype=torch.float64)}
         self._theirs = theirs.BatchedMultirotor(
             theirs.BatchedMultirotorParams([told] * count, count, cpu),
@@ -158,17 +161,37 @@ class Multirotor:
         }
         state = {name: torch.tensor(value) for name, value in state.items()}
         asked = {"cmd_motor_speeds": torch.tensor(push.rotor_speed)}
-        # Its derivatives are arrays of torch's default type, which is a single float.
-        usual = torch.get_default_dtype()
-        torch.set_default_dtype(torch.float64)
-        try:
-            with torch.no_grad():
-                after = self._theirs.step(state, asked, self._dt, self._rows)
-        finally:
-            torch.set_default_dtype(usual)
+        with _in_doubles():
+            after = self._theirs.step(state, asked, self._dt, self._rows)
         part = {name: value.numpy() for name, value in after.items()}
         qpos = np.concatenate([part["x"], part["q"][:, [3, 0, 1, 2]]], axis=-1)
         return qpos, np.concatenate([part["v"], part["w"]], axis=-1), part["rotor_speeds"]
+
+    def specific_force_b(
+        self, qpos: np.ndarray, qvel: np.ndarray, rotor_speed: np.ndarray
+    ) -> np.ndarray:
+        """Return force over mass in still air, (N, 3) [m/s^2]; the arguments are `step`'s."""
+        import torch
+
+        vel_b = to_local(quat_to_rot(qpos[:, 3:]), qvel[:, :3])
+        moving = (torch.tensor(part) for part in (qvel[:, 3:], rotor_speed, vel_b))
+        with _in_doubles():
+            force_b, _ = self._theirs.compute_body_wrench(*moving, self._rows)
+        return force_b.numpy() / self._mass
+
+
+@contextmanager
+def _in_doubles() -> Iterator[None]:
+    """Let RotorPy's arrays be doubles: they are of torch's default type."""
+    import torch
+
+    usual = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        torch.set_default_dtype(usual)
 
 
 def rotorpy() -> Any:

@@ -17,8 +17,9 @@ from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant
 from eval.quadrotor.rigid_body import euler_step
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.plans.follow import Recording
 from suite.diagnose.plans.sensors import Sensors
-from suite.diagnose.plans.simulate import FULL_V, Recording
+from suite.diagnose.plans.simulate import FULL_V
 from tracks.geometry.rotation import exp_rot
 
 HORIZON_S = 0.5

@@ -13,9 +13,10 @@ from eval.logs.flight_log import write_flight
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.plans.files import NAME, SCHEMA, write_plan
+from suite.diagnose.plans.follow import FlightFailed
 from suite.diagnose.plans.sensors import Sensors, log_of
 from suite.diagnose.plans.separating import plan_for, separations_of
-from suite.diagnose.plans.simulate import FlightFailed, fly
+from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import Trajectory
 from tracks.common.files import write_json
 from tracks.common.provenance import stamp

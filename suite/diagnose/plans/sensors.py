@@ -10,7 +10,7 @@ import numpy as np
 from eval.effects.log_faults import apply_log_faults
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.plans.simulate import Recording
+from suite.diagnose.plans.follow import Recording
 
 
 @dataclass(frozen=True)

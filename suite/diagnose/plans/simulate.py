@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from eval.quadrotor.plant import Command, Motion, Wrench, make_plant, uses_noise
+from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.plans.pilot import Gains, steer
+from suite.diagnose.plans.follow import Recording, Step, follow, wanted_of
+from suite.diagnose.plans.pilot import Gains
 from suite.diagnose.plans.trajectory import Reference, Trajectory
 from tracks.geometry.rotation import to_world
 
@@ -35,39 +36,6 @@ class Extra(Protocol):
     def wrench(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> Wrench:
         """Return the wrench (N, 3) that is added to `wrench`, once a step."""
         ...
-
-
-class Recording(NamedTuple):
-    """One flight at every physics step, K of them, without noise."""
-
-    dt: float
-    """Of a physics step [s]."""
-    period: int
-    """Physics steps for which a command is held; one row of a log each."""
-    time_s: np.ndarray
-    """(K,) [s]."""
-    motion: Motion
-    """(K, ...) at the start of each step."""
-    quat_wxyz: np.ndarray
-    """(K, 4)."""
-    rotor_speed: np.ndarray
-    """(K, 4) at the start of each step [rad/s]."""
-    command: Command
-    """(K, ...) as the pilot gave it."""
-    acc_b: np.ndarray
-    """(K, 3) specific force in the step that has just ended [m/s^2]."""
-    voltage: np.ndarray
-    """(K,) [V]."""
-    acting: Command
-    """(K, ...) what acted, before the vehicle's own delay; differs from `command` by an `Extra`."""
-    extra: Wrench
-    """(K, 3) what an `Extra` added."""
-    integrator: str | None = None
-    """How the simulator stepped where its step shows in the flight: `euler`, by `dt`."""
-
-
-class FlightFailed(RuntimeError):
-    """A simulated flight went where no log should: tipped over, into the ground, or away."""
 
 
 def fly(
@@ -96,110 +64,86 @@ def fly(
         FlightFailed: where a flight tips over, leaves the air or its trajectory.
         ValueError: for a rate that does not divide the rate loop's frequency.
     """
-    import mujoco
-
-    from eval.quadrotor.model import compile_quadrotor
-
     frequency = truth.controller.frequency
     period = round(frequency / rate_hz)
     if period < 1 or abs(period * rate_hz - frequency) > 1e-6 * frequency:
         raise ValueError(
             f"rate_hz = {rate_hz:g}: must divide the rate loop's frequency, {frequency:g} Hz"
         )
-    dt, count = 1.0 / frequency, len(trajectories)
-    steps = round(max(way.duration_s for way in trajectories) * frequency)
-    clock = np.arange(0, steps, period) * dt
-    ways = [way.reference(clock) for way in trajectories]
-    wanted = Reference(*(np.stack(parts, axis=1) for parts in zip(*ways, strict=True)))
+    dt = 1.0 / frequency
+    wanted = wanted_of(trajectories, period, dt)
     plant = make_plant(truth, dt)
     draws = None
     if rng is not None and uses_noise(plant):
-        draws = rng.standard_normal((steps + 1, count, 3))
-    model = compile_quadrotor(mujoco.MjSpec(), truth, dt)
-    datas = [mujoco.MjData(model) for _ in trajectories]
-    for index, data in enumerate(datas):
-        half = wanted.yaw[0, index] / 2
-        data.qpos[:3] = wanted.pos_w[0, index]
-        data.qpos[3:] = [np.cos(half), 0.0, 0.0, np.sin(half)]
-        data.qvel[:3] = wanted.vel_w[0, index]
-        mujoco.mj_step1(model, data)
-    state = hover_state(plant, (count,), noise=None if draws is None else draws[0])
-    hover = (state.rotor_speed**2).sum(-1)
-    gains, summed_w = gains or Gains(), np.zeros((count, 3))
-    command = Command(np.zeros(count), np.zeros((count, 3)))
-    still = np.zeros((count, 3))
-    acc_b = still + [0.0, 0.0, 9.81]
-    kept: list[Any] = []
-    for step in range(steps):
-        time_s = step * dt
-        motion, quat = _motion(datas)
-        if step % period == 0:
-            now = Reference(*(part[step // period] for part in wanted))
-            _check(motion, now, time_s)
-            summed_w = np.clip(summed_w + period * dt * (now.pos_w - motion.pos_w), -1.0, 1.0)
-            command = steer(nominal, gains, now, motion, summed_w)
-        power = (state.rotor_speed**2).sum(-1) / hover - 1.0
+        steps = round(max(way.duration_s for way in trajectories) * frequency)
+        draws = rng.standard_normal((steps + 1, len(trajectories), 3))
+    bodies = _MujocoBodies(truth, plant, wanted, dt, extra, draws, has_voltage)
+    return follow(bodies, nominal, trajectories, wanted, period, dt, gains)
+
+
+class _MujocoBodies:
+    """N quadrotors, each in a model of its own."""
+
+    integrator: str | None = INTEGRATOR
+
+    def __init__(
+        self,
+        truth: Vehicle,
+        plant: Plant,
+        wanted: Reference,
+        dt: float,
+        extra: Extra | None,
+        draws: np.ndarray | None,
+        has_voltage: bool,
+    ) -> None:
+        import mujoco
+
+        from eval.quadrotor.model import compile_quadrotor
+
+        self._plant, self._dt, self._extra, self._draws = plant, dt, extra, draws
+        self._has_voltage, self._steps = has_voltage, 0
+        count = wanted.yaw.shape[1]
+        self._model = compile_quadrotor(mujoco.MjSpec(), truth, dt)
+        self._datas = [mujoco.MjData(self._model) for _ in range(count)]
+        self._first, self._second = mujoco.mj_step1, mujoco.mj_step2
+        for index, data in enumerate(self._datas):
+            half = wanted.yaw[0, index] / 2
+            data.qpos[:3] = wanted.pos_w[0, index]
+            data.qpos[3:] = [np.cos(half), 0.0, 0.0, np.sin(half)]
+            data.qvel[:3] = wanted.vel_w[0, index]
+            self._first(self._model, data)
+        noise = None if draws is None else draws[0]
+        self._state = hover_state(plant, (count,), noise=noise)
+        self._hover = (self._state.rotor_speed**2).sum(-1)
+        self._still = Wrench(np.zeros((count, 3)), np.zeros((count, 3)))
+
+    def motion(self) -> tuple[Motion, np.ndarray]:
+        pose = np.array([data.qpos for data in self._datas])
+        velocity = np.array([data.qvel for data in self._datas])
+        rot_w = np.array([data.xmat[1] for data in self._datas]).reshape(-1, 3, 3)
+        return Motion(pose[:, :3], rot_w, velocity[:, :3], velocity[:, 3:]), pose[:, 3:]
+
+    def step(self, motion: Motion, command: Command, time_s: float) -> Step:
+        speed, added = self._state.rotor_speed, self._still
+        power = (speed**2).sum(-1) / self._hover - 1.0
         drop = FALL_V_PER_S * time_s + SAG_V * power
-        acting = command if extra is None else extra.command(command, time_s)
-        speed = state.rotor_speed
+        acting = command if self._extra is None else self._extra.command(command, time_s)
+        self._steps += 1
         inputs = Inputs(
             acting,
-            noise=None if draws is None else draws[step + 1],
-            voltage_drop=drop if has_voltage else None,
+            noise=None if self._draws is None else self._draws[self._steps],
+            voltage_drop=drop if self._has_voltage else None,
         )
-        state, wrench = plant_step(plant, state, motion, inputs, np.full(count, time_s))
-        added = Wrench(still, still)
-        if extra is not None:
-            added = extra.wrench(motion, wrench, time_s, dt)
+        now = np.full(len(self._datas), time_s)
+        self._state, wrench = plant_step(self._plant, self._state, motion, inputs, now)
+        if self._extra is not None:
+            added = self._extra.wrench(motion, wrench, time_s, self._dt)
             wrench = Wrench(wrench.force_b + added.force_b, wrench.torque_b + added.torque_b)
-        kept.append((motion, quat, speed, command, acc_b, FULL_V - drop, acting, added))
-        acc_b = wrench.force_b / plant.constants.mass
         force_w = to_world(motion.rot_w, wrench.force_b)
-        for index, data in enumerate(datas):
+        for index, data in enumerate(self._datas):
             data.qfrc_applied[:3] = force_w[index]
             data.qfrc_applied[3:] = wrench.torque_b[index]
-            mujoco.mj_step2(model, data)
-            mujoco.mj_step1(model, data)
-    return [
-        _recording(kept, index, round(way.duration_s * frequency), dt, period)
-        for index, way in enumerate(trajectories)
-    ]
-
-
-def _motion(datas: Sequence[Any]) -> tuple[Motion, np.ndarray]:
-    pose = np.array([data.qpos for data in datas])
-    velocity = np.array([data.qvel for data in datas])
-    rot_w = np.array([data.xmat[1] for data in datas]).reshape(-1, 3, 3)
-    return Motion(pose[:, :3], rot_w, velocity[:, :3], velocity[:, 3:]), pose[:, 3:]
-
-
-def _check(motion: Motion, wanted: Reference, time_s: float) -> None:
-    off = np.sqrt(((motion.pos_w - wanted.pos_w) ** 2).sum(-1))
-    # Written so that a state that is no number fails too.
-    sound = (off < 4.0) & (motion.rot_w[:, 2, 2] > 0.0) & (motion.pos_w[:, 2] > 0.02)
-    if not sound.all():
-        bad = int(np.flatnonzero(~sound)[0])
-        raise FlightFailed(
-            f"flight {bad + 1} failed at {time_s:.2f} s, {off[bad]:.1f} m off its trajectory; "
-            "make the trajectory gentler or the effect weaker"
-        )
-
-
-def _recording(kept: list[Any], index: int, steps: int, dt: float, period: int) -> Recording:
-    def column(pick: Any) -> np.ndarray:
-        return np.array([pick(entry)[index] for entry in kept[:steps]])
-
-    return Recording(
-        dt=dt,
-        period=period,
-        time_s=np.arange(steps) * dt,
-        motion=Motion(*(column(lambda entry, i=i: entry[0][i]) for i in range(4))),
-        quat_wxyz=column(lambda entry: entry[1]),
-        rotor_speed=column(lambda entry: entry[2]),
-        command=Command(*(column(lambda entry, i=i: entry[3][i]) for i in range(2))),
-        acc_b=column(lambda entry: entry[4]),
-        voltage=column(lambda entry: entry[5]),
-        acting=Command(*(column(lambda entry, i=i: entry[6][i]) for i in range(2))),
-        extra=Wrench(*(column(lambda entry, i=i: entry[7][i]) for i in range(2))),
-        integrator=INTEGRATOR,
-    )
+            self._second(self._model, data)
+            self._first(self._model, data)
+        acc_b = wrench.force_b / self._plant.constants.mass
+        return Step(speed, FULL_V - drop, acting, added, acc_b)

@@ -60,9 +60,10 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
         duration_s: of each flight.
     """
     from suite.blind.oracle.strength import given_vehicle
+    from suite.diagnose.plans.follow import FlightFailed
     from suite.diagnose.plans.sensors import SENSORS as ALL
     from suite.diagnose.plans.sensors import log_of
-    from suite.diagnose.plans.simulate import FlightFailed, fly
+    from suite.diagnose.plans.simulate import fly
     from suite.diagnose.plans.trajectory import ordinary_flights
 
     def attempt(number: int) -> Task:

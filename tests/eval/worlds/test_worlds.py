@@ -273,10 +273,14 @@ def moved(world, motion, frequency=1 / STEP_S, vehicle=PARITY):
     return result, flights[0]
 
 
-@pytest.mark.parametrize(
-    "motion",
-    [pytest.param(m, marks=() if m == "manoeuvre" else pytest.mark.slow) for m in MOTIONS],
-)
+def each_of(motions):
+    """All but the manoeuvre, which has everything, at full size."""
+    marks = {"manoeuvre": ()}
+    params = [pytest.param(m, marks=marks.get(m, pytest.mark.slow)) for m in motions]
+    return pytest.mark.parametrize("motion", params)
+
+
+@each_of(MOTIONS)
 def test_mjx_and_the_reference_step_as_mujoco_does(motion):
     result, flight = moved("mujoco", motion)
     plain, _ = moved("reference", motion)
@@ -292,7 +296,7 @@ def rotorpy():
     pytest.importorskip("torchdiffeq")
 
 
-@pytest.mark.parametrize("motion", MOTIONS)
+@each_of(MOTIONS)
 def test_rotorpy_steps_as_mujoco_does_but_for_the_length_of_mujocos_steps(motion, rotorpy):
     (_, ours), (_, theirs) = moved("mujoco", motion), moved("rotorpy", motion)
     assert np.abs(ours.pos_w - theirs.pos_w).max() < EULER_M
@@ -300,7 +304,7 @@ def test_rotorpy_steps_as_mujoco_does_but_for_the_length_of_mujocos_steps(motion
     assert np.abs(ours.quat_wxyz - theirs.quat_wxyz).max() < EULER_QUAT
 
 
-@pytest.mark.parametrize("motion", ["fall", "spin", "manoeuvre"])
+@each_of(["fall", "spin", "manoeuvre"])
 def test_what_differs_from_rotorpy_halves_with_the_step(motion, rotorpy):
     """Nothing else does: a difference of models would stay."""
 

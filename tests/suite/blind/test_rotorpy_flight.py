@@ -1,15 +1,50 @@
-"""What the blind set has RotorPy fly; it need not be installed for that."""
+"""What the blind set has RotorPy fly."""
 
+import numpy as np
 import pytest
 
-from suite.blind.rotorpy_flight import exact_parameters
-from tests.support.vehicles import with_effects
+from eval.quadrotor.plant import Motion
+from suite.blind.rotorpy_flight import check_effects, fly_rotorpy
+from suite.diagnose.plans.follow import FlightFailed
+from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.trajectory import Trajectory
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tracks.geometry.rotation import to_world
 
-
-def test_the_parameters_are_those_of_the_world():
-    assert exact_parameters(with_effects(rotor_drag=(1e-5,)))["k_d"] == 1e-5
+WAYS = [Trajectory("figure_eight", 1.0, speed=2.0), Trajectory("hover", 0.5)]
+LAGGED = with_lag(PLAIN, 0.03)
+G = np.array([0.0, 0.0, 9.81])
 
 
 def test_an_effect_that_rotorpy_does_not_have_as_it_is_is_refused():
+    check_effects(with_effects(rotor_drag=(1e-5,)))
     with pytest.raises(ValueError, match="effects.linear_drag: RotorPy does not have it; allowed:"):
-        exact_parameters(with_effects(linear_drag=((0.1, 0.1, 0.1),)))
+        check_effects(with_effects(linear_drag=((0.1, 0.1, 0.1),)))
+
+
+def test_flights_side_by_side_are_each_as_if_alone_and_move_as_their_accelerometers_say():
+    pytest.importorskip("rotorpy")
+    truth = with_effects(LAGGED, rotor_drag=(4e-4,))
+    eight, hover = fly_rotorpy(LAGGED, truth, WAYS, 100.0)
+    assert (len(eight.time_s), len(hover.time_s), eight.period) == (500, 250, 5)
+    assert eight.integrator is None
+    (alone,) = fly_rotorpy(LAGGED, truth, WAYS[1:], 100.0)
+    np.testing.assert_allclose(alone.motion.pos_w, hover.motion.pos_w, atol=1e-9)
+    felt_w = to_world(eight.motion.rot_w, eight.acc_b) - G
+    between = 0.5 * (felt_w[1:-1] + felt_w[2:])
+    moved = np.diff(eight.motion.vel_w, axis=0)[1:] / eight.dt
+    np.testing.assert_allclose(moved, between, atol=2e-3)
+
+
+def test_without_air_it_flies_as_mujoco_does():
+    pytest.importorskip("rotorpy")
+    (here,) = fly(LAGGED, LAGGED, WAYS[:1])
+    (there,) = fly_rotorpy(LAGGED, LAGGED, WAYS[:1], 100.0)
+    off = Motion(*(np.abs(a - b).max() for a, b in zip(here.motion, there.motion, strict=True)))
+    assert off.pos_w < 2e-3 and off.vel_w < 5e-3 and off.rate_b < 0.03
+
+
+def test_a_flight_into_the_ground_fails():
+    pytest.importorskip("rotorpy")
+    with pytest.raises(FlightFailed, match=r"flight 1 failed at \d\.\d\d s"):
+        fly_rotorpy(LAGGED, LAGGED, [Trajectory("hover", 0.5, height=0.0)], 100.0)

@@ -6,7 +6,8 @@ import pytest
 from eval.quadrotor.plant import Wrench, make_plant
 from eval.quadrotor.rigid_body import accelerations
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
-from suite.diagnose.plans.simulate import FULL_V, FlightFailed, fly
+from suite.diagnose.plans.follow import FlightFailed
+from suite.diagnose.plans.simulate import FULL_V, fly
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tests.support.ways import BARE, CIRCLE, EIGHT, bare_flights, having
