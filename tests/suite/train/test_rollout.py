@@ -264,9 +264,9 @@ def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
     """The second gate's centre, the last one's where none comes after, and the next's direction."""
     seen = []
 
-    def spy(spec, view, action_b):
+    def spy(spec, view, action_b, speed):
         jax.debug.callback(lambda *shown: seen.append(shown), view.second_w, view.axis_w)
-        return observe(spec, view, action_b)
+        return observe(spec, view, action_b, speed)
 
     monkeypatch.setattr(rollout, "observe", spy)
     config = replace(small_config(3, 1), spec=replace(SPEC, second_gate=True, gate_axis=True))
