@@ -1,6 +1,6 @@
 """What a policy sees: the paper's 12 numbers (Su et al. 2026, Eq. 1) or more, and a depth image.
 
-`observe` is the one place that assembles it, for trainer, judge, worlds and environments. A number
+`observe` is the one place that assembles it, for trainer, judge, worlds and environments. A vector
 more is a key in `policies.spec.EXTRAS` and a line in `EXTRA_VECTORS`.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from policies.spec import EXTRAS, DepthEncoding, PolicySpec
+from policies.spec import DepthEncoding, PolicySpec
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Array, Gates
 
@@ -59,19 +59,27 @@ EXTRA_VECTORS: dict[str, Callable[[View], Array]] = {
 """Key of a spec -> the three numbers, (..., 3) in body axes, that it adds to the state."""
 
 
-def observe(spec: PolicySpec, view: View, last_action_b: Array) -> Observation:
+def observe(
+    spec: PolicySpec, view: View, last_action_b: Array, speed: Array | None = None
+) -> Observation:
     """Return what a policy of `spec` is given.
 
     Args:
         spec: the policy's; its extras and its depth encoding count.
         view: what there is to see.
         last_action_b: (..., 3) the previous action, in the body axes of its own time [m/s^2].
+        speed: (...,) how fast each is to fly, 0 to 1, where the spec has that input; the spec's own
+            if None.
     """
     rot_w = view.rot_w
     vel_b, gate_b = to_local(rot_w, view.vel_w), to_local(rot_w, view.gate_w - view.pos_w)
     numbers = [vel_b, rot_w[..., 2, :], gate_b, last_action_b]
-    numbers += [EXTRA_VECTORS[key](view) for key in EXTRAS if getattr(spec, key)]
-    state = rot_w.__array_namespace__().concatenate(numbers, axis=-1)
+    numbers += [vector(view) for key, vector in EXTRA_VECTORS.items() if getattr(spec, key)]
+    xp = rot_w.__array_namespace__()
+    if spec.speed_input:
+        own = xp.full_like(vel_b[..., :1], spec.speed)
+        numbers.append(own if speed is None else speed[..., None])
+    state = xp.concatenate(numbers, axis=-1)
     if view.depth_m is None:
         return Observation(state, None)
     return Observation(state, encode_depth(spec.depth, view.depth_m, spec.camera.range_m))

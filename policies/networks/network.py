@@ -76,21 +76,21 @@ def fitted(params: Params, seen: PolicySpec, spec: PolicySpec) -> Params:
     """
     for entry in dataclasses.fields(spec):
         has, wanted = getattr(seen, entry.name), getattr(spec, entry.name)
-        if has != wanted and entry.name not in EXTRAS:
+        if has != wanted and entry.name not in (*EXTRAS, "speed"):
             raise ValueError(
                 f"the policy to start from has spec.{entry.name} {has}, and this run {wanted}; "
                 "train from nothing, or with the policy's own"
             )
     rows, first = [params["state.weight"][:STATE_SIZE]], STATE_SIZE
-    for key in EXTRAS:
+    for key, count in EXTRAS.items():
         has, wanted = getattr(seen, key), getattr(spec, key)
         if has and not wanted:
             raise ValueError(f"the policy to start from has spec.{key}; set spec.{key}=True")
         if has:
-            rows.append(params["state.weight"][first : first + 3])
-            first += 3
+            rows.append(params["state.weight"][first : first + count])
+            first += count
         elif wanted:
-            rows.append(jnp.zeros((3, rows[0].shape[1])))
+            rows.append(jnp.zeros((count, rows[0].shape[1])))
     return {**params, "state.weight": jnp.concatenate(rows)}
 
 

@@ -14,11 +14,13 @@ from suite.judging.flying import (
     about_policy,
     default_policy,
     flying_needs,
+    load_flier,
     read_course,
     say_differences,
     who_flies,
     workers_for,
 )
+from suite.judging.manner import Manner
 from suite.judging.requests import Collection
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
@@ -52,11 +54,10 @@ def collect(
             flights of another collection.
     """
     from eval.judging.results import Journal
-    from policies.policy import load_policy
 
-    course = read_course(collection)
+    course, manner = read_course(collection), Manner(speed=collection.speed)
     asked = collection.policy or default_policy()
-    policy = load_policy(asked, collection.trust)
+    policy = load_flier(asked, collection.trust, manner)
     out = Path(out)
     about = {
         "collection": collection,
@@ -103,7 +104,7 @@ def _fly_missing(
     what = f"{len(missing)} flights in the {collection.world} world"
     announce(console, what, flying_needs(len(missing), workers, collection.world))
     say_differences(console, collection.world, course)
-    asked = collection.policy or default_policy()
+    asked, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
     with console.progress("flights", len(course.trials)) as update:
 
         def keep(result: TrialResult, flight: Flight | None) -> None:
@@ -116,7 +117,7 @@ def _fly_missing(
 
         if missing:
             fly(
-                who_flies(policy, asked, collection.trust, workers),
+                who_flies(policy, asked, collection.trust, workers, manner),
                 missing,
                 course.vehicle,
                 collection.world,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.console import Console
 from suite.common.estimate import announce
@@ -20,6 +20,7 @@ from suite.judging.flying import (
     who_flies,
     workers_for,
 )
+from suite.judging.manner import Manner, manners
 from suite.judging.requests import Evaluation
 from tracks.common.grid import rich_table
 from tracks.common.provenance import stamp
@@ -28,6 +29,18 @@ from tracks.common.work import Workers
 if TYPE_CHECKING:
     from eval.worlds.trial import TrialResult
     from policies.policy import Policy
+
+
+class Flier(NamedTuple):
+    """Who flies a share of the trials."""
+
+    source: str
+    """What was asked for: a name or a path."""
+    policy: Policy
+    """Loaded, in its manner."""
+    label: str
+    """What tables call it."""
+    manner: Manner
 
 
 def evaluate(
@@ -49,26 +62,28 @@ def evaluate(
 
     course, out = read_course(evaluation), Path(out)
     asked = tuple(evaluation.policies or (default_policy(),))
-    policies = [load_flier(name, evaluation.trust, False) for name in asked]
-    called = labels(asked, [policy.name for policy in policies])
-    if evaluation.monitor:
-        policies += [load_flier(name, evaluation.trust, True) for name in asked]
-        called, asked = [*called, *(f"{label}+monitor" for label in called)], asked * 2
+    policies = [load_flier(name, evaluation.trust) for name in asked]
+    plain = list(zip(asked, policies, labels(asked, [p.name for p in policies]), strict=True))
+    fliers = [
+        Flier(name, manner(policy), manner.label(label), manner)
+        for manner in manners(evaluation.speed, evaluation.monitor)
+        for name, policy, label in plain
+    ]
     count = len(course.trials)
     workers = workers_for(count, workers, evaluation.world)
-    what = f"{count * len(asked)} trials in the {evaluation.world} world"
-    announce(console, what, flying_needs(count * len(asked), workers, evaluation.world))
+    flown = count * len(fliers)
+    what = f"{flown} trials in the {evaluation.world} world"
+    announce(console, what, flying_needs(flown, workers, evaluation.world))
     say_differences(console, evaluation.world, course)
     results: list[TrialResult] = []
     journals: list[Path] = []
-    for number, (name, policy, label) in enumerate(zip(asked, policies, called, strict=True)):
+    for number, flier in enumerate(fliers):
         journals.append(out / f"journal-{number}.jsonl")
-        flier = name, policy, label
         results += _fly_one(evaluation, course, flier, workers, journals[-1], console)
     summary = {
         **summarise(results),
         "judged": evaluation,
-        "policies": [about_policy(*pair) for pair in zip(asked, policies, strict=True)],
+        "policies": [about_policy(flier.source, flier.policy) for flier in fliers],
         "flown_otherwise": course.differences,
     }
     write_results(
@@ -90,20 +105,21 @@ def evaluate(
 def _fly_one(
     evaluation: Evaluation,
     course: Course,
-    flier: tuple[str, Policy, str],
+    flier: Flier,
     workers: Workers,
     journal_path: Path,
     console: Console,
 ) -> list[TrialResult]:
-    """Return the results of one policy (asked for as, itself, called) in the trials' order."""
+    """Return the results of one policy in the trials' order."""
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, fly
     from eval.judging.results import Journal
 
-    name, policy, label = flier
+    label = flier.label
     about = {
         **stamp(1, None),
-        "policy": about_policy(name, policy),
+        "policy": about_policy(flier.source, flier.policy),
+        "speed": flier.manner.speed,
         "vehicle": course.vehicle,
         "world": evaluation.world,
         "deadline_s": evaluation.deadline_s,
@@ -123,7 +139,7 @@ def _fly_one(
                 update(done, f"{share:.0%} success")
 
             fly(
-                who_flies(policy, name, evaluation.trust, workers),
+                who_flies(flier.policy, flier.source, evaluation.trust, workers, flier.manner),
                 missing,
                 course.vehicle,
                 evaluation.world,

@@ -11,6 +11,7 @@ from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.common.console import Console
 from suite.common.estimate import Estimate
 from suite.judging.content import PolicyContent, policy_digest
+from suite.judging.manner import PLAIN, Manner
 from suite.judging.requests import Collection, Evaluation
 from tracks.common.work import Workers, crew, usable_cores
 from tracks.input.ranges import check_ranges
@@ -170,42 +171,39 @@ def workers_for(trials: int, asked: Workers | None, world: str) -> Workers:
 
 
 def who_flies(
-    policy: Policy, name_or_path: str, trust: bool, workers: Workers
+    policy: Policy, name_or_path: str, trust: bool, workers: Workers, manner: Manner = PLAIN
 ) -> Policy | Callable[[], Policy]:
     """Return the loaded policy, or for several processes how each of them loads its own.
 
     Those of this machine read it where it is, those of a cluster are given its content.
-    """
-    from eval.judging.monitor import Monitored
 
-    monitored = isinstance(policy, Monitored)
+    Args:
+        policy: as it was loaded, in its manner.
+        name_or_path: where from.
+        trust: as `load_policy` has it.
+        workers: who shares the trials.
+        manner: in which it flies.
+    """
     if workers == 1:
         return policy
     if isinstance(workers, int):
-        return partial(load_flier, name_or_path, trust, monitored)
-    return partial(_flier_of, PolicyContent.of(name_or_path, trust), monitored)
+        return partial(load_flier, name_or_path, trust, manner)
+    return partial(_flier_of, PolicyContent.of(name_or_path, trust), manner)
 
 
-def _flier_of(content: PolicyContent, monitored: bool) -> Policy:
-    return _monitored(content()) if monitored else content()
+def _flier_of(content: PolicyContent, manner: Manner) -> Policy:
+    return manner(content())
 
 
-def _monitored(policy: Policy) -> Policy:
-    from eval.judging.monitor import Monitored
-
-    return Monitored(policy)
-
-
-def load_flier(name_or_path: str, trust: bool, monitored: bool) -> Policy:
-    """Return a policy to fly, with the safety monitor around it where it is asked for.
+def load_flier(name_or_path: str, trust: bool, manner: Manner = PLAIN) -> Policy:
+    """Return a policy to fly, in its manner.
 
     Raises:
-        PolicyError: where it cannot be loaded.
+        PolicyError: where it cannot be loaded, or not be flown so.
     """
     from policies.policy import load_policy
 
-    policy = load_policy(name_or_path, trust)
-    return _monitored(policy) if monitored else policy
+    return manner(load_policy(name_or_path, trust))
 
 
 def about_policy(name_or_path: str, policy: Policy) -> dict[str, Any]:

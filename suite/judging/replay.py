@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from suite.common.choices import parse_levels, parse_tracks
 from suite.common.console import Console
-from suite.judging.flying import custom_tracks, default_policy, trial_list
+from suite.judging.flying import custom_tracks, default_policy, load_flier, trial_list
+from suite.judging.manner import manners
 from suite.judging.requests import Evaluation
 from tracks.input.ranges import check_ranges, shown
 from tracks.input.reading import read_json
@@ -30,7 +31,8 @@ def read_evaluation(folder: Path) -> Evaluation:
     try:
         record = read_json(path)
         config: dict[str, Any] = record["config"]
-        fits = set(config) == {field.name for field in dataclasses.fields(Evaluation)}
+        names = {field.name for field in dataclasses.fields(Evaluation)}
+        fits = "policies" in config and set(config) <= names
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the record of a run ({error})") from error
     if not fits:
@@ -38,7 +40,10 @@ def read_evaluation(folder: Path) -> Evaluation:
     policies = config["policies"]
     if not isinstance(policies, list) or not all(isinstance(name, str) for name in policies):
         raise ValueError(f"{path}: policies is {shown(policies)}, allowed is a list of names")
-    asked = Evaluation(**{**config, "policies": tuple(policies)})
+    speeds = config.get("speed", [])
+    if not isinstance(speeds, list) or not all(isinstance(s, (int, float)) for s in speeds):
+        raise ValueError(f"{path}: speed is {shown(speeds)}, allowed is a list of numbers")
+    asked = Evaluation(**{**config, "policies": tuple(policies), "speed": tuple(speeds)})
     for name, value in vars(asked).items():
         default = getattr(Evaluation, name)
         # Those that are None by default are numbers.
@@ -69,7 +74,6 @@ def fly_again(
     from eval.judging.judge import JudgeOptions, Record, fly
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds.trial import track_of
-    from policies.policy import load_policy
 
     name = policy or (evaluation.policies or (default_policy(),))[0]
     tracks = custom_tracks(parse_tracks(evaluation.track))
@@ -80,7 +84,7 @@ def fly_again(
             flights[result.trial] = flight
 
     results = fly(
-        load_policy(name, evaluation.trust),
+        load_flier(name, evaluation.trust, manners(evaluation.speed, monitor=False)[0]),
         trials,
         load_vehicle(evaluation.vehicle),
         evaluation.world,

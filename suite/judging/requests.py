@@ -39,6 +39,9 @@ class Evaluation:
     """Also load policy files that can run code on this machine."""
     monitor: bool = False
     """Fly every policy a second time with the safety monitor around it, on the same trials."""
+    speed: Annotated[tuple[float, ...], Range(0.0, 1.0)] = ()
+    """How fast policies that take it as an input are asked to fly, 0 (careful) to 1 (a race); with
+    several, all fly the same trials at each. Without it as their cards say."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,8 @@ class Collection:
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str = "mujoco"
+    """As in suite eval."""
+    speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """As in suite eval."""
     seed: Seed = 100_000
     """Seed of the first trial; by default far from those that suite eval flies."""

@@ -96,6 +96,12 @@ class LossConfig:
     """lambda_j [s^6/m^2]."""
     progress: Annotated[float, Range(0.0, 1e6)] = 1.2
     """lambda_p of L_p [s/m]."""
+    progress_by_speed: Annotated[tuple[float, float], Range(0.0, 1e3, above=True, ordered=True)] = (
+        0.25,
+        2.0,
+    )
+    """Factors of `progress` where a policy with `spec.speed_input` is asked to fly at 0 and at 1;
+    between them it goes by a power [1]."""
     progress_norm: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Weight of L_p^norm, the ablation's direction-only progress [1]."""
     projection: Annotated[float, Range(0.0, 1e6)] = 0.0

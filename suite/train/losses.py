@@ -55,9 +55,12 @@ def speed_to_goal(step: Step) -> jax.Array:
     return (step.vel_w * to_goal).sum(-1) / norm(to_goal)
 
 
-def progress(_: LossConfig, step: Step) -> jax.Array:
-    """Return L_p, minus the speed towards the goal [m/s]."""
-    return -speed_to_goal(step)
+def progress(config: LossConfig, step: Step) -> jax.Array:
+    """Return L_p, minus the speed towards the goal, by how fast a world is to be flown [m/s]."""
+    if step.wanted is None:
+        return -speed_to_goal(step)
+    slow, fast = config.progress_by_speed
+    return -speed_to_goal(step) * slow * (fast / slow) ** step.wanted
 
 
 def progress_norm(_: LossConfig, step: Step) -> jax.Array:

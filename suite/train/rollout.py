@@ -122,7 +122,7 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
         depth_m = depth_image(worlds.scene, pos_w, rot_w, wide, spec.camera.range_m, SEEN)
         sensed = dynamics.seen(state, worlds.constants, False)
         view = view_in(worlds, sensed, target)._replace(depth_m=depth_m)
-        seen = observe(spec, view, last_action_b)
+        seen = observe(spec, view, last_action_b, worlds.wanted)
         if dynamics.noise is not None:
             noise = jax.random.normal(jax.random.fold_in(key, 2), seen.state.shape)
             seen = seen._replace(state=seen.state + dynamics.noise * noise)
@@ -132,10 +132,11 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
     return sight
 
 
-def observed_at_start(batch: int, config: TrainConfig) -> jax.Array:
+def observed_at_start(worlds: Worlds, config: TrainConfig) -> jax.Array:
     """Return the states on their way at the start, (B, state_delay, state_size): level, at rest."""
-    size = config.spec.state_size
-    return jnp.zeros((batch, config.physics.state_delay, size)).at[:, :, 5].set(1.0)
+    shape = (len(worlds.target), config.physics.state_delay, config.spec.state_size)
+    level = jnp.zeros(shape).at[:, :, 5].set(1.0)
+    return level if worlds.wanted is None else level.at[:, :, -1].set(worlds.wanted[:, None])
 
 
 def make_rollout(
@@ -165,7 +166,7 @@ def make_rollout(
             hidden=jnp.asarray(worlds.hidden),
             action_b=jnp.zeros((batch, 3)),
             embeddings=jnp.zeros((batch, physics.image_delay, width)),
-            observed=observed_at_start(batch, config),
+            observed=observed_at_start(worlds, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
             going=jnp.ones(batch),

@@ -53,6 +53,8 @@ class Step(NamedTuple):
     """(B,) smallest signed distance to a solid on the way [m]."""
     survival: jax.Array
     """(B,) probability to have flown until the step's end, a smooth one, with gradient [1]."""
+    wanted: jax.Array | None = None
+    """(B,) how fast the policy is asked to fly, 0 to 1, where it has that input [1]."""
 
 
 def norm(vector: jax.Array) -> jax.Array:
@@ -162,4 +164,5 @@ def make_step(
         passed=passed,
         clearance=distance.min(-1),
         survival=jnp.broadcast_to(survival, target.shape),
+        wanted=worlds.wanted,
     )

@@ -42,6 +42,8 @@ class Worlds(NamedTuple):
     """(B,) step at which a world leaves the loss."""
     fov_scale: Array
     """(B,) this iteration's scale of the rays across the optical axis."""
+    wanted: Array | None = None
+    """(B,) how fast the policy is asked to fly, 0 to 1, where it has that input [1]."""
 
 
 def difficulty_range(config: TrainConfig, iteration: int) -> tuple[float, float]:
@@ -135,6 +137,14 @@ def _fleet_constants(config: TrainConfig, iteration: int) -> dynamics.WorldParam
     return draw_fleet(config.fleet, 1.0 / config.spec.rate_hz, config.episode.batch, rng)
 
 
+def _wanted(config: TrainConfig, iteration: int) -> Array | None:
+    """Return how fast each world is to be flown, from draws of their own."""
+    if not config.spec.speed_input:
+        return None
+    rng = np.random.default_rng([config.seed, iteration, 3])
+    return rng.uniform(0.0, 1.0, config.episode.batch).astype(np.float32)
+
+
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     """Return the worlds of an iteration."""
     rng = np.random.default_rng([config.seed, iteration])
@@ -191,4 +201,5 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         remembers=np.where(rests, 0.0, 1.0).astype(np.float32),
         stop=np.where(rests, rng.integers(earliest, episode.steps + 1, batch), episode.steps),
         fov_scale=np.full(batch, rng.uniform(*physics.fov_scale), np.float32),
+        wanted=_wanted(config, iteration),
     )

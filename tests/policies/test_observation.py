@@ -53,6 +53,19 @@ def test_the_gates_direction_comes_last_and_turns_with_the_body():
     np.testing.assert_array_equal(alone[12:], with_both[15:])
 
 
+def test_how_fast_to_fly_comes_last_as_the_spec_or_each_row_says():
+    zero = np.zeros((2, 3))
+    view = View(zero, np.broadcast_to(np.eye(3), (2, 3, 3)), zero, zero, zero, zero + [1.0, 0, 0])
+    spec = replace(AXIS, speed_input=True, speed=0.3)
+    assert spec.state_size == 16
+    without = observe(AXIS, view, zero).state
+    own = observe(spec, view, zero).state
+    np.testing.assert_array_equal(own[:, :15], without)
+    np.testing.assert_array_equal(own[:, 15], 0.3)
+    told = observe(spec, view, zero, np.array([0.0, 0.9])).state
+    np.testing.assert_array_equal(told[:, 15], [0.0, 0.9])
+
+
 def test_the_papers_twelve_numbers():
     """Rolled a quarter turn to the right, so that its left points up and its top to the right."""
     rolled = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

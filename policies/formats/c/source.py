@@ -30,6 +30,7 @@ _OBSERVATION = (
 _EXTRA = {
     "second_gate": ("to the centre of the gate after the next (or the last), in body axes", "m"),
     "gate_axis": ("the next gate's flight direction, a unit vector in body axes", "1"),
+    "speed_input": ("how fast to fly, 0 (careful) to 1", "1"),
 }
 
 
@@ -154,11 +155,15 @@ def _values(
 
 
 def _observation(spec: PolicySpec) -> str:
-    rows = [*_OBSERVATION, *(_EXTRA[key] for key in EXTRAS if getattr(spec, key))]
-    assert 3 * len(rows) == spec.state_size and len(_OBSERVATION) * 3 == STATE_SIZE
-    return "\n".join(
-        f" *     {3 * k}..{3 * k + 2}: {what} [{unit}]" for k, (what, unit) in enumerate(rows)
-    )
+    assert len(_OBSERVATION) * 3 == STATE_SIZE
+    rows = [(3, *row) for row in _OBSERVATION]
+    rows += [(EXTRAS[key], *_EXTRA[key]) for key in EXTRAS if getattr(spec, key)]
+    lines, first = [], 0
+    for count, what, unit in rows:
+        places = f"{first}..{first + count - 1}" if count > 1 else str(first)
+        lines.append(f" *     {places}: {what} [{unit}]")
+        first += count
+    return "\n".join(lines)
 
 
 def _string(text: str) -> str:

@@ -101,7 +101,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
             action_b=jnp.zeros((batch, 3)),
             # An image of zeros is embedded as zeros, which is how the trainer's rollouts start.
             images=jnp.zeros((batch, physics.image_delay, spec.camera.height, spec.camera.width)),
-            observed=observed_at_start(batch, config),
+            observed=observed_at_start(worlds, config),
         )
 
         def step(carry: EpisodeCarry, key: jax.Array) -> tuple[EpisodeCarry, Record]:

@@ -56,7 +56,7 @@ def edit(folder, change):
         ("channels", [0, 32, 32], r"channels is \(0, 32, 32\), allowed is 2 to 1024"),
         ("channels", [16, 32], r"channels is \[16, 32\], expected 3 numbers"),
         ("channels", [16, 32, 32], r"expected float32 \(.*16"),
-        ("speed", 3, "unknown key 'speed', allowed are rate_hz, camera"),
+        ("tempo", 3, "unknown key 'tempo', allowed are rate_hz, camera"),
         ("camera", {"width": 34}, "camera.width is 34"),
         ("camera", {"height": 16}, "camera.height is 16"),
         ("camera", {"fov_deg": [70.0]}, r"fov_deg is \[70.0\], expected 2"),

@@ -16,6 +16,7 @@ SMALL = PolicySpec(rate_hz=33.0, hidden_size=64)
 SECOND = replace(SMALL, second_gate=True)
 AXIS = replace(SMALL, gate_axis=True)
 BOTH = replace(SECOND, gate_axis=True)
+PACED = replace(AXIS, speed_input=True, speed=0.5)
 CLIMB_B = jnp.asarray([1.0, 0.0, 1.0])
 ADAMW = optax.adamw(2e-3, b2=0.99, weight_decay=1e-2)
 
@@ -61,6 +62,8 @@ def test_one_action_for_all_is_learned_without_saturating_the_memory(seed):
         (SMALL, BOTH, slice(0, 12)),
         (SECOND, BOTH, slice(0, 15)),
         (AXIS, BOTH, np.r_[0:12, 15:18]),
+        (AXIS, PACED, slice(0, 15)),
+        (PACED, replace(PACED, second_gate=True, speed=1.0), np.r_[0:12, 15:19]),
     ],
 )
 def test_a_policy_goes_on_as_one_that_sees_more(seen, spec, columns):

@@ -50,7 +50,7 @@ def test_more_trials_take_more_processes_up_to_what_there_is(monkeypatch):
 
 
 def test_a_cluster_is_given_the_policy_and_this_machines_processes_its_name():
-    policy = load_flier("racer", False, False)
+    policy = load_flier("racer", False)
     assert who_flies(policy, "racer", False, 1) is policy
     here, there = (
         who_flies(policy, "racer", False, 2),

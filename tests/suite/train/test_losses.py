@@ -169,6 +169,14 @@ def test_the_closing_speed_carries_no_gradient():
     assert not np.any(jax.grad(collide)(vel))
 
 
+def test_progress_counts_by_how_fast_a_world_is_to_be_flown():
+    """0.5, 1 and 2 times as much at speeds of 0, 1/2 and 1."""
+    config = LossConfig(progress=0.4, progress_by_speed=(0.5, 2.0))
+    ahead = jnp.broadcast_to(jnp.array([3.0, 0.0, 0.0]), (3, 3))
+    step = a_step(3, vel_w=ahead, goal_w=ahead, wanted=jnp.array([0.0, 0.5, 1.0]))
+    np.testing.assert_allclose(weighted(config, step)["progress"], [-0.6, -1.2, -2.4], rtol=1e-6)
+
+
 def test_progress_is_the_papers_and_differentiates():
     config = LossConfig(progress=0.4)
     rng = np.random.default_rng(2)

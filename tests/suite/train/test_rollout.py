@@ -17,6 +17,7 @@ from suite.train.gradient import make_gradient
 from suite.train.losses import UNIT_FIELD
 from suite.train.rollout import make_rollout, view_in
 from suite.train.step import target_gate
+from suite.train.worlds import sample_worlds
 from tests.support.training import (
     KEY,
     SPEC,
@@ -263,9 +264,9 @@ def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
     """The second gate's centre, the last one's where none comes after, and the next's direction."""
     seen = []
 
-    def spy(spec, view, action_b):
+    def spy(spec, view, action_b, speed):
         jax.debug.callback(lambda *shown: seen.append(shown), view.second_w, view.axis_w)
-        return observe(spec, view, action_b)
+        return observe(spec, view, action_b, speed)
 
     monkeypatch.setattr(rollout, "observe", spy)
     config = replace(small_config(3, 1), spec=replace(SPEC, second_gate=True, gate_axis=True))
@@ -292,8 +293,11 @@ def test_a_state_on_its_way_at_the_start_is_that_of_a_level_drone_at_rest():
     zero = np.zeros(3)
     seen = View(zero, np.eye(3), zero, zero, zero, zero)
     expected = observe(config.spec, seen, zero).state
-    found = rollout.observed_at_start(2, config)
+    found = rollout.observed_at_start(sample_worlds(config, 0), config)
     np.testing.assert_array_equal(found, np.tile(expected, (2, 1, 1)))
+    asked = replace(config, spec=replace(config.spec, speed_input=True))
+    worlds = sample_worlds(asked, 0)
+    np.testing.assert_array_equal(rollout.observed_at_start(worlds, asked)[:, 0, -1], worlds.wanted)
 
 
 def test_hovering_above_the_frame_there_is_progress_to_be_made_backwards():

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 
 from suite.delta.replay import nominal_model
@@ -46,6 +47,17 @@ def test_none_has_missed_a_gate_unless_asked():
     assert np.abs(one - other).max() > 0.1
     gates = sample_worlds(config, 3).scene.gates
     assert np.all(np.isfinite(gates.center_w))
+
+
+def test_how_fast_to_fly_is_drawn_where_it_is_an_input_and_moves_nothing_else():
+    config = small_config(batch=64)
+    asked = replace(config, spec=replace(config.spec, speed_input=True))
+    plain, worlds = sample_worlds(config, 2), sample_worlds(asked, 2)
+    assert plain.wanted is None
+    assert worlds.wanted.min() < 0.1 and worlds.wanted.max() > 0.9
+    assert np.abs(worlds.wanted.mean() - 0.5) < 0.15
+    for one, other in zip(plain[:-1], worlds[:-1], strict=True):
+        jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 def test_drag_along_the_bodys_z_has_a_range_of_its_own():

@@ -1,0 +1,38 @@
+"""In what manner policies fly: asked for, refused, called."""
+
+from dataclasses import replace
+
+import pytest
+
+from policies.errors import PolicyError
+from policies.policy import load_policy
+from suite import cli
+from suite.judging.manner import Manner, manners
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return load_policy("racer")
+
+
+def test_every_speed_is_flown_and_again_with_the_monitor():
+    assert manners((), False) == [Manner()]
+    assert manners((0.0, 1.0), True) == [
+        Manner(speed=0.0), Manner(speed=1.0), Manner(True, 0.0), Manner(True, 1.0)
+    ]  # fmt: skip
+    assert Manner(True, 0.25).label("mine") == "mine@0.25+monitor"
+    assert Manner().label("mine") == "mine"
+
+
+def test_a_speed_goes_into_the_spec_that_is_observed_by(policy):
+    asked = replace(policy, spec=replace(policy.spec, speed_input=True))
+    assert Manner(speed=0.0)(asked).spec.speed == 0.0
+    assert Manner()(asked) is asked
+
+
+def test_a_policy_without_that_input_is_one_line(policy, tmp_path, capsys):
+    with pytest.raises(PolicyError, match="racer takes no speed"):
+        Manner(speed=0.5)(policy)
+    assert cli.main(["eval", "--policy", "racer", "--speed", "0.5", "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "spec.speed_input=True" in said and len(said.strip().splitlines()) == 1
