@@ -56,6 +56,11 @@ def composites(among: Sequence[Candidate]) -> list[Candidate]:
     return found
 
 
+def acts_through(one: Candidate) -> bool:
+    """Return whether `one`, or a part of it, acts through other effects alone."""
+    return any(composite.carried in one.effects for composite in COMPOSITES if composite.carried)
+
+
 def carried(among: Sequence[Candidate]) -> list[Candidate]:
     """Return the candidates that may act through another part of a composite `among` them alone."""
     names = {composite.carried for composite in COMPOSITES}

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.fit.composites import begin_of, lent_at
+from suite.diagnose.fit.composites import acts_through, begin_of, lent_at
 from suite.diagnose.fit.normal_equations import (
     NormalEquations,
     along_numbers,
@@ -137,7 +137,8 @@ def fitted_beside(
     at, space = [*beside, *candidate.indices], task.model.space
     lent = [number for number in block.lent if number in candidate.indices]
     if not candidate.parts or not lent:
-        return fitted(task, now, at, rounds=1)
+        rounds = task.limits.bilinear_rounds if acts_through(candidate) else 1
+        return fitted(task, now, at, rounds)
     columns = sorted({*beside, *block.columns_of(candidate)})
     change, told = along_numbers(block, now.theta, space, columns)
     begin = begin_of(space, now.theta, candidate, lent, change, told)

@@ -165,15 +165,11 @@ def _parts(
     """
     if not name.candidate.parts:
         return [name]
-    start, found = task.model.space.array("start"), []
+    found = []
     for part in name.candidate.parts:
         others = [c for c in name.candidate.parts if c is not part]
         beside = [*named, *(replace(name, candidate=other) for other in others)]
-        theta = now.theta.copy()
-        theta[list(part.indices)] = start[list(part.indices)]
-        indices = indices_of([n.candidate for n in beside])
-        without = fitted(task, look(task, theta, now.weights), indices)
-        best = _next_name(task, without, beside, among, seed)
+        best = _next_name(task, _less(task, now, part), beside, among, seed)
         rivals = dict.fromkeys(_instead_of(part, name))
         if best is not None and part.name in (best[0].candidate.name, *best[0].rivals):
             rivals |= dict.fromkeys((best[0].candidate.name, *best[0].rivals))
@@ -200,22 +196,30 @@ def _without_idle(
     seed: int,
 ) -> tuple[list[ViewName], ViewEquations]:
     """Return the names that are still needed beside all others, weighed anew with their rivals."""
-    start = task.model.space.array("start")
     for one in list(named):
         if one is named[-1] and not at_bound(task.model.space, now.theta, one.candidate):
             continue  # it was weighed just now
         others = [n for n in named if n is not one]
-        theta = now.theta.copy()
-        theta[list(one.candidate.indices)] = start[list(one.candidate.indices)]
-        without = fitted(
-            task, look(task, theta, now.weights), indices_of([n.candidate for n in others])
-        )
+        without = _less(task, now, one.candidate)
         found = _next_name(task, without, others, [one.candidate], seed)
         if found is None or at_bound(task.model.space, now.theta, one.candidate):
-            named, now = others, without
+            named, now = others, fitted(task, without, indices_of([n.candidate for n in others]))
         else:
             named = [replace(found[0], rivals=n.rivals) if n is one else n for n in named]
-    return named, now
+    # What has lost what it acts through is no name any more.
+    acts = np.abs(now.data.slope).max(axis=(0, 1)) > 0.0
+    return [n for n in named if acts[list(n.candidate.indices)].any()], now
+
+
+def _less(task: ViewTask, now: ViewEquations, candidate: Candidate) -> ViewEquations:
+    """Return the equations where `candidate` is as in the vehicle file and all else as in `now`.
+
+    Other names are not fitted anew: a drag that hovering flights do not ask for without a wind
+    would be gone, and with it what the wind acts through.
+    """
+    at, theta = list(candidate.indices), now.theta.copy()
+    theta[at] = task.model.space.array("start")[at]
+    return look(task, theta, now.weights)
 
 
 def _folds(now: ViewEquations) -> np.ndarray:
