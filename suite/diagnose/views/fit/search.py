@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eval.effects import EFFECTS
-from suite.diagnose.fit.composites import carried
+from suite.diagnose.fit.composites import acts_through, carried
 from suite.diagnose.fit.parameters import JOIN, Candidate, effects_in, indices_of
 from suite.diagnose.fit.permutation import folds_of, score_candidates
 from suite.diagnose.fit.rivals import flights_agree, without_idle
@@ -92,10 +92,10 @@ def search_view(task: ViewTask, among: Sequence[Candidate], seed: int = 0) -> Vi
         if found is None:
             break
         name, now = found
-        named += _parts(task, name, named, now, among, seed)
         # What is left is the noise: with a name less of it is.
         now = look(task, now.theta, weights_of(now.data, task.limits))
-        now = fitted(task, now, indices_of([n.candidate for n in named]))
+        now = fitted(task, now, indices_of([n.candidate for n in [*named, name]]))
+        named += _parts(task, name, named, now, among, seed)
         named, now = _without_idle(task, named, now, among, seed)
     return ViewSearch(task, tuple(named), first, now)
 
@@ -161,18 +161,20 @@ def _parts(
 ) -> list[ViewName]:
     """Return the effects of a new `name`, with what could stand for each beside the others.
 
-    `now` are the equations with all names, `named` those before.
+    `now` are the equations with all names, `named` those before. A wind on several headings is not
+    the same in all flights, and looks like their trims until it is named: so its rivals are those
+    that are left beside it.
     """
-    if not name.candidate.parts:
-        return [name]
+    if not acts_through(name.candidate):
+        return [replace(name, candidate=single) for single in name.candidate.singles]
     found = []
-    for part in name.candidate.parts:
-        others = [c for c in name.candidate.parts if c is not part]
-        beside = [*named, *(replace(name, candidate=other) for other in others)]
-        best = _next_name(task, _less(task, now, part), beside, among, seed)
+    for part in name.candidate.singles:
+        others = [replace(name, candidate=c) for c in name.candidate.singles if c is not part]
+        without, beside = _less(task, now, part), [*named, *others]
+        best = _next_name(task, without, beside, among, seed)
         rivals = dict.fromkeys(_instead_of(part, name))
-        if best is not None and part.name in (best[0].candidate.name, *best[0].rivals):
-            rivals |= dict.fromkeys((best[0].candidate.name, *best[0].rivals))
+        if best is not None:
+            rivals = dict.fromkeys((best[0].candidate.name, *best[0].rivals))
         rivals.pop(part.name, None)
         found.append(replace(name, candidate=part, rivals=tuple(rivals)))
     return found
