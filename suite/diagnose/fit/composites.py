@@ -67,12 +67,22 @@ def carried(among: Sequence[Candidate]) -> list[Candidate]:
     return [part for one in among for part in one.parts if part.name in names]
 
 
-def about(name: str) -> str:
-    """Return what a name, of an effect or a composite, means, for people."""
+def in_words(sets: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return what there is to say of composites in the `sets` of names of a diagnosis, a line each.
+
+    A set has the name first and then what could stand in its place.
+    """
+    first, others = {one[0] for one in sets}, {name for one in sets for name in one[1:]}
+    lines = []
     for composite in COMPOSITES:
-        if JOIN.join(composite.parts) == name:
-            return composite.about
-    return EFFECTS[name].summary
+        if set(composite.parts) <= first and composite.carried:
+            lines.append(
+                f"{' and '.join(composite.parts)} belong together: {composite.about}. One without "
+                "the other explains nothing here, or less."
+            )
+        if JOIN.join(composite.parts) in others:
+            lines.append(f"{JOIN.join(composite.parts)}: {composite.about}, as one hypothesis.")
+    return lines
 
 
 @dataclass(frozen=True)

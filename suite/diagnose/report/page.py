@@ -8,6 +8,7 @@ from typing import Any
 from eval.effects import EFFECTS
 from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.data.windows import UNITS
+from suite.diagnose.fit.composites import in_words
 from suite.diagnose.report.cells import cells, grid, short_name
 from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
 from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
@@ -111,6 +112,7 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
         f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
         for effect in found["effects"]
     ]
+    words += in_words([(e["name"], *e["alternatives"]) for e in found["effects"]])
     note = (
         "Values are totals: what the vehicle file had of an effect is replaced. Of the gap: the "
         "share that this effect takes away when it is added last."
