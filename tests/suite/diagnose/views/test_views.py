@@ -89,6 +89,6 @@ def test_flights_that_hardly_move_leave_wind_and_drag_beside_a_leaning_frame():
 
 
 def test_a_wind_is_named_alone_where_the_file_has_the_drag():
-    logs = flights(3, headings=(0.3,), **{**SLOW, "constant_wind": ((1.5, -2.0, 0.0),)})
+    logs = flights(4, headings=(0.3,), **{**SLOW, "constant_wind": ((1.5, -2.0, 0.0),)})
     found, _ = names(logs, with_effects(VEHICLE, linear_drag=(SIDE,)))
     assert set(found) == {"constant_wind"} and not any("+" in n for n in found["constant_wind"])
