@@ -87,7 +87,9 @@ def search_view(task: ViewTask, among: Sequence[Candidate], seed: int = 0) -> Vi
     first = now = look(task, start, weights_of(left_of(task, start), task.limits))
     among = view_candidates(among, first)
     named: list[ViewName] = []
-    while len(named) < task.limits.most_names:
+    for _ in range(2 * task.limits.most_names):  # a name that went may come again
+        if len(named) >= task.limits.most_names:
+            break
         found = _next_name(task, now, named, among, seed)
         if found is None:
             break
