@@ -118,14 +118,14 @@ def test_a_wind_on_two_headings_is_named_with_the_drag_that_passes_it_on():
     assert found["constant_wind"] == set()
 
 
-@pytest.mark.slow
 def test_a_load_on_a_line_is_said_to_swing():
     logs = [
         fly(LAGGED, seed, 8.0, speed=1.5, extra=Pendulum(0.08, 0.5, LAGGED.mass))
         for seed in range(3)
     ]
-    found = diagnosis_json(diagnose(logs, LAGGED))
-    assert found["verdict"] in ("unknown", "partly")
+    # Without names, for the search takes longer than what is asked here.
+    found = diagnosis_json(diagnose(logs, LAGGED, limits=Thresholds(most_names=0)))
+    assert found["verdict"] == "unknown"
     assert found["unexplained"]["where"].startswith("swings with 1.")
 
 
