@@ -48,14 +48,14 @@ def settle(
             named, estimate = _judge(task, look, named, place, estimate)
             place += 1
         needed = [n for n in named if n.p_value <= task.limits.name_p_value]
-        if [n.candidate for n in needed] == before:
-            break
         # A name that was taken on the way may be needed no more beside better ones.
         theta = estimate.theta.copy()
         for one in named:
             if one not in needed:
                 theta[list(one.candidate.indices)] = begin[list(one.candidate.indices)]
         named, estimate = needed, Estimate(theta, estimate.offset)
+        if [n.candidate for n in named] == before:
+            break
     return named, estimate
 
 
@@ -84,7 +84,7 @@ def _judge(
                 one = replace(one, p_value=1.0)
     else:
         one = replace(one, p_value=1.0)  # beside the others it does nothing
-    left = [c for c in task.among if not set(c.indices) & set(at)]
+    left = [c for c in task.among if not set(c.indices) & set(at) and one.candidate not in c.parts]
     columns = look.equations.columns_of
     fallen = {c: chi2_fall(look.equations, theta, model.space, [*at, *columns(c)]) for c in left}
     tried = []

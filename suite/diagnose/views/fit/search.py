@@ -98,7 +98,8 @@ def search_view(task: ViewTask, among: Sequence[Candidate], seed: int = 0) -> Vi
         now = look(task, now.theta, weights_of(now.data, task.limits))
         now = fitted(task, now, indices_of([n.candidate for n in [*named, name]]))
         named += _parts(task, name, named, now, among, seed)
-        named, now = _without_idle(task, named, now, among, seed)
+        weighed = named[-1] if not name.candidate.parts else None
+        named, now = _without_idle(task, named, now, weighed, seed)
     return ViewSearch(task, tuple(named), first, now)
 
 
@@ -196,13 +197,13 @@ def _without_idle(
     task: ViewTask,
     named: list[ViewName],
     now: ViewEquations,
-    among: Sequence[Candidate],
+    weighed: ViewName | None,
     seed: int,
 ) -> tuple[list[ViewName], ViewEquations]:
-    """Return the names that are still needed beside all others, weighed anew with their rivals."""
+    """Return the names that are still needed beside all others, but for one `weighed` just now."""
     for one in list(named):
-        if one is named[-1] and not at_bound(task.model.space, now.theta, one.candidate):
-            continue  # it was weighed just now
+        if one is weighed and not at_bound(task.model.space, now.theta, one.candidate):
+            continue
         others = [n for n in named if n is not one]
         without = _less(task, now, one.candidate)
         found = _next_name(task, without, others, [one.candidate], seed)
