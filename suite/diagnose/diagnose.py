@@ -19,6 +19,7 @@ from suite.diagnose.data.input_source import (
     rotors_are_input,
 )
 from suite.diagnose.data.windows import FlightWindows, cut, take
+from suite.diagnose.fit.composites import composites
 from suite.diagnose.fit.look import least_left
 from suite.diagnose.fit.model import Linearisation, RolloutModel
 from suite.diagnose.fit.normal_equations import (
@@ -39,7 +40,12 @@ from suite.diagnose.verdict.residual_structure import (
     residual_structure,
 )
 from suite.diagnose.verdict.turbulence import Turbulence, find_turbulence
-from suite.diagnose.verdict.verdict import Verdict, share_left, verdict_on
+from suite.diagnose.verdict.verdict import Verdict, share_left, verdict_on, with_swing
+from suite.diagnose.views.data.flights import ready
+from suite.diagnose.views.data.view import FORCE
+from suite.diagnose.views.fit.equations import ViewTask
+from suite.diagnose.views.fit.model import ForceModel
+from suite.diagnose.views.swing import Swing, swing_left
 
 
 class BeyondRollouts(Exception):
@@ -132,6 +138,7 @@ def _diagnose(
     windows, apart = take(whole, inside), take(whole, ~inside)
     has = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
     among = candidates(space, voltage, has if rotor_input else has | {"command"})
+    among += composites(among)
     say(f"{len(windows.flight)} stretches of 1 s to fit, {len(apart.flight)} held out")
     found = search(model, windows, among, say, _take(linear, inside), seed, limits)
 
@@ -146,11 +153,16 @@ def _diagnose(
     found, after, without, gone = confirmed(model, found, held, (before, after), limits)
     warnings += [f"{label}: withdrawn, held-out flights are no better for it" for label in gone]
     residual, turbulence = _left_over(model, found, seed, limits)
+    verdict, swing = verdict_on(found, residual, (before, after), rotor_input, limits), None
+    if turbulence or verdict.where:
+        swing = _swing(logs, vehicle, voltage, found, limits)
+    if swing:
+        verdict, turbulence = with_swing(verdict, swing.words, bool(found.named)), None
     if turbulence and found.named and not worse(after, before, limits=limits):
         # Wind that lasts from one stretch to the next looks like many a steady number.
         found, after = without_names(model, found), before
         residual, turbulence = _left_over(model, found, seed, limits)
-    verdict = verdict_on(found, residual, (before, after), rotor_input, limits)
+        verdict = verdict_on(found, residual, (before, after), rotor_input, limits)
     if turbulence:
         verdict = Verdict("named", share_left(before, after))
     if verdict.label == "unknown" and found.named:
@@ -215,6 +227,19 @@ def _left_over(
     if turbulence and shape.p_value <= limits.shape_p_value and shape.gain > turbulence.ratio:
         return residual, None
     return residual, turbulence
+
+
+def _swing(
+    logs: Sequence[FlightLog],
+    vehicle: Vehicle,
+    voltage: bool,
+    found: SearchResult,
+    limits: Thresholds,
+) -> Swing | None:
+    """Return the swing in what translation under the measured attitude leaves of `found`."""
+    flights = ready(logs, vehicle, limits).smoothed[FORCE.name]
+    model = ForceModel(vehicle, make_space(vehicle), voltage)
+    return swing_left(ViewTask(FORCE, model, flights, limits), found.estimate.theta)
 
 
 def _late(found: Diagnosis) -> dict[str, float]:

@@ -107,6 +107,8 @@ class Thresholds:
     """The same for height, as a share of it: near the ground the air changes with it [1]."""
     trusted_rad: float = 0.25
     """The same for attitude [rad]."""
+    bilinear_rounds: int = 6
+    """Gauss-Newton steps of a fit of effects of which one acts through another."""
     last_rounds: int = 10
     """Gauss-Newton steps of the last fit of all names: some effects saturate."""
     first_order_chi2: float = 25.0
@@ -154,6 +156,15 @@ class Thresholds:
     rotors' torque are known no better where nobody identified them [1]."""
     change_p_value: float = 0.02
     """Chance of a false name of a change, over all candidates."""
+    swing_periods_s: tuple[float, float] = (0.6, 3.5)
+    """Periods of pendulums of 0.1 to 3 m [s]."""
+    swing_p_value: float = 0.001
+    """Chance of a peak in the spectrum, over all periods."""
+    swing_share: float = 0.15
+    """Share of what the force view leaves that swings at least [1]."""
+    swing_driven: float = 0.5
+    """Force that is left over the acceleration at the same period, from which it is no error of a
+    model that the flight's own motion shows [1]."""
     view_block_s: float = 2.0
     """Stretches of a flight that a view takes for independent [s]."""
 

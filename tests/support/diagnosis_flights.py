@@ -31,7 +31,7 @@ def reference(rng, speed):
     return at
 
 
-def track(at, yaw_rate, t, motion):
+def track(at, yaw, t, motion):
     """A command that follows the curve: desired force, attitude error, body rates."""
     pos, vel, acc = at(t)
     wanted = acc + 4.0 * (pos - motion.pos_w) + 3.0 * (vel - motion.vel_w) + [0, 0, 9.81]
@@ -41,7 +41,7 @@ def track(at, yaw_rate, t, motion):
         wanted *= 24.0 / size
     up = wanted / np.linalg.norm(wanted)
     thrust = max(0.0, wanted @ motion.rot_w[:, 2])
-    nose = np.array([np.cos(yaw_rate * t), np.sin(yaw_rate * t), 0.0])
+    nose = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     left = np.cross(up, nose)
     left /= np.linalg.norm(left)
     rot = np.stack([np.cross(left, up), left, up], axis=1)
@@ -51,10 +51,21 @@ def track(at, yaw_rate, t, motion):
     return Command(np.asarray(thrust), np.clip([8.0, 8.0, 4.0] * vee, -6, 6))
 
 
-def fly(vehicle, seed, duration_s=10.0, speed=5.0, noise=1.0, motors=False, acc=False, extra=None):
+def fly(
+    vehicle,
+    seed,
+    duration_s=10.0,
+    speed=5.0,
+    noise=1.0,
+    motors=False,
+    acc=False,
+    extra=None,
+    heading=None,
+):
     """Return the log of one flight of the true `vehicle`.
 
-    `extra(motion, t)` gives a force in the world that no effect of the catalogue makes.
+    `extra(motion, t)` gives an acceleration in the world that no effect of the catalogue makes;
+    with a `heading` [rad] the vehicle keeps it.
     """
     rng = np.random.default_rng(seed)
     dt = 1.0 / vehicle.controller.frequency
@@ -70,7 +81,8 @@ def fly(vehicle, seed, duration_s=10.0, speed=5.0, noise=1.0, motors=False, acc=
         rot = quat_to_rot(data.qpos[3:].copy())
         motion = Motion(data.qpos[:3].copy(), rot, data.qvel[:3].copy(), data.qvel[3:].copy())
         if k % EVERY == 0:
-            command = track(at, yaw_rate, k * dt, motion)
+            yaw = yaw_rate * k * dt if heading is None else heading
+            command = track(at, yaw, k * dt, motion)
             rows.append(np.concatenate([[k * dt], data.qpos, data.qvel, [command.thrust],
                                         command.rate_b, state.rotor_speed, force]))  # fmt: skip
         inputs = Inputs(command, noise=rng.standard_normal(3) if draw else None)

@@ -1,6 +1,6 @@
 """Flights as real ones are: rotors measured, and a trim of each flight's own."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from tests.support.diagnosis_flights import fly
+from tests.support.pendulum import Pendulum
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 VEHICLE = with_lag(PLAIN, 0.03)
@@ -22,17 +23,28 @@ def flights(
     speed: float = 3.0,
     trim: float = 1.0,
     hidden: Mapping[str, Any] | None = None,
+    noise: float = 1.0,
+    headings: Sequence[float] = (),
+    load: tuple[float, float] | None = None,
     **effects: Any,
 ) -> list[FlightLog]:
     """Return logs of `VEHICLE` with effects, rotors measured, each with a trim of its own.
 
-    Effects are `hidden` by name, and what is given by keyword.
+    Effects are `hidden` by name, and what is given by keyword. With `headings` [rad] the flights
+    keep one each, in turn; a `load` of so many kg hangs on a line of so many metres.
     """
     effects = {**(hidden or {}), **effects}
     rng, logs = np.random.default_rng(seed), []
     for number in range(count):
         own = tuple((trim * TRIM * rng.standard_normal(3)).tolist())
         true = with_effects(VEHICLE, **effects, torque_trim=(own,))
-        log = fly(true, 100 * seed + number, duration_s, speed, motors=True)
+        swing = None
+        if load is not None:
+            swing = Pendulum(*load, VEHICLE.mass, tuple(rng.uniform(-0.25, 0.25, 2).tolist()))
+        heading = headings[number % len(headings)] if headings else None
+        log = fly(
+            true, 100 * seed + number, duration_s, speed, noise, motors=True, extra=swing,
+            heading=heading,
+        )  # fmt: skip
         logs.append(replace(log, about={}))
     return logs

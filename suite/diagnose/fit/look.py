@@ -9,10 +9,12 @@ import numpy as np
 
 from suite.diagnose.data.colour import Noise, left_as_noise, measured_noise
 from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.fit.composites import begin_of, lent_at
 from suite.diagnose.fit.model import Linearisation, RolloutModel
 from suite.diagnose.fit.normal_equations import (
     Estimate,
     NormalEquations,
+    along_numbers,
     fit,
     gauss_newton_step,
     normal_equations_of,
@@ -46,11 +48,29 @@ class SearchTask(NamedTuple):
         )
 
     def fit(
-        self, look: Look, start: Estimate, indices: list[int], known: Linearisation | None = None
+        self,
+        look: Look,
+        start: Estimate,
+        indices: list[int],
+        known: Linearisation | None = None,
+        rounds: int = 3,
     ) -> tuple[Estimate, NormalEquations]:
-        """Fit the numbers at `indices` to what can be trusted."""
-        windows, whitening = look.windows, look.whitening
-        return fit(self.model, windows, whitening, start, indices, known=known, limits=self.limits)
+        """Fit the numbers at `indices` to what can be trusted, in at most `rounds` steps."""
+        weighed = look.windows, look.whitening
+        return fit(self.model, *weighed, start, indices, rounds, known, self.limits)
+
+    def fit_beside(
+        self, look: Look, start: Estimate, beside: Sequence[int], candidate: Candidate
+    ) -> tuple[Estimate, NormalEquations]:
+        """Fit `candidate` and the numbers at `beside`; `look` was taken at `start`."""
+        at, space = sorted({*beside, *candidate.indices}), self.model.space
+        lent = [number for number in look.equations.lent if number in candidate.indices]
+        if not candidate.parts or not lent:
+            return self.fit(look, start, at, look.linear)
+        columns = sorted({*beside, *look.equations.columns_of(candidate)})
+        change, told = along_numbers(look.equations, start.theta, space, columns)
+        begin = begin_of(space, start.theta, candidate, lent, change, told)
+        return self.fit(look, Estimate(begin, start.offset), at, rounds=self.limits.bilinear_rounds)
 
 
 class Look(NamedTuple):
@@ -83,8 +103,24 @@ def look_at(
     view = trusted(task.windows, linear.residual, limits)
     noise = noise or measured_noise(linear.residual, linear.start_slope, view, limits)
     whitening = make_whitening(linear, noise, view, limits)
-    equations = normal_equations_of(whitening, linear, model.size)
+    equations = _equations(task, estimate, linear, whitening)
     return Look(linear, view, whitening, equations, noise)
+
+
+def _equations(
+    task: SearchTask, estimate: Estimate, linear: Linearisation, whitening: Whitening
+) -> NormalEquations:
+    """Return the normal equations along all numbers, and along those that are lent."""
+    model, size = task.model, task.model.size
+    acts = np.abs(linear.slope[..., :size]).max(axis=(0, 1, 2)) > 0.0
+    lent = lent_at(model.space, estimate.theta, task.among, acts)
+    if lent is None:
+        return normal_equations_of(whitening, linear, size)
+    numbers = list(lent.numbers)
+    there = model.linearise(lent.theta, estimate.offset, task.windows, numbers).slope
+    slope = np.concatenate([linear.slope[..., :size], there], axis=-1)
+    equations = normal_equations_of(whitening, linear._replace(slope=slope), size + len(numbers))
+    return equations._replace(lent=lent.numbers)
 
 
 def least_left(
@@ -115,7 +151,7 @@ def look_at_misfit(task: SearchTask, look: Look, estimate: Estimate) -> Look:
     linear = task.model.linearise(estimate.theta, estimate.offset, task.windows, None)
     noise = left_as_noise(linear.residual, linear.start_slope, look.windows, task.limits)
     whitening = make_whitening(linear, noise, look.windows, task.limits)
-    equations = normal_equations_of(whitening, linear, task.model.size)
+    equations = _equations(task, estimate, linear, whitening)
     return Look(linear, look.windows, whitening, equations, noise, off=True)
 
 

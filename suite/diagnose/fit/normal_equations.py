@@ -17,7 +17,7 @@ from scipy.stats import t as student
 from suite.diagnose.data.colour import measured_noise
 from suite.diagnose.data.windows import FlightWindows
 from suite.diagnose.fit.model import Linearisation, RolloutModel
-from suite.diagnose.fit.parameters import ParameterSpace
+from suite.diagnose.fit.parameters import Candidate, ParameterSpace
 from suite.diagnose.fit.rollout import STATE
 from suite.diagnose.fit.whitening import (
     Whitening,
@@ -40,6 +40,22 @@ class NormalEquations(NamedTuple):
     """(W,) r'r."""
     slow_energy: np.ndarray
     """(W, 12) energy of slow errors, by channel of pose, velocity and rates."""
+    lent: tuple[int, ...] = ()
+    """Numbers whose columns come once more, last: as they are where what they act through is there
+    (`composites.Lent`)."""
+
+    def columns_of(self, candidate: Candidate) -> tuple[int, ...]:
+        """Return the columns of `candidate` where the first are along all numbers, in order."""
+        if not candidate.parts:
+            return candidate.indices
+        first = self.gradient.shape[1] - len(self.lent)
+        again = {number: first + k for k, number in enumerate(self.lent)}
+        return tuple(again.get(number, number) for number in candidate.indices)
+
+    def numbers_of(self, columns: Sequence[int]) -> list[int]:
+        """Return the place in the vector of what each of `columns` is along."""
+        first = self.gradient.shape[1] - len(self.lent)
+        return [c if c < first else self.lent[c - first] for c in columns]
 
 
 @dataclass(frozen=True)
@@ -124,6 +140,22 @@ def gauss_newton_step(
     low, high, scale = (space.array(name)[at] for name in ("low", "high", "step"))
     change = solve(hessian, gradient, low - theta[at], high - theta[at], scale)
     return change, float(2 * gradient @ change - change @ hessian @ change)
+
+
+def along_numbers(
+    equations: NormalEquations, theta: np.ndarray, space: ParameterSpace, columns: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the change (P,) of all numbers that `columns` ask for, and what is told of each (P,).
+
+    `equations` were taken at `theta` (P,); numbers that no column is along are not changed.
+    """
+    at, numbers = list(columns), equations.numbers_of(columns)
+    hessian = equations.hessian.sum(axis=0)[np.ix_(at, at)]
+    gradient = equations.gradient.sum(axis=0)[at]
+    moved, _ = gauss_newton_step(hessian, gradient, theta, space, numbers)
+    change, told = np.zeros_like(theta), np.zeros_like(theta)
+    change[numbers], told[numbers] = moved, np.diag(hessian)
+    return change, told
 
 
 def fit(

@@ -14,6 +14,8 @@ from eval.effects.interface import at
 from eval.vehicles.vehicle import Vehicle
 from tracks.geometry.scene import Array
 
+JOIN = " + "
+"""Between the names of effects that are one hypothesis."""
 ParameterLayout = tuple[tuple[str, str, int | None], ...]
 """Effect, parameter and component of each number."""
 
@@ -40,11 +42,24 @@ class Candidate:
     """A way to explain a gap: numbers that are fitted together."""
 
     name: str
-    """Of the effect; one whose components come one at a time comes once each."""
+    """Of the effect; one whose components come one at a time comes once each. Of several effects
+    that are one hypothesis, their names joined."""
     indices: tuple[int, ...]
     """Places in the vector."""
     label: str
     """For people: the name, and the component (from 1) where it comes once each."""
+    parts: tuple[Candidate, ...] = ()
+    """Where several effects are one hypothesis: each of them."""
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of its effects."""
+        return effects_in(self.name)
+
+    @property
+    def singles(self) -> tuple[Candidate, ...]:
+        """Each of its effects as a candidate of its own."""
+        return self.parts or (self,)
 
 
 @dataclass(frozen=True)
@@ -155,6 +170,11 @@ def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> li
         else:
             found.append(Candidate(name, tuple(at_), name))
     return found
+
+
+def effects_in(name: str) -> tuple[str, ...]:
+    """Return the effects of a candidate's `name`: several where they are one hypothesis."""
+    return tuple(name.split(JOIN))
 
 
 def indices_of(chosen: Sequence[Candidate]) -> list[int]:

@@ -51,11 +51,13 @@ def score_candidates(
     `equations` are along all numbers, taken at `theta` (P,); windows of one `fold` (W,) are left
     out together; `seed` is of the null's draws.
     """
-    scale = space.array("step")
-    low, high = (space.array("low") - theta) / scale, (space.array("high") - theta) / scale
+    along = equations.numbers_of(range(equations.gradient.shape[1]))
+    scale = space.array("step")[along]
+    low, high = ((space.array(end) - theta)[along] / scale for end in ("low", "high"))
     hessian, gradient = equations.hessian * np.outer(scale, scale), equations.gradient * scale
-    seen = [c for c in among if np.einsum("wjj->j", hessian)[list(c.indices)].sum() > 1e-9]
-    groups = [tuple(sorted({*named, *c.indices})) for c in seen]
+    told, columns = np.einsum("wjj->j", hessian), equations.columns_of
+    seen = [c for c in among if told[list(columns(c))].sum() > 1e-9]
+    groups = [tuple(sorted({*named, *columns(c)})) for c in seen]
     gains, p_values, chance = permutation_test(
         hessian, gradient, groups, tuple(named), fold, seed, (low, high), limits
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from suite.diagnose.fit.look import Look, SearchTask, look_at
 from suite.diagnose.fit.normal_equations import Estimate, NormalEquations, gauss_newton_step
 from suite.diagnose.fit.parameters import Candidate, ParameterSpace, indices_of
 from suite.diagnose.thresholds import Thresholds
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -40,17 +43,19 @@ def settle(
         if not before:
             break
         estimate, _ = task.fit(look, estimate, indices_of(before))
-        for place in range(len(named)):
+        place = 0
+        while place < len(named):
             named, estimate = _judge(task, look, named, place, estimate)
+            place += 1
         needed = [n for n in named if n.p_value <= task.limits.name_p_value]
-        if [n.candidate for n in needed] == before:
-            break
         # A name that was taken on the way may be needed no more beside better ones.
         theta = estimate.theta.copy()
         for one in named:
             if one not in needed:
                 theta[list(one.candidate.indices)] = begin[list(one.candidate.indices)]
         named, estimate = needed, Estimate(theta, estimate.offset)
+        if [n.candidate for n in named] == before:
+            break
     return named, estimate
 
 
@@ -77,16 +82,22 @@ def _judge(
             gains = gains_by_flight(look.equations, theta, model.space, at, own, flight)
             if not flights_agree(gains):
                 one = replace(one, p_value=1.0)
-    left = [c for c in task.among if not set(c.indices) & set(at)]
-    fallen = {c: chi2_fall(look.equations, theta, model.space, [*at, *c.indices]) for c in left}
+    else:
+        one = replace(one, p_value=1.0)  # beside the others it does nothing
+    left = [c for c in task.among if not set(c.indices) & set(at) and one.candidate not in c.parts]
+    columns = look.equations.columns_of
+    fallen = {c: chi2_fall(look.equations, theta, model.space, [*at, *columns(c)]) for c in left}
     tried = []
     for candidate in left:
         if candidate == one.candidate or could_be_best(fallen, candidate, limits):
-            chosen = indices_of([*others, candidate])
-            after, equations = task.fit(look, without, chosen, look.linear)
+            after, equations = task.fit_beside(look, without, at, candidate)
             tried.append((float(equations.chi2.sum()) + len(candidate.indices), candidate, after))
             task.say(f"{one.candidate.label} or {candidate.label}: {tried[-1][0]:.1f}")
+    tried = without_idle(tried, limits)
     least, best, after = min(tried, key=lambda t: t[0])
+    if best.parts:
+        better = [NamedEffect(part, scores[best].p_value, scores[best].gain) for part in best.parts]
+        return [*named[:place], *better, *named[place + 1 :]], after
     if best != one.candidate:
         one = replace(one, candidate=best, p_value=scores[best].p_value)
     total = float(look.equations.chi2.sum())
@@ -141,11 +152,28 @@ def could_be_best(
 ) -> bool:
     """Return whether `candidate` could be the best: slopes alone say too little of large effects.
 
-    `fallen` holds the fall of chi-square to first order, by candidate.
+    `fallen` holds the fall of chi-square to first order, by candidate. Several effects together
+    have to explain more than each of them alone.
     """
-    most = max(fallen.values())
+    own, most = fallen.get(candidate, -np.inf), max(fallen.values())
+    alone = max((fallen.get(part, 0.0) for part in candidate.parts), default=-np.inf)
     slack = limits.first_order_chi2 + limits.first_order_share * abs(most)
-    return fallen.get(candidate, -np.inf) >= most - slack
+    return own >= most - slack and own > alone + limits.rival_chi2
+
+
+def without_idle(
+    tried: Sequence[tuple[float, Candidate, T]], limits: Thresholds
+) -> list[tuple[float, Candidate, T]]:
+    """Return what was `tried`, without composites of which one part alone explains as much.
+
+    Each comes with its squared error, to which its numbers were added.
+    """
+    cost = {candidate: chi2 for chi2, candidate, _ in tried}
+    return [
+        (chi2, candidate, more)
+        for chi2, candidate, more in tried
+        if all(chi2 + limits.rival_chi2 < cost.get(part, np.inf) for part in candidate.parts)
+    ]
 
 
 def chi2_fall(
@@ -156,5 +184,5 @@ def chi2_fall(
     hessian = equations.hessian[:, columns][:, :, columns].sum(0)
     if not columns or np.trace(hessian) < 1e-12:
         return 0.0
-    gradient = equations.gradient[:, columns].sum(0)
-    return gauss_newton_step(hessian, gradient, theta, space, columns)[1]
+    gradient, numbers = equations.gradient[:, columns].sum(0), equations.numbers_of(columns)
+    return gauss_newton_step(hessian, gradient, theta, space, numbers)[1]

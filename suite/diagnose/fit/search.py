@@ -23,7 +23,13 @@ from suite.diagnose.fit.normal_equations import (
 )
 from suite.diagnose.fit.parameters import Candidate, indices_of
 from suite.diagnose.fit.permutation import CandidateScore, folds_of
-from suite.diagnose.fit.rivals import NamedEffect, chi2_fall, could_be_best, settle
+from suite.diagnose.fit.rivals import (
+    NamedEffect,
+    chi2_fall,
+    could_be_best,
+    settle,
+    without_idle,
+)
 from suite.diagnose.fit.whitening import Whitening
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -102,7 +108,8 @@ def search(
         if best.gain <= limits.least_name_share * first[0].gain:
             break
         item, estimate = _best_of_short_list(task, look, estimate, chosen, scores)
-        named.append(NamedEffect(item.candidate, item.p_value, item.gain))
+        singles = item.candidate.singles
+        named += [NamedEffect(single, item.p_value, item.gain) for single in singles]
     named, estimate = settle(task, look, named, estimate)
     estimate, last = _last_fit(task, look, named, estimate)
     judge, judged = look, last
@@ -163,18 +170,20 @@ def _best_of_short_list(
     """Return which of the best `scores` fits best through the whole model beside `chosen`."""
     limits, space, tried = task.limits, task.model.space, []
     indices, chi2 = indices_of(chosen), float(look.equations.chi2.sum())
+    columns = look.equations.columns_of
     fallen = {
         s.candidate: chi2_fall(
-            look.equations, estimate.theta, space, [*indices, *s.candidate.indices]
+            look.equations, estimate.theta, space, [*indices, *columns(s.candidate)]
         )
         for s in scores
         if s.gain >= limits.near_share * scores[0].gain
     }
     near = [s for s in scores if could_be_best(fallen, s.candidate, limits)]
-    for item in near[: limits.short_list]:
-        at = indices_of([*chosen, item.candidate])
-        after, equations = task.fit(look, estimate, at, look.linear)
-        tried.append((float(equations.chi2.sum()) + 2 * len(at), item, after))
+    single = [s for s in near if not s.candidate.parts][: limits.short_list]
+    for item in [s for s in near if s.candidate.parts or s in single]:
+        after, equations = task.fit_beside(look, estimate, indices, item.candidate)
+        cost = float(equations.chi2.sum()) + 2 * len(item.candidate.indices)
+        tried.append((cost, item.candidate, (item, after)))
         task.say(f"{item.candidate.label}: {chi2 - equations.chi2.sum():.0f}")
-    _, item, after = min(tried, key=lambda t: t[0])
+    _, _, (item, after) = min(without_idle(tried, limits), key=lambda t: t[0])
     return item, after

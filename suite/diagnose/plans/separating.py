@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from suite.diagnose.fit.parameters import effects_in
 from suite.diagnose.plans.trajectory import Trajectory
 
 _FAST_WOBBLE = Trajectory("figure_eight", speed=6.5, size=4.0, turn="wobble")
@@ -70,7 +71,7 @@ SEPARATIONS: tuple[Separation, ...] = (
     ),
     Separation(
         ("constant_wind", "frame_tilt"),
-        "turn the heading on and on at speed, over a range of speeds",
+        "fly with at least two headings: turn on and on at speed, over a range of speeds",
         (_SLOW_EIGHT, _HOVER),
         (_SWEEP, _RANGE),
     ),
@@ -118,8 +119,11 @@ SEPARATIONS: tuple[Separation, ...] = (
 
 
 def separations_of(names: Iterable[str]) -> list[Separation]:
-    """Return the known ways to split the set `names`: those whose two effects are both in it."""
-    wanted = set(names)
+    """Return the known ways to split the set `names`: those whose two effects are both in it.
+
+    Of effects that are one hypothesis each counts.
+    """
+    wanted = {effect for name in names for effect in effects_in(name)}
     return [entry for entry in SEPARATIONS if wanted.issuperset(entry.pair)]
 
 

@@ -74,7 +74,7 @@ def _faults(diagnosis: Diagnosis) -> Grid:
             "named" if s.candidate.name in named else "not named",
         )
         for s in diagnosis.search.first
-        if EFFECTS[s.candidate.name].of_log
+        if all(EFFECTS[name].of_log for name in s.candidate.effects)
     ]
     note = (
         "In the search they compete with the physics that they imitate, in one model; the gain "

@@ -8,6 +8,7 @@ from typing import Any
 from eval.effects import EFFECTS
 from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.data.windows import UNITS
+from suite.diagnose.fit.composites import in_words
 from suite.diagnose.report.cells import cells, grid, short_name
 from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
 from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
@@ -111,6 +112,7 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
         f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
         for effect in found["effects"]
     ]
+    words += in_words([(e["name"], *e["alternatives"]) for e in found["effects"]])
     note = (
         "Values are totals: what the vehicle file had of an effect is replaced. Of the gap: the "
         "share that this effect takes away when it is added last."
@@ -167,7 +169,7 @@ def _candidates(diagnosis: Diagnosis) -> Section:
     named = {candidate.label for candidate in diagnosis.search.candidates}
     chance = scores[0].chance if scores else None
     rows = [
-        f"{s.candidate.label:24}{s.gain:>12.1f}{s.p_value:>8.3f}  "
+        f"{s.candidate.label:32}{s.gain:>12.1f}{s.p_value:>8.3f}  "
         + ("named" if s.candidate.label in named else "")
         for s in scores
     ]
@@ -178,7 +180,7 @@ def _candidates(diagnosis: Diagnosis) -> Section:
         "of all candidates is taken each time; p is how often that is as large. One name follows "
         f"another while p is at most {limits.name_p_value:g}; then all are refitted jointly."
     )
-    head = f"{'effect':24}{'gain':>12}{'p':>8}"
+    head = f"{'effect':32}{'gain':>12}{'p':>8}"
     return Section(
         "4. The candidates",
         [
@@ -194,7 +196,7 @@ def _identity(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
     for one in diagnosis.search.named:
         ordered = sorted(one.worse_by.items(), key=lambda item: item[1])
         for label, worse_by in ordered[:RIVALS]:
-            same = label.split()[0] in one.rivals
+            same = label.rstrip(" 1234") in one.rivals
             verdict = Cell("cannot be told apart", "bad") if same else Cell("ruled out")
             rows.append([*cells(one.candidate.label, label, f"{worse_by:.1f}"), verdict])
     headers = ["named", "in its place", "worse by", ""]

@@ -59,19 +59,21 @@ def headline(found: ViewsDiagnosis) -> str:
         if found.verdict == "no_gap":
             what = "has changed" if found.references else "is missing"
             return f"Nothing that the flights agree on {what}."
+        swings = f"It {found.swing.words}. " if found.swing else ""
         return (
-            f"No effect of the catalogue explains it; a black box closes {100 * could:.0f} % of "
-            f"the variance of the {view.name}."
+            f"{swings}No effect of the catalogue explains it; a black box closes "
+            f"{100 * could:.0f} % of the variance of the {view.name}."
         )
     names = " and ".join(
         " or ".join([name.candidate.label, *name.rivals]) for _, name in found.named
     )
     since = " since the reference flights" if found.references else ""
     share = gap.share(gap.closed) / max(could, 1e-9)
+    swings = f" What is left {found.swing.words}." if found.swing else ""
     return (
         f"{names}{since}: the {view.name} on held-out flights is {gap.rms(gap.after):.3g} instead "
         f"of {gap.rms(gap.before):.3g} {view.unit} off; of what any model could close of its "
-        f"changes within a flight here, {100 * min(share, 1.0):.0f} %."
+        f"changes within a flight here, {100 * min(share, 1.0):.0f} %.{swings}"
     )
 
 
@@ -126,7 +128,8 @@ def _where(found: ViewsDiagnosis) -> str | None:
         return None
     one = max(found.results, key=lambda r: r.gap.share(r.gap.left))
     axis = max(one.view.axes, key=lambda k: float(one.gap.left[k] * one.gap.variance[k]))
+    swings = f"{found.swing.words}; " if found.swing else ""
     return (
-        f"{one.view.name} along body {'xyz'[axis]}: a black box closes another "
+        f"{swings}{one.view.name} along body {'xyz'[axis]}: a black box closes another "
         f"{100 * max(float(one.gap.left[axis]), 0.0):.0f} % of its variance"
     )

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from eval.effects import EFFECTS
 from suite.common.charts import png, titled
 from suite.common.report import Details, Links, Part, Picture, Report, Section
+from suite.diagnose.fit.composites import in_words
 from suite.diagnose.report.cells import grid, short_name
 from suite.diagnose.report.charts import AFTER, BEFORE, FLOOR
 from suite.diagnose.report.parameters_json import components
@@ -118,6 +119,7 @@ def _answer(told: Mapping[str, Any]) -> list[Part]:
         f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
         for effect in told["effects"]
     ]
+    words += in_words([(e["name"], *e["alternatives"]) for e in told["effects"]])
     headers = ["effect", "cannot be told from", "view", "parameter", "total", "95 %"]
     note = "Totals: what the vehicle file had of an effect is replaced. 95 % with flights as draws."
     words.append(grid("", headers, rows, note))

@@ -14,7 +14,8 @@ from suite.diagnose.fit.normal_equations import (
     normal_equations_of,
     start_estimate,
 )
-from suite.diagnose.fit.parameters import Candidate, indices_of
+from suite.diagnose.fit.parameters import Candidate, effects_in, indices_of
+from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.fit.search import SearchResult, refitted
 from suite.diagnose.fit.whitening import make_whitening
 from suite.diagnose.thresholds import Thresholds
@@ -50,9 +51,14 @@ def confirmed(
         label = min((one.label for one in doubted), key=lambda k: float(without[k].energy.sum()))
         gone.append(label)
         kept = tuple(one for one in found.named if one.candidate.label != label)
+        if kept:
+            found = refitted(model, found, kept, limits)
+            kept = _acting(found)
         if not kept:
             return without_names(model, found), before, {}, gone
-        found = refitted(model, found, kept, limits)
+        if len(kept) < len(found.named):
+            gone += [one.candidate.label for one in found.named if one not in kept]
+            found = refitted(model, found, kept, limits)
         after = measure(model, found.estimate.theta, held, found.noise, limits)
     return found, after, {}, gone
 
@@ -67,13 +73,23 @@ def control(
 ) -> tuple[str, Gap] | None:
     """Return the best effect that is neither named nor a rival, fitted alone, and its gap."""
     taken = {candidate.name for candidate in found.candidates}
-    taken |= {rival for one in found.named for rival in one.rivals}
-    wrong = next((s.candidate for s in found.first if s.candidate.name not in taken), None)
+    taken |= {name for one in found.named for rival in one.rivals for name in effects_in(rival)}
+    among = (s.candidate for s in found.first if not s.candidate.parts)
+    wrong = next((one for one in among if one.name not in taken), None)
     if wrong is None:
         return None
     start = start_estimate(model, found.windows)
     theta = _refit(model, found, start, list(wrong.indices), limits)
     return wrong.label, measure(model, theta, held, found.noise, limits)
+
+
+def _acting(found: SearchResult) -> tuple[NamedEffect, ...]:
+    """Return the names of `found` that do something: a wind without its drag does not."""
+    told = np.einsum("wkk->k", found.judged.hessian)
+    at = {index: told[k] for k, index in enumerate(found.indices)}
+    return tuple(
+        one for one in found.named if any(at[index] > 0.0 for index in one.candidate.indices)
+    )
 
 
 def _shown(

@@ -57,6 +57,19 @@ def verdict_on(
     return Verdict("partly" if partly else "unknown", share, where)
 
 
+def with_swing(verdict: Verdict, words: str, named: bool) -> Verdict:
+    """Return `verdict` where a force swings, which nothing in the catalogue does.
+
+    `words` say how; `named` whether something was named besides.
+    """
+    where = f"{words}; {verdict.where}" if verdict.where else words
+    if verdict.where is None:
+        return Verdict(
+            "partly" if named else "unknown", verdict.share_left if named else 1.0, where
+        )
+    return verdict._replace(where=where)
+
+
 def share_left(before: Gap, after: Gap) -> float:
     """Return how much of the gap above the noise floor is left, 0 to 1."""
     left = max(after.rms - 1.0, 0.0)

@@ -11,10 +11,11 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.fit.composites import composites
 from suite.diagnose.fit.parameters import ParameterSpace, candidates, make_space, with_fitted
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.views.data.flights import ViewFlights, parted, ready
-from suite.diagnose.views.data.view import View
+from suite.diagnose.views.data.view import FORCE, View
 from suite.diagnose.views.fit.equations import ViewTask, half_widths, left_of, look
 from suite.diagnose.views.fit.model import ForceModel
 from suite.diagnose.views.fit.plausible import implausible
@@ -27,6 +28,7 @@ from suite.diagnose.views.fit.reference import (
 from suite.diagnose.views.fit.search import ViewName, ViewSearch, search_view
 from suite.diagnose.views.fit.weigh import weights_of
 from suite.diagnose.views.judged import ViewGap, judge
+from suite.diagnose.views.swing import Swing, swing_left
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,8 @@ class ViewsDiagnosis:
     """Names of the reference flights."""
     warnings: list[str]
     seconds: float
+    swing: Swing | None = None
+    """In what the force view leaves with its names."""
 
     @property
     def main(self) -> ViewResult:
@@ -119,7 +123,7 @@ def diagnose_by_views(
             apart = changed_task(known[view.name], found.first.theta, held[view.name])
             apart = apart._replace(means=True)
         else:
-            found = search_view(task, among, seed)
+            found = search_view(task, [*among, *composites(among)], seed)
             apart = task._replace(flights=held[view.name])
         gap = judge(found, apart, flights.floor[view.name])
         widths = half_widths(found.last, found.indices) if found.named else []
@@ -135,8 +139,13 @@ def diagnose_by_views(
         for name in result.names:
             far = implausible(space, result.search.last.theta, name.candidate, limits)
             warnings += [f"implausible: {one}, beyond three times what is usual" for one in far]
+    swing = None
+    for result in results:
+        if result.view.name == FORCE.name and not references:
+            every = ViewTask(result.view, model, flights.smoothed[FORCE.name], limits)
+            swing = swing_left(every, result.search.last.theta)
     return ViewsDiagnosis(
-        verdict=_verdict(results, limits),
+        verdict=_verdict(results, swing, limits),
         results=results,
         space=space,
         flights=flights,
@@ -146,6 +155,7 @@ def diagnose_by_views(
         references=tuple(log.name for log in references),
         warnings=warnings,
         seconds=time.monotonic() - began,
+        swing=swing,
     )
 
 
@@ -242,9 +252,14 @@ def _relative(result: ViewResult, name: ViewName) -> float:
     return float(np.mean([result.half_width[i] for i in at]) / max(away.mean(), 1e-12))
 
 
-def _verdict(results: Sequence[ViewResult], limits: Thresholds) -> str:
-    """Return what is said of the gap: what is named is judged by the views that name something."""
+def _verdict(results: Sequence[ViewResult], swing: Swing | None, limits: Thresholds) -> str:
+    """Return what is said of the gap: what is named is judged by the views that name something.
+
+    Nothing in the catalogue swings.
+    """
     named = [one for one in results if one.names]
+    if swing:
+        return "partly" if named else "unknown"
     if named:
         left = [one.gap.share(one.gap.left) for one in named]
         return "named" if max(left) <= limits.view_left_share else "partly"

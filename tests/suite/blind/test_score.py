@@ -42,6 +42,7 @@ def said(*effects, verdict="named", after=0.5, floor=0.5):
         ([effect("rotor_drag", "linear_drag")], True, 0),
         ([effect("linear_drag", "rotor_drag")], True, 0),
         ([effect("rotor_drag", "linear_drag", "quadratic_drag")], True, 0),
+        ([effect("rotor_drag", "linear_drag", "constant_wind + quadratic_drag")], True, 0),
         ([effect("rotor_drag")], False, 0),
         ([effect("rotor_drag", "linear_drag", "inflow")], False, 0),
         ([effect("linear_drag")], False, 1),

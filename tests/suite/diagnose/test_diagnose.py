@@ -27,6 +27,7 @@ from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.checks import run_checks
 from tests.support.broken_logs import BREAKAGES
 from tests.support.diagnosis_flights import fly
+from tests.support.pendulum import Pendulum
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tracks.common.files import plain, to_json
 
@@ -86,6 +87,46 @@ def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
 
     found = diagnosis_json(diagnose(flights(LAGGED, extra=swing), LAGGED))
     assert found["verdict"] in ("unknown", "partly")
+
+
+SIDE = {"linear_drag": ((0.25, 0.45, 0.1),), "constant_wind": ((0.4, -0.5, 0.0),)}
+"""A drag that differs along x and y, and a wind for it to pass on."""
+
+
+def blown(*headings):
+    """Return what is named of flights that hardly move, with what could stand in its place."""
+    truth = with_effects(LAGGED, **SIDE)
+    logs = [
+        fly(truth, 50 + k, 6.0, speed=0.2, noise=2.0, heading=heading)
+        for k, heading in enumerate(headings)
+    ]
+    found = diagnosis_json(diagnose(logs, LAGGED))
+    return {effect["name"]: set(effect["alternatives"]) for effect in found["effects"]}
+
+
+def test_a_wind_at_one_heading_is_one_of_a_set():
+    found = blown(0.3, 0.3, 0.3)
+    together = set(found).union(*found.values())
+    assert {"frame_tilt", "thrust_tilt"} <= together
+    assert {"constant_wind", "constant_wind + linear_drag"} & together
+
+
+@pytest.mark.slow
+def test_a_wind_on_two_headings_is_named_with_the_drag_that_passes_it_on():
+    found = blown(0.3, 0.3 + np.pi / 2, 0.3 + np.pi / 2)
+    assert set(found) == {"constant_wind", "linear_drag"}
+    assert found["constant_wind"] == set()
+
+
+def test_a_load_on_a_line_is_said_to_swing():
+    logs = [
+        fly(LAGGED, seed, 8.0, speed=1.5, extra=Pendulum(0.08, 0.5, LAGGED.mass))
+        for seed in range(3)
+    ]
+    # Without names, for the search takes longer than what is asked here.
+    found = diagnosis_json(diagnose(logs, LAGGED, limits=Thresholds(most_names=0)))
+    assert found["verdict"] == "unknown"
+    assert found["unexplained"]["where"].startswith("swings with 1.")
 
 
 def test_files_come_out_whole_and_bad_flights_are_named(tmp_path, capsys):

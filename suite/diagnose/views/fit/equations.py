@@ -7,11 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from suite.diagnose.fit.composites import acts_through, begin_of, lent_at
 from suite.diagnose.fit.normal_equations import (
     NormalEquations,
+    along_numbers,
     gauss_newton_step,
     half_widths95,
 )
+from suite.diagnose.fit.parameters import Candidate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.views.data.view import SmoothedFlight, View
 from suite.diagnose.views.fit.by_flight import means_of, units_of
@@ -66,11 +69,16 @@ def in_means(data: ViewData) -> ViewData:
 def look(task: ViewTask, theta: np.ndarray, weights: Weights) -> ViewEquations:
     """Return the equations of `task` at the numbers `theta` (P,)."""
     data = left_of(task, theta)
-    block = np.arange(len(data.flight)) if task.means else blocks_of(data, task.limits)
+    block = _blocks(task, data)
     first = np.unique(block, return_index=True)[1]
     return ViewEquations(
         theta, data, weights, equations_of(data, weights, block), data.flight[first]
     )
+
+
+def _blocks(task: ViewTask, data: ViewData) -> np.ndarray:
+    """Return the number of each moment's block (M,)."""
+    return np.arange(len(data.flight)) if task.means else blocks_of(data, task.limits)
 
 
 def fitted(
@@ -102,6 +110,39 @@ def fitted(
             break
         best = trial
     return best
+
+
+def with_lent(task: ViewTask, now: ViewEquations, among: Sequence[Candidate]) -> NormalEquations:
+    """Return the equations of `now`, also along what acts through parts of composites alone."""
+    acts = np.abs(now.data.slope).max(axis=(0, 1)) > 0.0
+    lent = lent_at(task.model.space, now.theta, among, acts)
+    if lent is None:
+        return now.block
+    there = left_of(task, lent.theta).slope[..., list(lent.numbers)]
+    data = now.data._replace(slope=np.concatenate([now.data.slope, there], axis=-1))
+    return equations_of(data, now.weights, _blocks(task, data))._replace(lent=lent.numbers)
+
+
+def fitted_beside(
+    task: ViewTask,
+    now: ViewEquations,
+    block: NormalEquations,
+    beside: Sequence[int],
+    candidate: Candidate,
+) -> ViewEquations:
+    """Return the equations with `candidate` fitted beside other numbers, near enough to compare it.
+
+    `block` is `with_lent` at `now`.
+    """
+    at, space = [*beside, *candidate.indices], task.model.space
+    lent = [number for number in block.lent if number in candidate.indices]
+    if not candidate.parts or not lent:
+        rounds = task.limits.bilinear_rounds if acts_through(candidate) else 1
+        return fitted(task, now, at, rounds)
+    columns = sorted({*beside, *block.columns_of(candidate)})
+    change, told = along_numbers(block, now.theta, space, columns)
+    begin = begin_of(space, now.theta, candidate, lent, change, told)
+    return fitted(task, look(task, begin, now.weights), at, task.limits.bilinear_rounds)
 
 
 def chi2_by_flight(task: ViewTask, found: ViewEquations, indices: Sequence[int]) -> np.ndarray:

@@ -46,12 +46,17 @@ def at_bound(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> 
     return bool(ends.any())
 
 
-def usual_first(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> tuple[bool, int]:
-    """Return by what those of equal fit are ordered: the plausible, then as the catalogue has them.
+def usual_first(
+    space: ParameterSpace, theta: np.ndarray, candidate: Candidate
+) -> tuple[bool, int, int]:
+    """Return by what those of equal fit are ordered: what is plausible comes first.
 
-    `theta` (P,) is with this candidate.
+    Then one effect comes before several, and then as the catalogue has them; `theta` (P,) is with
+    this candidate.
     """
-    return bool(implausible(space, theta, candidate)), list(EFFECTS).index(candidate.name)
+    effects = candidate.effects
+    far = bool(implausible(space, theta, candidate))
+    return far, len(effects), min(list(EFFECTS).index(name) for name in effects)
 
 
 def _neutral(parameter: object, start: float) -> float:

@@ -2,9 +2,17 @@
 
 import numpy as np
 
+from suite.diagnose.fit.composites import composites
 from suite.diagnose.fit.normal_equations import NormalEquations
-from suite.diagnose.fit.parameters import make_space
-from suite.diagnose.fit.rivals import chi2_fall, flights_agree, gains_by_flight
+from suite.diagnose.fit.parameters import candidates, make_space
+from suite.diagnose.fit.rivals import (
+    chi2_fall,
+    could_be_best,
+    flights_agree,
+    gains_by_flight,
+    without_idle,
+)
+from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.vehicles import PLAIN
 
 FLIGHT = np.repeat(np.arange(4), 6)
@@ -41,3 +49,15 @@ def test_what_flights_contradict_is_not():
     assert not flights_agree(gains)
     assert not flights_agree(np.array([100.0, 0.5, 0.2, -3.0]))
     assert flights_agree(np.array([5.0, -1.0]))
+
+
+def test_several_effects_have_to_explain_more_than_each_of_them_alone():
+    single = candidates(make_space(PLAIN), False, ())
+    payload = next(one for one in composites(single) if "mass_offset" in one.effects)
+    mass, com = payload.parts
+    tried = [(100.0, payload, None), (105.0, mass, None), (300.0, com, None)]
+    assert [one for _, one, _ in without_idle(tried, THRESHOLDS)] == [mass, com]
+    assert len(without_idle([(90.0, payload, None), *tried[1:]], THRESHOLDS)) == 3
+    fallen = {payload: 100.0, mass: 95.0, com: 10.0}
+    assert not could_be_best(fallen, payload, THRESHOLDS)
+    assert could_be_best({**fallen, mass: 50.0}, payload, THRESHOLDS)

@@ -8,6 +8,7 @@ from suite.diagnose.views.explainable import closed_share, fit_black_box, inputs
 from suite.diagnose.views.fit.by_flight import centred
 from suite.diagnose.views.judged import judge
 from tests.support.real_flights import VEHICLE, flights
+from tests.support.vehicles import with_effects
 
 DRAG = (0.4, 0.3, 0.2)
 
@@ -54,3 +55,40 @@ def test_a_lone_reference_flight_is_refused():
     logs = flights(2, seed=4)
     with pytest.raises(ValueError, match="at least 2"):
         diagnose_by_views(logs[:1], VEHICLE, logs[1:])
+
+
+SIDE = (0.25, 0.45, 0.1)
+"""A drag that is not the same along x and y, so that a heading changes what a wind does."""
+SLOW = {"speed": 1.5, "noise": 3.0, "linear_drag": (SIDE,)}
+
+
+def names(logs, vehicle=VEHICLE):
+    """Return what the force view names, with what could stand in its place."""
+    found = diagnose_by_views(logs, vehicle)
+    force = next(one for one in found.results if one.view.name == "force")
+    return {name.candidate.name: set(name.rivals) for name in force.names}, found
+
+
+def test_a_wind_at_one_heading_is_one_of_a_set_and_with_two_headings_alone():
+    wind = {**SLOW, "constant_wind": ((1.5, -2.0, 0.0),)}
+    one, _ = names(flights(4, headings=(0.3,), **wind))
+    assert set(one) == {"constant_wind", "linear_drag"}
+    assert {"frame_tilt", "thrust_tilt"} <= one["constant_wind"]
+    two, found = names(flights(4, headings=(0.3, 1.9, 1.9, 0.3), **wind))
+    assert set(two) == {"constant_wind", "linear_drag"} and two["constant_wind"] == set()
+    velocity = found.vehicle.effects["constant_wind"].velocity
+    assert velocity[:2] == pytest.approx([1.5, -2.0], abs=0.2)
+
+
+def test_flights_that_hardly_move_leave_wind_and_drag_beside_a_leaning_frame():
+    faint = {**SLOW, "speed": 0.2, "noise": 2.0, "constant_wind": ((0.4, -0.5, 0.0),)}
+    found, _ = names(flights(4, headings=(0.3,), **faint))
+    (effect,) = found
+    whole = {effect, *found[effect]}
+    assert whole >= {"frame_tilt", "thrust_tilt", "constant_wind + linear_drag"}
+
+
+def test_a_wind_is_named_alone_where_the_file_has_the_drag():
+    logs = flights(4, headings=(0.3,), **{**SLOW, "constant_wind": ((1.5, -2.0, 0.0),)})
+    found, _ = names(logs, with_effects(VEHICLE, linear_drag=(SIDE,)))
+    assert set(found) == {"constant_wind"} and not any("+" in n for n in found["constant_wind"])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from suite.diagnose.fit.composites import composites
 from suite.diagnose.fit.parameters import Candidate, candidates, make_space
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.views.data.flights import ready
@@ -167,5 +168,11 @@ def test_sizes_beyond_three_times_the_usual_are_implausible():
     theta[at[0]] = SPACE.array("high")[at[0]]
     assert at_bound(SPACE, theta, tilt)
     assert usual_first(SPACE, theta, tilt) > usual_first(SPACE, SPACE.array("start"), tilt)
+    whole = next(one for one in composites(candidates(SPACE, False, ())) if "wind" in one.name)
+    start = SPACE.array("start")
+    assert usual_first(SPACE, start, tilt) < usual_first(SPACE, start, whole)
+    assert usual_first(SPACE, start, whole) < usual_first(SPACE, theta, tilt)
+    start[list(whole.indices)] = 20.0
+    assert any("constant_wind velocity" in told for told in implausible(SPACE, start, whole))
     drag = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "linear_drag"]
     assert not at_bound(SPACE, theta, Candidate("linear_drag", tuple(drag), "linear_drag"))

@@ -1,0 +1,68 @@
+"""A load on a line swings, and a flight that goes to and fro does not."""
+
+import numpy as np
+import pytest
+
+from suite.diagnose.report.views_json import views_json
+from suite.diagnose.views.by_views import diagnose_by_views
+from suite.diagnose.views.data.view import SmoothedFlight
+from suite.diagnose.views.data.weak_form import weak_form
+from suite.diagnose.views.swing import Swing, find_swing
+from tests.support.real_flights import VEHICLE, flights
+
+TIME_S = np.arange(0.0, 20.0, 0.01)
+
+
+class Rows:
+    """As much of a flight's rows as a spectrum needs: it flies level, heading x."""
+
+    rot_w = np.broadcast_to(np.eye(3), (len(TIME_S), 3, 3))
+
+
+def made(period_s, pull, moved, rng, noise=0.1):
+    """A level flight that is left with a `pull` at a period, and moves as much as `moved`."""
+    form = weak_form(TIME_S, np.ones(len(TIME_S), bool), 0.2, 0.1)
+    turn = 2.0 * np.pi * form.middle_s[:, None] / period_s + rng.uniform(0.0, 6.0, 3)
+    left = pull * np.sin(turn) + noise * rng.standard_normal(turn.shape)
+    measured = moved * np.sin(turn + 1.0) + left
+    return SmoothedFlight(Rows(), form, measured), left
+
+
+def swing_of(*flights):
+    return find_swing([flight for flight, _ in flights], [left for _, left in flights])
+
+
+def test_a_pull_at_one_period_swings():
+    rng = np.random.default_rng(0)
+    found = swing_of(*(made(1.4, 0.3, 0.1, rng) for _ in range(3)))
+    assert found is not None and found.ci95[0] < 1.4 < found.ci95[1]
+    assert found.ci95[1] - found.ci95[0] < 0.2 and found.p_value < 1e-3
+    assert found.length_m == pytest.approx(9.81 * found.period_s**2 / 39.48, rel=1e-3)
+    assert "1.4" in found.words and "0.49 m" in Swing(1.4, (1.3, 1.5), 0.5, 0.0).words
+
+
+def test_what_the_flights_own_motion_shows_is_no_swing():
+    rng = np.random.default_rng(1)
+    assert swing_of(*(made(1.4, 0.3, 3.0, rng) for _ in range(3))) is None
+
+
+def test_noise_and_periods_that_flights_do_not_share_are_no_swing():
+    rng = np.random.default_rng(2)
+    for seed in range(10):
+        own = np.random.default_rng(seed)
+        assert swing_of(*(made(1.4, 0.0, 0.0, own) for _ in range(3))) is None
+    different = [made(period, 0.1, 0.0, rng) for period in (0.7, 1.0, 1.5, 2.2)]
+    assert swing_of(*different) is None
+    assert find_swing([], []) is None
+
+
+def test_a_load_on_a_line_is_said_to_swing_with_its_period():
+    found = diagnose_by_views(flights(4, seed=1, duration_s=10.0, speed=1.0, load=(0.08, 0.5)),
+                              VEHICLE)  # fmt: skip
+    assert found.verdict in ("partly", "unknown") and found.swing is not None
+    # A pendulum on a free body of 0.75 kg swings faster than on a wall, by sqrt(1 + 0.08 / 0.75).
+    assert found.swing.period_s == pytest.approx(1.42 / np.sqrt(1.0 + 0.08 / 0.75), rel=0.08)
+    told = views_json(found)
+    assert (
+        told["unexplained"]["where"].startswith("swings with 1.") and "swings" in told["headline"]
+    )
