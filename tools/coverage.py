@@ -32,7 +32,7 @@ from suite.diagnose.plans.fleets import (
     start,
     truths,
 )
-from suite.diagnose.plans.simulate import FlightFailed, Recording
+from suite.diagnose.plans.follow import FlightFailed, Recording
 
 CASES = {
     "rotors": ("rotors", ()),

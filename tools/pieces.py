@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import psutil
 
@@ -73,9 +73,10 @@ def workers_of(text: str | None) -> Iterator[Workers]:
     if text:
         yield read_workers(text) or 1
         return
-    from distributed import LocalCluster  # pyright: ignore[reportMissingImports]
+    from distributed import LocalCluster
 
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    made: Any = LocalCluster
+    with made(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         print(f"scheduler and two workers on {os.cpu_count()} cores")
         yield cluster.scheduler_address
 

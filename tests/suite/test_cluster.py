@@ -108,6 +108,7 @@ def test_a_driver_that_is_killed_goes_on_with_what_is_left(flown, tmp_path, root
 def tool(root, name):
     """Return a program of tools/ as a module."""
     spec = importlib.util.spec_from_file_location(name, root / "tools" / f"{name}.py")
+    assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

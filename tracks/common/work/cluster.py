@@ -122,7 +122,7 @@ class _Count:
 def _connected(address: str) -> Iterator[Any]:
     """Be a client of the scheduler at `address`."""
     try:
-        import distributed  # pyright: ignore[reportMissingImports]
+        import distributed
     except ModuleNotFoundError as error:
         raise UnusableCluster(
             f"--workers {address}: a cluster needs the package {error.name!r}: "
@@ -133,7 +133,8 @@ def _connected(address: str) -> Iterator[Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            client = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
+            # Of any type: what it returns is a coroutine only where it is asked to be.
+            client: Any = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise UnusableCluster(
             f"--workers {address}: no scheduler of a Dask cluster answers there; {ADVICE}"

@@ -60,6 +60,6 @@ def test_rates_that_are_not_logged_come_of_the_attitude():
     still, none = np.zeros((200, 3)), np.full((200, 3), np.nan)
     log = FlightLog("made", time_s, still, quat, still, none, pwm=np.zeros((200, 4)))
     rate_b = grid_of(log).known["rate_b"]
-    known = np.isfinite(rate_b).all(axis=1)
+    known = np.asarray(np.isfinite(rate_b).all(axis=1))
     assert known[10:-10].all()
     np.testing.assert_allclose(rate_b[known], np.tile([0.8, 0.0, 0.0], (known.sum(), 1)), atol=1e-9)

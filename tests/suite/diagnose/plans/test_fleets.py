@@ -50,6 +50,7 @@ def test_commanded_torques_and_thrust_are_those_of_the_commanded_rotors(flown):
     fleet, recordings = flown
     (log,) = logs_of(fleet, recordings, "torques", np.random.default_rng(0), sensors=QUIET)
     (rotors,) = logs_of(fleet, recordings, "rotors", np.random.default_rng(0), sensors=QUIET)
+    assert rotors.rotor_speed_cmd is not None and log.torque_cmd_b is not None
     thrust = fleet.truth.rotors.thrust_coefficient * rotors.rotor_speed_cmd**2
     # Both are means over a row.
     np.testing.assert_allclose(log.torque_cmd_b, torque_of(fleet.truth, thrust), atol=2e-3)

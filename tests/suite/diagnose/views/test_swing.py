@@ -1,5 +1,7 @@
 """A load on a line swings, and a flight that goes to and fro does not."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,8 @@ def made(period_s, pull, moved, rng, noise=0.1):
     turn = 2.0 * np.pi * form.middle_s[:, None] / period_s + rng.uniform(0.0, 6.0, 3)
     left = pull * np.sin(turn) + noise * rng.standard_normal(turn.shape)
     measured = moved * np.sin(turn + 1.0) + left
-    return SmoothedFlight(Rows(), form, measured), left
+    rows: Any = Rows()
+    return SmoothedFlight(rows, form, measured), left
 
 
 def swing_of(*flights):
