@@ -57,6 +57,7 @@ def when(happens, then, seconds=200):
     return beside
 
 
+@pytest.mark.slow
 def test_a_node_killed_after_a_third_leaves_the_table_as_it_is(flown, tmp_path, monkeypatch):
     args, one = flown
     monkeypatch.setattr(eval.judging.judge, "MOST_A_PIECE", 2)

@@ -48,10 +48,10 @@ Body = TorchState | torch_fleet.TorchReduced
 
 
 def to_torch(tree: Any) -> Any:
-    """Return a tree of named tuples with its arrays as tensors."""
+    """Return a tree of named tuples with its arrays as tensors, and None where there is none."""
     if isinstance(tree, tuple):
         return type(tree)(*(to_torch(part) for part in tree))
-    return torch.as_tensor(tree)
+    return None if tree is None else torch.as_tensor(tree)
 
 
 def _fade(x: Tensor, factor: Tensor) -> Tensor:

@@ -304,7 +304,8 @@ def test_rotorpy_steps_as_mujoco_does_but_for_the_length_of_mujocos_steps(motion
     assert np.abs(ours.quat_wxyz - theirs.quat_wxyz).max() < EULER_QUAT
 
 
-@each_of(["fall", "spin", "manoeuvre"])
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", ["fall", "spin", "manoeuvre"])
 def test_what_differs_from_rotorpy_halves_with_the_step(motion, rotorpy):
     """Nothing else does: a difference of models would stay."""
 

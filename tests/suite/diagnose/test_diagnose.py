@@ -104,6 +104,7 @@ def blown(*headings):
     return {effect["name"]: set(effect["alternatives"]) for effect in found["effects"]}
 
 
+@pytest.mark.slow
 def test_a_wind_at_one_heading_is_one_of_a_set():
     found = blown(0.3, 0.3, 0.3)
     together = set(found).union(*found.values())
@@ -118,6 +119,7 @@ def test_a_wind_on_two_headings_is_named_with_the_drag_that_passes_it_on():
     assert found["constant_wind"] == set()
 
 
+@pytest.mark.slow
 def test_a_load_on_a_line_is_said_to_swing():
     logs = [
         fly(LAGGED, seed, 8.0, speed=1.5, extra=Pendulum(0.08, 0.5, LAGGED.mass))

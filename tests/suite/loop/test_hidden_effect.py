@@ -159,7 +159,8 @@ def test_measured_flights_are_others_than_the_judged_and_noisy(whole):
     np.testing.assert_array_equal(logs[0].action_b, one.action_b[:count])
 
 
-@pytest.mark.parametrize("kind", ["train", pytest.param("fly", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["train", "fly"])
 def test_a_stopped_loop_comes_to_the_same(whole, kind, tmp_path, monkeypatch, root, capfd):
     out, _ = whole
     monkeypatch.chdir(root)

@@ -16,6 +16,7 @@ def nothing_kept():
     strength._entry.cache_clear()
 
 
+@pytest.mark.slow
 def test_the_committed_table_is_what_is_worked_out():
     stored = strength._load()["vehicles"]["dragged"]["full"]
     found = strengths("dragged", "full", ["rotor_drag", "clock_offset", "weak_motor", "gusts"])
