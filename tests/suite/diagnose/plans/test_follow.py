@@ -15,7 +15,7 @@ WAYS = [Trajectory("circle", 0.4, speed=1.0), Trajectory("hover", 0.2)]
 class Points:
     """Bodies that stay level and fall off their trajectories by `off_m` a second."""
 
-    integrator = "none"
+    integrator: str | None = "none"
 
     def __init__(self, wanted, off_m=0.0):
         self.off_m, self.steps, self.commands = off_m, 0, []
