@@ -40,7 +40,7 @@ from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import check_family
 from tracks.track import Track
 
-MOST_A_PIECE = 256
+MOST_A_PIECE = 640
 """Trials; more are several pieces, where several processes share them."""
 Trial = TypeVar("Trial")
 OnResult = Callable[[TrialResult, Flight | None], None]
