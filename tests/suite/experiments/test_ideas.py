@@ -127,6 +127,7 @@ def test_a_training_that_diverges_leaves_its_row_out(sky, made, tmp_path, monkey
     assert "the recipe itself, seed 5: training diverged" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_round_gates_are_flown_by_the_trainers_own_code(tmp_path, monkeypatch):
     small = Config(
         set=(*SMALL, "episode.batch=2"), iterations=1, round_trials=2, round_seconds=0.5,

@@ -175,6 +175,7 @@ def test_a_stopped_loop_comes_to_the_same(whole, kind, tmp_path, monkeypatch, ro
     assert (out / "table.md").read_text() == (again / "table.md").read_text()
 
 
+@pytest.mark.slow
 def test_without_delta_the_same_comes_of_half_the_stages(whole, tmp_path, monkeypatch, root):
     monkeypatch.chdir(root)
     stub, out = Stub(monkeypatch), tmp_path / "out"

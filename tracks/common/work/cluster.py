@@ -83,9 +83,11 @@ def share_out(
             numbers, packed = zip(*((n, pack(piece)) for n, piece in batch), strict=True)
             keys = [f"suite-{run}-{n}" for n in numbers]
             # Of one priority: the piece that was given first is worked on first.
-            for number, future in zip(
-                numbers, client.map(_work_on, packed, work=body, key=keys), strict=True
-            ):
+            with warnings.catch_warnings():
+                # That a training's start is large to send is known: it travels once.
+                warnings.simplefilter("ignore")
+                futures = client.map(_work_on, packed, work=body, key=keys)
+            for number, future in zip(numbers, futures, strict=True):
                 in_air[future] = number
                 future.add_done_callback(ended.put)
 

@@ -133,6 +133,7 @@ def test_wind_carries_the_vehicle_by_rotorpys_drag(installed):
     assert abs(still.pos_y) < 1e-6 and carried.pos_y > 0.1
 
 
+@pytest.mark.slow
 def test_outcomes_are_the_same_bits_at_any_place_in_any_batch(installed):
     policy, rules = RandomNetwork(), Rules(time_limit_s=0.6)
     wind = with_effects(gusts=(2.0, 5.0)).effects
