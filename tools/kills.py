@@ -64,7 +64,7 @@ def _content(path: Path) -> bytes:
     if path.suffix == ".json":
         return json.dumps(_timeless(json.loads(path.read_text()))).encode()
     if path.suffix == ".jsonl":
-        return json.dumps([_timeless(json.loads(row)) for row in path.open()]).encode()
+        return json.dumps([_timeless(json.loads(row)) for row in path.read_text().splitlines()]).encode()
     return path.read_bytes()
 
 
