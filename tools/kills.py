@@ -64,7 +64,8 @@ def _content(path: Path) -> bytes:
     if path.suffix == ".json":
         return json.dumps(_timeless(json.loads(path.read_text()))).encode()
     if path.suffix == ".jsonl":
-        return json.dumps([_timeless(json.loads(row)) for row in path.read_text().splitlines()]).encode()
+        rows = path.read_text().splitlines()
+        return json.dumps([_timeless(json.loads(row)) for row in rows]).encode()
     return path.read_bytes()
 
 
