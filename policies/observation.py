@@ -77,8 +77,8 @@ def observe(
     numbers += [vector(view) for key, vector in EXTRA_VECTORS.items() if getattr(spec, key)]
     xp = rot_w.__array_namespace__()
     if spec.speed_input:
-        own = xp.full_like(vel_b[..., :1], spec.speed)
-        numbers.append(own if speed is None else speed[..., None])
+        told = xp.full_like(vel_b[..., 0], spec.speed) if speed is None else speed
+        numbers.append(told[..., None])
     state = xp.concatenate(numbers, axis=-1)
     if view.depth_m is None:
         return Observation(state, None)

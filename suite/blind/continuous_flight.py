@@ -19,7 +19,7 @@ from suite.blind.continuous.engine import Flown, Rows, fly
 from suite.blind.continuous.log import Noise, log_of_flight, state_at
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import STEP_S, jittered_stamps, schedule
-from suite.diagnose.plans.follow import FlightFailed, Recording
+from suite.diagnose.plans.follow import Recording, check_flights
 from suite.diagnose.plans.pilot import Gains, steer
 from suite.diagnose.plans.sensors import Sensors
 from suite.diagnose.plans.simulate import FALL_V_PER_S, FULL_V, SAG_V, Extra
@@ -29,10 +29,6 @@ ROLL_S = 0.25
 """Flown before the first row and after the last, for poses that are logged late or early [s]."""
 GRID_HZ = 500.0
 """Of the recordings that an oracle works with; commands and rows of a log do not lie on it."""
-OFF_M = 4.0
-"""A flight further off its trajectory than this has failed [m]."""
-LOWEST_M = 0.02
-"""A flight lower than this has failed [m]."""
 
 
 def with_loop(vehicle: Vehicle, frequency: float) -> Vehicle:
@@ -100,19 +96,11 @@ class _Pilot:
         """Return the command that is logged and the one that acts, (N, 4) each."""
         row = seen.number
         now = Reference(*(part[row] for part in self._wanted))
-        off = now.pos_w - seen.pos_w
-        far = np.sqrt((off**2).sum(axis=1))
-        # Written so that a state that is no number fails too.
-        sound = (far < OFF_M) & (seen.rot_w[:, 2, 2] > 0.0) & (seen.pos_w[:, 2] > LOWEST_M)
-        if not sound.all():
-            bad = int(np.flatnonzero(~sound)[0])
-            raise FlightFailed(
-                f"flight {bad + 1} failed at {seen.time_s[bad]:.2f} s, {far[bad]:.1f} m off its "
-                "trajectory; make the trajectory gentler or the effect weaker"
-            )
-        since = self._stamp_s[row] - self._stamp_s[max(row - 1, 0)]
-        self._summed_w = np.clip(self._summed_w + since[:, None] * off, -1.0, 1.0)
         motion = Motion(seen.pos_w, seen.rot_w, seen.vel_w, seen.rate_b)
+        check_flights(motion, now, seen.time_s)
+        since = self._stamp_s[row] - self._stamp_s[max(row - 1, 0)]
+        off = now.pos_w - seen.pos_w
+        self._summed_w = np.clip(self._summed_w + since[:, None] * off, -1.0, 1.0)
         given = steer(self._nominal, Gains(), now, motion, self._summed_w)
         acting = given
         if self._extra is not None:

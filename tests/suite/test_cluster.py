@@ -1,6 +1,5 @@
 """Commands on a cluster of two nodes: the same files, also where a node or the driver is killed."""
 
-import importlib.util
 import json
 import os
 import shutil
@@ -20,6 +19,7 @@ from suite.common.console import Console
 from suite.common.running.apart import Job
 from suite.common.work import all_done
 from tests.support.cluster import cluster
+from tests.support.tools import tool
 
 TRIALS = ["--track", "zigzag", "--difficulty", "0,9", "--trials", "12"]
 FILES = ("table.md", "trials.parquet")
@@ -104,15 +104,6 @@ def test_a_driver_that_is_killed_goes_on_with_what_is_left(flown, tmp_path, root
             assert cli.main(args) == 0
     assert len(flown_again) == 24 - (len(kept) - 1), "what was finished is not flown again"
     assert same_table(out, one)
-
-
-def tool(root, name):
-    """Return a program of tools/ as a module."""
-    spec = importlib.util.spec_from_file_location(name, root / "tools" / f"{name}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def train_there(job, console):

@@ -122,7 +122,7 @@ def follow(
         motion, quat = bodies.motion()
         if step % period == 0:
             now = Reference(*(part[step // period] for part in wanted))
-            _check(motion, now, step * dt)
+            check_flights(motion, now, np.full(count, step * dt))
             summed_w = np.clip(summed_w + period * dt * (now.pos_w - motion.pos_w), -1.0, 1.0)
             command = steer(nominal, gains, now, motion, summed_w)
         entry = bodies.step(motion, command, step * dt)
@@ -149,7 +149,12 @@ def follow(
     return [_flight(whole, index, count) for index, count in enumerate(steps)]
 
 
-def _check(motion: Motion, wanted: Reference, time_s: float) -> None:
+def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None:
+    """Check that N flights are where a log may be, at `time_s` (N,) [s].
+
+    Raises:
+        FlightFailed: where one has tipped over, left the air or its trajectory.
+    """
     off = np.sqrt(((motion.pos_w - wanted.pos_w) ** 2).sum(-1))
     # Written so that a state that is no number fails too.
     upright, high = motion.rot_w[:, 2, 2] > 0.0, motion.pos_w[:, 2] > LOWEST_M
@@ -157,7 +162,7 @@ def _check(motion: Motion, wanted: Reference, time_s: float) -> None:
     if not sound.all():
         bad = int(np.flatnonzero(~sound)[0])
         raise FlightFailed(
-            f"flight {bad + 1} failed at {time_s:.2f} s, {off[bad]:.1f} m off its trajectory; "
+            f"flight {bad + 1} failed at {time_s[bad]:.2f} s, {off[bad]:.1f} m off its trajectory; "
             "make the trajectory gentler or the effect weaker"
         )
 
