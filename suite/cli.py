@@ -43,6 +43,9 @@ COMMANDS: dict[str, str] = {
 }
 """Name -> one-line summary; the command NAME lives in suite/commands/NAME.py."""
 
+REPEATED = ("--policy",)
+"""Options that are given once for each value."""
+
 
 def overview() -> str:
     """Return the text of `suite --help`."""
@@ -110,15 +113,25 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
     """Return the module of the command `name` and its configuration from `args`.
 
     Raises:
+        ValueError: for an option that is given twice.
         SystemExit: after --help (code 0), and for options that cannot be read (code 2).
     """
     import tyro
 
+    _refuse_twice(args)
     command = importlib.import_module(f"suite.commands.{name}")
     plain_flags = (tyro.conf.FlagCreatePairsOff,)
     options = command.config_type(args) if hasattr(command, "config_type") else command.Config
     config = tyro.cli(options, prog=f"suite {name}", args=args, config=plain_flags)
     return command, config
+
+
+def _refuse_twice(args: Sequence[str]) -> None:
+    """Refuse an option that is given twice: of two `--set` the first would be left out silently."""
+    flags = [arg.partition("=")[0] for arg in args if arg.startswith("--")]
+    for flag in flags:
+        if flags.count(flag) > 1 and flag not in REPEATED:
+            raise ValueError(f"{flag} is given twice; give it once, with all its values behind it")
 
 
 def _run(name: str, args: list[str]) -> int:

@@ -230,8 +230,8 @@ class TrainConfig:
     """Optimiser and its schedule."""
     seed: Seed = 0
     """Seed of the parameters, the tracks and the randomisation."""
-    devices: Annotated[int, Range(0, 4096)] = 0
-    """JAX devices to share the batch; 0 takes all that divide it."""
+    devices: Annotated[int, Range(1, 4096)] | None = None
+    """JAX devices to share the batch; None takes all that divide it."""
 
 
 def check_decides_in_time(spec: PolicySpec, vehicle: Vehicle) -> None:

@@ -6,7 +6,7 @@ import ast
 import dataclasses
 import math
 from collections.abc import Iterable
-from typing import TypeVar
+from typing import TypeVar, get_args, get_type_hints
 
 from tracks.common.names import unknown_name
 from tracks.input.ranges import check_ranges, is_finite, shown
@@ -42,6 +42,11 @@ def _changed(config: T, path: list[str], text: str, change: str) -> T:
     if dataclasses.is_dataclass(old):
         parts = ", ".join(field.name for field in dataclasses.fields(old))
         raise ValueError(f"--set {change}: {name!r} has parts, set one of {parts}")
+    kinds = get_args(get_type_hints(type(config))[name])
+    if type(None) in kinds and text == "None":
+        return dataclasses.replace(config, **{name: None})
+    if old is None and kinds[0] in (int, float, str):
+        old = kinds[0]()
     return dataclasses.replace(config, **{name: _value(old, text, change)})
 
 

@@ -63,11 +63,11 @@ def device_mesh(config: TrainConfig) -> Mesh:
     have, batch = jax.devices(), config.episode.batch
     count = config.devices or max(n for n in range(1, len(have) + 1) if batch % n == 0)
     if not 0 < count <= len(have):
-        raise ValueError(f"devices is {count}, allowed is 0 (all) to {len(have)}")
+        raise ValueError(f"devices is {count}, allowed is 1 to {len(have)}, or None for all")
     if hosts.several() and count < len(have):
         raise ValueError(
             f"episode.batch is {batch}, and devices {config.devices}: the {len(have)} devices of "
-            f"all {jax.process_count()} processes must divide the one, and the other be 0"
+            f"all {jax.process_count()} processes must divide the one, and the other be None"
         )
     if batch % count:
         raise ValueError(f"episode.batch is {batch}, not a multiple of the {count} devices")

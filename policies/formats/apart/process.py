@@ -1,9 +1,10 @@
 """A model that runs in a process of its own: it may loop for ever or abort, and we do not.
 
 A model from elsewhere is a program: a `Loop` of 2^62 rounds is one node of ONNX, also one that is
-worked out while the file is loaded; TorchScript has `while`. So onnxruntime and torch have the file
-in a process with limits of time and memory (`server.py`), and whoever does not answer in time is
-killed. That is for what goes wrong: a torch file is code and may do more, with trust and without.
+worked out while the file is loaded; TorchScript has `while`, and C anything. So onnxruntime, torch
+and a compiled policy.c have a process with limits of time and memory (`server.py`), and whoever
+does not answer in time is killed. That is for what goes wrong: torch files and C are code and may
+do more.
 """
 
 from __future__ import annotations
@@ -45,8 +46,11 @@ SERVER = Path(__file__).with_name("server.py")
 REMEDIES = {
     "onnxruntime": "export it for an older opset",
     "torch": "export it again with this version of torch",
+    "ctypes": "remove it, and it is compiled again",
 }
 """What to do where an engine refuses a model."""
+CALLED = {"ctypes": "compiled C"}
+"""Engines whose module has another name than people know them by."""
 
 
 class Port(NamedTuple):
@@ -69,7 +73,7 @@ class Apart:
         """Start the process and load the model there.
 
         Args:
-            model: a serialised model.
+            model: a serialised model, or a library's path.
             where: the file it came from, for messages.
             kind: one of `server.KINDS`.
             label: name of a text that a torch file carries.
@@ -78,10 +82,13 @@ class Apart:
             PolicyError: where the engine refuses it, or does not come to an end with it.
         """
         self._where, self._model = where, model
-        self._engine, self._kind, self._wanted = KINDS[kind][0], kind, label
+        self._module, self._kind, self._wanted = KINDS[kind][0], kind, label
+        self._engine = CALLED.get(self._module, self._module)
         about = self._start()
         self.label = about.get("label", "")
         """The text that was asked for; empty where there is none."""
+        self.sizes: list[int] = about.get("sizes", [])
+        """Of a C library: bytes of its memory, then the sizes of its observation."""
         self.inputs, self.outputs = (
             [Port(name, number, tuple(shape)) for name, number, shape in about[side]]
             for side in ("inputs", "outputs")
@@ -113,7 +120,7 @@ class Apart:
         if "error" in about:
             raise PolicyError(
                 f"{self._where}: {self._engine} {about['version']} cannot load it "
-                f"({about['error']}); {REMEDIES[self._engine]}"
+                f"({about['error']}); {REMEDIES[self._module]}"
             )
         return about
 

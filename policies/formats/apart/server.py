@@ -1,4 +1,4 @@
-"""The program that runs one model from elsewhere: ONNX, a torch exported program, TorchScript.
+"""The program that runs one model from elsewhere: ONNX, torch's two kinds, a C library.
 
 It imports nothing of ours and is run by its path. Frames come on standard input, answers go to the
 output. A frame is four bytes of length, a JSON object of that length, and the bytes of the float32
@@ -125,10 +125,39 @@ def _torch_run(torch: Any, module: Callable[..., Any]) -> Run:
     return run
 
 
+def load_library(ctypes: Any, path: bytes, label: str) -> Loaded:
+    """Load a C policy's shared library, whose path is all that was sent.
+
+    Memories travel as float32 words, whatever they hold; so does the byte that says a row is fresh.
+    """
+    import numpy as np
+
+    library = ctypes.CDLL(path.decode())
+    library.suite_json.restype = ctypes.c_char_p
+    state_bytes, *sizes = (library.suite_size(number) for number in range(4))
+    text = library.suite_json().decode(errors="replace")
+    about = {"inputs": [], "outputs": [], "label": text, "sizes": [state_bytes, *sizes]}
+
+    def run(feed: dict[str, Any]) -> list[Any]:
+        words = feed["memory"]
+        rows = len(words)
+        memory = np.ascontiguousarray(words.view(np.uint8)[:, :state_bytes])
+        fresh = feed["fresh"].astype(np.uint8)
+        action = np.empty((rows, 3), np.float32)
+        arrays = (memory, fresh, feed["state"], feed["image"], action)
+        library.suite_rows(rows, *(ctypes.c_void_p(array.ctypes.data) for array in arrays))
+        after = np.zeros(words.shape, np.float32)
+        after.view(np.uint8)[:, :state_bytes] = memory
+        return [action, after]
+
+    return about, run
+
+
 KINDS: dict[str, tuple[str, Callable[[Any, bytes, str], Loaded]]] = {
     "onnx": ("onnxruntime", load_onnx),
     "program": ("torch", load_program),
     "script": ("torch", load_script),
+    "library": ("ctypes", load_library),
 }
 """The module that runs a kind of model, and how it is loaded."""
 

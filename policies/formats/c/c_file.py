@@ -1,22 +1,24 @@
-"""policy.c as `Policy`: compiled and called in this process, one row after another."""
+"""policy.c as `Policy`: compiled, and called row after row in a process of its own."""
 
 from __future__ import annotations
 
-import ctypes
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from policies.errors import PolicyError
+from policies.formats.apart.process import ANSWER_BYTES, Apart
 from policies.formats.c.compiler import compiled_library
 from policies.formats.embedded_spec import extract
 from policies.spec import ACTION_SIZE, PolicySpec
 
 _STATE_MOST = 2**26
 """Bytes of one flight's `policy_state`."""
+_WORD = 4
+"""Bytes; memories travel in whole ones."""
 
 
 @final
@@ -28,25 +30,28 @@ class CPolicy:
     """What tables call it."""
     spec: PolicySpec
     """The rate, camera and scaling it expects of the world."""
-    library: Any
-    """The loaded library."""
+    library: Path
+    """The shared library."""
+    loaded: Apart
+    """It, in its process."""
     state_bytes: int
     """Size of `policy_state`."""
 
     def start(self, n: int) -> np.ndarray:
-        """Return the `policy_state` of n trials, reset: (n, state_bytes) bytes."""
-        return np.zeros((n, self.state_bytes), np.uint8)
+        """Return the `policy_state` of n trials, reset: its bytes as (n, k) float32 words."""
+        return np.zeros((n, -(-self.state_bytes // _WORD)), np.float32)
 
     def act(
         self, hidden: np.ndarray, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (action_b (n, 3) [m/s^2], hidden'); see `policies.policy.Policy.act`."""
-        after = np.array(hidden, np.uint8, order="C")
-        actions = np.empty((len(after), ACTION_SIZE), np.float32)
-        inputs = [np.ascontiguousarray(x, np.float32) for x in (state, image)]
-        begins = np.ascontiguousarray(fresh, np.uint8)
-        arrays = (after, begins, *inputs, actions)
-        self.library.suite_rows(len(after), *(ctypes.c_void_p(x.ctypes.data) for x in arrays))
+        actions = np.empty((len(hidden), ACTION_SIZE), np.float32)
+        after = np.empty_like(hidden)
+        most = max(1, ANSWER_BYTES // 2 // max(1, hidden[:1].nbytes))
+        for low in range(0, len(hidden), most):
+            rows = slice(low, low + most)
+            feed = {"memory": hidden[rows], "fresh": fresh[rows], "state": state[rows]}
+            actions[rows], after[rows] = self.loaded.run({**feed, "image": image[rows]})
         return actions, after
 
 
@@ -55,7 +60,7 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
 
     Raises:
         PolicyError: without trust, without a compiler, or where it does not compile, its sizes do
-            not fit, or the same inputs give two answers.
+            not fit, the same inputs give two answers, or it does not come to an end.
     """
     file = path / "policy.c" if path.is_dir() else path
     if not trust:
@@ -63,10 +68,9 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
             f"{file}: C is compiled and run on this machine and can do anything; if you trust who "
             "made the file, pass --trust; a policy to be shared needs none as .onnx"
         )
-    library = ctypes.CDLL(str(compiled_library(file)))
-    library.suite_json.restype = ctypes.c_char_p
-    state_bytes, *sizes = (library.suite_size(k) for k in range(4))
-    text = library.suite_json().decode(errors="replace")
+    library = compiled_library(file)
+    loaded = Apart(str(library).encode(), str(file), "library")
+    (state_bytes, *sizes), text = loaded.sizes, loaded.label
     spec = extract(text, str(file))
     expected = [spec.state_size, spec.camera.height, spec.camera.width]
     if sizes != expected or not 0 < state_bytes <= _STATE_MOST:
@@ -76,7 +80,8 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
             f"up to {_STATE_MOST} bytes; export it again"
         )
     named = json.loads(text).get("name") if text else None
-    return _proven(CPolicy(f"{named or file.stem}.c", spec, library, state_bytes), file)
+    policy = CPolicy(f"{named or file.stem}.c", spec, library, loaded, state_bytes)
+    return _proven(policy, file)
 
 
 def _proven(policy: CPolicy, file: Path) -> CPolicy:

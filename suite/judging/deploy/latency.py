@@ -51,13 +51,14 @@ def _timing(seconds: np.ndarray) -> Timing:
 
 
 def c_step(policy: CPolicy) -> Step:
-    """Return a step of a policy.c."""
+    """Return a step of a policy.c, called in this process as a flight controller calls it."""
     state, image = _inputs(policy.spec)
     memory, action = policy.start(1), np.zeros((1, 3), np.float32)
     held = (memory, state, image, action)
-    policy.library.policy_reset(ctypes.c_void_p(memory.ctypes.data))
+    library = ctypes.CDLL(str(policy.library))
+    library.policy_reset(ctypes.c_void_p(memory.ctypes.data))
     pointers = [ctypes.c_void_p(x.ctypes.data) for x in held]
-    function = policy.library.policy_step
+    function = library.policy_step
 
     def step() -> np.ndarray:
         function(*pointers)

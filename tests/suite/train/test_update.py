@@ -16,7 +16,7 @@ KEY = jax.random.key(3)
 
 def test_devices_that_are_not_there_or_do_not_divide_the_batch():
     have = len(jax.devices())
-    with pytest.raises(ValueError, match=f"devices is {have + 1}, allowed is 0"):
+    with pytest.raises(ValueError, match=f"devices is {have + 1}, allowed is 1 to {have}, or None"):
         device_mesh(replace(small_config(), devices=have + 1))
     with pytest.raises(ValueError, match="devices is -1"):
         device_mesh(replace(small_config(), devices=-1))

@@ -6,7 +6,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from policies.errors import PolicyError
+from policies.errors import NoAnswer, PolicyError
+from policies.formats.apart import process
 from policies.formats.c import arrays, quantised, source
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import STRICT, compiled_library, find_compiler
@@ -138,19 +139,36 @@ void policy_step(policy_state *, const float *, const float *, float *);
 """
 
 
-def test_any_c_with_this_door_flies_but_none_with_a_memory_of_its_own(tmp_path):
-    def written(answer, size=12):
-        (tmp_path / "policy.c").write_text(FOREIGN.format(answer=answer))
-        (tmp_path / "policy.h").write_text(DOOR.replace("{size}", str(size)))
-        return load_c(tmp_path, trust=True)
+def foreign(folder, answer, size=12):
+    (folder / "policy.c").write_text(FOREIGN.format(answer=answer))
+    (folder / "policy.h").write_text(DOOR.replace("{size}", str(size)))
+    return load_c(folder, trust=True)
 
-    policy = written("state->seen")
+
+def test_any_c_with_this_door_flies_but_none_with_a_memory_of_its_own(tmp_path):
+    policy = foreign(tmp_path, "state->seen")
     assert policy.name == "policy.c"
     assert (policy.spec.rate_hz, policy.state_bytes) == (30.0, 4)
     with pytest.raises(PolicyError, match="belongs into policy_state"):
-        written("(float)steps")
+        foreign(tmp_path, "(float)steps")
     with pytest.raises(PolicyError, match="expected by its POLICY_JSON"):
-        written("state->seen", size=15)
+        foreign(tmp_path, "state->seen", size=15)
+
+
+@pytest.mark.parametrize(
+    ("fault", "how"),
+    [("for (;;) {}", "not answered within 1 s"), ("action = 0; *action = 0;", "SIGSEGV")],
+)
+def test_c_that_hangs_or_crashes_in_flight_takes_nothing_with_it(fault, how, tmp_path, monkeypatch):
+    """The next trial's question goes to a fresh process."""
+    monkeypatch.setattr(process, "ANSWER_S", 1.0)
+    policy = foreign(tmp_path, f"state->seen;\n    if (observation[1] > 1e6f) {{ {fault} }}")
+    hidden, image, fresh = policy.start(2), np.zeros((2, 24, 32), np.float32), np.ones(2, bool)
+    calm = np.tile(np.arange(12, dtype=np.float32), (2, 1))
+    before, _ = policy.act(hidden, calm, image, fresh)
+    with pytest.raises(NoAnswer, match=f"compiled C does not come to an end with it .*{how}"):
+        policy.act(hidden, calm * 1e7, image, fresh)
+    assert policy.act(hidden, calm, image, fresh)[0].tobytes() == before.tobytes()
 
 
 def test_nothing_but_the_door_is_seen_from_outside(exports):
