@@ -135,6 +135,8 @@ class Thresholds:
     """Neighbouring moments of a view up to which errors may hang together."""
     view_rounds: int = 4
     """Gauss-Newton steps of a view's fits, which are nearly linear."""
+    least_fast_share: float = 0.5
+    """Fast changes that surely ask for less than this share of a name speak against it [1]."""
     least_view_share: float = 0.03
     """An effect that takes less than this share of a view's squared error is not named [1]."""
     implausible_times: float = 3.0

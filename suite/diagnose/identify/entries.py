@@ -13,7 +13,7 @@ from eval.effects import EFFECTS
 from eval.effects.interface import at
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.identify import force
-from suite.diagnose.identify.drive import MotorGuess
+from suite.diagnose.identify.data.drive import MotorGuess
 from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.numbers import Number, number
 from suite.diagnose.identify.torque import inertia_ratio

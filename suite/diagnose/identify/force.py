@@ -13,9 +13,15 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify.drive import MotorGuess, delayed, lagged, motor_thrusts, rotor_thrusts
+from suite.diagnose.identify.data.drive import (
+    MotorGuess,
+    delayed,
+    lagged,
+    motor_thrusts,
+    rotor_thrusts,
+)
+from suite.diagnose.identify.data.grid import FlightGrid, Windows, blocks_of, over, windows_of
 from suite.diagnose.identify.fit import Fitted, Rows, Unknown, fit
-from suite.diagnose.identify.grid import FlightGrid, Windows, blocks_of, over, windows_of
 
 WIDTH_S = 0.4
 BLOCK_S = 2.0
@@ -172,7 +178,7 @@ def _prepared(flight: FlightGrid, driven: str) -> _Prepared:
 
 def _velocity(pos_w: np.ndarray) -> np.ndarray:
     """Return the slope over 0.1 s, for the drag only."""
-    from suite.diagnose.identify.grid import STEP_S
+    from suite.diagnose.identify.data.grid import STEP_S
 
     reach = round(0.05 / STEP_S)
     out = np.full_like(pos_w, np.nan)

@@ -15,7 +15,7 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.identify import force, loop, torque
-from suite.diagnose.identify.drive import (
+from suite.diagnose.identify.data.drive import (
     MotorGuess,
     drive_of,
     guess_of,
@@ -23,9 +23,11 @@ from suite.diagnose.identify.drive import (
     rotor_thrusts,
     with_motors,
 )
+from suite.diagnose.identify.data.grid import FlightGrid, grid_of
+from suite.diagnose.identify.doubts import doubted
 from suite.diagnose.identify.entries import inertia_of, of_force, of_loop, of_torque, put
 from suite.diagnose.identify.fit import Fitted, NothingWhole, Unknown
-from suite.diagnose.identify.grid import FlightGrid, grid_of
+from suite.diagnose.identify.flapping import flapping_of
 from suite.diagnose.identify.numbers import Number, told
 from suite.diagnose.identify.untold import unasked, untold
 
@@ -81,7 +83,16 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
             f"{', '.join(flight.name for flight in flights)}: no stretch of a second with "
             "positions or body rates beside what drove it; import them again and read what it says"
         )
-    return state.done()
+    found = state.done()
+    if drive not in KNOWN_MOTORS or "drag" in leave or not {"force", "torque"} <= {*state.fitted}:
+        return found
+    force_fit, torque_fit = state.fitted["force"], state.fitted["torque"]
+    others = doubted(found.vehicle, state.start, drive, state.guess, force_fit, torque_fit)
+    entry = flapping_of(logs, found.vehicle, others)
+    if entry is None:
+        return found
+    vehicle = put(found.vehicle, entry)
+    return replace(found, vehicle=vehicle, numbers=(*found.numbers, entry))
 
 
 class _Start:

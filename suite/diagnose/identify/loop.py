@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify.drive import delayed, filled, lagged
+from suite.diagnose.identify.data.drive import delayed, filled, lagged
+from suite.diagnose.identify.data.grid import STEP_S, FlightGrid, blocks_of, over, windows_of
 from suite.diagnose.identify.fit import Fitted, Given, Rows, Unknown, fit
 from suite.diagnose.identify.force import BLOCK_S
-from suite.diagnose.identify.grid import STEP_S, FlightGrid, blocks_of, over, windows_of
 
 WIDTH_S = 0.06
 FREE = np.array([True, True, True])

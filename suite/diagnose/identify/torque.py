@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify.drive import delayed, lagged, torque_of
+from suite.diagnose.identify.data.drive import delayed, lagged, torque_of
+from suite.diagnose.identify.data.grid import FlightGrid, Windows, blocks_of, over, windows_of
 from suite.diagnose.identify.fit import Fitted, Given, Rows, Unknown, fit
 from suite.diagnose.identify.force import BLOCK_S
-from suite.diagnose.identify.grid import FlightGrid, Windows, blocks_of, over, windows_of
 
 WIDTH_S = 0.2
 BAND = WIDTH_S / (2.0 * np.pi)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.identify.data.grid import FlightGrid
 from suite.diagnose.identify.fit import Fitted
-from suite.diagnose.identify.grid import FlightGrid
 
 WHY = {
     "thrust": "thrust: too little of the force along body z is explained",

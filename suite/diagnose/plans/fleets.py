@@ -18,7 +18,7 @@ from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap, Vehicle
-from suite.diagnose.identify.drive import torque_of
+from suite.diagnose.identify.data.drive import torque_of
 from suite.diagnose.plans.follow import Recording
 from suite.diagnose.plans.sensors import Sensors, log_of
 from suite.diagnose.plans.simulate import fly
@@ -28,7 +28,7 @@ from tracks.geometry.rotation import exp_rot, rot_to_quat
 SENSORS = Sensors(
     "tracked", 250.0, pos=0.002, attitude=0.004, gyro=0.05, vel=0.03, rotor=5.0, voltage=0.02
 )
-DRAG, DELAY = "linear_drag", "command_delay"
+DRAG, DELAY, FLAPPING = "linear_drag", "command_delay", "blade_flapping"
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Fleet:
     """A vehicle with what flew it, and how its logs are written."""
 
     truth: Vehicle
-    """Flown; its `[motors]`, drag and delay are those to be found."""
+    """Flown; its `[motors]`, drag, flapping and delay are those to be found."""
     ways: tuple[Trajectory, ...]
     """One a flight."""
     scale: float = 1.0
@@ -113,7 +113,10 @@ def drawn(rng: np.random.Generator, duration_s: float = 8.0) -> Fleet:
             strict=True,
         )
     )
-    return Fleet(truth, ways, float(factor(0.15, 1)[0]))
+    scale = float(factor(0.15, 1)[0])
+    flapping = EFFECTS[FLAPPING].values(float(rng.uniform(1e-7, 6e-7)))
+    blown = MappingProxyType({**effects, FLAPPING: flapping})
+    return Fleet(replace(truth, effects=blown), ways, scale)
 
 
 def recordings_of(fleet: Fleet, rate_hz: float = SENSORS.rate_hz) -> list[Recording]:
@@ -172,7 +175,7 @@ def truths(fleet: Fleet, drive: str, told: str = "xyz") -> Mapping[str, tuple[fl
 
     The torque coefficient is that which goes with what else is in the file then: the inertia about
     z, which follows those about the axes `told` where it was not, and the thrust coefficient,
-    which only rotor speeds tell.
+    which only rotor speeds tell. Flapping goes with the rotors' speeds, so with that as well.
     """
     true, begun = fleet.truth, start()
     assert true.motors is not None
@@ -180,13 +183,16 @@ def truths(fleet: Fleet, drive: str, told: str = "xyz") -> Mapping[str, tuple[fl
     twist = true.rotors.torque_coefficient
     if "z" not in told:
         twist *= float(np.sqrt(np.prod([ratio["xy".index(axis)] for axis in told])) / ratio[2])
+    flapping = true.effects[FLAPPING].coefficient
     if drive != "rotors":
-        twist *= begun.rotors.thrust_coefficient / true.rotors.thrust_coefficient
+        ratio_t = begun.rotors.thrust_coefficient / true.rotors.thrust_coefficient
+        twist, flapping = twist * ratio_t, flapping * ratio_t**0.5
     return {
         "motors.thrust": true.motors.thrust,
         "motors.voltage_exponent": (true.motors.voltage_exponent,),
         "effects.linear_drag.coefficient": tuple(true.effects[DRAG].coefficient),
         "effects.thrust_scale.scale": (fleet.scale,),
+        "effects.blade_flapping.coefficient": (flapping,),
         "effects.command_delay.delay": (true.effects[DELAY].delay,),
         "inertia": true.inertia,
         "rotors.thrust_coefficient": (true.rotors.thrust_coefficient,),

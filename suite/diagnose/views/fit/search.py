@@ -1,8 +1,8 @@
 """The search of one view: what its flights agree on, beyond how they differ among themselves.
 
 A name must beat chance (signs of whole stretches shuffled, as in `fit.permutation`), lower the
-error of flights that its fit did not see in all flights but one, and be more than a trifle of what
-the view has to explain.
+error of flights that its fit did not see in all flights but one, be more than a trifle of what
+the view has to explain, and hold for slow and fast changes alike (`specification`).
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from suite.diagnose.views.fit.equations import (
     with_lent,
 )
 from suite.diagnose.views.fit.plausible import at_bound, usual_first
+from suite.diagnose.views.fit.specification import holds_at_any_speed
 from suite.diagnose.views.fit.weigh import weights_of
 
 
@@ -132,6 +133,8 @@ def _next_name(
         share = float(gains.sum() / before.sum())
         if at_bound(task.model.space, then.theta, score.candidate):
             continue  # that is no fit
+        if not holds_at_any_speed(task, then, score.candidate.indices):
+            continue
         if flights_agree(gains) and share >= task.limits.least_view_share:
             cost = float(then.block.chi2.sum()) + 2.0 * len(score.candidate.indices)
             name = ViewName(score.candidate, score.p_value, tuple(gains.tolist()), share)

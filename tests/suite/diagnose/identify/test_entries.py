@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from suite.diagnose.identify.drive import MotorGuess
+from suite.diagnose.identify.data.drive import MotorGuess
 from suite.diagnose.identify.entries import inertia_of, motors_of, put
 from suite.diagnose.identify.numbers import Number
 from tests.support.vehicles import PLAIN

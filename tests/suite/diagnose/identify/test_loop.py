@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from suite.diagnose.identify.grid import STEP_S, FlightGrid
+from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
 from suite.diagnose.identify.loop import couplings, followed
 from tests.support.vehicles import PLAIN
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.drive import delayed, lagged
-from suite.diagnose.identify.grid import STEP_S, FlightGrid
+from suite.diagnose.identify.data.drive import delayed, lagged
+from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
 from suite.diagnose.identify.torque import fit_rotor_lag, inertia_ratio, lag_and_delay, unknowns_of
 
 

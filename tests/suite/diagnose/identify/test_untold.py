@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
 from suite.diagnose.identify.fit import Fitted, Unknown
-from suite.diagnose.identify.grid import STEP_S, FlightGrid
 from suite.diagnose.identify.untold import unasked, untold
 from tests.support.vehicles import PLAIN
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.vehicles.vehicle import MotorMap, Vehicle
-from suite.diagnose.identify.grid import STEP_S, FlightGrid
+from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
 
 DRIVES = {
     "rotors": ("rotor_speed",),

@@ -3,7 +3,7 @@
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.identify.grid import STEP_S, FlightGrid, grid_of, over, windows_of
+from suite.diagnose.identify.data.grid import STEP_S, FlightGrid, grid_of, over, windows_of
 
 
 def grid(values):

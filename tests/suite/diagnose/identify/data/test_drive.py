@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.drive import (
+from suite.diagnose.identify.data.drive import (
     MotorGuess,
     delayed,
     drive_of,
@@ -11,7 +11,7 @@ from suite.diagnose.identify.drive import (
     motor_thrusts,
     torque_of,
 )
-from suite.diagnose.identify.grid import STEP_S, FlightGrid
+from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
 from tests.support.vehicles import PLAIN
 
 TIME = STEP_S * np.arange(400)
