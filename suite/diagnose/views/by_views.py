@@ -18,6 +18,7 @@ from suite.diagnose.views.data.flights import ViewFlights, parted, ready
 from suite.diagnose.views.data.view import FORCE, View
 from suite.diagnose.views.fit.equations import ViewTask, half_widths, left_of, look
 from suite.diagnose.views.fit.model import ForceModel
+from suite.diagnose.views.fit.motion_change import search_motion_change
 from suite.diagnose.views.fit.plausible import implausible
 from suite.diagnose.views.fit.reference import (
     RotorSpread,
@@ -122,6 +123,9 @@ def diagnose_by_views(
             found = search_change(known[view.name], task.flights, spread, among)
             apart = changed_task(known[view.name], found.first.theta, held[view.name])
             apart = apart._replace(means=True)
+            moved = None if found.named else search_motion_change(known[view.name], task, among)
+            if moved:
+                found, apart = moved, task._replace(flights=held[view.name])
         else:
             found = search_view(task, [*among, *composites(among)], seed)
             apart = task._replace(flights=held[view.name])

@@ -1,0 +1,115 @@
+"""What has changed in how a vehicle moves: each flight's own number, before and after.
+
+What changes within a flight tells a drag or a flapping of that flight alone. The numbers of the
+reference flights and those of the others are two samples, whose means are compared by how flights
+differ within each (Welch 1947, doi 10.1093/biomet/34.1-2.28), after Bonferroni over all candidates
+and their numbers. The vehicle file need not be right: what it lacks is in both samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import ttest_ind
+
+from suite.diagnose.fit.parameters import Candidate
+from suite.diagnose.fit.rivals import flights_agree
+from suite.diagnose.views.fit.by_flight import centred
+from suite.diagnose.views.fit.compare import ViewData
+from suite.diagnose.views.fit.equations import ViewTask, left_of, look
+from suite.diagnose.views.fit.plausible import at_bound, usual_first
+from suite.diagnose.views.fit.reference import in_balance
+from suite.diagnose.views.fit.search import ViewName, ViewSearch, view_candidates
+from suite.diagnose.views.fit.weigh import weights_of
+
+
+def within_flights(data: ViewData) -> ViewData:
+    """Return `data` with residual and slope less their flights' means."""
+    return data._replace(
+        residual=centred(data.residual, data.flight), slope=centred(data.slope, data.flight)
+    )
+
+
+def own_changes(inside: ViewData, indices: Sequence[int], scatter: np.ndarray) -> np.ndarray:
+    """Return by how much each of F flights alone wants the K numbers elsewhere, (F, K).
+
+    Args:
+        inside: from `within_flights`.
+        indices: the numbers.
+        scatter: (3,) noise by axis.
+    """
+    found = []
+    for number in np.unique(inside.flight):
+        rows = inside.flight == number
+        slope = (inside.slope[rows][..., list(indices)] / scatter[:, None]).reshape(
+            -1, len(indices)
+        )
+        left = (inside.residual[rows] / scatter).ravel()
+        found.append(np.linalg.lstsq(slope, left, rcond=1e-6)[0])
+    return np.array(found)
+
+
+def search_motion_change(
+    reference: ViewTask, task: ViewTask, among: Sequence[Candidate]
+) -> ViewSearch | None:
+    """Return the one of `among` that has changed since `reference`, None where none stands out.
+
+    Its numbers are totals. Both sets need two flights at least.
+    """
+    start, limits = in_balance(reference), task.limits
+    sets = [within_flights(left_of(one, start)) for one in (reference, task)]
+    if min(len(np.unique(one.flight)) for one in sets) < 2:
+        return None
+    weights = weights_of(sets[1], limits)
+    now = look(task, start, weights)
+    left, space = view_candidates(among, now), task.model.space
+    tests = sum(len(one.indices) for one in left)
+    tried = []
+    for candidate in left:
+        at = list(candidate.indices)
+        before, after = (own_changes(one, at, weights.scatter) for one in sets)
+        chance = np.nan_to_num(ttest_ind(before, after, equal_var=False).pvalue, nan=1.0)
+        p_value = float(chance.min()) * tests
+        if p_value > limits.change_p_value:
+            continue
+        gains, whole = _gains(sets[1], at, before.mean(axis=0), after, weights.scatter)
+        share = float(gains.sum() / whole)
+        theta = start.copy()
+        theta[at] += after.mean(axis=0)
+        if at_bound(space, np.clip(theta, space.array("low"), space.array("high")), candidate):
+            continue
+        if flights_agree(gains) and share >= limits.least_view_share:
+            name = ViewName(candidate, p_value, tuple(gains.tolist()), share)
+            tried.append((name, before.mean(axis=0), theta))
+    if not tried:
+        return None
+    most = max(name.share for name, *_ in tried)
+    alike = [one for one in tried if one[0].share >= (1.0 - limits.rival_share) * most]
+    alike.sort(key=lambda one: usual_first(space, one[2], one[0].candidate))
+    (name, since, theta), *others = alike
+    begun = start.copy()
+    begun[list(name.candidate.indices)] += since
+    rivals = tuple(dict.fromkeys(other.candidate.name for other, *_ in others))
+    named = ViewName(name.candidate, name.p_value, name.gains, name.share, rivals)
+    return ViewSearch(task, (named,), look(task, begun, weights), look(task, theta, weights))
+
+
+def _gains(
+    inside: ViewData, at: list[int], since: np.ndarray, after: np.ndarray, scatter: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return by how much each flight's squared error falls, and the sum of it before.
+
+    From the reference's numbers `since` (K,) to those that the other flights want; `after` (F, K).
+    """
+    gains, whole = [], 0.0
+    for k, number in enumerate(np.unique(inside.flight)):
+        rows = inside.flight == number
+        slope, others = inside.slope[rows][..., at], np.delete(after, k, axis=0).mean(axis=0)
+        errors = [
+            float((((inside.residual[rows] - slope @ change) / scatter) ** 2).sum())
+            for change in (since, others)
+        ]
+        gains.append(errors[0] - errors[1])
+        whole += errors[0]
+    return np.array(gains), max(whole, 1e-12)
