@@ -69,8 +69,8 @@ def search_motion_change(
     for candidate in left:
         at = list(candidate.indices)
         before, after = (own_changes(one, at, weights.scatter) for one in sets)
-        chance = np.nan_to_num(ttest_ind(before, after, equal_var=False).pvalue, nan=1.0)
-        p_value = float(chance.min()) * tests
+        _, chance = ttest_ind(before, after, equal_var=False)
+        p_value = float(np.nan_to_num(np.asarray(chance), nan=1.0).min()) * tests
         if p_value > limits.change_p_value:
             continue
         gains, whole = _gains(sets[1], at, before.mean(axis=0), after, weights.scatter)

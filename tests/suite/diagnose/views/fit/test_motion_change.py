@@ -1,4 +1,4 @@
-"""A change that shows in motion alone is told, and other manoeuvres of the same vehicle are none."""
+"""A change that shows in motion alone is told; other manoeuvres of the same vehicle are none."""
 
 import numpy as np
 import pytest
