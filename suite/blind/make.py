@@ -122,6 +122,12 @@ def load_manifest(out: Path) -> Manifest:
     return Manifest(table["cases"], table["answers"], table["failed"])
 
 
+def simulator_of(out: Path) -> str:
+    """Return who flew the set in `out`; MuJoCo where nothing says so."""
+    path = out / "set.json"
+    return str(read_json(path).get("simulator", MUJOCO)) if path.is_file() else MUJOCO
+
+
 def open_answers(out: Path) -> dict[str, dict[str, Any]]:
     """Return the answers by case, after checking that nobody changed them or the cases.
 

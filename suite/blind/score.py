@@ -9,10 +9,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
+
 from eval.effects import EFFECTS
 from eval.judging.statistics import wilson
-from suite.blind.cases import MULTIPLES
-from suite.blind.make import load_manifest, open_answers
+from eval.quadrotor.vehicle_file import load_vehicle
+from suite.blind.cases import MULTIPLES, ROTORPY
+from suite.blind.hubs import damping_of_hubs, is_of_hubs
+from suite.blind.make import load_manifest, open_answers, simulator_of
 from suite.diagnose.fit.parameters import effects_in
 from tracks.common.files import write_json, write_text
 from tracks.common.provenance import stamp
@@ -43,10 +47,12 @@ class Verdict:
     gap_ratio: float | None
     """Gap after over noise floor."""
     seconds: float | None
+    brought: int = 0
+    """Named effects that the simulator has beside the hidden ones, by their nature and size."""
 
     @property
     def exact(self) -> bool:
-        """Every hidden effect has its name, and nothing else was named."""
+        """Every hidden effect has its name, and nothing was named that is not there."""
         return self.found and self.extra == 0
 
 
@@ -64,9 +70,17 @@ class Share:
 
 
 def score_case(
-    name: str, answer: Mapping[str, Any], diagnosis: Mapping[str, Any] | None, seconds: float | None
+    name: str,
+    answer: Mapping[str, Any],
+    diagnosis: Mapping[str, Any] | None,
+    seconds: float | None,
+    hubs: np.ndarray | None = None,
 ) -> Verdict:
-    """Return how `diagnosis` (None where it failed) does against `answer`."""
+    """Return how `diagnosis` (None where it failed) does against `answer`.
+
+    `hubs` (3,) is the angular damping [1/s] that the simulator's rotors bring along, if it is one
+    that has it.
+    """
     truths: Sequence[Mapping[str, Any]] = answer["effects"]
     hidden = tuple(truth["name"] for truth in truths)
     outside = answer.get("outside")
@@ -75,6 +89,7 @@ def score_case(
         hidden, multiple = (outside["name"],), outside["multiple"]
     effects = [] if diagnosis is None else diagnosis.get("effects", [])
     sets = tuple((e["name"], *e.get("alternatives", [])) for e in effects)
+    brought = [hubs is not None and is_of_hubs(e, hubs) for e in effects]
     pairs = _matched(truths, sets)
     right = [_is_right(truths[t], sets[e]) for t, e in pairs.items()]
     names = {truth["name"] for truth in truths}
@@ -92,10 +107,14 @@ def score_case(
         "failed" if diagnosis is None else str(diagnosis["verdict"]),
         sets,
         bool(truths) and len(right) == len(truths) and all(right),
-        sum(not names & set(group) for group in sets) + _doubles(sets, pairs, names),
+        sum(
+            not names & set(group) and not there for group, there in zip(sets, brought, strict=True)
+        )
+        + _doubles(sets, pairs, names),
         tuple(covered),
         after / floor if floor and after is not None and sets else None,
         seconds,
+        sum(brought),
     )
 
 
@@ -106,13 +125,18 @@ def score_set(out: Path, results: Path | None = None) -> list[Verdict]:
         ValueError: where the set is not what was made.
     """
     folder = results or out / "results"
-    scored = []
+    scored, in_rotorpy = [], simulator_of(out) == ROTORPY
     for name, answer in open_answers(out).items():
+        hubs = None
+        if in_rotorpy:
+            vehicle = load_vehicle(str(out / "cases" / name / "vehicle.toml"))
+            hubs = damping_of_hubs(answer["effects"], vehicle)
         diagnosis = _read(folder / name / "diagnosis.json")
         timing = _read(folder / name / "seconds.json")
         # Without its time a diagnosis did not end well, whatever it left behind.
         good = diagnosis if timing else None
-        scored.append(score_case(name, answer, good, timing["seconds"] if timing else None))
+        seconds = timing["seconds"] if timing else None
+        scored.append(score_case(name, answer, good, seconds, hubs))
     return scored
 
 
@@ -135,6 +159,7 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
             )
             for m in MULTIPLES
         ),
+        *_beside_hubs("single", single),
         ("single effects: named, others perhaps too", [v.found for v in single], ""),
         ("single effects: verdict `named`", [v.verdict == "named" for v in single], ""),
         ("nulls: something named", [bool(v.named) for v in null], "at most 2 of 100"),
@@ -146,6 +171,7 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
         ),
         ("pairs: both named", [v.found for v in by.get("pair", [])], "80 %"),
         ("pairs: both named, nothing else", [v.exact for v in by.get("pair", [])], ""),
+        *_beside_hubs("pair", by.get("pair", [])),
         ("inseparable: the right set", [v.exact for v in by.get("blurred", [])], "95 %"),
         ("the same with separating flights", [v.exact for v in by.get("separated", [])], "95 %"),
         ("cases with a spurious extra name", [v.extra > 0 for v in verdicts if v.hidden], ""),
@@ -200,6 +226,14 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
     }
     write_json(out / "table.json", summary)
     return text
+
+
+def _beside_hubs(kind: str, verdicts: Sequence[Verdict]) -> list[tuple[str, list[bool], str]]:
+    """Return the line on what is right where hubs' damping counts as not there, if it was named."""
+    if not any(v.brought for v in verdicts):
+        return []
+    flags = [v.exact and not v.brought for v in verdicts]
+    return [(f"  {kind}: with no damping by moving hubs beside them", flags, "")]
 
 
 def _matched(

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from suite.blind.score import report, score_case, shares
@@ -126,3 +127,19 @@ def test_the_table_counts_and_the_files_are_written(tmp_path):
     text = report(tmp_path, verdicts)
     assert "| c | null |" in text and "| a |" not in text
     assert json.loads((tmp_path / "table.json").read_text())["seconds_median"] == 2.0
+
+
+def test_damping_by_moving_hubs_is_there_where_its_size_is_right():
+    hidden = {"kind": "single", "effects": [{**TRUTH["effects"][0], "name": "rotor_drag"}]}
+    drag, hubs = effect("rotor_drag", "linear_drag"), np.array([0.0, 0.0, 0.05])
+
+    def found(*size):
+        damping = effect("angular_damping")
+        damping["parameters"] = {"coefficient": {"value": list(size), "ci95": [None] * 3}}
+        return score_case("c", hidden, said(drag, damping), 1.0, hubs)
+
+    right = found(0.0, 0.0, 0.06)
+    assert (right.exact, right.extra, right.brought) == (True, 0, 1)
+    assert found(0.0, 0.0, 0.2).extra == found(0.06, 0.0, 0.0).extra == 1
+    assert found(0.2, 0.0, 0.06).extra == 1
+    assert score_case("c", hidden, said(drag), 1.0, hubs).exact
