@@ -47,7 +47,7 @@ def test_a_file_inside_a_checkpoint_and_other_kinds_are_pointed_on(checkpoint, t
         load_policy(tmp_path)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(file=st.sampled_from(["tiny.pt2", "tiny.onnx"]), keep=st.floats(0, 0.999))
 def test_a_file_cut_anywhere_is_refused_by_name(exported, tmp_path_factory, file, keep):
     path = tmp_path_factory.mktemp("cut") / file

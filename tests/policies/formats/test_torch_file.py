@@ -13,13 +13,21 @@ import torch
 
 from policies.block_policy import BlockPolicy
 from policies.errors import NoAnswer, PolicyError
+from policies.formats import torch_file
 from policies.formats.apart import process
 from policies.formats.embedded_spec import KEY
 from policies.policy import load_policy
+from tests.support.in_process import InProcess
 
 PROGRAM = "models/model.json"
 WEIGHTS = "data/weights/model_weights_config.json"
 SAMPLES = "data/sample_inputs/model.pt"
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Torch loads the file in this process, where it is imported already."""
+    monkeypatch.setattr(torch_file, "Apart", InProcess)
 
 
 def rewrite(source, target, change):
@@ -71,7 +79,7 @@ def test_without_trust_nothing_of_a_file_reaches_torch(exported, tmp_path):
         (lambda files: files.update({"extra/policy.json": b"{"}), "policy.json: not JSON"),
     ],
 )
-def test_a_damaged_archive_is_refused(exported, tmp_path, change, said):
+def test_a_damaged_archive_is_refused(exported, tmp_path, change, said, here):
     path = rewrite(exported / "tiny.pt2", tmp_path / "bad.pt2", change)
     with pytest.raises(PolicyError, match=said):
         load_policy(path, trust=True)
@@ -103,7 +111,7 @@ class Everything(torch.nn.Module):
 
 
 @pytest.mark.filterwarnings("ignore:The tensor attributes:UserWarning")
-def test_common_layers_pass_and_answer_as_torch_does(tmp_path):
+def test_common_layers_pass_and_answer_as_torch_does(tmp_path, here):
     module = Everything().eval()
     inputs = (torch.randn(2, 12), torch.randn(2, 24, 32), torch.randn(2, 8))
     batch = {0: torch.export.Dim("batch")}
@@ -135,7 +143,7 @@ def program(folder, module, *shapes, free=True):
 
 
 @pytest.mark.parametrize(("rows", "free"), [(2, True), (5, False), (1, False)])
-def test_a_policy_without_memory_and_of_any_batch_flies(tmp_path, rows, free):
+def test_a_policy_without_memory_and_of_any_batch_flies(tmp_path, rows, free, here):
     path = program(tmp_path, Reactive(), (rows, 12), (rows, 24, 32), free=free)
     policy = load_policy(path, trust=True)
     assert isinstance(policy, BlockPolicy)
@@ -171,7 +179,7 @@ class TooFew(torch.nn.Module):
         (Reactive(), [(2, 13), (2, 24, 32)], r"'state' has shape .*13.*expected \(batch, 12\)"),
     ],
 )
-def test_a_program_that_does_not_fit_is_told_what_does(tmp_path, module, shapes, said):
+def test_a_program_that_does_not_fit_is_told_what_does(tmp_path, module, shapes, said, here):
     with pytest.raises(PolicyError, match=said):
         load_policy(program(tmp_path, module, *shapes), trust=True)
 

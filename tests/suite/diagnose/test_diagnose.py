@@ -284,10 +284,8 @@ ALIKE = {
 """What half a minute of flight may leave open."""
 
 
-OF_EACH_KIND = (
-    "linear_drag", "gusts", "motor_lag", "com_offset", "rate_gain", "clock_offset",
-)  # fmt: skip
-"""Of forces, chance, rotors, the body, the controller and logs one; the rest with `-m slow`."""
+OF_TWO_KINDS = ("gusts", "com_offset")
+"""Of chance and of the body; the rest with `-m slow`, and in the blind sets."""
 
 
 @pytest.fixture(scope="module")
@@ -301,7 +299,7 @@ def test_no_effect_is_forgotten():
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=() if n in OF_EACH_KIND else pytest.mark.slow) for n in HIDDEN],
+    [pytest.param(n, marks=() if n in OF_TWO_KINDS else pytest.mark.slow) for n in HIDDEN],
 )
 def test_an_effect_is_named_alone(name, ways):
     truth = with_effects(GIVEN, **{**DRAG, name: HIDDEN[name]})
