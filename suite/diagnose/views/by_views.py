@@ -112,6 +112,7 @@ def diagnose_by_views(
     voltage = all(log.voltage is not None for log in [*logs, *references])
     model = ForceModel(vehicle, space, voltage)
     among = candidates(space, voltage, ())
+    whole = not any(log.partial for log in [*logs, *references])
     known, spread = _reference_tasks(flights, model, vehicle, references, limits)
     say(f"views: {', '.join(view.about for view in flights.views)}; by {flights.source}")
     held_numbers, held_names = _held(logs, flights, model, limits)
@@ -123,9 +124,10 @@ def diagnose_by_views(
             found = search_change(known[view.name], task.flights, spread, among)
             apart = changed_task(known[view.name], found.first.theta, held[view.name])
             apart = apart._replace(means=True)
-            moved = None if found.named else search_motion_change(known[view.name], task, among)
-            if moved:
-                found, apart = moved, task._replace(flights=held[view.name])
+            if whole and not found.named:
+                moved = search_motion_change(known[view.name], task, among)
+                if moved:
+                    found, apart = moved, task._replace(flights=held[view.name])
         else:
             found = search_view(task, [*among, *composites(among)], seed)
             apart = task._replace(flights=held[view.name])

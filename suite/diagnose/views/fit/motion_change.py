@@ -23,6 +23,9 @@ from suite.diagnose.views.fit.reference import in_balance
 from suite.diagnose.views.fit.search import ViewName, ViewSearch, view_candidates
 from suite.diagnose.views.fit.weigh import weights_of
 
+SLIGHT = 0.1
+"""Share of a change by which its numbers may lie beyond what is physical; noise does that."""
+
 
 def within_flights(data: ViewData) -> ViewData:
     """Return `data` with residual and slope less their flights' means."""
@@ -77,11 +80,14 @@ def search_motion_change(
         share = float(gains.sum() / whole)
         theta = start.copy()
         theta[at] += after.mean(axis=0)
-        if at_bound(space, np.clip(theta, space.array("low"), space.array("high")), candidate):
-            continue
+        possible = np.clip(theta, space.array("low"), space.array("high"))
+        beyond = np.linalg.norm((possible - theta)[at])
+        change = np.linalg.norm(after.mean(axis=0) - before.mean(axis=0))
+        if beyond > SLIGHT * change or at_bound(space, possible, candidate):
+            continue  # that is no fit
         if flights_agree(gains) and share >= limits.least_view_share:
             name = ViewName(candidate, p_value, tuple(gains.tolist()), share)
-            tried.append((name, before.mean(axis=0), theta))
+            tried.append((name, before.mean(axis=0), possible))
     if not tried:
         return None
     most = max(name.share for name, *_ in tried)
