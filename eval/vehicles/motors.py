@@ -27,6 +27,19 @@ def motor_thrust(motors: MotorMap, command: Any, voltage: Any = None) -> Any:
     return first * applied + second * applied**2
 
 
+def command_of_thrust(curve: tuple[Any, Any], thrust: Any) -> Any:
+    """Return what is applied, u of `T = t1 u + t2 u^2`, for thrusts (...) from 0 [N].
+
+    Args:
+        curve: t1, t2 [N], which grows.
+        thrust: [N].
+    """
+    first, second = curve
+    xp = thrust.__array_namespace__()
+    root = xp.sqrt(xp.maximum(first**2 + 4.0 * second * thrust, 1e-12))
+    return 2.0 * thrust / xp.maximum(first + root, 1e-6)
+
+
 def motor_speed(vehicle: Vehicle, command: Any, voltage: Any = None) -> Any:
     """Return the commanded rotor speeds (..., 4) [rad/s] of motor commands; see `motor_thrust`.
 

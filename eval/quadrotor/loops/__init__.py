@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from eval.quadrotor.loops import betaflight, crazyflie, px4
 from eval.quadrotor.loops.layout import layout_of
+from eval.vehicles.motors import command_of_thrust
 from eval.vehicles.vehicle import MotorMap, Vehicle
 from tracks.geometry.scene import Array
 
@@ -76,8 +77,7 @@ def look(
     xp = rate_b.__array_namespace__()
     first, second = loop.thrust
     each = xp.maximum(0.25 * force_z, 0.0)
-    root = xp.sqrt(xp.maximum(first**2 + 4.0 * second * each, 1e-12))
-    throttle = xp.clip(2.0 * each / xp.maximum(first + root, 1e-6), 0.0, 1.0)
+    throttle = xp.clip(command_of_thrust(loop.thrust, each), 0.0, 1.0)
     module = _MODULES[type(loop.gains)]
     memory, command = module.look(loop.gains, memory, throttle, rate_cmd_b, rate_b, dt, scale)
     return memory, first * command + second * command**2

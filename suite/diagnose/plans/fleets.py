@@ -17,6 +17,7 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.motors import command_of_thrust
 from eval.vehicles.vehicle import MotorMap, Vehicle
 from suite.diagnose.identify.data.drive import torque_of
 from suite.diagnose.plans.follow import Recording
@@ -217,8 +218,7 @@ def _commands(truth: Vehicle, recording: Recording) -> np.ndarray:
     motors = truth.motors
     assert motors is not None
     thrust = truth.rotors.thrust_coefficient * _asked_speed(truth, recording) ** 2
-    first, second = motors.thrust
-    applied = (-first + np.sqrt(first**2 + 4.0 * second * thrust)) / (2.0 * second)
+    applied = command_of_thrust(motors.thrust, thrust)
     late = round(truth.effects[DELAY].delay / recording.dt)
     volts = recording.voltage
     volts = np.concatenate([volts[late:], np.repeat(volts[-1:], late)])

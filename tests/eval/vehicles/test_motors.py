@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle, parse_vehicle, vehicle_table
-from eval.vehicles.motors import motor_speed, motor_thrust
+from eval.vehicles.motors import command_of_thrust, motor_speed, motor_thrust
 from eval.vehicles.vehicle import MotorMap
 from tests.support.vehicles import PLAIN
 
@@ -20,6 +20,13 @@ def test_thrust_goes_with_command_and_voltage():
     np.testing.assert_allclose(motor_thrust(MAP, command), 0.25)
     made_up_for = replace(MAP, voltage_exponent=0.0)
     np.testing.assert_allclose(motor_thrust(made_up_for, command, np.array([3.0])), 0.25)
+
+
+def test_a_thrust_has_one_command():
+    command = np.array([0.0, 0.3, 1.0])
+    for curve in ((0.2, 0.6), (0.0, 0.8), (0.5, 0.0)):
+        thrust = curve[0] * command + curve[1] * command**2
+        np.testing.assert_allclose(command_of_thrust(curve, thrust), command, atol=1e-9)
 
 
 def test_speed_is_that_of_the_thrust():
