@@ -9,6 +9,7 @@ import numpy as np
 from suite.diagnose.data.kinematics import Kinematics
 from suite.diagnose.data.windows import STATE_GROUPS
 from suite.diagnose.plans.separating import advice
+from suite.diagnose.report.cells import short_name
 from suite.diagnose.report.parameters_json import parameters_json
 from suite.diagnose.verdict.black_box import BlackBoxComparison
 from suite.diagnose.verdict.checks import Checks
@@ -40,7 +41,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "before_ci95": before.ci95(seed, diagnosis.limits),
             "after_ci95": after.ci95(seed, diagnosis.limits),
             "horizon_s": HEADLINE_S,
-            "held_out": diagnosis.held_out,
+            "held_out": [short_name(name) for name in diagnosis.held_out],
             "channels": {
                 f"{horizon:g} s": {
                     group: {

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from suite.diagnose.plans.separating import advice
+from suite.diagnose.report.cells import short_name
 from suite.diagnose.report.parameters_json import parameters_json
 from suite.diagnose.views.by_views import ViewResult, ViewsDiagnosis
 from suite.diagnose.views.fit.search import ViewName
@@ -33,7 +34,7 @@ def views_json(found: ViewsDiagnosis) -> dict[str, Any]:
             "after": gap.rms(gap.after),
             "noise_floor": gap.rms(gap.floor),
             "horizon_s": main.view.width_s,
-            "held_out": found.held_out,
+            "held_out": [short_name(name) for name in found.held_out],
             "channels": {one.view.name: _channels(one) for one in found.results},
             "closed": gap.share(gap.closed),
             "explainable": gap.share(gap.explainable),

@@ -12,7 +12,7 @@ from eval.effects import EFFECTS
 from suite.common.charts import png, titled
 from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.fit.composites import in_words
-from suite.diagnose.report.cells import grid, short_name
+from suite.diagnose.report.cells import grid
 from suite.diagnose.report.charts import AFTER, BEFORE, FLOOR
 from suite.diagnose.report.parameters_json import components
 from suite.diagnose.views.by_views import ViewsDiagnosis
@@ -61,7 +61,7 @@ def views_page(found: ViewsDiagnosis, told: Mapping[str, Any], toml: str) -> Rep
         facts={
             "flights": str(len(found.flights.names)),
             "reference": str(len(found.references)) if found.references else "none",
-            "held out": ", ".join(short_name(name) for name in gap["held_out"]),
+            "held out": ", ".join(gap["held_out"]),
             "rotors by": told["driven_by"],
             "took": f"{told['seconds']:.0f} s",
         },
@@ -95,7 +95,7 @@ def _picture(found: ViewsDiagnosis, told: Mapping[str, Any]) -> list[Part]:
     axes.set_xlabel("time [s]", fontsize=8)
     axes.legend(fontsize=8, frameon=False, ncols=3)
     titled(axes, f"{WHAT[one.view.name].capitalize()} along body {'xyz'[axis]} [{one.view.unit}]")
-    name = short_name(told["gap"]["held_out"][0])
+    name = told["gap"]["held_out"][0]
     caption = f"A stretch of {name}, which took no part in finding or fitting anything."
     return [Picture(png(figure), caption)]
 
