@@ -197,7 +197,8 @@ class _Start:
         teller = self.fitted.get("rotors", self.fitted.get("torque"))
         doubted = teller.give("late", "lag") if known and teller is not None else None
         wanted = [u for u in both if not known or (doubted and u.name in doubted.names)]
-        unknowns = [*loop.gains(), *loop.couplings(self.start), *wanted]
+        besides = [*loop.couplings(self.start), *loop.air_torques(flown)]
+        unknowns = [*loop.gains(), *besides, *wanted]
         self.keep("loop", loop.fit_loop(flown, self.start, unknowns, self.lags(), doubted))
 
     def lags(self) -> dict[str, float]:

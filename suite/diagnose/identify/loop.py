@@ -3,8 +3,9 @@
 The loop is flown by its commands alone and compared with the gyro (output error; Ljung 1999, Sec.
 4.3): measured rates in the loop's own equation would make the gyro's noise look like slower gains.
 Per axis, `lag d2w/dt2 + dw/dt + K w = K rate_cmd(t - delay) + lag de/dt + e`, where `e` is what is
-missed of `w x J w`: the controller makes up for it, but by rotors that lag. It is that of the rates
-without it (one step of Picard's iteration); rotor speeds are taken to change by little.
+missed of `w x J w`, since the controller makes up for it by rotors that lag, and what moving air
+turns besides. It is that of the rates without it (one step of Picard's iteration); rotor speeds are
+taken to change by little.
 """
 
 from __future__ import annotations
@@ -38,6 +39,16 @@ def couplings(vehicle: Vehicle) -> list[Unknown]:
     starts = ((z - y) / x, (x - z) / y, (y - x) / z)
     both = zip("xyz", starts, strict=True)
     return [Unknown(f"coupling_{a}", start, -1.0, 1.0, 0.2, 1e-2) for a, start in both]
+
+
+def air_torques(flights: Sequence[FlightGrid]) -> list[Unknown]:
+    """Return how much moving air turns the body, acceleration over speed (flapping) [1/(m s)].
+
+    They are of no use but for the others' sake, and none where the velocity is not known.
+    """
+    if not all(flight.has("vel_w", "rot_w") for flight in flights):
+        return []
+    return [Unknown(f"air_{axis}", 0.0, -20.0, 20.0, 2.0, 1e-2) for axis in "xy"]
 
 
 def fit_loop(
@@ -99,4 +110,8 @@ def followed(flight: FlightGrid, vehicle: Vehicle, told: Mapping[str, float]) ->
     products = linear[:, [1, 2, 0]] * linear[:, [2, 0, 1]]
     coupled = products * [told[f"coupling_{axis}"] for axis in "xyz"]
     push = lagged(coupled, told["lag"]) - coupled
+    if "air_x" in told:
+        vel_b = filled(np.einsum("gji,gj->gi", flight.known["rot_w"], flight.known["vel_w"]))
+        push[:, 0] += told["air_x"] * vel_b[:, 1]
+        push[:, 1] -= told["air_y"] * vel_b[:, 0]
     return linear + answer(push, [[lag, 1.0]] * 3)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
-from suite.diagnose.identify.loop import couplings, followed
+from suite.diagnose.identify.loop import air_torques, couplings, followed
 from tests.support.vehicles import PLAIN
 
 COUPLED = {unknown.name: unknown.start for unknown in couplings(PLAIN)}
@@ -48,3 +48,23 @@ def test_what_the_controller_makes_up_for_comes_as_late_as_the_rotors():
     rate = followed(flight, fast, {"lag": lag_s, "late": lag_s - 0.5 * STEP_S, **COUPLED})
     # The plain linear loop is 0.085 rad/s off.
     assert np.abs(rate - exact)[200:].max() < 0.02
+
+
+def test_moving_air_turns_by_its_torque_over_the_gain():
+    """A constant `J a` turns by a / K once the loop is at rest; at 2 m/s along y and -3 along x."""
+    count = 400
+    known = {
+        "rate_cmd_b": np.zeros((count, 3)),
+        "vel_w": np.tile([0.0, 0.0, 0.0], (count, 1)),
+        "rot_w": np.tile([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], (count, 1, 1)),
+    }
+    # The body is turned by 90 degrees: its x axis is the world's y.
+    known["vel_w"][100:] = [-2.0, -3.0, 0.0]
+    flight = FlightGrid("made", STEP_S * np.arange(count), known)
+    assert [one.name for one in air_torques([flight])] == ["air_x", "air_y"]
+    told = {"lag": 0.03, "late": 0.03, **COUPLED, "air_x": 0.5, "air_y": 0.4}
+    rate = followed(flight, PLAIN, told)
+    gain = PLAIN.controller.rate_gain
+    np.testing.assert_allclose(rate[-1], [0.5 * 2.0 / gain[0], 0.4 * 3.0 / gain[1], 0.0], rtol=1e-3)
+    bare = FlightGrid("made", flight.time_s, {"rate_cmd_b": known["rate_cmd_b"]})
+    assert air_torques([flight, bare]) == []
