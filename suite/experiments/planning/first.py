@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-
 from suite.experiments.planning.course import Course, nearness, passing
 from suite.experiments.planning.solver import Judged
 from suite.experiments.planning.spline import Spline, along, fitted, unpacked

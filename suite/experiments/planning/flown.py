@@ -100,10 +100,9 @@ def fly(autopilot: Autopilot, course: Course, spline: Spline, passed_s: Array, t
         action_b = action(ask, motion.pos_w, motion.rot_w, motion.vel_w)
         state = attitude_step(autopilot, state, motion, action_b, gate_w, count)
 
-        def physics(carry: Any, _: None) -> tuple[Any, None]:
-            plant, motion = carry
-            plant, motion, _ = step(autopilot.plant, plant, motion, Inputs(state.command), 0.0)
-            return (plant, motion), None
+        def physics(carry: Any, none: None) -> tuple[Any, None]:
+            plant, motion, _ = step(autopilot.plant, *carry, Inputs(state.command), 0.0)
+            return (plant, motion), none
 
         (plant, motion), _ = jax.lax.scan(physics, (state.plant, motion), length=every)
         state = state._replace(plant=plant)

@@ -1,4 +1,4 @@
-"""A plan as a policy, so that the judge flies it as it flies any: by its rules, through its autopilot.
+"""A plan as a policy: the judge flies it as it flies any, by its rules, through its autopilot.
 
 What the judge shows of the next gate, where it is and how it faces in body axes, and the world's up
 say exactly where the drone is, as the plan knows where the gates are. Images it does not need.
@@ -28,14 +28,14 @@ LONGEST_S = 20.0
 class Memory(NamedTuple):
     """What it remembers of one trial."""
 
-    count: int
-    """Decisions so far."""
+    decisions: int
+    """So far."""
     pos_w: np.ndarray
     """(3,) where it was last [m]."""
 
 
 class PlannedPolicy:
-    """Flies one track's plan, one trial at a time, with a decision each step of the attitude loop."""
+    """Flies one track's plan, one trial at a time; it decides at each step of the attitude loop."""
 
     name = "planned"
     spec = PolicySpec(rate_hz=ATTITUDE_HZ, camera=Camera(width=1, height=1), gate_axis=True)

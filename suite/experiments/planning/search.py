@@ -75,16 +75,22 @@ def starts(vehicle: Vehicle) -> tuple[Limits, ...]:
     )
 
 
-def plans(vehicle: Vehicle, trials: Sequence[TrialSpec], effort: Effort) -> list[Plan]:
+def plans(
+    vehicle: Vehicle,
+    trials: Sequence[TrialSpec],
+    effort: Effort,
+    tell: Callable[[float], Any] = lambda done: None,
+) -> list[Plan]:
     """Return a plan for each trial's track; they are looked for side by side.
 
     Args:
         vehicle: what flies.
         trials: of one family, so that their laps take about as long.
         effort: how hard is looked.
+        tell: told how many of the first `effort.first + effort.flown` steps are done.
     """
     with jax.enable_x64(True):
-        return _plans(vehicle, trials, effort)
+        return _plans(vehicle, trials, effort, tell)
 
 
 def fly_plan(
@@ -100,46 +106,40 @@ def fly_plan(
     return results[0], flights[0]
 
 
-def _plans(vehicle: Vehicle, trials: Sequence[TrialSpec], effort: Effort) -> list[Plan]:
+def _plans(
+    vehicle: Vehicle, trials: Sequence[TrialSpec], effort: Effort, tell: Callable[[float], Any]
+) -> list[Plan]:
     limits = starts(vehicle)
     asked = [trial for trial in trials for _ in limits]
-    room = np.full(len(asked), float(np.linalg.norm(vehicle.body.half_size)) + MARGIN_M)
     tracks = [track_of({}, trial) for trial in asked]
-    numbers = _first(tracks, list(limits) * len(trials), room, effort.first)
-    autopilot = make_autopilot(vehicle)
-    ticks = 100 * int(np.ceil(numbers[:, -1].max() + SLACK_S))
-    problem = partial(
-        _flown,
-        plant=autopilot.plant,
-        controller=autopilot.controller,
-        every=autopilot.attitude_every,
-        ticks=ticks,
-    )
-    passed_s = _passed(tracks, room, numbers, ticks)
+    room = np.full(len(asked), float(np.linalg.norm(vehicle.body.half_size)) + MARGIN_M)
+    numbers = _first(tracks, list(limits) * len(trials), room, effort.first, tell)
+    refine = _Refining(vehicle, 100 * int(np.ceil(numbers[:, -1].max() + SLACK_S)))
+    passed_s = _passed(tracks, room, numbers, refine.ticks)
     best: dict[TrialSpec, Plan] = {}
-    done = np.zeros(len(asked), bool)
     for attempt in range(effort.tries):
         steps = effort.again if attempt else effort.flown
-        numbers, passed_s = _refined(problem, tracks, room, numbers, passed_s, steps)
-        for row in np.flatnonzero(~done):
+        count = (lambda done: None) if attempt else lambda done: tell(effort.first + done)
+        numbers, passed_s = refine(tracks, room, numbers, passed_s, steps, count)
+        left = [row for row, trial in enumerate(asked) if not (trial in best and best[trial].flown)]
+        for row in left:
             trial = asked[row]
-            result, _ = fly_plan(vehicle, trial, numbers[row])
-            done[row] = result.success
-            lap = (result.success, -result.time_s if result.success else result.gates_passed)
+            seen, _ = fly_plan(vehicle, trial, numbers[row])
             plan = Plan(
-                trial, numbers[row].tolist(), float(passed_s[row, -1]), result.success,
-                result.ending, result.time_s,
+                trial, numbers[row].tolist(), float(passed_s[row, -1]), seen.success, seen.ending,
+                seen.time_s,
             )  # fmt: skip
-            kept = best.get(trial)
-            if kept is None or (plan.flown, -plan.lap_s) > (kept.flown, -kept.lap_s):
+            if trial not in best or _merit(plan) > _merit(best[trial]):
                 best[trial] = plan
-            del lap
-        won = {trial for trial in trials if best[trial].flown}
-        done |= np.array([trial in won for trial in asked])
-        if done.all():
+        failed = np.array([not best[trial].flown for trial in asked])
+        if not failed.any():
             break
-        room = np.where(done, room, room + MORE_ROOM_M)
+        room = np.where(failed, room + MORE_ROOM_M, room)
     return [best[trial] for trial in trials]
+
+
+def _merit(plan: Plan) -> tuple[bool, float]:
+    return plan.flown, -plan.lap_s
 
 
 def _courses(tracks: Sequence[Track], room: np.ndarray) -> Any:
@@ -151,14 +151,19 @@ def _stacked(rows: Sequence[Any]) -> Any:
 
 
 def _first(
-    tracks: Sequence[Track], limits: Sequence[Limits], room: np.ndarray, steps: int
+    tracks: Sequence[Track],
+    limits: Sequence[Limits],
+    room: np.ndarray,
+    steps: int,
+    tell: Callable[[float], Any],
 ) -> np.ndarray:
     """Return the numbers (N, n) of first plans."""
     rest = (_courses(tracks, room), jax.tree.map(np.float64, _stacked(limits)))
     numbers = np.stack([np.asarray(packed(guess(track))) for track in tracks])
     search = solver.begin(numbers, _first_judged(numbers, rest))
-    for _ in range(steps):
+    for count in range(steps):
         search = _first_step(search, rest)
+        tell(count)
     return np.asarray(search.numbers)
 
 
@@ -173,25 +178,39 @@ def _passed(
     return np.stack(found)
 
 
-def _refined(
-    problem: Callable[..., Any],
-    tracks: Sequence[Track],
-    room: np.ndarray,
-    numbers: np.ndarray,
-    passed_s: np.ndarray,
-    steps: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return numbers (N, n) and passing times (N, G) after so many steps through the quadrotor."""
-    courses = _courses(tracks, room)
-    for part in (steps // 2, steps - steps // 2):
-        judged, passed_s = problem(numbers, (courses, passed_s), what="look")
-        passed_s = np.asarray(passed_s)
-        search = solver.begin(numbers, judged)
-        for _ in range(part):
-            search = problem(search, (courses, passed_s), what="step")
-        numbers = np.asarray(search.numbers)
-    _, passed_s = problem(numbers, (courses, passed_s), what="look")
-    return numbers, np.asarray(passed_s)
+class _Refining:
+    """Plans brought on through the quadrotor, side by side."""
+
+    def __init__(self, vehicle: Vehicle, ticks: int) -> None:
+        autopilot = make_autopilot(vehicle)
+        self.ticks, self._controller = ticks, autopilot.controller
+        self._plant, self._every = autopilot.plant, autopilot.attitude_every
+
+    def __call__(
+        self,
+        tracks: Sequence[Track],
+        room: np.ndarray,
+        numbers: np.ndarray,
+        passed_s: np.ndarray,
+        steps: int,
+        tell: Callable[[float], Any],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return numbers (N, n) and passing times (N, G) after so many steps."""
+        courses, done = _courses(tracks, room), 0
+        for part in (steps // 2, steps - steps // 2):
+            # The heading turns to the next gate when the last one was passed.
+            judged, passed_s = self._do("look", numbers, courses, passed_s)
+            search = solver.begin(numbers, judged)
+            for _ in range(part):
+                search = self._do("step", search, courses, passed_s)
+                done += 1
+                tell(done)
+            numbers = np.asarray(search.numbers)
+        return numbers, np.asarray(self._do("look", numbers, courses, passed_s)[1])
+
+    def _do(self, what: str, at: Any, courses: Any, passed_s: Any) -> Any:
+        rest = (courses, np.asarray(passed_s))
+        return _flown(at, rest, what, self._plant, self._controller, self._every, self.ticks)
 
 
 @jax.jit
