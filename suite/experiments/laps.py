@@ -20,9 +20,9 @@ from suite.common.running.apart import Job
 from suite.common.work import all_done
 from suite.experiments.pages.document import Place
 from suite.experiments.pages.laps import HOW, MEANINGS, cell_table, failures, lead, worst_tracks
-from suite.experiments.planning.beside import Flown, beside
 from suite.experiments.planning.search import Effort, Plan, fly_plan, plans
 from suite.experiments.study import judging, options
+from suite.experiments.study.beside import Flown, beside
 from suite.experiments.study.cache import code_digest, digest, engines
 from suite.judging.flying import default_policy, labels, policy_digest, who_flies, workers_for
 from tracks.common.files import write_json
@@ -104,11 +104,11 @@ def planned(
     cells: dict[tuple[str, int], list[TrialSpec]] = {}
     for trial in trials:
         cells.setdefault((trial.track, trial.difficulty), []).append(trial)
-    code = code_digest("tracks", "policies", "eval", "suite/experiments/planning")
+    rooms = ("tracks", "policies", "eval", "suite/diagnose/plans", "suite/experiments/planning")
     jobs = []
     for some in cells.values():
         cell = Cell(vehicle, some, Effort())
-        name = digest({"cell": cell._asdict(), "code": code, "engines": engines()})
+        name = digest({"cell": cell._asdict(), "code": code_digest(*rooms), "engines": engines()})
         jobs.append(Job(cell, place.cache / "laps" / name))
     rows = all_done(plan_cell, jobs, place.workers, console, "planning")
     by_trial = {plan.trial: plan for some in rows for plan in some}

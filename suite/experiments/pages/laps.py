@@ -11,8 +11,8 @@ import numpy as np
 from eval.judging.statistics import Interval, bootstrap_median
 from eval.worlds.trial import TrialSpec, track_of
 from suite.common.report import Picture
-from suite.experiments.planning.beside import Flown, Lap, goes_around
 from suite.experiments.planning.search import Plan
+from suite.experiments.study.beside import Flown, Lap, goes_around
 from tracks.common.grid import Grid, table
 from tracks.families import JUDGED
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from eval.effects.interface import GRAVITY
 from eval.quadrotor.attitude import level_heading
 from eval.quadrotor.autopilot import Autopilot, AutopilotState, attitude_step
 from eval.quadrotor.plant import Command, Motion
@@ -90,7 +91,7 @@ def fly(autopilot: Autopilot, course: Course, spline: Spline, passed_s: Array, t
     time_s = jnp.arange(ticks) * period
     motion = start_motion(course)
     plant = hover_state(autopilot.plant, (1,), jnp)
-    hover = Command(jnp.full((1,), 9.81), jnp.zeros((1, 3)))
+    hover = Command(jnp.full((1,), GRAVITY), jnp.zeros((1, 3)))
     state = AutopilotState(plant, hover, level_heading(motion.rot_w))
     number = jnp.minimum((time_s[:, None] > passed_s).sum(-1), len(passed_s) - 1)
 
@@ -101,8 +102,8 @@ def fly(autopilot: Autopilot, course: Course, spline: Spline, passed_s: Array, t
         state = attitude_step(autopilot, state, motion, action_b, gate_w, count)
 
         def physics(carry: Any, none: None) -> tuple[Any, None]:
-            plant, motion, _ = step(autopilot.plant, *carry, Inputs(state.command), 0.0)
-            return (plant, motion), none
+            now, body, _ = step(autopilot.plant, *carry, inputs=Inputs(state.command), time_s=0.0)
+            return (now, body), none
 
         (plant, motion), _ = jax.lax.scan(physics, (state.plant, motion), length=every)
         state = state._replace(plant=plant)

@@ -8,7 +8,7 @@ import numpy as np
 
 from eval.logs.flight import Flight
 from eval.worlds.trial import TrialResult, TrialSpec
-from suite.experiments.planning.legs import Leg, legs
+from suite.experiments.study.legs import Leg, legs
 
 AROUND = 0.9
 """A leg on which the direction turns by so many circles has gone around."""
