@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from suite.experiments.planning.course import Course, nearness, passing
-from suite.experiments.planning.solver import Judged
+from suite.experiments.planning.course import PLACE_M, Course, nearness, passing
+from suite.experiments.planning.solver import FELT, SMOOTH, Judged
 from suite.experiments.planning.spline import Spline, along, fitted, unpacked
 from tracks.geometry.scene import Array
 from tracks.track import Track
@@ -29,6 +29,10 @@ SPEED = 4.0
 """Of the path that the search starts from [m/s]."""
 SLOW = 3.0
 """By which it starts from rest [m/s^2]."""
+THRUST, RATE, UP_Z = 1.0, 0.5, 0.05
+"""Excesses of 1: of thrust [m/s^2], of turning [rad/s], of tilt [1]."""
+END_S = 0.1
+"""By how much the path's end may be off the last gate, at a cost of half a second [s]."""
 AXIS_M = 0.3
 """So far before and behind a gate it is on its axis [m]."""
 
@@ -79,16 +83,15 @@ def first_plan(numbers: Array, rest: tuple[Course, Limits]) -> Judged:
     excess = [
         gates.excess.reshape(-1),
         nearness(course, path.pos_w) * counts,
-        (size - limits.thrust) * counts,
-        (limits.least_thrust - size) * counts,
-        (turn - limits.rate) * counts[1:] * 2.0,
-        (limits.upright - up[:, 2]) * counts * 20.0,
+        (size - limits.thrust) / THRUST * counts,
+        (limits.least_thrust - size) / THRUST * counts,
+        (turn - limits.rate) / RATE * counts[1:],
+        (limits.upright - up[:, 2]) / UP_Z * counts,
     ]
     off = [
-        20.0 * (spline.control_w[:3] - course.start_w).reshape(-1),
-        10.0 * (lap_s - spline.duration_s)[None],
-        0.02 * jnp.diff(spline.control_w, 3, axis=0).reshape(-1),
+        (spline.control_w[:3] - course.start_w).reshape(-1) / PLACE_M,
+        (lap_s - spline.duration_s)[None] / END_S,
+        SMOOTH * jnp.diff(spline.control_w, 3, axis=0).reshape(-1),
     ]
-    return Judged(
-        lap_s, jnp.concatenate(excess), jnp.concatenate(off), path.acc_w.reshape(-1) / 10.0
-    )
+    felt = path.acc_w.reshape(-1) / FELT
+    return Judged(lap_s, jnp.concatenate(excess), jnp.concatenate(off), felt)

@@ -18,7 +18,7 @@ from eval.quadrotor.plant import Command, Motion
 from eval.quadrotor.stepper import Inputs, hover_state, step
 from suite.diagnose.plans.pilot import Gains, corrected
 from suite.experiments.planning.course import Course, nearness, passing
-from suite.experiments.planning.solver import Judged
+from suite.experiments.planning.solver import FELT, SMOOTH, Judged
 from suite.experiments.planning.spline import INTERVALS, Along, Spline, along, unpacked
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Array
@@ -33,10 +33,6 @@ UPRIGHT = 0.06
 
 UP_Z = 0.05
 """An excess of 1, of that [1]."""
-FELT = 10.0
-"""Of a reference's acceleration, what a step of the search feels as 1 [m/s^2]."""
-SMOOTH = 0.02
-"""Weight of the control points' third differences, where nothing else says where they are [1/m]."""
 
 
 class Ask(NamedTuple):

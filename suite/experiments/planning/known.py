@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from eval.quadrotor.autopilot import ATTITUDE_HZ
 from policies.policy import Hidden
 from policies.spec import STATE_SIZE, PolicySpec
 from suite.experiments.planning.flown import Ask, action, asked
@@ -38,13 +37,13 @@ class PlannedPolicy:
     """Flies one track's plan, one trial at a time; it decides at each step of the attitude loop."""
 
     name = "planned"
-    spec = PolicySpec(rate_hz=ATTITUDE_HZ, camera=Camera(width=1, height=1), gate_axis=True)
 
-    def __init__(self, track: Track, numbers: np.ndarray) -> None:
-        """Make it from the track and the numbers of its plan, a spline."""
+    def __init__(self, track: Track, numbers: np.ndarray, rate_hz: float) -> None:
+        """Make it from the track, its plan's numbers, and the attitude loop's frequency [Hz]."""
+        self.spec = PolicySpec(rate_hz=rate_hz, camera=Camera(width=1, height=1), gate_axis=True)
         self._gates, self._start_w = track.scene.gates, track.start_pos_w
         with jax.enable_x64(True):
-            time_s = np.arange(round(LONGEST_S * ATTITUDE_HZ) + 1) / ATTITUDE_HZ
+            time_s = np.arange(round(LONGEST_S * rate_hz) + 1) / rate_hz
             asks = asked(unpacked(np.asarray(numbers, float)), time_s)
             self._asks: Ask = jax.tree.map(np.asarray, asks)
 

@@ -97,7 +97,7 @@ def fly_plan(
     vehicle: Vehicle, trial: TrialSpec, numbers: Sequence[float]
 ) -> tuple[TrialResult, Flight]:
     """Return how the judge sees a plan end in MuJoCo, and the flight."""
-    policy = PlannedPolicy(track_of({}, trial), np.asarray(numbers))
+    policy = PlannedPolicy(track_of({}, trial), np.asarray(numbers), 1 / _period_s(vehicle))
     flights: list[Any] = []
     options = JudgeOptions(slots=1, workers=1)
     results = fly(
@@ -114,8 +114,10 @@ def _plans(
     tracks = [track_of({}, trial) for trial in asked]
     room = np.full(len(asked), float(np.linalg.norm(vehicle.body.half_size)) + MARGIN_M)
     numbers = _first(tracks, list(limits) * len(trials), room, effort.first, tell)
-    refine = _Refining(vehicle, 100 * int(np.ceil(numbers[:, -1].max() + SLACK_S)))
-    passed_s = _passed(tracks, room, numbers, refine.ticks)
+    # Whole seconds: every other length is compiled anew.
+    longest_s, period_s = np.ceil(numbers[:, -1].max() + SLACK_S), _period_s(vehicle)
+    refine = _Refining(vehicle, round(longest_s / period_s))
+    passed_s = _passed(tracks, room, numbers, period_s * np.arange(refine.ticks))
     best: dict[TrialSpec, Plan] = {}
     for attempt in range(effort.tries):
         steps = effort.again if attempt else effort.flown
@@ -136,6 +138,12 @@ def _plans(
             break
         room = np.where(failed, room + MORE_ROOM_M, room)
     return [best[trial] for trial in trials]
+
+
+def _period_s(vehicle: Vehicle) -> float:
+    """Return the period of the attitude loop [s]."""
+    autopilot = make_autopilot(vehicle)
+    return autopilot.attitude_every * autopilot.dt
 
 
 def _merit(plan: Plan) -> tuple[bool, float]:
@@ -168,13 +176,13 @@ def _first(
 
 
 def _passed(
-    tracks: Sequence[Track], room: np.ndarray, numbers: np.ndarray, ticks: int
+    tracks: Sequence[Track], room: np.ndarray, numbers: np.ndarray, time_s: np.ndarray
 ) -> np.ndarray:
-    """Return when first plans pass their gates (N, G) [s]."""
-    time_s, found = 0.01 * np.arange(ticks), []
+    """Return when first plans, seen at `time_s`, pass their gates (N, G) [s]."""
+    found = []
     for track, keep, row in zip(tracks, room, numbers, strict=True):
-        path = along(unpacked(row), time_s)
-        found.append(np.asarray(passing(course_of(track, keep), path.pos_w, 0.01).time_s))
+        pos_w = along(unpacked(row), time_s).pos_w
+        found.append(np.asarray(passing(course_of(track, keep), pos_w, time_s[1]).time_s))
     return np.stack(found)
 
 

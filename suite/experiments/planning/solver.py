@@ -15,13 +15,18 @@ import jax.numpy as jnp
 
 from tracks.geometry.scene import Array
 
-DAMPING = 0.1
-"""At the start."""
-LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e6
+DAMPING, LEAST_DAMPING, MOST_DAMPING = 0.1, 1e-7, 1e6
+"""At the start, and its bounds."""
+TAKEN, REFUSED = 1 / 3, 4.0
+"""What it is multiplied by after a step that is taken, and after one that is not."""
 MOST = 3.0
 """By which a number changes in a step [m or s]."""
 LEAST_REACH = 1e-2
 """Of a change of every number by itself."""
+FELT = 10.0
+"""Of a path's acceleration, what a step of a search feels as 1 [m/s^2]."""
+SMOOTH = 0.02
+"""Weight of a path's control points' third differences, where nothing else says where they are."""
 LOOKS = 6
 """Guesses, each from the one before, which limits a step breaks."""
 
@@ -89,7 +94,7 @@ def step(problem: Problem, search: Search, rest: Any) -> Search:
     judged = jax.vmap(problem)(tried, rest)
     cost = cost_of(judged)
     good = cost < search.cost  # false for what is no number
-    damping = jnp.where(good, search.damping / 3.0, search.damping * 4.0)
+    damping = jnp.where(good, TAKEN * search.damping, REFUSED * search.damping)
     return Search(
         jnp.where(good[:, None], tried, search.numbers),
         jnp.where(good, cost, search.cost),
