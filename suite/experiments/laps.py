@@ -29,8 +29,10 @@ from tracks.common.files import write_json
 from tracks.input.ranges import Seed, Trials
 from tracks.input.reading import read_json
 
+TOGETHER = 2
+"""Tracks of a cell that are planned side by side, as one piece of work."""
 PLANS = "plans.json"
-"""A cell's plans, in its folder."""
+"""A piece's plans, in its folder."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,8 @@ class Config:
     """A shipped vehicle's name or a vehicle file (.toml)."""
 
 
-class Cell(NamedTuple):
-    """What is planned as one piece: the tracks of a family at a level."""
+class Together(NamedTuple):
+    """What is planned as one piece: tracks of a family at a level."""
 
     vehicle: Vehicle
     trials: Sequence[TrialSpec]
@@ -100,32 +102,33 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
 def planned(
     vehicle: Vehicle, trials: Sequence[TrialSpec], place: Place, console: Console
 ) -> list[Plan]:
-    """Return a plan for each trial's track; those of a cell are found again in the cache."""
+    """Return a plan for each trial's track; those that were made are found in the cache."""
     cells: dict[tuple[str, int], list[TrialSpec]] = {}
     for trial in trials:
         cells.setdefault((trial.track, trial.difficulty), []).append(trial)
     rooms = ("tracks", "policies", "eval", "suite/diagnose/plans", "suite/experiments/planning")
     jobs = []
-    for some in cells.values():
-        cell = Cell(vehicle, some, Effort())
-        name = digest({"cell": cell._asdict(), "code": code_digest(*rooms), "engines": engines()})
-        jobs.append(Job(cell, place.cache / "laps" / name))
-    rows = all_done(plan_cell, jobs, place.workers, console, "planning")
+    for every in cells.values():
+        for first in range(0, len(every), TOGETHER):
+            piece = Together(vehicle, every[first : first + TOGETHER], Effort())
+            about = {"cell": piece._asdict(), "code": code_digest(*rooms), "engines": engines()}
+            jobs.append(Job(piece, place.cache / "laps" / digest(about)))
+    rows = all_done(plan_piece, jobs, place.workers, console, "planning")
     by_trial = {plan.trial: plan for some in rows for plan in some}
     return [by_trial[trial] for trial in trials]
 
 
-def plan_cell(job: Job, console: Console) -> list[Plan]:
-    """Return the plans of a job's `Cell`, made unless they are in its folder."""
-    cell, path = job.task, job.folder / PLANS
+def plan_piece(job: Job, console: Console) -> list[Plan]:
+    """Return the plans of a job's `Together`, made unless they are in its folder."""
+    piece, path = job.task, job.folder / PLANS
     if not path.is_file():
-        effort, (track, level, _) = cell.effort, cell.trials[0]
+        effort, (track, level, seed) = piece.effort, piece.trials[0]
         total = effort.first + effort.flown
-        with console.progress(f"planning {track} {level}", total) as update:
-            made = plans(cell.vehicle, cell.trials, effort, update)
+        with console.progress(f"planning {track} {level}, from seed {seed}", total) as update:
+            made = plans(piece.vehicle, piece.trials, effort, update)
         job.folder.mkdir(parents=True, exist_ok=True)
         write_json(path, [plan._asdict() for plan in made])
-    return [Plan(**{**row, "trial": TrialSpec(*row["trial"])}) for row in read_json(path)]
+    return [Plan(**{**row, "trial": TrialSpec(**row["trial"])}) for row in read_json(path)]
 
 
 def policy_flights(
