@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from eval.effects.interface import GRAVITY
+from eval.judging.guard import ActionLimits
 from eval.quadrotor.attitude import level_heading
 from eval.quadrotor.autopilot import Autopilot, AutopilotState, attitude_step
 from eval.quadrotor.plant import Command, Motion
@@ -27,6 +28,8 @@ GAINS = Gains(position=8.0, velocity=5.0, integral=0.0, correction=1e3)
 """Of the pilot: it has the true state and no noise, and what it flies is planned with it."""
 AHEAD_S = 0.15
 """The acceleration is asked for so much earlier, about what the attitude is late [s]."""
+LONGEST_ACTION = 0.999 * ActionLimits().size
+"""Just what the judge does not shorten [m/s^2]."""
 UPRIGHT = 0.06
 """Least z of body z: past 0 a trial has tipped [1]."""
 
@@ -61,9 +64,15 @@ def asked(spline: Spline, time_s: Array) -> Ask:
 
 
 def action(ask: Ask, pos_w: Array, rot_w: Array, vel_w: Array) -> Array:
-    """Return the action (..., 3) in body axes that follows `ask` (..., 3) [m/s^2]."""
+    """Return the action (..., 3) in body axes that follows `ask` (..., 3) [m/s^2].
+
+    It is no longer than the judge lets actions be, so that what is planned is what is flown.
+    """
+    xp = pos_w.__array_namespace__()
     off_w, slow_w = ask.here.pos_w - pos_w, ask.here.vel_w - vel_w
-    return to_local(rot_w, corrected(GAINS, ask.acc_w, off_w, slow_w))
+    action_b = to_local(rot_w, corrected(GAINS, ask.acc_w, off_w, slow_w))
+    size = xp.sqrt((action_b**2).sum(-1, keepdims=True) + 1e-12)
+    return action_b * xp.minimum(1.0, LONGEST_ACTION / size)
 
 
 def start_motion(course: Course) -> Motion:
