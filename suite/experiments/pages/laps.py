@@ -23,8 +23,9 @@ MEANINGS = (
     "plan was flown to the end. It is an upper bound on the least lap, found by a local search: "
     "a faster one may well be there. Policy: the median lap over the trials that it finishes on "
     "those tracks. Ratio: the policy's lap over the plan's on the same track, median over tracks "
-    "with its 95 % bootstrap interval. Path: the same for the metres flown. Around: trials in "
-    "which the direction of flight turns by a whole circle on the way to one gate."
+    "with its 95 % bootstrap interval, which with one or two tracks is only their range. Path: "
+    "the same for the metres flown. Around: trials in which the direction of flight turns by a "
+    "whole circle on the way to one gate."
 )
 HOW = (
     "A plan is a reference path, a cubic B-spline over time, and what is judged is how it is "
