@@ -19,9 +19,9 @@ def planner(monkeypatch):
         pieces.append(list(trials))
         return [Plan(trial, [0.5], 2.0, True, "finished", 2.0) for trial in trials]
 
-    def short(*args):
+    def short(policy, trials, vehicle, world, options, keep, record):
         asked = JudgeOptions(slots=4, workers=1, rules=Rules(time_limit_s=0.5))
-        return fly(*args[:4], asked, *args[5:])
+        return fly(policy, trials, vehicle, world, asked, keep, record)
 
     monkeypatch.setattr(laps, "plans", plans)
     monkeypatch.setattr(laps, "fly_plan", lambda vehicle, trial, n: flown(2.0, trial=trial))
