@@ -1,11 +1,12 @@
 """What the page on laps says of plans and policies."""
 
 from eval.worlds.trial import TrialSpec
+from suite.common.report import Picture
 from suite.experiments.pages.laps import cell_table, failures, lead, worst_tracks
 from suite.experiments.planning.search import Plan
 from suite.experiments.study.beside import beside
 from tests.support.laps import flown
-from tracks.common.grid import markdown
+from tracks.common.grid import Grid, markdown
 
 TRIALS = [TrialSpec("ellipse", 9, 0), TrialSpec("zigzag", 0, 0), TrialSpec("zigzag", 0, 1)]
 
@@ -52,6 +53,7 @@ def test_failures_and_the_lead_say_what_is_left_out():
 def test_the_worst_track_comes_first_and_is_drawn():
     _, best, mine, laps = made()
     _, grid, picture = worst_tracks(best, {"p": mine}, {"p": laps})
+    assert isinstance(grid, Grid) and isinstance(picture, Picture)
     first = markdown(grid).splitlines()[2]
     assert "ellipse | 9 | 0 | 2.00 | 10.00 | 5.00" in first and "circles to gate 4" in first
     assert picture.png.startswith(b"\x89PNG") and "p (right)" in picture.caption

@@ -11,7 +11,7 @@ def test_both_finish_and_one_goes_around():
     lap = beside(plan, mine)
     assert lap.planned_s == 3.0 and lap.policy_s == 9.0 and lap.ratio == pytest.approx(3.0)
     assert lap.path == pytest.approx(1.27, abs=0.02)
-    assert goes_around(lap) and lap.around.gate == 4
+    assert goes_around(lap) and lap.around and lap.around.gate == 4
     assert not goes_around(beside(plan, plan)) and beside(plan, plan).path == 1.0
 
 
