@@ -21,6 +21,8 @@ from tracks.geometry.scene import Array
 from tracks.track import Track
 
 SAMPLES = 160
+POINTS = 400
+"""Of the path that the search starts from."""
 BEYOND = 1.06
 """The path is looked at so far beyond its duration, which ends about the last gate."""
 DRAG = 0.25
@@ -61,7 +63,7 @@ def guess(track: Track) -> Spline:
     far = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
     ease_s = SPEED / SLOW
     duration_s = far[-1] / SPEED + 0.5 * ease_s
-    time_s = np.linspace(0.0, duration_s, 400)
+    time_s = np.linspace(0.0, duration_s, POINTS)
     gone = np.where(time_s < ease_s, 0.5 * SLOW * time_s**2, SPEED * (time_s - 0.5 * ease_s))
     path = np.stack([np.interp(gone, far, points[:, k]) for k in range(3)], axis=-1)
     return fitted(path, duration_s)

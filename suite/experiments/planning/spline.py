@@ -12,8 +12,6 @@ from tracks.geometry.scene import Array
 
 INTERVALS = 40
 """Of a spline; about 0.07 s each on a lap."""
-POINTS = 400
-"""Of a path that a spline is fitted to."""
 REST = 100.0
 """Weight of the start from rest."""
 NUMBERS = 3 * (INTERVALS + 3) + 1
@@ -68,15 +66,6 @@ def along(spline: Spline, time_s: Array) -> Along:
     acc = left * c[0] + (3 * u - 2) * c[1] + (1 - 3 * u) * c[2] + u * c[3]
     vel, acc = vel / step, acc / step**2
     return Along(pos + beyond * vel, vel, jnp.where(beyond > 0.0, 0.0, acc))
-
-
-def later(spline: Spline, delay_s: float) -> Spline:
-    """Return one spline that rests at its start for `delay_s` [s] and is then flown as it was."""
-    duration_s = float(spline.duration_s) + delay_s
-    time_s = np.linspace(0.0, duration_s, POINTS)
-    return fitted(
-        np.asarray(along(spline, np.maximum(time_s - delay_s, 0.0)).pos_w), duration_s, 0.01
-    )
 
 
 def fitted(points_w: np.ndarray, duration_s: float, stiffness: float = 1.0) -> Spline:

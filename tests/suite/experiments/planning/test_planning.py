@@ -54,10 +54,6 @@ def test_a_spline_rests_follows_and_goes_straight_on():
     np.testing.assert_allclose(after.pos_w[1] - after.pos_w[0], 0.5 * after.vel_w[0])
     same = spline.unpacked(spline.packed(line))
     np.testing.assert_array_equal(same.control_w, line.control_w)
-    rested = spline.later(line, 0.3)
-    np.testing.assert_allclose(
-        along(rested, middle + 0.3).pos_w, along(line, middle).pos_w, atol=0.02
-    )
 
 
 def test_a_path_through_the_gates_passes_them_in_order_and_one_beside_them_does_not(track):
