@@ -121,7 +121,9 @@ def test_a_finished_loop_is_only_told_again(whole, monkeypatch, capfd):
 def test_another_configuration_is_refused(whole, monkeypatch, capfd):
     out, _ = whole
     small = Small(monkeypatch)
-    assert cli.main(["loop", *ARGS, "--trials", "5", "--out", str(out)]) == 2
+    other = list(ARGS)
+    other[other.index("--trials") + 1] = "5"
+    assert cli.main(["loop", *other, "--out", str(out)]) == 2
     said = capfd.readouterr().err
     assert "trials is 3 there, 5 here" in said and "another --out" in said
     assert not small.flown and not small.trained
