@@ -13,10 +13,11 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
+from dataclasses import is_dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
 from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 from suite.common.running.interrupts import end_at_once, ends_in_seconds
@@ -42,9 +43,6 @@ COMMANDS: dict[str, str] = {
     "view": "a recording, pictures and a video of trials",
 }
 """Name -> one-line summary; the command NAME lives in suite/commands/NAME.py."""
-
-REPEATED = ("--policy",)
-"""Options that are given once for each value."""
 
 
 def overview() -> str:
@@ -118,20 +116,36 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
     """
     import tyro
 
-    _refuse_twice(args)
     command = importlib.import_module(f"suite.commands.{name}")
     plain_flags = (tyro.conf.FlagCreatePairsOff,)
     options = command.config_type(args) if hasattr(command, "config_type") else command.Config
+    _refuse_twice(args, options)
     config = tyro.cli(options, prog=f"suite {name}", args=args, config=plain_flags)
     return command, config
 
 
-def _refuse_twice(args: Sequence[str]) -> None:
+def _refuse_twice(args: Sequence[str], options: Any) -> None:
     """Refuse an option that is given twice: of two `--set` the first would be left out silently."""
-    flags = [arg.partition("=")[0] for arg in args if arg.startswith("--")]
-    for flag in flags:
-        if flags.count(flag) > 1 and flag not in REPEATED:
-            raise ValueError(f"{flag} is given twice; give it once, with all its values behind it")
+    flags = [arg.partition("=")[0].replace("_", "-") for arg in args if arg.startswith("--")]
+    twice = {flag for flag in flags if flags.count(flag) > 1}
+    for flag in sorted(twice - set(_once_a_value(options)) if twice else ()):
+        raise ValueError(f"{flag} is given twice; give it once, with all its values behind it")
+
+
+def _once_a_value(options: Any) -> Iterator[str]:
+    """Yield those of `options`, a type as tyro reads it, that are given once for each value."""
+    from tyro.conf import UseAppendAction
+
+    for part in get_args(options):
+        yield from _once_a_value(part)
+    made = get_origin(options) or options
+    if isinstance(made, type) and is_dataclass(made):
+        for name, kind in get_type_hints(made, include_extras=True).items():
+            extras = getattr(kind, "__metadata__", ())
+            if UseAppendAction in extras:
+                named = next((x.name for x in extras if getattr(x, "name", None)), name)
+                yield f"--{named.replace('_', '-')}"
+            yield from _once_a_value(kind)
 
 
 def _run(name: str, args: list[str]) -> int:

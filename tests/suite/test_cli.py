@@ -198,6 +198,13 @@ def test_a_reader_that_leaves_ends_the_program_quietly(args):
     assert done.stderr == ""
 
 
+def test_options_of_one_value_each_may_be_given_again():
+    _, config = cli.parse("reproduce", ["worlds", "--world", "mjx", "--world", "rotorpy"])
+    assert config.experiment.world == ("mjx", "rotorpy")
+    _, config = cli.parse("eval", ["--policy", "swift", "--policy", "racer"])
+    assert config.flown.policies == ("swift", "racer")
+
+
 def test_info_says_versions_devices_and_machine(capfd):
     assert cli.main(["info", "--json"]) == 0
     facts = json.loads(capfd.readouterr().out)
@@ -267,6 +274,7 @@ HUGE = "9" * 400
         "train --set devices=0",
         "train --set devices=1 --set seed=2",
         "eval --trials 1 --trials 2",
+        "export --policy swift --policy racer",
         "train --set episode.batch=10000000000",
         f"train --set episode.steps={'(' * 300}",
         f"train --set {'x' * 5000}",
