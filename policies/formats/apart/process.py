@@ -46,7 +46,7 @@ SERVER = Path(__file__).with_name("server.py")
 REMEDIES = {
     "onnxruntime": "export it for an older opset",
     "torch": "export it again with this version of torch",
-    "ctypes": "remove it, and it is compiled again",
+    "ctypes": "it must define policy_reset and policy_step as its policy.h declares them",
 }
 """What to do where an engine refuses a model."""
 CALLED = {"ctypes": "compiled C"}

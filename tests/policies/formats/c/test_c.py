@@ -155,6 +155,15 @@ def test_any_c_with_this_door_flies_but_none_with_a_memory_of_its_own(tmp_path):
         foreign(tmp_path, "state->seen", size=15)
 
 
+def test_c_without_its_functions_is_refused_with_what_it_lacks(tmp_path):
+    (tmp_path / "policy.h").write_text(DOOR.replace("{size}", "12"))
+    (tmp_path / "policy.c").write_text('#include "policy.h"\n')
+    with pytest.raises(
+        PolicyError, match="compiled C .* cannot load it .*must define policy_reset"
+    ):
+        load_c(tmp_path, trust=True)
+
+
 @pytest.mark.parametrize(
     ("fault", "how"),
     [("for (;;) {}", "not answered within 1 s"), ("action = 0; *action = 0;", "SIGSEGV")],
