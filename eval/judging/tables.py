@@ -160,7 +160,8 @@ def percent(interval: Interval) -> str:
     return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
 
 
-def _number(interval: Interval) -> str:
+def with_interval(interval: Interval) -> str:
+    """Return a number with its interval: "6.55 [6.31, 6.70]", or "-" for none."""
     if np.isnan(interval.value):
         return "-"
     return f"{interval.value:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
@@ -191,9 +192,9 @@ def _cell_grid(cells: Sequence[Tally]) -> Grid:
             str(cell.trials),
             percent(cell.success),
             f"{cell.gates_passed:.1f}",
-            _number(cell.v_max),
-            _number(cell.v_mean),
-            _number(cell.lap_s),
+            with_interval(cell.v_max),
+            with_interval(cell.v_mean),
+            with_interval(cell.lap_s),
             ", ".join(ended) or "-",
         )
         lines.append(line)

@@ -24,7 +24,7 @@ from suite.experiments.planning.search import Effort, Plan, fly_plan, plans
 from suite.experiments.study import judging, options
 from suite.experiments.study.beside import Flown, beside
 from suite.experiments.study.cache import code_digest, digest, engines
-from suite.judging.flying import default_policy, labels, policy_digest, who_flies, workers_for
+from suite.judging.flying import default_policy, who_flies, workers_for
 from tracks.common.files import write_json
 from tracks.input.ranges import Seed, Trials
 from tracks.input.reading import read_json
@@ -62,14 +62,13 @@ class Together(NamedTuple):
 
 def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
     """Return the page and its numbers; plans that are missing are made first."""
-    vehicle, asked = load_vehicle(config.vehicle), config.policy or (default_policy(),)
-    names = labels(asked, [load_policy(policy).name for policy in asked])
+    vehicle = load_vehicle(config.vehicle)
+    policies = judging.named_policies(config.policy or (default_policy(),))
     trials = judging.trials_of(config)
     found = planned(vehicle, trials, place, console)
     best = {plan.trial: fly_plan(vehicle, plan.trial, plan.numbers) for plan in found}
     flights = {
-        name: policy_flights(policy, vehicle, trials, place)
-        for name, policy in zip(names, asked, strict=True)
+        name: policy_flights(policy, vehicle, trials, place) for name, policy in policies.items()
     }
     laps = {
         name: [beside(best[trial], mine[trial]) for trial in trials]
@@ -79,10 +78,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         title="Laps: how far from the limit",
         lead=lead(found, laps),
         facts={
-            **{
-                name: f"{path}, SHA-256 {policy_digest(path)[:16]}"
-                for name, path in zip(names, asked, strict=True)
-            },
+            **judging.policy_facts(policies),
             "tracks": f"three families, levels {config.difficulty}, seeds "
             f"{options.judged_seeds(config)}: {len(trials)}, the same for plans and policies",
             "vehicle": config.vehicle,

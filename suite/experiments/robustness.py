@@ -10,7 +10,6 @@ import tyro
 
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
-from policies.policy import load_policy
 from suite.common.console import Console
 from suite.common.report import Picture, Report, Section
 from suite.experiments.pages.document import Place
@@ -18,8 +17,7 @@ from suite.experiments.pages.tables import condition_grid
 from suite.experiments.study import disturbed, judging, options
 from suite.experiments.study.conditions import STATE_UNIT, Condition, log_faults
 from suite.experiments.study.disturbed import Grown, Tested
-from suite.judging.content import policy_digest
-from suite.judging.flying import default_policy, labels
+from suite.judging.flying import default_policy
 from tracks.input.ranges import Seed, Trials
 
 UNDISTURBED = "undisturbed"
@@ -70,22 +68,19 @@ class Config:
 
 def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
     """Return the page and its numbers; what is missing is flown first."""
-    vehicle, asked = load_vehicle(config.vehicle), config.policy or (default_policy(),)
-    names = labels(asked, [load_policy(policy).name for policy in asked])
+    vehicle = load_vehicle(config.vehicle)
+    policies = judging.named_policies(config.policy or (default_policy(),))
     alone, sweeps = disturbed.asked_conditions(vehicle, config.only)
     base, trials = Condition(UNDISTURBED, 0.0, "", vehicle), judging.trials_of(config)
-    fliers = {name: [(policy, trials)] for name, policy in zip(names, asked, strict=True)}
+    fliers = {name: [(policy, trials)] for name, policy in policies.items()}
     effects, grown = disturbed.flown_under(
         [base, *alone], sweeps, fliers, place.cache, console, place.workers
     )
     report = Report(
         title="Robustness: what the policy survives",
-        lead=_lead(names[0], effects, grown),
+        lead=_lead(next(iter(policies)), effects, grown),
         facts={
-            **{
-                name: f"{path}, SHA-256 {policy_digest(path)[:16]}"
-                for name, path in zip(names, asked, strict=True)
-            },
+            **judging.policy_facts(policies),
             "trials": f"three tracks, level {config.difficulty}, seeds "
             f"{options.judged_seeds(config)}: {len(trials)} trials a condition, the same in all",
             "vehicle": config.vehicle,

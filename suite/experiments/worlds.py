@@ -16,13 +16,11 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds import REFERENCE, differences, world_class
 from eval.worlds.trial import TrialResult
 from policies import shipped
-from policies.policy import load_policy
 from suite.common.console import Console
 from suite.common.report import Report, Section
 from suite.experiments.pages.document import Place
 from suite.experiments.pages.tables import points_cell
 from suite.experiments.study import judging, options
-from suite.judging.flying import labels, policy_digest
 from tracks.common.grid import Cell, Grid, table
 from tracks.families import JUDGED
 from tracks.input.ranges import Seed, Trials
@@ -103,14 +101,14 @@ def columns(config: Config) -> list[Column]:
 def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
     """Return the page and its numbers; what is missing is flown first."""
     flown_in = columns(config)
-    asked = config.policy or tuple(shipped.names())
-    names = labels(asked, [load_policy(policy).name for policy in asked])
+    policies = judging.named_policies(config.policy or tuple(shipped.names()))
+    names = list(policies)
     trials = judging.trials_of(config)
     orders = {
         (name, column.label): judging.Order(
             judging.Flier(policy, column.vehicle, world=column.world), trials
         )
-        for name, policy in zip(names, asked, strict=True)
+        for name, policy in policies.items()
         for column in flown_in
     }
     results = judging.flown(orders, place.cache, console, "flying in every world")
@@ -119,10 +117,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         title="Worlds: the same trials in other simulators",
         lead=_lead(names, flown_in, results, changed),
         facts={
-            **{
-                name: f"{path}, SHA-256 {policy_digest(path)[:16]}"
-                for name, path in zip(names, asked, strict=True)
-            },
+            **judging.policy_facts(policies),
             "trials": f"three tracks, levels {config.difficulty}, seeds "
             f"{options.judged_seeds(config)}: {len(trials)} of each policy in each world",
             "vehicle": config.vehicle,

@@ -11,11 +11,25 @@ NEAR_RADIUS_M = 0.35
 
 def is_inside(opening_g: Array, point_g: Array) -> Array:
     """Return whether (y, z) points (..., 2) lie in the convex opening (..., V, 2)."""
+    _, turn = sides(opening_g, point_g)
+    return (turn >= 0).all(-1)
+
+
+def sides(opening_g: Array, point_g: Array) -> tuple[Array, Array]:
+    """Return the sides of an opening, and on which side of each a point lies.
+
+    Args:
+        opening_g: (..., V, 2) corners (y, z), counter-clockwise [m].
+        point_g: (..., 2) [m].
+
+    Returns:
+        edge (..., V, 2) from corner to corner [m]; turn (..., V), the distance inside of an edge
+        times its length [m^2].
+    """
     xp = point_g.__array_namespace__()
     edge = xp.roll(opening_g, -1, axis=-2) - opening_g
     away = point_g[..., None, :] - opening_g
-    turn = edge[..., 0] * away[..., 1] - edge[..., 1] * away[..., 0]
-    return (turn >= 0).all(-1)
+    return edge, edge[..., 0] * away[..., 1] - edge[..., 1] * away[..., 0]
 
 
 def crossing(

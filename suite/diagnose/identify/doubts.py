@@ -51,6 +51,5 @@ def doubted(
                 other = put(other, entry)
         found.append(other)
     for fit in one_off(torque, INERTIA):
-        x, y, z = inertia_of(start, told(fit))
-        found.append(replace(vehicle, inertia=(float(x), float(y), float(z))))
+        found.append(replace(vehicle, inertia=tuple(inertia_of(start, told(fit)).tolist())))
     return found

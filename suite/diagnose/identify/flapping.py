@@ -15,7 +15,7 @@ from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.fit.parameters import candidates, make_space
 from suite.diagnose.identify.fit import Z95
 from suite.diagnose.identify.numbers import Number
-from suite.diagnose.views.data.flights import ready
+from suite.diagnose.views.data.flights import ViewFlights, ready
 from suite.diagnose.views.data.view import TORQUE
 from suite.diagnose.views.fit.equations import ViewTask, half_widths, look
 from suite.diagnose.views.fit.model import ForceModel
@@ -40,26 +40,28 @@ def flapping_of(
         return None
     if flights is None or TORQUE not in flights.views:
         return None
-    space = make_space(vehicle)
     voltage = all(log.voltage is not None for log in whole)
-    task = ViewTask(TORQUE, ForceModel(vehicle, space, voltage), flights.smoothed[TORQUE.name])
-    among = [one for one in candidates(space, voltage, ()) if one.name == EFFECT]
+    task = _task(flights, vehicle, voltage)
+    among = [one for one in candidates(task.model.space, voltage, ()) if one.name == EFFECT]
     found = search_view(task, among)
     if not found.named:
         return None
     value = float(found.last.theta[found.indices[0]])
     half = float(half_widths(found.last, found.indices)[0])
-    moved = [_step(whole, other, found) for other in doubted]
+    tasks = (_task(ready(whole, other), other, voltage) for other in doubted)
+    moved = [_step(other, found) for other in tasks]
     half = float(np.hypot(half, Z95 * np.linalg.norm(moved)))
     return Number(f"effects.{EFFECT}.{KEY}", UNIT, [value], [(value - half, value + half)])
 
 
-def _step(logs: Sequence[FlightLog], vehicle: Vehicle, found: ViewSearch) -> float:
-    """Return by how much the coefficient of `found` moves where the vehicle is another."""
-    space = make_space(vehicle)
-    theta = space.array("start")
-    theta[found.indices] = found.last.theta[found.indices]
-    model = ForceModel(vehicle, space, all(log.voltage is not None for log in logs))
-    task = found.task._replace(model=model, flights=ready(logs, vehicle).smoothed[TORQUE.name])
-    then, (at,) = look(task, theta, found.last.weights), found.indices
+def _task(flights: ViewFlights, vehicle: Vehicle, voltage: bool) -> ViewTask:
+    model = ForceModel(vehicle, make_space(vehicle), voltage)
+    return ViewTask(TORQUE, model, flights.smoothed[TORQUE.name])
+
+
+def _step(task: ViewTask, found: ViewSearch) -> float:
+    """Return by how much the coefficient of `found` moves where the vehicle is that of `task`."""
+    theta, (at,) = task.model.space.array("start"), found.indices
+    theta[at] = found.last.theta[at]
+    then = look(task, theta, found.last.weights)
     return float(then.block.gradient[:, at].sum() / then.block.hessian[:, at, at].sum())

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from eval.judging.statistics import Interval, bootstrap_median
+from eval.judging.tables import with_interval
 from eval.worlds.trial import TrialSpec, track_of
 from suite.common.report import Picture
 from suite.experiments.planning.search import Plan
@@ -56,10 +57,6 @@ def _spread(values: Sequence[float]) -> str:
     return f"{np.median(values):.2f} [{min(values):.2f}, {max(values):.2f}]"
 
 
-def _with_interval(found: Interval) -> str:
-    return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]" if found.value > 0 else "-"
-
-
 def cell_table(found: Sequence[Plan], laps: Mapping[str, Sequence[Lap]]) -> Grid:
     """Return plans and policies cell by cell, then over all cells."""
     headers = ["track", "level", "plan [s]", "plans flown", "policy", "finished", "lap [s]"]
@@ -77,7 +74,7 @@ def cell_table(found: Sequence[Plan], laps: Mapping[str, Sequence[Lap]]) -> Grid
                 cell[0] if cell else "all", str(cell[1]) if cell else "",
                 _spread(done), f"{len(done)} of {len(plan)}", name,
                 f"{sum(lap.policy_s is not None for lap in mine)} of {len(mine)}",
-                _median([lap.policy_s for lap in both]), _with_interval(_ratio(mine)),
+                _median([lap.policy_s for lap in both]), with_interval(_ratio(mine)),
                 _median([lap.path for lap in mine]),
                 f"{sum(map(goes_around, mine))} of {len(mine)}",
             ])  # fmt: skip
@@ -151,7 +148,7 @@ def lead(found: Sequence[Plan], laps: Mapping[str, Sequence[Lap]]) -> str:
         both = [lap for lap in mine if lap.ratio is not None]
         around = [lap for lap in both if goes_around(lap)]
         text = (
-            f"{name} takes {_with_interval(_ratio(mine))} times as long (median over the "
+            f"{name} takes {with_interval(_ratio(mine))} times as long (median over the "
             f"{len(both)} tracks that both finish, 95 % interval)"
         )
         if around:

@@ -10,6 +10,7 @@ import numpy as np
 
 from eval.worlds.slots import layout_of, pad_gates
 from tracks.geometry.clearance import nearest_obstacle
+from tracks.geometry.crossing import sides
 from tracks.geometry.gates import yaw_rotation
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Array, Gates, Scene, pad
@@ -80,11 +81,9 @@ def inside_by(opening_g: Array, point_g: Array) -> Array:
 
     Sides of no length count as far away.
     """
-    side = jnp.roll(opening_g, -1, axis=-2) - opening_g
-    length = jnp.sqrt((side**2).sum(-1))
+    edge, turn = sides(opening_g, point_g)
+    length = jnp.sqrt((edge**2).sum(-1))
     real = length > 1e-9
-    away = point_g[:, None] - opening_g
-    turn = side[..., 0] * away[..., 1] - side[..., 1] * away[..., 0]
     return jnp.where(real, turn / jnp.where(real, length, 1.0), 10.0)
 
 

@@ -27,7 +27,7 @@ from suite.common.console import Console
 from suite.common.estimate import announce
 from suite.experiments.study.cache import code_digest, digest, engines
 from suite.judging.content import PolicyContent, policy_digest
-from suite.judging.flying import TRIALS_A_PROCESS, cost_of, flying_needs, trial_list
+from suite.judging.flying import TRIALS_A_PROCESS, cost_of, flying_needs, labels, trial_list
 from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import JUDGED
 
@@ -140,6 +140,16 @@ def judged_cells(
         name: summarise([row._replace(policy=name) for row in rows])["cells"]
         for name, rows in results.items()
     }
+
+
+def named_policies(asked: Sequence[str]) -> dict[str, str]:
+    """Return the policies that are asked for by what tables call them."""
+    return dict(zip(labels(asked, [load_policy(path).name for path in asked]), asked, strict=True))
+
+
+def policy_facts(policies: Mapping[str, str]) -> dict[str, str]:
+    """Return what a page says of which policies flew."""
+    return {name: f"{path}, SHA-256 {policy_digest(path)[:16]}" for name, path in policies.items()}
 
 
 def trials_of(config: Any, levels: Sequence[int] | None = None) -> list[TrialSpec]:

@@ -9,6 +9,7 @@ and their numbers. The vehicle file need not be right: what it lacks is in both 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import ttest_ind
@@ -65,8 +66,7 @@ def search_motion_change(
     if min(len(np.unique(one.flight)) for one in sets) < 2:
         return None
     weights = weights_of(sets[1], limits)
-    now = look(task, start, weights)
-    left, space = view_candidates(among, now), task.model.space
+    left, space = view_candidates(among, look(task, start, weights)), task.model.space
     tests = sum(len(one.indices) for one in left)
     tried = []
     for candidate in left:
@@ -76,18 +76,18 @@ def search_motion_change(
         p_value = float(np.nan_to_num(np.asarray(chance), nan=1.0).min()) * tests
         if p_value > limits.change_p_value:
             continue
-        gains, whole = _gains(sets[1], at, before.mean(axis=0), after, weights.scatter)
+        since, wanted = before.mean(axis=0), after.mean(axis=0)
+        gains, whole = _gains(sets[1], at, since, after, weights.scatter)
         share = float(gains.sum() / whole)
         theta = start.copy()
-        theta[at] += after.mean(axis=0)
+        theta[at] += wanted
         possible = np.clip(theta, space.array("low"), space.array("high"))
         beyond = np.linalg.norm((possible - theta)[at])
-        change = np.linalg.norm(after.mean(axis=0) - before.mean(axis=0))
-        if beyond > SLIGHT * change or at_bound(space, possible, candidate):
+        if beyond > SLIGHT * np.linalg.norm(wanted - since) or at_bound(space, possible, candidate):
             continue  # that is no fit
         if flights_agree(gains) and share >= limits.least_view_share:
             name = ViewName(candidate, p_value, tuple(gains.tolist()), share)
-            tried.append((name, before.mean(axis=0), possible))
+            tried.append((name, since, possible))
     if not tried:
         return None
     most = max(name.share for name, *_ in tried)
@@ -97,8 +97,8 @@ def search_motion_change(
     begun = start.copy()
     begun[list(name.candidate.indices)] += since
     rivals = tuple(dict.fromkeys(other.candidate.name for other, *_ in others))
-    named = ViewName(name.candidate, name.p_value, name.gains, name.share, rivals)
-    return ViewSearch(task, (named,), look(task, begun, weights), look(task, theta, weights))
+    named = (replace(name, rivals=rivals),)
+    return ViewSearch(task, named, look(task, begun, weights), look(task, theta, weights))
 
 
 def _gains(

@@ -133,9 +133,11 @@ def _next_name(
         share = float(gains.sum() / before.sum())
         if at_bound(task.model.space, then.theta, score.candidate):
             continue  # that is no fit
-        if not holds_at_any_speed(task, then, score.candidate.indices):
-            continue
-        if flights_agree(gains) and share >= task.limits.least_view_share:
+        if (
+            flights_agree(gains)
+            and share >= task.limits.least_view_share
+            and holds_at_any_speed(task, then, score.candidate.indices)
+        ):
             cost = float(then.block.chi2.sum()) + 2.0 * len(score.candidate.indices)
             name = ViewName(score.candidate, score.p_value, tuple(gains.tolist()), share)
             tried.append((cost, score.candidate, (name, then)))
