@@ -15,7 +15,7 @@ USABLE := import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3,
 
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: env race test lint docs lock clean
+.PHONY: env race test tests lint style types docs lock clean
 
 env: $(STAMP)
 
@@ -36,13 +36,21 @@ $(STAMP): requirements.lock pyproject.toml setup.py
 race: $(STAMP)
 	$(VENV)/bin/suite loop --preset small --out $(OUT)
 
-lint: $(STAMP)
+lint: style types
+
+style: $(STAMP)
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
+
+types: $(STAMP)
 	$(PY) -m pyright --pythonpath $(PY) --warnings
 
-test: lint
+tests: $(STAMP)
 	$(PY) -m pytest -n $(JOBS) --dist worksteal
+
+# The types are checked on one core, beside the tests.
+test: style
+	@$(MAKE) --jobs 2 types tests
 
 docs: $(STAMP)
 	$(PY) -m mkdocs build --quiet --clean --strict

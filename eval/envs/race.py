@@ -21,6 +21,7 @@ from eval.worlds.trial import (
     has_diverged,
     is_wrench,
     judge_state,
+    next_centre,
     next_gate,
     start_progress,
 )
@@ -95,7 +96,7 @@ class Race:
                 break
             before = self.progress
             motion, step = motion_of(data), before.step
-            gate_w = next_gate(self._course, before.gates).center_w
+            gate_w = next_centre(self._course, before.gates)
             noise = None if self._draws is None else self._draws[step + 1]
             self._loops, wrench = autopilot_step(
                 self.autopilot, self._loops, motion, self.action_b, gate_w, step, noise

@@ -189,9 +189,11 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
             )  # fmt: skip
             yield index, result, None
         return
+    # MJX compiles anew for another number; elsewhere a slot that stays empty only costs time.
+    slots = options.slots if task.world == "mjx" else min(options.slots, max(1, len(share)))
     world = world_class(task.world)(
         task.vehicle, policy.spec.camera, layout_of(task.tracks.values()), options.rules,
-        slots=options.slots, threads=options.threads,
+        slots=slots, threads=options.threads,
     )  # fmt: skip
     yield from _Slots(task, policy, world).run(share)
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
 from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant
@@ -107,6 +109,8 @@ def attitude_step(
     The arguments are those of `autopilot_step`; the plant is left as it is.
     """
     due = step % autopilot.attitude_every == 0
+    if isinstance(due, np.ndarray) and not due.any():
+        return state  # most steps hold the command
     period = autopilot.attitude_every * autopilot.dt
     heading_w = blend_heading(state.heading_w, gate_w - motion.pos_w, period)
     force_w = action_to_force(action_b, motion.rot_w)

@@ -55,6 +55,8 @@ def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> A
     yaw = torque_b[..., 2, None] * per_yaw
     exact = force_z[..., None] * per_force + level + yaw
     outside = xp.any((exact < 0.0) | (exact > thrust_max), axis=-1, keepdims=True)
+    if isinstance(outside, np.ndarray) and not outside.any():
+        return exact
 
     spread = xp.max(level, axis=-1, keepdims=True) - xp.min(level, axis=-1, keepdims=True)
     level = level * (thrust_max / xp.maximum(spread, thrust_max))

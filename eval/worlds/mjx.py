@@ -37,6 +37,7 @@ from eval.worlds.trial import (
     has_diverged,
     is_wrench,
     judge_state,
+    next_centre,
     next_gate,
     start_progress,
 )
@@ -250,7 +251,7 @@ class MjxWorld:
             done, draws = inputs
             flying = (steps > done) & (state.progress.ended == FLYING)
             motion, step = _motion(state.qpos, state.qvel), state.progress.step
-            gate_w = next_gate(course, state.progress.gates).center_w
+            gate_w = next_centre(course, state.progress.gates)
             loops, wrench = autopilot_step(
                 self._autopilot, state.loops, motion, action_b, gate_w, step, draws
             )

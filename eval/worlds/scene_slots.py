@@ -28,6 +28,7 @@ from eval.worlds.trial import (
     TrialSpec,
     has_diverged,
     judge_state,
+    next_centre,
     next_gate,
     start_progress,
 )
@@ -203,7 +204,7 @@ class SceneSlots(ABC):
             if not flying.any():
                 break
             step, motion = self._progress.step, self._motion()
-            gate_w = next_gate(self._course, self._progress.gates).center_w
+            gate_w = next_centre(self._course, self._progress.gates)
             speed_before = self._loops.plant.rotor_speed
             draws = self._draws(step)
             loops, push = self._control(motion, action_b, gate_w, step, draws)

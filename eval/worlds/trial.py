@@ -5,7 +5,7 @@ The rules are pure functions of arrays over many trials (N rows) and take numpy 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -146,9 +146,18 @@ def start_progress(pos_w: Array) -> Progress:
 
 def next_gate(course: Course, number: Array) -> Gates:
     """Return each row's gate `number` (N,), past the last one the last, with arrays (N, ...)."""
+    return Gates(*_rows_of(course, number, course.gates))
+
+
+def next_centre(course: Course, number: Array) -> Array:
+    """Return the centre (N, 3) of each row's gate `number` (N,), as `next_gate` has it [m]."""
+    return _rows_of(course, number, [course.gates.center_w])[0]
+
+
+def _rows_of(course: Course, number: Array, fields: Sequence[Array]) -> list[Array]:
     xp = number.__array_namespace__()
-    rows = xp.arange(number.shape[0])
-    return Gates(*(field[rows, xp.minimum(number, course.count - 1)] for field in course.gates))
+    rows, at = xp.arange(number.shape[0]), xp.minimum(number, course.count - 1)
+    return [field[rows, at] for field in fields]
 
 
 def has_diverged(rules: Rules, motion: Motion) -> Array:
@@ -198,7 +207,7 @@ def judge_state(
     gate = next_gate(course, progress.gates)
     passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, progress.pos_w, pos_w)
     gates = progress.gates + (passed & free & (progress.gates < course.count))
-    near = is_near(next_gate(course, progress.gates_035).center_w, pos_w, rules.near_radius_m)
+    near = is_near(next_centre(course, progress.gates_035), pos_w, rules.near_radius_m)
     gates_035 = progress.gates_035 + (near & free & (progress.gates_035 < course.count))
     speed = xp.sqrt((vel_w * vel_w).sum(-1))
     last_step, short_step = round(rules.time_limit_s / dt), round(rules.short_window_s / dt)

@@ -14,10 +14,16 @@ def select(mask: Array, new: Any, old: Any) -> Any:
 
     Both are arrays (N, ...), or alike nested tuples and dicts of such.
     """
+    if isinstance(mask, np.ndarray) and mask.all():
+        return new
+    return _selected(mask, new, old)
+
+
+def _selected(mask: Array, new: Any, old: Any) -> Any:
     if isinstance(new, dict):
-        return {name: select(mask, new[name], old[name]) for name in new}
+        return {name: _selected(mask, new[name], old[name]) for name in new}
     if isinstance(new, tuple):
-        parts = [select(mask, a, b) for a, b in zip(new, old, strict=True)]
+        parts = [_selected(mask, a, b) for a, b in zip(new, old, strict=True)]
         return type(new)(*parts) if hasattr(new, "_fields") else tuple(parts)
     xp = mask.__array_namespace__()
     return xp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Array
 
@@ -51,6 +53,8 @@ def crossing(
     xp = before_w.__array_namespace__()
     before, after = to_local(rot_w, before_w - center_w), to_local(rot_w, after_w - center_w)
     crosses = (before[..., 0] < 0) & (after[..., 0] >= 0)
+    if isinstance(crosses, np.ndarray) and not crosses.any():
+        return crosses, crosses  # as in most steps of a flight
     travel = after[..., 0] - before[..., 0]
     share = -before[..., 0] / xp.where(crosses, travel, 1.0)
     point = before[..., 1:] + share[..., None] * (after - before)[..., 1:]

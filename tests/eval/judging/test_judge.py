@@ -40,6 +40,19 @@ def test_no_trials():
     assert fly(Pursuit(), [], VEHICLE) == []
 
 
+def test_a_policy_is_asked_for_no_more_rows_than_there_are_trials():
+    asked = []
+
+    class Counted(Steady):
+        def act(self, hidden, state, image, fresh):
+            asked.append(len(state))
+            return super().act(hidden, state, image, fresh)
+
+    trials = [TrialSpec("zigzag", 0, seed) for seed in range(3)]
+    fly(Counted(), trials, VEHICLE, options=JudgeOptions(rules=SHORT))
+    assert set(asked) == {3}
+
+
 @pytest.mark.parametrize("rate_hz", [7.0, 30.0, 100.0, 500.0])
 def test_decisions_come_at_the_policys_rate(rate_hz):
     flights = []

@@ -1,5 +1,7 @@
 """What a diagnosis writes: every step in the report, a recording that loads, a plan."""
 
+import contextlib
+import io
 import json
 import re
 import subprocess
@@ -38,11 +40,24 @@ def diagnosed(tmp_path_factory):
         str(write_flight(folder / f"{k}.parquet", fly(truth, k, duration_s=6.0, motors=True)))
         for k in range(3)
     ]
+    bad = folder / "bad.csv"
+    bad.write_text("time,pos_x\n0,1\n", encoding="utf-8")
     save_vehicle(LAGGED, folder / "v.toml")
     out = folder / "out"
-    line = [*paths, "--vehicle", str(folder / "v.toml"), "--out", str(out), "--plan"]
-    assert main(["diagnose", *line, "--drive", "commands", "--seed", "3"]) == 0
+    line = [*paths, str(bad), "--vehicle", str(folder / "v.toml"), "--out", str(out), "--plan"]
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert main(["diagnose", *line, "--drive", "commands", "--seed", "3", "--json"]) == 0
+    (folder / "said.json").write_text(said.getvalue(), encoding="utf-8")
     return out
+
+
+def test_files_come_out_whole_and_bad_flights_are_named(diagnosed):
+    found = json.loads((diagnosed / "diagnosis.json").read_text(encoding="utf-8"))
+    assert json.loads((diagnosed.parent / "said.json").read_text(encoding="utf-8")) == found
+    assert any("bad.csv" in warning for warning in found["warnings"])
+    names = {effect["name"] for effect in found["effects"]}
+    assert names and set(load_vehicle(diagnosed / "vehicle.toml").effects) == names
 
 
 def test_every_step_is_in_the_report(diagnosed):
@@ -70,7 +85,6 @@ def test_the_numbers_beside_the_names_are_in_the_json(diagnosed):
     assert abs(found["kinematics"]["gyro_bias"]["value"][0]) < 0.01
     effect = found["effects"][0]
     assert found["plan"]["flights"] == [] or effect["alternatives"]
-    assert load_vehicle(diagnosed / "vehicle.toml").effects
 
 
 def test_the_recording_holds_what_was_measured_and_simulated(diagnosed):
