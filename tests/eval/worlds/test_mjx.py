@@ -65,6 +65,7 @@ def test_ends_agree_on_a_few(few):
     assert [r.gates_passed for r in ours] == [r.gates_passed for r in theirs]
 
 
+@pytest.mark.slow
 def test_a_load_on_a_line_swings_alike():
     effects = {**VEHICLE.effects, "slung_load": SlungLoad(0.05, 0.5)}
     trials = [TrialSpec("zigzag", 9, seed) for seed in range(2)]
