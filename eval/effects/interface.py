@@ -75,7 +75,7 @@ class Flow(NamedTuple):
     `rotor_acc`, and None where it is not known."""
     memory: Any = None
     """What this effect carries from step to step; None for one without `start` and `carry`."""
-    dt: Array | None = None
+    dt: Any = None
     """Length of the step [s]; only for an effect that carries something."""
 
 
