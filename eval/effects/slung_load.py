@@ -29,7 +29,7 @@ class SlungLoad(NamedTuple):
     """(...,) of the line at rest, L [m]."""
 
 
-class Swing(NamedTuple):
+class LoadState(NamedTuple):
     """What is carried from step to step."""
 
     line_w: Array
@@ -38,14 +38,16 @@ class Swing(NamedTuple):
     """(..., 3) of the load relative to the centre of mass, u [m/s]."""
 
 
-def start_of(values: SlungLoad, flow: Flow) -> Swing:
+def start_of(values: SlungLoad, flow: Flow) -> LoadState:
     """Return a load that hangs at rest straight below the vehicle, along gravity."""
     xp = flow.rate_b.__array_namespace__()
     gravity_w = flow.constants.gravity_w + xp.zeros_like(flow.rate_b)
     size = xp.sqrt(xp.sum(gravity_w**2, axis=-1, keepdims=True))
-    # The line gives way until it holds the load, which is 1 / _share of its pull.
+    # The line gives way until T = m_L g, of which T (1 / m_L + 1 / M) holds the two together.
     stretch = size / _share(values, flow) * _lag(flow) / STIFFNESS**2
-    return Swing((per_axis(values.length) + stretch) * gravity_w / size, xp.zeros_like(flow.rate_b))
+    return LoadState(
+        (per_axis(values.length) + stretch) * gravity_w / size, xp.zeros_like(flow.rate_b)
+    )
 
 
 def force_of(values: SlungLoad, flow: Flow) -> Array:
@@ -54,12 +56,12 @@ def force_of(values: SlungLoad, flow: Flow) -> Array:
     return to_local(flow.rot_w, per_axis(values.mass) * _share(values, flow) * parting * along_w)
 
 
-def carried(values: SlungLoad, flow: Flow, acc_w: Array) -> Swing:
+def carried(values: SlungLoad, flow: Flow, acc_w: Array) -> LoadState:
     """Return the load after the step, by semi-implicit Euler as the body's own."""
     along_w, parting = _pull(values, flow)
     load_acc_w = flow.constants.gravity_w - _share(values, flow) * parting * along_w
     vel_w = flow.memory.vel_w + flow.dt * (load_acc_w - acc_w)
-    return Swing(flow.memory.line_w + flow.dt * vel_w, vel_w)
+    return LoadState(flow.memory.line_w + flow.dt * vel_w, vel_w)
 
 
 def _pull(values: SlungLoad, flow: Flow) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.effects.interface import GRAVITY
-from eval.effects.slung_load import STIFFNESS, SlungLoad, Swing
+from eval.effects.slung_load import STIFFNESS, SlungLoad, LoadState
 from eval.quadrotor.plant import Command, Motion, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step, rollout, step
 from tests.support.vehicles import PLAIN, at_rest, with_effects, with_lag
@@ -24,13 +24,13 @@ def hanging(plant, line_w=None, vel_w=(0.0, 0.0, 0.0)):
     state = hover_state(plant, ())
     swing = state.carried["slung_load"]
     line_w = swing.line_w if line_w is None else np.asarray(line_w)
-    return state._replace(carried={"slung_load": Swing(line_w, np.asarray(vel_w))})
+    return state._replace(carried={"slung_load": LoadState(line_w, np.asarray(vel_w))})
 
 
 def flown(plant, state, motion, inputs, duration_s):
     """Yield state, motion and wrench after each step."""
     for k in range(round(duration_s / float(plant.dt))):
-        now = inputs(k * plant.dt) if callable(inputs) else inputs
+        now = inputs if isinstance(inputs, Inputs) else inputs(k * plant.dt)
         state, motion, wrench = step(plant, state, motion, now, k * plant.dt)
         yield state.carried["slung_load"], motion, wrench, state
 
@@ -146,7 +146,9 @@ def test_gradients_are_finite_wherever_the_load_is(mass, line_w):
 
     def end(values, line_w, vel_w):
         plant = make_plant(PLAIN, 0.004, {"slung_load": values})
-        state = hover_state(plant, (), jnp)._replace(carried={"slung_load": Swing(line_w, vel_w)})
+        state = hover_state(plant, (), jnp)._replace(
+            carried={"slung_load": LoadState(line_w, vel_w)}
+        )
         return rollout(plant, start, inputs, state).motion.pos_w.sum()
 
     values = SlungLoad(jnp.asarray(mass), jnp.asarray(LENGTH))
