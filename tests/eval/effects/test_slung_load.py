@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.effects.interface import GRAVITY
-from eval.effects.slung_load import STIFFNESS, SlungLoad, LoadState
+from eval.effects.slung_load import STIFFNESS, LoadState, SlungLoad
 from eval.quadrotor.plant import Command, Motion, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step, rollout, step
 from tests.support.vehicles import PLAIN, at_rest, with_effects, with_lag
