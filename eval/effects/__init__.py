@@ -31,6 +31,7 @@ from eval.effects import (
     rotor_drag,
     rotor_gyroscopic,
     rotor_spin_up,
+    slung_load,
     thrust_scale,
     thrust_tilt,
     torque_trim,
@@ -49,6 +50,8 @@ def _wrong(name: str, effect: Any) -> str | None:
         return f"a {type(effect).__name__}; must be an eval.effects.interface.Effect"
     if effect.name != name:
         return f"its Effect is called {effect.name!r}; both names must be the same"
+    if (effect.start is None) != (effect.carry is None):
+        return "a memory with only one of `start` and `carry`; it needs both"
     if not effect.in_flight and any(callable(p.neutral) for p in effect.parameters):
         return "a fault of the log; its neutral values must be numbers"
     return None
@@ -84,6 +87,7 @@ _OWN = {
         accelerometer_bias,
         frame_tilt,
         clock_offset,
+        slung_load,
     )
 }
 # In the order in which they act: what scales a thrust stands after what adds to it, and random
@@ -98,6 +102,11 @@ def find_effect(name: str) -> Effect:
         ValueError: for an unknown name, with the nearest one.
     """
     return EFFECTS.find(name)
+
+
+def nameable_effects() -> list[str]:
+    """Return the names of the effects that a diagnosis may name, in the catalogue's order."""
+    return [name for name, effect in EFFECTS.items() if effect.nameable]
 
 
 def all_values(vehicle: Vehicle) -> dict[str, Any]:

@@ -73,6 +73,10 @@ class Flow(NamedTuple):
     rotor_acc: Array | None = None
     """(..., 4) mean change of the rotor speeds over the step [rad/s^2]; only where an effect says
     `rotor_acc`, and None where it is not known."""
+    memory: Any = None
+    """What this effect carries from step to step; None for one without `start` and `carry`."""
+    dt: Any = None
+    """Length of the step [s]; only for an effect that carries something."""
 
 
 class Gust(NamedTuple):
@@ -133,6 +137,7 @@ class Parameter:
 
 
 Values = Any  # the effect's own NamedTuple of floats, tuples or arrays
+Memory = Any  # arrays (..., K), or nested tuples and dicts of them
 
 
 class Sample(NamedTuple):
@@ -177,6 +182,13 @@ class Effect:
     """Returns an added force on the centre of mass in body axes (..., 3) [N]."""
     torque: Callable[[Values, Flow], Array] | None = None
     """Returns an added torque in body axes (..., 3) [N m]."""
+    start: Callable[[Values, Flow], Memory] | None = None
+    """For an effect with a motion of its own, such as a load's, together with `carry`: returns what
+    it carries at the start, of a vehicle that has hovered until now. The hooks above see it as
+    `Flow.memory`."""
+    carry: Callable[[Values, Flow, Array], Memory] | None = None
+    """Returns what it carries after the step, from the acceleration of the centre of mass during it
+    by all that acts, in the world (..., 3) [m/s^2]."""
     measure: Callable[[Values, Sample], Sample] | None = None
     """A fault of the log: returns what is logged of what truly was. Values as far on the other side
     of neutral undo it, at least to first order."""
@@ -209,8 +221,23 @@ class Effect:
         """Whether it acts by chance, so that no rollout repeats it."""
         return self.gust is not None
 
+    @property
+    def by_state(self) -> bool:
+        """Whether it follows from the vehicle's own state, so that a stretch may begin anywhere."""
+        return not self.random and self.start is None
+
+    @property
+    def nameable(self) -> bool:
+        """Whether a diagnosis may name it: flights can tell a number of it."""
+        return bool(self.told(True) or self.told(False))
+
     def told(self, voltage: bool) -> tuple[Parameter, ...]:
-        """Return the parameters that flights can tell with a voltage in their logs, or without."""
+        """Return the parameters that flights can tell with a voltage in their logs, or without.
+
+        An effect with a motion of its own has none: a log does not show where that stands.
+        """
+        if self.start is not None:
+            return ()
         return tuple(p for p in self.parameters if p.fitted and p.voltage in (None, voltage))
 
     def components(self, voltage: bool) -> tuple[tuple[Parameter, int], ...]:

@@ -199,6 +199,11 @@ def uses_rotor_acc(plant: Plant) -> bool:
     return any(EFFECTS[name].rotor_acc for name in plant.effects)
 
 
+def uses_memory(plant: Plant) -> bool:
+    """Return whether an effect of `plant` has a motion of its own, which is carried along."""
+    return any(EFFECTS[name].start is not None for name in plant.effects)
+
+
 def in_order(effects: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Return the effects in the table's order, in which they act; JAX sorts dicts by name."""
     return [(name, effects[name]) for name in EFFECTS if name in effects]

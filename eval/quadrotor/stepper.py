@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.effects.interface import GRAVITY, Array, Flow, Gust
+from eval.effects.interface import GRAVITY, Array, Flow, Gust, Memory
 from eval.quadrotor import loops
 from eval.quadrotor.delay import delayed
 from eval.quadrotor.mixer import mix, rate_torque
@@ -27,9 +27,10 @@ from eval.quadrotor.plant import (
     Wrench,
     in_order,
     unpacked,
+    uses_memory,
     uses_rotor_acc,
 )
-from eval.quadrotor.rigid_body import euler_step
+from eval.quadrotor.rigid_body import accelerations, euler_step
 from eval.quadrotor.rotors import RotorStep, follow, speed_command, steady
 from tracks.geometry.rotation import to_local
 
@@ -45,6 +46,8 @@ class PlantState(NamedTuple):
     """(..., 3) of each effect that makes random wind [m/s]."""
     loop: Any = ()
     """What a firmware's rate loop remembers; nothing for the nominal one."""
+    carried: dict[str, Memory] = {}
+    """What each effect with a motion of its own carries."""
 
 
 class Inputs(NamedTuple):
@@ -106,7 +109,22 @@ def hover_state(
             wind[name] = still if noise is None else start(value, noise) + still
     speed = wanted_speed(plant, hover, still)
     memory = loops.start(plant.loop, batch_shape, xp)
-    return PlantState(speed, xp.broadcast_to(hover.packed[..., None], past), wind, memory)
+    past = xp.broadcast_to(hover.packed[..., None], past)
+    return PlantState(speed, past, wind, memory, _carried_in_hover(plant, speed, still))
+
+
+def _carried_in_hover(plant: Plant, rotor_speed: Array, still: Array) -> dict[str, Memory]:
+    """Return what effects with a motion of their own carry where plants hovered until now."""
+    carried = {}
+    if uses_memory(plant):
+        level = Motion(still, still[..., None] + np.eye(3), still, still)
+        rotors = steady(rotor_speed)
+        _, flow = wind_and_flow(plant, {}, level, rotors, Inputs(), still[..., 0])
+        for name, value in in_order(plant.effects):
+            start = EFFECTS[name].start
+            if start is not None:
+                carried[name] = start(value, flow._replace(dt=plant.dt))
+    return carried
 
 
 def wanted_speed(plant: Plant, command: Command, rate_b: Array) -> Array:
@@ -183,8 +201,9 @@ def plant_step(
     winds, flow = wind_and_flow(plant, state.wind, motion, rotors, inputs, time_s)
     if uses_rotor_acc(plant):
         flow = flow._replace(rotor_acc=(rotors.end - before) / plant.dt)
-    wrench = with_push(plant, wrench_on(plant, rotors, flow), inputs.push_b)
-    return state._replace(wind=winds), wrench
+    wrench = with_push(plant, wrench_on(plant, rotors, flow, state.carried), inputs.push_b)
+    carried = _carried_on(plant, state.carried, motion, flow, wrench)
+    return state._replace(wind=winds, carried=carried), wrench
 
 
 def step(
@@ -327,15 +346,49 @@ def rotor_wrench(plant: Plant, rotors: RotorStep, thrust: Array) -> Wrench:
     return Wrench(force_b, torque_b)
 
 
-def wrench_on(plant: Plant, rotors: RotorStep, flow: Flow) -> Wrench:
-    """Return what the rotors and the effects do to the body."""
+def wrench_on(
+    plant: Plant, rotors: RotorStep, flow: Flow, carried: Mapping[str, Memory] | None = None
+) -> Wrench:
+    """Return what the rotors and the effects do to the body; `carried` is `PlantState.carried`.
+
+    Raises:
+        ValueError: where that lacks what an effect carries.
+    """
     thrust = still_thrust(plant, rotors)
     for name, value in in_order(plant.effects):
         change = EFFECTS[name].thrust
-        thrust = thrust if change is None else change(value, flow, thrust)
+        if change is not None:
+            thrust = change(value, _seen(plant, name, flow, carried), thrust)
     force_b, torque_b = rotor_wrench(plant, rotors, thrust)
     for name, value in in_order(plant.effects):
         push, twist = EFFECTS[name].force, EFFECTS[name].torque
-        force_b = force_b if push is None else force_b + push(value, flow)
-        torque_b = torque_b if twist is None else torque_b + twist(value, flow)
+        sees = _seen(plant, name, flow, carried)
+        force_b = force_b if push is None else force_b + push(value, sees)
+        torque_b = torque_b if twist is None else torque_b + twist(value, sees)
     return Wrench(force_b, torque_b)
+
+
+def _seen(plant: Plant, name: str, flow: Flow, carried: Mapping[str, Memory] | None) -> Flow:
+    """Return `flow` as the effect `name` sees it: with what it carries, where it does."""
+    if EFFECTS[name].start is None:
+        return flow
+    if not carried or name not in carried:
+        raise ValueError(
+            f"effects.{name} has a motion of its own, which is not followed here; leave it out of "
+            "the vehicle, or fly it with eval.quadrotor.stepper from hover_state on"
+        )
+    return flow._replace(memory=carried[name], dt=plant.dt)
+
+
+def _carried_on(
+    plant: Plant, carried: Mapping[str, Memory], motion: Motion, flow: Flow, wrench: Wrench
+) -> dict[str, Memory]:
+    """Return what effects with a motion of their own carry after a step under `wrench`."""
+    after = {}
+    if uses_memory(plant):
+        acc_w, _ = accelerations(plant, motion, wrench)
+        for name, value in in_order(plant.effects):
+            carry = EFFECTS[name].carry
+            if carry is not None:
+                after[name] = carry(value, _seen(plant, name, flow, carried), acc_w)
+    return after

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from eval.effects import EFFECTS
+from eval.effects import EFFECTS, nameable_effects
 from eval.worlds.other.rotorpy_vehicle import ROTORPY_EFFECTS
 from suite.blind.oracle.strength import vehicle_names
 from suite.blind.outside import KINDS
@@ -54,7 +54,7 @@ class Case:
 
 def full_count() -> int:
     """Return the number of cases of a full set."""
-    return len(EFFECTS) * len(MULTIPLES) + sum(FULL.values())
+    return len(nameable_effects()) * len(MULTIPLES) + sum(FULL.values())
 
 
 def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
@@ -119,7 +119,7 @@ def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case
     """
     share = _share_of(count, sum(CONTINUOUS_FULL.values()))
     rng = np.random.default_rng([seed, 2])
-    singles = rng.permutation(list(EFFECTS))
+    singles = rng.permutation(nameable_effects())
     others = rng.permutation([kind for kind in KINDS if kind != TOO_ROUGH])
     cases = []
     for kind, number in CONTINUOUS_FULL.items():
@@ -151,7 +151,7 @@ def _share_of(count: int | None, full: int) -> float:
 
 
 def _singles(rng: np.random.Generator, seed: int, share: float) -> list[Case]:
-    wanted = [(name, multiple) for multiple in MULTIPLES for name in EFFECTS]
+    wanted = [(name, multiple) for multiple in MULTIPLES for name in nameable_effects()]
     keep = max(round(share * len(wanted)), 1)
     chosen = sorted(rng.permutation(len(wanted))[:keep])
     found = []
@@ -169,7 +169,8 @@ def _drawn(rng: np.random.Generator, kind: str, index: int, number: tuple[int, i
         vehicle, sensors = _equipment(rng, ())
         return Case(kind, (name,), float(rng.choice([3.0, 6.0])), vehicle, sensors, number)
     if kind == "pair":
-        pool = [name for name, effect in EFFECTS.items() if not (effect.random or effect.slow)]
+        names = nameable_effects()
+        pool = [name for name in names if not (EFFECTS[name].random or EFFECTS[name].slow)]
         first, second = (pool[i] for i in rng.choice(len(pool), 2, replace=False))
         vehicle, sensors = _equipment(rng, (first, second))
         return Case(kind, (first, second), MULTIPLES[1], vehicle, sensors, number)

@@ -39,7 +39,10 @@ class Outside:
 
 
 class SlungLoad(Outside):
-    """A point mass of `strength` kg on an elastic line below the centre of mass."""
+    """A point mass of `strength` kg on an elastic line below the centre of mass.
+
+    An engine's own law: the catalogue's load is on a stiff line, and no diagnosis fits that.
+    """
 
     LENGTH_M, STIFFNESS, DAMPING = 0.4, 60.0, 0.3
 

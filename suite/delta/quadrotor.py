@@ -158,6 +158,7 @@ def replay_quadrotor(
         jnp.where(jnp.isfinite(speed), speed, hover.rotor_speed),
         jnp.swapaxes(jnp.asarray(windows.past), 1, 2),
         hover.wind,
+        carried=hover.carried,
     )
     zero = jnp.zeros((count, 3))
     body = QuadrotorState(

@@ -145,6 +145,7 @@ def resolve(
     """
     from eval.quadrotor.vehicle_file import load_vehicle
     from policies.formats.policy_file import load_policy_checkpoint
+    from suite.diagnose.fit.parameters import check_by_state
     from suite.judging.content import policy_digest
     from suite.judging.flying import checkpoint_folder, default_policy
 
@@ -166,6 +167,7 @@ def resolve(
                 f"--iterations is {iterations}, but with --world nothing is trained from "
                 "scratch; say how long to fine-tune with --finetune-iterations"
             )
+        check_by_state(simulated)
         simulator, world = parse_world(world, vehicle)
         true = load_vehicle(world)
         if simulated == true and simulator in OWN:

@@ -234,7 +234,7 @@ def alternatives(
         whole = log_ratio(info.block(name), truth[name])
         found[name] = {}
         for other, effect in EFFECTS.items():
-            silent = "acc_b" in effect.needs and not has_acc
+            silent = "acc_b" in effect.needs and not has_acc or not effect.nameable
             if other in truth or effect.random or silent:
                 continue
             # All four rotors together imitate a thrust scale; a weak motor is one of them.
@@ -255,7 +255,7 @@ def _changed(nominal: Vehicle, columns: Sequence[Column], steps: np.ndarray) -> 
     """Return every effect's values with leading axes (P, 1), each changed in its own columns."""
     changed = {}
     for name, values in all_values(nominal).items():
-        if EFFECTS[name].random:
+        if not EFFECTS[name].by_state:
             continue
         fields = {}
         for key, value in values._asdict().items():

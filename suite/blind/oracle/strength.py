@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.effects import EFFECTS
+from eval.effects import EFFECTS, nameable_effects
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.oracle.information import (
@@ -63,7 +63,7 @@ def make_table(progress: Callable[[float, str], None] | None = None) -> dict[str
     for name in vehicle_names():
         entries[name] = {}
         for sensors in SENSORS:
-            entries[name][sensors] = strengths(name, sensors, list(EFFECTS))
+            entries[name][sensors] = strengths(name, sensors, nameable_effects())
             if progress is not None:
                 done = len(entries[name]) + (len(entries) - 1) * len(SENSORS)
                 progress(done, f"{name}, {sensors}")
@@ -141,7 +141,7 @@ def table_text() -> str:
         "| effect | component | unit | " + " | ".join(f"{v}, {s}" for v, s in vehicles) + " |",
         "|---|---|---|" + "---|" * len(vehicles),
     ]
-    for name in EFFECTS:
+    for name in nameable_effects():
         found: dict[Column, dict[tuple[str, str], float]] = {}
         for where in vehicles:
             columns = columns_in_table(*where, name)

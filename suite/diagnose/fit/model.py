@@ -86,7 +86,7 @@ class RolloutModel:
         """Numbers F that are free in each window: its start, and the rotor speeds' errors."""
         self.starts = list(range(self.size, self.size + self.free))
         """Places of the free numbers among all directions."""
-        base = {name: v for name, v in space.base.items() if not EFFECTS[name].random}
+        base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}
         self.given = VehicleArrays(*nominal_quadrotor(vehicle), base, loop_of(vehicle))
         self.dt = step_s(vehicle)
         """About the length of a step [s]."""

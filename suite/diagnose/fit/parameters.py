@@ -102,11 +102,31 @@ def effects_at(layout: ParameterLayout, base: Mapping[str, Any], theta: Array) -
     return {name: type(base[name])(**fields) for name, fields in values.items()}
 
 
+def check_by_state(vehicle: Vehicle) -> None:
+    """Refuse a vehicle that no stretch of a flight can begin with.
+
+    Raises:
+        ValueError: for an effect with a motion of its own, and what to do about it.
+    """
+    for name in vehicle.effects:
+        if EFFECTS[name].start is not None:
+            raise ValueError(
+                f"{vehicle.name}: effects.{name} has a motion of its own, and no log says how it "
+                "moves where a stretch of a flight begins; take it out of the vehicle file here "
+                "and put it back to fly"
+            )
+
+
 def make_space(vehicle: Vehicle) -> ParameterSpace:
-    """Return the vector of `vehicle`: all but what acts by chance or no flight can tell."""
+    """Return the vector of `vehicle`: all but what acts by chance or no flight can tell.
+
+    Raises:
+        ValueError: for a vehicle whose file has an effect with a motion of its own.
+    """
+    check_by_state(vehicle)
     base, entries = all_values(vehicle), []
     for name, effect in EFFECTS.items():
-        if effect.random:
+        if not effect.by_state:
             continue
         for parameter in effect.parameters:
             if not parameter.fitted:

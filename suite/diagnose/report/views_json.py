@@ -62,7 +62,7 @@ def headline(found: ViewsDiagnosis) -> str:
             return f"Nothing that the flights agree on {what}."
         swings = f"It {found.swing.words}. " if found.swing else ""
         return (
-            f"{swings}No effect of the catalogue explains it; a black box closes "
+            f"{swings}No effect that flights can tell explains it; a black box closes "
             f"{100 * could:.0f} % of the variance of the {view.name}."
         )
     names = " and ".join(

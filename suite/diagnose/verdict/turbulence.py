@@ -78,7 +78,7 @@ def find_turbulence(
 def _passed_on(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarray:
     """Return (W, 6 KNOTS, 3 KNOTS): the push per m/s of wind in the world at each knot."""
     given = model.given
-    values = {n: v for n, v in model.space.effects(theta).items() if not EFFECTS[n].random}
+    values = {n: v for n, v in model.space.effects(theta).items() if EFFECTS[n].by_state}
     steady_wind = constant_wind.EFFECT.name
     plain = np.asarray(values[steady_wind].velocity)
     motion = Motion(*(np.asarray(field) for field in knot.track))

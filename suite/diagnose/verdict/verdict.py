@@ -58,7 +58,7 @@ def verdict_on(
 
 
 def with_swing(verdict: Verdict, words: str, named: bool) -> Verdict:
-    """Return `verdict` where a force swings, which nothing in the catalogue does.
+    """Return `verdict` where a force swings, which nothing that is fitted does.
 
     `words` say how; `named` whether something was named besides.
     """

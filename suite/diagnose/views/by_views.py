@@ -261,7 +261,7 @@ def _relative(result: ViewResult, name: ViewName) -> float:
 def _verdict(results: Sequence[ViewResult], swing: Swing | None, limits: Thresholds) -> str:
     """Return what is said of the gap: what is named is judged by the views that name something.
 
-    Nothing in the catalogue swings.
+    Nothing that is fitted swings.
     """
     named = [one for one in results if one.names]
     if swing:

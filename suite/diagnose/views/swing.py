@@ -53,11 +53,12 @@ class Swing(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return what is said of it."""
+        """Return what is said of it, and what a vehicle file needs to fly with it."""
         low, high = self.ci95
         return (
             f"swings with {self.period_s:.2f} s period (95 % {low:.2f} to {high:.2f}), "
-            f"as a load on a line of {self.length_m:.2g} m would"
+            f"as a load on a line of {self.length_m:.2g} m would (to fly it, weigh the load and "
+            f"write mass and length = {self.length_m:.2g} into [effects.slung_load])"
         )
 
 

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS, all_values, find_effect
-from eval.effects.interface import neutral
+from eval.effects.interface import Effect, Parameter, along_z, neutral
 from eval.effects.log_faults import apply_log_faults
+from eval.effects.slung_load import SlungLoad
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from tests.support.flights import small_log
@@ -116,3 +118,50 @@ def test_effects_import_neither_mujoco_nor_jax():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert output.stdout.strip() == "[]"
+
+
+class Flywheel(NamedTuple):
+    """Values of an effect of another package."""
+
+    push: Any
+
+
+WHEEL = Effect(
+    name="flywheel",
+    summary="A push that grows with the way that the vehicle was accelerated up",
+    equation="tau_b += push s e3, ds/dt = dv_z/dt",
+    source="test",
+    values=Flywheel,
+    parameters=(Parameter("push", "N m s/m", 0.0, 0.0, 1.0, (0.1, 0.2)),),
+    start=lambda values, flow: {"speed": flow.pos_w[..., 2]},
+    torque=lambda values, flow: along_z(values.push * flow.memory["speed"]),
+    carry=lambda values, flow, acc_w: {"speed": flow.memory["speed"] + flow.dt * acc_w[..., 2]},
+)
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_an_effect_of_another_package_may_have_a_motion_of_its_own(monkeypatch, xp):
+    monkeypatch.setitem(EFFECTS._entries, WHEEL.name, WHEEL)
+    monkeypatch.setitem(EFFECTS._values, WHEEL.name, WHEEL)
+    plant = make_plant(PLAIN, 0.002, {"flywheel": Flywheel(0.5), "slung_load": SlungLoad(0.1, 0.5)})
+    state, motion = (
+        hover_state(plant, (2,), xp),
+        Motion(*(xp.stack([xp.asarray(f)] * 2) for f in MOVING)),
+    )
+    inputs = Inputs(rotor_speed=xp.full((2, 4), 1000.0))
+    for _ in range(2):
+        state, _ = plant_step(plant, state, motion, inputs, 0.0)
+    state, wrench = plant_step(plant, state, motion, inputs, 0.0)
+    # Four rotors push 6.4 N; a load of 0.981 N hangs on 0.75 kg. Two steps went before.
+    gained = 0.004 * ((6.4 - 0.981) / 0.75 - 9.81)
+    np.testing.assert_allclose(wrench.torque_b, [[0.0, 0.0, 0.5 * gained]] * 2, rtol=0.05)
+    assert set(state.carried) == {"flywheel", "slung_load"}
+    assert not WHEEL.nameable and not WHEEL.by_state, "no stretch of a flight can begin with it"
+    with pytest.raises(ValueError, match="effects.* motion of its own.*leave it out"):
+        plant_step(plant, state._replace(carried={}), motion, inputs, 0.0)
+
+
+def test_a_memory_needs_both_of_its_hooks():
+    half = replace(WHEEL, carry=None)
+    with pytest.raises(ValueError, match="only one of `start` and `carry`"):
+        EFFECTS.register("flywheel", half)

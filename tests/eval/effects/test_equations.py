@@ -280,6 +280,15 @@ def test_thrust_tilt():
     near(torque, 0.0)
 
 
+def test_slung_load():
+    # Of a vehicle in hover it hangs straight down, and pulls by its weight.
+    near(added(slung_load=(0.05, 0.5))[0], [0.0, 0.0, -0.05 * 9.81])
+    near(added(slung_load=(0.05, 0.5))[1], 0.0)
+    # In a body on its side, "down" is another axis.
+    side = MOVING._replace(rot_w=np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+    near(added(side, slung_load=(0.05, 0.5))[0], [0.0, -0.05 * 9.81, 0.0])
+
+
 def test_frame_tilt():
     plant = make_plant(with_effects(frame_tilt=((0.01, 0.02),)), 0.002)
     gravity = plant.constants.gravity_w

@@ -133,6 +133,7 @@ TRIMMED = {
     "constant_wind": ((1.0, -2.0, 0.3),),
     "ground_effect": (1.0, 0.0635),
     "gusts": (0.8, 4.0),
+    "slung_load": (0.05, 0.5),
 }
 
 

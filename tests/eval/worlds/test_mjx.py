@@ -1,10 +1,12 @@
 """The world mjx against the world mujoco."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from eval.effects.slung_load import SlungLoad
 from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
@@ -16,7 +18,7 @@ POSITION_TOLERANCE_M = 2e-4
 1e-7 of each step, the images' edges do not enter as the pilot here does not look."""
 
 
-def both(trials, rules=None, record=None):
+def both(trials, rules=None, record=None, vehicle=VEHICLE):
     options = JudgeOptions(slots=12, workers=1, rules=rules or Rules())
     found = []
     for world in ("mujoco", "mjx"):
@@ -24,7 +26,7 @@ def both(trials, rules=None, record=None):
         results = fly(
             Pursuit(),
             trials,
-            VEHICLE,
+            vehicle,
             world,
             options,
             lambda *ended, flights=flights: flights.append(ended),
@@ -61,6 +63,19 @@ def test_ends_agree_on_a_few(few):
     assert [r.ended_by for r in ours] == [r.ended_by for r in theirs]
     assert [r.collided_with for r in ours] == [r.collided_with for r in theirs]
     assert [r.gates_passed for r in ours] == [r.gates_passed for r in theirs]
+
+
+@pytest.mark.slow
+def test_a_load_on_a_line_swings_alike():
+    effects = {**VEHICLE.effects, "slung_load": SlungLoad(0.05, 0.5)}
+    trials = [TrialSpec("zigzag", 9, seed) for seed in range(2)]
+    loaded = replace(VEHICLE, effects=effects)
+    (_, ours), (_, theirs) = both(trials, Rules(time_limit_s=1.2), Record(), loaded)
+    for trial in ours:
+        rows = min(len(ours[trial].time_s), len(theirs[trial].time_s)) - 1
+        assert rows > 60
+        gap = np.abs(ours[trial].pos_w[:rows] - theirs[trial].pos_w[:rows]).max()
+        assert gap < POSITION_TOLERANCE_M
 
 
 @pytest.mark.slow

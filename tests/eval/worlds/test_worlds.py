@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eval.effects.slung_load import SlungLoad
 from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds import WORLDS as TABLE
@@ -62,6 +63,25 @@ def test_collision_with_the_ground(world):
     t = np.linspace(0, 3, 30001)
     fallen = 2 / 0.72 * (t - (1 - np.exp(-0.72 * t)) / 0.72)
     assert result.time_s == pytest.approx(t[np.searchsorted(fallen, 1.475)] + 0.06, rel=0.03)
+
+
+def test_a_load_on_a_line_is_the_trials_own():
+    """It begins hanging in each slot's trial, whatever flew there before and flies beside it."""
+    loaded = replace(VEHICLE, effects={**VEHICLE.effects, "slung_load": SlungLoad(0.1, 0.5)})
+    track, rules = straight(height=3.0), Rules(time_limit_s=1.5)
+    trials = [TrialSpec(track.family, 0, seed) for seed in range(3)]
+
+    def flown(vehicle, world, slots):
+        options = JudgeOptions(slots=slots, workers=1, rules=rules)
+        tracks = {track.family: track}
+        found = fly(Pursuit(2.5), trials, vehicle, world, options, tracks=tracks)
+        return [(r.pos_x, r.pos_y, r.pos_z, r.v_max, r.gates_passed) for r in found]
+
+    ours = flown(loaded, "mujoco", 2)
+    assert ours == flown(loaded, "mujoco", 1) == flown(loaded, "reference", 1)
+    assert ours[0] == ours[1] == ours[2], "the same flight in a slot that is used again"
+    without = flown(VEHICLE, "mujoco", 1)
+    assert ours[0][2] < without[0][2] - 0.1, "nothing makes up for its weight"
 
 
 @pytest.mark.parametrize("world", WORLDS)

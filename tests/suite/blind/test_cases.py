@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from eval.effects import EFFECTS
+from eval.effects import EFFECTS, nameable_effects
 from suite.blind.cases import (
     DRAWERS,
     MULTIPLES,
@@ -19,7 +19,7 @@ def test_a_full_set_has_the_numbers_that_were_promised():
     cases = draw_cases(SETS["published"])
     kinds = Counter(case.kind for case in cases.values())
     assert kinds == {
-        "single": 2 * len(EFFECTS),
+        "single": 2 * len(nameable_effects()),
         "null": 100,
         "outside": 40,
         "pair": 20,
@@ -27,7 +27,7 @@ def test_a_full_set_has_the_numbers_that_were_promised():
         "separated": 15,
     }
     singles = {(c.hidden[0], c.multiple) for c in cases.values() if c.kind == "single"}
-    assert singles == {(name, m) for name in EFFECTS for m in (2.0, 6.0)}
+    assert singles == {(name, m) for name in nameable_effects() for m in (2.0, 6.0)}
     outside = {case.hidden[0] for case in cases.values() if case.kind == "outside"}
     assert len(outside) >= 6
     blurred = sorted((c.seed, c.hidden) for c in cases.values() if c.kind == "blurred")
@@ -59,6 +59,17 @@ def test_the_continuous_set_has_its_numbers_and_each_single_effect_once():
     assert few == {"null": 2, "single": 2, "pair": 1, "outside": 1}
     with pytest.raises(ValueError, match="count"):
         draw_continuous_cases(1, 0)
+
+
+@pytest.mark.parametrize("simulator", DRAWERS)
+def test_an_effect_that_no_flight_can_tell_is_never_drawn(simulator, monkeypatch):
+    """Sets that are published stay what they are, whatever such effects the catalogue gains."""
+    draw = DRAWERS[simulator]
+    cases = draw(SETS["published"], None)
+    assert "slung_load" in EFFECTS and "slung_load" not in nameable_effects()
+    assert not any("slung_load" in c.hidden for c in cases.values() if c.kind != "outside")
+    monkeypatch.delitem(EFFECTS._entries, "slung_load")
+    assert "slung_load" not in EFFECTS and draw(SETS["published"], None) == cases
 
 
 def test_no_two_simulators_and_no_two_sets_share_a_seed():

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS
+from eval.effects import EFFECTS, nameable_effects
 from suite.blind.hidden import changed_values, draw_change
 from suite.blind.oracle.strength import columns_in_table, detectable_along, given_vehicle
 
 
 def test_a_strength_is_the_multiple_of_the_table_or_cut_at_a_bound():
     nominal = given_vehicle("bare")
-    for name in EFFECTS:
+    for name in nameable_effects():
         vehicle = nominal if name not in ("constant_wind", "gusts") else given_vehicle("dragged")
         rng = np.random.default_rng(3)
         change, multiple = draw_change(rng, vehicle, "full", name, 2.0)

@@ -146,3 +146,15 @@ def test_logs_without_actions_are_refused(logs):
     bare = replace(logs[0], extra={})
     with pytest.raises(ValueError, match="action_x.*suite collect"):
         cut_quadrotor_windows([bare], QuadrotorConfig(load_vehicle("reference")), 1.0, 0.2)
+
+
+def test_a_load_on_a_line_hangs_still_where_a_window_starts_and_then_swings(logs):
+    loaded = with_effects(
+        TRUE, **{k: tuple(v) for k, v in TRUE.effects.items()}, slung_load=(0.1, 0.5)
+    )
+    config = QuadrotorConfig(loaded)
+    windows, cut = cut_quadrotor_windows(logs[:1], config, 0.5, 0.5)
+    pos_w, _, _ = replay_quadrotor(config, cut, windows, None)
+    sunk = np.asarray(pos_w)[:, -1, 2] - windows.pos_w[:, -1, 2]
+    # 0.1 kg under 0.75 kg that nobody lifts more for: g m / (M + m) t^2 / 2.
+    np.testing.assert_allclose(sunk, -0.5 * 9.81 * 0.1 / 0.85 * 0.5**2, rtol=0.3)

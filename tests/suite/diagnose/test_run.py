@@ -111,3 +111,11 @@ def test_the_recording_opens_with_the_command_that_people_have(diagnosed):
     line = [sys.executable, "-m", "rerun", "rrd", "verify", str(diagnosed / "recording.rrd")]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_file_with_a_load_on_a_line_is_refused_in_one_line(tmp_path, capsys):
+    save_vehicle(with_effects(slung_load=(0.05, 0.5)), tmp_path / "loaded.toml")
+    line = [str(tmp_path), "--vehicle", str(tmp_path / "loaded.toml"), "--out", str(tmp_path / "o")]
+    assert main(["diagnose", *line]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "effects.slung_load" in said and "take it out" in said and "\n" not in said

@@ -2,11 +2,13 @@
 
 import pytest
 
+from eval.quadrotor.vehicle_file import save_vehicle
 from eval.worlds.other import rotorpy as rotorpy_world
 from suite import cli
 from suite.loop.config import DeltaLoopConfig, HiddenLoopConfig, parse_world, resolve
 from suite.train.presets import finetune, preset
 from tests.support.engines import STAND_IN
+from tests.support.vehicles import with_effects
 
 EXAMPLE = "examples/hidden.toml"
 
@@ -61,6 +63,16 @@ def test_what_cannot_be_hidden_is_said_before_anything_is_written(
     said = capsys.readouterr().err
     assert words in said and len(said.strip().splitlines()) == 1
     assert not out.exists()
+
+
+def test_a_load_on_a_line_may_be_hidden_but_not_known(tmp_path, monkeypatch, root):
+    """No stretch of a flight tells the diagnosis how it swings."""
+    monkeypatch.chdir(root)
+    loaded = str(tmp_path / "loaded.toml")
+    save_vehicle(with_effects(slung_load=(0.05, 0.5)), loaded)
+    assert resolve(recipe="small", vehicle="reference", world=loaded).true_vehicle == loaded
+    with pytest.raises(ValueError, match="effects.slung_load has a motion of its own"):
+        resolve(recipe="small", vehicle=loaded, world="reference")
 
 
 def test_fine_tuning_is_shorter_and_gentler():

@@ -42,7 +42,7 @@ class ForceModel:
     def __init__(self, vehicle: Vehicle, space: ParameterSpace, voltage: bool) -> None:
         """Prepare `vehicle` with the numbers of `space`; `voltage`: whether the rows have one."""
         self.space = space
-        base = {name: v for name, v in space.base.items() if not EFFECTS[name].random}
+        base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}
         self._given = VehicleArrays(*nominal_quadrotor(vehicle), base)
         self._compiled = _forces(space.layout, voltage)
 

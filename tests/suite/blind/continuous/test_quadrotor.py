@@ -1,9 +1,11 @@
 """True constants, worked by hand from the catalogue's table."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS
+from eval.effects import EFFECTS, nameable_effects
 from suite.blind.continuous.quadrotor import leaning_z, quadrotor_of
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects
 
@@ -62,9 +64,11 @@ def test_a_tilt_rolls_first_and_then_pitches():
 
 
 def test_every_effect_of_the_catalogue_has_an_equation_and_another_is_refused():
-    vehicle = drawn_effects(np.random.default_rng(0))
-    assert set(vehicle.effects) == set(EFFECTS)
-    quadrotor_of(vehicle)
+    drawn = drawn_effects(np.random.default_rng(0)).effects
+    assert set(drawn) == set(EFFECTS)
+    quadrotor_of(replace(PLAIN, effects={name: drawn[name] for name in nameable_effects()}))
+    with pytest.raises(ValueError, match="effects.slung_load: .* no equation for it"):
+        quadrotor_of(with_effects(slung_load=(0.05, 0.5)))
     odd = with_effects()
     object.__setattr__(odd, "effects", {"ripple": None})
     with pytest.raises(ValueError, match="effects.ripple: .* no equation for it; allowed: .*gusts"):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS
+from eval.effects import nameable_effects
 from suite.blind.oracle.information import Column, columns_of, detectable, information, left_over
 from suite.blind.oracle.stretches import cut
 from suite.diagnose.plans.sensors import SENSORS
@@ -38,7 +38,7 @@ def test_lookalikes_look_alike_and_strangers_do_not(flights):
 
 def test_every_effect_has_columns_but_what_cannot_be_told():
     names = {column.effect for column in columns_of(False)}
-    assert names == set(EFFECTS) - {"gusts"}
+    assert names == set(nameable_effects()) - {"gusts"}
     assert Column("com_offset", "offset", 2) not in columns_of(False)
     sag = [c.parameter for c in columns_of(True) if c.effect == "battery_sag"]
     assert sag == ["per_volt"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS
+from eval.effects import nameable_effects
 from suite.blind.oracle import strength
 from suite.blind.oracle.strength import columns_in_table, detectable_along, strengths
 from tests.support.faults import with_imu_fault
@@ -25,7 +25,7 @@ def test_the_committed_table_is_what_is_worked_out():
         for key in ("matrix", "detectable"):
             if key in entry:
                 np.testing.assert_allclose(entry[key], stored[name][key], rtol=1e-6)
-    assert list(stored) and set(stored) == set(EFFECTS)
+    assert list(stored) and set(stored) == set(nameable_effects())
 
 
 def test_an_effect_that_is_not_in_the_table_is_worked_out(monkeypatch):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS
+from eval.effects import nameable_effects
 from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.windows import cut
 from suite.diagnose.fit.look import trusted
@@ -45,9 +45,19 @@ def test_a_vector_of_numbers_is_the_vehicles_effects_and_back():
     theta[place["linear_drag", "coefficient", 1]] = 0.4
     drag = effects_at(SPACE.layout, SPACE.base, theta)["linear_drag"].coefficient
     np.testing.assert_allclose(drag, [0.0, 0.4, 0.0])
-    assert len({candidate.label for candidate in candidates(SPACE, True, NEEDED)}) >= len(EFFECTS)
+    assert len({candidate.label for candidate in candidates(SPACE, True, NEEDED)}) >= len(
+        nameable_effects()
+    )
     wind = next(c for c in candidates(SPACE, True, NEEDED) if c.name == "constant_wind")
     assert indices_of([wind, wind]) == sorted(wind.indices)
+
+
+def test_a_vehicle_that_no_stretch_can_begin_with_is_refused():
+    assert not any(entry.effect == "slung_load" for entry in SPACE.entries)
+    with pytest.raises(
+        ValueError, match=r"effects\.slung_load has a motion of its own.*take it out"
+    ):
+        make_space(with_effects(slung_load=(0.05, 0.5)))
 
 
 def test_slopes_are_those_of_small_changes(flown):

@@ -66,6 +66,7 @@ def test_a_load_on_a_line_is_said_to_swing_with_its_period():
     # A pendulum on a free body of 0.75 kg swings faster than on a wall, by sqrt(1 + 0.08 / 0.75).
     assert found.swing.period_s == pytest.approx(1.42 / np.sqrt(1.0 + 0.08 / 0.75), rel=0.08)
     told = views_json(found)
+    assert f"length = {found.swing.length_m:.2g} into [effects.slung_load]" in told["headline"]
     assert (
         told["unexplained"]["where"].startswith("swings with 1.") and "swings" in told["headline"]
     )
