@@ -31,8 +31,10 @@ def confirmed(
 ) -> tuple[SearchResult, Gap, dict[str, Gap], list[str]]:
     """Return `found` without the names that do not lower the gap on held-out flights.
 
-    A name stays where these flights could not show it, as those that keep off the ground cannot
-    show its effect. `gaps` are those before and after it was found.
+    Where the model stays off the noise floor, what it lacks lends a part of itself to any number:
+    a name has to lower the gap by a share of what is left then. A name stays where these flights
+    could not show it, as those that keep off the ground cannot show its effect. `gaps` are those
+    before and after it was found.
 
     Returns:
         What stays, its gap, the gaps without each of its names, and the labels of what went.
@@ -40,10 +42,13 @@ def confirmed(
     (before, after), gone = gaps, list[str]()
     while found.named:
         without = _without_each(model, found, held, limits)
+        # Of the mean score, 1 is noise and all else what no name explains.
+        rest = max(0.0, 1.0 - 1.0 / after.score.mean()) if found.off else 0.0
         doubted = [
             one
             for one in found.candidates
-            if without[one.label].energy.sum() <= after.energy.sum()
+            if without[one.label].energy.sum()
+            <= (1.0 + limits.least_beside_rest * rest) * after.energy.sum()
             and _shown(model, found, one, held, limits)
         ]
         if not doubted:

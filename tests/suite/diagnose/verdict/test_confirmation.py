@@ -35,6 +35,20 @@ def test_a_name_that_held_out_flights_do_not_want_is_withdrawn(drag):
     np.testing.assert_allclose(kept.estimate.theta[kept.indices], theta[kept.indices], rtol=0.05)
 
 
+def test_where_the_model_lacks_something_a_name_must_take_away_a_share_of_the_rest(drag):
+    found, held, limits = drag.search, drag.held_windows, drag.limits
+    # As if the rest were so large that the gap without the drag is a fifth larger only.
+    raised = drag.without["linear_drag"].energy.sum() / 1.2 / drag.after.energy.sum()
+    after = drag.after._replace(score=raised * drag.after.score, energy=raised * drag.after.energy)
+    off = replace(found, judging=found.judging._replace())
+    assert off.off and not found.off
+    gone = {
+        one.off: confirmed(drag.model, one, held, (drag.before, after), limits)[3]
+        for one in (found, off)
+    }
+    assert gone == {False: [], True: ["linear_drag"]}
+
+
 def test_one_that_they_could_not_show_stays(drag):
     _, (kept, _, _, gone) = judged(drag, spoilt(drag, 1e-4))
     assert gone == [] and "torque_trim" in [one.label for one in kept.candidates]
