@@ -50,7 +50,7 @@ tests: $(STAMP)
 
 # The types are checked on one core, beside the tests.
 test: style
-	@$(MAKE) --jobs 2 types tests
+	@$(MAKE) --no-print-directory --jobs 2 types tests
 
 docs: $(STAMP)
 	$(PY) -m mkdocs build --quiet --clean --strict

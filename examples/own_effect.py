@@ -7,13 +7,13 @@ To have it in every command, put the file into a package with an entry point of 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 from eval.effects import EFFECTS
 from eval.effects.interface import Array, Effect, Flow, Parameter
 from eval.judging.judge import JudgeOptions, fly
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import with_effects
 from eval.worlds.trial import TrialSpec
 from policies.policy import load_policy
 from tracks.geometry.rotation import to_local
@@ -49,11 +49,10 @@ def main() -> None:
     EFFECTS.register(TETHER.name, TETHER)
     vehicle, policy = load_vehicle("reference"), load_policy("swift")
     for stiffness in (0.0, 0.4):
-        effects = {**vehicle.effects, TETHER.name: Tether(stiffness)}
         (result,) = fly(
             policy,
             [TrialSpec("zigzag", difficulty=0, seed=1)],
-            replace(vehicle, effects=effects),
+            with_effects(vehicle, {TETHER.name: Tether(stiffness)}),
             options=JudgeOptions(workers=1),
         )
         print(f"{stiffness:.1f} N/m: {result.gates_passed} gates, {result.ending}")

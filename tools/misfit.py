@@ -127,17 +127,16 @@ def flyable(seed: list[int]) -> Iterator[tuple[list[bool], list[str], str]]:
 
 def main(count: int, seed: int) -> int:
     """Try `count` cases, one a core, and return the exit code."""
-    held, false, flown = list[bool](), 0, 0
+    found = dict[int, tuple[list[bool], list[str], str]]()
 
-    def keep(number: int, found: tuple[list[bool], list[str], str]) -> None:
-        nonlocal false, flown
-        inside, wrong, line = found
-        held.extend(inside)
-        flown, false = flown + 1, false + bool(wrong)
-        print(f"{number}: {line}", flush=True)
+    def keep(number: int, one: tuple[list[bool], list[str], str]) -> None:
+        found[number] = one
+        print(f"{number}: {one[-1]}", flush=True)
 
     cases = [[seed, number] for number in range(count)]
     work_off(flyable, cases, usable_cores(), keep, pinned=True)
+    held = [hold for inside, _, _ in found.values() for hold in inside]
+    flown, false = len(found), sum(bool(wrong) for _, wrong, _ in found.values())
     print(f"intervals of a named drag that hold it: {sum(held)} of {len(held)}", end=" ")
     print(f"({wilson(sum(held), max(len(held), 1))})" if held else "")
     print(f"cases with a false name: {false} of {flown} ({wilson(false, max(flown, 1))})")

@@ -21,7 +21,7 @@ from eval.judging.recorder import Recorder
 from eval.judging.sensors import SensorNoise, Sensors, check_noise
 from eval.logs.flight import Flight
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import REFERENCE, World, world_class
+from eval.worlds import REFERENCE, World, compiles, world_class
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import (
     DIVERGED,
@@ -139,8 +139,7 @@ def fly(
             on_result(result, flight)
 
     workers = _workers(task, len(trials))
-    # Every piece compiles an MJX world anew.
-    most = len(trials) if world == "mjx" else MOST_A_PIECE
+    most = len(trials) if compiles(world) else MOST_A_PIECE
     shares = pieces_of(list(enumerate(trials)), crew(workers), most)
     work_off(partial(fly_share, task), shares, workers, keep)
     return [results[index] for index in range(len(trials))]
@@ -172,7 +171,7 @@ def _workers(task: Task, trials: int) -> Workers:
     if asked is not None:
         return asked
     # A process takes seconds to start, and a policy object may not be of the kind that travels.
-    if task.world == "mjx" or _is_policy(task.policy) or trials < 4 * task.options.slots:
+    if compiles(task.world) or _is_policy(task.policy) or trials < 4 * task.options.slots:
         return 1
     return usable_cores()
 
@@ -189,8 +188,8 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
             )  # fmt: skip
             yield index, result, None
         return
-    # MJX compiles anew for another number; elsewhere a slot that stays empty only costs time.
-    slots = options.slots if task.world == "mjx" else min(options.slots, max(1, len(share)))
+    # A slot that stays empty only costs time.
+    slots = options.slots if compiles(task.world) else min(options.slots, max(1, len(share)))
     world = world_class(task.world)(
         task.vehicle, policy.spec.camera, layout_of(task.tracks.values()), options.rules,
         slots=slots, threads=options.threads,

@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
 from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant
 from eval.quadrotor.stepper import Inputs, PlantState, hover_state, plant_step
 from eval.vehicles.vehicle import Controller, Vehicle
+from tracks.common.masks import nowhere
 from tracks.common.tree_rows import packed, select
 from tracks.geometry.scene import Array
 
@@ -109,7 +108,7 @@ def attitude_step(
     The arguments are those of `autopilot_step`; the plant is left as it is.
     """
     due = step % autopilot.attitude_every == 0
-    if isinstance(due, np.ndarray) and not due.any():
+    if nowhere(due):
         return state  # most steps hold the command
     period = autopilot.attitude_every * autopilot.dt
     heading_w = blend_heading(state.heading_w, gate_w - motion.pos_w, period)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from tracks.common.masks import nowhere
 from tracks.geometry.rotation import cross
 from tracks.geometry.scene import Array
 
@@ -55,7 +56,7 @@ def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> A
     yaw = torque_b[..., 2, None] * per_yaw
     exact = force_z[..., None] * per_force + level + yaw
     outside = xp.any((exact < 0.0) | (exact > thrust_max), axis=-1, keepdims=True)
-    if isinstance(outside, np.ndarray) and not outside.any():
+    if nowhere(outside):
         return exact
 
     spread = xp.max(level, axis=-1, keepdims=True) - xp.min(level, axis=-1, keepdims=True)

@@ -69,7 +69,9 @@ class World(Protocol):
     Static methods that it may have: `check()` raises a ValueError with what to do where a package
     is missing; `differences(vehicle)` returns a sentence for everything that it flies otherwise
     than the file says; `nearest(vehicle)` the vehicle whose file says best what it flies. `cost` is
-    what a trial costs over one in MuJoCo, for estimates; 1 without it.
+    what a trial costs over one in MuJoCo, for estimates; 1 without it. `compiles` is true where
+    every number of slots is a program of its own: such a world is given all trials at once, in one
+    process and in as many slots as are asked for.
     """
 
     name: str
@@ -113,6 +115,11 @@ def world_class(name: str) -> Any:
     if hasattr(world, "check"):
         world.check()
     return world
+
+
+def compiles(name: str) -> bool:
+    """Return whether the world `name` compiles a program for its number of slots."""
+    return getattr(WORLDS.find(name), "compiles", False)
 
 
 def differences(name: str, vehicle: Vehicle) -> list[str]:

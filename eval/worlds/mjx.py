@@ -71,6 +71,7 @@ class MjxWorld:
 
     name = "mjx"
     integrator = "euler"
+    compiles = True
 
     def __init__(
         self,

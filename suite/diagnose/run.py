@@ -14,7 +14,7 @@ from suite.common.console import Console
 from suite.common.report import write_report
 from suite.delta.run import flight_files
 from suite.diagnose.diagnose import BeyondRollouts, diagnose
-from suite.diagnose.fit.parameters import check_by_state
+from suite.diagnose.fit.parameters import refuse_own_motion
 from suite.diagnose.plans.plan import fly_plan, write_plan_of
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
@@ -65,7 +65,7 @@ def diagnose_files(
         ValueError: for flights or a vehicle file that cannot be used.
     """
     vehicle = load_vehicle(vehicle_name)
-    check_by_state(vehicle)
+    refuse_own_motion(vehicle)
     truth = None if fly is None else load_vehicle(fly)
     logs, warnings = read_flights(flight_files(paths), partial=True)
     before, told = read_flights(flight_files(reference), partial=True) if reference else ([], [])

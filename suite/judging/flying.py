@@ -166,8 +166,10 @@ def workers_for(trials: int, asked: Workers | None, world: str) -> Workers:
     """Return who flies `trials` where `asked` workers were given; None takes what is worth it."""
     if asked is not None:
         return asked
+    from eval.worlds import compiles
+
     worth = max(1, trials // TRIALS_A_PROCESS)
-    return 1 if world == "mjx" else min(usable_cores(), worth)
+    return 1 if compiles(world) else min(usable_cores(), worth)
 
 
 def who_flies(

@@ -145,7 +145,7 @@ def resolve(
     """
     from eval.quadrotor.vehicle_file import load_vehicle
     from policies.formats.policy_file import load_policy_checkpoint
-    from suite.diagnose.fit.parameters import check_by_state
+    from suite.diagnose.fit.parameters import refuse_own_motion
     from suite.judging.content import policy_digest
     from suite.judging.flying import checkpoint_folder, default_policy
 
@@ -167,7 +167,7 @@ def resolve(
                 f"--iterations is {iterations}, but with --world nothing is trained from "
                 "scratch; say how long to fine-tune with --finetune-iterations"
             )
-        check_by_state(simulated)
+        refuse_own_motion(simulated)
         simulator, world = parse_world(world, vehicle)
         true = load_vehicle(world)
         if simulated == true and simulator in OWN:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tracks.common.masks import everywhere
 from tracks.geometry.scene import Array
 
 
@@ -14,7 +15,7 @@ def select(mask: Array, new: Any, old: Any) -> Any:
 
     Both are arrays (N, ...), or alike nested tuples and dicts of such.
     """
-    if isinstance(mask, np.ndarray) and mask.all():
+    if everywhere(mask):
         return new
     return _selected(mask, new, old)
 

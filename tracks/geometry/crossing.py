@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
+from tracks.common.masks import nowhere
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Array
 
@@ -53,7 +52,7 @@ def crossing(
     xp = before_w.__array_namespace__()
     before, after = to_local(rot_w, before_w - center_w), to_local(rot_w, after_w - center_w)
     crosses = (before[..., 0] < 0) & (after[..., 0] >= 0)
-    if isinstance(crosses, np.ndarray) and not crosses.any():
+    if nowhere(crosses):
         return crosses, crosses  # as in most steps of a flight
     travel = after[..., 0] - before[..., 0]
     share = -before[..., 0] / xp.where(crosses, travel, 1.0)

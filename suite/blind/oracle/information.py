@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.effects import EFFECTS, all_values
+from eval.effects import EFFECTS, all_values, nameable_effects
 from eval.effects.interface import GRAVITY, Parameter, Sample, Values, as_arrays, at, neutral
 from eval.effects.log_faults import lateness, measured
 from eval.quadrotor.plant import Motion
@@ -233,8 +233,9 @@ def alternatives(
     for name in truth:
         whole = log_ratio(info.block(name), truth[name])
         found[name] = {}
-        for other, effect in EFFECTS.items():
-            silent = "acc_b" in effect.needs and not has_acc or not effect.nameable
+        for other in nameable_effects():
+            effect = EFFECTS[other]
+            silent = "acc_b" in effect.needs and not has_acc
             if other in truth or effect.random or silent:
                 continue
             # All four rotors together imitate a thrust scale; a weak motor is one of them.

@@ -102,7 +102,7 @@ def effects_at(layout: ParameterLayout, base: Mapping[str, Any], theta: Array) -
     return {name: type(base[name])(**fields) for name, fields in values.items()}
 
 
-def check_by_state(vehicle: Vehicle) -> None:
+def refuse_own_motion(vehicle: Vehicle) -> None:
     """Refuse a vehicle that no stretch of a flight can begin with.
 
     Raises:
@@ -123,7 +123,7 @@ def make_space(vehicle: Vehicle) -> ParameterSpace:
     Raises:
         ValueError: for a vehicle whose file has an effect with a motion of its own.
     """
-    check_by_state(vehicle)
+    refuse_own_motion(vehicle)
     base, entries = all_values(vehicle), []
     for name, effect in EFFECTS.items():
         if not effect.by_state:

@@ -11,7 +11,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.provenance import stamp
 from suite.delta.run import flight_files
-from suite.diagnose.fit.parameters import check_by_state
+from suite.diagnose.fit.parameters import refuse_own_motion
 from suite.diagnose.identify.identify import Identified, identify
 from suite.diagnose.identify.numbers import as_json
 
@@ -42,7 +42,7 @@ def identify_files(
         if part not in PARTS:
             raise ValueError(f"--leave {part!r}: allowed: {', '.join(PARTS)}")
     start = load_vehicle(vehicle)
-    check_by_state(start)
+    refuse_own_motion(start)
     logs, warnings = read_flights(flight_files(flights), partial=True)
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
     found = identify(logs, start, leave)

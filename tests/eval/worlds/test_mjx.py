@@ -1,7 +1,6 @@
 """The world mjx against the world mujoco."""
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ import pytest
 from eval.effects.slung_load import SlungLoad
 from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import with_effects
 from eval.worlds.trial import Rules, TrialSpec
 from tests.support.pilots import Pursuit
 
@@ -67,9 +67,8 @@ def test_ends_agree_on_a_few(few):
 
 @pytest.mark.slow
 def test_a_load_on_a_line_swings_alike():
-    effects = {**VEHICLE.effects, "slung_load": SlungLoad(0.05, 0.5)}
     trials = [TrialSpec("zigzag", 9, seed) for seed in range(2)]
-    loaded = replace(VEHICLE, effects=effects)
+    loaded = with_effects(VEHICLE, {"slung_load": SlungLoad(0.05, 0.5)})
     (_, ours), (_, theirs) = both(trials, Rules(time_limit_s=1.2), Record(), loaded)
     for trial in ours:
         rows = min(len(ours[trial].time_s), len(theirs[trial].time_s)) - 1

@@ -125,12 +125,8 @@ def test_a_wind_on_two_headings_is_named_with_the_drag_that_passes_it_on():
 @pytest.mark.slow
 def test_a_payload_is_its_mass_and_where_it_sits(ways):
     payload = {"mass_offset": (0.06,), "com_offset": ((0.005, -0.003, 0.0),)}
-    truth, rng = with_effects(GIVEN, **DRAG, **payload), np.random.default_rng(9)
-    flights = fly_ways(GIVEN, truth, ways, SENSORS["estimator"].rate_hz, rng=rng)
-    logs = [
-        log_of(flight, truth, SENSORS["estimator"], rng, f"{k}") for k, flight in enumerate(flights)
-    ]
-    found = diagnosis_json(diagnose(logs, GIVEN))
+    truth = with_effects(GIVEN, **DRAG, **payload)
+    found = diagnosis_json(diagnose(logged(truth, ways, 9), GIVEN))
     effects = {effect["name"]: effect for effect in found["effects"]}
     heavy = effects.pop("mass_offset", None) or effects.pop("thrust_scale")
     assert {heavy["name"], *heavy["alternatives"]} <= {"mass_offset", "thrust_scale"}
@@ -298,6 +294,13 @@ def ways():
     return ordinary_flights(np.random.default_rng(5), duration_s=5.5)
 
 
+def logged(truth, ways, seed):
+    """Return what an estimator logs of flights of `truth`, which the controller takes for GIVEN."""
+    rng, sensors = np.random.default_rng(seed), SENSORS["estimator"]
+    flights = fly_ways(GIVEN, truth, ways, sensors.rate_hz, rng=rng)
+    return [log_of(flight, truth, sensors, rng, f"flight_{k}") for k, flight in enumerate(flights)]
+
+
 def test_no_effect_is_forgotten():
     assert set(HIDDEN) == set(nameable_effects())
 
@@ -308,12 +311,7 @@ def test_no_effect_is_forgotten():
 )
 def test_an_effect_is_named_alone(name, ways):
     truth = with_effects(GIVEN, **{**DRAG, name: HIDDEN[name]})
-    rng = np.random.default_rng(list(EFFECTS).index(name))
-    flights = fly_ways(GIVEN, truth, ways, SENSORS["estimator"].rate_hz, rng=rng)
-    logs = [
-        log_of(flight, truth, SENSORS["estimator"], rng, f"flight_{k}")
-        for k, flight in enumerate(flights)
-    ]
+    logs = logged(truth, ways, list(EFFECTS).index(name))
     found = diagnosis_json(diagnose(logs, GIVEN))
     assert found["verdict"] in ("named", "partly"), found["unexplained"]
     assert [effect["name"] for effect in found["effects"]] == [name]

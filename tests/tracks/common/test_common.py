@@ -2,8 +2,6 @@
 
 import tomllib
 
-import jax.numpy as jnp
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,7 +10,6 @@ from tracks.common.names import closest, unknown_name
 from tracks.common.provenance import git_commit, stamp
 from tracks.common.toml_table import read_toml
 from tracks.common.toml_text import to_toml
-from tracks.common.tree_rows import packed, select
 from tracks.common.version import VERSION
 
 KEYS = st.text("abcdefgh_", min_size=1, max_size=6)
@@ -60,20 +57,3 @@ def test_a_table_names_the_file_and_the_key_that_is_wrong(tmp_path):
         gate.close()
     with pytest.raises(ValueError, match=r"the file has no 'name'; add it \(a text\)"):
         table.text("name")
-
-
-@pytest.mark.parametrize("xp", [np, jnp])
-def test_rows_are_chosen_through_tuples_and_dicts(xp):
-    mask = xp.asarray([True, False])
-    new = {"a": (xp.ones((2, 3)), xp.ones(2))}
-    old = {"a": (xp.zeros((2, 3)), xp.zeros(2))}
-    chosen = select(mask, new, old)["a"]
-    np.testing.assert_array_equal(chosen[0], [[1, 1, 1], [0, 0, 0]])
-    np.testing.assert_array_equal(chosen[1], [1, 0])
-
-
-def test_packed_lays_rows_one_after_another():
-    across = np.arange(6.0).reshape(2, 3).T
-    (again,) = packed((across,))
-    np.testing.assert_array_equal(again, across)
-    assert again.flags.c_contiguous and not across.flags.c_contiguous
