@@ -77,6 +77,14 @@ class QuadrotorConfig:
     """The rate loop's gain varies by up to this share either way [1]."""
     wind_std: Annotated[tuple[float, float, float], Range(0.0, 100.0)] = (1.0, 1.0, 0.2)
     """Standard deviation of the constant wind over worlds, around the vehicle's [m/s]."""
+    thrust_spread: Share = 0.0
+    """The true thrust varies by up to this share of the vehicle's either way [1]."""
+    com_std_m: Annotated[float, Range(0.0, 0.02)] = 0.0
+    """Standard deviation of the centre of mass along x and along y, around the vehicle's, cut off
+    at twice that [m]."""
+    trim_std: Annotated[float, Range(0.0, 0.2)] = 0.0
+    """Standard deviation of a constant torque about x and about y, around the vehicle's, cut off at
+    twice that; about z a fifth of it [N m]."""
 
 
 @dataclass(frozen=True)
@@ -96,12 +104,10 @@ class LossConfig:
     """lambda_j [s^6/m^2]."""
     progress: Annotated[float, Range(0.0, 1e6)] = 1.2
     """lambda_p of L_p [s/m]."""
-    progress_by_speed: Annotated[tuple[float, float], Range(0.0, 1e3, above=True, ordered=True)] = (
-        0.25,
-        2.0,
-    )
-    """Factors of `progress` where a policy with `spec.speed_input` is asked to fly at 0 and at 1;
-    between them it goes by a power [1]."""
+    speed_range: Annotated[tuple[float, float], Range(0.1, 100.0, ordered=True)] = (1.5, 7.0)
+    """Speeds that a policy with `spec.speed_input` is asked for by 0 and by 1, and evenly between:
+    progress counts up to it, and what is faster costs as much as progress is worth; at 1 nothing
+    does [m/s]."""
     progress_norm: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Weight of L_p^norm, the ablation's direction-only progress [1]."""
     projection: Annotated[float, Range(0.0, 1e6)] = 0.0
@@ -185,6 +191,9 @@ class EpisodeConfig:
     usual for a difficulty: with 2 they lie about as far apart as those of circles and ellipses."""
     gate_corners: Annotated[int, Range(3, 64)] = 4
     """Corners of the gates' openings: 4 for squares, more for rounder gates of the same width."""
+    race_share: Share = 0.5
+    """Share of worlds in which a policy with `spec.speed_input` is asked for 1; in the others it is
+    asked for anything from 0 to 1."""
     hairpin_share: Share = 0.0
     """Share of tracks with one or two gates that are met nearly from the side and left backwards,
     as at the apexes of the hardest ellipses."""

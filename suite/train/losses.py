@@ -56,11 +56,16 @@ def speed_to_goal(step: Step) -> jax.Array:
 
 
 def progress(config: LossConfig, step: Step) -> jax.Array:
-    """Return L_p, minus the speed towards the goal, by how fast a world is to be flown [m/s]."""
+    """Return L_p, minus the speed towards the goal as far as it is asked for [m/s].
+
+    Beyond the speed that a world is asked for, more progress counts nothing and speed, whichever
+    way, costs.
+    """
     if step.wanted is None:
         return -speed_to_goal(step)
-    slow, fast = config.progress_by_speed
-    return -speed_to_goal(step) * slow * (fast / slow) ** step.wanted
+    slow, fast = config.speed_range
+    limit = jnp.where(step.wanted < 1.0, slow + (fast - slow) * step.wanted, jnp.inf)
+    return jnp.maximum(norm(step.vel_w) - limit, 0.0) - jnp.minimum(speed_to_goal(step), limit)
 
 
 def progress_norm(_: LossConfig, step: Step) -> jax.Array:

@@ -142,7 +142,9 @@ def _wanted(config: TrainConfig, iteration: int) -> Array | None:
     if not config.spec.speed_input:
         return None
     rng = np.random.default_rng([config.seed, iteration, 3])
-    return rng.uniform(0.0, 1.0, config.episode.batch).astype(np.float32)
+    batch = config.episode.batch
+    races = rng.random(batch) < config.episode.race_share
+    return np.where(races, 1.0, rng.random(batch)).astype(np.float32)
 
 
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:

@@ -92,6 +92,9 @@ def draw_effects(
     def either_way(*shape: int) -> np.ndarray:
         return rng.uniform(-1.0, 1.0, (batch, *shape))
 
+    def cut_normal(*shape: int) -> np.ndarray:
+        return np.clip(rng.standard_normal((batch, *shape)), -2.0, 2.0)
+
     mass = own("mass_offset").offset + vehicle.mass
     drag = own("linear_drag").coefficient + config.drag_spread * either_way(3)
     delay = own("command_delay").delay + config.delay_spread_s * either_way()
@@ -109,6 +112,16 @@ def draw_effects(
         "mass_offset": (mass * (1 + config.mass_std * rng.standard_normal(batch)) - vehicle.mass,),
         "rate_gain": (own("rate_gain").scale * (1 + config.gain_spread * either_way(3)),),
     }
+    # Only where they are asked for: a plant is the dearer the more of its effects vary.
+    if config.thrust_spread:
+        scale = 1 + config.thrust_spread * either_way()
+        fields["thrust_scale"] = (own("thrust_scale").scale * scale,)
+    if config.com_std_m:
+        offset = config.com_std_m * cut_normal(3) * [1.0, 1.0, 0.0]
+        fields["com_offset"] = (own("com_offset").offset + offset,)
+    if config.trim_std:
+        torque = config.trim_std * cut_normal(3) * [1.0, 1.0, 0.2]
+        fields["torque_trim"] = (own("torque_trim").torque + torque,)
     return {
         name: EFFECTS[name].values(*(np.asarray(x, np.float32) for x in values))
         for name, values in fields.items()

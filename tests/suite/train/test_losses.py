@@ -169,12 +169,20 @@ def test_the_closing_speed_carries_no_gradient():
     assert not np.any(jax.grad(collide)(vel))
 
 
-def test_progress_counts_by_how_fast_a_world_is_to_be_flown():
-    """0.5, 1 and 2 times as much at speeds of 0, 1/2 and 1."""
-    config = LossConfig(progress=0.4, progress_by_speed=(0.5, 2.0))
+def test_progress_counts_up_to_the_speed_that_is_asked_for_and_what_is_faster_costs():
+    """3 m/s towards the goal where 1, 3.5 and 6 m/s are asked for, the last one without a limit."""
+    config = LossConfig(progress=0.4, speed_range=(1.0, 6.0))
     ahead = jnp.broadcast_to(jnp.array([3.0, 0.0, 0.0]), (3, 3))
     step = a_step(3, vel_w=ahead, goal_w=ahead, wanted=jnp.array([0.0, 0.5, 1.0]))
-    np.testing.assert_allclose(weighted(config, step)["progress"], [-0.6, -1.2, -2.4], rtol=1e-6)
+    np.testing.assert_allclose(weighted(config, step)["progress"], [0.4, -1.2, -1.2], rtol=1e-6)
+
+    def total(vel):
+        return weighted(config, step._replace(vel_w=vel))["progress"].sum()
+
+    pull = jax.grad(total)(ahead)
+    np.testing.assert_allclose(pull[:, 0], [0.4, -0.4, -0.4], rtol=1e-6)
+    fast = jax.grad(total)(3 * ahead)
+    np.testing.assert_allclose(fast[:, 0], [0.4, 0.4, -0.4], rtol=1e-6, err_msg="a race has no end")
 
 
 def test_progress_is_the_papers_and_differentiates():

@@ -259,6 +259,29 @@ def test_quadrotors_vary_around_the_vehicle_and_the_tracks_stay_the_same():
     assert np.all((bare["command_delay"].delay >= 0) & (bare["command_delay"].delay <= 0.01))
 
 
+def test_thrust_centre_of_mass_and_trim_vary_where_asked_and_move_no_other_draw():
+    own = {
+        "com_offset": EFFECTS["com_offset"].values(np.array([0.006, 0.0, 0.001])),
+        "thrust_scale": EFFECTS["thrust_scale"].values(np.float64(0.9)),
+    }
+    vehicle = replace(PLAIN, effects={**PLAIN.effects, **own})
+    config = QuadrotorConfig(vehicle)
+    wide = replace(config, thrust_spread=0.2, com_std_m=0.004, trim_std=0.02)
+    before = quadrotor.draw_effects(config, 500, np.random.default_rng(1))
+    after = quadrotor.draw_effects(wide, 500, np.random.default_rng(1))
+    assert set(after) - set(before) == {"thrust_scale", "com_offset", "torque_trim"}
+    for name, values in before.items():
+        np.testing.assert_array_equal(values[0], after[name][0])
+    scale, (offset,) = after["thrust_scale"].scale, after["com_offset"]
+    assert 0.72 <= scale.min() < 0.75 and 1.05 < scale.max() <= 1.08
+    np.testing.assert_allclose(offset.mean(0), [0.006, 0.0, 0.001], atol=6e-4)
+    np.testing.assert_allclose(offset.std(0), [0.00384, 0.00384, 0.0], atol=3e-4)
+    assert np.abs(offset[:, 1]).max() <= 0.008 + 1e-6
+    np.testing.assert_allclose(
+        after["torque_trim"].torque.std(0), [0.0192, 0.0192, 0.00384], rtol=0.08
+    )
+
+
 @pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.in_flight])
 def test_every_effect_of_a_vehicle_file_flies_in_training(name):
     """A typical strength of it changes where the quadrotor is after half a second."""
