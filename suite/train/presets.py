@@ -47,6 +47,35 @@ def swift() -> TrainConfig:
     )
 
 
+def swift_quad() -> TrainConfig:
+    """Return how `swift` is trained on to `swift-quad`: through quadrotors that vary widely.
+
+    They are drawn around `racer5`, which is not the vehicle of the tables. How fast to fly is an
+    input, and changes of acceleration cost less: through the point mass that had to keep actions
+    to what a quadrotor follows.
+    """
+    from eval.quadrotor.vehicle_file import load_vehicle
+
+    base = swift()
+    return replace(
+        base,
+        spec=replace(base.spec, speed_input=True),
+        quadrotor=QuadrotorConfig(
+            load_vehicle("racer5"),
+            mass_std=0.08,
+            lag_spread_s=0.03,
+            drag_spread=0.5,
+            delay_spread_s=0.07,
+            gain_spread=0.3,
+            thrust_spread=0.1,
+            com_std_m=0.003,
+            trim_std=0.01,
+        ),
+        loss=replace(base.loss, acceleration=5e-3, jerk=4e-4),
+        optimizer=replace(base.optimizer, iterations=1500, rate=6e-4),
+    )
+
+
 def paper() -> TrainConfig:
     """Return the weights of Su et al. 2026 and the simulator of Zhang et al. 2025 as printed.
 
@@ -122,13 +151,14 @@ def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
 
 
 def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:
-    """Return `config` through the quadrotor of `vehicle` instead of the point mass.
+    """Return `config` through the quadrotor of `vehicle`, which varies as the recipe's own does.
 
     Raises:
         ValueError: where the policy decides faster than the vehicle's controller runs.
     """
     check_decides_in_time(config.spec, vehicle)
-    return replace(config, quadrotor=QuadrotorConfig(vehicle), fleet=None)
+    own = config.quadrotor or QuadrotorConfig(vehicle)
+    return replace(config, quadrotor=replace(own, vehicle=vehicle), fleet=None)
 
 
 def with_fleet(config: TrainConfig) -> TrainConfig:
@@ -155,7 +185,9 @@ def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) ->
             raise ValueError(f"--vehicle is {vehicle}, but {flown} has none: add --model quad")
         if model is None:
             return config
-        return with_fleet(config) if model == "fleet" else replace(config, fleet=None)
+        if model == "fleet":
+            return with_fleet(config)
+        return replace(config, quadrotor=None, fleet=None)
     if vehicle is None:
         raise ValueError(
             "--model quad needs --vehicle: a vehicle file, or a shipped one by its name "
@@ -164,7 +196,14 @@ def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) ->
     return with_quadrotor(config, load_vehicle(vehicle))
 
 
-PRESETS = {"racer": racer, "swift": swift, "paper": paper, "small": small, "gpu": gpu}
+PRESETS = {
+    "racer": racer,
+    "swift": swift,
+    "swift-quad": swift_quad,
+    "paper": paper,
+    "small": small,
+    "gpu": gpu,
+}
 """Name -> function that returns the configuration; the docstring is its description."""
 
 
