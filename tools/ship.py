@@ -42,12 +42,14 @@ def card(name: str, runs: Sequence[Path], judged: Path | None) -> str:
     machine = made[-1]["machine"]
     stored = load_policy_checkpoint(runs[-1] / "policy")
     size = sum(array.size for array in stored.params.values())
+    flown = made[-1]["config"]["quadrotor"]
+    where = f"quadrotors around `{flown['vehicle']['name']}`" if flown else "the point mass"
     text = f"""# {name}
 
 CNN-GRU of Su et al. 2026 ({stored.spec.state_size} numbers and a depth image, {size / 1000:.0f}k
-parameters), trained in the point mass on the `random` tracks only; it has seen neither the judged
+parameters), trained through {where} on the `random` tracks only; it has seen neither the judged
 families nor the vehicle of the tables. The recipe's numbers were chosen by looking at flights of
-earlier recipes on the judged tracks and vehicle, at other seeds (50,000 on).
+earlier recipes on the judged tracks and vehicle, at other seeds.
 
 | made by | seed | commit | iterations | time |
 |---|---|---|---|---|

@@ -4,6 +4,7 @@ import pytest
 
 from eval.quadrotor.vehicle_file import save_vehicle
 from eval.worlds.other import rotorpy as rotorpy_world
+from policies import shipped
 from suite import cli
 from suite.loop.config import DeltaLoopConfig, HiddenLoopConfig, parse_world, resolve
 from suite.train.presets import finetune, preset
@@ -94,7 +95,7 @@ def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
     assert isinstance(hidden, HiddenLoopConfig)
     assert (hidden.trials, hidden.flights, hidden.fit.iterations) == (50, 5, 400)
     assert hidden.tuning.optimizer.iterations == 200 and hidden.tuning.quadrotor is not None
-    assert hidden.true_vehicle == EXAMPLE and hidden.policy == "swift"
+    assert hidden.true_vehicle == EXAMPLE and hidden.policy == shipped.DEFAULT
     assert set(hidden.digests) == {"vehicle", "world", "policy"}
 
 

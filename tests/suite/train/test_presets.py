@@ -33,6 +33,17 @@ def test_a_model_is_asked_for_by_name_or_the_recipes_own():
         check(both)
 
 
+def test_swift_quad_varies_its_quadrotors_widely_around_any_vehicle_that_is_asked_for():
+    own = preset("swift-quad")
+    check(own)
+    assert own.quadrotor is not None and own.quadrotor.vehicle.name == "racer5"
+    other = chosen_model(own, "quad", "crazyflie21").quadrotor
+    assert other is not None and other.vehicle.name == "crazyflie21"
+    assert replace(other, vehicle=own.quadrotor.vehicle) == own.quadrotor
+    assert chosen_model(own, "point", None).quadrotor is None
+    assert chosen_model(own, "fleet", None).quadrotor is None
+
+
 @pytest.mark.slow
 def test_the_gpu_preset_trains_on_what_there_is_at_a_small_size(tmp_path):
     small = ["--iterations", "2", "--set", "episode.batch=8", "episode.steps=4"]
