@@ -2,7 +2,8 @@
 
 import json
 
-from suite.experiments.table2 import where_it_breaks
+from policies import shipped
+from suite.experiments.table2 import Config, loop_config, where_it_breaks
 from tests.support.documents import another_racer, page, reproduce
 from tests.support.judged_cells import cell
 
@@ -33,10 +34,11 @@ def test_table2_and_all_levels(sky, tmp_path, capfd):
     assert "| paper, with Delta Action Model | 9 | 7/10 | 6.1 |" in text
     assert "seeds: 7 to 7, 1 trials a cell" in text
     # Other documents find the flights of this one.
-    assert reproduce(tmp_path, "seeds", "--policies", "swift", "--trials", "1", "--seed", "7") == 0
+    asked = ("--policies", shipped.DEFAULT, "--trials", "1", "--seed", "7")
+    assert reproduce(tmp_path, "seeds", *asked) == 0
     assert len(sky.flown) == 30
     text, numbers = page(tmp_path, "seeds")
-    assert numbers["spread"]["median"] == "swift"
+    assert numbers["spread"]["median"] == shipped.DEFAULT
     # A second time nothing is flown and the same is written.
     capfd.readouterr()
     assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7", "--json") == 0
@@ -65,3 +67,9 @@ def test_table2_with_policies_tuned_under_the_delta_model(sky, tmp_path):
     overall = numbers["with_against_without"][-1]
     assert overall["track"] == "all" and overall["trials"] == 12
     assert "What the Delta Action Model changes" in text and "with - without" in text
+
+
+def test_a_shipped_policy_is_fine_tuned_by_its_own_recipe():
+    config = Config(delta_iterations=3)
+    assert loop_config(config, "swift-quad").tuning.quadrotor is not None
+    assert loop_config(config, "swift").tuning.quadrotor is None
