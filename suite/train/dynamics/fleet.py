@@ -137,6 +137,13 @@ GRAVITY = 9.81
 """[m/s^2]."""
 YAW_GAIN, YAW_ATTITUDE = 0.4, 0.5
 """Gains of rate and attitude about z over those about x and y."""
+TRIM_AXES = (1.0, 1.0, 0.2)
+"""A constant torque about x, y and z as shares of that about x."""
+
+
+def cut_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Return normal draws that are cut off at twice their deviation of 1."""
+    return np.clip(rng.standard_normal(shape), -2.0, 2.0)
 
 
 def draw_vehicles(
@@ -148,7 +155,7 @@ def draw_vehicles(
         return rng.uniform(*span, (batch, *shape))
 
     def normal(std: float, *shape: int) -> np.ndarray:
-        return std * np.clip(rng.standard_normal((batch, *shape)), -2.0, 2.0)
+        return std * cut_normal(rng, batch, *shape)
 
     def axes(level: np.ndarray, up: np.ndarray) -> np.ndarray:
         return np.stack([level, level, up], -1)
@@ -168,7 +175,7 @@ def draw_vehicles(
     radius = drawn(config.gyration_m)
     com = off(normal(config.com_offset_m, 2), 0.0)
     lever = np.stack([-com[:, 1], com[:, 0], np.zeros(batch)], -1) / (radius**2)[:, None]
-    trim = off(normal(config.trim, 3), 0.0) * [1.0, 1.0, 0.2]
+    trim = off(normal(config.trim, 3), 0.0) * TRIM_AXES
     return Vehicles(
         time_step=period_s * (1 + normal(config.time_step_std)),
         thrust_max=GRAVITY * drawn(config.thrust_to_weight),

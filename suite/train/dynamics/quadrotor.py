@@ -23,6 +23,7 @@ from eval.quadrotor.plant import Command, Motion, Plant, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, PlantState, hover_state, step
 from eval.vehicles.vehicle import Vehicle
 from suite.train.config import QuadrotorConfig
+from suite.train.dynamics.fleet import TRIM_AXES, cut_normal
 from suite.train.dynamics.point_mass import attitude, faded
 from tracks.geometry.scene import Array
 
@@ -92,9 +93,6 @@ def draw_effects(
     def either_way(*shape: int) -> np.ndarray:
         return rng.uniform(-1.0, 1.0, (batch, *shape))
 
-    def cut_normal(*shape: int) -> np.ndarray:
-        return np.clip(rng.standard_normal((batch, *shape)), -2.0, 2.0)
-
     mass = own("mass_offset").offset + vehicle.mass
     drag = own("linear_drag").coefficient + config.drag_spread * either_way(3)
     delay = own("command_delay").delay + config.delay_spread_s * either_way()
@@ -117,10 +115,10 @@ def draw_effects(
         scale = 1 + config.thrust_spread * either_way()
         fields["thrust_scale"] = (own("thrust_scale").scale * scale,)
     if config.com_std_m:
-        offset = config.com_std_m * cut_normal(3) * [1.0, 1.0, 0.0]
+        offset = config.com_std_m * cut_normal(rng, batch, 3) * [1.0, 1.0, 0.0]
         fields["com_offset"] = (own("com_offset").offset + offset,)
     if config.trim_std:
-        torque = config.trim_std * cut_normal(3) * [1.0, 1.0, 0.2]
+        torque = config.trim_std * cut_normal(rng, batch, 3) * TRIM_AXES
         fields["torque_trim"] = (own("torque_trim").torque + torque,)
     return {
         name: EFFECTS[name].values(*(np.asarray(x, np.float32) for x in values))
