@@ -1,0 +1,227 @@
+"""Loops in worlds that hide an effect: what the diagnosis and Delta Action Models give back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, NamedTuple
+
+from eval.effects import EFFECTS
+from eval.judging.results import read_trials
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from eval.vehicles.vehicle import Vehicle, with_effects
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from suite.common.report import Report, Section
+from suite.common.running.apart import Job
+from suite.common.work import all_done
+from suite.experiments.pages import hidden_worlds as pages
+from suite.experiments.pages.document import Place
+from suite.experiments.pages.hidden_worlds import Came
+from suite.experiments.study import judging, options
+from suite.experiments.study.cache import code_digest, digest, engines
+from suite.judging.content import policy_digest
+from suite.judging.flying import default_policy
+from suite.loop.config import HiddenLoopConfig, resolve
+from suite.loop.hidden_effect import LABELS, MODELS
+from suite.loop.run import run_loop
+from suite.loop.work import read_diagnosis
+from suite.train.presets import PRESETS
+from tracks.common.names import unknown_name
+from tracks.input.ranges import Iterations, Range, Seed, Trials
+from tracks.input.reading import read_json
+
+ROOMS = ("tracks", "policies", "eval", "suite/train", "suite/delta", "suite/diagnose", "suite/loop")
+"""Code whose change makes every loop anew."""
+APART = 1000
+"""The loops' seeds lie so far apart, so that no two of them judge the same trials."""
+
+
+class Hidden(NamedTuple):
+    """A world that hides something."""
+
+    words: str
+    """What, for people."""
+    effects: Mapping[str, Mapping[str, Any]]
+    """Parameters by effect, added to the vehicle that the simulation knows."""
+
+
+WORLDS: dict[str, Hidden] = {
+    "heavy battery": Hidden(
+        "0.4 kg more, 53 % of the mass, and the centre of mass 8 mm further back",
+        {"mass_offset": {"offset": 0.4}, "com_offset": {"offset": (-0.008, 0.0, 0.0)}},
+    ),
+    "moved centre of mass": Hidden(
+        "12 mm ahead and 4 mm to the left", {"com_offset": {"offset": (0.012, 0.004, 0.0)}}
+    ),
+    "weak rotor": Hidden(
+        "rotor 1 gives 70 % of its thrust", {"weak_motor": {"scale": (0.7, 1.0, 1.0, 1.0)}}
+    ),
+    "drag and wind": Hidden(
+        "four times the linear drag, in a wind of 5 m/s",
+        {
+            "linear_drag": {"coefficient": (0.7, 0.7, 1.2)},
+            "constant_wind": {"velocity": (-3.0, 4.0, 0.0)},
+        },
+    ),
+    "long delay": Hidden("commands act after 85 ms", {"command_delay": {"delay": 0.085}}),
+}
+"""By name."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Run `suite loop --world` in worlds that hide an effect, and tell what gives success back.
+
+    From every seed the same policy is fine-tuned anew in every world: as a control, with a Delta
+    Action Model, with the effect that the diagnosis names, and with both.
+    """
+
+    policy: str | None = None
+    """A shipped policy's name or a checkpoint's folder; by default the shipped."""
+    only: tuple[str, ...] = ()
+    """Only these worlds, by name; by default all."""
+    training_seeds: tuple[Annotated[int, Range(0, 500)], ...] = (0, 1, 2)
+    """One loop each: flights, noise, fits and fine-tunings differ."""
+    difficulty: str = "3,9"
+    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
+    trials: Trials = 10
+    """Judged trials of each policy on every track at every level, for every training seed."""
+    flights: Trials = 3
+    """Recorded flights on every track at every level, for every training seed."""
+    iterations: Iterations = 100
+    """Gradient steps of each fine-tuning."""
+    fit_iterations: Iterations = 200
+    """Gradient steps of the fit of each Delta Action Model."""
+    set: tuple[str, ...] = ()
+    """Change settings of the fine-tuning by name."""
+    seed: Seed = 0
+    """Seed of the first judged trial of the first training seed; those of the others follow at
+    distances of 1,000."""
+    vehicle: str = "reference"
+    """What the simulation knows: a shipped vehicle's name or a vehicle file (.toml)."""
+
+
+class Asked(NamedTuple):
+    """One loop."""
+
+    config: Config
+    world: str
+    training_seed: int
+
+
+def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
+    """Return the page and its numbers; loops that are missing are run first."""
+    simulated = load_vehicle(config.vehicle)
+    policy = config.policy or default_policy()
+    config = replace(config, policy=policy)
+    for name in config.only:
+        if name not in WORLDS:
+            raise unknown_name("hidden world", name, WORLDS)
+    worlds = {name: hidden for name, hidden in WORLDS.items() if name in (config.only or WORLDS)}
+    jobs = []
+    for seed in config.training_seeds:
+        for name, hidden in worlds.items():
+            true = world_of(simulated, hidden)
+            about = {
+                "loop": replace(config, only=(), training_seeds=(seed,)),
+                "policy": policy_digest(policy),
+                "vehicles": [simulated, true],
+                "code": code_digest(*ROOMS),
+                "engines": engines(),
+            }
+            folder = place.cache / "loops" / f"{name.replace(' ', '-')}-{seed}-{digest(about)}"
+            jobs.append(Job(Asked(config, name, seed), folder))
+    loop_of(jobs[0])
+    came = all_done(run_one, jobs, place.workers, console, "loops in hidden worlds")
+    rows, words = pages.rows_of(came), {name: hidden.words for name, hidden in worlds.items()}
+    report = Report(
+        title="Hidden worlds: what gives success back",
+        lead=pages.lead(rows),
+        facts={
+            **judging.policy_facts({"policy": policy}),
+            "simulation's vehicle": config.vehicle,
+            "training seeds": " ".join(map(str, config.training_seeds)),
+            "trials": f"three tracks, levels {config.difficulty}: "
+            f"{len(judging.trials_of(config))} of each policy for each training seed, seeds "
+            f"{options.judged_seeds(config)} and so on at distances of {APART}",
+            "recorded": f"{config.flights} flights on every track and level, at other seeds",
+            "fine-tuning": f"{config.iterations} gradient steps each",
+        },
+        sections=[
+            Section("Success", [pages.success_grid(rows), *pages.HOW]),
+            Section("What it is worth", [pages.worth_grid(rows), pages.WORTH]),
+            Section("Laps", [pages.lap_grid(rows), pages.LAPS]),
+            Section("What is hidden, and what is named", [pages.named_grid(came, words)]),
+            Section("Delta Action Models", [pages.errors_grid(came), pages.ERRORS]),
+        ],
+    )
+    return report, {
+        "worlds": [row._asdict() for row in rows],
+        "diagnoses": [
+            {"world": one.world, "training_seed": one.training_seed, **one.diagnosis}
+            for one in came
+        ],
+        "errors": [
+            {"world": one.world, "training_seed": one.training_seed, **one.errors} for one in came
+        ],
+    }
+
+
+def world_of(simulated: Vehicle, hidden: Hidden) -> Vehicle:
+    """Return what flies there."""
+    values = {name: EFFECTS[name].values(**given) for name, given in hidden.effects.items()}
+    return with_effects(simulated, values)
+
+
+def loop_of(job: Job) -> HiddenLoopConfig:
+    """Return the loop of a job's `Asked`, having written its world's file.
+
+    Raises:
+        ValueError: for an option that cannot be used.
+    """
+    config, name, seed = job.task
+    path = job.folder / "world.toml"
+    save_vehicle(world_of(load_vehicle(config.vehicle), WORLDS[name]), path, WORLDS[name].words)
+    loop = resolve(
+        recipe=config.policy if config.policy in PRESETS else "swift",
+        world=str(path),
+        policy=config.policy,
+        difficulty=config.difficulty,
+        trials=config.trials,
+        flights=config.flights,
+        vehicle=config.vehicle,
+        seed=config.seed + APART * seed,
+        finetune_iterations=config.iterations,
+        fit_iterations=config.fit_iterations,
+        changes=config.set,
+    )
+    assert isinstance(loop, HiddenLoopConfig)
+    return loop
+
+
+def run_one(job: Job, console: Console) -> Came:
+    """Run the loop of a job's `Asked`, or what is left of it, in the job's folder."""
+    out = job.folder / "loop"
+    try:
+        run_loop(loop_of(job), out, console)
+    except WorkFailed:
+        # A loop whose diagnosis names nothing ends there, and that is a result.
+        if not (out / "diagnosis" / "stage.json").is_file() or read_diagnosis(out)["effects"]:
+            raise
+    found = read_diagnosis(out)
+    paths = {name: out / f"eval-{name}" / "trials.parquet" for name in LABELS}
+    errors = {}
+    for variant, whose in MODELS.items():
+        path = out / f"delta-{variant}" / "delta.json"
+        if path.is_file():
+            fitted = read_json(path)
+            errors[whose] = fitted["without"]["position_m"]
+            errors[f"{whose}, with delta"] = fitted["delta_action"]["position_m"]
+    return Came(
+        job.task.world,
+        job.task.training_seed,
+        {name: read_trials(path) for name, path in paths.items() if path.is_file()},
+        {key: found[key] for key in ("verdict", "effects", "gap")},
+        errors,
+    )

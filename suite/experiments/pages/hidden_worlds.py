@@ -1,0 +1,245 @@
+"""What the page on hidden worlds shows: success, what it is worth, laps, names and errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.judging.statistics import Interval, wilson
+from eval.judging.tables import percent
+from eval.worlds.trial import TrialResult
+from suite.experiments.pages.tables import points_cell
+from suite.experiments.study.intervals import Gap, nested
+from suite.loop.compare import BEFORE
+from suite.loop.hidden_effect import BOTH, CONTROL, DELTA, LABELS, NAMED, NOMINAL
+from suite.loop.work import named_effects
+from tracks.common.files import to_json
+from tracks.common.grid import Cell, Grid, table
+
+ALL = "all"
+PAIRS = {
+    "named - control": (NAMED, CONTROL),
+    "delta - control": (DELTA, CONTROL),
+    "both - named": (BOTH, NAMED),
+    "control - before": (CONTROL, BEFORE),
+    "named - nothing hidden": (NAMED, NOMINAL),
+}
+"""What is held against what."""
+HOW = (
+    "Every policy is fine-tuned from the same one, for as many gradient steps on the same tracks. "
+    "Control: through the simulation's quadrotor as it is; with delta: through it with a Delta "
+    "Action Model of the flights; with the named effect: through the quadrotor that the diagnosis "
+    "corrected from the same flights; with both: through that with a Delta Action Model of what it "
+    "still lacks. All randomise their quadrotor as the recipe does. The first column flies the "
+    "simulation's vehicle, all others the hidden world.",
+    "Success over all training seeds, [95 % Wilson intervals].",
+)
+WORTH = (
+    "Differences in points over the same trials, with 95 % bootstrap intervals that draw training "
+    "seeds anew and the trials of each; in brackets each training seed's own. Not corrected for "
+    "there being several. A loop whose diagnosis names nothing has no fine-tuned policies, and "
+    "counts in none."
+)
+LAPS = (
+    "Lap over that of the policy where nothing is hidden on the same trial, median over the "
+    "trials that both finish; how many these are."
+)
+ERRORS = (
+    "Held-out flights as measured, flown again for 1 s: error in position [m], mean over the "
+    "training seeds. The noise of the start is in every number."
+)
+
+
+class Came(NamedTuple):
+    """What one loop came to."""
+
+    world: str
+    training_seed: int
+    results: dict[str, list[TrialResult]]
+    """By policy; without those that are fine-tuned where nothing was named."""
+    diagnosis: dict[str, Any]
+    """Verdict, effects and gap."""
+    errors: dict[str, float]
+    """After 1 s of held-out flights, in position [m], by what flew."""
+
+
+class Row(NamedTuple):
+    """A world, or all of them."""
+
+    world: str
+    loops: int
+    """Training seeds."""
+    named: int
+    """Loops in which the diagnosis named something."""
+    success: dict[str, Interval]
+    """By policy."""
+    gaps: dict[str, Gap]
+    """In success, by `PAIRS`."""
+    laps: dict[str, tuple[float, int]]
+    """By policy: median ratio of laps, and over how many trials."""
+
+
+def rows_of(came: Sequence[Came]) -> list[Row]:
+    """Return a row for every world, and one for all."""
+    names = list(dict.fromkeys(one.world for one in came))
+    every = [(name, [one for one in came if one.world == name]) for name in names]
+    return [_row(name, some) for name, some in [*every, (ALL, came)]]
+
+
+def _row(name: str, came: Sequence[Came]) -> Row:
+    success, gaps, laps = {}, {}, {}
+    for policy in LABELS:
+        flown = [one.results[policy] for one in came if policy in one.results]
+        won = [result.success for rows in flown for result in rows]
+        if won:
+            success[policy] = wilson(sum(won), len(won))
+            pairs = [(one.results[policy], one.results[NOMINAL]) for one in came
+                     if policy in one.results]  # fmt: skip
+            laps[policy] = _lap_ratio(pairs)
+    for pair, (one, other) in PAIRS.items():
+        seeds = dict.fromkeys(loop.training_seed for loop in came)
+        apart = [
+            np.concatenate([_won(loop.results[one]) - _won(loop.results[other]) for loop in mine])
+            for mine in (
+                [c for c in came if c.training_seed == seed and {one, other} <= set(c.results)]
+                for seed in seeds
+            )
+            if mine
+        ]
+        if apart:
+            gaps[pair] = nested(apart)
+    named = sum(bool(one.diagnosis["effects"]) for one in came)
+    return Row(name, len(came), named, success, gaps, laps)
+
+
+def _won(rows: Sequence[TrialResult]) -> np.ndarray:
+    return np.array([row.success for row in rows], float)
+
+
+def _lap_ratio(
+    pairs: Sequence[tuple[Sequence[TrialResult], Sequence[TrialResult]]],
+) -> tuple[float, int]:
+    ratios = [
+        mine.time_s / theirs.time_s
+        for ours, others in pairs
+        for mine, theirs in zip(ours, others, strict=True)
+        if mine.success and theirs.success
+    ]
+    return (float(np.median(ratios)) if ratios else float("nan")), len(ratios)
+
+
+def lead(rows: Sequence[Row]) -> str:
+    """Return in sentences what was lost and what gives it back."""
+    *worlds, over = rows
+
+    def rate(policy: str) -> str:
+        found = over.success.get(policy)
+        return "-" if found is None else f"{100 * found.value:.0f} %"
+
+    text = (
+        f"Over {len(worlds)} hidden worlds and {over.loops} loops {rate(BEFORE)} succeed, of "
+        f"{rate(NOMINAL)} where nothing is hidden. The diagnosis names something in {over.named} "
+        f"of {over.loops} loops."
+    )
+    if NAMED not in over.success:
+        return text
+
+    def apart(pair: str) -> str:
+        return f"{points_cell(over.gaps[pair].difference).text} points"
+
+    text += (
+        f" Fine-tuned with what it names {rate(NAMED)} succeed, with a Delta Action Model "
+        f"{rate(DELTA)}, with both {rate(BOTH)}, and as the control {rate(CONTROL)}: the named "
+        f"effect is worth {apart('named - control')}, the Delta Action Model "
+        f"{apart('delta - control')}, and on top of the named effect {apart('both - named')}."
+    )
+    for pair, words in (
+        ("named - control", "The named effect gains"),
+        ("delta - control", "The Delta Action Model gains"),
+    ):
+        told = {
+            verdict: [row.world for row in worlds
+                      if pair in row.gaps and row.gaps[pair].verdict == verdict]
+            for verdict in ("gain", "loss")
+        }  # fmt: skip
+        text += f" {words} in: {', '.join(told['gain']) or 'none'}"
+        text += f"; loses in: {', '.join(told['loss'])}." if told["loss"] else "."
+    return text
+
+
+def success_grid(rows: Sequence[Row]) -> Grid:
+    """Return success by world and policy."""
+    lines = [
+        [row.world, *(percent(row.success[p]) if p in row.success else "-" for p in LABELS)]
+        for row in rows
+    ]
+    return table(["hidden", *LABELS.values()], lines)
+
+
+def worth_grid(rows: Sequence[Row]) -> Grid:
+    """Return differences by world."""
+    lines: list[list[str | Cell]] = []
+    for row in rows:
+        line: list[str | Cell] = [row.world]
+        for pair in PAIRS:
+            if pair not in row.gaps:
+                line.append("-")
+                continue
+            gap = row.gaps[pair]
+            each = " ".join(f"{round(100 * seed) + 0.0:+.0f}" for seed in gap.of_seeds)
+            cell = points_cell(gap.difference)
+            line.append(Cell(f"{cell.text} ({each})", cell.tone))
+        lines.append(line)
+    return table(["hidden", *PAIRS], lines)
+
+
+def lap_grid(rows: Sequence[Row]) -> Grid:
+    """Return laps by world and policy."""
+    later = [policy for policy in LABELS if policy != NOMINAL]
+    lines = [
+        [
+            row.world,
+            *("{:.3f} ({})".format(*row.laps[p]) if p in row.laps and row.laps[p][1] else "-"
+              for p in later),
+        ]
+        for row in rows
+    ]  # fmt: skip
+    return table(["hidden", *(LABELS[policy] for policy in later)], lines)
+
+
+def named_grid(came: Sequence[Came], words: Mapping[str, str]) -> Grid:
+    """Return what every diagnosis said, beside what is true."""
+    lines = []
+    for one in came:
+        values = [
+            f"{effect['name']} {name} {to_json(entry['value'])} {entry['unit']}"
+            for effect in one.diagnosis["effects"]
+            for name, entry in effect["parameters"].items()
+        ]
+        gap = one.diagnosis["gap"]
+        lines.append(
+            [
+                one.world,
+                words[one.world],
+                str(one.training_seed),
+                one.diagnosis["verdict"],
+                named_effects(one.diagnosis) or "nothing",
+                "; ".join(values),
+                f"{gap['before']:.2f}, {gap['after']:.2f}",
+            ]
+        )
+    headers = ["hidden", "what", "training seed", "verdict", "named", "values"]
+    return table([*headers, "held-out gap before, after"], lines)
+
+
+def errors_grid(came: Sequence[Came]) -> Grid:
+    """Return the Delta Action Models' errors on held-out flights."""
+    columns = list(dict.fromkeys(name for one in came for name in one.errors))
+    lines = []
+    for world in dict.fromkeys(one.world for one in came):
+        mine = [one.errors for one in came if one.world == world]
+        means = ([errors[c] for errors in mine if c in errors] for c in columns)
+        lines.append([world, *(f"{np.mean(some):.3f}" if some else "-" for some in means)])
+    return table(["hidden", *(f"{c} quadrotor" for c in columns)], lines)

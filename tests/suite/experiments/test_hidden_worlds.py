@@ -1,0 +1,113 @@
+"""Loops in hidden worlds: each world and seed once, kept, paired, and told where nothing is named.
+
+The loops themselves are stand-ins; tests/suite/loop has theirs.
+"""
+
+import json
+
+import numpy as np
+import pytest
+
+from eval.judging.results import write_trials
+from eval.quadrotor.vehicle_file import load_vehicle
+from suite.common.errors import WorkFailed
+from suite.experiments import hidden_worlds
+from suite.experiments.hidden_worlds import WORLDS, world_of
+from suite.experiments.pages.hidden_worlds import ALL, Came, rows_of
+from suite.loop.hidden_effect import BOTH, CONTROL, LABELS, NAMED, NOMINAL
+from tests.support.documents import page, reproduce
+from tests.support.loops import trial_result
+
+WON = {NOMINAL: 4, "before": 2, CONTROL: 2, "delta": 3, NAMED: 4, BOTH: 3}
+"""Trials of four that each policy wins."""
+EFFECT = {
+    "name": "weak_motor",
+    "alternatives": [],
+    "parameters": {"scale": {"value": [0.7, 1.0, 1.0, 1.0], "unit": "1", "ci95": None}},
+}
+
+
+def flown(won, seed=0):
+    return [trial_result(seed + k, k < won) for k in range(4)]
+
+
+@pytest.fixture
+def loops(monkeypatch):
+    """Return the configurations of the loops that were run; a delay is never named."""
+    run = []
+
+    def stand_in(config, out, console):
+        if not (out / "diagnosis" / "stage.json").is_file():
+            run.append(config)
+        blind = load_vehicle(config.world).effects["command_delay"].delay > 0.05
+        for name, won in WON.items():
+            if blind and name not in (NOMINAL, "before"):
+                continue
+            folder = out / f"eval-{name}"
+            folder.mkdir(parents=True, exist_ok=True)
+            write_trials(folder / "trials.parquet", flown(won, config.seed), {})
+        (out / "diagnosis").mkdir(exist_ok=True)
+        found = {"verdict": "unknown" if blind else "named", "effects": [] if blind else [EFFECT],
+                 "gap": {"before": 5.0, "after": 5.0 if blind else 1.0}}  # fmt: skip
+        (out / "diagnosis" / "diagnosis.json").write_text(json.dumps(found))
+        (out / "diagnosis" / "stage.json").write_text("{}")
+        if blind:
+            raise WorkFailed("the diagnosis names nothing to correct")
+        for name in (CONTROL, NAMED):
+            (out / f"delta-{name}").mkdir(exist_ok=True)
+            errors = {"without": {"position_m": 1.0}, "delta_action": {"position_m": 0.25}}
+            (out / f"delta-{name}" / "delta.json").write_text(json.dumps(errors))
+
+    monkeypatch.setattr(hidden_worlds, "run_loop", stand_in)
+    return run
+
+
+def test_every_world_from_every_seed_once_and_found_again(loops, tmp_path):
+    args = ["--policy", "racer", "--only", "weak rotor", "long delay", "--trials", "4"]
+    args += ["--training-seeds", "0", "1", "2", "--seed", "7", "--difficulty", "3"]
+    assert reproduce(tmp_path, "hidden_worlds", *args) == 0
+    assert [config.seed for config in loops] == [7, 7, 1007, 1007, 2007, 2007]
+    worlds = [load_vehicle(config.world) for config in loops]
+    assert worlds[0] == world_of(load_vehicle("reference"), WORLDS["weak rotor"])
+    assert {config.tuning.optimizer.iterations for config in loops} == {100}
+    text, numbers = page(tmp_path, "hidden_worlds")
+    assert "names something in 3 of 6 loops" in text and "gains in: weak rotor" in text
+    rotor, delay, over = numbers["worlds"]
+    assert [row["named"] for row in (rotor, delay, over)] == [3, 0, 3] and over["world"] == ALL
+    assert rotor["gaps"]["named - control"]["of_seeds"] == [0.5, 0.5, 0.5]
+    assert set(delay["success"]) == {NOMINAL, "before"} and delay["gaps"] == {}
+    assert rotor["success"]["before"]["value"] == 0.5
+    assert all(WORLDS[name].words in text for name in ("weak rotor", "long delay"))
+    assert reproduce(tmp_path, "hidden_worlds", *args) == 0
+    assert len(loops) == 6
+
+
+def test_differences_are_in_pairs_and_count_no_loop_without_names():
+    def came(seed, won, named=True):
+        names = LABELS if named else (NOMINAL, "before")
+        found = {"effects": [EFFECT] if named else [], "verdict": "", "gap": {}}
+        return Came("a", seed, {name: flown(won[name]) for name in names}, found, {})
+
+    row, _ = rows_of(
+        [came(0, WON), came(1, {**WON, NAMED: 2}), came(2, {**WON, "before": 0}, named=False)]
+    )
+    gap = row.gaps["named - control"]
+    assert gap.of_seeds == [0.5, 0.0] and gap.difference.value == 0.25
+    assert row.success["before"].value == pytest.approx(4 / 12) and row.named == 2
+    assert row.laps[NAMED] == (1.0, 6)
+    assert np.isclose(row.laps[NOMINAL][0], 1.0)
+
+
+def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeypatch):
+    def broken(config, out, console):
+        raise WorkFailed("the training diverged")
+
+    monkeypatch.setattr(hidden_worlds, "run_loop", broken)
+    args = ["--policy", "racer", "--only", "weak rotor"]
+    assert reproduce(tmp_path, "hidden_worlds", *args) == 1
+
+
+def test_a_world_that_does_not_exist_is_code_2(loops, tmp_path, capsys):
+    assert reproduce(tmp_path, "hidden_worlds", "--only", "weak roter") == 2
+    assert "Did you mean 'weak rotor'?" in capsys.readouterr().err
+    assert not loops
