@@ -8,6 +8,7 @@ the wanted net acceleration in body axes. Parameters are a flat dict of float32 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -69,14 +70,16 @@ def _drawn(key: jax.Array, spec: PolicySpec) -> Params:
 def fitted(params: Params, seen: PolicySpec, spec: PolicySpec) -> Params:
     """Return parameters of a policy that sees `seen` as parameters for `spec`.
 
-    Numbers that `spec` adds to the state get weights of zero, so the policy acts as it did.
+    Numbers that `spec` adds to the state get weights of zero, so the policy acts as it did. At
+    another rate its memory keeps its pace in seconds: the update gate's bias grows by the logarithm
+    of the rates' ratio, which is exact for what is remembered over many decisions.
 
     Raises:
         ValueError: where the policy sees what `spec` does not have, or they differ in all but that.
     """
     for entry in dataclasses.fields(spec):
         has, wanted = getattr(seen, entry.name), getattr(spec, entry.name)
-        if has != wanted and entry.name not in (*EXTRAS, "speed"):
+        if has != wanted and entry.name not in (*EXTRAS, "speed", "rate_hz"):
             raise ValueError(
                 f"the policy to start from has spec.{entry.name} {has}, and this run {wanted}; "
                 "train from nothing, or with the policy's own"
@@ -91,7 +94,9 @@ def fitted(params: Params, seen: PolicySpec, spec: PolicySpec) -> Params:
             first += count
         elif wanted:
             rows.append(jnp.zeros((count, rows[0].shape[1])))
-    return {**params, "state.weight": jnp.concatenate(rows)}
+    keeps = slice(spec.hidden_size, 2 * spec.hidden_size)
+    bias = params["gru.bias_input"].at[keeps].add(math.log(spec.rate_hz / seen.rate_hz))
+    return {**params, "state.weight": jnp.concatenate(rows), "gru.bias_input": bias}
 
 
 def encode(params: Params, image: jax.Array) -> jax.Array:

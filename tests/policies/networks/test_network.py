@@ -101,10 +101,27 @@ def test_channels_and_hidden_size_decide_how_many_weights_there_are():
     assert action.shape == (5, 3) and hidden.shape == (5, 96)
 
 
-def test_a_policy_of_another_size_or_rate_is_refused():
+def test_at_twice_the_rate_a_memory_lasts_as_long():
+    """Two decisions forget what one did, where little is forgotten in each."""
     params = network.init(jax.random.key(5), SMALL)
-    for changed, words in (({"hidden_size": 32}, "hidden_size 64, and this run 32"),
-                           ({"channels": (16, 32, 32)}, r"channels .*128\), and this run \(16"),
-                           ({"rate_hz": 60.0}, "rate_hz .*, and this run 60.0")):  # fmt: skip
+    # With an update gate of 0.9 whatever is seen, and nothing new, states only fade.
+    params = {name: jnp.zeros_like(value) for name, value in params.items()}
+    params["gru.bias_input"] = params["gru.bias_input"].at[64:128].set(np.log(0.9 / 0.1))
+    often = network.fitted(params, SMALL, replace(SMALL, rate_hz=2 * SMALL.rate_hz))
+    seen = jnp.zeros((1, SMALL.state_size)), jnp.zeros((1, 24, 32))
+    _, once = network.step(params, jnp.ones((1, 64)), *seen)
+    _, half = network.step(often, jnp.ones((1, 64)), *seen)
+    _, twice = network.step(often, half, *seen)
+    np.testing.assert_allclose(once, 0.9, rtol=1e-5)
+    np.testing.assert_allclose(twice, once, rtol=0.005)
+
+
+def test_a_policy_of_another_size_is_refused():
+    params = network.init(jax.random.key(5), SMALL)
+    other = {
+        "hidden_size 64, and this run 32": {"hidden_size": 32},
+        r"channels .*128\), and this run \(16": {"channels": (16, 32, 32)},
+    }
+    for words, changed in other.items():
         with pytest.raises(ValueError, match=words):
             network.fitted(params, SMALL, replace(SMALL, **changed))
