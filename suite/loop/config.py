@@ -11,7 +11,7 @@ from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
 from suite.train.config import TrainConfig, check
 from suite.train.overrides import override
-from suite.train.presets import finetune, preset, with_iterations, with_quadrotor
+from suite.train.presets import at_rate, finetune, preset, with_iterations, with_quadrotor
 from tracks.common.files import to_json
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials, check_ranges
 
@@ -180,7 +180,7 @@ def resolve(
         policy = default_policy() if policy is None else policy
     if policy is not None:
         given = load_policy_checkpoint(checkpoint_folder(policy))
-        training = replace(training, spec=given.spec)
+        training = replace(at_rate(training, given.spec.rate_hz), spec=given.spec)
         digests["policy"] = policy_digest(policy)
     # A Delta Action Model corrects one vehicle's dynamics, and a fleet is many.
     tuning = replace(finetune(training), fleet=None)

@@ -128,6 +128,31 @@ def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
     return replace(config, optimizer=replace(config.optimizer, iterations=iterations))
 
 
+def at_rate(config: TrainConfig, rate_hz: float) -> TrainConfig:
+    """Return `config` with decisions at `rate_hz`, its rollouts and delays as long in seconds.
+
+    Delays of the point mass are cut off at the two decisions that it can hold.
+    """
+    ratio, physics, episode = rate_hz / config.spec.rate_hz, config.physics, config.episode
+    stride = max(1, round(ratio * episode.image_stride))
+    least, most = (min(2.0, ratio * delay) for delay in physics.action_delay)
+    return replace(
+        config,
+        spec=replace(config.spec, rate_hz=rate_hz),
+        physics=replace(
+            physics,
+            action_delay=(least, most),
+            state_delay=round(ratio * physics.state_delay),
+            image_delay=round(ratio * physics.image_delay),
+        ),
+        episode=replace(
+            episode,
+            image_stride=stride,
+            steps=stride * max(1, round(ratio * episode.steps / stride)),
+        ),
+    )
+
+
 def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
     """Return how a policy that `config` trained is fine-tuned, under a Delta Action Model or not.
 

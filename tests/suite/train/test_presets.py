@@ -7,7 +7,7 @@ import pytest
 from suite import cli
 from suite.train.config import TrainConfig, check
 from suite.train.dynamics.fleet import FleetConfig
-from suite.train.presets import PRESETS, chosen_model, preset
+from suite.train.presets import PRESETS, at_rate, chosen_model, preset
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -42,6 +42,20 @@ def test_swift_quad_varies_its_quadrotors_widely_around_any_vehicle_that_is_aske
     assert replace(other, vehicle=own.quadrotor.vehicle) == own.quadrotor
     assert chosen_model(own, "point", None).quadrotor is None
     assert chosen_model(own, "fleet", None).quadrotor is None
+
+
+def test_another_rate_keeps_rollouts_and_delays_in_seconds():
+    slow = preset("swift-quad")
+    fast = at_rate(slow, 30.0)
+    check(fast)
+    assert (fast.episode.steps, fast.episode.image_stride) == (180, 6)
+    assert fast.physics.action_delay == (0.0, 2.0), "not 3: the point mass holds no more"
+    assert at_rate(fast, 15.0).episode == slow.episode and at_rate(slow, 15.0) == slow
+    odd = at_rate(slow, 20.0)
+    check(odd)
+    assert (odd.episode.steps, odd.episode.image_stride) == (120, 4)
+    late = at_rate(preset("paper"), 30.0).physics
+    assert (late.state_delay, late.image_delay) == (2, 4)
 
 
 @pytest.mark.slow
