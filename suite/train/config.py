@@ -144,6 +144,12 @@ class LossConfig:
     weight of `progress` a crash costs what the way lost is worth."""
     survival_width_m: Annotated[float, Range(1e-3, 10.0)] = 0.04
     """How far from contact with the body the probability to fly on begins to fall [m]."""
+    tilt: Annotated[float, Range(0.0, 1e6)] = 0.0
+    """Weight of L_tilt, which grows from 0 at `tilt_from_deg` to 1 where body z is level: the judge
+    ends a trial beyond, and above 0 such a world leaves the loss. It has a gradient through
+    quadrotors only; a point mass has no attitude to learn [1]."""
+    tilt_from_deg: Annotated[float, Range(0.0, 90.0, below=True)] = 65.0
+    """Tilt from which on L_tilt counts [deg]."""
     path_samples: Annotated[int, Range(1, 1000)] = 4
     """Points of every step's path at which the nearest obstacle is looked up."""
 

@@ -6,6 +6,7 @@ A new term is a function of a `Step`, a line in `LOSSES` and its weight in `Loss
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 
 import jax
@@ -47,6 +48,12 @@ def acceleration(_: LossConfig, step: Step) -> jax.Array:
 def jerk(_: LossConfig, step: Step) -> jax.Array:
     """Return L_j [m^2/s^6]."""
     return (step.jerk_w * step.jerk_w).sum(-1)
+
+
+def tilt(config: LossConfig, step: Step) -> jax.Array:
+    """Return L_tilt, the square of how far body z is down from `tilt_from_deg` to level [1]."""
+    least = math.cos(math.radians(config.tilt_from_deg))
+    return (jnp.maximum(least - step.up, 0.0) / least) ** 2
 
 
 def speed_to_goal(step: Step) -> jax.Array:
@@ -109,6 +116,7 @@ LOSSES: dict[str, tuple[tuple[Term, str], ...]] = {
     "collide": ((collide, "collide"),),
     "acceleration": ((acceleration, "acceleration"),),
     "jerk": ((jerk, "jerk"),),
+    "tilt": ((tilt, "tilt"),),
     "progress": (
         (progress, "progress"),
         (progress_norm, "progress_norm"),

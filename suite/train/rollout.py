@@ -200,6 +200,8 @@ def make_rollout(
             if config.episode.finish:
                 goes_on = goes_on & (passed_after < worlds.scene.gates.center_w.shape[1])
             alive = carry.alive * (made.clearance > -weights.crash_depth_m) * goes_on
+            if weights.tilt > 0.0:
+                alive = alive * (made.up > 0.0)
             record = StepRecord(
                 image=seen.image,
                 terms={

@@ -37,6 +37,8 @@ class Step(NamedTuple):
     """(B, 3) net acceleration [m/s^2]."""
     jerk_w: jax.Array
     """(B, 3) change of the acceleration from the step before, over the step's time [m/s^3]."""
+    up: jax.Array
+    """(B,) z of body z at the step's end, with gradient where the attitude has one [1]."""
     gap: jax.Array
     """(B, S) distance to the nearest solid beyond r_q at points of the path, with gradient [m]."""
     away_w: jax.Array
@@ -156,6 +158,7 @@ def make_step(
         vel_w=after.vel_w,
         acc_w=after.acc_w,
         jerk_w=(after.acc_w - before.acc_w) / worlds.constants.time_step[:, None],
+        up=after.rot_w[:, 2, 2],
         gap=gap,
         away_w=away_w,
         goal_w=goal_w,

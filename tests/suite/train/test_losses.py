@@ -47,7 +47,7 @@ def a_step(batch, **known):
     zero = jnp.zeros((batch, 3))
     rest = {name: zero for name in ("pos_w", "vel_w", "acc_w", "jerk_w", "goal_w", "place_g")}
     path = {"gap": jnp.ones((batch, 1)), "away_w": zero[:, None], "clearance": jnp.ones(batch)}
-    path["survival"] = jnp.ones(batch)
+    path |= {"survival": jnp.ones(batch), "up": jnp.ones(batch)}
     gate = {"gate": unit_gate(batch), "passed": jnp.zeros(batch, bool)}
     return Step(**{**rest, **path, **gate, **known})
 
@@ -77,13 +77,28 @@ def guidance_term(config, gates, pos_w, vel_w):
 def test_every_weight_of_the_table_scales_its_term_alone():
     rng = np.random.default_rng(9)
     names = ("pos_w", "vel_w", "acc_w", "jerk_w", "goal_w", "place_g")
-    step = a_step(4, **{name: jnp.asarray(rng.normal(0, 2, (4, 3))) for name in names})
+    drawn = {name: jnp.asarray(rng.normal(0, 2, (4, 3))) for name in names}
+    step = a_step(4, up=jnp.asarray([1.0, 0.3, 0.0, -0.5]), **drawn)
     nothing = {weight: 0.0 for terms in losses.LOSSES.values() for _, weight in terms}
     for name, terms in losses.LOSSES.items():
         for term, weight in terms:
             found = weighted(replace(LossConfig(), **{**nothing, weight: 3.0}), step)
             np.testing.assert_allclose(found[name], 3.0 * term(LossConfig(), step), rtol=1e-6)
             assert not any(np.any(value) for key, value in found.items() if key != name)
+
+
+def test_tilt_costs_from_an_angle_on_and_one_where_the_body_lies_level():
+    angle = np.radians([0.0, 59.0, 75.0, 90.0, 120.0])
+    config = LossConfig(tilt_from_deg=60.0)
+
+    def cost(up):
+        return losses.tilt(config, a_step(5, up=up))
+
+    up = jnp.asarray(np.cos(angle))
+    wanted = [0.0, 0.0, (1 - np.cos(angle[2]) / 0.5) ** 2, 1.0, 4.0]
+    np.testing.assert_allclose(cost(up), wanted, atol=1e-6)
+    slope = jax.grad(lambda up: cost(up).sum())(up)
+    assert np.all(slope[:2] == 0) and np.all(np.diff(slope[1:]) < 0), "the further, the dearer"
 
 
 nearest = jax.jit(nearest_obstacle)
