@@ -19,7 +19,8 @@ class Config:
     """
 
     preset: str = "swift"
-    """The recipe: swift, swift-quad (through quadrotors), racer, small, gpu or paper."""
+    """The recipe: swift, swift-quad or swift-30 (through quadrotors), racer, small, gpu or
+    paper."""
     policy: str | None = None
     """Start from this policy instead of training one: a shipped name or a checkpoint's folder."""
     track: str = "all"

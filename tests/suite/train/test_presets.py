@@ -44,6 +44,14 @@ def test_swift_quad_varies_its_quadrotors_widely_around_any_vehicle_that_is_aske
     assert chosen_model(own, "fleet", None).quadrotor is None
 
 
+def test_swift_30_decides_twice_as_often_on_rollouts_as_long():
+    slow, fast = preset("swift-quad"), preset("swift-30")
+    check(fast)
+    assert fast.spec == replace(slow.spec, rate_hz=30.0)
+    seconds = [config.episode.steps / config.spec.rate_hz for config in (slow, fast)]
+    assert seconds[0] == seconds[1] and fast.loss.tilt > 0.0 == slow.loss.tilt
+
+
 def test_another_rate_keeps_rollouts_and_delays_in_seconds():
     slow = preset("swift-quad")
     fast = at_rate(slow, 30.0)
