@@ -11,7 +11,7 @@ from tracks.common.grid import Grid, table
 
 SURE = 0.90
 """Where others won all of their few trials, our Wilson interval must reach down to this."""
-FLOORS = {0: 0.97, 3: 0.97, 6: 0.90, 9: 0.70}
+FLOORS = {0: 0.99, 3: 0.98, 6: 0.97, 9: 0.95}
 """Success that the shipped policy must reach, by level."""
 
 
@@ -69,6 +69,8 @@ def verdict(found: Sequence[Goal]) -> str:
         f"{met} of {len(found)} cells meet the whole goal: {won} in success against the better of "
         f"paper and baseline, {fast} in v_max against both."
     )
+    reached = sum(goal.floor_miss == 0 for goal in found)
+    text += f" The success that a shipped policy is to reach is reached in {reached}."
     largest = sum(goal.of_ten_miss == 0 for goal in found)
     if not any(goal.of_ten_miss is None for goal in found):
         text += f" If the printed v_max is the largest of ten trials, it is reached in {largest}."

@@ -15,13 +15,14 @@ def test_goals_by_hand():
     ]
     zero, three, nine = goals(cells)
     assert (zero.success_miss, zero.v_max_miss) == (0, 0)
-    assert zero.floor_miss == pytest.approx(0.01) and not zero.met
-    assert three.success_miss == pytest.approx(0.037) and three.floor_miss == pytest.approx(0.04)
+    assert zero.floor_miss == pytest.approx(0.03) and not zero.met
+    assert three.success_miss == pytest.approx(0.037) and three.floor_miss == pytest.approx(0.05)
     assert (three.v_max, three.v_max_miss) == (6.2, pytest.approx(1.2))
     assert nine.success == 0.7 and nine.success_miss == pytest.approx(0.08)
-    assert nine.v_max_miss == 0 and nine.floor_miss == pytest.approx(0.08)
+    assert nine.v_max_miss == 0 and nine.floor_miss == pytest.approx(0.33)
     text = verdict([zero, three, nine])
     assert text.startswith("0 of 3 cells meet the whole goal: 1 in success")
+    assert "a shipped policy is to reach is reached in 0." in text
     assert "zigzag at level 9, by 8 points; v_max misses most on circular at level 3" in text
     (perfect,) = goals([cell("ellipse", 6, 1.0, 6.4, low=0.963)])
     assert perfect.met and verdict([perfect]).startswith("1 of 1 cells meet the whole goal")
