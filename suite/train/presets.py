@@ -79,17 +79,17 @@ def swift_quad() -> TrainConfig:
 def swift_30() -> TrainConfig:
     """Return how `swift-quad` is trained on to `swift-30`: twice the decisions, and faster.
 
-    Changes of acceleration cost a quarter of that, nearly all worlds are races, and tipping over,
-    which ends a judged trial, has a price: at this speed it is what most trials would end by.
+    Changes of acceleration cost a quarter of that, and tipping over, which ends a judged trial, has
+    a price: at this speed it is what most failed trials would end by.
     """
     base = at_rate(swift_quad(), 30.0)
     assert base.quadrotor is not None
     return replace(
         base,
         quadrotor=replace(base.quadrotor, delay_spread_s=0.05),
-        loss=replace(base.loss, acceleration=2e-3, jerk=1e-4, progress=2.0, tilt=20.0),
-        episode=replace(base.episode, race_share=0.8),
-        optimizer=replace(base.optimizer, iterations=1000, rate=4e-4),
+        loss=replace(base.loss, acceleration=2e-3, jerk=1e-4, progress=1.7, tilt=40.0),
+        episode=replace(base.episode, race_share=0.6),
+        optimizer=replace(base.optimizer, iterations=2000, rate=4e-4),
     )
 
 
