@@ -5,7 +5,6 @@ The loops themselves are stand-ins; tests/suite/loop has theirs.
 
 import json
 
-import numpy as np
 import pytest
 
 from eval.judging.results import write_trials
@@ -13,22 +12,10 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from suite.common.errors import WorkFailed
 from suite.experiments import hidden_worlds
 from suite.experiments.hidden_worlds import WORLDS, world_of
-from suite.experiments.pages.hidden_worlds import ALL, Came, rows_of
-from suite.loop.hidden_effect import BOTH, CONTROL, LABELS, NAMED, NOMINAL
+from suite.experiments.pages.hidden_worlds import ALL
+from suite.loop.hidden_effect import CONTROL, NAMED, NOMINAL
 from tests.support.documents import page, reproduce
-from tests.support.loops import trial_result
-
-WON = {NOMINAL: 4, "before": 2, CONTROL: 2, "delta": 3, NAMED: 4, BOTH: 3}
-"""Trials of four that each policy wins."""
-EFFECT = {
-    "name": "weak_motor",
-    "alternatives": [],
-    "parameters": {"scale": {"value": [0.7, 1.0, 1.0, 1.0], "unit": "1", "ci95": None}},
-}
-
-
-def flown(won, seed=0):
-    return [trial_result(seed + k, k < won) for k in range(4)]
+from tests.support.loops import EFFECT, WON, four_trials
 
 
 @pytest.fixture
@@ -45,7 +32,7 @@ def loops(monkeypatch):
                 continue
             folder = out / f"eval-{name}"
             folder.mkdir(parents=True, exist_ok=True)
-            write_trials(folder / "trials.parquet", flown(won, config.seed), {})
+            write_trials(folder / "trials.parquet", four_trials(won, config.seed), {})
         (out / "diagnosis").mkdir(exist_ok=True)
         found = {"verdict": "unknown" if blind else "named", "effects": [] if blind else [EFFECT],
                  "gap": {"before": 5.0, "after": 5.0 if blind else 1.0}}  # fmt: skip
@@ -80,22 +67,6 @@ def test_every_world_from_every_seed_once_and_found_again(loops, tmp_path):
     assert all(WORLDS[name].words in text for name in ("weak rotor", "long delay"))
     assert reproduce(tmp_path, "hidden_worlds", *args) == 0
     assert len(loops) == 6
-
-
-def test_differences_are_in_pairs_and_count_no_loop_without_names():
-    def came(seed, won, named=True):
-        names = LABELS if named else (NOMINAL, "before")
-        found = {"effects": [EFFECT] if named else [], "verdict": "", "gap": {}}
-        return Came("a", seed, {name: flown(won[name]) for name in names}, found, {})
-
-    row, _ = rows_of(
-        [came(0, WON), came(1, {**WON, NAMED: 2}), came(2, {**WON, "before": 0}, named=False)]
-    )
-    gap = row.gaps["named - control"]
-    assert gap.of_seeds == [0.5, 0.0] and gap.difference.value == 0.25
-    assert row.success["before"].value == pytest.approx(4 / 12) and row.named == 2
-    assert row.laps[NAMED] == (1.0, 6)
-    assert np.isclose(row.laps[NOMINAL][0], 1.0)
 
 
 def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeypatch):

@@ -1,0 +1,35 @@
+"""What the page on hidden worlds makes of loops: differences in pairs, laps, sentences."""
+
+import pytest
+
+from suite.experiments.pages.hidden_worlds import Came, lead, rows_of
+from suite.loop.hidden_effect import LABELS, NAMED
+from tests.support.loops import EFFECT, WON, four_trials
+
+
+def came(seed, won, named=True):
+    """Return a loop; one that names nothing has no fine-tuned policies."""
+    names = LABELS if named else ("nominal", "before")
+    found = {"effects": [EFFECT] if named else [], "verdict": "", "gap": {}}
+    return Came("a", seed, {name: four_trials(won[name]) for name in names}, found, {})
+
+
+def test_differences_are_in_pairs_and_count_no_loop_without_names():
+    row, _ = rows_of(
+        [came(0, WON), came(1, {**WON, NAMED: 2}), came(2, {**WON, "before": 0}, named=False)]
+    )
+    gap = row.gaps["named - control"]
+    assert gap.of_seeds == [0.5, 0.0] and gap.difference.value == 0.25
+    assert row.success["before"].value == pytest.approx(4 / 12) and row.named == 2
+    assert row.laps[NAMED] == (1.0, 6)
+    assert row.laps["nominal"] == (1.0, 12)
+
+
+def test_the_lead_says_what_gained_and_where_nothing_is_named_only_what_was_lost():
+    said = lead(rows_of([came(seed, WON) for seed in range(3)]))
+    assert "3 loops 50 % succeed, of 100 %" in said and "in 3 of 3 loops" in said
+    assert "The named effect gains in: a." in said and "loses" not in said
+    worse = lead(rows_of([came(seed, {**WON, NAMED: 0}) for seed in range(3)]))
+    assert "The named effect gains in: none; loses in: a." in worse
+    silent = lead(rows_of([came(0, WON, named=False)]))
+    assert silent.endswith("in 0 of 1 loops.")
