@@ -84,18 +84,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     import jax
 
     from policies.formats.delta_file import load_delta
-    from policies.formats.policy_file import load_policy_checkpoint
-    from policies.networks.network import fitted
     from suite.delta.corrected import check_corrects
-    from suite.judging.flying import checkpoint_folder
-    from suite.train.run import train
+    from suite.train.run import started_from, train
 
     resolved = resolve(config)
     params, delta = None, None
     if config.from_ is not None:
-        start = load_policy_checkpoint(checkpoint_folder(config.from_, "--from"))
-        params = jax.tree.map(jax.numpy.asarray, start.params)
-        params = fitted(params, start.spec, resolved.spec)
+        params = started_from(config.from_, resolved.spec)
     if config.delta is not None:
         stored = load_delta(config.delta)
         if resolved.fleet is not None:

@@ -1,52 +1,51 @@
-"""What randomised dynamics in training buy: the same recipe with them and without, disturbed."""
+"""What randomised dynamics in training buy, spread by spread: disturbed with each and without."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
 
-import numpy as np
+import tyro
 
-from eval.judging.statistics import Interval, wilson
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.common.console import Console
 from suite.common.report import Picture, Report, Section
+from suite.experiments.pages import randomisation as pages
 from suite.experiments.pages.document import Place
-from suite.experiments.pages.tables import condition_grid, points_cell
+from suite.experiments.pages.randomisation import FIXED, RANDOMISED, UNDISTURBED, WITHOUT
 from suite.experiments.study import disturbed, judging, options, training
-from suite.experiments.study.disturbed import Tested
-from suite.experiments.study.intervals import Gap, nested
-from suite.train.config import PointMassConfig, TrainConfig
-from tracks.common.grid import Grid, table
+from suite.experiments.study.conditions import Condition
+from suite.train.dynamics import spreads
+from tracks.common.names import unknown_name
 from tracks.input.ranges import Iterations, Seed, Trials
 
-FIXED, RANDOMISED = "fixed", "randomised"
-ALL = "all disturbances"
-MEANING = (
-    "Success: over all trials under all sizes of the disturbance but the undisturbed one. "
-    "Difference: randomised - fixed, in points, with a 95 % bootstrap interval that draws training "
-    "seeds anew and the trials of each, a trial with all its conditions. A gain or a loss is where "
-    "it leaves zero out and every seed agrees; with few seeds one of several rows may stand out by "
-    "chance."
-)
+DISTURBED = (
+    "mass", "thrust_scale", "motor lag", "drag", "latency", "rate_gain", "com_offset",
+    "torque_trim", "wind", "depth noise",
+)  # fmt: skip
+"""Effects at their usual size, and sweeps, that a spread is there for."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Train one recipe with randomised dynamics and with fixed ones, and disturb what comes out.
+    """Train one recipe with all its spreads, without each, and without any, and disturb them.
 
-    Every training seed flies its share of the trials, the same share in both settings.
+    Every training seed flies its share of the trials, the same share in all settings.
     """
 
-    preset: str = "small"
+    preset: str = "swift-quad"
     """The recipe."""
+    from_: Annotated[str | None, tyro.conf.arg(name="from")] = "swift"
+    """All are trained on from this shipped name or checkpoint's folder; None: from nothing."""
     set: tuple[str, ...] = ()
     """Change settings of the recipe by name."""
-    iterations: Iterations | None = None
-    """Gradient steps, instead of the preset's."""
+    iterations: Iterations | None = 200
+    """Gradient steps; None: the preset's."""
+    without: tuple[str, ...] = ()
+    """Only these spreads are left out one by one, by name; by default each that the recipe has."""
     training_seeds: tuple[Seed, ...] = (0, 1, 2)
-    """Seeds that both settings are trained from."""
+    """Seeds that every setting is trained from."""
     difficulty: str = "3"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials = 32
@@ -55,17 +54,8 @@ class Config:
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """What is disturbed: a shipped vehicle's name or a vehicle file (.toml)."""
-    only: tuple[str, ...] = ()
-    """Only these sweeps, by name; by default all."""
-
-
-class Compared(NamedTuple):
-    """Two settings of the recipe under some conditions, all of them together."""
-
-    rates: dict[str, Interval]
-    """Each setting's success, with Wilson intervals."""
-    gap: Gap
-    """In success, the second - the first."""
+    only: tuple[str, ...] = DISTURBED
+    """Only these effects and sweeps, by name."""
 
 
 def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
@@ -73,42 +63,38 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     from suite.experiments.pages.charts import sweeps_chart
 
     seeds, recipe = config.training_seeds, options.asked_recipe(config)
-    _, sweeps = disturbed.asked_conditions(load_vehicle(config.vehicle), config.only, effects=False)
+    rows, vehicle = settings(config), load_vehicle(config.vehicle)
+    alone, sweeps = disturbed.asked_conditions(vehicle, config.only)
     trials = judging.trials_of(config)
-    rows = [
-        training.Row(FIXED, "fixed dynamics", fixed(recipe)),
-        training.Row(RANDOMISED, "the recipe's dynamics", recipe),
-    ]
     runs = training.trained(
-        training.Study(rows, seeds, may_diverge=False), place.cache, console, place.workers
-    )
+        training.Study(rows, seeds, may_diverge=False, start=config.from_),
+        place.cache, console, place.workers,
+    )  # fmt: skip
     shares = {seed: trials[part :: len(seeds)] for part, seed in enumerate(seeds)}
     fliers = {
         row.key: [(run.policy, shares[run.seed]) for run in runs if run.row == row.key]
         for row in rows
     }
-    _, grown = disturbed.flown_under([], sweeps, fliers, place.cache, console, place.workers)
-    base = next(iter(grown.values()))[0]
-    worse = {sweep.name: points[1:] for sweep, points in grown.items()}
-    worse[ALL] = [point for points in worse.values() for point in points]
-    sizes = {seed: len(share) for seed, share in shares.items()}
-    compared = {
-        what: compare(
-            {row.key: np.array([p.won(row.key) for p in points]) for row in rows},
-            list(sizes.values()),
-        )
-        for what, points in {"undisturbed": [base], **worse}.items()
-    }
-    grids = [condition_grid(points, base, (s.axis,), s.name) for s, points in grown.items()]
-    picture = Picture(sweeps_chart(grown), "Success with 95 % Wilson intervals.")
+    base = Condition(UNDISTURBED, 0.0, "", vehicle)
+    (still, *effects), grown = disturbed.flown_under(
+        [base, *alone], sweeps, fliers, place.cache, console, place.workers
+    )
+    tested = [*effects, *(point for points in grown.values() for point in points[1:])]
+    worth = pages.worth_of(still, tested, [len(share) for share in shares.values()])
+    sections = [Section("Spread by spread", [pages.worth_grid(worth), *pages.MEANING])]
+    pictured = [Picture(sweeps_chart(pages.two_of(grown)), pages.CAPTION)] if grown else []
+    sections += [
+        Section("By disturbance", [pages.success_grid([still, *tested]), *pictured]),
+        Section("Every training", [pages.seeds_grid(shares, still, tested), pages.BY_SEED]),
+    ]
     report = Report(
         title="What randomised dynamics in training buy",
-        lead=lead(compared),
+        lead=pages.lead(worth),
         facts={
             "recipe": f"{options.recipe_words(config)}, {recipe.optimizer.iterations} gradient "
             "steps",
-            "randomised": _ranges(recipe),
-            "fixed": "the middle of those ranges; no wind, no noise",
+            RANDOMISED: spreads.words(recipe),
+            FIXED: "none of that",
             "training seeds": " ".join(map(str, seeds)),
             "trained at commit": training.commits(runs),
             "trials": f"three tracks, level {config.difficulty}, seeds "
@@ -116,116 +102,33 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
             "training seeds",
             "vehicle": config.vehicle,
         },
-        sections=[
-            Section("By disturbance", [_summary(compared), MEANING, picture]),
-            Section("Every training", [_by_seed(sizes, base, worse[ALL])]),
-            Section("Every condition", grids),
-        ],
+        sections=sections,
     )
     return report, {
-        "compared": {what: {"rates": e.rates, **e.gap._asdict()} for what, e in compared.items()},
-        "conditions": [
-            disturbed.tested_numbers(p, base) for points in grown.values() for p in points
-        ],
+        "worth": {
+            name: {what: {"rates": w.rates, **w.gap._asdict()} for what, w in mine.items()}
+            for name, mine in worth.items()
+        },
+        "conditions": [disturbed.tested_numbers(entry, still) for entry in [still, *tested]],
     }
 
 
-def fixed(recipe: TrainConfig) -> TrainConfig:
-    """Return `recipe` with every world's dynamics in the middle of what they are drawn from."""
+def settings(config: Config) -> Sequence[training.Row]:
+    """Return what is trained: with nothing varied, without each spread, and the recipe.
 
-    def middle(bounds: tuple[float, float]) -> tuple[float, float]:
-        centre = sum(bounds) / 2
-        return centre, centre
-
-    physics: PointMassConfig = recipe.physics
-    return replace(
-        recipe,
-        physics=replace(
-            physics,
-            lag_std=0.0,
-            drag=middle(physics.drag),
-            drag_up=middle(physics.drag_up),
-            wind_std=(0.0, 0.0, 0.0),
-            time_step_std=0.0,
-            action_delay=middle(physics.action_delay),
-            depth_noise=0.0,
-            fov_scale=(1.0, 1.0),
-        ),
-    )
-
-
-def compare(won: Mapping[str, np.ndarray], sizes: Sequence[int]) -> Compared:
-    """Return two settings' success over all conditions together, and how they differ.
-
-    Args:
-        won: which trials succeeded, (conditions, trials) bool of each setting.
-        sizes: trials of each training seed, in their order.
+    Raises:
+        ValueError: for a spread that the recipe has not.
     """
-    rates = {name: wilson(int(each.sum()), each.size) for name, each in won.items()}
-    first, second = (each.mean(axis=0) for each in won.values())
-    return Compared(rates, nested(np.split(second - first, np.cumsum(sizes)[:-1])))
-
-
-def lead(compared: Mapping[str, Compared]) -> str:
-    """Return in sentences what randomisation gains and loses."""
-
-    def said(name: str) -> str:
-        fixed, randomised = (100 * rate.value for rate in compared[name].rates.values())
-        points = points_cell(compared[name].gap.difference).text
-        return (
-            f"{randomised:.0f} % succeed where dynamics were randomised in training and "
-            f"{fixed:.0f} % where they were not ({points} points)"
-        )
-
-    words = [f"Over all disturbances {said(ALL)}; undisturbed {said('undisturbed')}."]
-    for verdict, meant in (
-        ("gain", "Randomisation gains in"),
-        ("loss", "It loses in"),
-        ("unclear", "These trainings do not tell for"),
-    ):
-        named = [what for what, entry in compared.items() if entry.gap.verdict == verdict]
-        if named:
-            words.append(f"{meant}: {', '.join(named)}.")
-    return " ".join(words)
-
-
-def _summary(compared: Mapping[str, Compared]) -> Grid:
-    lines = [
-        [
-            what,
-            *(f"{100 * rate.value:.0f}" for rate in rates.values()),
-            points_cell(gap.difference),
-            " ".join(f"{100 * each:+.0f}" for each in gap.of_seeds),
-            "" if gap.verdict == "unclear" else gap.verdict,
-        ]
-        for what, (rates, gap) in compared.items()
+    recipe = options.asked_recipe(config)
+    known = spreads.spreads(recipe)
+    for name in config.without:
+        if name not in known:
+            raise unknown_name("spread", name, known)
+    return [
+        training.Row(FIXED, "nothing varied", spreads.fixed(recipe)),
+        *(
+            training.Row(f"{WITHOUT}{name}", f"all but {name}", known[name])
+            for name in config.without or known
+        ),
+        training.Row(RANDOMISED, "the recipe", recipe),
     ]
-    headers = ["disturbance", f"{FIXED} [%]", f"{RANDOMISED} [%]", "difference [points]"]
-    return table([*headers, "by seed", ""], lines)
-
-
-def _by_seed(sizes: Mapping[int, int], base: Tested, worse: Sequence[Tested]) -> Grid:
-    lines, start, names = [], 0, list(base.results)
-    for seed, size in sizes.items():
-        mine = slice(start, start + size)
-        start += size
-        rates = [
-            100 * np.mean([point.won(name)[mine] for point in points])
-            for points in ([base], worse)
-            for name in names
-        ]
-        lines.append([str(seed), str(size), *(f"{rate:.0f}" for rate in rates)])
-    headers = ["training seed", "trials"]
-    headers += [f"{name}, {how} [%]" for how in ("undisturbed", "disturbed") for name in names]
-    return table(headers, lines)
-
-
-def _ranges(recipe: TrainConfig) -> str:
-    physics = recipe.physics
-    low, high = physics.drag
-    first, last = physics.action_delay
-    return (
-        f"lag {physics.lag_mean:g} +- {physics.lag_std:g} 1/s, drag {low:g} to {high:g} 1/s, delay "
-        f"{first:g} to {last:g} decisions, wind {physics.wind_std[0]:g} m/s, time step "
-        f"{100 * physics.time_step_std:g} %, field of view, noise of the image"
-    )

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import tyro
 
 from eval.judging.tables import Tally
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -46,6 +47,8 @@ class Config:
     """Without --policies: change settings of the recipe by name."""
     iterations: Iterations | None = None
     """Without --policies: gradient steps, instead of the preset's."""
+    from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Without --policies: all are trained on from this shipped name or checkpoint's folder."""
     training_seeds: tuple[Seed, ...] = (0, 1, 2, 3, 4)
     """Without --policies: the seeds that are trained."""
     trials: Trials = 100
@@ -114,7 +117,7 @@ def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:
     """Return the policies by what the tables call them; missing ones are trained."""
     if not config.policies:
         row = training.Row("recipe", "the recipe", options.asked_recipe(config))
-        study = training.Study([row], config.training_seeds, may_diverge=False)
+        study = training.Study([row], config.training_seeds, may_diverge=False, start=config.from_)
         runs = training.trained(study, place.cache, console, place.workers)
         return {f"seed {run.seed}": run.policy for run in runs}
     inside = [Path(path, "policy") for path in config.policies]

@@ -16,8 +16,6 @@ import numpy as np
 from eval.judging.results import read_trials
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.delta_file import load_delta
-from policies.formats.policy_file import load_policy_checkpoint
-from policies.networks.network import fitted
 from suite.common.choices import parse_levels
 from suite.common.console import Console, Quiet
 from suite.common.errors import WorkFailed
@@ -289,8 +287,7 @@ def _tune(run: LoopRun, variant: Variant) -> Stage:
 def _tuning(run: LoopRun, variant: Variant) -> Tuning:
     """Return what a variant is fine-tuned from and through."""
     tuning, first = run.tuning(variant.diagnosed), replace(variant, tuned=None)
-    stored = load_policy_checkpoint(run.policy(first))
-    start = fitted(jax.tree.map(jnp.asarray, stored.params), stored.spec, tuning.spec)
+    start = training.started_from(str(run.policy(first)), tuning.spec)
     delta = None
     if variant.delta is not None:
         delta = load_delta(run.out / variant.delta / "delta").params

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from policies.networks import delta_network, network
+from policies.spec import PolicySpec
 from suite.common.console import Console
 from suite.common.estimate import Estimate
 from suite.common.running import hosts
@@ -55,6 +57,24 @@ def estimate(
     seconds = compile_s + config.optimizer.iterations * frames * passes / (steps_per_core_s * cores)
     floats = frames * (images * pixels + 24 * config.spec.hidden_size)
     return Estimate(seconds, 8e8 + floats * 4.0)
+
+
+def started_from(policy: str, spec: PolicySpec, option: str = "--from") -> network.Params:
+    """Return the parameters of `policy` as those of a policy with `spec`, to train on.
+
+    Args:
+        policy: a shipped policy's name or a checkpoint's folder.
+        spec: of what is trained.
+        option: that gave it.
+
+    Raises:
+        ValueError: where there is none, or it sees what `spec` does not have; `option` is named.
+    """
+    from policies.formats.policy_file import load_policy_checkpoint
+    from suite.judging.flying import checkpoint_folder
+
+    start = load_policy_checkpoint(checkpoint_folder(policy, option))
+    return network.fitted(jax.tree.map(jnp.asarray, start.params), start.spec, spec)
 
 
 def train(

@@ -110,8 +110,9 @@ def four_gate_recipe(config: FourGates) -> TrainConfig:
 
 
 def recipe_words(config: Any) -> str:
-    """Return --preset and --set as they were asked for."""
-    return " ".join([config.preset, *config.set])
+    """Return --preset, --set and, where there is one, --from as they were asked for."""
+    start = getattr(config, "from_", None)
+    return " ".join([config.preset, *config.set, *([] if start is None else ["from", start])])
 
 
 def judged_seeds(config: Any) -> str:

@@ -89,6 +89,9 @@ class Study:
     """Whether the rows take turns, so that they meet the same load of the machine."""
     may_diverge: bool = True
     """Whether the others go on where a training diverges."""
+    start: str | None = None
+    """The policy that all are trained on from, a shipped name or a checkpoint's folder; None:
+    from nothing. Not for PPO."""
 
     def pieces(self) -> list[tuple[str, Any]]:
         """Return key and whole configuration of every training, in the order they are done."""
@@ -144,24 +147,35 @@ def trained(
     memory *= workers if isinstance(workers, int) else 1
     whole = Estimate(sum(need.seconds for need in needs), memory)
     announce(console, f"{len(pieces)} trainings, less those that are there", whole)
-    do = functools.partial(train_one, looks=study.looks, may_diverge=study.may_diverge)
-    jobs = [Job(piece, cache / _place_of(piece, study.looks)) for piece in pieces]
+    begin = {} if study.start is None else {"start": study.start}
+    do = functools.partial(train_one, looks=study.looks, may_diverge=study.may_diverge, **begin)
+    jobs = [Job(piece, cache / _place_of(piece, study)) for piece in pieces]
     ended = all_done(do, jobs, workers, console, "training")
     return [_read(job, end) for job, end in zip(jobs, ended, strict=True)]
 
 
-def _place_of(piece: tuple[str, Any], looks: Looks | None) -> Path:
+def _place_of(piece: tuple[str, Any], study: Study) -> Path:
     """Return the folder of a training within the cache."""
-    key, config = piece
+    from suite.judging.content import policy_digest
+
+    (key, config), looks = piece, study.looks
     if looks and looks.measurements:
         return Path("schemes", digest([key, config, looks]))
-    return Path("trainings", digest(config))
+    if study.start is None:
+        return Path("trainings", digest(config))
+    return Path("trainings", digest([config, policy_digest(study.start)]))
 
 
 def train_one(
-    job: Job, console: Console, looks: Looks | None = None, may_diverge: bool = False
+    job: Job,
+    console: Console,
+    looks: Looks | None = None,
+    may_diverge: bool = False,
+    start: str | None = None,
 ) -> Ended:
     """Train one of `Study.pieces` in the job's folder, or find it, and look at it as `looks` says.
+
+    `start` is the `Study`'s.
 
     Raises:
         WorkFailed: where it diverges and may not.
@@ -169,7 +183,7 @@ def train_one(
     from suite.experiments.study.validation import make_validation, stored_params
     from suite.train.ppo.run import train_ppo
     from suite.train.repeat import Watch
-    from suite.train.run import train
+    from suite.train.run import started_from, train
 
     (key, config), folder, watch = job.task, job.folder, None
     is_ppo, diverged = isinstance(config, PpoConfig), ""
@@ -179,8 +193,9 @@ def train_one(
         )
         measure = make_validation(shared, *looks[1:], rewarded(shared))
         watch = Watch(max(1, iterations // looks.measurements), measure)
+    begin = {} if start is None else {"params": started_from(start, config.spec)}
     try:
-        (train_ppo if is_ppo else train)(config, folder, console, watch=watch)
+        (train_ppo if is_ppo else train)(config, folder, console, watch=watch, **begin)
     except WorkFailed as failure:
         if not may_diverge:
             raise

@@ -40,7 +40,7 @@ def made(monkeypatch):
     """Return the configurations that were trained; each gives racer, with another digest."""
     configs = []
 
-    def stand_in(config, folder, console, watch=None):
+    def stand_in(config, folder, console, params=None, watch=None):
         if not (folder / "policy").is_dir():
             configs.append(config)
             another_racer(folder / "policy", 1000 + len(configs))

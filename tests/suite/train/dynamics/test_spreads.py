@@ -1,0 +1,58 @@
+"""Spreads by name, each left out alone, and what is left without any."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from suite.train.dynamics.quadrotor import draw_effects
+from suite.train.dynamics.spreads import fixed, spreads, words
+from suite.train.presets import preset, with_fleet
+
+
+def test_each_spread_of_a_quadrotor_is_left_out_alone():
+    recipe = preset("swift-quad")
+    assert recipe.quadrotor is not None
+    found = spreads(recipe)
+    assert list(found) == [
+        "mass", "thrust", "rotor lag", "drag", "delay", "rate gain", "centre of mass",
+        "torque trim", "wind", "period", "image",
+    ]  # fmt: skip
+    assert found["delay"].quadrotor == replace(recipe.quadrotor, delay_spread_s=0.0)
+    assert found["image"].quadrotor == recipe.quadrotor
+    assert all(replace(each, quadrotor=None, physics=recipe.physics) ==
+               replace(recipe, quadrotor=None) for each in found.values())  # fmt: skip
+    assert "delay" not in spreads(found["delay"])
+
+
+def test_quadrotors_without_spreads_are_all_alike():
+    recipe = fixed(preset("swift-quad"))
+    assert recipe.quadrotor is not None
+    assert spreads(recipe) == {} and recipe.physics.time_step_std == 0
+    drawn = draw_effects(recipe.quadrotor, 4, np.random.default_rng(0))
+    for values in drawn.values():
+        for value in values:
+            assert np.ptp(np.asarray(value), axis=0).max() == 0
+
+
+def test_point_masses_without_spreads_have_the_middle_of_their_ranges():
+    recipe = preset("swift")
+    still = fixed(recipe)
+    assert replace(still, physics=recipe.physics) == recipe
+    physics = still.physics
+    assert physics.drag == pytest.approx((0.45, 0.45))
+    assert physics.drag_up == pytest.approx((1.1, 1.1))
+    assert physics.action_delay == (0.75, 0.75) and physics.lag_mean == recipe.physics.lag_mean
+    assert not (physics.lag_std or any(physics.wind_std) or physics.time_step_std)
+    assert physics.depth_noise == 0 and physics.fov_scale == (1, 1)
+
+
+def test_what_varies_is_said_in_words():
+    assert "delay 70 ms" in words(preset("swift-quad"))
+    assert words(preset("swift-quad")).startswith("around racer5: mass 8 %")
+    assert "delay 0 to 1.5 decisions" in words(preset("swift"))
+
+
+def test_of_a_fleet_nothing_can_be_left_out():
+    with pytest.raises(ValueError, match="a fleet is drawn as a whole"):
+        spreads(with_fleet(preset("swift")))
