@@ -86,7 +86,7 @@ def swift_30() -> TrainConfig:
     assert base.quadrotor is not None
     return replace(
         base,
-        quadrotor=replace(base.quadrotor, delay_spread_s=0.05),
+        quadrotor=replace(base.quadrotor, delay_spread_s=0.08),
         loss=replace(base.loss, acceleration=2e-3, jerk=1e-4, progress=1.7, tilt=40.0),
         episode=replace(base.episode, race_share=0.6),
         optimizer=replace(base.optimizer, iterations=2000, rate=4e-4),

@@ -91,7 +91,9 @@ def _density(d: float, rng: np.random.Generator, stretches: int, mix: Mix) -> Pe
     mean = level * kind * np.array([air, air, pillar, ground])
     numbers = np.floor(mean[:, None] + rng.random((4, stretches))).astype(int) * (level > 0)
     for row, most in zip(numbers, MAX_TOTALS, strict=True):
-        row[:] = np.diff(np.minimum(np.cumsum(row), most), prepend=0)
+        if row.sum() > most:
+            # Any of them go, not those at the end: there a policy would learn to meet fewer.
+            row[:] = rng.multivariate_hypergeometric(row, int(most))
     return PerStretch(*numbers)
 
 

@@ -21,10 +21,7 @@ QUADROTOR: dict[str, dict[str, Any]] = {
     "wind": {"wind_std": STILL},
 }
 """Settings of `QuadrotorConfig` that leave the vehicle as its file says."""
-EVERYWHERE: dict[str, dict[str, Any]] = {
-    "period": {"time_step_std": 0.0},
-    "image": {"depth_noise": 0.0, "fov_scale": (1.0, 1.0)},
-}
+IMAGE = {"depth_noise": 0.0, "fov_scale": (1.0, 1.0)}
 """Settings of `PointMassConfig` that quadrotors heed as well."""
 
 
@@ -54,8 +51,7 @@ def spreads(config: TrainConfig) -> dict[str, TrainConfig]:
             name: replace(config, physics=replace(physics, **changes))
             for name, changes in _of_point_mass(physics).items()
         }
-    for name, changes in EVERYWHERE.items():
-        found[name] = replace(config, physics=replace(physics, **changes))
+    found["image"] = replace(config, physics=replace(physics, **IMAGE))
     return {name: without for name, without in found.items() if without != config}
 
 
@@ -69,13 +65,14 @@ def fixed(config: TrainConfig) -> TrainConfig:
 def words(config: TrainConfig) -> str:
     """Return in words between what the dynamics of `config` vary."""
     physics, quadrotor = config.physics, config.quadrotor
-    both = f"period {100 * physics.time_step_std:g} %, field of view, noise of the image"
+    both = "field of view, noise of the image"
     if quadrotor is None:
         low, high = physics.drag
         first, last = physics.action_delay
         return (
             f"lag {physics.lag_mean:g} +- {physics.lag_std:g} 1/s, drag {low:g} to {high:g} 1/s, "
-            f"delay {first:g} to {last:g} decisions, wind {physics.wind_std[0]:g} m/s, {both}"
+            f"delay {first:g} to {last:g} decisions, wind {physics.wind_std[0]:g} m/s, time step "
+            f"{100 * physics.time_step_std:g} %, {both}"
         )
     return f"around {quadrotor.vehicle.name}: {_of_quadrotor(quadrotor)}, {both}"
 
@@ -100,4 +97,5 @@ def _of_point_mass(physics: PointMassConfig) -> dict[str, dict[str, Any]]:
         "drag": {"drag": middle(physics.drag), "drag_up": middle(physics.drag_up)},
         "delay": {"action_delay": middle(physics.action_delay)},
         "wind": {"wind_std": STILL},
+        "time step": {"time_step_std": 0.0},
     }

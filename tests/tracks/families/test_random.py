@@ -83,6 +83,20 @@ def test_density_runs_from_none_to_beyond_level_9(tracks):
     assert hard.mean() > 1.4 * easy.mean()
 
 
+def test_dense_tracks_are_as_dense_at_the_end_as_at_the_start():
+    """What is too much for a scene is left out anywhere."""
+    rng, mix = np.random.default_rng(4), Mix(density=(1.5, 1.5), bare_share=0.0)
+    by_stretch = np.zeros(7)
+    for _ in range(60):
+        track = random_track(0.9, rng, mix)
+        gates, scene = track.scene.gates.center_w, track.scene
+        middles = (gates[1:] + gates[:-1]) / 2
+        for center in np.concatenate([solids.center_w for solids in scene[1:5]])[32:]:
+            by_stretch[np.linalg.norm(middles - center, axis=1).argmin()] += 1
+    assert by_stretch.sum() > 60 * 40
+    assert by_stretch[-2:].mean() > 0.85 * by_stretch[:2].mean()
+
+
 def steepest(track):
     """Return the largest angle between a stretch and the gate that it leads to [deg]."""
     return np.rad2deg(np.arccos(shape_numbers(track)[2])).max()
