@@ -189,6 +189,9 @@ class EpisodeConfig:
     """Range of the obstacles' density as a share of the judged families'."""
     bare_share: Share = 0.2
     """Share of tracks without obstacles."""
+    beside_m: Annotated[tuple[float, float], Range(0.1, 100.0, ordered=True)] = (2.0, 4.0)
+    """How far beside the straight lines between gates obstacles stand at most, drawn for every
+    track: the nearer, the more of them stand in the way [m]."""
     finish: bool = False
     """Whether a world leaves the loss as it passes its last gate. If not, it is to fly on to a
     point 10 m beyond, so that speed is worth more at the last gate than at the others."""

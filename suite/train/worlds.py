@@ -162,6 +162,7 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         hairpin_share=episode.hairpin_share,
         gate_corners=episode.gate_corners,
         height_spread=episode.height_spread,
+        beside_m=episode.beside_m,
     )
     for rest in rests:
         track = first_gates(random_track(rng.uniform(low, high), rng, mix), episode.gates)

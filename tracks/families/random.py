@@ -55,6 +55,9 @@ class Mix(NamedTuple):
     """Corners of the gates' openings: squares, or regular polygons around the same circle."""
     height_spread: float = 1.0
     """How far the gates' heights lie apart, as a share of what is usual."""
+    beside_m: tuple[float, float] = (2.0, 4.0)
+    """How far beside the straight lines between gates a track's obstacles stand at most, from and
+    to; near lines more of them stand in the way [m]."""
 
 
 MIX = Mix()
@@ -79,7 +82,7 @@ def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:
     start_pos_w = np.array([*start, start_height])
 
     stretches = np.arange(GATE_COUNT - 1)
-    site = straight_sites(gates, stretches, rng.uniform(2.0, 4.0))
+    site = straight_sites(gates, stretches, rng.uniform(*mix.beside_m))
     return furnish(rng, gates, start_pos_w, _density(d, rng, len(stretches), mix), site)
 
 

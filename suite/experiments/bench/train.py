@@ -2,7 +2,8 @@
 
 Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids at
 the preset `paper`: batch 64, 150 steps, 24x32 images, two threads. The same again through a fleet
-of quadrotors in the place of the point mass.
+of quadrotors in the place of the point mass, and ours through the judge's quadrotor, varied as the
+preset `swift-quad` does.
 """
 
 from __future__ import annotations
@@ -167,12 +168,14 @@ def _two_cores() -> Iterator[None]:
 
 def _compare(batch: int, steps: int, rounds: int) -> Comparison:
     point = bench_config(batch, steps)
-    models = {"point": point, "fleet": with_fleet(point)}
+    quadrotor = replace(point, quadrotor=preset("swift-quad").quadrotor)
+    models = {"point": point, "fleet": with_fleet(point), "quadrotor": quadrotor}
     sides = {}
     for model, config in models.items():
         worlds = bench_worlds(config)
         sides[model, OURS] = _ours(config, worlds)
-        sides[model, BASELINE] = _baseline(config, worlds)
+        if model != "quadrotor":
+            sides[model, BASELINE] = _baseline(config, worlds)
     taken: dict[tuple[str, str], list[float]] = {key: [] for key in sides}
     for side in sides.values():
         side()
@@ -208,6 +211,11 @@ def _compare(batch: int, steps: int, rounds: int) -> Comparison:
             "unit": unit,
             "ratio": round(rates["fleet", OURS] / rates["fleet", BASELINE], 2),
             "time_over_point_mass": round(ours / rates["fleet", OURS], 2),
+        },
+        "quadrotor": {
+            "ours": round(rates["quadrotor", OURS]),
+            "unit": unit,
+            "time_over_point_mass": round(ours / rates["quadrotor", OURS], 2),
         },
         "rounds_s": {f"{model} {side}": seconds for (model, side), seconds in taken.items()},
     }

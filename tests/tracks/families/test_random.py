@@ -5,6 +5,7 @@ import pytest
 
 from tracks.families import make_track, random_track
 from tracks.families.random import Mix, is_free
+from tracks.geometry.obstacles import segment_distance
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +96,20 @@ def test_dense_tracks_are_as_dense_at_the_end_as_at_the_start():
             by_stretch[np.linalg.norm(middles - center, axis=1).argmin()] += 1
     assert by_stretch.sum() > 60 * 40
     assert by_stretch[-2:].mean() > 0.85 * by_stretch[:2].mean()
+
+
+def test_obstacles_stand_in_the_way_where_they_are_to_be_near():
+    def share_in_line(beside_m):
+        rng, inside, total = np.random.default_rng(5), 0, 0
+        for _ in range(40):
+            track = random_track(0.5, rng, Mix(bare_share=0.0, beside_m=beside_m))
+            centers = np.concatenate([solids.center_w for solids in track.scene[1:5]])[32:, :2]
+            gates = track.scene.gates.center_w[:, :2]
+            away = segment_distance(centers[:, None], gates[:-1], gates[1:]).min(axis=1)
+            inside, total = inside + (away < 0.5).sum(), total + len(away)
+        return inside / total
+
+    assert share_in_line((0.8, 1.5)) > 2 * share_in_line((3.0, 4.0)) > 0
 
 
 def steepest(track):
