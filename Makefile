@@ -1,5 +1,5 @@
 # make env    the environment in .venv, from requirements.lock
-# make race   the whole loop at a small size: train, fly, record, fit, fine-tune, fly again
+# make race   fly a policy where the dynamics hide an effect, name it, train for it, fly again
 # make test   lint, types and tests
 # make lint   ruff and pyright
 # make docs   the pages of docs/ as a site in site/, links checked
@@ -34,7 +34,7 @@ $(STAMP): requirements.lock pyproject.toml setup.py
 	@touch $(STAMP)
 
 race: $(STAMP)
-	$(VENV)/bin/suite loop --preset small --out $(OUT)
+	$(VENV)/bin/suite loop --world examples/hidden.toml --policy racer --preset small --no-delta --workers $(JOBS) --out $(OUT)
 
 lint: style types
 

@@ -125,7 +125,7 @@ def paper() -> TrainConfig:
 
 
 def small() -> TrainConfig:
-    """Return a run of minutes on two cores, for `make race`: it flies, it does not win."""
+    """Return a run of minutes on two cores: it flies, it does not win."""
     base = racer()
     return replace(
         base,
