@@ -20,12 +20,6 @@ from suite.train.dynamics import spreads
 from tracks.common.names import unknown_name
 from tracks.input.ranges import Iterations, Seed, Trials
 
-DISTURBED = (
-    "mass", "thrust_scale", "motor lag", "drag", "latency", "rate_gain", "com_offset",
-    "torque_trim", "wind", "depth noise",
-)  # fmt: skip
-"""Effects at their usual size, and sweeps, that a spread is there for."""
-
 
 @dataclass(frozen=True)
 class Config:
@@ -54,8 +48,8 @@ class Config:
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """What is disturbed: a shipped vehicle's name or a vehicle file (.toml)."""
-    only: tuple[str, ...] = DISTURBED
-    """Only these effects and sweeps, by name."""
+    only: tuple[str, ...] = tuple(pages.AGAINST.values())
+    """Only these effects, at their usual size, and sweeps, by name."""
 
 
 def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:

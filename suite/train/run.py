@@ -59,21 +59,20 @@ def estimate(
     return Estimate(seconds, 8e8 + floats * 4.0)
 
 
-def started_from(policy: str, spec: PolicySpec, option: str = "--from") -> network.Params:
+def started_from(policy: str, spec: PolicySpec) -> network.Params:
     """Return the parameters of `policy` as those of a policy with `spec`, to train on.
 
     Args:
         policy: a shipped policy's name or a checkpoint's folder.
         spec: of what is trained.
-        option: that gave it.
 
     Raises:
-        ValueError: where there is none, or it sees what `spec` does not have; `option` is named.
+        ValueError: where there is none, or it sees what `spec` does not have.
     """
     from policies.formats.policy_file import load_policy_checkpoint
     from suite.judging.flying import checkpoint_folder
 
-    start = load_policy_checkpoint(checkpoint_folder(policy, option))
+    start = load_policy_checkpoint(checkpoint_folder(policy, "--from"))
     return network.fitted(jax.tree.map(jnp.asarray, start.params), start.spec, spec)
 
 

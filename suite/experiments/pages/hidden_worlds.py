@@ -10,7 +10,7 @@ import numpy as np
 from eval.judging.statistics import Interval, wilson
 from eval.judging.tables import percent
 from eval.worlds.trial import TrialResult
-from suite.experiments.pages.tables import points_cell
+from suite.experiments.pages.tables import gap_cell, points_cell
 from suite.experiments.study.intervals import Gap, nested
 from suite.loop.compare import BEFORE
 from suite.loop.hidden_effect import BOTH, CONTROL, DELTA, LABELS, NAMED, NOMINAL
@@ -183,14 +183,7 @@ def worth_grid(rows: Sequence[Row]) -> Grid:
     lines: list[list[str | Cell]] = []
     for row in rows:
         line: list[str | Cell] = [row.world]
-        for pair in PAIRS:
-            if pair not in row.gaps:
-                line.append("-")
-                continue
-            gap = row.gaps[pair]
-            each = " ".join(f"{round(100 * seed) + 0.0:+.0f}" for seed in gap.of_seeds)
-            cell = points_cell(gap.difference)
-            line.append(Cell(f"{cell.text} ({each})", cell.tone))
+        line += [gap_cell(row.gaps[pair]) if pair in row.gaps else "-" for pair in PAIRS]
         lines.append(line)
     return table(["hidden", *PAIRS], lines)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.judging.statistics import Interval, wilson
-from suite.experiments.pages.tables import points_cell
+from suite.experiments.pages.tables import gap_cell, points_cell
 from suite.experiments.study.disturbed import Grown, Tested
 from suite.experiments.study.intervals import Gap, nested
 from tracks.common.grid import Cell, Grid, table
@@ -115,25 +115,18 @@ def lead(worth: Mapping[str, Mapping[str, Worth]]) -> str:
 
 def worth_grid(worth: Mapping[str, Mapping[str, Worth]]) -> Grid:
     """Return what each spread is worth, and last all of them."""
-    last = {FIXED: worth[FIXED]}
     lines = []
-    for name, mine in {**{n: w for n, w in worth.items() if n != FIXED}, **last}.items():
-        spread = name.removeprefix(WITHOUT)
+    for name in sorted(worth, key=lambda setting: setting == FIXED):
+        mine, spread = worth[name], name.removeprefix(WITHOUT)
         line: list[str | Cell] = ["all of them" if name == FIXED else spread]
         line.append(AGAINST.get(spread, "-"))
         for what in (UNDISTURBED, OWN, ALL):
-            line.append(_gap_cell(mine[what].gap) if what in mine else "-")
+            line.append(gap_cell(mine[what].gap) if what in mine else "-")
         verdicts = [mine[what].gap.verdict if what in mine else "unclear" for what in (OWN, ALL)]
         line += ["" if verdict == "unclear" else verdict for verdict in verdicts]
         lines.append(line)
     headers = ["spread", "its own disturbance", UNDISTURBED, OWN, ALL, f"{OWN}?", "all?"]
     return table(headers, lines)
-
-
-def _gap_cell(gap: Gap) -> Cell:
-    cell = points_cell(gap.difference)
-    each = " ".join(f"{round(100 * seed) + 0.0:+.0f}" for seed in gap.of_seeds)
-    return Cell(f"{cell.text} ({each})", cell.tone)
 
 
 def success_grid(tested: Sequence[Tested]) -> Grid:

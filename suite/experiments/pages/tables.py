@@ -8,6 +8,7 @@ from eval.judging.statistics import Interval, PairedDifference, paired_success
 from eval.judging.tables import Tally, markdown_table, percent
 from suite.common.report import Section
 from suite.experiments.study.disturbed import Tested
+from suite.experiments.study.intervals import Gap
 from suite.experiments.study.summary import METRICS
 from suite.experiments.study.training import Trained
 from tracks.common.grid import Cell, Grid, table
@@ -18,6 +19,13 @@ def points_cell(difference: PairedDifference | Interval) -> Cell:
     value, low, high = (f"{round(100 * x) + 0.0:+.0f}" for x in difference[:3])
     tone = "good" if difference.low > 0 else "bad" if difference.high < 0 else ""
     return Cell(f"{value} [{low}, {high}]", tone)
+
+
+def gap_cell(gap: Gap) -> Cell:
+    """Return a difference as `points_cell` does, and in brackets each training seed's own."""
+    cell = points_cell(gap.difference)
+    each = " ".join(f"{round(100 * seed) + 0.0:+.0f}" for seed in gap.of_seeds)
+    return Cell(f"{cell.text} ({each})", cell.tone)
 
 
 def condition_grid(

@@ -147,8 +147,9 @@ def trained(
     memory *= workers if isinstance(workers, int) else 1
     whole = Estimate(sum(need.seconds for need in needs), memory)
     announce(console, f"{len(pieces)} trainings, less those that are there", whole)
-    begin = {} if study.start is None else {"start": study.start}
-    do = functools.partial(train_one, looks=study.looks, may_diverge=study.may_diverge, **begin)
+    do = functools.partial(
+        train_one, looks=study.looks, may_diverge=study.may_diverge, start=study.start
+    )
     jobs = [Job(piece, cache / _place_of(piece, study)) for piece in pieces]
     ended = all_done(do, jobs, workers, console, "training")
     return [_read(job, end) for job, end in zip(jobs, ended, strict=True)]
