@@ -18,9 +18,9 @@ class Config:
     The same command again goes on where it was stopped.
     """
 
-    preset: str = "swift"
+    preset: str | None = None
     """The recipe: swift, swift-quad or swift-30 (through quadrotors), racer, small, gpu or
-    paper."""
+    paper. By default that of the policy to start from, or swift."""
     policy: str | None = None
     """Start from this policy instead of training one: a shipped name or a checkpoint's folder."""
     track: str = "all"

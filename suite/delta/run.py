@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,14 @@ from tracks.common.files import plain, write_json, write_text
 
 PLANT_STEPS_S, POINT_STEPS_S = 4e5, 1.5e5
 """Steps of the quadrotor and of the point mass a second that a fit makes, for the estimate."""
+FLOWN = {
+    "point_mass": "point mass as trained in",
+    "without": "quadrotor of the vehicle file",
+    "fitted_point_mass": "point mass, lag, drag and delay fitted",
+    "delta_action": "with Delta Action Model",
+}
+"""What flew the held-out flights again, by its key in delta.json: the corrected dynamics first, the
+Delta Action Model last."""
 
 
 def fitting_estimate(config: FitConfig, steps: float, through_quadrotor: bool) -> Estimate:
@@ -142,15 +150,15 @@ def errors(result: DeltaFit) -> dict[str, ReplayErrors]:
     return {"without": result.without, "delta_action": result.with_delta}
 
 
+def errors_by_name(fitted: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
+    """Return the held-out errors in delta.json by what flew, in the order of `FLOWN`."""
+    return {name: fitted[key] for key, name in FLOWN.items() if key in fitted}
+
+
 def table(result: DeltaFit, horizon_s: float) -> str:
     """Return the held-out errors as a Markdown table."""
     whose = "point mass" if isinstance(result, PointMassFit) else "quadrotor"
-    names = {
-        "without": "quadrotor of the vehicle file",
-        "point_mass": "point mass as trained in",
-        "fitted_point_mass": "point mass, lag, drag and delay fitted",
-        "delta_action": f"{whose} with Delta Action Model",
-    }
+    names = {**FLOWN, "delta_action": f"{whose} {FLOWN['delta_action']}"}
     lines = [
         f"| held-out flights, after {horizon_s:g} s | position error [m] "
         f"| velocity error [m/s] | of the {whose}'s |",

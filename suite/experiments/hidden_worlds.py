@@ -26,7 +26,6 @@ from suite.loop.config import HiddenLoopConfig, resolve
 from suite.loop.hidden_effect import LABELS, MODELS
 from suite.loop.run import run_loop
 from suite.loop.work import read_diagnosis
-from suite.train.presets import PRESETS
 from tracks.common.names import unknown_name
 from tracks.input.ranges import Iterations, Range, Seed, Trials
 from tracks.input.reading import read_json
@@ -89,7 +88,7 @@ class Config:
     """Judged trials of each policy on every track at every level, for every training seed."""
     flights: Trials = 3
     """Recorded flights on every track at every level, for every training seed."""
-    iterations: Iterations = 100
+    iterations: Iterations = 60
     """Gradient steps of each fine-tuning."""
     fit_iterations: Iterations = 200
     """Gradient steps of the fit of each Delta Action Model."""
@@ -184,7 +183,6 @@ def loop_of(job: Job) -> HiddenLoopConfig:
     path = job.folder / "world.toml"
     save_vehicle(world_of(load_vehicle(config.vehicle), WORLDS[name]), path, WORLDS[name].words)
     loop = resolve(
-        recipe=config.policy if config.policy in PRESETS else "swift",
         world=str(path),
         policy=config.policy,
         difficulty=config.difficulty,
@@ -216,8 +214,8 @@ def run_one(job: Job, console: Console) -> Came:
         path = out / f"delta-{variant}" / "delta.json"
         if path.is_file():
             fitted = read_json(path)
-            errors[whose] = fitted["without"]["position_m"]
-            errors[f"{whose}, with delta"] = fitted["delta_action"]["position_m"]
+            errors[f"{whose} quadrotor"] = fitted["without"]["position_m"]
+            errors[f"{whose} quadrotor with delta"] = fitted["delta_action"]["position_m"]
     return Came(
         job.task.world,
         job.task.training_seed,

@@ -192,6 +192,7 @@ def ideas(config: Config) -> list[training.Row]:
     )
     fading = f"loss.gradient_decay={2 * base.loss.gradient_decay:g}"
     scalar = f"loss.projection={PROJECTION:g}", f"loss.projection_decay={PROJECTION_DECAY:g}"
+    price = f"loss.survival={base.loss.progress:g}"
     corners = f"episode.gate_corners={ROUND_CORNERS}"
     rows = {
         "second gate": ("the gate after the next is observed", ("spec.second_gate=True",)),
@@ -201,6 +202,7 @@ def ideas(config: Config) -> list[training.Row]:
         "heights": ("gates further up and down", ("episode.height_spread=2.0",)),
         "curriculum": ("difficulty grows over the first half", ("episode.easy_until=0.5",)),
         "one check": ("collision check at a step's end alone", ("loss.path_samples=1",)),
+        "survival": ("a crash costs the progress after it", (price,)),
         "longer": ("twice the horizon, half the worlds", longer),
         "longer, truncated": ("and gradients that fade twice as fast", (*longer, fading)),
         "L_proj": ("the scalar substitute in the field's place", ("loss.field_gain=0", *scalar)),

@@ -170,10 +170,8 @@ def variants_of(config: Config, place: Place, console: Console) -> list[TablePol
 def loop_config(config: Config, policy: str) -> LoopConfig:
     """Return the loop that fine-tunes `policy`, on flights of seeds that no table judges."""
     from suite.loop.config import resolve
-    from suite.train.presets import PRESETS
 
     loop = resolve(
-        recipe=policy if policy in PRESETS else "swift",
         policy=policy,
         difficulty="0,3,6,9",
         trials=LOOP_TRIALS,

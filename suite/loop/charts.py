@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from eval.judging.statistics import Interval
 from suite.common.charts import png, titled
+from suite.delta.run import errors_by_name
 from suite.loop.compare import BEFORE, WITH, WITHOUT, Line
 from suite.loop.standings import Standing
 
@@ -18,6 +19,8 @@ COLOURS = {BEFORE: "#8b93a1", WITHOUT: "#e0892b", WITH: "#2463c9"}
 LABELS = {BEFORE: "before", WITHOUT: "tuned without delta", WITH: "tuned with delta"}
 SEVERAL = ("#8b93a1", "#c0504d", "#e0892b", "#7a5fb5", "#2463c9", "#2e9e6b")
 """Colours of up to six policies."""
+BESIDE_MOST = 8
+"""Cells that have room for their names in two charts side by side."""
 PANELS = (
     ("gates", "Gates a rollout", 1),
     ("collided", "Worlds that collided [%]", 100),
@@ -28,11 +31,13 @@ PANELS = (
 
 def comparison_chart(lines: Sequence[Line]) -> bytes:
     """Return success rates and mean speeds of the three policies by track and level."""
-    figure = Figure(figsize=(10.4, 3.9), layout="constrained")
+    beside = len(lines) <= BESIDE_MOST
+    figure = Figure(figsize=(10.4, 3.9 if beside else 6.6), layout="constrained")
+    panels = figure.subplots(1, 2) if beside else figure.subplots(2, 1)
     cells = [line.track if line.difficulty is None else f"{line.track}\nlevel {line.difficulty}"
              for line in lines]  # fmt: skip
     titles = {"success": "Success [%]", "v_mean": "Mean speed, median over trials [m/s]"}
-    for axes, (field, title) in zip(figure.subplots(1, 2), titles.items(), strict=True):
+    for axes, (field, title) in zip(panels, titles.items(), strict=True):
         dots = [
             (LABELS[variant], colour, [getattr(line, field)[number] for line in lines])
             for number, (variant, colour) in enumerate(COLOURS.items())
@@ -145,12 +150,10 @@ def delta_chart(fitted: Mapping[str, Any]) -> bytes:
     ):
         errors = [row[key] for row in fitted["curve"]]
         axes.plot(at, errors, style, color=COLOURS[WITH], lw=1.8, label=label)
-    for key, label, colour in (
-        ("point_mass", "point mass as trained in", COLOURS[BEFORE]),
-        ("fitted_point_mass", "point mass, lag, drag and delay fitted", COLOURS[WITHOUT]),
-    ):
-        level = fitted[key]["position_m"]
-        axes.axhline(level, color=colour, lw=1.8, label=f"{label}, held-out flights")
+    *rivals, _ = errors_by_name(fitted).items()
+    for (name, error), role in zip(rivals, (BEFORE, WITHOUT), strict=False):
+        label = f"{name}, held-out flights"
+        axes.axhline(error["position_m"], color=COLOURS[role], lw=1.8, label=label)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("iteration of the fit", fontsize=9)
     titled(axes, f"Position error after {fitted['horizon_s']:g} s [m]")

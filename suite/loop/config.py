@@ -11,7 +11,14 @@ from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
 from suite.train.config import TrainConfig, check
 from suite.train.overrides import override
-from suite.train.presets import at_rate, finetune, preset, with_iterations, with_quadrotor
+from suite.train.presets import (
+    PRESETS,
+    at_rate,
+    finetune,
+    preset,
+    with_iterations,
+    with_quadrotor,
+)
 from tracks.common.files import to_json
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials, check_ranges
 
@@ -91,10 +98,10 @@ class LoopConfig:
 
 @dataclass(frozen=True)
 class DeltaLoopConfig(LoopConfig):
-    """A loop through the point mass."""
+    """A loop through the recipe's own dynamics, the point mass or a quadrotor."""
 
     training: TrainConfig
-    """The first training; its physics is what the Delta Action Model corrects."""
+    """The first training; its dynamics are what the Delta Action Model corrects."""
 
 
 @dataclass(frozen=True)
@@ -119,9 +126,14 @@ class HiddenLoopConfig(LoopConfig):
         return self.simulator
 
 
+def recipe_of(policy: str | None) -> str:
+    """Return the recipe that a policy is fine-tuned by: the shipped one's own, else `swift`."""
+    return policy if policy in PRESETS else "swift"
+
+
 def resolve(
     *,
-    recipe: str,
+    recipe: str | None = None,
     world: str | None = None,
     policy: str | None = None,
     track: str = "all",
@@ -138,7 +150,8 @@ def resolve(
 ) -> LoopConfig:
     """Return the loop that a recipe and options ask for; None takes the recipe's size.
 
-    With a world nothing is trained from scratch: without a policy the shipped default flies.
+    Without a recipe it is the policy's own. With a world nothing is trained from scratch: without
+    a policy the shipped default flies.
 
     Raises:
         ValueError: for an option that cannot be used, naming it and what is allowed.
@@ -149,6 +162,9 @@ def resolve(
     from suite.judging.content import policy_digest
     from suite.judging.flying import checkpoint_folder, default_policy
 
+    if world is not None and policy is None:
+        policy = default_policy()
+    recipe = recipe_of(policy) if recipe is None else recipe
     training, simulator = replace(preset(recipe), seed=seed), OWN[0]
     sizes = SIZES if world is None else HIDDEN_SIZES
     size = sizes.get(recipe, sizes[""])
@@ -177,7 +193,6 @@ def resolve(
                 "simulator, such as rotorpy"
             )
         digests["world"] = _digest(true)
-        policy = default_policy() if policy is None else policy
     if policy is not None:
         given = load_policy_checkpoint(checkpoint_folder(policy))
         training = replace(at_rate(training, given.spec.rate_hz), spec=given.spec)

@@ -14,6 +14,7 @@ from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.choices import parse_tracks
 from suite.common.report import Picture, Section
+from suite.delta.run import errors_by_name
 from suite.loop.charts import comparison_chart, delta_chart, training_chart
 from suite.loop.compare import BEFORE, CAVEAT, WITH, WITHOUT, compare, grids, verdict
 from suite.loop.config import DeltaLoopConfig, LoopConfig
@@ -48,18 +49,15 @@ def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResu
 
 
 def _delta(fitted: Mapping) -> Section:
-    names = (
-        ("point_mass", "point mass as trained in"),
-        ("fitted_point_mass", "point mass, lag, drag and delay fitted to the same flights"),
-        ("delta_action", "point mass with Delta Action Model"),
-    )
-    base_m = fitted["point_mass"]["position_m"]
-    rows = [errors_row(name, fitted[key], base_m) for key, name in names]
+    errors = errors_by_name(fitted)
+    base_m = next(iter(errors.values()))["position_m"]
+    rows = [errors_row(name, error, base_m) for name, error in errors.items()]
+    corrected = f"quadrotor of {fitted['vehicle']['name']}" if "vehicle" in fitted else "point mass"
     windows, held, horizon = fitted["windows"], len(fitted["held_out"]), fitted["horizon_s"]
     return Section(
         "Delta Action Model on held-out flights",
         [
-            f"Recorded actions are flown again in the point mass for {horizon:g} s. "
+            f"Recorded actions are flown again in the {corrected} for {horizon:g} s. "
             f"{held} flights ({windows['held_out']} windows) took no part in any fit; "
             f"{windows['fit']} windows of the others did.",
             Grid("", ["", "position error [m]", "velocity error [m/s]", "of the first"], rows),
@@ -76,9 +74,8 @@ def _training(out: Path, config: DeltaLoopConfig) -> Section:
         first = f"From {config.policy}: "
     words = (
         f"{first}{config.tuning.optimizer.iterations} of fine-tuning, without and with the frozen "
-        "Delta Action Model. The curves are of the point mass each was trained in, on random "
-        "tracks, so the two fine-tunings' levels are not comparable: with the model it is another "
-        "vehicle."
+        "Delta Action Model. The curves are of the dynamics each was trained in, on random tracks, "
+        "so the two fine-tunings' levels are not comparable: with the model it is another vehicle."
     )
     return Section("Training", [words, Picture(chart, "Thin: each iteration. Thick: means.")])
 
@@ -99,7 +96,7 @@ LOOP = Loop(
     find=find,
     reading="All three policies fly the same trials in the MuJoCo quadrotor, without the Delta "
     "Action Model. Tuned without delta is the control: as many iterations on the same tracks, in "
-    "the uncorrected point mass. Coloured differences are those whose interval does not hold zero.",
+    "the uncorrected dynamics. Coloured differences are those whose interval does not hold zero.",
     caveat=CAVEAT,
     advice="where the policy crashes within a second or two, train it for longer (--iterations), "
     "or record more flights (--flights), with another --out",

@@ -112,7 +112,7 @@ def _begin(run: LoopRun) -> Stage:
             training.train(config.training, folder, run.console)
 
         needs = training.estimate(config.training)
-        return Stage("train", "training in the point mass", needs, train)
+        return Stage("train", "training the first policy", needs, train)
 
     def copy(folder: Path) -> None:
         with replacing_folder(folder / "policy") as beside:

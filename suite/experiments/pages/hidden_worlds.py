@@ -139,9 +139,9 @@ def lead(rows: Sequence[Row]) -> str:
         return "-" if found is None else f"{100 * found.value:.0f} %"
 
     text = (
-        f"Over {len(worlds)} hidden worlds and {over.loops} loops {rate(BEFORE)} succeed, of "
+        f"Hidden worlds: {len(worlds)}, loops: {over.loops}. There {rate(BEFORE)} succeed, of "
         f"{rate(NOMINAL)} where nothing is hidden. The diagnosis names something in {over.named} "
-        f"of {over.loops} loops."
+        f"of {over.loops}."
     )
     if NAMED not in over.success:
         return text
@@ -235,4 +235,4 @@ def errors_grid(came: Sequence[Came]) -> Grid:
         mine = [one.errors for one in came if one.world == world]
         means = ([errors[c] for errors in mine if c in errors] for c in columns)
         lines.append([world, *(f"{np.mean(some):.3f}" if some else "-" for some in means)])
-    return table(["hidden", *(f"{c} quadrotor" for c in columns)], lines)
+    return table(["hidden", *columns], lines)

@@ -56,9 +56,9 @@ def test_every_world_from_every_seed_once_and_found_again(loops, tmp_path):
     assert [config.seed for config in loops] == [7, 7, 1007, 1007, 2007, 2007]
     worlds = [load_vehicle(config.world) for config in loops]
     assert worlds[0] == world_of(load_vehicle("reference"), WORLDS["weak rotor"])
-    assert {config.tuning.optimizer.iterations for config in loops} == {100}
+    assert {config.tuning.optimizer.iterations for config in loops} == {60}
     text, numbers = page(tmp_path, "hidden_worlds")
-    assert "names something in 3 of 6 loops" in text and "gains in: weak rotor" in text
+    assert "names something in 3 of 6." in text and "gains in: weak rotor" in text
     rotor, delay, over = numbers["worlds"]
     assert [row["named"] for row in (rotor, delay, over)] == [3, 0, 3] and over["world"] == ALL
     assert rotor["gaps"]["named - control"]["of_seeds"] == [0.5, 0.5, 0.5]

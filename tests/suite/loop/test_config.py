@@ -6,7 +6,7 @@ from eval.quadrotor.vehicle_file import save_vehicle
 from eval.worlds.other import rotorpy as rotorpy_world
 from policies import shipped
 from suite import cli
-from suite.loop.config import DeltaLoopConfig, HiddenLoopConfig, parse_world, resolve
+from suite.loop.config import DeltaLoopConfig, HiddenLoopConfig, parse_world, recipe_of, resolve
 from suite.train.presets import finetune, preset
 from tests.support.engines import STAND_IN
 from tests.support.vehicles import with_effects
@@ -97,6 +97,19 @@ def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
     assert hidden.tuning.optimizer.iterations == 200 and hidden.tuning.quadrotor is not None
     assert hidden.true_vehicle == EXAMPLE and hidden.policy == shipped.DEFAULT
     assert set(hidden.digests) == {"vehicle", "world", "policy"}
+
+
+@pytest.mark.parametrize(
+    ("policy", "recipe"),
+    [("racer", "racer"), ("swift-30", "swift-30"), ("swift-small", "swift"), (None, "swift")],
+)
+def test_a_policy_is_fine_tuned_by_its_own_recipe(policy, recipe, root, monkeypatch):
+    monkeypatch.chdir(root)
+    assert resolve(policy=policy) == resolve(policy=policy, recipe=recipe)
+    hidden = recipe_of(policy or shipped.DEFAULT)
+    assert resolve(policy=policy, world=EXAMPLE) == resolve(
+        policy=policy, world=EXAMPLE, recipe=hidden
+    )
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,20 @@ import pytest
 from matplotlib.image import imread
 
 from suite.common.errors import WorkFailed
+from suite.common.report import Picture
 from suite.common.stages import is_done
+from suite.delta.fit import DeltaFit, PointMassFit, ReplayErrors
+from suite.delta.replay import nominal_model
+from suite.delta.run import FLOWN, errors
 from suite.loop import charts, delta_action, hidden_effect, work
+from suite.loop.compare import compare
 from suite.loop.config import resolve
 from suite.loop.report import errors_row
 from suite.loop.variants import DeltaModel, Variant
 from suite.loop.work import LoopRun, Quiet, plan
+from suite.train.config import PointMassConfig
+from tests.support.loops import trial_result
+from tracks.common.grid import Grid
 
 LOOPS = (delta_action.LOOP, hidden_effect.LOOP)
 
@@ -79,6 +88,23 @@ def test_running_means_keep_a_line_and_smooth_a_step():
     assert step[50] == 0 and step[150] == 1 and 0.3 < step[99] < 0.7
 
 
+@pytest.mark.parametrize("levels", [1, 2, 4])
+def test_names_of_cells_do_not_run_into_each_other(levels, monkeypatch):
+    trials = [
+        trial_result(0, True, level)._replace(track=track)
+        for track in ("zigzag", "circular", "ellipse")
+        for level in range(levels)
+    ]
+    drawn = []
+    monkeypatch.setattr(charts, "png", lambda figure: drawn.append(figure) or b"")
+    charts.comparison_chart(compare(dict.fromkeys(("before", "without", "with"), trials)))
+    for axes in drawn[0].axes:
+        drawn[0].draw_without_rendering()
+        boxes = [label.get_window_extent() for label in axes.get_xticklabels()]
+        apart = [right.x0 - left.x1 for left, right in pairwise(boxes)]
+        assert len(boxes) == 3 * levels + 1 and min(apart) > 0
+
+
 def test_curves_that_are_not_there_are_left_out():
     rows = [{"iteration": k, "gates": k, "collided": 0.5, "speed": 3.0} for k in range(5)]
     alone, both = (
@@ -92,3 +118,36 @@ def test_errors_are_told_with_their_share_where_asked():
     errors = {"position_m": 0.1234, "velocity_m_s": 2.0}
     assert [cell.text for cell in errors_row("a", errors)] == ["a", "0.123", "2.000"]
     assert errors_row("a", errors, base_m=0.2468)[-1].text == "50 %"
+
+
+FIT = {"params": {}, "without": ReplayErrors(0.4, 0.8), "with_delta": ReplayErrors(0.1, 0.3)}
+CURVE = [{"iteration": k, "held_out_m": 0.4 - 0.1 * k, "fit_m": 0.3 - 0.1 * k} for k in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("fitted", "about", "corrected"),
+    [
+        (
+            PointMassFit(
+                **FIT,
+                curve=CURVE,
+                identified=nominal_model(PointMassConfig()),
+                rival=ReplayErrors(0.2, 0.5),
+            ),
+            {},
+            "point mass",
+        ),
+        (DeltaFit(**FIT, curve=CURVE), {"vehicle": {"name": "racer5"}}, "quadrotor of racer5"),
+    ],
+    ids=("point mass", "quadrotor"),
+)
+def test_a_report_tells_of_whatever_was_corrected(fitted, about, corrected):
+    flown = {key: error._asdict() for key, error in errors(fitted).items()}
+    rest = {"windows": {"fit": 9, "held_out": 3}, "held_out": ["a"], "horizon_s": 1.0}
+    section = delta_action._delta({**flown, **about, **rest, "curve": CURVE})
+    words, grid, picture = section.parts
+    assert isinstance(words, str) and isinstance(grid, Grid) and isinstance(picture, Picture)
+    assert f"flown again in the {corrected} for 1 s" in words
+    assert [row[0].text for row in grid.rows] == [FLOWN[key] for key in flown]
+    assert [row[-1].text for row in grid.rows][:: len(flown) - 1] == ["100 %", "25 %"]
+    assert picture.png

@@ -27,9 +27,9 @@ def test_differences_are_in_pairs_and_count_no_loop_without_names():
 
 def test_the_lead_says_what_gained_and_where_nothing_is_named_only_what_was_lost():
     said = lead(rows_of([came(seed, WON) for seed in range(3)]))
-    assert "3 loops 50 % succeed, of 100 %" in said and "in 3 of 3 loops" in said
+    assert "loops: 3. There 50 % succeed, of 100 %" in said and "in 3 of 3." in said
     assert "The named effect gains in: a." in said and "loses" not in said
     worse = lead(rows_of([came(seed, {**WON, NAMED: 0}) for seed in range(3)]))
     assert "The named effect gains in: none; loses in: a." in worse
     silent = lead(rows_of([came(0, WON, named=False)]))
-    assert silent.endswith("in 0 of 1 loops.")
+    assert silent.endswith("in 0 of 1.")
