@@ -29,6 +29,9 @@ from suite.train.dynamics.quadrotor import (
 )
 from tracks.geometry.rotation import to_local
 
+LEAST_PHYSICS_HZ = 250.0
+"""Records are flown again at about this rate even where training steps are longer [Hz]."""
+
 
 class QuadrotorWindows(NamedTuple):
     """N windows of T rows; row 0 is where the replay starts, at a decision."""
@@ -59,7 +62,7 @@ class QuadrotorWindows(NamedTuple):
 
 def row_substeps(config: QuadrotorConfig, row_s: float) -> Substeps:
     """Return how a row's period is cut: one step of the attitude loop."""
-    physics = whole_steps(row_s * config.physics_hz)
+    physics = whole_steps(row_s * max(config.physics_hz, LEAST_PHYSICS_HZ))
     return Substeps(1, physics, row_s / physics)
 
 

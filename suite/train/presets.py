@@ -62,6 +62,8 @@ def swift_quad() -> TrainConfig:
         spec=replace(base.spec, speed_input=True),
         quadrotor=QuadrotorConfig(
             load_vehicle("racer5"),
+            attitude_hz=60.0,
+            physics_hz=120.0,
             mass_std=0.08,
             lag_spread_s=0.03,
             drag_spread=0.5,

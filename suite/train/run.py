@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
 
 from policies.networks import delta_network, network
 from policies.spec import PolicySpec
@@ -23,7 +22,13 @@ from suite.common.estimate import Estimate
 from suite.common.running import hosts
 from suite.train.config import TrainConfig, check
 from suite.train.repeat import Method, Outcome, Run, Watch, flight_note, repeat
-from suite.train.update import device_mesh, make_update, shared_out, start_state
+from suite.train.update import (
+    device_mesh,
+    make_update,
+    shared_out,
+    start_state,
+    state_place,
+)
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
 from tracks.common.work import usable_cores
@@ -112,9 +117,7 @@ def train(
         make_update=lambda: make_update(config, mesh, delta),
         note=functools.partial(flight_note, "loss"),
     )
-    # Placed as the update returns it: placed otherwise, the second step would compile it again.
-    place = NamedSharding(mesh, PartitionSpec())
-    run = Run(config, config.spec, config.seed, origin, folder, place)
+    run = Run(config, config.spec, config.seed, origin, folder, state_place(mesh))
     return repeat(method, run, start_state(config, params), console, watch)
 
 

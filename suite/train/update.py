@@ -74,6 +74,14 @@ def device_mesh(config: TrainConfig) -> Mesh:
     return Mesh(np.array(have[:count]), ("worlds",))
 
 
+def state_place(mesh: Mesh) -> NamedSharding:
+    """Return where a state goes before the first step: where the update leaves it.
+
+    Placed otherwise, the second step would compile the update again.
+    """
+    return NamedSharding(mesh, PartitionSpec())
+
+
 def shared_out(worlds: Worlds, mesh: Mesh) -> Worlds:
     """Return worlds with each process's part on its devices; as they are in one process alone."""
     if not hosts.several():
@@ -135,7 +143,7 @@ def make_update(
     seed = jax.random.key(np.uint32(config.seed))
 
     # The first process saves what all of them hold.
-    held = NamedSharding(mesh, PartitionSpec()) if hosts.several() else None
+    held = state_place(mesh) if hosts.several() else None
 
     @functools.partial(jax.jit, out_shardings=held)
     def update(state: TrainState, worlds: Worlds) -> tuple[TrainState, dict[str, jax.Array]]:

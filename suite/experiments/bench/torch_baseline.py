@@ -1,8 +1,9 @@
 """The trainer's method as a plain torch-eager loop: the baseline of `suite bench train`.
 
-Same network, point mass or fleet, losses, field, delays and noise as `suite.train` with the preset
-`paper`, one step after another with the encoder inside the loop, and backward through it. What the
-preset does not use is not here, so that a yardstick stays what it is while the trainer grows.
+Same network, dynamics (point mass, fleet or quadrotors), losses, field, delays and noise as
+`suite.train` with the preset `paper`, one step after another with the encoder inside the loop, and
+backward through it. What the preset does not use is not here, so that a yardstick stays what it is
+while the trainer grows.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ import numpy as np
 import torch
 
 from policies.formats.torch_twin import torch_twin
-from suite.experiments.bench import torch_fleet, torch_scene
+from suite.experiments.bench import torch_fleet, torch_quadrotor, torch_scene
 from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
 from suite.train.dynamics.point_mass import GRAVITY, PointMassParams
+from suite.train.dynamics.quadrotor import QuadrotorParams, substeps
 from suite.train.dynamics.reduced import ReducedParams, state_noise, steps_of
 from suite.train.losses import MAX_PULL, UNIT_FIELD
 from suite.train.presets import paper
@@ -43,19 +45,17 @@ class TorchState(NamedTuple):
     commands_w: Tensor
 
 
-Body = TorchState | torch_fleet.TorchReduced
+Body = TorchState | torch_fleet.TorchReduced | torch_quadrotor.TorchQuadrotor
 """What flies."""
 
 
 def to_torch(tree: Any) -> Any:
     """Return a tree of named tuples with its arrays as tensors, and None where there is none."""
+    if isinstance(tree, dict):
+        return {name: to_torch(part) for name, part in tree.items()}
     if isinstance(tree, tuple):
         return type(tree)(*(to_torch(part) for part in tree))
     return None if tree is None else torch.as_tensor(tree)
-
-
-def _fade(x: Tensor, factor: Tensor) -> Tensor:
-    return x * factor + (x * (1 - factor)).detach()
 
 
 def _norm(vector: Tensor) -> Tensor:
@@ -88,7 +88,7 @@ def step(
     air_b = to_local(body.rot_w, body.vel_w - constants.wind_w)
     acc = thrust - to_world(body.rot_w, constants.drag * air_b)
     fade = (-config.loss.gradient_decay * dt).exp()
-    pos, vel = _fade(body.pos_w, fade), _fade(body.vel_w, fade)
+    pos, vel = torch_fleet.faded(body.pos_w, fade), torch_fleet.faded(body.vel_w, fade)
     pos = pos + vel * dt + 0.5 * body.acc_w * dt * dt
     vel = vel + 0.5 * (body.acc_w + acc) * dt
     with torch.no_grad():
@@ -124,6 +124,9 @@ class Baseline:
         self.network = torch_twin(params, config.spec).requires_grad_(True)
         rate, decay = config.optimizer.rate, config.optimizer.weight_decay
         self.optimizer = torch.optim.AdamW(self.network.parameters(), rate, weight_decay=decay)
+        self.cut = None
+        if config.quadrotor is not None:
+            self.cut = substeps(config.quadrotor, 1.0 / config.spec.rate_hz)
         if config.fleet is not None:
             self.noise = torch.from_numpy(np.array(state_noise(config.fleet, config.spec)))
         self.rays = torch.as_tensor(pixel_rays_b(config.spec.camera), dtype=torch.float32)
@@ -139,6 +142,7 @@ class Baseline:
     def loss(self, worlds: Worlds) -> Tensor:
         """Return the mean loss over steps and worlds of a rollout."""
         config, physics = self.config, self.config.physics
+        worlds = self.prepared(worlds)
         count = worlds.pos_w.shape[0]
         zero = torch.zeros(count, 3)
         body = self.start(worlds)
@@ -166,12 +170,24 @@ class Baseline:
             target = target + (passed & (target < worlds.scene.gates.center_w.shape[1]))
         return total / config.episode.steps
 
+    def prepared(self, worlds: Worlds) -> Worlds:
+        """Return the worlds with their quadrotors ready to be stepped, if that is what flies."""
+        if self.cut is None:
+            return worlds
+        assert self.config.quadrotor is not None
+        given = worlds.constants
+        assert isinstance(given, QuadrotorParams)
+        plants = torch_quadrotor.prepare(self.config.quadrotor, given, self.cut.dt)
+        return worlds._replace(constants=plants)
+
     def start(self, worlds: Worlds) -> Body:
         """Return the bodies at the start of a rollout."""
         zero = torch.zeros_like(worlds.pos_w)
         rot_w = attitude(zero, worlds.heading_w)
         if isinstance(worlds.constants, ReducedParams):
             return torch_fleet.start(worlds.constants, worlds.pos_w, worlds.vel_w, rot_w)
+        if isinstance(worlds.constants, torch_quadrotor.Plants):
+            return torch_quadrotor.start(worlds.constants, worlds.pos_w, worlds.vel_w, rot_w)
         return TorchState(
             worlds.pos_w, worlds.vel_w, zero, zero, rot_w,
             worlds.heading_w, torch.zeros(len(zero), 2, 3),
@@ -192,9 +208,12 @@ class Baseline:
         if isinstance(body, TorchState):
             assert isinstance(constants, PointMassParams)
             return step(body, constants, action, target_w, config)
+        decay = config.loss.gradient_decay
+        if isinstance(body, torch_quadrotor.TorchQuadrotor):
+            assert isinstance(constants, torch_quadrotor.Plants) and self.cut is not None
+            return torch_quadrotor.step(body, constants, action, target_w, self.cut, decay)
         assert isinstance(constants, ReducedParams) and config.fleet is not None
         steps = steps_of(config.fleet, 1.0 / config.spec.rate_hz)
-        decay = config.loss.gradient_decay
         return torch_fleet.step(body, constants, action, target_w, steps, decay)
 
     def target_gate(self, gates: Gates, target: Tensor) -> tuple[Gates, Tensor]:

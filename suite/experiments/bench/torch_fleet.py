@@ -26,6 +26,18 @@ class TorchReduced(NamedTuple):
     commands: Tensor
 
 
+class Gains(NamedTuple):
+    """What the attitude loop has as tensors; see `suite.train.dynamics.reduced.Gains`."""
+
+    attitude_gain: Tensor
+    rate_max: Tensor
+
+
+def faded(x: Tensor, factor: Tensor) -> Tensor:
+    """Return `x` with its gradient times `factor`."""
+    return x * factor + (x * (1 - factor)).detach()
+
+
 def exp_rot(vector: Tensor) -> Tensor:
     """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     zero = torch.zeros_like(vector[..., 0])
@@ -60,10 +72,10 @@ def blend(heading_w: Tensor, to_gate_w: Tensor, dt: Tensor) -> Tensor:
     return torch.stack([x / length, y / length, torch.zeros_like(x)], -1)
 
 
-def asked(params: ReducedParams, body: TorchReduced, action: Tensor, heading_w: Tensor) -> Tensor:
+def asked(gains: Gains, rot_w: Tensor, action: Tensor, heading_w: Tensor) -> Tensor:
     """Return thrust and rates (B, 4) of the attitude loop; see `attitude_command`."""
-    force_b = action + GRAVITY * body.rot_w[:, 2]
-    heading_b = to_local(body.rot_w, heading_w)
+    force_b = action + GRAVITY * rot_w[:, 2]
+    heading_b = to_local(rot_w, heading_w)
     up_b = force_b / force_b.norm(dim=-1, keepdim=True).clamp(min=LEAST_FORCE)
     a, b, c = up_b.unbind(-1)
     across = a * a + b * b
@@ -76,8 +88,8 @@ def asked(params: ReducedParams, body: TorchReduced, action: Tensor, heading_w: 
     aside = (heading_b * torch.linalg.cross(up_b, front)).sum(-1)
     yaw = torch.atan2(aside, ahead)
     error = torch.stack([-b * angle / sine, a * angle / sine, yaw], -1)
-    limit = params.vehicle.rate_max
-    rate = torch.minimum(torch.maximum(params.vehicle.attitude_gain * error, -limit), limit)
+    limit = gains.rate_max
+    rate = torch.minimum(torch.maximum(gains.attitude_gain * error, -limit), limit)
     return torch.cat([force_b[:, 2:].clamp(min=0), rate], -1)
 
 
@@ -88,7 +100,8 @@ def fly(
     vehicle = params.vehicle
     with torch.no_grad():
         heading_w = blend(body.heading_w, target_w - body.pos_w, dt[:, 0])
-    now = asked(params, body, action, heading_w)
+    gains = Gains(vehicle.attitude_gain, vehicle.rate_max)
+    now = asked(gains, body.rot_w, action, heading_w)
     commands = torch.cat([now[:, None], body.commands[:, :-1]], 1)
     acting = (params.delay_share[..., None] * commands).sum(1)
     rate, trim = body.loop[..., 0], body.loop[..., 2]
@@ -136,10 +149,6 @@ def step(
     """Advance one policy period; see `suite.train.dynamics.reduced.step`."""
     period = params.time_step[:, None]
     fade = (-decay * period).exp()
-
-    def faded(x: Tensor, factor: Tensor) -> Tensor:
-        return x * factor + (x * (1 - factor)).detach()
-
     before_w = faded(body.vel_w, fade)
     body = body._replace(
         pos_w=faded(body.pos_w, fade),

@@ -11,19 +11,27 @@ from suite.experiments.bench import train
 from suite.experiments.bench.torch_baseline import Baseline, to_torch
 from suite.train.dynamics.fleet import FleetConfig
 from suite.train.gradient import make_gradient
+from suite.train.presets import preset
 from tests.support.training import fresh_params
 
-QUIET = FleetConfig(vel_noise=0.0, axis_noise=0.0, gate_noise_m=0.0)
+MODELS = {
+    "point": {},
+    "fleet": {"fleet": FleetConfig(vel_noise=0.0, axis_noise=0.0, gate_noise_m=0.0)},
+    "quadrotor": {"quadrotor": preset("swift-quad").quadrotor},
+}
 
 
 @pytest.fixture(
     scope="module",
-    params=[None, pytest.param(QUIET, marks=pytest.mark.slow)],
-    ids=["point", "fleet"],
+    params=[
+        "point",
+        pytest.param("fleet", marks=pytest.mark.slow),
+        pytest.param("quadrotor", marks=pytest.mark.slow),
+    ],
 )
 def pair(request):
     """Return (our gradient, our loss, the baseline after backward, its loss, config)."""
-    base = replace(train.bench_config(6, 12), fleet=request.param)
+    base = replace(train.bench_config(6, 12), **MODELS[request.param])
     config = replace(base, physics=replace(base.physics, depth_noise=0.0))
     worlds, params = train.bench_worlds(config), fresh_params(config.spec)
     gradient, loss, _ = jax.jit(make_gradient(config))(params, worlds, jax.random.key(0), None)
@@ -39,13 +47,15 @@ def test_both_sides_compute_the_same_loss(pair):
 
 
 def test_both_sides_compute_the_same_gradient(pair):
+    """The convolutions see the images, which differ a little."""
     gradient, _, baseline, _, config = pair
     ours = torch_twin({name: np.asarray(value) for name, value in gradient.items()}, config.spec)
     expected = dict(ours.named_parameters())
     for name, value in baseline.network.named_parameters():
         size = float(expected[name].abs().max())
         assert value.grad is not None and size > 0
-        assert float((value.grad - expected[name]).abs().max()) < 0.01 * size, name
+        share = 0.03 if name.startswith("conv") else 0.005
+        assert float((value.grad - expected[name]).abs().max()) < share * size, name
 
 
 def test_the_baseline_refuses_what_its_preset_does_not_have():

@@ -17,6 +17,7 @@ from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
 from suite.train.dynamics.quadrotor import QuadrotorParams, quadrotor_dynamics, substeps
 from suite.train.gradient import make_gradient
+from suite.train.presets import preset
 from suite.train.rollout import make_rollout
 from suite.train.worlds import sample_worlds
 from tests.support.courses import straight
@@ -121,16 +122,37 @@ def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(floa
 
 
 @pytest.mark.parametrize("vehicle", [REFERENCE, HIDDEN], ids=["reference", "hidden"])
-def test_training_steps_stay_near_the_judges(float64, vehicle):
-    """At 15 Hz with 250 Hz physics: 7 steps of 9.5 ms for the judge's 6 or 7 of 10 ms."""
-    config = QuadrotorConfig(vehicle, **ALIKE)
+@pytest.mark.parametrize(
+    ("rates", "steps", "off_m"),
+    [((100.0, 250.0), (7, 2), 0.02), ((60.0, 120.0), (4, 2), 0.03)],
+    ids=["default", "swift-quad"],
+)
+def test_training_steps_stay_near_the_judges(float64, vehicle, rates, steps, off_m):
+    """At 15 Hz: 7 or 4 steps for the judge's 6 or 7 of 10 ms."""
+    config = QuadrotorConfig(vehicle, *rates, **ALIKE)
     cut = substeps(config, 1 / 15)
-    assert cut[:2] == (7, 2) and cut.dt == pytest.approx(1 / 15 / 14)
+    assert cut[:2] == steps and cut.dt == pytest.approx(1 / 15 / np.prod(steps))
     actions = lively_actions(15)
     ours, judged = fly_trainer(config, actions, 15.0), fly_judge(vehicle, actions, 15.0)
     assert np.all(np.linalg.norm(judged[0][-1] - [0.0, 0.0, 10.0], axis=-1) > 0.4)
-    assert np.linalg.norm(ours[0] - judged[0], axis=-1).max() < 0.02
+    assert np.linalg.norm(ours[0] - judged[0], axis=-1).max() < off_m
     assert np.linalg.norm(ours[2] - judged[2], axis=-1).max() < 0.1
+
+
+def test_long_steps_change_a_flight_by_far_less_than_what_is_drawn(float64):
+    config = preset("swift-30").quadrotor
+    assert config is not None
+    # The same actions for all, so that only the vehicles differ.
+    actions = np.repeat(lively_actions(30, batch=1), 32, axis=1)
+
+    def off(other):
+        """Return how far apart flights end in the median over vehicles [m]."""
+        return np.median(np.linalg.norm((other - fine)[-1], axis=-1))
+
+    fine = fly_trainer(replace(config, attitude_hz=100.0, physics_hz=500.0), actions, 30.0)[0]
+    long, drawn = fly_trainer(config, actions, 30.0)[0], np.roll(fine, 1, axis=1)
+    assert substeps(config, 1 / 30)[:2] == (2, 2)
+    assert 0 < off(long) < 0.02 * off(drawn)
 
 
 def test_gradients_of_a_flight_are_those_of_finite_differences(float64, monkeypatch):
