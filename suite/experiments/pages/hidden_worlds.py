@@ -10,12 +10,12 @@ import numpy as np
 from eval.judging.statistics import Interval, wilson
 from eval.judging.tables import percent
 from eval.worlds.trial import TrialResult
+from suite.diagnose.report.parameters_json import components
 from suite.experiments.pages.tables import gap_cell, points_cell
 from suite.experiments.study.intervals import Gap, nested
 from suite.loop.compare import BEFORE
 from suite.loop.hidden_effect import BOTH, CONTROL, DELTA, LABELS, NAMED, NOMINAL
 from suite.loop.work import named_effects
-from tracks.common.files import to_json
 from tracks.common.grid import Cell, Grid, table
 
 ALL = "all"
@@ -207,9 +207,10 @@ def named_grid(came: Sequence[Came], words: Mapping[str, str]) -> Grid:
     lines = []
     for one in came:
         values = [
-            f"{effect['name']} {name} {to_json(entry['value'])} {entry['unit']}"
+            f"{effect['name']} {label}: {value:.4g}"
             for effect in one.diagnosis["effects"]
-            for name, entry in effect["parameters"].items()
+            for label, value, _ in components(effect["parameters"])
+            if value is not None
         ]
         gap = one.diagnosis["gap"]
         lines.append(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from suite.experiments.pages.hidden_worlds import Came, lead, rows_of
+from suite.experiments.pages.hidden_worlds import Came, lead, named_grid, rows_of
 from suite.loop.hidden_effect import LABELS, NAMED
 from tests.support.loops import EFFECT, WON, four_trials
 
@@ -33,3 +33,16 @@ def test_the_lead_says_what_gained_and_where_nothing_is_named_only_what_was_lost
     assert "The named effect gains in: none; loses in: a." in worse
     silent = lead(rows_of([came(0, WON, named=False)]))
     assert silent.endswith("in 0 of 1.")
+
+
+def test_what_is_named_is_told_in_as_many_digits_as_mean_something():
+    """Of a vector only what the flights can tell."""
+    values = {"offset": {"value": [0.012001345, None], "ci95": None, "unit": "m"}}
+    found = {
+        "effects": [{"name": "com_offset", "alternatives": [], "parameters": values}],
+        "verdict": "named",
+        "gap": {"before": 7.123, "after": 1.0},
+    }
+    ((*_, named, told, gap),) = named_grid([Came("a", 0, {}, found, {})], {"a": "moved"}).rows
+    assert named.text == "com_offset" and gap.text == "7.12, 1.00"
+    assert told.text == "com_offset offset 1 [m]: 0.012"
