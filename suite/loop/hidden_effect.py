@@ -12,12 +12,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from eval.effects import EFFECTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import differences
 from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.report import Links, Picture, Section
+from suite.diagnose.report.cells import grid
+from suite.diagnose.report.parameters_json import components, in_digits
 from suite.loop.charts import success_chart, tuning_chart
 from suite.loop.compare import BEFORE, points, told_apart
 from suite.loop.config import OWN, HiddenLoopConfig, LoopConfig
@@ -26,7 +29,7 @@ from suite.loop.standings import Standing, cell_grid, overall_grid, standings
 from suite.loop.variants import DeltaModel, Findings, Loop, Shown, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
-from tracks.common.grid import Cell, Grid
+from tracks.common.grid import Grid
 
 NOMINAL, CONTROL, DELTA, NAMED, BOTH = "nominal", "control", "delta", "named", "both"
 LABELS = {
@@ -113,19 +116,18 @@ def verdict(
 
 def _diagnosis(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Section:
     gap = diagnosis["gap"]
-    rows = []
-    for effect in diagnosis["effects"]:
-        for name, entry in effect["parameters"].items():
-            value, interval = to_json(entry["value"]), to_json(entry["ci95"])
-            cells = (effect["name"], ", ".join(effect["alternatives"]), name, value, interval)
-            rows.append([Cell(text) for text in (*cells, entry["unit"])])
-    headers = ["effect", "or", "parameter", "value", "95 % interval", "unit"]
+    rows = [
+        (effect["name"], ", ".join(effect["alternatives"]), label, *in_digits(value, span))
+        for effect in diagnosis["effects"]
+        for label, value, span in components(effect["parameters"])
+    ]
+    headers = ["effect", "or", "parameter", "value", "95 %"]
     return Section(
         "What the diagnosis found in the flights",
         [
             f"Verdict: {diagnosis['verdict']}. Held-out gap {gap['before']:.2f} before, "
             f"{gap['after']:.2f} after; 1 is the noise floor.",
-            Grid("", headers, rows),
+            grid("", headers, rows),
             *what_is_hidden(config),
             Links([("diagnosis/report.html", "the diagnosis's own report")]),
         ],
@@ -147,11 +149,14 @@ def what_is_hidden(config: HiddenLoopConfig) -> list[str]:
 
 def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
     """Return the effects that `true` has and `simulated` has not, or has otherwise, in words."""
-    parts = [
-        f"{name} {value._asdict()}"
-        for name, value in true.effects.items()
-        if simulated.effects.get(name) != value
-    ]
+    parts = []
+    for name, value in true.effects.items():
+        if simulated.effects.get(name) != value:
+            held = (
+                f"{parameter.name} {to_json(getattr(value, parameter.name))} {parameter.unit}"
+                for parameter in EFFECTS[name].parameters
+            )
+            parts.append(f"{name} ({', '.join(held)})")
     parts += [f"no {name}" for name in simulated.effects if name not in true.effects]
     return "; ".join(parts) or "other nominal values"
 

@@ -12,7 +12,7 @@ from suite.diagnose.fit.composites import in_words
 from suite.diagnose.report.cells import cells, grid, short_name
 from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
 from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
-from suite.diagnose.report.parameters_json import components
+from suite.diagnose.report.parameters_json import components, in_digits
 from suite.diagnose.report.result_sections import held_out_section, residual_section
 from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
@@ -99,8 +99,7 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
             effect["name"],
             ", ".join(effect["alternatives"]) or "none",
             label,
-            "not seen" if value is None else f"{value:.4g}",
-            "" if span is None else f"{span[0]:.4g} to {span[1]:.4g}",
+            *in_digits(value, span),
             "exempt" if effect["gap_removed"] is None else f"{100 * effect['gap_removed']:.0f} %",
             f"{effect['p_value']:.2g}",
         )

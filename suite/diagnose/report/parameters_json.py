@@ -22,6 +22,12 @@ def components(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
             yield f"{name} {k + 1} [{unit}]", one, span[k] if span else None
 
 
+def in_digits(value: float | None, span: Sequence[float] | None) -> tuple[str, str]:
+    """Return a component's value and its interval as cells show them."""
+    between = "" if span is None else f"{span[0]:.4g} to {span[1]:.4g}"
+    return "not seen" if value is None else f"{value:.4g}", between
+
+
 def parameters_json(
     space: ParameterSpace,
     name: str,

@@ -14,7 +14,7 @@ from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.fit.composites import in_words
 from suite.diagnose.report.cells import grid
 from suite.diagnose.report.charts import AFTER, BEFORE, FLOOR
-from suite.diagnose.report.parameters_json import components
+from suite.diagnose.report.parameters_json import components, in_digits
 from suite.diagnose.views.by_views import ViewsDiagnosis
 from suite.diagnose.views.fit.equations import left_of
 from tracks.common.grid import Grid
@@ -107,8 +107,7 @@ def _answer(told: Mapping[str, Any]) -> list[Part]:
             ", ".join(effect["alternatives"]) or "none",
             effect["view"],
             label,
-            "not seen" if value is None else f"{value:.4g}",
-            "" if span is None else f"{span[0]:.4g} to {span[1]:.4g}",
+            *in_digits(value, span),
         )
         for effect in told["effects"]
         for label, value, span in components(effect["parameters"])

@@ -111,7 +111,10 @@ def test_the_loop_leaves_tables_report_and_recording(whole):
     assert all(f"| {label} |" in table for label in LABELS.values())
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4 and "<script" not in page
-    assert "ComOffset" not in page and "com_offset {&#x27;offset&#x27;: (0.012" in page
+    assert "com_offset (offset [0.012, 0.0, 0.0] m)." in page
+    rows = page.replace("\n", "")
+    assert "<td>offset 1 [m]</td><td>0.011</td><td></td>" in rows
+    assert "<td>offset 3 [m]</td><td>not seen</td>" in rows
     for line in page.split('href="')[1:]:
         assert (out / line.split('"')[0]).is_file()
 
@@ -215,7 +218,7 @@ def test_the_example_hides_one_effect(root):
     assert true.mass == simulated.mass and true.rotors == simulated.rotors
     assert true.controller == simulated.controller
     assert set(true.effects) - set(simulated.effects) == {"com_offset"}
-    assert hidden_effects(simulated, true) == "com_offset {'offset': (0.012, 0.0, 0.0)}"
+    assert hidden_effects(simulated, true) == "com_offset (offset [0.012, 0.0, 0.0] m)"
     assert hidden_effects(true, simulated) == "no com_offset"
 
 
