@@ -81,6 +81,12 @@ def test_help_imports_nothing_heavy():
         assert f"  {name} " in done.stdout
 
 
+def test_the_page_of_commands_lists_every_one(root):
+    page = (root / "docs" / "commands.md").read_text()
+    rows = [f"| `{name}` | {summary} |" for name, summary in sorted(cli.COMMANDS.items())]
+    assert [row for row in rows if row not in page] == []
+
+
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
 def test_every_command_has_help_for_every_option(name, capsys):
     assert cli.main([name, "--help"]) == 0
