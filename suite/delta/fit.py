@@ -44,7 +44,7 @@ class FitConfig:
     iterations: Iterations = 1500
     """Gradient steps."""
     batch: Annotated[int, Range(1, 10**6)] = 256
-    """PointMassWindows per gradient step."""
+    """Windows per gradient step."""
     rate: Annotated[float, Range(0.0, 10.0)] = 5e-3
     """Peak learning rate; it falls to zero as a cosine."""
     velocity_weight: Annotated[float, Range(0.0, 1e6)] = 0.3
@@ -190,7 +190,8 @@ def fit_network(
             "held_out_m": float(errors(held_out, params)[0].mean()),
         }
         curve.append(row)
-        show(iteration + 1, f"1 s error {row['fit_m']:.3f} m, held out {row['held_out_m']:.3f} m")
+        after = f"error after {config.horizon_s:g} s"
+        show(iteration + 1, f"{after} {row['fit_m']:.3f} m, held out {row['held_out_m']:.3f} m")
 
     start = delta_network.init(jax.random.key(config.seed))
 

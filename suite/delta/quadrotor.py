@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from eval.quadrotor.stepper import PlantState, hover_state
+from eval.quadrotor.stepper import hover_state
 from policies.networks import delta_network
 from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before, state_after
 from suite.delta.windows import refuse_none, stacked
@@ -66,12 +66,22 @@ def row_substeps(config: QuadrotorConfig, row_s: float) -> Substeps:
     return Substeps(1, physics, row_s / physics)
 
 
+def row_period(logs: Sequence[FlightLog]) -> float:
+    """Return the time between rows, the median over all of `logs` [s]."""
+    return float(np.median(np.concatenate([np.diff(log.time_s) for log in logs])))
+
+
 def cut_quadrotor_windows(
-    logs: Sequence[FlightLog], config: QuadrotorConfig, duration_s: float, stride_s: float
+    logs: Sequence[FlightLog],
+    config: QuadrotorConfig,
+    duration_s: float,
+    stride_s: float,
+    row_s: float | None = None,
 ) -> tuple[QuadrotorWindows, Substeps]:
     """Return windows of `duration_s`, about one every `stride_s` of every flight, and their grid.
 
-    A window with a missing value or an uneven row is left out.
+    A window with a missing value or a row of another length than `row_s` is left out; `row_s` [s]
+    is these logs' own where it is not given.
 
     Raises:
         ValueError: where a log has no actions, or no flight is as long as a window.
@@ -82,7 +92,7 @@ def cut_quadrotor_windows(
                 f"{log.name}: columns action_x, action_y, action_z, policy_step and cmd_* are "
                 "needed to fit the Delta Action Model; record flights with suite collect"
             )
-    row_s = float(np.median(np.concatenate([np.diff(log.time_s) for log in logs])))
+    row_s = row_period(logs) if row_s is None else row_s
     cut = row_substeps(config, row_s)
     plant = plant_of(config, {}, cut.dt, varies=False)
     length = plant.delay_weight.shape[-1]
@@ -157,11 +167,9 @@ def replay_quadrotor(
     count = windows.pos_w.shape[0]
     hover = hover_state(plant, (count,), jnp)
     speed = jnp.asarray(windows.rotor_speed)
-    state = PlantState(
-        jnp.where(jnp.isfinite(speed), speed, hover.rotor_speed),
-        jnp.swapaxes(jnp.asarray(windows.past), 1, 2),
-        hover.wind,
-        carried=hover.carried,
+    state = hover._replace(
+        rotor_speed=jnp.where(jnp.isfinite(speed), speed, hover.rotor_speed),
+        past_commands=jnp.swapaxes(jnp.asarray(windows.past), 1, 2),
     )
     zero = jnp.zeros((count, 3))
     body = QuadrotorState(

@@ -104,10 +104,11 @@ def fit_delta(
     known: Any
     held_out: Any
     if isinstance(dynamics, QuadrotorConfig):
-        from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor
+        from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor, row_period
 
+        row_s = row_period(logs)
         cuts = [
-            cut_quadrotor_windows(part, dynamics, config.horizon_s, config.stride_s)
+            cut_quadrotor_windows(part, dynamics, config.horizon_s, config.stride_s, row_s)
             for part in parts
         ]
         known, held_out = (windows for windows, _ in cuts)

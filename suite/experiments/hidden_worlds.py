@@ -30,7 +30,16 @@ from tracks.common.names import unknown_name
 from tracks.input.ranges import Iterations, Range, Seed, Trials
 from tracks.input.reading import read_json
 
-ROOMS = ("tracks", "policies", "eval", "suite/train", "suite/delta", "suite/diagnose", "suite/loop")
+ROOMS = (
+    "tracks",
+    "policies",
+    "eval",
+    "suite/judging",
+    "suite/train",
+    "suite/delta",
+    "suite/diagnose",
+    "suite/loop",
+)
 """Code whose change makes every loop anew."""
 APART = 1000
 """The loops' seeds lie so far apart, so that no two of them judge the same trials."""
@@ -84,7 +93,7 @@ class Config:
     """One loop each: flights, noise, fits and fine-tunings differ."""
     difficulty: str = "3,9"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
-    trials: Trials = 10
+    trials: Annotated[int, Range(1, APART)] = 10
     """Judged trials of each policy on every track at every level, for every training seed."""
     flights: Trials = 3
     """Recorded flights on every track at every level, for every training seed."""
@@ -95,8 +104,8 @@ class Config:
     set: tuple[str, ...] = ()
     """Change settings of the fine-tuning by name."""
     seed: Seed = 0
-    """Seed of the first judged trial of the first training seed; those of the others follow at
-    distances of 1,000."""
+    """Seed of the first judged trial of training seed 0; those of training seed K are 1,000 K
+    above."""
     vehicle: str = "reference"
     """What the simulation knows: a shipped vehicle's name or a vehicle file (.toml)."""
 
@@ -114,6 +123,8 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     simulated = load_vehicle(config.vehicle)
     policy = config.policy or default_policy()
     config = replace(config, policy=policy)
+    owned = {"optimizer.iterations": "give --iterations", "seed": "give --training-seeds"}
+    options.check_owned(config.set, owned)
     for name in config.only:
         if name not in WORLDS:
             raise unknown_name("hidden world", name, WORLDS)
@@ -143,7 +154,10 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
             "training seeds": " ".join(map(str, config.training_seeds)),
             "trials": f"three tracks, levels {config.difficulty}: "
             f"{len(judging.trials_of(config))} of each policy for each training seed, seeds "
-            f"{options.judged_seeds(config)} and so on at distances of {APART}",
+            + ", ".join(
+                options.judged_seeds(replace(config, seed=config.seed + APART * seed))
+                for seed in config.training_seeds
+            ),
             "recorded": f"{config.flights} flights on every track and level, at other seeds",
             "fine-tuning": f"{config.iterations} gradient steps each",
         },

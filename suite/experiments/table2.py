@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from eval.judging.tables import Tally, percent
@@ -20,7 +20,7 @@ from suite.experiments.pages.goals import goal_grid, goals, verdict
 from suite.experiments.pages.paper import sim_to_sim
 from suite.experiments.pages.tables import every_cell
 from suite.experiments.study import judging, options
-from suite.experiments.study.cache import code_digest, digest
+from suite.experiments.study.cache import code_digest, digest, engines
 from suite.judging.content import policy_digest
 from suite.judging.flying import default_policy
 from suite.loop import compare
@@ -34,7 +34,15 @@ if TYPE_CHECKING:
 OURS, WITH, CONTROL = "ours", "ours, with Delta Action Model", "ours, tuned as long without it"
 LOOP_TRIALS = 10
 """Judged trials a cell in the loop's own tables, which are not shown here."""
-LOOP_ROOMS = ("tracks", "policies", "eval", "suite/train", "suite/delta", "suite/loop")
+LOOP_ROOMS = (
+    "tracks",
+    "policies",
+    "eval",
+    "suite/judging",
+    "suite/train",
+    "suite/delta",
+    "suite/loop",
+)
 """Code that flies, fits and fine-tunes: a loop that older code ran is not taken for this one's."""
 COLUMNS = [
     header
@@ -150,11 +158,11 @@ def variants_of(config: Config, place: Place, console: Console) -> list[TablePol
     policy = config.policy or default_policy()
     chosen = {OURS: policy, **{name: path for name, path in given.items() if path}}
     if config.delta_iterations:
+        from suite.common.console import Quiet
         from suite.loop.run import run_loop
-        from suite.loop.work import Quiet
 
         loop = loop_config(config, policy)
-        folder = place.cache / "loops" / digest([loop, code_digest(*LOOP_ROOMS)])
+        folder = place.cache / "loops" / digest([loop, code_digest(*LOOP_ROOMS), engines()])
         run_loop(loop, folder, Quiet(), place.workers)
         chosen[WITH] = str(folder / "tuned-with" / "policy")
         chosen[CONTROL] = str(folder / "tuned-without" / "policy")
@@ -171,15 +179,17 @@ def loop_config(config: Config, policy: str) -> LoopConfig:
     """Return the loop that fine-tunes `policy`, on flights of seeds that no table judges."""
     from suite.loop.config import resolve
 
-    loop = resolve(
+    owned = {"optimizer.iterations": "give --delta-iterations", "seed": "give --seed"}
+    options.check_owned(config.delta_set, owned, "--delta-set")
+    return resolve(
         policy=policy,
         difficulty="0,3,6,9",
         trials=LOOP_TRIALS,
         vehicle=config.vehicle,
+        seed=config.seed,
         finetune_iterations=config.delta_iterations,
         changes=config.delta_set,
     )
-    return replace(loop, seed=config.seed)
 
 
 def _merit(results: Mapping[str, Sequence[TrialResult]]) -> list[compare.Line]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
 from suite.common.choices import is_track_file, parse_levels, parse_tracks
@@ -126,6 +127,21 @@ class HiddenLoopConfig(LoopConfig):
         return self.simulator
 
 
+def by_content(config: LoopConfig) -> LoopConfig:
+    """Return the loop with its files by name: what they hold is in `digests`.
+
+    So where they lie, and from where the loop is called, makes it no other loop.
+    """
+
+    def name(path: str | None) -> str | None:
+        return None if path is None else Path(path).name
+
+    config = replace(config, policy=name(config.policy), vehicle=Path(config.vehicle).name)
+    if isinstance(config, HiddenLoopConfig):
+        return replace(config, world=Path(config.world).name)
+    return config
+
+
 def recipe_of(policy: str | None) -> str:
     """Return the recipe that a policy is fine-tuned by: the shipped one's own, else `swift`."""
     return policy if policy in PRESETS else "swift"
@@ -151,7 +167,8 @@ def resolve(
     """Return the loop that a recipe and options ask for; None takes the recipe's size.
 
     Without a recipe it is the policy's own. With a world nothing is trained from scratch: without
-    a policy the shipped default flies.
+    a policy the shipped default flies. Where a policy is given, `changes` are of its fine-tuning as
+    it is, else of the recipe that the fine-tuning follows from.
 
     Raises:
         ValueError: for an option that cannot be used, naming it and what is allowed.
@@ -203,7 +220,9 @@ def resolve(
     if longer is not None:
         tuning = with_iterations(tuning, longer)
     if world is not None:
-        tuning = override(with_quadrotor(tuning, simulated), changes)
+        tuning = with_quadrotor(tuning, simulated)
+    if policy is not None:
+        tuning = override(tuning, changes)
     fitted = size.fit_iterations if fit_iterations is None else fit_iterations
     check(tuning)
     config = LoopConfig(

@@ -98,7 +98,9 @@ def verdict(
     def percent(name: str) -> str:
         return f"{100 * by_name[name].success.value:.0f} %"
 
-    back = "not to be told from" if apart[NOMINAL].high >= 0 else "below"
+    back = "not to be told from"
+    if apart[NOMINAL].low > 0 or apart[NOMINAL].high < 0:
+        back = "above" if apart[NOMINAL].low > 0 else "below"
     told = (
         f"In {where} {percent(BEFORE)} of {trials} trials succeed, in the simulation's "
         f"vehicle {percent(NOMINAL)}. The diagnosis names {named_effects(diagnosis)}. Fine-tuned "
@@ -158,7 +160,9 @@ def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
             )
             parts.append(f"{name} ({', '.join(held)})")
     parts += [f"no {name}" for name in simulated.effects if name not in true.effects]
-    return "; ".join(parts) or "other nominal values"
+    if replace(true, name=simulated.name, effects=simulated.effects) != simulated:
+        parts.append("other nominal values")
+    return "; ".join(parts)
 
 
 def _delta(out: Path) -> Section:

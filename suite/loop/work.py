@@ -47,8 +47,6 @@ DIAGNOSIS = Estimate(90.0, 1.5e9)
 """What a diagnosis needs."""
 PHYSICS_HZ = 200.0
 """Steps of the quadrotor in which a Delta Action Model is fitted, for the estimate [Hz]."""
-QUADROTOR_COST = 3.0
-"""A gradient step through the quadrotor over one through the point mass, for the estimate."""
 
 
 @dataclass(frozen=True)
@@ -278,9 +276,7 @@ def _tune(run: LoopRun, variant: Variant) -> Stage:
         jobs = [job for job in jobs if not is_done(job.folder)]
         all_done(_tune_one, jobs, run.workers, run.console, "fine-tuning")
 
-    point = training.estimate(replace(run.config.tuning, quadrotor=None))
-    cost = 1.0 if run.config.tuning.quadrotor is None else QUADROTOR_COST
-    needs = Estimate(cost * point.seconds, point.memory_bytes)
+    needs = training.estimate(run.config.tuning)
     return Stage(f"tuned-{variant.name}", f"fine-tuning {variant.tuned}", needs, work)
 
 

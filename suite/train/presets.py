@@ -225,8 +225,10 @@ def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) ->
 
     if model != "quad":
         if vehicle is not None:
-            flown = "a fleet" if model == "fleet" else "the point mass"
-            raise ValueError(f"--vehicle is {vehicle}, but {flown} has none: add --model quad")
+            flown = "a fleet has none" if model == "fleet" else "the point mass has none"
+            if model is None and config.quadrotor is not None:
+                flown = f"this recipe's quadrotors are around {config.quadrotor.vehicle.name}"
+            raise ValueError(f"--vehicle is {vehicle}, but {flown}: add --model quad")
         if model is None:
             return config
         if model == "fleet":

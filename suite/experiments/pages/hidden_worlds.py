@@ -34,7 +34,7 @@ HOW = (
     "corrected from the same flights; with both: through that with a Delta Action Model of what it "
     "still lacks. All randomise their quadrotor as the recipe does. The first column flies the "
     "simulation's vehicle, all others the hidden world.",
-    "Success over all training seeds, [95 % Wilson intervals].",
+    "Success over the training seeds from which something was named, [95 % Wilson intervals].",
 )
 WORTH = (
     "Differences in points over the same trials, with 95 % bootstrap intervals that draw training "
@@ -90,13 +90,14 @@ def rows_of(came: Sequence[Came]) -> list[Row]:
 
 def _row(name: str, came: Sequence[Came]) -> Row:
     success, gaps, laps = {}, {}, {}
+    # All policies over the same loops, or where nothing was named would count before only.
+    told = [one for one in came if NAMED in one.results] or came
     for policy in LABELS:
-        flown = [one.results[policy] for one in came if policy in one.results]
-        won = [result.success for rows in flown for result in rows]
+        pairs = [(one.results[policy], one.results[NOMINAL]) for one in told
+                 if policy in one.results]  # fmt: skip
+        won = [result.success for rows, _ in pairs for result in rows]
         if won:
             success[policy] = wilson(sum(won), len(won))
-            pairs = [(one.results[policy], one.results[NOMINAL]) for one in came
-                     if policy in one.results]  # fmt: skip
             laps[policy] = _lap_ratio(pairs)
     for pair, (one, other) in PAIRS.items():
         seeds = dict.fromkeys(loop.training_seed for loop in came)

@@ -65,12 +65,13 @@ def _check_unseen(option: str, seed: int, training_seeds: Sequence[int]) -> None
         )
 
 
-def check_owned(changes: Sequence[str], owned: Mapping[str, str]) -> None:
+def check_owned(changes: Sequence[str], owned: Mapping[str, str], option: str = "--set") -> None:
     """Refuse changes, as --set takes them, of settings that an experiment sets itself.
 
     Args:
         changes: SETTING=VALUE each.
         owned: what to do instead, by a setting's path.
+        option: that gave the changes.
 
     Raises:
         ValueError: naming the setting and what to do instead.
@@ -78,7 +79,7 @@ def check_owned(changes: Sequence[str], owned: Mapping[str, str]) -> None:
     for change in changes:
         path = change.partition("=")[0].strip()
         if path in owned:
-            raise ValueError(f"--set {change!r}: this experiment sets {path}; {owned[path]}")
+            raise ValueError(f"{option} {change!r}: this experiment sets {path}; {owned[path]}")
 
 
 def asked_recipe(config: Any) -> TrainConfig:

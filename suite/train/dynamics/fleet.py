@@ -78,7 +78,7 @@ class FleetConfig:
     """Quadratic drag along the body's z [1/m]."""
     wind_std: Annotated[tuple[float, float, float], Range(0.0, 100.0)] = (1.0, 1.0, 0.2)
     """Standard deviation of the constant wind [m/s]."""
-    time_step_std: Share = 0.03
+    time_step_std: Annotated[float, Range(0.0, 0.25)] = 0.03
     """Standard deviation of the policy's period over worlds, as a share of it [1]."""
     state_latency_s: Annotated[Span, Range(0.0, 0.2, ordered=True)] = (0.0, 0.02)
     """Age of the state that the policy sees [s]."""

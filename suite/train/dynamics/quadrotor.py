@@ -97,6 +97,7 @@ def draw_effects(
     drag = own("linear_drag").coefficient + config.drag_spread * either_way(3)
     delay = own("command_delay").delay + config.delay_spread_s * either_way()
     wind = rng.standard_normal((batch, 3)) * np.asarray(config.wind_std)
+    lightest = vehicle.mass + at(EFFECTS["mass_offset"].parameters[0].low, vehicle)
 
     def lag(either: np.ndarray) -> np.ndarray:
         whole = own("motor_lag").time_constant * (1 + config.lag_spread * either)
@@ -107,7 +108,10 @@ def draw_effects(
         "constant_wind": (own("constant_wind").velocity + wind,),
         "motor_lag": (lag(either_way()),),
         "command_delay": (np.clip(delay, 0.0, longest_delay(config)),),
-        "mass_offset": (mass * (1 + config.mass_std * rng.standard_normal(batch)) - vehicle.mass,),
+        "mass_offset": (
+            np.maximum(mass * (1 + config.mass_std * rng.standard_normal(batch)), lightest)
+            - vehicle.mass,
+        ),
         "rate_gain": (own("rate_gain").scale * (1 + config.gain_spread * either_way(3)),),
     }
     # Only where they are asked for: a plant is the dearer the more of its effects vary.

@@ -28,6 +28,7 @@ from eval.quadrotor.rotors import follow, speed_command
 from policies.spec import PolicySpec
 from suite.train.dynamics.fleet import GRAVITY, FleetConfig, Vehicles, draw_vehicles
 from suite.train.dynamics.point_mass import attitude, faded
+from suite.train.dynamics.quadrotor import whole_steps
 from tracks.geometry.rotation import exp_rot, to_local, to_world
 from tracks.geometry.scene import Array
 
@@ -86,7 +87,7 @@ class ReducedState(NamedTuple):
 
 def steps_of(config: FleetConfig, period_s: float) -> int:
     """Return how many steps a policy period is cut into."""
-    return max(1, round(period_s * config.attitude_hz - 1e-6))
+    return whole_steps(period_s * config.attitude_hz)
 
 
 def prepare(vehicles: Vehicles, steps: int, longest_delay: float | None = None) -> ReducedParams:

@@ -68,11 +68,12 @@ def words(config: TrainConfig) -> str:
     both = "field of view, noise of the image"
     if quadrotor is None:
         low, high = physics.drag
+        least, most = physics.drag_up
         first, last = physics.action_delay
         return (
-            f"lag {physics.lag_mean:g} +- {physics.lag_std:g} 1/s, drag {low:g} to {high:g} 1/s, "
-            f"delay {first:g} to {last:g} decisions, wind {physics.wind_std[0]:g} m/s, time step "
-            f"{100 * physics.time_step_std:g} %, {both}"
+            f"lag {physics.lag_mean:g} +- {physics.lag_std:g} 1/s, drag {low:g} to {high:g} 1/s "
+            f"({least:g} to {most:g} along z), delay {first:g} to {last:g} decisions, "
+            f"wind {physics.wind_std[0]:g} m/s, time step {100 * physics.time_step_std:g} %, {both}"
         )
     return f"around {quadrotor.vehicle.name}: {_of_quadrotor(quadrotor)}, {both}"
 

@@ -18,7 +18,7 @@ from policies.spec import PolicySpec
 from suite.common.console import Console
 from suite.delta.burn_in import state_after
 from suite.delta.fit import FitConfig, window_errors
-from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor
+from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor, row_period
 from suite.delta.run import fit_delta
 from suite.train.config import QuadrotorConfig
 from tests.support.courses import straight
@@ -140,6 +140,25 @@ def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path):
     for name, value in result.params.items():
         np.testing.assert_array_equal(stored.params[name], value)
     assert "| quadrotor with Delta Action Model |" in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_a_firmwares_rate_loop_replays_too(logs):
+    """Its memory is of the loop, which looks for the first time where a window starts."""
+    config = QuadrotorConfig(load_vehicle("crazyflie21"))
+    windows, cut = cut_quadrotor_windows(logs[:1], config, 0.5, 0.3)
+    pos_w, vel_w, _ = jax.jit(partial(replay_quadrotor, config, cut))(windows, None)
+    assert np.all(np.isfinite(pos_w)) and np.all(np.isfinite(vel_w))
+
+
+def test_windows_of_two_parts_have_one_grid(logs):
+    """A log with rows of another length than most has no windows, instead of wrong ones."""
+    slow = replace(logs[0], time_s=2.0 * logs[0].time_s)
+    config = QuadrotorConfig(TRUE)
+    row_s = row_period([*logs[1:], slow])
+    assert row_s == pytest.approx(0.01)
+    with pytest.raises(ValueError, match="no window of 0.5 s"):
+        cut_quadrotor_windows([slow], config, 0.5, 0.3, row_s)
+    assert len(cut_quadrotor_windows([slow], config, 0.5, 0.3)[0].pos_w) > 0
 
 
 def test_logs_without_actions_are_refused(logs):

@@ -59,6 +59,7 @@ def test_every_world_from_every_seed_once_and_found_again(loops, tmp_path):
     assert {config.tuning.optimizer.iterations for config in loops} == {60}
     text, numbers = page(tmp_path, "hidden_worlds")
     assert "names something in 3 of 6." in text and "gains in: weak rotor" in text
+    assert "seeds 7 to 10, 1007 to 1010, 2007 to 2010" in text
     rotor, delay, over = numbers["worlds"]
     assert [row["named"] for row in (rotor, delay, over)] == [3, 0, 3] and over["world"] == ALL
     assert rotor["gaps"]["named - control"]["of_seeds"] == [0.5, 0.5, 0.5]
@@ -78,7 +79,15 @@ def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeyp
     assert reproduce(tmp_path, "hidden_worlds", *args) == 1
 
 
-def test_a_world_that_does_not_exist_is_code_2(loops, tmp_path, capsys):
-    assert reproduce(tmp_path, "hidden_worlds", "--only", "weak roter") == 2
-    assert "Did you mean 'weak rotor'?" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--only", "weak roter"], "Did you mean 'weak rotor'?"),
+        (["--set", "seed=3"], "this experiment sets seed; give --training-seeds"),
+        (["--trials", "1001"], "--trials is 1001, allowed is 1 to 1000"),
+    ],
+)
+def test_what_cannot_be_used_is_code_2(args, words, loops, tmp_path, capsys):
+    assert reproduce(tmp_path, "hidden_worlds", *args) == 2
+    assert words in capsys.readouterr().err
     assert not loops

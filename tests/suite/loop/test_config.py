@@ -6,7 +6,14 @@ from eval.quadrotor.vehicle_file import save_vehicle
 from eval.worlds.other import rotorpy as rotorpy_world
 from policies import shipped
 from suite import cli
-from suite.loop.config import DeltaLoopConfig, HiddenLoopConfig, parse_world, recipe_of, resolve
+from suite.loop.config import (
+    DeltaLoopConfig,
+    HiddenLoopConfig,
+    by_content,
+    parse_world,
+    recipe_of,
+    resolve,
+)
 from suite.train.presets import finetune, preset
 from tests.support.engines import STAND_IN
 from tests.support.vehicles import with_effects
@@ -110,6 +117,26 @@ def test_a_policy_is_fine_tuned_by_its_own_recipe(policy, recipe, root, monkeypa
     assert resolve(policy=policy, world=EXAMPLE) == resolve(
         policy=policy, world=EXAMPLE, recipe=hidden
     )
+
+
+def test_settings_are_of_the_fine_tuning_where_a_policy_is_given():
+    """Else of the recipe, which the fine-tuning follows at its share of the rate."""
+    changes = ("optimizer.rate=1e-4", "episode.easy_until=0.2")
+    given = resolve(policy="racer", changes=changes).tuning
+    assert (given.optimizer.rate, given.episode.easy_until) == (1e-4, 0.2)
+    trained = resolve(recipe="small", changes=changes).tuning
+    assert (trained.optimizer.rate, trained.episode.easy_until) == (pytest.approx(3e-5), 0.0)
+
+
+def test_where_files_lie_makes_no_other_loop(root, monkeypatch, tmp_path):
+    monkeypatch.chdir(root)
+    moved = tmp_path / "hidden.toml"
+    moved.write_bytes((root / EXAMPLE).read_bytes())
+    here, there = (resolve(recipe="small", world=str(path)) for path in (EXAMPLE, moved))
+    assert here != there and by_content(here) == by_content(there)
+    other = tmp_path / "other" / "hidden.toml"
+    save_vehicle(with_effects(com_offset=((0.005, 0.0, 0.0),)), other)
+    assert by_content(resolve(recipe="small", world=str(other))) != by_content(here)
 
 
 @pytest.fixture

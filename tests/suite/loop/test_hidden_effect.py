@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from eval.effects.com_offset import ComOffset
+from eval.effects.torque_trim import TorqueTrim
 from eval.judging.results import read_trials
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from eval.vehicles.vehicle import with_effects
 from policies.formats.delta_file import save_delta
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import delta_network
@@ -233,7 +235,7 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
     assert [one.vehicle for one in judged] == ["reference"] + ["examples/rotorpy.toml"] * 5
     assert place(config) == "the world rotorpy"
     told = what_is_hidden(config)
-    assert "rotor_drag {'coefficient': 7.8e-05}" in told[0] and "no linear_drag" in told[0]
+    assert "rotor_drag (coefficient 7.8e-05 kg/rad)" in told[0] and "no linear_drag" in told[0]
     assert "the rotors' drag acts at each hub" in told[1]
     same = resolve(recipe="small", world="rotorpy")
     assert isinstance(same, HiddenLoopConfig)
@@ -264,3 +266,23 @@ def test_the_verdict_does_not_claim_what_the_intervals_do_not_hold():
     words = verdict(standings(results, ("before", "control", "nominal")), answer([NAMED]), 40)
     assert "not to be told from the same fine-tuning without it" in words
     assert "below the policy where nothing is hidden" in words
+
+
+@pytest.mark.parametrize(
+    ("nominal", "named", "how"),
+    [(39, 40, "not to be told from"), (20, 40, "above"), (40, 20, "below")],
+)
+def test_the_verdict_says_what_came_back_of_what_was_lost(nominal, named, how):
+    won = dict.fromkeys(("before", "control"), 10) | {"nominal": nominal, "named": named}
+    results = {name: [trial_result(k, k < count) for k in range(40)] for name, count in won.items()}
+    words = verdict(standings(results, ("before", "control", "nominal")), answer([NAMED]), 40)
+    assert f", and {how} the policy where nothing is hidden" in words
+
+
+def test_what_is_hidden_may_be_nominal_too():
+    simulated = load_vehicle("reference")
+    other = replace(simulated, mass=0.8)
+    assert hidden_effects(simulated, other) == "other nominal values"
+    trimmed = with_effects(simulated, {"torque_trim": TorqueTrim(np.array([0.01, 0.0, 0.0]))})
+    told = hidden_effects(simulated, replace(trimmed, mass=0.8))
+    assert told == "torque_trim (torque [0.01, 0.0, 0.0] N m); other nominal values"

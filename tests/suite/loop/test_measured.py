@@ -53,9 +53,17 @@ def test_crashed_flights_lose_their_end_and_short_ones_are_left_out(logs, tmp_pa
     )
     assert before[0] - after[0] == pytest.approx(CONTACT_MARGIN_S, abs=0.034)
     assert before[1] == after[1]
-    assert enough(files, 1.0) == files
     for row in rows:
         row["file"] = None
     (flights / "flights.json").write_text(json.dumps({"flights": rows}))
     with pytest.raises(ValueError, match="no flight in .* is 1.5 s long"):
         measure(flights, tmp_path / "none", 0)
+
+
+def test_the_diagnosis_gets_five_flights_or_as_many_as_are_long_enough(logs, tmp_path):
+    files = [tmp_path / f"{number}.parquet" for number in range(7)]
+    for file in files:
+        write_flight(file, logs[0])
+    assert enough(files, 1.0) == files[:5]
+    assert enough(files, 5.5 * logs[0].duration_s) == files[:6]
+    assert enough(files, 99.0 * logs[0].duration_s) == files

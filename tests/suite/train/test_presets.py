@@ -33,6 +33,13 @@ def test_a_model_is_asked_for_by_name_or_the_recipes_own():
         check(both)
 
 
+def test_another_vehicle_than_the_recipes_wants_a_word():
+    with pytest.raises(ValueError, match="quadrotors are around racer5: add --model quad"):
+        chosen_model(preset("swift-quad"), None, "reference")
+    with pytest.raises(ValueError, match="the point mass has none: add --model quad"):
+        chosen_model(preset("swift"), None, "reference")
+
+
 def test_swift_quad_varies_its_quadrotors_widely_around_any_vehicle_that_is_asked_for():
     own = preset("swift-quad")
     check(own)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
+import pytest
 
 from suite.delta.replay import nominal_model
 from suite.train.dynamics.point_mass import PointMassParams
@@ -39,14 +40,15 @@ def test_worlds_beside_a_gate_have_missed_it():
     assert np.linalg.norm(worlds.vel_w, axis=-1).max() < 5.0
 
 
-def test_none_has_missed_a_gate_unless_asked():
-    """The default's worlds are what they were before there was the setting."""
-    config = small_config(batch=8, rest_share=0.0)
-    with_some = replace(config, episode=replace(config.episode, missed_share=0.5))
-    one, other = (sample_worlds(c, 3).pos_w for c in (config, with_some))
-    assert np.abs(one - other).max() > 0.1
-    gates = sample_worlds(config, 3).scene.gates
-    assert np.all(np.isfinite(gates.center_w))
+@pytest.mark.parametrize(("share", "least", "most"), [(0.0, 0.0, 0.1), (0.5, 0.35, 0.65)])
+def test_as_many_have_missed_a_gate_as_are_asked_for(share, least, most):
+    worlds = sample_worlds(small_config(batch=80, rest_share=0.0, missed_share=share), 3)
+    gates, rows = worlds.scene.gates, np.arange(80)
+    turn = gates.rot_w[rows, worlds.target]
+    local = np.einsum("bij,bi->bj", turn, worlds.pos_w - gates.center_w[rows, worlds.target])
+    beside = np.hypot(local[:, 1], local[:, 2])
+    missed = (np.abs(local[:, 0] - 0.25) < 0.96) & (beside > 0.85) & (beside < 1.85)
+    assert least <= missed.mean() <= most
 
 
 def test_how_fast_to_fly_is_drawn_where_it_is_an_input_and_moves_nothing_else():

@@ -155,6 +155,12 @@ def test_long_steps_change_a_flight_by_far_less_than_what_is_drawn(float64):
     assert 0 < off(long) < 0.02 * off(drawn)
 
 
+def test_no_vehicle_is_drawn_lighter_than_the_catalogue_knows():
+    config = QuadrotorConfig(PLAIN, mass_std=0.9)
+    drawn = quadrotor.draw_effects(config, 200, np.random.default_rng(0))["mass_offset"].offset
+    assert drawn.min() == pytest.approx(-0.5 * PLAIN.mass) and np.ptp(drawn) > PLAIN.mass
+
+
 def test_gradients_of_a_flight_are_those_of_finite_differences(float64, monkeypatch):
     """Through attitude loop, rate loop, mixer, rotors, delay and effects; heading held."""
     monkeypatch.setattr(quadrotor, "blend_heading", lambda heading_w, *_: heading_w)
