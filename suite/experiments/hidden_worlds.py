@@ -8,8 +8,9 @@ from typing import Annotated, Any, NamedTuple
 
 from eval.effects import EFFECTS
 from eval.judging.results import read_trials
-from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle, shipped_vehicles
 from eval.vehicles.vehicle import Vehicle, with_effects
+from policies import shipped
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.report import Report, Section
@@ -21,7 +22,7 @@ from suite.experiments.pages.hidden_worlds import Came
 from suite.experiments.study import judging, options
 from suite.experiments.study.cache import code_digest, digest, engines
 from suite.judging.content import policy_digest
-from suite.judging.flying import default_policy
+from suite.judging.flying import checkpoint_folder, default_policy
 from suite.loop.config import HiddenLoopConfig, resolve
 from suite.loop.hidden_effect import LABELS, MODELS
 from suite.loop.run import run_loop
@@ -116,6 +117,8 @@ class Asked(NamedTuple):
     config: Config
     world: str
     training_seed: int
+    simulated: Vehicle
+    """What the simulation knows, by content: the loop may run where there are none of our files."""
 
 
 def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
@@ -129,6 +132,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         if name not in WORLDS:
             raise unknown_name("hidden world", name, WORLDS)
     worlds = {name: hidden for name, hidden in WORLDS.items() if name in (config.only or WORLDS)}
+    start = None if policy in shipped.names() else checkpoint_folder(policy)
     jobs = []
     for seed in config.training_seeds:
         for name, hidden in worlds.items():
@@ -141,7 +145,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
                 "engines": engines(),
             }
             folder = place.cache / "loops" / f"{name.replace(' ', '-')}-{seed}-{digest(about)}"
-            jobs.append(Job(Asked(config, name, seed), folder))
+            jobs.append(Job(Asked(config, name, seed, simulated), folder, start))
     loop_of(jobs[0])
     came = all_done(run_one, jobs, place.workers, console, "loops in hidden worlds")
     rows, words = pages.rows_of(came), {name: hidden.words for name, hidden in worlds.items()}
@@ -188,21 +192,24 @@ def world_of(simulated: Vehicle, hidden: Hidden) -> Vehicle:
 
 
 def loop_of(job: Job) -> HiddenLoopConfig:
-    """Return the loop of a job's `Asked`, having written its world's file.
+    """Return the loop of a job's `Asked`, having written its vehicles' files.
 
     Raises:
         ValueError: for an option that cannot be used.
     """
-    config, name, seed = job.task
-    path = job.folder / "world.toml"
-    save_vehicle(world_of(load_vehicle(config.vehicle), WORLDS[name]), path, WORLDS[name].words)
+    config, name, seed, simulated = job.task
+    path, vehicle = job.folder / "world.toml", config.vehicle
+    save_vehicle(world_of(simulated, WORLDS[name]), path, WORLDS[name].words)
+    if vehicle not in shipped_vehicles():
+        vehicle = str(job.folder / "vehicle.toml")
+        save_vehicle(simulated, vehicle, "what the simulation knows")
     loop = resolve(
         world=str(path),
-        policy=config.policy,
+        policy=config.policy if job.reads is None else str(job.reads),
         difficulty=config.difficulty,
         trials=config.trials,
         flights=config.flights,
-        vehicle=config.vehicle,
+        vehicle=vehicle,
         seed=config.seed + APART * seed,
         finetune_iterations=config.iterations,
         fit_iterations=config.fit_iterations,

@@ -128,17 +128,18 @@ class HiddenLoopConfig(LoopConfig):
 
 
 def by_content(config: LoopConfig) -> LoopConfig:
-    """Return the loop with its files by name: what they hold is in `digests`.
+    """Return the loop without where its files lie: what they hold is in `digests`.
 
-    So where they lie, and from where the loop is called, makes it no other loop.
+    So a loop that is moved, or called from another folder or machine, is no other loop.
     """
 
-    def name(path: str | None) -> str | None:
-        return None if path is None else Path(path).name
+    def name(given: str) -> str:
+        return "a file" if Path(given).exists() else given
 
-    config = replace(config, policy=name(config.policy), vehicle=Path(config.vehicle).name)
+    policy = None if config.policy is None else name(config.policy)
+    config = replace(config, policy=policy, vehicle=name(config.vehicle))
     if isinstance(config, HiddenLoopConfig):
-        return replace(config, world=Path(config.world).name)
+        return replace(config, world=name(config.world))
     return config
 
 

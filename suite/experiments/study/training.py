@@ -136,6 +136,7 @@ def trained(
     Raises:
         WorkFailed: where one diverges that may not.
     """
+    from suite.judging.flying import checkpoint_folder
     from suite.train.ppo.run import estimate as ppo_estimate
     from suite.train.run import estimate
 
@@ -147,10 +148,9 @@ def trained(
     memory *= workers if isinstance(workers, int) else 1
     whole = Estimate(sum(need.seconds for need in needs), memory)
     announce(console, f"{len(pieces)} trainings, less those that are there", whole)
-    do = functools.partial(
-        train_one, looks=study.looks, may_diverge=study.may_diverge, start=study.start
-    )
-    jobs = [Job(piece, cache / _place_of(piece, study)) for piece in pieces]
+    do = functools.partial(train_one, looks=study.looks, may_diverge=study.may_diverge)
+    start = None if study.start is None else checkpoint_folder(study.start, "--from")
+    jobs = [Job(piece, cache / _place_of(piece, study), start) for piece in pieces]
     ended = all_done(do, jobs, workers, console, "training")
     return [_read(job, end) for job, end in zip(jobs, ended, strict=True)]
 
@@ -172,11 +172,10 @@ def train_one(
     console: Console,
     looks: Looks | None = None,
     may_diverge: bool = False,
-    start: str | None = None,
 ) -> Ended:
     """Train one of `Study.pieces` in the job's folder, or find it, and look at it as `looks` says.
 
-    `start` is the `Study`'s.
+    It starts from the checkpoint that the job reads, if it reads one.
 
     Raises:
         WorkFailed: where it diverges and may not.
@@ -194,7 +193,9 @@ def train_one(
         )
         measure = make_validation(shared, *looks[1:], rewarded(shared))
         watch = Watch(max(1, iterations // looks.measurements), measure)
-    begin = {} if start is None else {"params": started_from(start, config.spec)}
+    begin = {}
+    if job.reads is not None:
+        begin = {"params": started_from(str(job.reads), config.spec)}
     try:
         (train_ppo if is_ppo else train)(config, folder, console, watch=watch, **begin)
     except WorkFailed as failure:

@@ -4,15 +4,19 @@ The loops themselves are stand-ins; tests/suite/loop has theirs.
 """
 
 import json
+import shutil
 
 import pytest
 
 from eval.judging.results import write_trials
-from eval.quadrotor.vehicle_file import load_vehicle
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from policies import shipped
 from suite.common.errors import WorkFailed
+from suite.common.running.apart import Job
 from suite.experiments import hidden_worlds
-from suite.experiments.hidden_worlds import WORLDS, world_of
+from suite.experiments.hidden_worlds import WORLDS, Asked, Config, loop_of, world_of
 from suite.experiments.pages.hidden_worlds import ALL
+from suite.loop.config import by_content
 from suite.loop.hidden_effect import CONTROL, NAMED, NOMINAL
 from tests.support.documents import page, reproduce
 from tests.support.loops import EFFECT, WON, four_trials
@@ -68,6 +72,20 @@ def test_every_world_from_every_seed_once_and_found_again(loops, tmp_path):
     assert all(WORLDS[name].words in text for name in ("weak rotor", "long delay"))
     assert reproduce(tmp_path, "hidden_worlds", *args) == 0
     assert len(loops) == 6
+
+
+def test_a_loop_needs_none_of_our_files_where_it_runs(tmp_path):
+    """A policy and a vehicle of one's own go along by content, and make the same loop anywhere."""
+    mine, vehicle = tmp_path / "mine", tmp_path / "mine.toml"
+    shutil.copytree(shipped.locate("racer"), mine)
+    save_vehicle(load_vehicle("racer5"), vehicle)
+    config = Config(policy=str(mine), vehicle=str(vehicle))
+    asked = Asked(config, "weak rotor", 0, load_vehicle(str(vehicle)))
+    here = by_content(loop_of(Job(asked, tmp_path / "here", mine)))
+    shutil.move(mine, tmp_path / "reads")
+    vehicle.unlink()
+    there = by_content(loop_of(Job(asked, tmp_path / "there", tmp_path / "reads")))
+    assert here == there and set(here.digests) == {"policy", "vehicle", "world"}
 
 
 def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeypatch):
