@@ -55,7 +55,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
-    from suite.diagnose.report.parameters_json import components
+    from suite.diagnose.report.parameters_json import components, in_digits
     from suite.diagnose.run import diagnose_files
 
     result = diagnose_files(
@@ -81,8 +81,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             if value is None:
                 console.say(f"    {label}: no flight can tell")
             else:
-                between = f", 95 %: {span[0]:.4g} to {span[1]:.4g}" if span else ""
-                console.say(f"    {label}: {value:.4g}{between}")
+                shown, between = in_digits(value, span)
+                console.say(f"    {label}: {shown}" + (f", 95 %: {between}" if between else ""))
     gap = result["gap"]
     console.say(f"gap on held-out flights: {gap['before']:.2f} before, {gap['after']:.2f} after; "
                 f"{gap['noise_floor']:.2g} is the noise floor")  # fmt: skip

@@ -20,7 +20,7 @@ from suite.experiments.pages import hidden_worlds as pages
 from suite.experiments.pages.document import Place
 from suite.experiments.pages.hidden_worlds import Came
 from suite.experiments.study import judging, options
-from suite.experiments.study.cache import code_digest, digest, engines
+from suite.experiments.study.cache import LOOP_ROOMS, code_digest, digest, engines
 from suite.judging.content import policy_digest
 from suite.judging.flying import checkpoint_folder, default_policy
 from suite.loop.config import HiddenLoopConfig, resolve
@@ -31,16 +31,7 @@ from tracks.common.names import unknown_name
 from tracks.input.ranges import Iterations, Range, Seed, Trials
 from tracks.input.reading import read_json
 
-ROOMS = (
-    "tracks",
-    "policies",
-    "eval",
-    "suite/judging",
-    "suite/train",
-    "suite/delta",
-    "suite/diagnose",
-    "suite/loop",
-)
+ROOMS = (*LOOP_ROOMS, "suite/diagnose")
 """Code whose change makes every loop anew."""
 APART = 1000
 """The loops' seeds lie so far apart, so that no two of them judge the same trials."""

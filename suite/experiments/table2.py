@@ -20,7 +20,7 @@ from suite.experiments.pages.goals import goal_grid, goals, verdict
 from suite.experiments.pages.paper import sim_to_sim
 from suite.experiments.pages.tables import every_cell
 from suite.experiments.study import judging, options
-from suite.experiments.study.cache import code_digest, digest, engines
+from suite.experiments.study.cache import LOOP_ROOMS, code_digest, digest, engines
 from suite.judging.content import policy_digest
 from suite.judging.flying import default_policy
 from suite.loop import compare
@@ -34,16 +34,6 @@ if TYPE_CHECKING:
 OURS, WITH, CONTROL = "ours", "ours, with Delta Action Model", "ours, tuned as long without it"
 LOOP_TRIALS = 10
 """Judged trials a cell in the loop's own tables, which are not shown here."""
-LOOP_ROOMS = (
-    "tracks",
-    "policies",
-    "eval",
-    "suite/judging",
-    "suite/train",
-    "suite/delta",
-    "suite/loop",
-)
-"""Code that flies, fits and fine-tunes: a loop that older code ran is not taken for this one's."""
 COLUMNS = [
     header
     for track in JUDGED

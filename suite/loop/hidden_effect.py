@@ -98,15 +98,14 @@ def verdict(
     def percent(name: str) -> str:
         return f"{100 * by_name[name].success.value:.0f} %"
 
-    back = "not to be told from"
-    if apart[NOMINAL].low > 0 or apart[NOMINAL].high < 0:
-        back = "above" if apart[NOMINAL].low > 0 else "below"
+    lost = apart[NOMINAL]
+    back = "above" if lost.low > 0 else "below" if lost.high < 0 else "not to be told from"
     told = (
         f"In {where} {percent(BEFORE)} of {trials} trials succeed, in the simulation's "
         f"vehicle {percent(NOMINAL)}. The diagnosis names {named_effects(diagnosis)}. Fine-tuned "
         f"with it, {percent(NAMED)} succeed there: {told_apart(apart[CONTROL])} the "
         f"same fine-tuning without it ({percent(CONTROL)}; difference {points(apart[CONTROL])}), "
-        f"and {back} the policy where nothing is hidden (difference {points(apart[NOMINAL])})."
+        f"and {back} the policy where nothing is hidden (difference {points(lost)})."
     )
     if DELTA not in by_name:
         return told

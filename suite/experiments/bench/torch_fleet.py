@@ -10,7 +10,7 @@ import torch
 from eval.quadrotor.attitude import HEADING_RATE, LEAST_FORCE
 from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.dynamics.fleet import GRAVITY
-from suite.train.dynamics.reduced import ReducedParams
+from suite.train.dynamics.reduced import Gains, ReducedParams
 
 
 class TorchReduced(NamedTuple):
@@ -24,13 +24,6 @@ class TorchReduced(NamedTuple):
     loop: Tensor
     thrust_root: Tensor
     commands: Tensor
-
-
-class Gains(NamedTuple):
-    """What the attitude loop has as tensors; see `suite.train.dynamics.reduced.Gains`."""
-
-    attitude_gain: Tensor
-    rate_max: Tensor
 
 
 def faded(x: Tensor, factor: Tensor) -> Tensor:

@@ -11,15 +11,11 @@ from eval.effects.interface import GRAVITY
 from eval.quadrotor.delay import delay_weight
 from eval.quadrotor.loops import NOMINAL
 from eval.quadrotor.mixer import mixer_matrix
-from suite.experiments.bench.torch_fleet import Gains, asked, blend, exp_rot, faded
+from suite.experiments.bench.torch_fleet import asked, blend, exp_rot, faded
 from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import QuadrotorConfig
-from suite.train.dynamics.quadrotor import (
-    QuadrotorParams,
-    Substeps,
-    draw_effects,
-    longest_delay,
-)
+from suite.train.dynamics.quadrotor import QuadrotorParams, Substeps, longest_delay
+from suite.train.dynamics.reduced import Gains
 
 NEGLIGIBLE_N = 1e-6
 """Thrusts below this are none; see `eval.quadrotor.rotors`."""
@@ -94,9 +90,9 @@ def prepare(config: QuadrotorConfig, params: QuadrotorParams, dt: float) -> Plan
     effects, batch = params.effects, len(params.time_step)
     for name in vehicle.effects:
         if name not in effects:
-            allowed = ", ".join(draw_effects(config, 1, np.random.default_rng(0)))
             raise ValueError(
-                f"effects.{name} is in the vehicle, allowed for the torch baseline are {allowed}"
+                f"effects.{name} is in the vehicle, allowed for the torch baseline are "
+                f"{', '.join(effects)}"
             )
 
     def drawn(effect: str, field: str, other: float, *shape: int) -> Tensor:

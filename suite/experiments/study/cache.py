@@ -13,6 +13,16 @@ from tracks.common.files import to_json
 ROOT = Path(__file__).resolve().parents[3]
 NO_RESULT = ("view", "importers", "envs")
 """Folders whose code changes no flight."""
+LOOP_ROOMS = (
+    "tracks",
+    "policies",
+    "eval",
+    "suite/judging",
+    "suite/train",
+    "suite/delta",
+    "suite/loop",
+)
+"""Code that flies, fits and fine-tunes in a `suite loop`, but for a diagnosis."""
 
 
 def digest(value: Any) -> str:

@@ -31,7 +31,9 @@ MODELS = {
 )
 def pair(request):
     """Return (our gradient, our loss, the baseline after backward, its loss, config)."""
-    base = replace(train.bench_config(6, 12), **MODELS[request.param])
+    # What images differ by adds up fastest through the quadrotors' many steps.
+    steps = 6 if request.param == "quadrotor" else 12
+    base = replace(train.bench_config(6, steps), **MODELS[request.param])
     config = replace(base, physics=replace(base.physics, depth_noise=0.0))
     worlds, params = train.bench_worlds(config), fresh_params(config.spec)
     gradient, loss, _ = jax.jit(make_gradient(config))(params, worlds, jax.random.key(0), None)
@@ -47,15 +49,13 @@ def test_both_sides_compute_the_same_loss(pair):
 
 
 def test_both_sides_compute_the_same_gradient(pair):
-    """The convolutions see the images, which differ a little."""
     gradient, _, baseline, _, config = pair
     ours = torch_twin({name: np.asarray(value) for name, value in gradient.items()}, config.spec)
     expected = dict(ours.named_parameters())
     for name, value in baseline.network.named_parameters():
         size = float(expected[name].abs().max())
         assert value.grad is not None and size > 0
-        share = 0.03 if name.startswith("conv") else 0.005
-        assert float((value.grad - expected[name]).abs().max()) < share * size, name
+        assert float((value.grad - expected[name]).abs().max()) < 0.01 * size, name
 
 
 def test_the_baseline_refuses_what_its_preset_does_not_have():
