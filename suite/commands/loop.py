@@ -19,7 +19,7 @@ class Config:
     """
 
     preset: str | None = None
-    """The recipe: swift, swift-quad or swift-30 (through quadrotors), racer, small, gpu or
+    """The recipe: swift, direct, swift-quad or swift-30 (through quadrotors), racer, small, gpu or
     paper. By default that of the policy to start from, or swift."""
     policy: str | None = None
     """Start from this policy instead of training one: a shipped name or a checkpoint's folder."""

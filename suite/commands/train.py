@@ -23,8 +23,9 @@ class Config:
     """Train a policy; the same command again resumes where it was stopped."""
 
     preset: str = "racer"
-    """The recipe: racer, swift (18 numbers instead of the paper's 12), swift-quad (with
-    --from swift), swift-30 (with --from swift-quad), small, gpu or paper."""
+    """The recipe: racer, direct (through quadrotors from the first step), swift (18 numbers instead
+    of the paper's 12), swift-quad (with --from swift), swift-30 (with --from swift-quad), small,
+    gpu or paper."""
     model: Literal["point", "quad", "fleet"] | None = None
     """What flies in training: the point mass, the quadrotor of --vehicle with its effects, or
     quadrotors of a class, drawn anew for every world; the recipe's own if not given."""

@@ -193,6 +193,10 @@ def ideas(config: Config) -> list[training.Row]:
     fading = f"loss.gradient_decay={2 * base.loss.gradient_decay:g}"
     scalar = f"loss.projection={PROJECTION:g}", f"loss.projection_decay={PROJECTION_DECAY:g}"
     price = f"loss.survival={base.loss.progress:g}"
+    thirds = f"episode.steps={base.episode.steps // 3}", f"episode.batch={3 * base.episode.batch}"
+    # A world that stops on the way would be told of no future there.
+    value = f"loss.value={base.loss.progress:g}", "episode.stop_from=1.0"
+    live_on, again = "episode.live_on=0.7", "episode.again=0.5"
     corners = f"episode.gate_corners={ROUND_CORNERS}"
     rows = {
         "second gate": ("the gate after the next is observed", ("spec.second_gate=True",)),
@@ -203,6 +207,15 @@ def ideas(config: Config) -> list[training.Row]:
         "curriculum": ("difficulty grows over the first half", ("episode.easy_until=0.5",)),
         "one check": ("collision check at a step's end alone", ("loss.path_samples=1",)),
         "survival": ("a crash costs the progress after it", (price,)),
+        "critic": ("a critic's value of what comes after", value),
+        "short": ("a third of the horizon, three times the worlds", thirds),
+        "short, critic": ("and a critic's value of what comes after", (*thirds, *value)),
+        "short, critic, live on": (
+            "and worlds go on from rollout to rollout",
+            (*thirds, *value, live_on),
+        ),
+        "live on": ("worlds go on from rollout to rollout", (live_on,)),
+        "again": ("crashed worlds go on from before the crash", (again,)),
         "longer": ("twice the horizon, half the worlds", longer),
         "longer, truncated": ("and gradients that fade twice as fast", (*longer, fading)),
         "L_proj": ("the scalar substitute in the field's place", ("loss.field_gain=0", *scalar)),

@@ -142,6 +142,10 @@ class LossConfig:
     survival: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Price of a crash, as a weight of the progress that it costs later [s/m]; 0: none. At the
     weight of `progress` a crash costs what the way lost is worth."""
+    value: Annotated[float, Range(0.0, 1e6)] = 0.0
+    """Weight of the progress that a critic expects after the rollout [s/m]; 0: none, and no critic
+    learns. At the weight of `progress` a way is worth the same after the rollout's end as before;
+    a world that will crash there has little to come."""
     survival_width_m: Annotated[float, Range(1e-3, 10.0)] = 0.04
     """How far from contact with the body the probability to fly on begins to fall [m]."""
     tilt: Annotated[float, Range(0.0, 1e6)] = 0.0
@@ -198,6 +202,14 @@ class EpisodeConfig:
     height_spread: Annotated[float, Range(0.0, 100.0)] = 1.0
     """How far gates' heights lie apart before they are held to 0.8 to 2.2 m, as a share of what is
     usual for a difficulty: with 2 they lie about as far apart as those of circles and ellipses."""
+    live_on: Share = 0.0
+    """Share of the worlds still flying at the end of a rollout that the next rollout goes on with,
+    in the place of fresh ones."""
+    again: Share = 0.0
+    """Share of the worlds that crash which the next rollout goes on with from before the crash: the
+    tracks, vehicles and places where the policy fails."""
+    again_before_s: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (1.0, 2.0)
+    """How long before the crash that is, drawn for every world [s]."""
     gate_corners: Annotated[int, Range(3, 64)] = 4
     """Corners of the gates' openings: 4 for squares, more for rounder gates of the same width."""
     race_share: Share = 0.5
@@ -206,6 +218,27 @@ class EpisodeConfig:
     hairpin_share: Share = 0.0
     """Share of tracks with one or two gates that are met nearly from the side and left backwards,
     as at the apexes of the hardest ellipses."""
+
+    @property
+    def carries(self) -> bool:
+        """Whether worlds outlive a rollout."""
+        return self.live_on > 0.0 or self.again > 0.0
+
+
+@dataclass(frozen=True)
+class CriticConfig:
+    """The critic of `loss.value`: what it learns is the mean progress to come, in m/s."""
+
+    horizon_s: Annotated[float, Range(0.0, 1e4, above=True)] = 2.0
+    """Progress later than about this counts little: its weight falls by e in this time [s]."""
+    trace: Share = 0.95
+    """lambda of the returns that it learns (Sutton and Barto 2018, Sec. 12.1) [1]."""
+    size: Annotated[int, Range(1, 8192)] = 128
+    """Width of its two hidden layers."""
+    rate: Annotated[float, Range(0.0, 10.0)] = 1e-3
+    """Adam's learning rate."""
+    passes: Annotated[int, Range(1, 10_000)] = 16
+    """Steps of Adam after each rollout, over all of it; it sees no images, so they cost little."""
 
 
 @dataclass(frozen=True)
@@ -246,6 +279,8 @@ class TrainConfig:
     """Worlds and horizon."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Optimiser and its schedule."""
+    critic: CriticConfig = field(default_factory=CriticConfig)
+    """Of `loss.value`, where that is not 0."""
     seed: Seed = 0
     """Seed of the parameters, the tracks and the randomisation."""
     devices: Annotated[int, Range(1, 4096)] | None = None

@@ -10,7 +10,10 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from policies.networks import delta_network, network
+from suite.train.beyond import critic
+from suite.train.beyond.value import to_come
 from suite.train.config import TrainConfig
+from suite.train.dynamics.interface import DynamicsState
 from suite.train.rollout import StepRecord, make_rollout
 from suite.train.worlds import Worlds
 
@@ -80,12 +83,23 @@ def sampled_encoder_gradient(
     return encoder_gradient(params, images, cotangents)
 
 
+def seen_by_critic(
+    worlds: Worlds, before: DynamicsState, _: DynamicsState, target: jax.Array
+) -> jax.Array:
+    """Return what the critic sees at a step's beginning, (B, F)."""
+    return critic.features(worlds, before, target)
+
+
 def make_gradient(
     config: TrainConfig,
 ) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
-    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) on one device."""
-    stride = config.episode.image_stride
-    rollout = make_rollout(config)
+    """Return gradient(params, worlds, key, delta, judge) -> (gradient, loss, records).
+
+    It is that of one device. `judge` is the critic's parameters where `loss.value` asks for one;
+    the records then note what it saw.
+    """
+    stride, steps = config.episode.image_stride, config.episode.steps
+    rollout = make_rollout(config, seen_by_critic if config.loss.value > 0.0 else None)
     width = config.spec.hidden_size
 
     def frozen_encode(params: network.Params, image: jax.Array) -> jax.Array:
@@ -96,11 +110,26 @@ def make_gradient(
         worlds: Worlds,
         key: jax.Array,
         delta: delta_network.Params | None,
+        judge: critic.Params | None = None,
     ) -> tuple[network.Params, jax.Array, StepRecord]:
-        embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], width))
+        def flown(
+            params: network.Params, embedding_shift: jax.Array
+        ) -> tuple[jax.Array, StepRecord]:
+            loss, records = rollout(params, embedding_shift, worlds, key, frozen_encode, delta)
+            last, records = records.last, records._replace(last=None)
+            if judge is None or last is None:
+                return loss, records
+            value = critic.value(judge, critic.features(worlds, last.state, last.target))
+            rest = last.alive * to_come(config, value)
+            over_steps = jnp.broadcast_to(jax.lax.stop_gradient(rest), (steps, len(rest)))
+            return loss + rest.mean(), records._replace(
+                terms={**records.terms, "value": over_steps}
+            )
+
+        embedding_shift = jnp.zeros((steps, worlds.pos_w.shape[0], width))
         (loss, records), (direct, cotangents) = jax.value_and_grad(
-            rollout, argnums=(0, 1), has_aux=True
-        )(params, embedding_shift, worlds, key, frozen_encode, delta)
+            flown, argnums=(0, 1), has_aux=True
+        )(params, embedding_shift)
         through_images = sampled_encoder_gradient(
             params, records.image, cotangents, stride, jax.random.fold_in(key, stride)
         )
@@ -115,17 +144,21 @@ def shard_gradient(
     """Return the gradient shared by the devices of `mesh`, each with its part of the worlds.
 
     Returns:
-        gradient(params, worlds, key, delta) -> (gradient, loss, records without images); the
+        gradient(params, worlds, key, delta, judge) -> (gradient, loss, records without images); the
         gradient and the loss are means over all worlds, the records are gathered.
     """
     local = make_gradient(config)
     axis = mesh.axis_names[0]
 
     def part(
-        params: network.Params, worlds: Worlds, key: jax.Array, delta: delta_network.Params | None
+        params: network.Params,
+        worlds: Worlds,
+        key: jax.Array,
+        delta: delta_network.Params | None,
+        judge: critic.Params | None,
     ) -> tuple[network.Params, jax.Array, StepRecord]:
         key = jax.random.fold_in(key, jax.lax.axis_index(axis))
-        gradient, loss, records = local(params, worlds, key, delta)
+        gradient, loss, records = local(params, worlds, key, delta, judge)
         records = records._replace(image=jnp.zeros((config.episode.steps, 1)))
         return jax.lax.pmean(gradient, axis), jax.lax.pmean(loss, axis), records
 
@@ -134,7 +167,7 @@ def shard_gradient(
     return jax.shard_map(
         part,
         mesh=mesh,
-        in_specs=(P(), worlds_spec, P(), P()),
+        in_specs=(P(), worlds_spec, P(), P(), P()),
         out_specs=(P(), P(), records_spec),
         check_vma=False,
     )

@@ -75,8 +75,16 @@ class StepRecord(NamedTuple):
     """(B, hidden) recurrent state after the step."""
     alive: jax.Array
     """1 where the step counted in the loss, else 0."""
+    crashed: jax.Array
+    """Bool: the world had crashed before the step."""
+    worth: jax.Array
+    """Progress as far as it was asked for, never less than none [m/s]."""
     noted: Any = None
     """What `note` returned, where there was one."""
+    after: RolloutCarry | None = None
+    """What the world carries on, where another rollout may begin with it."""
+    last: RolloutCarry | None = None
+    """(B, ...) what worlds carry after the rollout's last step, alone of these with gradient."""
 
 
 Note = Callable[[Worlds, DynamicsState, DynamicsState, jax.Array], Any]
@@ -139,30 +147,24 @@ def observed_at_start(worlds: Worlds, config: TrainConfig) -> jax.Array:
     return level if worlds.wanted is None else level.at[:, :, -1].set(worlds.wanted[:, None])
 
 
-def make_rollout(
-    config: TrainConfig, note: Note | None = None
-) -> Callable[..., tuple[jax.Array, StepRecord]]:
-    """Return rollout(params, embedding_shift, worlds, key, encode, delta) -> (loss, records).
+def choose(where: jax.Array, ones: Any, others: Any) -> Any:
+    """Return the leaves (B, ...) of `ones` for worlds `where` (B,) is true, else of `others`."""
 
-    `encode(params, image)` gives the embeddings; `embedding_shift` is (T, B, hidden); `delta` is
-    the frozen Delta Action network's parameters or None. The loss is the mean over steps and
-    worlds; records are (T, B, ...).
-    """
-    physics, weights = config.physics, config.loss
-    sight, dynamics = make_sight(config), make_dynamics(config)
+    def pick(one: jax.Array, other: jax.Array) -> jax.Array:
+        return jnp.where(where.reshape(-1, *(1,) * (one.ndim - 1)), one, other)
 
-    def rollout(
-        params: network.Params,
-        embedding_shift: jax.Array,
-        worlds: Worlds,
-        key: jax.Array,
-        encode: Callable[[network.Params, jax.Array], jax.Array],
-        delta: delta_network.Params | None = None,
-    ) -> tuple[jax.Array, StepRecord]:
-        steps, batch, width = embedding_shift.shape
-        start = RolloutCarry(
+    return jax.tree.map(pick, ones, others)
+
+
+def make_start(config: TrainConfig) -> Callable[[Worlds], RolloutCarry]:
+    """Return start(worlds) -> what worlds carry into a rollout's first step."""
+    physics, width, dynamics = config.physics, config.spec.hidden_size, make_dynamics(config)
+
+    def start(worlds: Worlds) -> RolloutCarry:
+        batch = len(worlds.target)
+        fresh = RolloutCarry(
             state=dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w),
-            target=worlds.target,
+            target=jnp.asarray(worlds.target),
             hidden=jnp.asarray(worlds.hidden),
             action_b=jnp.zeros((batch, 3)),
             embeddings=jnp.zeros((batch, physics.image_delay, width)),
@@ -172,6 +174,34 @@ def make_rollout(
             going=jnp.ones(batch),
             survival=jnp.ones(batch),
         )
+        if worlds.begun is None:
+            return fresh
+        return choose(jnp.asarray(worlds.begun), worlds.flown, fresh)
+
+    return start
+
+
+def make_rollout(
+    config: TrainConfig, note: Note | None = None
+) -> Callable[..., tuple[jax.Array, StepRecord]]:
+    """Return rollout(params, embedding_shift, worlds, key, encode, delta) -> (loss, records).
+
+    `encode(params, image)` gives the embeddings; `embedding_shift` is (T, B, hidden); `delta` is
+    the frozen Delta Action network's parameters or None. The loss is the mean over steps and
+    worlds; records are (T, B, ...).
+    """
+    weights = config.loss
+    start, sight, dynamics = make_start(config), make_sight(config), make_dynamics(config)
+
+    def rollout(
+        params: network.Params,
+        embedding_shift: jax.Array,
+        worlds: Worlds,
+        key: jax.Array,
+        encode: Callable[[network.Params, jax.Array], jax.Array],
+        delta: delta_network.Params | None = None,
+    ) -> tuple[jax.Array, StepRecord]:
+        steps = len(embedding_shift)
 
         def step(
             carry: RolloutCarry, inputs: tuple[jax.Array, jax.Array, jax.Array]
@@ -196,7 +226,8 @@ def make_rollout(
             made = make_step(weights, worlds, before, after, target, carry.survival, crashed)
             terms = losses.weighted(weights, made)
             passed_after = target + made.passed
-            goes_on = number + 1 < worlds.stop
+            # To reach the rollout's end is not to stop: what comes after it may be worth something.
+            goes_on = (number + 1 < worlds.stop) | (number + 1 == steps)
             if config.episode.finish:
                 goes_on = goes_on & (passed_after < worlds.scene.gates.center_w.shape[1])
             alive = carry.alive * (made.clearance > -weights.crash_depth_m) * goes_on
@@ -214,6 +245,8 @@ def make_rollout(
                 pos_w=after.pos_w,
                 hidden=hidden,
                 alive=carry.alive,
+                crashed=crashed,
+                worth=jnp.maximum(-losses.progress(weights, made), 0.0),
                 noted=None if note is None else note(worlds, before, after, target),
             )
             carry = RolloutCarry(
@@ -228,11 +261,12 @@ def make_rollout(
                 going=carry.going * goes_on,
                 survival=made.survival,
             )
-            return carry, record
+            return carry, record._replace(after=carry) if config.episode.carries else record
 
         keys = jax.random.split(key, steps)
-        _, records = jax.lax.scan(step, start, (embedding_shift, keys, jnp.arange(steps)))
+        inputs = embedding_shift, keys, jnp.arange(steps)
+        last, records = jax.lax.scan(step, start(worlds), inputs)
         loss = functools.reduce(jnp.add, (records.terms[name].mean() for name in losses.LOSSES))
-        return loss, jax.lax.stop_gradient(records)
+        return loss, jax.lax.stop_gradient(records)._replace(last=last)
 
     return rollout

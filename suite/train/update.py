@@ -14,6 +14,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from policies.networks import delta_network, network
 from suite.common.running import hosts
+from suite.train.beyond.carried import Carried, carried_over, nothing_carried, taken_over
+from suite.train.beyond.value import Critic, Way, make_teach, start_critic
 from suite.train.config import OptimizerConfig, TrainConfig
 from suite.train.gradient import shard_gradient
 from suite.train.rollout import StepRecord
@@ -32,6 +34,10 @@ class TrainState(NamedTuple):
     """Gradient steps done, a scalar."""
     hidden: jax.Array
     """(B, hidden) recurrent states from random steps of the last rollout."""
+    critic: Critic | None = None
+    """Of what comes after a rollout, where `loss.value` asks for one."""
+    carried: Carried | None = None
+    """Worlds that the next rollout goes on with, where the episodes' settings ask for such."""
 
 
 def make_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
@@ -50,8 +56,14 @@ def start_state(config: TrainConfig, params: network.Params | None = None) -> Tr
     if params is None:
         params = network.init(jax.random.key(config.seed), config.spec)
     hidden = jnp.zeros((config.episode.batch, config.spec.hidden_size))
-    optimizer = make_optimizer(config.optimizer).init(params)
-    return TrainState(params, optimizer, jnp.zeros((), int), hidden)
+    return TrainState(
+        params=params,
+        optimizer=make_optimizer(config.optimizer).init(params),
+        iteration=jnp.zeros((), int),
+        hidden=hidden,
+        critic=start_critic(config) if config.loss.value > 0.0 else None,
+        carried=nothing_carried(config) if config.episode.carries else None,
+    )
 
 
 def device_mesh(config: TrainConfig) -> Mesh:
@@ -140,7 +152,7 @@ def make_update(
     """
     optimizer = make_optimizer(config.optimizer)
     gradient_of = shard_gradient(config, mesh)
-    seed = jax.random.key(np.uint32(config.seed))
+    seed, teach = jax.random.key(np.uint32(config.seed)), make_teach(config)
 
     # The first process saves what all of them hold.
     held = state_place(mesh) if hosts.several() else None
@@ -149,12 +161,31 @@ def make_update(
     def update(state: TrainState, worlds: Worlds) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(seed, state.iteration)
         worlds = worlds._replace(hidden=state.hidden * worlds.remembers[:, None])
-        gradient, loss, records = gradient_of(state.params, worlds, key, delta)
+        carried, critic = state.carried, state.critic
+        if carried is not None:
+            worlds = taken_over(config, worlds, carried)
+        gradient, loss, records = gradient_of(
+            state.params, worlds, key, delta, None if critic is None else critic.params
+        )
         change, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
-        # optax types any tree of parameters; it gives back the one it was given.
-        params = cast(network.Params, optax.apply_updates(state.params, change))
-        hidden = sample_hidden(jax.random.fold_in(key, config.episode.batch), records, state.hidden)
-        state = TrainState(params, optimizer_state, state.iteration + 1, hidden)
-        return state, curve_numbers(loss, gradient, records)
+        numbers = curve_numbers(loss, gradient, records)
+        batch = config.episode.batch
+        if records.after is not None:
+            last = jax.random.fold_in(key, batch + 1)
+            carried = carried_over(config, last, worlds, records.after)
+        if critic is not None:
+            way = Way(records.noted, records.worth, records.alive, records.crashed)
+            critic, learnt = teach(critic, way)
+            numbers |= learnt
+        state = TrainState(
+            # optax types any tree of parameters; it gives back the one it was given.
+            params=cast(network.Params, optax.apply_updates(state.params, change)),
+            optimizer=optimizer_state,
+            iteration=state.iteration + 1,
+            hidden=sample_hidden(jax.random.fold_in(key, batch), records, state.hidden),
+            critic=critic,
+            carried=carried,
+        )
+        return state, numbers
 
     return update

@@ -6,7 +6,7 @@ A pure function of (config, iteration), so a resumed run sees the worlds that it
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,6 +44,10 @@ class Worlds(NamedTuple):
     """(B,) this iteration's scale of the rays across the optical axis."""
     wanted: Array | None = None
     """(B,) how fast the policy is asked to fly, 0 to 1, where it has that input [1]."""
+    flown: Any = None
+    """A `RolloutCarry` with which worlds begin that were flown before; None: none was."""
+    begun: Array | None = None
+    """(B,) bool: where `flown` is what a world begins with, in the place of its start."""
 
 
 def difficulty_range(config: TrainConfig, iteration: int) -> tuple[float, float]:

@@ -36,8 +36,8 @@ class PpoConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     """beta_2, r_q and the points of a step's path, for the reward; nothing else of it is read."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
-    """Worlds and horizon; `stop_from` and `finish` are not read, since the value of what follows is
-    learned."""
+    """Worlds and horizon; `stop_from`, `finish`, `live_on` and `again` are not read, since the
+    value of what follows is learned and a world is flown anew where it ends."""
     seed: Seed = 0
     """Seed of the parameters, the tracks, the randomisation and the exploration."""
     iterations: Iterations = 200

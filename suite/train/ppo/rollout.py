@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from policies.networks import network
+from suite.train.beyond import critic
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import make_dynamics
-from suite.train.ppo import critic
 from suite.train.ppo.reward import RewardTerms, make_reward
 from suite.train.rollout import make_sight, observed_at_start, queue
 from suite.train.step import BODY_RADIUS_M, target_gate
@@ -47,7 +47,7 @@ class Record(NamedTuple):
     log_prob: jax.Array
     """Logarithm of the density of that action."""
     seen: jax.Array
-    """(B, critic.FEATURES) what the critic saw before the step."""
+    """(B, F) what the critic saw before the step."""
     reward: RewardTerms
     """Of the step."""
     done: jax.Array

@@ -16,8 +16,8 @@ import numpy as np
 import optax
 
 from policies.networks import network
+from suite.train.beyond import critic
 from suite.train.gradient import sampled_encoder_gradient
-from suite.train.ppo import critic
 from suite.train.ppo.config import PpoConfig
 from suite.train.ppo.objective import Actor, Sequences, advantages, clipped_loss
 from suite.train.ppo.rollout import Record, make_rollout
@@ -61,7 +61,8 @@ def start_state(config: PpoConfig) -> PpoState:
     params = network.init(jax.random.key(config.seed), config.spec)
     # With its type said: a weak one would have the second iteration compiled again.
     actor = Actor(params, jnp.full(3, math.log(config.deviation), jnp.float32))
-    value = critic.init(jax.random.fold_in(jax.random.key(config.seed), 1), config.critic_size)
+    critic_key = jax.random.fold_in(jax.random.key(config.seed), 1)
+    value = critic.init(critic_key, config.critic_size, critic.features_of(config.spec))
     actor_optimizer, critic_optimizer = make_optimizers(config)
     return PpoState(
         actor=actor,

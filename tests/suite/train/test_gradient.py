@@ -80,7 +80,7 @@ from suite.train.update import device_mesh
 from tests.support.training import boxes_worlds, fresh_params, largest_difference, small_config
 config = small_config()
 assert device_mesh(config).size == 2
-args = (fresh_params(), boxes_worlds(config), jax.random.key(0), None)
+args = (fresh_params(), boxes_worlds(config), jax.random.key(0), None, None)
 results = []
 for count in (1, 2):
     mesh = Mesh(np.array(jax.devices()[:count]), ("worlds",))

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,6 +19,7 @@ from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.train import repeat, run
+from suite.train.beyond import carried
 from suite.train.dynamics import point_mass
 from tests.support.training import boxes_worlds, fresh_params, small_config
 
@@ -105,6 +107,25 @@ def test_a_stopped_run_resumes_exactly(whole, tmp_path, monkeypatch):
     assert_same_run(tmp_path, whole)
 
 
+def test_a_run_with_a_critic_and_worlds_that_live_on_resumes_exactly(tmp_path, monkeypatch):
+    monkeypatch.setattr(carried, "sample_worlds", boxes_worlds)
+    config = small_config(loss={"value": 1.2}, live_on=0.7, again=0.5, again_before_s=(0.0, 0.1))
+    folders = tmp_path / "whole", tmp_path / "stopped"
+    run.train(config, folders[0], Console())
+    go_on = stop_at(monkeypatch, 4)
+    with pytest.raises(KeyboardInterrupt):
+        run.train(config, folders[1], Console())
+    go_on()
+    run.train(config, folders[1], Console())
+    assert_same_run(*folders[::-1])
+    state = load_arrays(folders[0] / "state", kind="training").arrays
+    taken = next(value for name, value in state.items() if name.endswith("carried.taken"))
+    assert np.any(taken), "worlds go on, so that a state without them would not do"
+    update: Any = compiled_update(config, run.device_mesh(config))
+    assert update._cache_size() == 1
+    assert all("value_explained" in row for row in rows(folders[0]))
+
+
 class Killed(BaseException):
     """Stands for a kill: nothing after it is written."""
 
@@ -166,6 +187,7 @@ from pathlib import Path
 import tracks.common.files
 from suite.common.console import Console
 from suite.train import repeat, run
+from suite.train.beyond import carried
 from tests.support.training import boxes_worlds, small_config
 run.sample_worlds, repeat.SAVE_PERIOD_S = boxes_worlds, 0.0
 real, renamed = os.replace, []

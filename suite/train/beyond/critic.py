@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from policies.spec import PolicySpec
 from suite.train.dynamics.interface import DynamicsState
 from suite.train.step import NEAR, target_gate
 from suite.train.worlds import Worlds
@@ -20,7 +21,7 @@ Params = dict[str, jax.Array]
 AHEAD_S = (0.0, 0.1, 0.2, 0.4, 0.8)
 """Times at which the critic sees how close a solid is, along the present velocity [s]."""
 FEATURES = 29 + 2 * len(AHEAD_S)
-"""Numbers that the critic sees."""
+"""Numbers that the critic sees, but for how fast it is to be flown."""
 REACH_M = 2.0
 """Obstacles further away than this look the same [m]."""
 TOUCH_M = 0.2
@@ -28,20 +29,23 @@ TOUCH_M = 0.2
 
 
 def features(worlds: Worlds, body: DynamicsState, target: jax.Array) -> jax.Array:
-    """Return what the critic sees of worlds that have passed `target` (B,) gates, (B, FEATURES).
+    """Return what the critic sees of worlds that have passed `target` (B,) gates, (B, F).
 
     Position, velocity, acceleration, the next gate, the drone's forward and up axes and the
     direction away from the nearest obstacle, in the frame of the current gate and scaled to numbers
     around one; the position again where it is near; how close solids are now and further on; when
-    and where the gate's plane is reached, were the velocity kept; the opening's half width and how
-    many gates are left.
+    and where the gate's plane is reached, were the velocity kept; the opening's half width, how
+    many gates are left and, where the policy is told, how fast it is to fly: F numbers, see
+    `features_of`. Gates and obstacles are looked up on values without gradient.
     """
     gates = worlds.scene.gates
     gate, _ = target_gate(gates, target)
     following, _ = target_gate(gates, target, ahead=1)
     times = jnp.asarray(AHEAD_S)[:, None]
     path_w = body.pos_w[:, None] + times * body.vel_w[:, None]
-    distance, away_w = nearest_obstacle(worlds.scene, path_w, NEAR)
+    held_w = jax.lax.stop_gradient(path_w)
+    distance, away_w = nearest_obstacle(worlds.scene, held_w, NEAR)
+    distance = distance + ((path_w - held_w) * away_w).sum(-1)
     pos_g = to_local(gate.rot_w, body.pos_w - gate.center_w)
     vel_g = to_local(gate.rot_w, body.vel_w)
     half_width = gate.opening_g.max((1, 2))[:, None]
@@ -64,12 +68,19 @@ def features(worlds: Worlds, body: DynamicsState, target: jax.Array) -> jax.Arra
         2.0 * half_width,
         jnp.minimum(left, 2)[:, None] - 1.0,
     ]
+    if worlds.wanted is not None:
+        columns.append(worlds.wanted[:, None])
     return jnp.concatenate(columns, axis=-1)
 
 
-def init(key: jax.Array, width: int) -> Params:
+def features_of(spec: PolicySpec) -> int:
+    """Return how many numbers the critic sees of worlds that a policy with `spec` flies in."""
+    return FEATURES + spec.speed_input
+
+
+def init(key: jax.Array, width: int, seen: int = FEATURES) -> Params:
     """Return fresh parameters of an MLP with two hidden layers of `width`, near zero in value."""
-    sizes = [(FEATURES, width), (width, width), (width, 1)]
+    sizes = [(seen, width), (width, width), (width, 1)]
     params: Params = {}
     for number, (k, (rows, columns)) in enumerate(
         zip(jax.random.split(key, len(sizes)), sizes, strict=True)

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from suite.train.beyond import critic
 from suite.train.dynamics import point_mass
-from suite.train.ppo import critic
 from tests.support.training import boxes_worlds, small_config
 from tracks.geometry.gates import square_gates
 from tracks.geometry.scene import Gates, Spheres

@@ -1,0 +1,80 @@
+"""Worlds that the next rollout goes on with: those still flying, and those before their crash.
+
+A rollout of a few seconds from a start that was drawn shows a policy few of the states that it
+brings itself into. Worlds that live on do, and those that are flown again from before their crash
+are of the tracks and places where it fails. A whole state is taken over, the vehicle's and the
+policy's, so that nothing tells the policy that a rollout ended.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from suite.train.config import TrainConfig
+from suite.train.rollout import RolloutCarry, choose, make_start
+from suite.train.worlds import Worlds, sample_worlds
+
+
+class Carried(NamedTuple):
+    """What a rollout leaves to the next one, (B, ...) each."""
+
+    worlds: Worlds
+    """That it flew in."""
+    flown: RolloutCarry
+    """From where they are to be flown on."""
+    taken: jax.Array
+    """(B,) bool: which of them are."""
+
+
+def nothing_carried(config: TrainConfig) -> Carried:
+    """Return what the first rollout finds: no world goes on."""
+    worlds = jax.tree.map(jnp.asarray, sample_worlds(config, 0))
+    start = jax.jit(make_start(config))(worlds)
+    return Carried(worlds, start, jnp.zeros(len(worlds.target), bool))
+
+
+def taken_over(config: TrainConfig, worlds: Worlds, carried: Carried) -> Worlds:
+    """Return fresh `worlds` with those of `carried` that go on in the place of as many."""
+    kept = choose(carried.taken, carried.worlds, worlds)
+    return kept._replace(
+        # The field of view is an iteration's own, and no world that goes on is stopped on the way.
+        fov_scale=worlds.fov_scale,
+        stop=jnp.where(carried.taken, config.episode.steps, worlds.stop),
+        flown=carried.flown,
+        begun=carried.taken,
+    )
+
+
+def carried_over(
+    config: TrainConfig, key: jax.Array, worlds: Worlds, after: RolloutCarry
+) -> Carried:
+    """Return what a rollout in `worlds` leaves to the next.
+
+    A world that crashed goes on from before that, where it was flying long enough; one that flies
+    and has gates left goes on from the end; each with the share of `config`.
+
+    Args:
+        config: of the run.
+        key: of the draws.
+        worlds: (B, ...).
+        after: (T, B, ...) what they carried after each step.
+    """
+    episode = config.episode
+    steps, batch = after.alive.shape
+    dice, early = jax.random.split(key)
+    drawn = jax.random.uniform(dice, (2, batch))
+    crashed = after.going > after.alive
+    low, high = (config.spec.rate_hz * seconds for seconds in episode.again_before_s)
+    back = jax.random.uniform(early, (batch,), minval=low, maxval=high)
+    before = jnp.argmax(crashed, axis=0) - jnp.maximum(jnp.round(back), 1.0).astype(int)
+    again = crashed.any(0) & (before >= 0) & (drawn[0] < episode.again)
+    flying = (after.alive[-1] > 0) & (after.target[-1] < worlds.scene.gates.center_w.shape[1])
+    flying = flying & (drawn[1] < episode.live_on)
+    step, world = jnp.where(again, before, steps - 1), jnp.arange(batch)
+    flown = jax.tree.map(lambda array: array[step, world], after)
+    one = jnp.ones(batch)
+    flown = flown._replace(alive=one, going=one, survival=one)
+    return Carried(worlds._replace(flown=None, begun=None), flown, again | flying)

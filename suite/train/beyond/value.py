@@ -1,0 +1,114 @@
+"""The value of what comes after a rollout: learnt from its returns, paid at its end.
+
+A rollout is short, and what its last second does is felt after it. A critic that knows the worlds
+(Xu et al. 2022, "Accelerated Policy Learning with Parallel Differentiable Simulation") tells the
+policy what its last state is worth, with gradient: how much progress is to come, none where it
+crashes first. Progress is never counted as less than none, so to crash never pays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from suite.train.beyond import critic
+from suite.train.config import TrainConfig
+
+
+class Critic(NamedTuple):
+    """A critic as it learns."""
+
+    params: critic.Params
+    """Of its network."""
+    optimizer: optax.OptState
+    """Of Adam."""
+
+
+class Way(NamedTuple):
+    """What a critic learns from: a rollout's steps, (T, B, ...)."""
+
+    seen: jax.Array
+    """(T, B, F) its features at each step's beginning."""
+    worth: jax.Array
+    """Progress of the step, never less than none [m/s]."""
+    alive: jax.Array
+    """1 where the step counted in the loss, else 0."""
+    crashed: jax.Array
+    """Bool: the world had crashed before the step."""
+
+
+def start_critic(config: TrainConfig) -> Critic:
+    """Return a fresh critic for a run of `config`."""
+    key = jax.random.fold_in(jax.random.key(config.seed), 1)
+    params = critic.init(key, config.critic.size, critic.features_of(config.spec))
+    return Critic(params, optax.adam(config.critic.rate).init(params))
+
+
+def discount(config: TrainConfig) -> float:
+    """Return by how much progress counts less for each decision later."""
+    return math.exp(-1.0 / (config.critic.horizon_s * config.spec.rate_hz))
+
+
+def to_come(config: TrainConfig, value: jax.Array) -> jax.Array:
+    """Return the weighted loss of states with `value` (B,) [m/s] after the last step.
+
+    It is minus all progress to come, in the unit of a loss averaged over the rollout's steps.
+    """
+    decisions = 1.0 / (1.0 - discount(config))
+    return -config.loss.value * value * decisions / config.episode.steps
+
+
+def returns(config: TrainConfig, value: jax.Array, way: Way) -> jax.Array:
+    """Return what the critic is to say of the steps but the last, (T - 1, B) [m/s].
+
+    Nothing comes after a crash. A world that leaves the loss otherwise, at its last gate or
+    because it was stopped, is taken to fly on as it flew.
+
+    Args:
+        config: horizon and trace.
+        value: (T, B) what it says now, without gradient [m/s].
+        way: the rollout.
+    """
+    fade, trace = discount(config), config.critic.trace
+
+    def back(later: jax.Array, now: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        worth, following, goes_on, crashed = now
+        ahead = (1.0 - trace) * following + trace * later
+        ahead = jnp.where(goes_on > 0, ahead, jnp.where(crashed, 0.0, worth))
+        total = (1.0 - fade) * worth + fade * ahead
+        return total, total
+
+    steps = way.worth[:-1], value[1:], way.alive[1:], way.crashed[1:]
+    return jax.lax.scan(back, value[-1], steps, reverse=True)[1]
+
+
+def make_teach(config: TrainConfig) -> Callable[[Critic, Way], tuple[Critic, dict[str, jax.Array]]]:
+    """Return teach(critic, way) -> (critic', numbers of the curve)."""
+    adam = optax.adam(config.critic.rate)
+
+    def teach(held: Critic, way: Way) -> tuple[Critic, dict[str, jax.Array]]:
+        goal = returns(config, critic.value(held.params, way.seen), way)
+        seen, counts = way.seen[:-1], way.alive[:-1]
+        total = jnp.maximum(counts.sum(), 1.0)
+
+        def error(params: critic.Params) -> jax.Array:
+            return (counts * (critic.value(params, seen) - goal) ** 2).sum() / total
+
+        def learn(held: Critic, _: None) -> tuple[Critic, jax.Array]:
+            found, gradient = jax.value_and_grad(error)(held.params)
+            change, optimizer = adam.update(gradient, held.optimizer, held.params)
+            # optax types any tree of parameters; it gives back the one it was given.
+            params = cast(critic.Params, optax.apply_updates(held.params, change))
+            return Critic(params, optimizer), found
+
+        held, errors = jax.lax.scan(learn, held, None, length=config.critic.passes)
+        mean = (counts * goal).sum() / total
+        spread = (counts * (goal - mean) ** 2).sum() / total
+        return held, {"value": mean, "value_explained": 1.0 - errors[0] / (spread + 1e-8)}
+
+    return teach
