@@ -39,7 +39,7 @@ COMMANDS: dict[str, str] = {
     "reproduce": "the paper's tables and more, one document each: table2, ablation, robustness",
     "tracks": "list the track families, or draw a track as a picture",
     "delta": "fit the Delta Action Model to recorded flights",
-    "train": "train a policy by backpropagation through a point mass or a quadrotor",
+    "train": "train a policy by backpropagation through quadrotors or a point mass",
     "view": "a recording, pictures and a video of trials",
 }
 """Name -> one-line summary; the command NAME lives in suite/commands/NAME.py."""

@@ -1,4 +1,4 @@
-"""`suite train`: a policy by backpropagation through a point mass or quadrotors."""
+"""`suite train`: a policy by backpropagation through quadrotors or a point mass."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from tracks.input.ranges import Iterations, Seed
 class Config:
     """Train a policy; the same command again resumes where it was stopped."""
 
-    preset: str = "racer"
-    """The recipe: racer, direct (through quadrotors from the first step), swift (18 numbers instead
-    of the paper's 12), swift-quad (with --from swift), swift-30 (with --from swift-quad), small,
-    gpu or paper."""
+    preset: str = "direct"
+    """The recipe: direct (through quadrotors from the first step), racer (through the point mass,
+    with the paper's 12 numbers), swift (with 18), swift-quad (with --from swift), swift-30 (with
+    --from swift-quad), small, gpu or paper."""
     model: Literal["point", "quad", "fleet"] | None = None
     """What flies in training: the point mass, the quadrotor of --vehicle with its effects, or
     quadrotors of a class, drawn anew for every world; the recipe's own if not given."""

@@ -145,7 +145,8 @@ class LossConfig:
     value: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Weight of the progress that a critic expects after the rollout [s/m]; 0: none, and no critic
     learns. At the weight of `progress` a way is worth the same after the rollout's end as before;
-    a world that will crash there has little to come."""
+    a world that will crash there has little to come, and one that `episode.stop_from` stops on the
+    way has nothing."""
     survival_width_m: Annotated[float, Range(1e-3, 10.0)] = 0.04
     """How far from contact with the body the probability to fly on begins to fall [m]."""
     tilt: Annotated[float, Range(0.0, 1e6)] = 0.0
@@ -317,8 +318,26 @@ def check(config: TrainConfig) -> None:
         check_decides_in_time(config.spec, config.quadrotor.vehicle)
     if config.fleet is not None and config.quadrotor is not None:
         raise ValueError("a run has a fleet or one vehicle's quadrotor, and this one has both")
+    _check_beyond(config)
     stride, steps = config.episode.image_stride, config.episode.steps
     if steps % stride:
         raise ValueError(
             f"episode.image_stride is {stride}, allowed are divisors of episode.steps ({steps})"
+        )
+
+
+def _check_beyond(config: TrainConfig) -> None:
+    """Refuse settings of what comes after a rollout that would do nothing."""
+    loss, episode = config.loss, config.episode
+    for name, value in (("loss.value", loss.value), ("episode.again", episode.again)):
+        if value > 0.0 and math.isinf(loss.crash_depth_m):
+            raise ValueError(
+                f"{name} is {value:g} and loss.crash_depth_m is inf, by which no world crashes; "
+                "allowed is a finite one, such as 0"
+            )
+    least, length = episode.again_before_s[0], episode.steps / config.spec.rate_hz
+    if episode.again > 0.0 and least >= length:
+        raise ValueError(
+            f"episode.again_before_s begins at {least:g} s, allowed is less than the {length:g} s "
+            "of a rollout"
         )

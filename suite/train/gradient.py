@@ -11,7 +11,7 @@ from jax.sharding import PartitionSpec as P
 
 from policies.networks import delta_network, network
 from suite.train.beyond import critic
-from suite.train.beyond.value import to_come
+from suite.train.beyond.value import Way, to_come
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import DynamicsState
 from suite.train.rollout import StepRecord, make_rollout
@@ -96,7 +96,7 @@ def make_gradient(
     """Return gradient(params, worlds, key, delta, judge) -> (gradient, loss, records).
 
     It is that of one device. `judge` is the critic's parameters where `loss.value` asks for one;
-    the records then note what it saw.
+    the records then note the `Way` that it learns from.
     """
     stride, steps = config.episode.image_stride, config.episode.steps
     rollout = make_rollout(config, seen_by_critic if config.loss.value > 0.0 else None)
@@ -115,16 +115,22 @@ def make_gradient(
         def flown(
             params: network.Params, embedding_shift: jax.Array
         ) -> tuple[jax.Array, StepRecord]:
-            loss, records = rollout(params, embedding_shift, worlds, key, frozen_encode, delta)
-            last, records = records.last, records._replace(last=None)
-            if judge is None or last is None:
-                return loss, records
-            value = critic.value(judge, critic.features(worlds, last.state, last.target))
-            rest = last.alive * to_come(config, value)
-            over_steps = jnp.broadcast_to(jax.lax.stop_gradient(rest), (steps, len(rest)))
-            return loss + rest.mean(), records._replace(
-                terms={**records.terms, "value": over_steps}
+            loss, records, last = rollout(
+                params, embedding_shift, worlds, key, frozen_encode, delta
             )
+            if judge is None:
+                return loss, records
+            seen = critic.features(worlds, last.state, last.target)
+            rest = last.alive * to_come(config, critic.value(judge, seen))
+            held = jax.lax.stop_gradient((seen, last.alive, rest))
+            way = Way(
+                seen=jnp.concatenate([records.noted, held[0][None]]),
+                worth=records.worth,
+                alive=jnp.concatenate([records.alive, held[1][None]]),
+                hit=records.hit,
+            )
+            terms = {**records.terms, "value": jnp.broadcast_to(held[2], records.alive.shape)}
+            return loss + rest.mean(), records._replace(terms=terms, noted=way)
 
         embedding_shift = jnp.zeros((steps, worlds.pos_w.shape[0], width))
         (loss, records), (direct, cotangents) = jax.value_and_grad(

@@ -79,10 +79,7 @@ def swift_quad() -> TrainConfig:
 
 
 def direct() -> TrainConfig:
-    """Return the shortest way to a policy: through those quadrotors from the first step on.
-
-    Twenty minutes on two cores.
-    """
+    """Return the shortest way to a policy: through those quadrotors from the first step on."""
     return replace(swift_quad(), optimizer=OptimizerConfig(iterations=1600))
 
 

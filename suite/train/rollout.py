@@ -75,16 +75,14 @@ class StepRecord(NamedTuple):
     """(B, hidden) recurrent state after the step."""
     alive: jax.Array
     """1 where the step counted in the loss, else 0."""
-    crashed: jax.Array
-    """Bool: the world had crashed before the step."""
+    hit: jax.Array
+    """Bool: the world counted until this step, and crashed in it."""
     worth: jax.Array
     """Progress as far as it was asked for, never less than none [m/s]."""
     noted: Any = None
     """What `note` returned, where there was one."""
     after: RolloutCarry | None = None
     """What the world carries on, where another rollout may begin with it."""
-    last: RolloutCarry | None = None
-    """(B, ...) what worlds carry after the rollout's last step, alone of these with gradient."""
 
 
 Note = Callable[[Worlds, DynamicsState, DynamicsState, jax.Array], Any]
@@ -183,12 +181,13 @@ def make_start(config: TrainConfig) -> Callable[[Worlds], RolloutCarry]:
 
 def make_rollout(
     config: TrainConfig, note: Note | None = None
-) -> Callable[..., tuple[jax.Array, StepRecord]]:
-    """Return rollout(params, embedding_shift, worlds, key, encode, delta) -> (loss, records).
+) -> Callable[..., tuple[jax.Array, StepRecord, RolloutCarry]]:
+    """Return rollout(params, embedding_shift, worlds, key, encode, delta) -> (loss, records, last).
 
     `encode(params, image)` gives the embeddings; `embedding_shift` is (T, B, hidden); `delta` is
     the frozen Delta Action network's parameters or None. The loss is the mean over steps and
-    worlds; records are (T, B, ...).
+    worlds; records are (T, B, ...), without gradient; `last` (B, ...), what worlds carry after the
+    last step, has one.
     """
     weights = config.loss
     start, sight, dynamics = make_start(config), make_sight(config), make_dynamics(config)
@@ -200,7 +199,7 @@ def make_rollout(
         key: jax.Array,
         encode: Callable[[network.Params, jax.Array], jax.Array],
         delta: delta_network.Params | None = None,
-    ) -> tuple[jax.Array, StepRecord]:
+    ) -> tuple[jax.Array, StepRecord, RolloutCarry]:
         steps = len(embedding_shift)
 
         def step(
@@ -230,9 +229,9 @@ def make_rollout(
             goes_on = (number + 1 < worlds.stop) | (number + 1 == steps)
             if config.episode.finish:
                 goes_on = goes_on & (passed_after < worlds.scene.gates.center_w.shape[1])
-            alive = carry.alive * (made.clearance > -weights.crash_depth_m) * goes_on
+            unhurt = made.clearance > -weights.crash_depth_m
             if weights.tilt > 0.0:
-                alive = alive * (made.up > 0.0)
+                unhurt = unhurt & (made.up > 0.0)
             record = StepRecord(
                 image=seen.image,
                 terms={
@@ -245,7 +244,7 @@ def make_rollout(
                 pos_w=after.pos_w,
                 hidden=hidden,
                 alive=carry.alive,
-                crashed=crashed,
+                hit=(carry.alive > 0) & ~unhurt,
                 worth=jnp.maximum(-losses.progress(weights, made), 0.0),
                 noted=None if note is None else note(worlds, before, after, target),
             )
@@ -257,7 +256,7 @@ def make_rollout(
                 embeddings=embeddings,
                 observed=observed,
                 delta_hidden=delta_hidden,
-                alive=alive,
+                alive=carry.alive * unhurt * goes_on,
                 going=carry.going * goes_on,
                 survival=made.survival,
             )
@@ -267,6 +266,6 @@ def make_rollout(
         inputs = embedding_shift, keys, jnp.arange(steps)
         last, records = jax.lax.scan(step, start(worlds), inputs)
         loss = functools.reduce(jnp.add, (records.terms[name].mean() for name in losses.LOSSES))
-        return loss, jax.lax.stop_gradient(records)._replace(last=last)
+        return loss, jax.lax.stop_gradient(records), last
 
     return rollout

@@ -1,4 +1,4 @@
-"""A training run in a folder, by backpropagation through the point mass.
+"""A training run in a folder, by backpropagation through its dynamics.
 
 Worlds and noise depend on the seed and the iteration alone; `repeat.py` says what the folder holds.
 """

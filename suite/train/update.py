@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from policies.networks import delta_network, network
 from suite.common.running import hosts
 from suite.train.beyond.carried import Carried, carried_over, nothing_carried, taken_over
-from suite.train.beyond.value import Critic, Way, make_teach, start_critic
+from suite.train.beyond.value import Critic, make_teach, start_critic
 from suite.train.config import OptimizerConfig, TrainConfig
 from suite.train.gradient import shard_gradient
 from suite.train.rollout import StepRecord
@@ -154,10 +154,8 @@ def make_update(
     gradient_of = shard_gradient(config, mesh)
     seed, teach = jax.random.key(np.uint32(config.seed)), make_teach(config)
 
-    # The first process saves what all of them hold.
-    held = state_place(mesh) if hosts.several() else None
-
-    @functools.partial(jax.jit, out_shardings=held)
+    # Every device holds the whole state, and the first process saves it.
+    @functools.partial(jax.jit, out_shardings=state_place(mesh))
     def update(state: TrainState, worlds: Worlds) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(seed, state.iteration)
         worlds = worlds._replace(hidden=state.hidden * worlds.remembers[:, None])
@@ -172,10 +170,9 @@ def make_update(
         batch = config.episode.batch
         if records.after is not None:
             last = jax.random.fold_in(key, batch + 1)
-            carried = carried_over(config, last, worlds, records.after)
+            carried = carried_over(config, last, worlds, records.after, records.hit)
         if critic is not None:
-            way = Way(records.noted, records.worth, records.alive, records.crashed)
-            critic, learnt = teach(critic, way)
+            critic, learnt = teach(critic, records.noted)
             numbers |= learnt
         state = TrainState(
             # optax types any tree of parameters; it gives back the one it was given.

@@ -109,7 +109,7 @@ def make_flight(
     def fly(params: network.Params, worlds: Worlds) -> Scores:
         embedding_shift = jnp.zeros((episode.steps, episode.batch, config.spec.hidden_size))
         key = jax.random.key(np.uint32(config.seed))
-        _, records = rollout(params, embedding_shift, worlds, key, network.encode)
+        _, records, _ = rollout(params, embedding_shift, worlds, key, network.encode)
         noted = 0.0 if reward is None else records.noted
         gates = worlds.scene.gates.center_w.shape[1]
         return scored(records.passed, records.clearance, records.speed, gates, noted)

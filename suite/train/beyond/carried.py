@@ -33,6 +33,8 @@ def nothing_carried(config: TrainConfig) -> Carried:
     """Return what the first rollout finds: no world goes on."""
     worlds = jax.tree.map(jnp.asarray, sample_worlds(config, 0))
     start = jax.jit(make_start(config))(worlds)
+    # With their types said: weak ones would have the second iteration compiled again.
+    start = jax.tree.map(lambda array: jnp.asarray(array, array.dtype), start)
     return Carried(worlds, start, jnp.zeros(len(worlds.target), bool))
 
 
@@ -49,7 +51,7 @@ def taken_over(config: TrainConfig, worlds: Worlds, carried: Carried) -> Worlds:
 
 
 def carried_over(
-    config: TrainConfig, key: jax.Array, worlds: Worlds, after: RolloutCarry
+    config: TrainConfig, key: jax.Array, worlds: Worlds, after: RolloutCarry, hit: jax.Array
 ) -> Carried:
     """Return what a rollout in `worlds` leaves to the next.
 
@@ -61,20 +63,22 @@ def carried_over(
         key: of the draws.
         worlds: (B, ...).
         after: (T, B, ...) what they carried after each step.
+        hit: (T, B) bool, in which step they crashed.
     """
     episode = config.episode
     steps, batch = after.alive.shape
     dice, early = jax.random.split(key)
     drawn = jax.random.uniform(dice, (2, batch))
-    crashed = after.going > after.alive
     low, high = (config.spec.rate_hz * seconds for seconds in episode.again_before_s)
     back = jax.random.uniform(early, (batch,), minval=low, maxval=high)
-    before = jnp.argmax(crashed, axis=0) - jnp.maximum(jnp.round(back), 1.0).astype(int)
-    again = crashed.any(0) & (before >= 0) & (drawn[0] < episode.again)
+    before = jnp.argmax(hit, axis=0) - jnp.maximum(jnp.round(back), 1.0).astype(int)
+    again = hit.any(0) & (before >= 0) & (drawn[0] < episode.again)
     flying = (after.alive[-1] > 0) & (after.target[-1] < worlds.scene.gates.center_w.shape[1])
     flying = flying & (drawn[1] < episode.live_on)
     step, world = jnp.where(again, before, steps - 1), jnp.arange(batch)
     flown = jax.tree.map(lambda array: array[step, world], after)
-    one = jnp.ones(batch)
+    one, taken = jnp.ones(batch), again | flying
     flown = flown._replace(alive=one, going=one, survival=one)
-    return Carried(worlds._replace(flown=None, begun=None), flown, again | flying)
+    # A world that crashed may be anywhere by now, and what is saved must be finite.
+    flown = choose(taken, flown, jax.tree.map(jnp.zeros_like, flown))
+    return Carried(worlds._replace(flown=None, begun=None), flown, taken)

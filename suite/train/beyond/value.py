@@ -30,16 +30,16 @@ class Critic(NamedTuple):
 
 
 class Way(NamedTuple):
-    """What a critic learns from: a rollout's steps, (T, B, ...)."""
+    """What a critic learns from: a rollout of T steps."""
 
     seen: jax.Array
-    """(T, B, F) its features at each step's beginning."""
+    """(T + 1, B, F) its features before each step and after the last."""
     worth: jax.Array
-    """Progress of the step, never less than none [m/s]."""
+    """(T, B) progress of the step, never less than none [m/s]."""
     alive: jax.Array
-    """1 where the step counted in the loss, else 0."""
-    crashed: jax.Array
-    """Bool: the world had crashed before the step."""
+    """(T + 1, B) 1 where the world counted in the loss, else 0."""
+    hit: jax.Array
+    """(T, B) bool: the world crashed in the step."""
 
 
 def start_critic(config: TrainConfig) -> Critic:
@@ -64,26 +64,26 @@ def to_come(config: TrainConfig, value: jax.Array) -> jax.Array:
 
 
 def returns(config: TrainConfig, value: jax.Array, way: Way) -> jax.Array:
-    """Return what the critic is to say of the steps but the last, (T - 1, B) [m/s].
+    """Return what the critic is to say before each step, (T, B) [m/s].
 
     Nothing comes after a crash. A world that leaves the loss otherwise, at its last gate or
     because it was stopped, is taken to fly on as it flew.
 
     Args:
         config: horizon and trace.
-        value: (T, B) what it says now, without gradient [m/s].
+        value: (T + 1, B) what it says now, without gradient [m/s].
         way: the rollout.
     """
     fade, trace = discount(config), config.critic.trace
 
     def back(later: jax.Array, now: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-        worth, following, goes_on, crashed = now
+        worth, following, goes_on, hit = now
         ahead = (1.0 - trace) * following + trace * later
-        ahead = jnp.where(goes_on > 0, ahead, jnp.where(crashed, 0.0, worth))
+        ahead = jnp.where(hit, 0.0, jnp.where(goes_on > 0, ahead, worth))
         total = (1.0 - fade) * worth + fade * ahead
         return total, total
 
-    steps = way.worth[:-1], value[1:], way.alive[1:], way.crashed[1:]
+    steps = way.worth, value[1:], way.alive[1:], way.hit
     return jax.lax.scan(back, value[-1], steps, reverse=True)[1]
 
 

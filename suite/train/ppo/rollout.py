@@ -13,7 +13,7 @@ from suite.train.beyond import critic
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import make_dynamics
 from suite.train.ppo.reward import RewardTerms, make_reward
-from suite.train.rollout import make_sight, observed_at_start, queue
+from suite.train.rollout import choose, make_sight, observed_at_start, queue
 from suite.train.step import BODY_RADIUS_M, target_gate
 from suite.train.worlds import Worlds
 
@@ -72,15 +72,6 @@ def log_probability(mean: jax.Array, log_deviation: jax.Array, action: jax.Array
     return -(0.5 * away * away + log_deviation + 0.5 * jnp.log(2 * jnp.pi)).sum(-1)
 
 
-def chosen(done: jax.Array, fresh: Any, going: Any) -> Any:
-    """Return the rows of `fresh` where done (B,), and of `going` elsewhere, for trees (B, ...)."""
-
-    def pick(new: jax.Array, old: jax.Array) -> jax.Array:
-        return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-    return jax.tree.map(pick, fresh, going)
-
-
 def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]:
     """Return rollout(params, log_deviation, worlds, key) -> (records (T, B, ...), seen (B, F)).
 
@@ -129,7 +120,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
                 speed=jnp.linalg.norm(after.vel_w, axis=-1),
             )
             going = EpisodeCarry(after, target + passed, hidden, action, images, observed)
-            return chosen(done, start, going), record
+            return choose(done, start, going), record
 
         last, records = jax.lax.scan(step, start, jax.random.split(key, config.episode.steps))
         return records, critic.features(worlds, last.state, last.target)

@@ -75,17 +75,20 @@ import jax
 jax.config.update("jax_num_cpu_devices", 2)
 import numpy as np
 from jax.sharding import Mesh
+from suite.train.beyond.value import start_critic
 from suite.train.gradient import shard_gradient
 from suite.train.update import device_mesh
 from tests.support.training import boxes_worlds, fresh_params, largest_difference, small_config
-config = small_config()
+config = small_config(loss={"value": 1.2}, live_on=0.5)
 assert device_mesh(config).size == 2
-args = (fresh_params(), boxes_worlds(config), jax.random.key(0), None, None)
+judge = start_critic(config).params
+args = (fresh_params(), boxes_worlds(config), jax.random.key(0), None, judge)
 results = []
 for count in (1, 2):
     mesh = Mesh(np.array(jax.devices()[:count]), ("worlds",))
     gradient, loss, records = jax.jit(shard_gradient(config, mesh))(*args)
-    results.append((gradient, loss, records.pos_w, records.terms))
+    noted = records.noted.seen, records.noted.worth, records.after.state.pos_w
+    results.append((gradient, loss, records.pos_w, records.terms, *noted))
 print(largest_difference(results[1], results[0]))
 """
 

@@ -208,7 +208,7 @@ def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
         scene=worlds.scene._replace(boxes=boxes._replace(center_w=center, half_size=wall)),
     )  # fmt: skip
     embedding_shift = jnp.zeros((6, 4, SPEC.hidden_size))
-    _, records = jax.jit(make_rollout(config), static_argnums=4)(
+    _, records, _ = jax.jit(make_rollout(config), static_argnums=4)(
         params, embedding_shift, moved, KEY, blind
     )
     total = np.abs(sum(np.array(term) for term in records.terms.values()))
@@ -374,7 +374,7 @@ def test_a_crashed_world_keeps_the_price_of_its_crash_and_nothing_else():
         scene=worlds.scene._replace(boxes=boxes), vel_w=worlds.heading_w * np.float32(2.0)
     )
     shift = jnp.zeros((4, 2, SPEC.hidden_size))
-    _, records = jax.jit(lambda p: make_rollout(config)(p, shift, worlds, KEY, blind))(
+    _, records, _ = jax.jit(lambda p: make_rollout(config)(p, shift, worlds, KEY, blind))(
         fresh_params()
     )
     np.testing.assert_array_equal(records.alive[:, 0], [1, 0, 0, 0])

@@ -32,7 +32,7 @@ def test_two_rollouts_of_worlds_that_live_on_are_one_of_twice_the_length(model):
     ]
     gradient = jax.jit(make_gradient(config))
     first = gradient(params, worlds, KEY, None)[2]
-    left = carried.carried_over(config, KEY, worlds, first.after)
+    left = carried.carried_over(config, KEY, worlds, first.after, first.hit)
     assert np.all(left.taken)
     fresh = jax.tree.map(jnp.asarray, boxes_worlds(config, 1))
     second = gradient(params, carried.taken_over(config, fresh, left), KEY, None)[2]
@@ -42,7 +42,7 @@ def test_two_rollouts_of_worlds_that_live_on_are_one_of_twice_the_length(model):
 
 
 def after_of(config, steps, crash_at):
-    """Return what steps carried in which world i crashed in step `crash_at`[i], None: it did not.
+    """Return worlds, what steps carried, and where world i crashed: in step `crash_at`[i], or not.
 
     The z of the action is the step's number.
     """
@@ -52,17 +52,18 @@ def after_of(config, steps, crash_at):
     number = jnp.broadcast_to(jnp.arange(steps)[:, None, None], after.action_b.shape)
     ends = np.array([steps if at is None else at for at in crash_at])
     alive = jnp.asarray(1.0 * (np.arange(steps)[:, None] < ends))
-    return worlds, after._replace(action_b=1.0 * number, alive=alive)
+    hit = jnp.asarray(np.arange(steps)[:, None] == ends)
+    return worlds, after._replace(action_b=1.0 * number, alive=alive), hit
 
 
 def test_a_crashed_world_goes_on_from_one_to_two_seconds_before():
     config = small_config(steps=150, again=1.0)
-    worlds, after = after_of(config, 150, [120, 10, None, 149])
+    worlds, after, hit = after_of(config, 150, [120, 10, None, 149])
     seen = []
     for seed in range(30):
-        left = carried.carried_over(config, jax.random.key(seed), worlds, after)
+        left = carried.carried_over(config, jax.random.key(seed), worlds, after, hit)
         assert list(left.taken) == [True, False, False, True], "the second crashed too early"
-        assert np.all(left.flown.alive == 1) and np.all(left.flown.going == 1)
+        assert list(left.flown.alive) == [1, 0, 0, 1] == list(left.flown.going)
         seen.append(np.array(left.flown.action_b[:, 2]))
     back = (np.array([120, 149]) - np.array(seen)[:, [0, 3]]) / SPEC.rate_hz
     assert back.min() >= 1.0 - 0.5 / SPEC.rate_hz and back.max() <= 2.0 + 0.5 / SPEC.rate_hz
@@ -71,11 +72,11 @@ def test_a_crashed_world_goes_on_from_one_to_two_seconds_before():
 
 def test_shares_are_those_asked_for_and_a_world_with_no_gate_left_does_not_go_on():
     config = small_config(batch=256, steps=4, live_on=0.25)
-    worlds, after = after_of(config, 4, [None] * 256)
-    taken = np.asarray(carried.carried_over(config, KEY, worlds, after).taken)
+    worlds, after, hit = after_of(config, 4, [None] * 256)
+    taken = np.asarray(carried.carried_over(config, KEY, worlds, after, hit).taken)
     assert 0.15 < taken.mean() < 0.35
     done = after._replace(target=jnp.full_like(after.target, config.episode.gates))
-    assert not np.any(carried.carried_over(config, KEY, worlds, done).taken)
+    assert not np.any(carried.carried_over(config, KEY, worlds, done, hit).taken)
 
 
 def test_fresh_worlds_take_the_place_of_those_that_do_not_go_on():

@@ -3,7 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+from policies.spec import PolicySpec
 from suite.train.beyond import critic
 from suite.train.dynamics import point_mass
 from tests.support.training import boxes_worlds, small_config
@@ -42,6 +44,33 @@ def test_the_features_of_a_state():
     np.testing.assert_allclose(found[0], expected, atol=1e-5)
     last = features(worlds, body, jnp.asarray([2]))[0]
     assert last[-1] == -1.0 and not np.any(last[9:12]), "no gate is left, and none comes after"
+
+
+def test_the_features_gradient_is_that_of_finite_differences():
+    """But for the direction away from the obstacle, which is held."""
+    worlds = worlds_with((-1.0, 2.0, 50.0), 0.5)
+    ahead = jnp.asarray([[1.0, 0.0, 0.0]])
+
+    @jax.jit
+    def seen(motion):
+        body = point_mass.start(motion[None, :3], motion[None, 3:], ahead)
+        return critic.features(worlds, body, jnp.asarray([0]))[0]
+
+    motion, step = jnp.asarray([-1.0, 0.4, 50.1, 2.0, 0.3, -0.2]), 0.01
+    found = jax.jacfwd(seen)(motion)
+    sides = [(seen(motion + e) - seen(motion - e)) / (2 * step) for e in step * jnp.eye(6)]
+    kept = np.delete(np.arange(critic.FEATURES), np.s_[18:21])
+    np.testing.assert_allclose(found[kept], np.stack(sides, -1)[kept], atol=0.01)
+    assert np.abs(found[24:29, 1]).min() > 0.5, "the distances are among them"
+
+
+def test_the_last_number_is_how_fast_to_fly_where_the_policy_is_told():
+    spec = PolicySpec(speed_input=True)
+    assert critic.features_of(PolicySpec()) == critic.FEATURES == critic.features_of(spec) - 1
+    worlds = worlds_with((-1.0, 2.0, 50.0), 0.5)._replace(wanted=jnp.asarray([0.3]))
+    body = point_mass.start(*(jnp.asarray([x]) for x in ([-1.0, 0, 50], [2.0, 0, 0], [1.0, 0, 0])))
+    found = critic.features(worlds, body, jnp.asarray([0]))
+    assert found.shape == (1, critic.features_of(spec)) and found[0, -1] == pytest.approx(0.3)
 
 
 def test_a_fresh_value_is_near_zero_and_is_that_of_a_plain_loop():

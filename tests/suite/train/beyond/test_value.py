@@ -27,30 +27,34 @@ CONFIG = replace(
 FADE = np.exp(-1.0 / (0.5 * SPEC.rate_hz))
 
 
-def way_of(worth, alive, crashed):
+def way_of(worth, alive, hit):
     """Return a rollout of one world, of which the critic sees nothing but zeros."""
-    worth, alive, crashed = (jnp.asarray(x)[:, None] for x in (worth, alive, crashed))
-    return value.Way(jnp.zeros((*worth.shape, critic.FEATURES)), worth, 1.0 * alive, crashed)
+    worth, alive, hit = (jnp.asarray(x)[:, None] for x in (worth, alive, hit))
+    return value.Way(jnp.zeros((*alive.shape, critic.FEATURES)), worth, 1.0 * alive, hit)
 
 
-@pytest.mark.parametrize("ends", ["not", "crash", "left"])
+@pytest.mark.parametrize("ends", ["not", "crash", "crash at the end", "left"])
 def test_returns_are_those_of_a_plain_loop(ends):
-    worth, says = np.array([3.0, 5.0, 1.0, 4.0]), np.array([2.0, 3.0, 7.0, 6.0])
-    on = np.array([True, True, ends == "not", ends == "not"])
-    way = way_of(worth, on, ~on & (ends == "crash"))
+    worth, says = np.array([3.0, 5.0, 1.0]), np.array([2.0, 3.0, 7.0, 6.0])
+    goes_on = ends in ("not", "crash at the end")
+    on = np.array([True, True, goes_on, ends == "not"])
+    hit = np.arange(3) == {"crash": 1, "crash at the end": 2}.get(ends)
+    way = way_of(worth, on, hit)
     found = value.returns(CONFIG, jnp.asarray(says)[:, None], way)[:, 0]
     expected, later = np.zeros(3), says[3]
     for t in (2, 1, 0):
         ahead = 0.2 * says[t + 1] + 0.8 * later
-        if not on[t + 1]:
-            ahead = 0.0 if ends == "crash" else worth[t]
+        if hit[t]:
+            ahead = 0.0
+        elif not on[t + 1]:
+            ahead = worth[t]
         expected[t] = later = (1 - FADE) * worth[t] + FADE * ahead
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_a_constant_speed_is_worth_itself_and_its_loss_is_that_of_all_the_way_to_come():
-    way = way_of(np.full(4, 5.0), np.ones(4, bool), np.zeros(4, bool))
-    np.testing.assert_allclose(value.returns(CONFIG, jnp.full((4, 1), 5.0), way), 5.0, rtol=1e-6)
+    way = way_of(np.full(4, 5.0), np.ones(5, bool), np.zeros(4, bool))
+    np.testing.assert_allclose(value.returns(CONFIG, jnp.full((5, 1), 5.0), way), 5.0, rtol=1e-6)
     to_come = 5.0 * sum(FADE**k for k in range(1000))
     paid = float(value.to_come(CONFIG, jnp.asarray(5.0)))
     assert paid == pytest.approx(-1.6 * to_come / CONFIG.episode.steps, rel=1e-4)
@@ -62,8 +66,9 @@ def test_a_critic_learns_which_worlds_crash():
     doomed = rng.random(batch) < 0.5
     seen = np.zeros((6, batch, critic.FEATURES))
     seen[..., 0] = doomed
-    crashed = (np.arange(6)[:, None] > 1) & doomed
-    way = value.Way(*map(jnp.asarray, (seen, np.full((6, batch), 4.0), 1.0 * ~crashed, crashed)))
+    alive = 1.0 - ((np.arange(6)[:, None] > 1) & doomed)
+    hit = (np.arange(5)[:, None] == 1) & doomed
+    way = value.Way(*map(jnp.asarray, (seen, np.full((5, batch), 4.0), alive, hit)))
     held, teach = value.start_critic(CONFIG), jax.jit(value.make_teach(CONFIG))
     for _ in range(60):
         held, _ = teach(held, way)
@@ -87,9 +92,7 @@ def test_the_gradient_with_a_critic_is_that_of_the_plain_loop_and_its_last_value
     still = jnp.zeros((CONFIG.episode.steps, 4, SPEC.hidden_size))
 
     def plain(params):
-        flown, records = make_rollout(CONFIG)(params, still, worlds, KEY, network.encode)
-        last = records.last
-        assert last is not None
+        flown, _, last = make_rollout(CONFIG)(params, still, worlds, KEY, network.encode)
         rest = critic.value(judge, critic.features(worlds, last.state, last.target))
         return flown + (last.alive * value.to_come(CONFIG, rest)).mean()
 
@@ -102,9 +105,15 @@ def test_the_gradient_with_a_critic_is_that_of_the_plain_loop_and_its_last_value
     assert total == pytest.approx(float(loss), rel=1e-5)
 
 
-def test_a_world_that_has_left_the_loss_has_nothing_to_come(judged):
+def test_a_world_that_was_stopped_or_has_crashed_has_nothing_to_come(judged):
     worlds, params, judge = judged
-    worlds = worlds._replace(stop=np.array([6, 6, 2, 6]))
+    # The second begins inside a bar of its first gate's frame.
+    pos_w = np.array(worlds.pos_w)
+    pos_w[1] = worlds.scene.boxes.center_w[1, 0]
+    worlds = worlds._replace(stop=np.array([6, 6, 2, 6]), pos_w=pos_w)
     records = jax.jit(make_gradient(CONFIG))(params, worlds, KEY, None, judge)[2]
-    paid = np.asarray(records.terms["value"][0])
-    assert paid[2] == 0 and np.all(paid[[0, 1, 3]] != 0)
+    paid, way = np.asarray(records.terms["value"][0]), records.noted
+    assert list(paid != 0) == [True, False, False, True]
+    assert way.seen.shape == (7, 4, critic.FEATURES) and way.alive.shape == (7, 4)
+    assert list(way.hit[0]) == [False, True, False, False] and way.hit.sum() == 1
+    assert list(way.alive.sum(0)) == [7, 1, 2, 7]
