@@ -60,8 +60,7 @@ def test_how_fast_to_fly_is_drawn_where_it_is_an_input_and_moves_nothing_else():
     assert 0.3 < races.mean() < 0.7
     assert worlds.wanted.min() < 0.2 and 0.8 < worlds.wanted[~races].max() < 1.0
     assert np.abs(worlds.wanted[~races].mean() - 0.5) < 0.15
-    for one, other in zip(plain[:-1], worlds[:-1], strict=True):
-        jax.tree.map(np.testing.assert_array_equal, one, other)
+    jax.tree.map(np.testing.assert_array_equal, plain, worlds._replace(wanted=None))
 
 
 def test_drag_along_the_bodys_z_has_a_range_of_its_own():

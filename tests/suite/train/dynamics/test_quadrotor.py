@@ -350,7 +350,9 @@ def test_the_command_line_asks_for_model_and_vehicle_together(tmp_path):
     assert config.quadrotor is not None and config.quadrotor.vehicle == REFERENCE
     changed = resolve(Config(model="quad", vehicle="racer5", set=("quadrotor.physics_hz=500",)))
     assert changed.quadrotor is not None and changed.quadrotor.physics_hz == 500.0
-    assert resolve(Config()).quadrotor is None
+    own = resolve(Config()).quadrotor
+    assert own is not None and own.vehicle != REFERENCE, "by default it has not seen the tables'"
+    assert resolve(Config(preset="racer")).quadrotor is None
     with pytest.raises(ValueError, match="--model quad needs --vehicle.*reference"):
         resolve(Config(model="quad"))
     with pytest.raises(ValueError, match="--vehicle is racer5.*add --model quad"):
