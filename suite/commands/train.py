@@ -30,7 +30,8 @@ class Config:
     """What flies in training: the point mass, the quadrotor of --vehicle with its effects, or
     quadrotors of a class, drawn anew for every world; the recipe's own if not given."""
     vehicle: str | None = None
-    """With --model quad: a shipped vehicle's name or a vehicle file (.toml)."""
+    """What the training's quadrotors are drawn around: a shipped vehicle's name or a vehicle file
+    (.toml); with --model quad, or with a preset that trains through quadrotors."""
     out: Path = Path("runs/train")
     """Folder of the run; a run that stands there is resumed."""
     seed: Seed = 0

@@ -221,18 +221,20 @@ def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) ->
     Args:
         config: a recipe.
         model: "point", "quad" or "fleet"; None: what the recipe has.
-        vehicle: a vehicle file or a shipped name; with "quad" only.
+        vehicle: a vehicle file or a shipped name; with "quad", or with a recipe that has its own
+            quadrotors, which then are around this one.
 
     Raises:
         ValueError: where one is given without the other, or the vehicle cannot be used.
     """
     from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 
+    if model is None and config.quadrotor is not None and vehicle is not None:
+        return with_quadrotor(config, load_vehicle(vehicle))
     if model != "quad":
         if vehicle is not None:
-            flown = "a fleet has none" if model == "fleet" else "the point mass has none"
-            if model is None and config.quadrotor is not None:
-                flown = f"this recipe's quadrotors are around {config.quadrotor.vehicle.name}"
+            fleet = model == "fleet" or (model is None and config.fleet is not None)
+            flown = "a fleet has none" if fleet else "the point mass has none"
             raise ValueError(f"--vehicle is {vehicle}, but {flown}: add --model quad")
         if model is None:
             return config

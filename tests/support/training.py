@@ -18,7 +18,7 @@ from suite.train.config import (
 from suite.train.rollout import make_rollout
 from suite.train.worlds import Worlds, sample_worlds
 from tracks.geometry.camera import Camera
-from tracks.geometry.scene import Boxes, Rods, Scene, Spheres
+from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
 
 SPEC = PolicySpec(camera=Camera(width=20, height=20), hidden_size=8)
 KEY = jax.random.key(5)
@@ -66,6 +66,39 @@ def boxes_worlds(config: TrainConfig, iteration: int = 0) -> Worlds:
     """Return the worlds of an iteration with the boxes of `boxes_only`."""
     worlds = sample_worlds(config, iteration)
     return worlds._replace(scene=boxes_only(worlds.scene))
+
+
+def straight_worlds(worlds: Worlds, speed: float, wall_x: float = 50.0) -> Worlds:
+    """Return two worlds as a straight flight along x at `speed`: gates at 2 m and 4 m, one wall.
+
+    The wall stands across the second world's path, at `wall_x`.
+    """
+    scene = boxes_only(worlds.scene)
+    x = np.array([2.0, 4.0])
+    center = np.stack([x, 0 * x, 0 * x + 1.5], -1)
+    square = 0.6 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    sizes = np.full((2, 2), 0.2)
+    gates = Gates(
+        np.broadcast_to(center, (2, 2, 3)),
+        np.broadcast_to(np.eye(3), (2, 2, 3, 3)),
+        np.broadcast_to(square, (2, 2, 4, 2)),
+        sizes,
+        sizes,
+    )
+    walls = np.full((2, 8, 3), 1e3)
+    walls[1, 0] = [wall_x, 0, 1.5]
+    boxes = Boxes(
+        walls, np.broadcast_to(np.eye(3), (2, 8, 3, 3)), np.full((2, 8, 3), [0.1, 3.0, 3.0])
+    )
+    scene = scene._replace(gates=gates, boxes=boxes)
+    scene = jax.tree.map(lambda array: np.asarray(array, np.float32), scene)
+    row = np.ones((2, 1), np.float32)
+    return worlds._replace(
+        scene=scene,
+        pos_w=row * np.array([0, 0, 1.5], np.float32),
+        vel_w=row * np.array([speed, 0, 0], np.float32),
+        heading_w=row * np.array([1, 0, 0], np.float32),
+    )
 
 
 def doubled(tree):

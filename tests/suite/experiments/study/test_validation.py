@@ -2,7 +2,6 @@
 
 from functools import cache
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,8 +15,7 @@ from suite.experiments.study.validation import (
 )
 from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import sample_worlds
-from tests.support.training import boxes_only, fresh_params, small_config
-from tracks.geometry.scene import Boxes, Gates
+from tests.support.training import fresh_params, small_config, straight_worlds
 
 CONFIG = small_config(
     batch=2, gates=2, physics={"drag": (0.0, 0.0), "wind_std": (0, 0, 0), "time_step_std": 0.0}
@@ -48,33 +46,7 @@ def measure(worlds):
 
 def straight(wall_x):
     """Return two worlds: gates 2 m and 4 m ahead, 6 m/s, and a wall across the second's path."""
-    worlds = sample_worlds(FLOWN, 0)
-    scene = boxes_only(worlds.scene)
-    x = np.array([2.0, 4.0])
-    center = np.stack([x, 0 * x, 0 * x + 1.5], -1)
-    square = 0.6 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    sizes = np.full((2, 2), 0.2)
-    gates = Gates(
-        np.broadcast_to(center, (2, 2, 3)),
-        np.broadcast_to(np.eye(3), (2, 2, 3, 3)),
-        np.broadcast_to(square, (2, 2, 4, 2)),
-        sizes,
-        sizes,
-    )
-    walls = np.full((2, 8, 3), 1e3)
-    walls[1, 0] = [wall_x, 0, 1.5]
-    boxes = Boxes(
-        walls, np.broadcast_to(np.eye(3), (2, 8, 3, 3)), np.full((2, 8, 3), [0.1, 3.0, 3.0])
-    )
-    scene = scene._replace(gates=gates, boxes=boxes)
-    scene = jax.tree.map(lambda array: np.asarray(array, np.float32), scene)
-    row = np.ones((2, 1), np.float32)
-    return worlds._replace(
-        scene=scene,
-        pos_w=row * np.array([0, 0, 1.5], np.float32),
-        vel_w=row * np.array([SPEED, 0, 0], np.float32),
-        heading_w=row * np.array([1, 0, 0], np.float32),
-    )
+    return straight_worlds(sample_worlds(FLOWN, 0), SPEED, wall_x)
 
 
 def test_a_straight_flight_through_two_gates_is_a_success():

@@ -355,7 +355,11 @@ def test_the_command_line_asks_for_model_and_vehicle_together(tmp_path):
     assert resolve(Config(preset="racer")).quadrotor is None
     with pytest.raises(ValueError, match="--model quad needs --vehicle.*reference"):
         resolve(Config(model="quad"))
-    with pytest.raises(ValueError, match="--vehicle is racer5.*add --model quad"):
-        resolve(Config(vehicle="racer5"))
+    around = resolve(Config(vehicle="reference")).quadrotor
+    assert around == replace(own, vehicle=REFERENCE), "the recipe's own spreads"
+    with pytest.raises(ValueError, match="--vehicle is racer5.*point mass has none.*--model quad"):
+        resolve(Config(preset="swift", vehicle="racer5"))
+    with pytest.raises(ValueError, match="--vehicle is racer5.*fleet has none.*--model quad"):
+        resolve(Config(model="fleet", vehicle="racer5"))
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
         resolve(Config(model="quad", vehicle="racer6"))
