@@ -58,7 +58,7 @@ WORLDS: dict[str, Hidden] = {
         "rotor 1 gives 70 % of its thrust", {"weak_motor": {"scale": (0.7, 1.0, 1.0, 1.0)}}
     ),
     "drag and wind": Hidden(
-        "four times the linear drag, in a wind of 5 m/s",
+        "linear drag of 0.7, 0.7 and 1.2 1/s, in a wind of 5 m/s",
         {
             "linear_drag": {"coefficient": (0.7, 0.7, 1.2)},
             "constant_wind": {"velocity": (-3.0, 4.0, 0.0)},

@@ -13,7 +13,7 @@ import tyro
 from eval.judging.tables import Tally
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.policy import load_policy
-from suite.common.console import Console
+from suite.common.console import Console, duration
 from suite.common.report import Picture, Report, Section
 from suite.experiments.pages.document import Place
 from suite.experiments.pages.tables import every_cell
@@ -101,8 +101,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         facts={
             "recipe": "given policies" if config.policies else options.recipe_words(config),
             **{
-                name: f"SHA-256 {policy_digest(path)[:16]}, trained at commit "
-                f"{training.commit_of(Path(path))}"
+                name: f"SHA-256 {policy_digest(path)[:16]}, {_trained(Path(path))}"
                 for name, path in policies.items()
             },
             "vehicle": config.vehicle,
@@ -111,6 +110,13 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         sections=[Section("Success and speed by training seed", parts), every_cell(everything)],
     )
     return report, {"spread": found, "cells": everything}
+
+
+def _trained(policy: Path) -> str:
+    """Return at which commit a policy was trained, and how long where its run is there."""
+    seconds = training.seconds_of(policy)
+    took = f" in {duration(seconds)}" if seconds else ""
+    return f"trained at commit {training.commit_of(policy)}{took}"
 
 
 def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:

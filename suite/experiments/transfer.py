@@ -43,7 +43,7 @@ from tracks.families import MAX_COUNTS, make_track
 from tracks.geometry.scene import stack
 from tracks.input.ranges import Seed, Trials
 
-STILL_AIR = PointMassConfig(
+NOMINAL = PointMassConfig(
     lag_std=0.0,
     drag=(0.3, 0.3),
     drag_up=(0.9, 0.9),
@@ -52,16 +52,17 @@ STILL_AIR = PointMassConfig(
     depth_noise=0.0,
     fov_scale=(1.0, 1.0),
 )
-"""A point mass without randomisation, and the images of all that is flown here."""
+"""A point mass without randomisation, much as `reference` flies; and the images of both."""
 DELAY_S = 1 / 30
 """Of the point mass's commands [s]."""
 MEANINGS = (
-    f"{POINT}: the trainer's, with a lag of {STILL_AIR.lag_mean:g} 1/s, drag of 0.3, 0.3 and 0.9 "
+    f"{POINT}: the trainer's, with a lag of {NOMINAL.lag_mean:g} 1/s, drag of 0.3, 0.3 and 0.9 "
     f"1/s, commands {1000 * DELAY_S:.0f} ms late, and nothing drawn. {QUADROTOR}: the trainer's, "
     "of the judged vehicle with its effects, in single precision and fewer, longer steps. Both "
     "end a trial by the trainer's collisions and show the nearest solids of each kind alone; the "
-    f"point mass cannot tip over. {JUDGE}: MuJoCo. Minus {JUDGE}: on the same trials, in points, "
-    "with Newcombe's paired 95 % interval."
+    "point mass is the same for every vehicle and cannot tip over, and the quadrotor is looked at "
+    f"for that where a decision ends, not in every step. {JUDGE}: MuJoCo. Minus {JUDGE}: on the "
+    "same trials, in points, with Newcombe's paired 95 % interval."
 )
 
 
@@ -133,7 +134,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
 def point_recipe(spec: PolicySpec, _: Vehicle) -> TrainConfig:
     """Return what flies as the point mass without randomisation."""
     delay = min(2.0, DELAY_S * spec.rate_hz)
-    return TrainConfig(spec=spec, physics=replace(STILL_AIR, action_delay=(delay, delay)))
+    return TrainConfig(spec=spec, physics=replace(NOMINAL, action_delay=(delay, delay)))
 
 
 def quadrotor_recipe(spec: PolicySpec, vehicle: Vehicle) -> TrainConfig:
@@ -147,7 +148,7 @@ def quadrotor_recipe(spec: PolicySpec, vehicle: Vehicle) -> TrainConfig:
         gain_spread=0.0,
         wind_std=(0.0, 0.0, 0.0),
     )
-    return TrainConfig(spec=spec, physics=STILL_AIR, quadrotor=exact)
+    return TrainConfig(spec=spec, physics=NOMINAL, quadrotor=exact)
 
 
 TRAINERS: Mapping[str, Callable[[PolicySpec, Vehicle], TrainConfig]] = {
@@ -174,30 +175,31 @@ def trainer_wins(
         console: where progress goes.
     """
     limit = Rules().time_limit_s
-    config = validation_worlds(replace(recipe, seed=0), at_once, 0, limit)
+    config = validation_worlds(recipe, at_once, 0, limit)
     params, fly = stored_params(shipped.locate(policy)), make_judged_flight(config)
+    drawn = sample_worlds(config, 0)
     won: list[bool] = []
     flown = QUADROTOR if config.quadrotor is not None else POINT
     with console.progress(f"flying in the trainer's {flown}", len(trials)) as update:
         for first in range(0, len(trials), at_once):
-            worlds = judged_worlds(config, trials[first : first + at_once])
+            worlds = judged_worlds(drawn, config.spec, trials[first : first + at_once])
             won += np.asarray(fly(params, jax.tree.map(jnp.asarray, worlds))).tolist()
             update(len(won))
     return won
 
 
-def judged_worlds(config: TrainConfig, trials: Sequence[TrialSpec]) -> Worlds:
-    """Return the trials' tracks as worlds of `config`: from rest, asked for the policy's speed.
+def judged_worlds(drawn: Worlds, spec: PolicySpec, trials: Sequence[TrialSpec]) -> Worlds:
+    """Return the trials' tracks as worlds: from their start, asked for the policy's speed.
 
     Args:
-        config: of `validation_worlds`, for as many worlds as there are trials.
+        drawn: as many worlds, from rest, that have the constants of the dynamics.
+        spec: of the policy.
         trials: on families' tracks.
     """
     tracks = [make_track(*trial) for trial in trials]
     yaw = np.array([track.start_yaw for track in tracks])
     heading_w = np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], -1)
-    spec = config.spec
-    return sample_worlds(config, 0)._replace(
+    return drawn._replace(
         scene=stack([track.scene for track in tracks], MAX_COUNTS),
         pos_w=np.stack([track.start_pos_w for track in tracks]).astype(np.float32),
         heading_w=heading_w.astype(np.float32),

@@ -327,13 +327,13 @@ def check(config: TrainConfig) -> None:
 
 
 def _check_beyond(config: TrainConfig) -> None:
-    """Refuse settings of what comes after a rollout that would do nothing."""
+    """Refuse what comes after a rollout where nothing crashes or no rollout is long enough."""
     loss, episode = config.loss, config.episode
     for name, value in (("loss.value", loss.value), ("episode.again", episode.again)):
         if value > 0.0 and math.isinf(loss.crash_depth_m):
             raise ValueError(
-                f"{name} is {value:g} and loss.crash_depth_m is inf, by which no world crashes; "
-                "allowed is a finite one, such as 0"
+                f"{name} is {value:g} and loss.crash_depth_m is inf, by which no world crashes "
+                "into anything; allowed is a finite one, such as 0"
             )
     least, length = episode.again_before_s[0], episode.steps / config.spec.rate_hz
     if episode.again > 0.0 and least >= length:

@@ -93,10 +93,10 @@ def seen_by_critic(
 def make_gradient(
     config: TrainConfig,
 ) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
-    """Return gradient(params, worlds, key, delta, judge) -> (gradient, loss, records).
+    """Return gradient(params, worlds, key, delta, critic_params) -> (gradient, loss, records).
 
-    It is that of one device. `judge` is the critic's parameters where `loss.value` asks for one;
-    the records then note the `Way` that it learns from.
+    It is that of one device. `critic_params` are there where `loss.value` asks for them; the
+    records then note the `Way` that it learns from.
     """
     stride, steps = config.episode.image_stride, config.episode.steps
     rollout = make_rollout(config, seen_by_critic if config.loss.value > 0.0 else None)
@@ -110,7 +110,7 @@ def make_gradient(
         worlds: Worlds,
         key: jax.Array,
         delta: delta_network.Params | None,
-        judge: critic.Params | None = None,
+        critic_params: critic.Params | None = None,
     ) -> tuple[network.Params, jax.Array, StepRecord]:
         def flown(
             params: network.Params, embedding_shift: jax.Array
@@ -118,16 +118,18 @@ def make_gradient(
             loss, records, last = rollout(
                 params, embedding_shift, worlds, key, frozen_encode, delta
             )
-            if judge is None:
+            if critic_params is None:
                 return loss, records
             seen = critic.features(worlds, last.state, last.target)
-            rest = last.alive * to_come(config, critic.value(judge, seen))
+            rest = last.alive * to_come(config, critic.value(critic_params, seen))
             held = jax.lax.stop_gradient((seen, last.alive, rest))
+            number = jnp.arange(steps)[:, None]
             way = Way(
                 seen=jnp.concatenate([records.noted, held[0][None]]),
                 worth=records.worth,
                 alive=jnp.concatenate([records.alive, held[1][None]]),
                 hit=records.hit,
+                stopped=(records.alive > 0) & (number + 1 >= worlds.stop),
             )
             terms = {**records.terms, "value": jnp.broadcast_to(held[2], records.alive.shape)}
             return loss + rest.mean(), records._replace(terms=terms, noted=way)
@@ -150,8 +152,8 @@ def shard_gradient(
     """Return the gradient shared by the devices of `mesh`, each with its part of the worlds.
 
     Returns:
-        gradient(params, worlds, key, delta, judge) -> (gradient, loss, records without images); the
-        gradient and the loss are means over all worlds, the records are gathered.
+        gradient(params, worlds, key, delta, critic_params) -> (gradient, loss, records without
+        images); gradient and loss are means over all worlds, the records are gathered.
     """
     local = make_gradient(config)
     axis = mesh.axis_names[0]
@@ -161,10 +163,10 @@ def shard_gradient(
         worlds: Worlds,
         key: jax.Array,
         delta: delta_network.Params | None,
-        judge: critic.Params | None,
+        critic_params: critic.Params | None,
     ) -> tuple[network.Params, jax.Array, StepRecord]:
         key = jax.random.fold_in(key, jax.lax.axis_index(axis))
-        gradient, loss, records = local(params, worlds, key, delta, judge)
+        gradient, loss, records = local(params, worlds, key, delta, critic_params)
         records = records._replace(image=jnp.zeros((config.episode.steps, 1)))
         return jax.lax.pmean(gradient, axis), jax.lax.pmean(loss, axis), records
 

@@ -225,7 +225,8 @@ def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) ->
             quadrotors, which then are around this one.
 
     Raises:
-        ValueError: where one is given without the other, or the vehicle cannot be used.
+        ValueError: where a vehicle is given and no quadrotor flies, "quad" without a vehicle, or
+            a vehicle that cannot be used.
     """
     from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 

@@ -1,6 +1,7 @@
 """A training run in a folder, by backpropagation through its dynamics.
 
-Worlds and noise depend on the seed and the iteration alone; `repeat.py` says what the folder holds.
+Fresh worlds and noise depend on the seed and the iteration alone; `repeat.py` says what the folder
+holds.
 """
 
 from __future__ import annotations

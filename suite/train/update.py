@@ -14,7 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from policies.networks import delta_network, network
 from suite.common.running import hosts
-from suite.train.beyond.carried import Carried, carried_over, nothing_carried, taken_over
+from suite.train.beyond.carried import carried_over, nothing_carried, taken_over
 from suite.train.beyond.value import Critic, make_teach, start_critic
 from suite.train.config import OptimizerConfig, TrainConfig
 from suite.train.gradient import shard_gradient
@@ -36,7 +36,7 @@ class TrainState(NamedTuple):
     """(B, hidden) recurrent states from random steps of the last rollout."""
     critic: Critic | None = None
     """Of what comes after a rollout, where `loss.value` asks for one."""
-    carried: Carried | None = None
+    carried: Worlds | None = None
     """Worlds that the next rollout goes on with, where the episodes' settings ask for such."""
 
 

@@ -18,7 +18,7 @@ POINT = "point mass"
 QUADROTOR = "quadrotor"
 JUDGE = "judge"
 SOURCES = {
-    "policy": f"it fails in the {POINT} as well: what it saw, remembered or planned",
+    "policy": "it fails in both of the trainer's: what it saw, remembered or planned",
     "dynamics": f"it succeeds in the {POINT} and fails in the {QUADROTOR}: what it does there a "
     "quadrotor does not follow",
     "simulator": f"it succeeds in the trainer's {QUADROTOR}: the judge's steps, contacts, images",

@@ -218,8 +218,7 @@ def _read(job: Job, ended: Ended) -> Trained:
     """Return a training from its folder."""
     (key, config), policy = job.task, job.folder / "policy"
     points, compile_s = curve_of(job.folder, config.episode.batch * config.episode.steps)
-    seconds = sum(row["seconds"] for row in curve.read(job.folder) if not row["cold"])
-    about = (str(policy), seconds, compile_s, commit_of(policy))
+    about = (str(policy), seconds_of(policy), compile_s, commit_of(policy))
     return Trained(key, config.seed, *about, ended.diverged, ended.points or points)
 
 
@@ -251,6 +250,11 @@ def curve_of(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
         done = point.pop("iteration")
         points.append({"steps": done * frames, "time": float(spent[done]), **point})
     return points, compiling
+
+
+def seconds_of(policy: Path) -> float:
+    """Return how long `policy` (RUN/policy) was trained, without steps that compiled [s]."""
+    return sum(row["seconds"] for row in curve.read(policy.parent) if not row["cold"])
 
 
 def commit_of(policy: Path) -> str:

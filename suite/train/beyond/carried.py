@@ -8,8 +8,6 @@ policy's, so that nothing tells the policy that a rollout ended.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 
@@ -18,42 +16,32 @@ from suite.train.rollout import RolloutCarry, choose, make_start
 from suite.train.worlds import Worlds, sample_worlds
 
 
-class Carried(NamedTuple):
-    """What a rollout leaves to the next one, (B, ...) each."""
-
-    worlds: Worlds
-    """That it flew in."""
-    flown: RolloutCarry
-    """From where they are to be flown on."""
-    taken: jax.Array
-    """(B,) bool: which of them are."""
-
-
-def nothing_carried(config: TrainConfig) -> Carried:
-    """Return what the first rollout finds: no world goes on."""
+def nothing_carried(config: TrainConfig) -> Worlds:
+    """Return what the first rollout finds: worlds of which none goes on."""
     worlds = jax.tree.map(jnp.asarray, sample_worlds(config, 0))
     start = jax.jit(make_start(config))(worlds)
     # With their types said: weak ones would have the second iteration compiled again.
     start = jax.tree.map(lambda array: jnp.asarray(array, array.dtype), start)
-    return Carried(worlds, start, jnp.zeros(len(worlds.target), bool))
+    return worlds._replace(flown=start, begun=jnp.zeros(len(worlds.target), bool))
 
 
-def taken_over(config: TrainConfig, worlds: Worlds, carried: Carried) -> Worlds:
+def taken_over(config: TrainConfig, worlds: Worlds, carried: Worlds) -> Worlds:
     """Return fresh `worlds` with those of `carried` that go on in the place of as many."""
-    kept = choose(carried.taken, carried.worlds, worlds)
+    begun = jnp.asarray(carried.begun)
+    kept = choose(begun, carried._replace(flown=None, begun=None), worlds)
     return kept._replace(
         # The field of view is an iteration's own, and no world that goes on is stopped on the way.
         fov_scale=worlds.fov_scale,
-        stop=jnp.where(carried.taken, config.episode.steps, worlds.stop),
+        stop=jnp.where(begun, config.episode.steps, worlds.stop),
         flown=carried.flown,
-        begun=carried.taken,
+        begun=begun,
     )
 
 
 def carried_over(
     config: TrainConfig, key: jax.Array, worlds: Worlds, after: RolloutCarry, hit: jax.Array
-) -> Carried:
-    """Return what a rollout in `worlds` leaves to the next.
+) -> Worlds:
+    """Return what a rollout in `worlds` leaves to the next: with `begun`, which of them go on.
 
     A world that crashed goes on from before that, where it was flying long enough; one that flies
     and has gates left goes on from the end; each with the share of `config`.
@@ -81,4 +69,4 @@ def carried_over(
     flown = flown._replace(alive=one, going=one, survival=one)
     # A world that crashed may be anywhere by now, and what is saved must be finite.
     flown = choose(taken, flown, jax.tree.map(jnp.zeros_like, flown))
-    return Carried(worlds._replace(flown=None, begun=None), flown, taken)
+    return worlds._replace(flown=flown, begun=taken)

@@ -78,9 +78,9 @@ def features_of(spec: PolicySpec) -> int:
     return FEATURES + spec.speed_input
 
 
-def init(key: jax.Array, width: int, seen: int = FEATURES) -> Params:
-    """Return fresh parameters of an MLP with two hidden layers of `width`, near zero in value."""
-    sizes = [(seen, width), (width, width), (width, 1)]
+def init(key: jax.Array, width: int, count: int = FEATURES) -> Params:
+    """Return fresh parameters for `count` features: two hidden layers of `width`, a small value."""
+    sizes = [(count, width), (width, width), (width, 1)]
     params: Params = {}
     for number, (k, (rows, columns)) in enumerate(
         zip(jax.random.split(key, len(sizes)), sizes, strict=True)
@@ -92,7 +92,7 @@ def init(key: jax.Array, width: int, seen: int = FEATURES) -> Params:
 
 
 def value(params: Params, seen: jax.Array) -> jax.Array:
-    """Return the values (...) of states seen as (..., FEATURES)."""
+    """Return the values (...) of states with features (..., F)."""
     x = jnp.tanh(seen @ params["weight0"] + params["bias0"])
     x = jnp.tanh(x @ params["weight1"] + params["bias1"])
     return (x @ params["weight2"] + params["bias2"])[..., 0]

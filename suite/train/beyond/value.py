@@ -40,6 +40,8 @@ class Way(NamedTuple):
     """(T + 1, B) 1 where the world counted in the loss, else 0."""
     hit: jax.Array
     """(T, B) bool: the world crashed in the step."""
+    stopped: jax.Array
+    """(T, B) bool: it was taken out of the loss by the step's end, and would have flown on."""
 
 
 def start_critic(config: TrainConfig) -> Critic:
@@ -66,8 +68,9 @@ def to_come(config: TrainConfig, value: jax.Array) -> jax.Array:
 def returns(config: TrainConfig, value: jax.Array, way: Way) -> jax.Array:
     """Return what the critic is to say before each step, (T, B) [m/s].
 
-    Nothing comes after a crash. A world that leaves the loss otherwise, at its last gate or
-    because it was stopped, is taken to fly on as it flew.
+    Nothing comes after a crash. A world that was stopped flies on, and what comes is what the
+    critic says there. One that leaves the loss otherwise, at its last gate, is taken to fly on as
+    it did in the step before: the progress of the step that passes a gate may be to that gate.
 
     Args:
         config: horizon and trace.
@@ -77,13 +80,15 @@ def returns(config: TrainConfig, value: jax.Array, way: Way) -> jax.Array:
     fade, trace = discount(config), config.critic.trace
 
     def back(later: jax.Array, now: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-        worth, following, goes_on, hit = now
+        worth, steady, following, goes_on, hit, stopped = now
         ahead = (1.0 - trace) * following + trace * later
-        ahead = jnp.where(hit, 0.0, jnp.where(goes_on > 0, ahead, worth))
+        ended = jnp.where(hit, 0.0, jnp.where(stopped, following, steady))
+        ahead = jnp.where(goes_on > 0, ahead, ended)
         total = (1.0 - fade) * worth + fade * ahead
         return total, total
 
-    steps = way.worth, value[1:], way.alive[1:], way.hit
+    steady = jnp.concatenate([way.worth[:1], way.worth[:-1]])
+    steps = way.worth, steady, value[1:], way.alive[1:], way.hit, way.stopped
     return jax.lax.scan(back, value[-1], steps, reverse=True)[1]
 
 

@@ -10,7 +10,7 @@ import pytest
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.running.apart import Job
-from suite.experiments.ideas import Config, compared, ideas, is_round, lead
+from suite.experiments.ideas import Config, compared, ideas, is_round, lead, refused_rows
 from suite.experiments.study.training import Looks, train_one
 from suite.train import run as training_run
 from suite.train.overrides import override
@@ -125,6 +125,19 @@ def test_a_training_that_diverges_leaves_its_row_out(sky, made, tmp_path, monkey
     worse.add(False)
     assert reproduce(tmp_path / "other", *args) == 1
     assert "the recipe itself, seed 5: training diverged" in capsys.readouterr().err
+
+
+def test_a_change_that_does_not_go_with_the_recipe_is_found_before_anything_is_trained(
+    sky, made, tmp_path, capsys
+):
+    args = ["ideas", "--preset", "paper", "--set", "loss.progress=0.5", "--only", "critic"]
+    assert reproduce(tmp_path, *args) == 2 and not made
+    assert "--only 'critic': loss.value is 0.5 and loss.crash_depth_m is inf" in (
+        capsys.readouterr().err
+    )
+    rows = ideas(Config(preset="paper", set=()))
+    left_out = refused_rows(rows, named=False)
+    assert {"critic", "again"} < set(left_out) and "live on" not in left_out
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from suite.common.curve import append
 from suite.experiments.seeds import repeats
 from tests.support.documents import page, reproduce
 from tests.support.judged_cells import cell
@@ -32,3 +33,8 @@ def test_seeds_are_trained_once_and_compared(sky, made, tmp_path):
     text, numbers = page(tmp_path, "seeds")
     assert set(numbers["spread"]["mean_success"]) == {"seed 0", "seed 4"}
     assert "small episode.batch=2" in text
+    digest = next((tmp_path / "cache" / "trainings").glob("*/policy"))
+    rows = [{"iteration": k, "seconds": 45.2, "cold": k == 0} for k in range(3)]
+    append(digest.parent, rows)
+    assert reproduce(tmp_path, "seeds", *args) == 0
+    assert "trained at commit unknown in 1 min 30 s" in page(tmp_path, "seeds")[0]

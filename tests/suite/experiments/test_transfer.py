@@ -1,6 +1,7 @@
 """Judged trials in the trainer's dynamics: the same tracks, by the judge's rules."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,10 @@ import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
+from policies import shipped
+from policies.formats.policy_file import load_policy_checkpoint
 from policies.spec import PolicySpec
+from suite.common.console import Console
 from suite.experiments import transfer
 from suite.experiments.study.validation import validation_worlds
 from suite.train.config import EpisodeConfig
@@ -24,7 +28,8 @@ SPEED = 6.0
 def test_worlds_are_the_judged_tracks_from_their_start():
     spec = PolicySpec(speed_input=True, speed=0.7)
     recipe = transfer.quadrotor_recipe(spec, load_vehicle("reference"))
-    worlds = transfer.judged_worlds(validation_worlds(recipe, 2, 0, 1.0), TRIALS)
+    drawn = sample_worlds(validation_worlds(recipe, 2, 0, 1.0), 0)
+    worlds = transfer.judged_worlds(drawn, spec, TRIALS)
     for row, trial in enumerate(TRIALS):
         track = make_track(*trial)
         centers = worlds.scene.gates.center_w[row]
@@ -97,3 +102,32 @@ def test_the_page_says_where_failures_come_from(sky, monkeypatch, tmp_path):
 def test_a_policy_that_is_no_checkpoint_is_refused(sky, tmp_path, capsys):
     assert reproduce(tmp_path, "transfer", "--policy", str(tmp_path / "none.onnx")) == 2
     assert "none.onnx" in capsys.readouterr().err
+
+
+def test_up_is_that_of_the_bodys_z_axis():
+    half, full = np.cos(np.pi / 3), np.sin(np.pi / 3)
+    rolled = np.array([[1, 0, 0], [0, half, -full], [0, full, half]])
+    upside_down = np.diag([1.0, -1.0, -1.0])
+    state = SimpleNamespace(rot_w=jnp.asarray(np.stack([rolled, upside_down])))
+    assert transfer._up(None, None, state, None).tolist() == pytest.approx([0.5, -1.0])
+
+
+def test_batches_are_flown_in_the_order_of_the_trials(monkeypatch):
+    """Whoever starts on the left has won, in the stand-in; parameters are the policy's own."""
+    seen = []
+
+    def made(config):
+        assert config.episode.steps == 20 * config.spec.rate_hz and config.episode.batch == 2
+
+        def fly(params, worlds):
+            seen.append(params)
+            return worlds.pos_w[:, 1] > 0
+
+        return fly
+
+    monkeypatch.setattr(transfer, "make_judged_flight", made)
+    trials = [TrialSpec(track, 5, seed) for track in ("zigzag", "circular") for seed in (3, 4)]
+    recipe = transfer.point_recipe(load_policy_checkpoint(shipped.folder("racer")).spec, None)
+    won = transfer.trainer_wins("racer", recipe, trials, 2, Console())
+    assert won == [make_track(*trial).start_pos_w[1] > 0 for trial in trials]
+    assert len(seen) == 2 and set(seen[0]) == set(fresh_params())

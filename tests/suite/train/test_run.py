@@ -119,8 +119,8 @@ def test_a_run_with_a_critic_and_worlds_that_live_on_resumes_exactly(tmp_path, m
     run.train(config, folders[1], Console())
     assert_same_run(*folders[::-1])
     state = load_arrays(folders[0] / "state", kind="training").arrays
-    taken = next(value for name, value in state.items() if name.endswith("carried.taken"))
-    assert np.any(taken), "worlds go on, so that a state without them would not do"
+    begun = next(value for name, value in state.items() if name.endswith("carried.begun"))
+    assert np.any(begun), "worlds go on, so that a state without them would not do"
     update: Any = compiled_update(config, run.device_mesh(config))
     assert update._cache_size() == 1
     assert all("value_explained" in row for row in rows(folders[0]))
@@ -187,7 +187,6 @@ from pathlib import Path
 import tracks.common.files
 from suite.common.console import Console
 from suite.train import repeat, run
-from suite.train.beyond import carried
 from tests.support.training import boxes_worlds, small_config
 run.sample_worlds, repeat.SAVE_PERIOD_S = boxes_worlds, 0.0
 real, renamed = os.replace, []

@@ -33,7 +33,7 @@ def test_two_rollouts_of_worlds_that_live_on_are_one_of_twice_the_length(model):
     gradient = jax.jit(make_gradient(config))
     first = gradient(params, worlds, KEY, None)[2]
     left = carried.carried_over(config, KEY, worlds, first.after, first.hit)
-    assert np.all(left.taken)
+    assert np.all(left.begun)
     fresh = jax.tree.map(jnp.asarray, boxes_worlds(config, 1))
     second = gradient(params, carried.taken_over(config, fresh, left), KEY, None)[2]
     flown = np.concatenate([first.pos_w, second.pos_w])
@@ -62,7 +62,7 @@ def test_a_crashed_world_goes_on_from_one_to_two_seconds_before():
     seen = []
     for seed in range(30):
         left = carried.carried_over(config, jax.random.key(seed), worlds, after, hit)
-        assert list(left.taken) == [True, False, False, True], "the second crashed too early"
+        assert list(left.begun) == [True, False, False, True], "the second crashed too early"
         assert list(left.flown.alive) == [1, 0, 0, 1] == list(left.flown.going)
         seen.append(np.array(left.flown.action_b[:, 2]))
     back = (np.array([120, 149]) - np.array(seen)[:, [0, 3]]) / SPEC.rate_hz
@@ -73,10 +73,14 @@ def test_a_crashed_world_goes_on_from_one_to_two_seconds_before():
 def test_shares_are_those_asked_for_and_a_world_with_no_gate_left_does_not_go_on():
     config = small_config(batch=256, steps=4, live_on=0.25)
     worlds, after, hit = after_of(config, 4, [None] * 256)
-    taken = np.asarray(carried.carried_over(config, KEY, worlds, after, hit).taken)
+    taken = np.asarray(carried.carried_over(config, KEY, worlds, after, hit).begun)
     assert 0.15 < taken.mean() < 0.35
     done = after._replace(target=jnp.full_like(after.target, config.episode.gates))
-    assert not np.any(carried.carried_over(config, KEY, worlds, done, hit).taken)
+    assert not np.any(carried.carried_over(config, KEY, worlds, done, hit).begun)
+    config = small_config(batch=256, steps=4, again=0.25, again_before_s=(0.0, 0.0))
+    worlds, after, hit = after_of(config, 4, [2] * 256)
+    taken = np.asarray(carried.carried_over(config, KEY, worlds, after, hit).begun)
+    assert 0.15 < taken.mean() < 0.35
 
 
 def test_fresh_worlds_take_the_place_of_those_that_do_not_go_on():
@@ -84,7 +88,7 @@ def test_fresh_worlds_take_the_place_of_those_that_do_not_go_on():
     old, fresh = (jax.tree.map(jnp.asarray, boxes_worlds(config, i)) for i in (0, 1))
     taken = jnp.asarray([True, False, True, False])
     start = jax.jit(make_start(config))(old)
-    mixed = carried.taken_over(config, fresh, carried.Carried(old, start, taken))
+    mixed = carried.taken_over(config, fresh, old._replace(flown=start, begun=taken))
     gates = mixed.scene.gates.center_w
     for world, of in enumerate((old, fresh, old, fresh)):
         assert np.array_equal(gates[world], of.scene.gates.center_w[world])
@@ -97,4 +101,12 @@ def test_fresh_worlds_take_the_place_of_those_that_do_not_go_on():
 
 def test_the_first_rollout_goes_on_with_nothing(monkeypatch):
     monkeypatch.setattr(carried, "sample_worlds", boxes_worlds)
-    assert not np.any(carried.nothing_carried(small_config(live_on=0.5)).taken)
+    config = small_config(live_on=0.5)
+    fresh = jax.tree.map(jnp.asarray, boxes_worlds(config, 1))
+    mixed = carried.taken_over(config, fresh, carried.nothing_carried(config))
+    assert np.array_equal(mixed.stop, fresh.stop)
+    start = make_start(config)
+    for ours, theirs in zip(
+        jax.tree.leaves(start(mixed)), jax.tree.leaves(start(fresh)), strict=True
+    ):
+        assert np.array_equal(ours, theirs)

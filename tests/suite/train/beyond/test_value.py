@@ -27,19 +27,20 @@ CONFIG = replace(
 FADE = np.exp(-1.0 / (0.5 * SPEC.rate_hz))
 
 
-def way_of(worth, alive, hit):
+def way_of(worth, alive, hit, stopped=None):
     """Return a rollout of one world, of which the critic sees nothing but zeros."""
-    worth, alive, hit = (jnp.asarray(x)[:, None] for x in (worth, alive, hit))
-    return value.Way(jnp.zeros((*alive.shape, critic.FEATURES)), worth, 1.0 * alive, hit)
+    stopped = np.zeros_like(hit) if stopped is None else stopped
+    worth, alive, hit, stopped = (jnp.asarray(x)[:, None] for x in (worth, alive, hit, stopped))
+    return value.Way(jnp.zeros((*alive.shape, critic.FEATURES)), worth, 1.0 * alive, hit, stopped)
 
 
-@pytest.mark.parametrize("ends", ["not", "crash", "crash at the end", "left"])
+@pytest.mark.parametrize("ends", ["not", "crash", "crash at the end", "finish", "stop"])
 def test_returns_are_those_of_a_plain_loop(ends):
     worth, says = np.array([3.0, 5.0, 1.0]), np.array([2.0, 3.0, 7.0, 6.0])
     goes_on = ends in ("not", "crash at the end")
     on = np.array([True, True, goes_on, ends == "not"])
     hit = np.arange(3) == {"crash": 1, "crash at the end": 2}.get(ends)
-    way = way_of(worth, on, hit)
+    way = way_of(worth, on, hit, (np.arange(3) >= 1) & (ends == "stop"))
     found = value.returns(CONFIG, jnp.asarray(says)[:, None], way)[:, 0]
     expected, later = np.zeros(3), says[3]
     for t in (2, 1, 0):
@@ -47,7 +48,7 @@ def test_returns_are_those_of_a_plain_loop(ends):
         if hit[t]:
             ahead = 0.0
         elif not on[t + 1]:
-            ahead = worth[t]
+            ahead = says[t + 1] if ends == "stop" else worth[t - 1]
         expected[t] = later = (1 - FADE) * worth[t] + FADE * ahead
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
@@ -68,7 +69,8 @@ def test_a_critic_learns_which_worlds_crash():
     seen[..., 0] = doomed
     alive = 1.0 - ((np.arange(6)[:, None] > 1) & doomed)
     hit = (np.arange(5)[:, None] == 1) & doomed
-    way = value.Way(*map(jnp.asarray, (seen, np.full((5, batch), 4.0), alive, hit)))
+    still = np.zeros_like(hit)
+    way = value.Way(*map(jnp.asarray, (seen, np.full((5, batch), 4.0), alive, hit, still)))
     held, teach = value.start_critic(CONFIG), jax.jit(value.make_teach(CONFIG))
     for _ in range(60):
         held, _ = teach(held, way)
@@ -117,3 +119,5 @@ def test_a_world_that_was_stopped_or_has_crashed_has_nothing_to_come(judged):
     assert way.seen.shape == (7, 4, critic.FEATURES) and way.alive.shape == (7, 4)
     assert list(way.hit[0]) == [False, True, False, False] and way.hit.sum() == 1
     assert list(way.alive.sum(0)) == [7, 1, 2, 7]
+    # Where a rollout ends the loss goes on, so what is said there changes no return.
+    assert [list(np.flatnonzero(row)) for row in way.stopped.T] == [[5], [], [1], [5]]
