@@ -40,8 +40,6 @@ class Eye:
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         self._rays_b = pixel_rays_b(camera)
-        longest = float(np.linalg.norm(self._rays_b, axis=-1).max())
-        self._cutoff = camera.range_m * longest
 
     def image(
         self, model: mujoco.MjModel, data: mujoco.MjData, pos_w: np.ndarray, rot_w: np.ndarray
@@ -67,7 +65,8 @@ class Eye:
             depth,
             None,
             count,
-            self._cutoff,
+            # A nearer cut-off leaves out the ground as well, where its origin is further away.
+            mujoco.mjMAXVAL,
         )
         depth = np.where(geom < 0, self.camera.range_m, depth)
         depth = np.minimum(depth, self.camera.range_m)

@@ -8,7 +8,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.engine import BODY, Eye, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import layout_of
 from tests.support.courses import straight
-from tracks.geometry.camera import Camera
+from tracks.geometry.camera import Camera, pixel_rays_b
 
 VEHICLE = load_vehicle("reference")
 
@@ -40,6 +40,19 @@ def test_depth_is_planar_and_ends_at_the_range(wall):
     middle = image[image.shape[0] // 2 - 1, image.shape[1] // 2]
     assert middle == pytest.approx(2.95)
     assert image.max() == Camera().range_m
+
+
+@pytest.mark.parametrize("away", [0.0, 5.0, 14.0, 15.0, 40.0, 1000.0])
+def test_the_ground_is_seen_wherever_the_world_is_flown(wall, away):
+    """MuJoCo's rays leave a plane out whose origin is beyond their cut-off."""
+    _, model, data = wall
+    camera, height = Camera(pitch_deg=0.0), 1.5
+    image = Eye(camera).image(model, data, np.array([-away, -away, height]), np.eye(3))
+    down = -pixel_rays_b(camera)[:, 2].reshape(image.shape)
+    ground = height / np.maximum(down, 1e-9)
+    seen = (ground < camera.range_m) & (image > ground - 0.01)
+    assert seen.sum() > 100
+    np.testing.assert_allclose(image[seen], ground[seen], atol=1e-6)
 
 
 def test_a_contact_has_the_solids_name(wall):
