@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,11 +24,12 @@ from tracks.families import make_track
 
 TRIALS = [TrialSpec("zigzag", 3, 7), TrialSpec("ellipse", 9, 8)]
 SPEED = 6.0
+REFERENCE = load_vehicle("reference")
 
 
 def test_worlds_are_the_judged_tracks_from_their_start():
     spec = PolicySpec(speed_input=True, speed=0.7)
-    recipe = transfer.quadrotor_recipe(spec, load_vehicle("reference"))
+    recipe = transfer.quadrotor_recipe(spec, REFERENCE)
     drawn = sample_worlds(validation_worlds(recipe, 2, 0, 1.0), 0)
     worlds = transfer.judged_worlds(drawn, spec, TRIALS)
     for row, trial in enumerate(TRIALS):
@@ -43,9 +45,9 @@ def test_worlds_are_the_judged_tracks_from_their_start():
 
 @pytest.mark.parametrize("made", transfer.TRAINERS.values())
 def test_nothing_is_drawn(made):
-    recipe = made(SPEC, load_vehicle("reference"))
+    recipe = made(SPEC, REFERENCE)
     drawn = sample_worlds(validation_worlds(recipe, 3, 0, 1.0), 0)
-    constants = drawn.constants
+    constants: Any = drawn.constants
     values = [constants] if recipe.quadrotor is None else constants.effects.values()
     for arrays in values:
         for array in arrays:
@@ -54,10 +56,10 @@ def test_nothing_is_drawn(made):
 
 
 def test_commands_of_the_point_mass_are_as_late_at_any_rate():
-    delays = {
-        rate: transfer.point_recipe(PolicySpec(rate_hz=rate), None).physics.action_delay[0] / rate
-        for rate in (10.0, 15.0, 30.0)
-    }
+    delays = {}
+    for rate in (10.0, 15.0, 30.0):
+        recipe = transfer.point_recipe(PolicySpec(rate_hz=rate), REFERENCE)
+        delays[rate] = recipe.physics.action_delay[0] / rate
     assert delays == pytest.approx(dict.fromkeys(delays, transfer.DELAY_S))
 
 
@@ -71,7 +73,7 @@ def test_commands_of_the_point_mass_are_as_late_at_any_rate():
 )
 def test_a_quadrotor_that_tips_over_has_failed(made, up, wins, monkeypatch):
     monkeypatch.setattr(transfer, "_up", lambda worlds, *_: jnp.full(len(worlds.target), up))
-    recipe = replace(made(SPEC, load_vehicle("reference")), episode=EpisodeConfig(gates=2))
+    recipe = replace(made(SPEC, REFERENCE), episode=EpisodeConfig(gates=2))
     config = validation_worlds(recipe, 2, 9, 0.8)
     coasting = {k: v * (k != "action.weight") for k, v in fresh_params().items()}
     worlds = straight_worlds(sample_worlds(config, 0), SPEED)
@@ -108,8 +110,10 @@ def test_up_is_that_of_the_bodys_z_axis():
     half, full = np.cos(np.pi / 3), np.sin(np.pi / 3)
     rolled = np.array([[1, 0, 0], [0, half, -full], [0, full, half]])
     upside_down = np.diag([1.0, -1.0, -1.0])
-    state = SimpleNamespace(rot_w=jnp.asarray(np.stack([rolled, upside_down])))
-    assert transfer._up(None, None, state, None).tolist() == pytest.approx([0.5, -1.0])
+    nothing: Any = None
+    state: Any = SimpleNamespace(rot_w=jnp.asarray(np.stack([rolled, upside_down])))
+    up = transfer._up(nothing, nothing, state, nothing)
+    assert up.tolist() == pytest.approx([0.5, -1.0])
 
 
 def test_batches_are_flown_in_the_order_of_the_trials(monkeypatch):
@@ -127,7 +131,7 @@ def test_batches_are_flown_in_the_order_of_the_trials(monkeypatch):
 
     monkeypatch.setattr(transfer, "make_judged_flight", made)
     trials = [TrialSpec(track, 5, seed) for track in ("zigzag", "circular") for seed in (3, 4)]
-    recipe = transfer.point_recipe(load_policy_checkpoint(shipped.folder("racer")).spec, None)
+    recipe = transfer.point_recipe(load_policy_checkpoint(shipped.folder("racer")).spec, REFERENCE)
     won = transfer.trainer_wins("racer", recipe, trials, 2, Console())
     assert won == [make_track(*trial).start_pos_w[1] > 0 for trial in trials]
     assert len(seen) == 2 and set(seen[0]) == set(fresh_params())

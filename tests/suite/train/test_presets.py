@@ -33,9 +33,7 @@ def test_a_model_is_asked_for_by_name_or_the_recipes_own():
         check(both)
 
 
-def test_another_vehicle_than_the_recipes_wants_a_word():
-    with pytest.raises(ValueError, match="quadrotors are around racer5: add --model quad"):
-        chosen_model(preset("swift-quad"), None, "reference")
+def test_a_vehicle_for_a_point_mass_is_refused():
     with pytest.raises(ValueError, match="the point mass has none: add --model quad"):
         chosen_model(preset("swift"), None, "reference")
 

@@ -62,7 +62,8 @@ def test_a_crashed_world_goes_on_from_one_to_two_seconds_before():
     seen = []
     for seed in range(30):
         left = carried.carried_over(config, jax.random.key(seed), worlds, after, hit)
-        assert list(left.begun) == [True, False, False, True], "the second crashed too early"
+        begun = np.asarray(left.begun, bool)
+        assert begun.tolist() == [True, False, False, True], "the second crashed too early"
         assert list(left.flown.alive) == [1, 0, 0, 1] == list(left.flown.going)
         seen.append(np.array(left.flown.action_b[:, 2]))
     back = (np.array([120, 149]) - np.array(seen)[:, [0, 3]]) / SPEC.rate_hz
