@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
@@ -64,7 +65,7 @@ class _RotorpyBodies:
         self._multirotor = Multirotor(truth, dt, count)
         self._qpos = np.concatenate([wanted.pos_w[0], quat], axis=-1)
         self._qvel = np.concatenate([wanted.vel_w[0], np.zeros((count, 3))], axis=-1)
-        hover = Command(np.full(count, 9.81), np.zeros((count, 3)))
+        hover = Command(np.full(count, GRAVITY), np.zeros((count, 3)))
         self._speed = wanted_speed(self._plant, hover, np.zeros((count, 3)))
         self._still = np.zeros((count, 3))
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.importers.checks.attitude import BAD, GOOD, TIMES_BETTER
 from eval.importers.findings import Finding
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, conjugate, turn
 from eval.logs.velocity import velocity_from_position
 
-GRAVITY = np.array([0.0, 0.0, 9.81])
 CALM_SPEED, CALM_ACC = 0.3, 1.0
 """Below these [m/s, m/s^2], root mean square, a flight tells nothing."""
 UNITS = {"m/s": 1.0, "cm/s": 0.01, "mm/s": 1e-3}
@@ -98,16 +98,16 @@ def check_accelerometer(rows: dict[str, np.ndarray], fix: bool) -> list[Finding]
     """Hold the accelerometer against the force that bends the path; correct `rows` under `fix`."""
     if "acc" not in rows:
         return []
-    force = turn(conjugate(rows["quat"]), _acceleration(rows) + GRAVITY)
+    force = turn(conjugate(rows["quat"]), _acceleration(rows) + [0.0, 0.0, GRAVITY])
     acc = rows["acc"]
     size = _rms(force)
     readings = {
         "specific force in m/s^2": acc,
-        "in g": 9.81 * acc,
+        "in g": GRAVITY * acc,
         "of the other sign": -acc,
-        "in g and of the other sign": -9.81 * acc,
+        "in g and of the other sign": -GRAVITY * acc,
         "in forward-right-down axes": acc * HALF_TURN,
-        "in g and forward-right-down axes": 9.81 * acc * HALF_TURN,
+        "in g and forward-right-down axes": GRAVITY * acc * HALF_TURN,
     }
     residual = {name: _rms(reading - force) / size for name, reading in readings.items()}
     given = residual["specific force in m/s^2"]
@@ -165,7 +165,7 @@ def _acceleration(rows: dict[str, np.ndarray]) -> np.ndarray:
 def _lateral(acc_w: np.ndarray, quat: np.ndarray, world: bool, body: bool) -> float:
     acc = acc_w * HALF_TURN if world else acc_w
     attitude = quat * QUAT_HALF_TURN if body else quat
-    return _rms(turn(conjugate(attitude), acc + GRAVITY)[:, :2])
+    return _rms(turn(conjugate(attitude), acc + [0.0, 0.0, GRAVITY])[:, :2])
 
 
 def _rms(value: np.ndarray) -> float:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.importers.findings import Finding
 from eval.vehicles.vehicle import Vehicle
 
-GRAVITY = 9.81
 NEAR = 1.2
 """A factor within this of the measured one explains it, where no other does."""
 FITS = 1.35

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.importers.findings import Finding
 from eval.importers.formats.table import numbers
 from eval.importers.head import first_line
@@ -31,7 +32,7 @@ DEG = np.pi / 180.0
 ACC_1G = 2048.0
 """Raw counts of accSmooth per g, on all boards of Betaflight 4."""
 _ROTATION = {"": DEG, "deg/s": DEG, "rad/s": 1.0}
-_ACCELERATION = {"": 9.81 / ACC_1G, "g": 9.81, "m/s2": 1.0}
+_ACCELERATION = {"": GRAVITY / ACC_1G, "g": GRAVITY, "m/s2": 1.0}
 _TIME = {"": 1e-6, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 _VOLT = {"": 0.01, "V": 1.0, "mV": 1e-3}
 """Factors to our units by the unit in the header; raw voltages of Betaflight 4 are in 10 mV."""

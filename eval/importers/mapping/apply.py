@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.importers.findings import Finding
 from eval.importers.frames import (
     attitude,
@@ -23,7 +24,6 @@ from eval.importers.rows import measured
 from eval.importers.signals import Recording, Signal, collect
 from eval.logs.columns import FlightLogError
 
-GRAVITY = np.array([0.0, 0.0, 9.81])
 Part = tuple[np.ndarray, np.ndarray]
 Find = Callable[[tuple[str, ...]], Part | None]
 """Time [s] and values (N, C) of columns, or None where one of them is not there."""
@@ -127,11 +127,11 @@ def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> Non
     samples = signals.pop(signal)
     value = samples.value
     if signal == "acc" and not column.gravity:
-        value = value + GRAVITY
+        value = value + [0.0, 0.0, GRAVITY]
     if "quat" not in signals:
         if signal == "acc":
             for k, axis in enumerate("xyz"):
-                kept = (value - GRAVITY)[:, k : k + 1]
+                kept = (value - [0.0, 0.0, GRAVITY])[:, k : k + 1]
                 signals[f"{KEPT}acc_w_{axis}"] = Signal(samples.time_s, kept)
         return
     quat = measured(signals["quat"], samples.time_s, smooth=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.importers.checks.units import TIMES
 from eval.importers.frames import BODIES, WORLDS
 from eval.logs.columns import GROUPS
@@ -25,7 +26,7 @@ RPM = float(2.0 * np.pi / 60.0)
 _LENGTH = {"m": 1.0, "cm": 0.01, "mm": 1e-3}
 _TURN = {"rad/s": 1.0, "deg/s": DEG, "mrad/s": 1e-3}
 _ANGLE = {"rad": 1.0, "deg": DEG}
-_FORCE = {"m/s^2": 1.0, "g": 9.81}
+_FORCE = {"m/s^2": 1.0, "g": GRAVITY}
 _SPEED = {"rad/s": 1.0, "rpm": RPM, "Hz": float(2.0 * np.pi)}
 _SHARE = {"1": 1.0, "%": 0.01, "65535": 1.0 / 65535.0}
 PER_MASS = "N"

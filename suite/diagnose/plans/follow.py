@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Command, Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.plans.pilot import Gains, steer
@@ -116,7 +117,7 @@ def follow(
     steps = [round(way.duration_s / dt) for way in trajectories]
     gains, summed_w = gains or Gains(), np.zeros((count, 3))
     command = Command(np.zeros(count), np.zeros((count, 3)))
-    acc_b = np.zeros((count, 3)) + [0.0, 0.0, 9.81]
+    acc_b = np.zeros((count, 3)) + [0.0, 0.0, GRAVITY]
     motions, quats, commands, accs, stepped = [], [], [], [], []
     for step in range(max(steps)):
         motion, quat = bodies.motion()

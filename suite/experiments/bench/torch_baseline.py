@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from eval.effects.interface import GRAVITY
 from policies.formats.torch_twin import torch_twin
 from suite.experiments.bench import torch_fleet, torch_quadrotor, torch_scene
 from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
-from suite.train.dynamics.point_mass import GRAVITY, PointMassParams
+from suite.train.dynamics.point_mass import PointMassParams
 from suite.train.dynamics.quadrotor import QuadrotorParams, substeps
 from suite.train.dynamics.reduced import ReducedParams, state_noise, steps_of
 from suite.train.losses import MAX_PULL, UNIT_FIELD

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import torch
 
+from eval.effects.interface import GRAVITY
 from eval.quadrotor.attitude import HEADING_RATE, LEAST_FORCE
 from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
-from suite.train.dynamics.fleet import GRAVITY
 from suite.train.dynamics.reduced import Gains, ReducedParams
 
 

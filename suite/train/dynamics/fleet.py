@@ -11,6 +11,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from tracks.geometry.scene import Array
 from tracks.input.ranges import Range, Share
 
@@ -133,8 +134,6 @@ class Vehicles(NamedTuple):
     """(B,) [s]."""
 
 
-GRAVITY = 9.81
-"""[m/s^2]."""
 YAW_GAIN, YAW_ATTITUDE = 0.4, 0.5
 """Gains of rate and attitude about z over those about x and y."""
 TRIM_AXES = (1.0, 1.0, 0.2)

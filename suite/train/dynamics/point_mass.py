@@ -11,11 +11,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from eval.effects.interface import GRAVITY
 from tracks.geometry.rotation import to_local, to_world
 from tracks.geometry.scene import Array
-
-GRAVITY = 9.81
-"""[m/s^2]."""
 
 
 class PointMassParams(NamedTuple):

@@ -22,11 +22,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading
 from eval.quadrotor.delay import delay_weight
 from eval.quadrotor.rotors import follow, speed_command
 from policies.spec import PolicySpec
-from suite.train.dynamics.fleet import GRAVITY, FleetConfig, Vehicles, draw_vehicles
+from suite.train.dynamics.fleet import FleetConfig, Vehicles, draw_vehicles
 from suite.train.dynamics.point_mass import attitude, faded
 from suite.train.dynamics.quadrotor import whole_steps
 from tracks.geometry.rotation import exp_rot, to_local, to_world
