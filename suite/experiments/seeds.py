@@ -41,7 +41,7 @@ class Config:
     policies: tuple[str, ...] = ()
     """Policies of one recipe, one a training seed: run folders of `suite train`, checkpoints'
     folders, or names."""
-    preset: str = "racer"
+    preset: str = "direct"
     """Without --policies: the recipe."""
     set: tuple[str, ...] = ()
     """Without --policies: change settings of the recipe by name."""
