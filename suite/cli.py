@@ -51,7 +51,7 @@ def overview() -> str:
     lines = [
         "usage: suite COMMAND [options]",
         "",
-        "Train drone racing policies through a point mass and judge them in MuJoCo.",
+        "Train drone racing policies through differentiable dynamics and judge them in MuJoCo.",
         "",
         *(f"  {name:<{width}}  {summary}" for name, summary in sorted(COMMANDS.items())),
         "",

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
 from suite.common.console import Console
 from suite.judging.link.watchdog import Limits
 from suite.judging.requests import Evaluation
-from tracks.input.ranges import Seed, Trials
+from tracks.input.ranges import Range, Seed, Trials
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,9 @@ class Config:
     """Seed of the first trial."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
+    speed: Annotated[float, Range(0.0, 1.0)] | None = None
+    """How fast a policy that takes it as an input is asked to fly, 0 (careful) to 1 (a race);
+    without it as its card says."""
     link: str = ""
     """udpin:HOST:PORT or udpout:HOST:PORT of a vehicle that speaks MAVLink; one flight. Without it
     the vehicle is simulated in real time, on this machine's loopback."""
@@ -67,6 +70,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         seed=config.seed,
         vehicle=config.vehicle,
         trust=config.trust,
+        speed=() if config.speed is None else (config.speed,),
     )
     if config.link and not config.confirm:
         raise ValueError(

@@ -37,6 +37,8 @@ class Config:
     """For a policy: a shipped vehicle's name or a vehicle file (.toml)."""
     seed: Seed = 0
     """For a policy: the trials' seed."""
+    speed: Annotated[float, Range(0.0, 1.0)] | None = None
+    """For a policy that takes it as an input: how fast it is asked to fly, as in suite eval."""
     out: Path = Path("runs/view")
     """Folder for the pictures (PNG), the video and the GIF."""
     rerun: Path | None = None
@@ -117,6 +119,7 @@ def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec]]:
             seed=config.seed,
             vehicle=config.vehicle,
             trust=config.trust,
+            speed=() if config.speed is None else (config.speed,),
         )
         return evaluation, first_trials(evaluation)[: config.count]
     from eval.judging.results import read_trials

@@ -9,7 +9,7 @@ from typing import Any
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.provenance import write_run_record
-from suite.judging.flying import Course, about_policy, default_policy, read_course
+from suite.judging.flying import Course, about_policy, default_policy, load_flier, read_course
 from suite.judging.link.companion import FINISHED, Companion
 from suite.judging.link.flights import Flight, fly_link, fly_simulated, totals, write_log
 from suite.judging.link.messages import Wire, dialect
@@ -17,6 +17,7 @@ from suite.judging.link.report import delays
 from suite.judging.link.server import COMPANION, VEHICLE
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
+from suite.judging.manner import manners
 from suite.judging.requests import Evaluation
 from tracks.common.files import write_json
 from tracks.common.grid import rich_table, table
@@ -34,12 +35,10 @@ def fly_commanded(
         ValueError: for anything that cannot be used, before the first flight.
         WorkFailed: where pymavlink is missing, or no vehicle answered.
     """
-    from policies.policy import load_policy
-
     dialect()
     course = read_course(asked)
     name = policy or default_policy()
-    loaded = load_policy(name, asked.trust)
+    loaded = load_flier(name, asked.trust, manners(asked.speed, monitor=False)[0])
     out.mkdir(parents=True, exist_ok=True)
     about = {"policy": about_policy(name, loaded), "limits": limits, "link": link or "simulated"}
     if link:

@@ -4,6 +4,8 @@ import json
 
 from eval.judging.results import read_trials
 from suite import cli
+from suite.commands import view
+from suite.judging.manner import Manner, manners
 
 
 def _eval(out, *args):
@@ -30,3 +32,13 @@ def test_view_of_something_else_is_refused(tmp_path, capsys):
     (tmp_path / "trials.parquet").write_text("no parquet")
     assert cli.main(["view", str(tmp_path)]) == 2
     assert "run.json" in capsys.readouterr().err
+
+
+def test_view_asks_a_policy_for_a_speed(capsys, tmp_path):
+    evaluation, _ = view._chosen(view.Config(run="swift-30", speed=0.4))
+    assert manners(evaluation.speed, monitor=False) == [Manner(speed=0.4)]
+    asked = ["view", "--out", str(tmp_path), "--difficulty", "0", "--speed"]
+    assert cli.main([*asked, "0.4", "swift"]) == 2
+    assert "--speed 0.4: swift takes no speed" in capsys.readouterr().err
+    assert cli.main([*asked, "1.4", "swift-30"]) == 2
+    assert "--speed is 1.4" in capsys.readouterr().err

@@ -9,6 +9,7 @@ import pytest
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec, track_of
+from policies.policy import load_policy
 from policies.spec import PolicySpec
 from suite import cli
 from suite.judging.link import commanded, server
@@ -321,3 +322,15 @@ def test_limits_are_checked_before_anything_flies(capsys, tmp_path):
     assert cli.main(["fly", "--out", str(tmp_path), "--silence-s", "-1"]) == 2
     assert "silence-s" in capsys.readouterr().err
     assert replace(Limits(), tilt_deg=45.0).tilt_deg == 45.0
+
+
+def test_a_speed_is_asked_of_policies_that_take_one(capsys, tmp_path, monkeypatch):
+    asked = ["fly", "--out", str(tmp_path), "--policy"]
+    assert cli.main([*asked, "swift", "--speed", "0.3"]) == 2
+    assert "--speed 0.3: swift takes no speed" in capsys.readouterr().err
+    flown = []
+    monkeypatch.setattr(commanded, "_real", lambda policy, *_: flown.append(policy) or {})
+    link = ["--link", "udpin:127.0.0.1:0", "--confirm"]
+    assert cli.main([*asked, "swift-30", "--speed", "0.3", *link]) == 0
+    assert cli.main([*asked, "swift-30", *link]) == 0
+    assert [policy.spec.speed for policy in flown] == [0.3, load_policy("swift-30").spec.speed]
