@@ -48,6 +48,7 @@ class Console:
         label: str,
         total: float,
         clock: Callable[[], float] = time.monotonic,
+        begun: float = 0.0,
     ) -> Iterator[Update]:
         """Show how far a long piece of work is; yields the function to call as it goes.
 
@@ -55,9 +56,10 @@ class Console:
             label: what is being done, a few words.
             total: the `done` at which it is finished, in any unit.
             clock: seconds, increasing.
+            begun: the `done` at which it starts: what was there before took no time here.
         """
         if sys.stderr.isatty():
-            with _bar(label, total) as update:
+            with _bar(label, total, begun) as update:
                 yield update
             return
         started = last = clock()
@@ -68,7 +70,8 @@ class Console:
             if now - last < PLAIN_PERIOD_S:
                 return
             last = now
-            left = duration((now - started) * (total - done) / done) if done else "unknown"
+            new = done - begun
+            left = duration((now - started) * (total - done) / new) if new else "unknown"
             self.note(f"{label}: {done:g} of {total:g}, {left} left{note and ', ' + note}")
 
         yield update
@@ -85,7 +88,7 @@ class Quiet(Console):
 
 
 @contextmanager
-def _bar(label: str, total: float) -> Iterator[Update]:
+def _bar(label: str, total: float, begun: float) -> Iterator[Update]:
     from rich.console import Console as RichConsole
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -97,7 +100,7 @@ def _bar(label: str, total: float) -> Iterator[Update]:
         TextColumn("{task.fields[note]}"),
     )
     with Progress(*columns, console=RichConsole(stderr=True), transient=True) as bars:
-        task = bars.add_task(label, total=total, note="")
+        task = bars.add_task(label, total=total, completed=begun, note="")
 
         def update(done: float, note: str = "") -> None:
             bars.update(task, completed=done, note=note)

@@ -156,7 +156,7 @@ def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watc
             watched.append({"iteration": done, **watch.measure(state.params)})
 
     try:
-        with console.progress("training", total) as show:
+        with console.progress("training", total, begun=first) as show:
             if _is_missing(watch, run.folder, first, total):
                 look()
             for iteration in range(first, total):

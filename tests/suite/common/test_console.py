@@ -14,6 +14,14 @@ def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
     assert lines[0] == "flying: 20 of 100, 40 s left, 3.1 m/s"
 
 
+def test_the_time_left_counts_only_what_was_done_since_it_began(capsys):
+    now = [0.0]
+    with Console().progress("training", 100, clock=lambda: now[0], begun=80) as update:
+        now[0] = 12.0
+        update(90)
+    assert capsys.readouterr().err == "training: 90 of 100, 12 s left\n"
+
+
 def test_figures_for_people():
     assert [duration(s) for s in (0.44, 9.96, 59.6, 200, 7500)] == [
         "0.4 s",
