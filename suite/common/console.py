@@ -100,7 +100,8 @@ def _bar(label: str, total: float, begun: float) -> Iterator[Update]:
         TextColumn("{task.fields[note]}"),
     )
     with Progress(*columns, console=RichConsole(stderr=True), transient=True) as bars:
-        task = bars.add_task(label, total=total, completed=begun, note="")
+        task = bars.add_task(label, total=total, note="")
+        bars.update(task, completed=begun)
 
         def update(done: float, note: str = "") -> None:
             bars.update(task, completed=done, note=note)

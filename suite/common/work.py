@@ -28,7 +28,9 @@ class Silent(Quiet):
         """Print nothing."""
 
     @contextmanager
-    def progress(self, label: str, total: float, clock: object = None) -> Iterator[Update]:
+    def progress(
+        self, label: str, total: float, clock: object = None, begun: float = 0.0
+    ) -> Iterator[Update]:
         """Show nothing."""
 
         def update(done: float, note: str = "") -> None:
