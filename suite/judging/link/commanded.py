@@ -93,8 +93,11 @@ def _real(
     row = {**trial._asdict(), "handed_over": companion.over}
     file = write_log(companion, row, out)
     console.say(f"handed over: {companion.over}; log: {file}")
+    _warn_of_missed(companion.missed_decisions, console)
     return {
         **delays(companion.rows, limits.deadline_s),
+        "late_answers": companion.late_answers,
+        "missed_decisions": companion.missed_decisions,
         "gates_passed": companion.gate,
         "success": companion.over == FINISHED,
         "flights": [{**row, "file": file}],
@@ -127,4 +130,13 @@ def _show(found: dict[str, Any], flights: list[Flight], console: Console) -> Non
         console.note(
             f"warning: the simulated vehicle was late {found['vehicle_slips']} times; run again on "
             "a free machine"
+        )
+    _warn_of_missed(found["missed_decisions"], console)
+
+
+def _warn_of_missed(count: int, console: Console) -> None:
+    if count:
+        console.note(
+            f"warning: {count} decisions were missed, as no state came in their time; send states "
+            "(ODOMETRY) several times as often as the policy decides"
         )

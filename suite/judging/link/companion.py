@@ -91,10 +91,10 @@ class Companion:
         self._clocks = ClockCheck(self._limits)
         self._hidden, self._fresh = policy.start(1), True
         self._action_b, self._heading_w = np.zeros((1, 3)), np.zeros((1, 3))
-        self._begun_s, self._decisions, self._late = 0.0, 0, 0
+        self._begun_s, self._next, self._late = 0.0, 0, 0
         self._last: State | None = None
         self.gate = 0
-        self.late_answers = self.bad_actions = 0
+        self.late_answers = self.bad_actions = self.missed_decisions = 0
         self.over: str | None = None
         self.rows: list[Row] = []
         self.events: list[str] = []
@@ -168,8 +168,7 @@ class Companion:
         self._last = state
 
     def _fly(self, state: State) -> list[bytes]:
-        due = self._begun_s + self._decisions / self._policy.spec.rate_hz - _SLACK_S
-        decided = state.time_s >= due
+        decided = self._is_due(state)
         rot_w = quat_to_rot(state.quat_wxyz)[None]
         image_age_s = self._clock() - self._depth_at
         if decided:
@@ -195,6 +194,20 @@ class Companion:
         )  # fmt: skip
         return [sent]
 
+    def _is_due(self, state: State) -> bool:
+        """Say whether to decide on a state; what states came too late for is not made up for.
+
+        The policy's memory knows one distance between decisions: several in a burst after a gap
+        would be more time to it than has passed.
+        """
+        since_s = state.time_s - self._begun_s + _SLACK_S
+        now = int(since_s * self._policy.spec.rate_hz)
+        if now < self._next:
+            return False
+        self.missed_decisions += now - self._next
+        self._next = now + 1
+        return True
+
     def _decide(self, state: State, rot_w: np.ndarray) -> None:
         depth = self._depth
         assert depth is not None
@@ -216,7 +229,6 @@ class Companion:
         limits = ActionLimits(deadline_s=self._limits.deadline_s)
         guarded = guard_action(limits, answer, self._action_b, took_s, self._policy.name)
         self._action_b, self._fresh = guarded.action_b, False
-        self._decisions += 1
         late = bool(guarded.late[0])
         self.late_answers += late
         self._late = self._late + 1 if late else 0

@@ -104,6 +104,7 @@ def _one(
         "vehicle_slips": flown.slips,
         "late_actions": companion.late_answers,
         "bad_actions": companion.bad_actions,
+        "missed_decisions": companion.missed_decisions,
         "file": write_log(companion, flown.result._asdict(), out),
     }
     return Flight(row, companion.rows)
@@ -155,6 +156,7 @@ def totals(flights: list[Flight], limits: Limits) -> dict[str, Any]:
         "handed_over": sum(flight.row["handed_over"] is not None for flight in flights),
         "vehicle_slips": sum(flight.row["vehicle_slips"] for flight in flights),
         "late_answers": sum(flight.row["late_actions"] for flight in flights),
+        "missed_decisions": sum(flight.row["missed_decisions"] for flight in flights),
         **delays(rows, limits.deadline_s),
     }
 

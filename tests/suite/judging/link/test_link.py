@@ -181,6 +181,17 @@ def test_late_answers_are_not_flown_and_hand_over_where_they_go_on(bench):
     assert one.companion.late_answers == 3
 
 
+def test_what_a_gap_between_states_missed_is_counted_and_not_made_up_for(bench):
+    one = bench(Steady((0.0, 0.0, 0.0), spec=PolicySpec(rate_hz=50.0)))
+    one.show()
+    for gap_s in (0.01, 0.01, 0.01, 0.07, 0.01, 0.01, 0.01):
+        one.tell()
+        one.now += gap_s
+    # States at 0, 10, 20, 30, 100, 110, 120 ms; those of 40, 60 and 80 ms did not come.
+    assert [row.decided for row in one.companion.rows] == [True, False] * 3 + [True]
+    assert one.companion.missed_decisions == 3
+
+
 def test_a_camera_that_stops_hands_over(bench):
     one = bench().fly(40)
     assert one.companion.flying
@@ -243,7 +254,12 @@ def test_both_ends_agree_on_the_flight(flown, tmp_path):
     assert log.about["handed_over"] is None and log.about["events"]
     assert log.action_b is not None and log.action_b.shape == (len(rows), 3)
     assert log.gate is not None and log.gate.max() == companion.gate
-    row = {**sim.result("p")._asdict(), "handed_over": None, "vehicle_slips": 0}
+    row = {
+        **sim.result("p")._asdict(),
+        "handed_over": None,
+        "vehicle_slips": 0,
+        "missed_decisions": 0,
+    }
     assert totals([Flight(row, rows)], Limits())["set_points"] == len(rows)
 
 
