@@ -100,7 +100,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
                 "--delta corrects one vehicle's dynamics, and a fleet is many: add --model point"
             )
         dynamics = resolved.quadrotor or resolved.physics
-        check_corrects(stored.config.get("fit", {}), dynamics, config.delta)
+        fit = stored.config.get("fit", {})
+        check_corrects(fit, dynamics, resolved.spec.rate_hz, config.delta)
         delta = jax.tree.map(jax.numpy.asarray, stored.params)
     outcome = train(resolved, config.out, console, params, delta)
     if one.number:

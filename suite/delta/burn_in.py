@@ -1,7 +1,9 @@
 """What the Delta Action network remembers when a window starts: its burn-in.
 
 In fine-tuning the network runs for seconds, so it is not fitted from a zero state alone: before
-each window it runs over what was measured since the flight's start, up to a few seconds.
+a window it runs over what was measured since the flight's start, up to a few seconds. Nor is it
+fitted from such states alone: most worlds of the trainer start on the way, and what was flown
+before nobody knows there.
 """
 
 from __future__ import annotations
@@ -49,6 +51,13 @@ def burn_in_before(
         inputs[count - (first - start) :] = np.concatenate(before, axis=-1)
         seen[count - (first - start) :] = 1.0
     return BurnIn(inputs, seen)
+
+
+def forgotten(burn_in: BurnIn, share: float) -> BurnIn:
+    """Return burn-ins of which the first `share` (0 to 1) of the windows have seen nothing."""
+    count = len(burn_in.seen)
+    knows = (jnp.arange(count) >= round(share * count))[:, None]
+    return burn_in._replace(seen=jnp.where(knows, jnp.asarray(burn_in.seen), 0.0))
 
 
 def state_after(params: delta_network.Params | None, burn_in: BurnIn) -> jax.Array:

@@ -12,6 +12,8 @@ from tracks.common.files import plain
 
 POINT, QUAD = "point", "quad"
 """The two models, as `suite train --model` calls them."""
+RATE_SHARE = 0.05
+"""So far may the rate of the fitted flights be off that of a training."""
 
 
 def corrected(dynamics: PointMassConfig | QuadrotorConfig) -> dict[str, Any]:
@@ -25,13 +27,18 @@ def corrected(dynamics: PointMassConfig | QuadrotorConfig) -> dict[str, Any]:
 
 
 def check_corrects(
-    fit: Mapping[str, Any], dynamics: PointMassConfig | QuadrotorConfig, where: Path
+    fit: Mapping[str, Any],
+    dynamics: PointMassConfig | QuadrotorConfig,
+    rate_hz: float,
+    where: Path,
 ) -> None:
     """Refuse a Delta Action Model of other dynamics than those that are trained through.
 
     Args:
-        fit: of the checkpoint; one that does not say what it corrects passes for a point mass.
+        fit: of the checkpoint; one that does not say what it corrects passes for a point mass, and
+            one that does not say its rate for any.
         dynamics: what is trained through.
+        rate_hz: of the policy that is trained: the network steps once a decision.
         where: the checkpoint, for the message.
 
     Raises:
@@ -43,6 +50,13 @@ def check_corrects(
         raise ValueError(
             f"--delta {where} corrects --model {model}, and this run has --model "
             f"{mine['model']}; train with the model that it was fitted to"
+        )
+    rate = fit.get("rate_hz", rate_hz)
+    if abs(rate - rate_hz) > RATE_SHARE * rate_hz:
+        raise ValueError(
+            f"--delta {where} was fitted to flights of {rate:.3g} decisions a second, and this "
+            f"run has {rate_hz:g}: it remembers from one to the next; fit again to flights of a "
+            f"policy of {rate_hz:g} Hz, or give --set spec.rate_hz={round(rate)}"
         )
     plant = fit.get("plant", mine["plant"])
     if plant == mine["plant"]:

@@ -20,6 +20,7 @@ import numpy as np
 import optax
 
 from policies.networks import delta_network
+from suite.delta.burn_in import forgotten
 from suite.delta.replay import PointMassModel, nominal_model, replay
 from suite.delta.windows import PointMassWindows
 from suite.train.config import PointMassConfig
@@ -49,6 +50,9 @@ class FitConfig:
     """Peak learning rate; it falls to zero as a cosine."""
     velocity_weight: Annotated[float, Range(0.0, 1e6)] = 0.3
     """Weight of the velocity's error beside the position's [s]."""
+    blank_share: Annotated[float, Range(0.0, 1.0)] = 0.5
+    """Share of a batch's windows that the network starts without a memory of what came before, as
+    it does in worlds of the trainer that start on the way."""
     size_weight: Annotated[float, Range(0.0, 1e6)] = 1e-3
     """Weight of the correction's size, so that it is no larger than it must be [s^2]."""
     seed: Seed = 0
@@ -196,7 +200,9 @@ def fit_network(
     start = delta_network.init(jax.random.key(config.seed))
 
     def loss(params: delta_network.Params, batch: Any) -> jax.Array:
-        return _loss(config, replay, batch, params)
+        # Batches are drawn in no order: their first windows are any.
+        burn_in = forgotten(batch.burn_in, config.blank_share)
+        return _loss(config, replay, batch._replace(burn_in=burn_in), params)
 
     params = _descend(config, loss, start, known, config.iterations, watch)
     return DeltaFit(

@@ -18,7 +18,7 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.stepper import hover_state
 from policies.networks import delta_network
 from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before, state_after
-from suite.delta.windows import refuse_none, stacked
+from suite.delta.windows import decision_period, refuse_none, stacked
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics.quadrotor import (
     QuadrotorState,
@@ -119,7 +119,7 @@ def _flight_windows(
     at = np.flatnonzero(decides & log.whole)
     if len(at) < 2:
         return []
-    before = round(BURN_IN_S / float(np.median(np.diff(time[at]))))
+    before = round(BURN_IN_S / decision_period(time[at], row_s))
     back = int(np.ceil(length * cut.dt / row_s - 1e-9))
     found, next_s = [], time[0]
     for number, first in enumerate(at.tolist()):

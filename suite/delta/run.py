@@ -16,7 +16,7 @@ from suite.common.estimate import Estimate, announce
 from suite.common.provenance import write_run_record
 from suite.delta.corrected import QUAD, corrected
 from suite.delta.fit import DeltaFit, FitConfig, PointMassFit, ReplayErrors, fit, fit_network
-from suite.delta.windows import cut_windows
+from suite.delta.windows import cut_windows, decision_rate
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain, write_json, write_text
 
@@ -134,7 +134,8 @@ def fit_delta(
         "curve": result.curve,
     }
     write_run_record(out, config, config.seed)
-    save_delta(out / "delta", result.params, seed=config.seed, fit={**plain(config), **about})
+    fitted = {**plain(config), **about, "rate_hz": decision_rate(logs)}
+    save_delta(out / "delta", result.params, seed=config.seed, fit=fitted)
     write_json(out / "delta.json", plain(summary))
     write_text(out / "table.md", table(result, config.horizon_s))
     return result

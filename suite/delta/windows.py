@@ -99,6 +99,38 @@ def stacked(windows: Sequence[T]) -> T:
     return jax.tree.map(lambda *arrays: np.stack(arrays).astype(np.float32), *windows)
 
 
+def decision_period(time_s: np.ndarray, row_s: float) -> float:
+    """Return the time between a policy's decisions [s], NaN where there are fewer than two.
+
+    It is a mean: decisions stand on a log's rows, so that at 15 Hz every 10 ms some are 60 and
+    some 70 ms apart, and none as far as they are on average. Gaps in the record are left out.
+
+    Args:
+        time_s: (T,) of the rows with a decision.
+        row_s: between rows.
+    """
+    gaps = np.diff(time_s)
+    if not len(gaps):
+        return float("nan")
+    return float(gaps[gaps < _longest_gap(float(np.median(gaps)), row_s)].mean())
+
+
+def decision_rate(logs: Sequence[FlightLog]) -> float:
+    """Return how often the policy decided in flights with its decisions, their median [Hz]."""
+    found = []
+    for log in logs:
+        assert log.policy_step is not None
+        at = np.flatnonzero(log.policy_step & log.whole)
+        row_s = float(np.median(np.diff(log.time_s)))
+        found.append(1.0 / decision_period(log.time_s[at], row_s))
+    return float(np.nanmedian(found))
+
+
+def _longest_gap(period_s: float, row_s: float) -> float:
+    """Return what is too far apart for two decisions in a row [s]."""
+    return 1.5 * period_s + row_s
+
+
 def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[PointMassWindows]:
     action, decides = log.action_b, log.policy_step
     if action is None or decides is None:
@@ -115,13 +147,14 @@ def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[
     heading = _heading(rot)
     if len(at) < HISTORY + 3:
         return []
-    period = float(np.median(np.diff(time)))
+    row_s = float(np.median(np.diff(log.time_s)))
+    period = decision_period(time, row_s)
     steps, stride = round(duration_s / period), max(1, round(stride_s / period))
     found = []
     for first in range(HISTORY, len(at) - steps, stride):
         span = slice(first, first + steps + 1)
         steady = np.diff(time[first - HISTORY : first + steps + 1])
-        if (steady > 1.5 * period).any() or not np.isfinite(acc[first]).all():
+        if (steady > _longest_gap(period, row_s)).any() or not np.isfinite(acc[first]).all():
             continue
         found.append(
             PointMassWindows(

@@ -253,7 +253,7 @@ class OptimizerConfig:
     rate_end: Annotated[float, Range(0.0, 10.0)] = 1e-5
     """Learning rate at the end."""
     warmup: Annotated[int, Range(0, 10**9)] = 20
-    """Iterations of linear warm-up."""
+    """Iterations of linear warm-up; the first of them changes nothing."""
     weight_decay: Annotated[float, Range(0.0, 10.0)] = 1e-2
     """AdamW's decoupled weight decay."""
     memory: Annotated[float, Range(0.0, 1.0, below=True)] = 0.99

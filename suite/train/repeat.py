@@ -116,7 +116,7 @@ def repeat(
     """
     folder = run.folder
     if hosts.writes():
-        fresh = _resume(run.origin, folder, fresh)
+        fresh = _resume(run, fresh)
     state = jax.device_put(hosts.from_the_first(fresh), run.place)
     done = int(state.iteration)
     if not hosts.writes():
@@ -221,7 +221,12 @@ def _check_finite(iteration: int, row: dict[str, float], folder: Path) -> None:
 
 
 def _save(run: Run, state: Any) -> None:
-    described = {**run.origin, "iteration": int(state.iteration), "threads": threads()}
+    described = {
+        **run.origin,
+        "iteration": int(state.iteration),
+        "threads": threads(),
+        "devices": run.place.num_devices,
+    }
     policy = run.folder / "policy"
     save_policy(policy, state.params, run.spec, seed=run.seed, training=described)
     # The state comes last: what it says is done has its policy and its curve on the disk.
@@ -234,7 +239,8 @@ def _save(run: Run, state: Any) -> None:
     )
 
 
-def _resume(origin: dict[str, Any], folder: Path, fresh: Any) -> Any:
+def _resume(run: Run, fresh: Any) -> Any:
+    origin, folder, devices = run.origin, run.folder, run.place.num_devices
     place = folder / "state"
     recover_folder(place)
     if not place.exists():
@@ -256,6 +262,12 @@ def _resume(origin: dict[str, Any], folder: Path, fresh: Any) -> Any:
             f"{folder} was trained with {before} threads of XLA, and here are {now}: sums would "
             f"round otherwise from here on. Set NPROC={before} in the environment to go on with "
             "the same bits, or give another --out"
+        )
+    if theirs.get("devices", devices) != devices:
+        raise ValueError(
+            f"{folder} was trained on {theirs['devices']} JAX devices, and here are {devices}: "
+            "each draws noise of its own. Give it as many again (docs/training.md, several "
+            "devices), or another --out"
         )
     stored = load_arrays(place, kind="training")
     state = jax.tree.map(jnp.asarray, tree_from_arrays(fresh, stored.arrays, str(place)))

@@ -138,11 +138,11 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
     return sight
 
 
-def observed_at_start(worlds: Worlds, config: TrainConfig) -> jax.Array:
-    """Return the states on their way at the start, (B, state_delay, state_size): level, at rest."""
-    shape = (len(worlds.target), config.physics.state_delay, config.spec.state_size)
-    level = jnp.zeros(shape).at[:, :, 5].set(1.0)
-    return level if worlds.wanted is None else level.at[:, :, -1].set(worlds.wanted[:, None])
+def observed_at_start(worlds: Worlds, state: DynamicsState, config: TrainConfig) -> jax.Array:
+    """Return the states on their way at first, (B, state_delay, state_size): the start's own."""
+    view, still = view_in(worlds, state, jnp.asarray(worlds.target)), jnp.zeros_like(state.pos_w)
+    seen = observe(config.spec, view, still, worlds.wanted).state
+    return jnp.repeat(seen[:, None], config.physics.state_delay, axis=1)
 
 
 def choose(where: jax.Array, ones: Any, others: Any) -> Any:
@@ -160,13 +160,14 @@ def make_start(config: TrainConfig) -> Callable[[Worlds], RolloutCarry]:
 
     def start(worlds: Worlds) -> RolloutCarry:
         batch = len(worlds.target)
+        state = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
         fresh = RolloutCarry(
-            state=dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w),
+            state=state,
             target=jnp.asarray(worlds.target),
             hidden=jnp.asarray(worlds.hidden),
             action_b=jnp.zeros((batch, 3)),
             embeddings=jnp.zeros((batch, physics.image_delay, width)),
-            observed=observed_at_start(worlds, config),
+            observed=observed_at_start(worlds, state, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
             going=jnp.ones(batch),
@@ -214,7 +215,7 @@ def make_rollout(
             action, hidden = network.recur(params, carry.hidden, embedding, state)
             flown, delta_hidden = action, carry.delta_hidden
             if delta is not None:
-                vel_b = to_local(jax.lax.stop_gradient(before.rot_w), before.vel_w)
+                vel_b = to_local(before.rot_w, before.vel_w)
                 correction, delta_hidden = delta_network.step(
                     delta, delta_hidden, vel_b, before.rot_w[:, 2], action
                 )

@@ -149,9 +149,7 @@ class Baseline:
         body = self.start(worlds)
         camera = config.spec.camera
         images = [torch.zeros(count, camera.height, camera.width)] * physics.image_delay
-        upright = torch.zeros(count, config.spec.state_size)
-        upright[:, 5] = 1.0
-        states = [upright] * physics.state_delay
+        states: list[Tensor] = []
         hidden = worlds.hidden
         action, target = zero, worlds.target.long()
         total = torch.zeros(())
@@ -163,7 +161,7 @@ class Baseline:
             state = torch.cat([seen[0], now.rot_w[:, 2], seen[1], action], -1)
             if config.fleet is not None:
                 state = state + self.noise * torch.randn_like(state)
-            states.append(state)
+            states = [*(states or [state] * physics.state_delay), state]
             action, hidden = self.network(states.pop(0), images.pop(0), hidden)
             before, body = body, self.fly(worlds, body, action, target_w)
             passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)

@@ -267,7 +267,7 @@ def quadrotor_dynamics(
         noise = None
         if uses_noise(plant):
             shape = (cut.attitude, cut.physics, *body.pos_w.shape)
-            noise = jax.random.normal(jax.random.fold_in(key, 1), shape)
+            noise = jax.random.normal(jax.random.fold_in(key, 3), shape)
 
         def towards(heading_w: jax.Array, pos_w: jax.Array) -> jax.Array:
             return blend_heading(heading_w, target_w - pos_w, turn_s)

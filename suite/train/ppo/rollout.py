@@ -85,14 +85,15 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
         params: network.Params, log_deviation: jax.Array, worlds: Worlds, key: jax.Array
     ) -> tuple[Record, jax.Array]:
         batch = worlds.pos_w.shape[0]
+        state = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
         start = EpisodeCarry(
-            state=dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w),
+            state=state,
             target=worlds.target,
             hidden=jnp.asarray(worlds.hidden),
             action_b=jnp.zeros((batch, 3)),
             # An image of zeros is embedded as zeros, which is how the trainer's rollouts start.
             images=jnp.zeros((batch, physics.image_delay, spec.camera.height, spec.camera.width)),
-            observed=observed_at_start(worlds, config),
+            observed=observed_at_start(worlds, state, config),
         )
 
         def step(carry: EpisodeCarry, key: jax.Array) -> tuple[EpisodeCarry, Record]:

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from policies.networks import delta_network
-from suite.delta.burn_in import BurnIn, burn_in_before, state_after
+from suite.delta.burn_in import BurnIn, burn_in_before, forgotten, state_after
 
 STILL = np.tile(np.eye(3), (5, 1, 1))
 
@@ -31,3 +31,11 @@ def test_what_was_not_seen_is_not_remembered():
     np.testing.assert_array_equal(
         found, state_after(params, BurnIn(inputs[:, 2:], late.seen[:, 2:]))
     )
+
+
+def test_a_share_of_the_windows_forgets_what_it_saw():
+    inputs = np.ones((5, 3, 9))
+    part = forgotten(BurnIn(inputs, np.ones((5, 3))), 0.4)
+    np.testing.assert_array_equal(part.seen, [[0.0] * 3] * 2 + [[1.0] * 3] * 3)
+    assert forgotten(part, 0.0).seen.sum() == 9.0 and forgotten(part, 1.0).seen.sum() == 0.0
+    np.testing.assert_array_equal(part.inputs, inputs)

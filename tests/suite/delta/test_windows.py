@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from suite.delta.replay import PointMassModel, nominal_model
-from suite.delta.windows import cut_windows
+from suite.delta.windows import cut_windows, decision_period, decision_rate
 from suite.train.config import PointMassConfig
 from tests.support.point_mass_flights import fly
 
@@ -53,3 +53,16 @@ def test_windows_of_unlike_rates_are_cut_to_what_all_have():
     alone = cut_windows([log], 0.5, 0.3)
     count = len(alone.pos_w)
     np.testing.assert_array_equal(both.burn_in.seen[:count], alone.burn_in.seen[:, -45:])
+
+
+@pytest.mark.parametrize("rate_hz", [15.0, 30.0, 45.0, 60.0, 90.0])
+def test_the_period_of_decisions_that_stand_on_rows_is_that_of_the_policy(rate_hz):
+    time = np.ceil(np.arange(0.0, 20.0, 1.0 / rate_hz) * 100 - 1e-9) / 100
+    assert decision_period(time, 0.01) == pytest.approx(1.0 / rate_hz, rel=2e-3)
+    gap = np.concatenate([time, time[-1] + 3.0 + time])
+    assert decision_period(gap, 0.01) == pytest.approx(1.0 / rate_hz, rel=2e-3)
+    assert np.isnan(decision_period(time[:1], 0.01))
+
+
+def test_the_rate_of_flights_is_that_of_their_policy():
+    assert decision_rate(fly(nominal_model(PointMassConfig()), 2)) == pytest.approx(30.0, rel=1e-3)

@@ -1,7 +1,8 @@
 """A method that only counts, repeated in a folder: what is measured, resumed and refused."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -112,6 +113,13 @@ def test_a_run_on_several_threads_does_not_go_on_with_one_and_goes_on_with_more(
         repeat(counting(4), run_in(tmp_path), FRESH, Console())
     monkeypatch.setenv("NPROC", "16")
     assert repeat(counting(4), run_in(tmp_path), FRESH, Console()).iterations == 4
+
+
+def test_a_run_on_some_devices_does_not_go_on_on_more(tmp_path):
+    run, two = run_in(tmp_path), SimpleNamespace(num_devices=2)
+    repeat(counting(2), run, FRESH, Console())
+    with pytest.raises(ValueError, match=r"on 1 JAX devices, and here are 2: each .*as many again"):
+        repeat(counting(4), run._replace(place=cast(Any, two)), FRESH, Console())
 
 
 def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):

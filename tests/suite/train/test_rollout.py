@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from policies.networks import delta_network, network
-from policies.observation import View, observe
+from policies.observation import observe
 from suite.train import rollout
 from suite.train.config import PointMassConfig
 from suite.train.dynamics import point_mass
@@ -287,17 +287,20 @@ def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
     np.testing.assert_allclose(seen[0][1], expected, atol=1e-6)
 
 
-def test_a_state_on_its_way_at_the_start_is_that_of_a_level_drone_at_rest():
-    """The judge's own words for it: the third row of the rotation is (0, 0, 1)."""
-    config = replace(small_config(2), physics=PointMassConfig(state_delay=1))
-    zero = np.zeros(3)
-    seen = View(zero, np.eye(3), zero, zero, zero, zero)
-    expected = observe(config.spec, seen, zero).state
-    found = rollout.observed_at_start(sample_worlds(config, 0), config)
-    np.testing.assert_array_equal(found, np.tile(expected, (2, 1, 1)))
-    asked = replace(config, spec=replace(config.spec, speed_input=True))
-    worlds = sample_worlds(asked, 0)
-    np.testing.assert_array_equal(rollout.observed_at_start(worlds, asked)[:, 0, -1], worlds.wanted)
+def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
+    """A world that starts in flight knows its speed and its gate from the first decision on."""
+    config = replace(small_config(2), physics=PointMassConfig(state_delay=2))
+    config = replace(config, spec=replace(config.spec, speed_input=True))
+    worlds = sample_worlds(config, 0)
+    worlds = worlds._replace(vel_w=3.0 * worlds.heading_w)
+    found = rollout.make_start(config)(worlds).observed
+    assert found.shape == (2, 2, config.spec.state_size)
+    np.testing.assert_array_equal(found[:, 0], found[:, 1])
+    np.testing.assert_allclose(np.linalg.norm(found[:, 0, :3], axis=-1), 3.0, rtol=1e-6)
+    to_gate = target_gate(worlds.scene.gates, worlds.target)[1] - worlds.pos_w
+    far = np.linalg.norm(to_gate, axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(found[:, 0, 6:9], axis=-1), far, rtol=1e-5)
+    np.testing.assert_array_equal(found[:, 0, -1], worlds.wanted)
 
 
 def test_hovering_above_the_frame_there_is_progress_to_be_made_backwards():

@@ -12,6 +12,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import Rules, TrialSpec
+from policies.networks import delta_network
 from suite.commands.train import Config, resolve
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
@@ -204,7 +205,10 @@ def test_gradients_of_a_flight_are_those_of_finite_differences(float64, monkeypa
 
 
 def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatch):
-    """The whole of a blind policy's loss: no decay, no field, no closing speed, heading held."""
+    """The whole of a blind policy's loss: no decay, no field, no closing speed, heading held.
+
+    A Delta Action network corrects it, of which the attitude, which turns its velocity, is a part.
+    """
     monkeypatch.setattr(quadrotor, "blend_heading", lambda heading_w, *_: heading_w)
     config = small_config(
         batch=2,
@@ -213,6 +217,9 @@ def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatc
     )
     config = replace(config, quadrotor=QuadrotorConfig(HIDDEN))
     params, worlds = doubled(fresh_params()), doubled(boxes_worlds(config))
+    worlds = worlds._replace(vel_w=4.0 * worlds.heading_w)
+    delta = doubled(delta_network.init(jax.random.key(1)))
+    delta["output.weight"] += 1.5 * jax.random.normal(jax.random.key(2), (delta_network.HIDDEN, 3))
     rollout = make_rollout(config)
 
     @jax.jit
@@ -220,7 +227,7 @@ def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatc
     def loss(params):
         embedding_shift = jnp.zeros((5, 2, SPEC.hidden_size))
         blind = lambda p, image: jnp.zeros((2, SPEC.hidden_size))  # noqa: E731
-        return rollout(params, embedding_shift, worlds, jax.random.key(5), blind, None)[0]
+        return rollout(params, embedding_shift, worlds, jax.random.key(5), blind, delta)[0]
 
     gradient = loss(params)[1]
     rng = np.random.default_rng(0)
