@@ -38,8 +38,10 @@ class PairedDifference(NamedTuple):
     """Trials in which only the second succeeded."""
 
 
-def wilson(successes: int, trials: int, confidence: float = CONFIDENCE) -> Interval:
+def wilson(successes: float, trials: int, confidence: float = CONFIDENCE) -> Interval:
     """Return the success rate with its score interval (Wilson 1927, no continuity correction).
+
+    A trial that was flown several times may count with its mean.
 
     Raises:
         ValueError: unless 0 <= successes <= trials and trials >= 1.

@@ -34,7 +34,8 @@ HOW = (
     "corrected from the same flights; with both: through that with a Delta Action Model of what it "
     "still lacks. All randomise their quadrotor as the recipe does. The first column flies the "
     "simulation's vehicle, all others the hidden world.",
-    "Success over the training seeds from which something was named, [95 % Wilson intervals].",
+    "Success over the training seeds from which something was named, [95 % Wilson intervals]; over "
+    "all worlds each trial counts once, with its mean, as all worlds fly the same.",
 )
 WORTH = (
     "Differences in points over the same trials, with 95 % bootstrap intervals that draw training "
@@ -93,30 +94,39 @@ def _row(name: str, came: Sequence[Came]) -> Row:
     # All policies over the same loops, or where nothing was named would count before only.
     told = [one for one in came if NAMED in one.results] or came
     for policy in LABELS:
-        pairs = [(one.results[policy], one.results[NOMINAL]) for one in told
-                 if policy in one.results]  # fmt: skip
-        won = [result.success for rows, _ in pairs for result in rows]
+        won = [_won(some, policy) for some in _by_seed(told, policy)]
         if won:
-            success[policy] = wilson(sum(won), len(won))
-            laps[policy] = _lap_ratio(pairs)
+            trials = np.concatenate(won)
+            success[policy] = wilson(float(trials.sum()), len(trials))
+            laps[policy] = _lap_ratio(
+                [(one.results[policy], one.results[NOMINAL]) for one in told
+                 if policy in one.results]
+            )  # fmt: skip
     for pair, (one, other) in PAIRS.items():
-        seeds = dict.fromkeys(loop.training_seed for loop in came)
-        apart = [
-            np.concatenate([_won(loop.results[one]) - _won(loop.results[other]) for loop in mine])
-            for mine in (
-                [c for c in came if c.training_seed == seed and {one, other} <= set(c.results)]
-                for seed in seeds
-            )
-            if mine
-        ]
+        apart = [_won(some, one) - _won(some, other) for some in _by_seed(came, one, other)]
         if apart:
             gaps[pair] = nested(apart)
     named = sum(bool(one.diagnosis["effects"]) for one in came)
     return Row(name, len(came), named, success, gaps, laps)
 
 
-def _won(rows: Sequence[TrialResult]) -> np.ndarray:
-    return np.array([row.success for row in rows], float)
+def _by_seed(came: Sequence[Came], *policies: str) -> list[list[Came]]:
+    """Return the loops that have all these policies, those of one training seed together."""
+    seeds = dict.fromkeys(loop.training_seed for loop in came)
+    found = [
+        [c for c in came if c.training_seed == seed and set(policies) <= set(c.results)]
+        for seed in seeds
+    ]
+    return [some for some in found if some]
+
+
+def _won(came: Sequence[Came], policy: str) -> np.ndarray:
+    """Return success (trials,) of one training seed's loops: a trial's mean over their worlds.
+
+    They fly the same trials, and where nothing is hidden the same flights, so that worlds add
+    nothing to how many trials there are.
+    """
+    return np.mean([[row.success for row in one.results[policy]] for one in came], axis=0)
 
 
 def _lap_ratio(

@@ -5,11 +5,11 @@ from suite.loop.hidden_effect import LABELS, NAMED
 from tests.support.loops import EFFECT, WON, four_trials
 
 
-def came(seed, won, named=True):
+def came(seed, won, named=True, world="a"):
     """Return a loop; one that names nothing has no fine-tuned policies."""
     names = LABELS if named else ("nominal", "before")
     found = {"effects": [EFFECT] if named else [], "verdict": "", "gap": {}}
-    return Came("a", seed, {name: four_trials(won[name]) for name in names}, found, {})
+    return Came(world, seed, {name: four_trials(won[name]) for name in names}, found, {})
 
 
 def test_differences_are_in_pairs_and_count_no_loop_without_names():
@@ -21,6 +21,17 @@ def test_differences_are_in_pairs_and_count_no_loop_without_names():
     assert row.success["before"].value == 0.5 and row.loops == 3 and row.named == 2
     assert row.laps[NAMED] == (1.0, 6)
     assert row.laps["nominal"] == (1.0, 8)
+
+
+def test_worlds_of_one_training_seed_add_no_trials():
+    """They fly the same, and where nothing is hidden the same flights."""
+    one, many = (
+        rows_of([came(seed, WON, world=world) for seed in range(3) for world in worlds])[-1]
+        for worlds in ("a", "abcde")
+    )
+    assert many.loops == 15 and many.success == one.success
+    assert many.gaps == one.gaps
+    assert many.laps["nominal"] == (1.0, 60)
 
 
 def test_the_lead_says_what_gained_and_where_nothing_is_named_only_what_was_lost():
