@@ -13,6 +13,8 @@ HALF_TURN = np.array([1.0, -1.0, -1.0])
 """Diagonal of the half turn about x; its own inverse."""
 QUAT_HALF_TURN = np.array([1.0, 1.0, -1.0, -1.0])
 """The same on a quaternion wxyz when world and body are both turned."""
+BODY_VECTORS = ("rate", "acc", "cmd_rate", "cmd_torque")
+"""Signals that are vectors in body axes."""
 _ROOT_HALF = float(np.sqrt(0.5))
 _WORLD = {
     "z-up": np.array([1.0, 0.0, 0.0, 0.0]),

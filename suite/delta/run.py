@@ -41,7 +41,7 @@ def fitting_estimate(config: FitConfig, steps: float, through_quadrotor: bool) -
 
 
 def flight_files(paths: Sequence[Path]) -> list[Path]:
-    """Return the flight logs among `paths`, folders standing for the logs in them.
+    """Return the flight logs among `paths`, folders standing for the logs in them, each once.
 
     Raises:
         ValueError: where there is none.
@@ -53,7 +53,7 @@ def flight_files(paths: Sequence[Path]) -> list[Path]:
     if not files:
         where = ", ".join(map(str, paths)) or "nowhere"
         raise ValueError(f"no flight logs in {where}; record some with suite collect")
-    return files
+    return list({path.resolve(): path for path in reversed(files)}.values())[::-1]
 
 
 def split(

@@ -104,7 +104,7 @@ def _diagnose(
     or_else: bool = False,
 ) -> Diagnosis:
     """Return the diagnosis with bodies that `integrator` moves."""
-    rotor_input, warnings = rotors_are_input(logs, drive), list[str]()
+    rotor_input, warnings = rotors_are_input(logs, drive, vehicle), list[str]()
     if drive == "auto" and not rotor_input and another_controller(logs, vehicle, limits):
         warnings.append("the nominal rate loop does not give the measured rotor speeds; they drive")
         rotor_input = True

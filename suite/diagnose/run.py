@@ -72,11 +72,17 @@ def diagnose_files(
     warnings = [*warnings, *told]
     for warning in warnings:
         console.note(f"warning: {warning}")
-    asked = {"--compare-delta": compare_delta, "--plan": plan, "--fly": fly is not None}
+    asked = {
+        "--compare-delta": compare_delta,
+        "--plan": plan,
+        "--fly": fly is not None,
+        "--drive": drive != "auto",
+        "--integrator": integrator != "auto",
+    }
     unused = [f"{flag} is of rollouts: left out" for flag, given in asked.items() if given]
     told = [*warnings, *unused]
     by_views = partial(diagnose_views, logs, before, vehicle, out, console, SCHEMA, seed, told)
-    if before or only_views(logs):
+    if before or only_views(logs, vehicle):
         return by_views()
     try:
         result = diagnose(logs, vehicle, drive, console.note, seed, integrator=integrator,

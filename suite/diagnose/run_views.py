@@ -11,6 +11,7 @@ from eval.quadrotor.vehicle_file import save_vehicle
 from eval.vehicles.vehicle import Vehicle
 from suite.common.console import Console
 from suite.common.report import write_report
+from suite.diagnose.data.input_source import forgets
 from suite.diagnose.report.views_json import views_json
 from suite.diagnose.report.views_page import views_page
 from suite.diagnose.views.by_views import diagnose_by_views
@@ -18,9 +19,17 @@ from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
 
 
-def only_views(logs: Sequence[FlightLog]) -> bool:
-    """Return whether rollouts cannot be flown: something is missing, or motor commands drive."""
-    return any(log.partial or (log.rotor_speed is None and log.rate_cmd_b is None) for log in logs)
+def only_views(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
+    """Return whether rollouts cannot be flown.
+
+    Something is missing, or what drives is known by motor commands alone, or by those to a rate
+    loop that remembers.
+    """
+    return any(
+        log.partial
+        or (log.rotor_speed is None and (log.rate_cmd_b is None or not forgets(vehicle)))
+        for log in logs
+    )
 
 
 def diagnose_views(

@@ -16,14 +16,14 @@ from suite.judging.flying import (
     flying_needs,
     load_flier,
     read_course,
-    say_differences,
+    say_notes,
     who_flies,
     workers_for,
 )
 from suite.judging.manner import Manner
 from suite.judging.requests import Collection
 from tracks.common.files import plain, write_json
-from tracks.common.provenance import stamp
+from tracks.common.provenance import git_commit, stamp
 from tracks.common.work import Workers
 from tracks.input.reading import read_json
 
@@ -56,6 +56,7 @@ def collect(
     from eval.judging.results import Journal
 
     course, manner = read_course(collection), Manner(speed=collection.speed)
+    _refuse_one_name({trial.track for trial in course.trials})
     asked = collection.policy or default_policy()
     policy = load_flier(asked, collection.trust, manner)
     out = Path(out)
@@ -63,6 +64,8 @@ def collect(
         "collection": collection,
         "policy": about_policy(asked, policy),
         "vehicle": course.vehicle,
+        "tracks": course.tracks,
+        "git_commit": git_commit(),
     }
     rows = _rows_there(out, plain(about))
     with Journal(out / JOURNAL, about) as journal:
@@ -103,7 +106,7 @@ def _fly_missing(
     workers = workers_for(len(missing), workers, collection.world)
     what = f"{len(missing)} flights in the {collection.world} world"
     announce(console, what, flying_needs(len(missing), workers, collection.world))
-    say_differences(console, collection.world, course)
+    say_notes(console, collection.world, course)
     asked, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
     with console.progress("flights", len(course.trials)) as update:
 
@@ -148,6 +151,17 @@ def _row(out: Path, result: TrialResult) -> Row | None:
     return {"file": name, **result._asdict()}
 
 
+def _refuse_one_name(tracks: set[str]) -> None:
+    """Refuse tracks whose logs would be written over each other."""
+    stems = [Path(track).stem for track in tracks]
+    for stem in stems:
+        if stems.count(stem) > 1:
+            raise ValueError(
+                f"--track: more than one is called {stem!r}, and logs are named after their track; "
+                "rename a file, or collect them into folders of their own"
+            )
+
+
 def _log_name(result: TrialResult) -> str:
     return f"{Path(result.track).stem}-{result.difficulty}-{result.seed}.parquet"
 
@@ -182,7 +196,10 @@ def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, Row]:
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a list of flights ({error}); move it away") from error
     if not same:
-        raise ValueError(f"{path}: of another collection; give another --out or move it away")
+        raise ValueError(
+            f"{path}: of another collection, or of another version of the code; give another --out "
+            "or move it away"
+        )
     return {
         t: row for t, row in rows.items() if row["file"] is None or (out / row["file"]).is_file()
     }

@@ -16,7 +16,7 @@ from suite.judging.flying import (
     labels,
     load_flier,
     read_course,
-    say_differences,
+    say_notes,
     who_flies,
     workers_for,
 )
@@ -74,7 +74,7 @@ def evaluate(
     flown = count * len(fliers)
     what = f"{flown} trials in the {evaluation.world} world"
     announce(console, what, flying_needs(flown, workers, evaluation.world))
-    say_differences(console, evaluation.world, course)
+    say_notes(console, evaluation.world, course)
     results: list[TrialResult] = []
     journals: list[Path] = []
     for number, flier in enumerate(fliers):
@@ -147,4 +147,5 @@ def _fly_one(
                 keep,
                 tracks=course.tracks,
             )
-        return [journal.done[trial] for trial in course.trials]
+        # Flown before, perhaps beside other policies and under another label.
+        return [journal.done[trial]._replace(policy=label) for trial in course.trials]

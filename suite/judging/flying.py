@@ -78,11 +78,11 @@ def labels(policies: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def trial_list(
-    tracks: Sequence[str], levels: Sequence[int], trials: int, seed: int
+    tracks: Sequence[str], levels: Sequence[int], trials: int, seed: int, once: bool = False
 ) -> list[TrialSpec]:
     """Return the trials of every track at every level, with the seeds seed, seed + 1, ...
 
-    A track from a file has no levels: it is flown once a seed.
+    A track from a file has no levels: it is flown once a seed, or `once` in all.
     """
     from eval.worlds.trial import TrialSpec
 
@@ -91,7 +91,7 @@ def trial_list(
         TrialSpec(track, level, number)
         for track in tracks
         for level in ([0] if is_track_file(track) else levels)
-        for number in seeds
+        for number in (seeds[:1] if once and is_track_file(track) else seeds)
     ]
 
 
@@ -106,6 +106,8 @@ class Course(NamedTuple):
     """On what."""
     differences: list[str]
     """What of the vehicle the world flies otherwise, in sentences."""
+    notes: list[str]
+    """What else a person is told, in sentences."""
 
 
 def read_course(wanted: Evaluation | Collection) -> Course:
@@ -114,22 +116,31 @@ def read_course(wanted: Evaluation | Collection) -> Course:
     Raises:
         ValueError: for an unknown world or track, too few trials, or a bad track or vehicle file.
     """
+    from eval.effects import EFFECTS
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds import differences, world_class
 
     world_class(wanted.world)
     check_ranges(wanted, options=True)
     names = parse_tracks(wanted.track)
-    trials = trial_list(names, parse_levels(wanted.difficulty), wanted.trials, wanted.seed)
     vehicle = load_vehicle(wanted.vehicle)
-    flown_otherwise = differences(wanted.world, vehicle)
-    return Course(trials, custom_tracks(names), vehicle, flown_otherwise)
+    flown_otherwise, notes = differences(wanted.world, vehicle), list[str]()
+    levels, tracks = parse_levels(wanted.difficulty), custom_tracks(names)
+    once = not any(EFFECTS[name].random for name in vehicle.effects)
+    if once and wanted.trials > 1:
+        notes = [
+            f"{name}: flown once, not {wanted.trials} times: a track from a file and a vehicle on "
+            "which nothing acts by chance are the same at every seed; gusts and noise are not"
+            for name in tracks
+        ]
+    trials = trial_list(names, levels, wanted.trials, wanted.seed, once)
+    return Course(trials, tracks, vehicle, flown_otherwise, notes)
 
 
-def say_differences(console: Console, world: str, course: Course) -> None:
-    """Tell a person what of the vehicle `world` flies otherwise than its file says."""
-    for sentence in course.differences:
-        console.note(f"{world}: {sentence}")
+def say_notes(console: Console, world: str, course: Course) -> None:
+    """Tell a person what of `course` is not as was asked for."""
+    for sentence in [*(f"{world}: {told}" for told in course.differences), *course.notes]:
+        console.note(sentence)
 
 
 def flying_needs(trials: float, workers: Workers, world: str = "mujoco") -> Estimate:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS
+from eval.quadrotor.loops import KINDS
 from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Controller, Rotors, Vehicle
 
@@ -24,6 +25,16 @@ PLAIN = Vehicle(
     controller=Controller(rate_gain=(20.0, 20.0, 8.0), frequency=500.0),
 )
 """Rotors without lag, no effects."""
+REMEMBERING = replace(
+    PLAIN,
+    controller=replace(
+        PLAIN.controller,
+        kind="crazyflie",
+        settings=KINDS["crazyflie"].Settings(),
+        rate_gain=(1.0, 1.0, 1.0),
+    ),
+)
+"""With a firmware's rate loop: integrators and filters that no log tells of."""
 
 
 def with_effects(vehicle: Vehicle = PLAIN, **values: Any) -> Vehicle:

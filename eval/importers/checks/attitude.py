@@ -10,7 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from eval.importers.findings import Finding
-from eval.importers.frames import HALF_TURN, conjugate, multiply, rotation_vector
+from eval.importers.frames import (
+    BODY_VECTORS,
+    HALF_TURN,
+    conjugate,
+    multiply,
+    rotation_vector,
+)
 from eval.importers.signals import median_step
 
 SPAN_S = 0.06
@@ -72,8 +78,10 @@ def check_attitude(rows: dict[str, np.ndarray], fix: bool) -> list[Finding]:
     if not fix:
         return [Finding("doubt", "attitude", text + "; left as it is")]
     rows["quat"] = _read(quat, order, inverse)
+    if "cmd_quat" in rows:  # written as what it is held against
+        rows["cmd_quat"] = _read(rows["cmd_quat"], order, inverse)
     if turned:
-        for name in ("rate", "cmd_rate", "acc"):
+        for name in BODY_VECTORS:
             if name in rows:
                 rows[name] = rows[name] * HALF_TURN
     return [Finding("corrected", "attitude", text)]

@@ -12,7 +12,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.checks.attitude import BAD, GOOD, TIMES_BETTER
 from eval.importers.findings import Finding
-from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, conjugate, turn
+from eval.importers.frames import BODY_VECTORS, HALF_TURN, QUAT_HALF_TURN, conjugate, turn
 from eval.logs.velocity import velocity_from_position
 
 CALM_SPEED, CALM_ACC = 0.3, 1.0
@@ -87,8 +87,10 @@ def check_frames(rows: dict[str, np.ndarray], fix: bool) -> list[Finding]:
         if name in rows:
             rows[name] = rows[name] * HALF_TURN
     if body:
-        rows["quat"] = rows["quat"] * QUAT_HALF_TURN
-        for name in ("rate", "cmd_rate", "acc"):
+        for name in ("quat", "cmd_quat"):
+            if name in rows:
+                rows[name] = rows[name] * QUAT_HALF_TURN
+        for name in BODY_VECTORS:
             if name in rows:
                 rows[name] = rows[name] * HALF_TURN
     return [Finding("corrected", "frames", text)]

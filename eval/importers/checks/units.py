@@ -105,7 +105,7 @@ def _integral(samples: Signal, first: float, last: float) -> float:
 
 
 def _moved(recording: Recording) -> float | None:
-    if "vel" not in recording.signals:
+    if not {"pos", "vel"} <= recording.signals.keys():
         return None
     pos, vel = recording.signals["pos"], recording.signals["vel"]
     travelled = _integral(vel, pos.time_s[0], pos.time_s[-1])

@@ -8,8 +8,9 @@ from eval.effects.interface import GRAVITY
 from eval.importers.findings import Finding
 from eval.vehicles.vehicle import Vehicle
 
-NEAR = 1.2
-"""A factor within this of the measured one explains it, where no other does."""
+NEAR, CLEAR = 1.2, 1.1
+"""A factor within the first of the measured one may explain it; where just one is within the
+second, it does."""
 FITS = 1.35
 """Speeds within this factor of what carries the weight are as they should be (thrust: squared)."""
 FACTORS = {
@@ -45,19 +46,29 @@ def check_weight(rows: dict[str, np.ndarray], vehicle: Vehicle | None, fix: bool
     figures = f"by {vehicle.name!r} they lift {lift:.3g} times the weight"
     if 1.0 / FITS < factor < FITS:
         return [Finding("ok", "rotor speeds", figures)]
-    near = {
-        words: abs(np.log(factor / wrong))
-        for words, wrong in FACTORS.items()
-        if abs(np.log(factor / wrong)) < np.log(NEAR)
-    }
+    near = _within(NEAR, factor)
     if not near:
         text = f"{figures}: the speeds' unit, the mass or the thrust coefficient is wrong"
         return [Finding("doubt", "rotor speeds", text)]
-    words = min(near, key=lambda name: near[name])
+    clear = _within(CLEAR, factor)
+    if len(clear) != 1:
+        text = f"{figures}: they are {factor:.3g} times too large, which may be {' or '.join(near)}"
+        return [Finding("doubt", "rotor speeds", text + "; left as they are, scale them yourself")]
+    (words,) = clear
     text = f"{figures}: they are {FACTORS[words]:.3g} times too large ({words})"
+    if len(near) > 1:
+        others = " or ".join(name for name in near if name != words)
+        text += f"; if the vehicle file is far off, it may be {others}"
     if not fix:
         return [Finding("doubt", "rotor speeds", text + "; left as they are")]
     for name in ("motor", "motor_cmd"):
         if name in rows:
             rows[name] = rows[name] / FACTORS[words]
     return [Finding("corrected", "rotor speeds", text)]
+
+
+def _within(limit: float, factor: float) -> list[str]:
+    """Return which of `FACTORS` are within the ratio `limit` of the measured `factor`."""
+    return [
+        words for words, wrong in FACTORS.items() if abs(np.log(factor / wrong)) < np.log(limit)
+    ]

@@ -94,7 +94,7 @@ def _first(
 def _values(part: Part, column: Column) -> Part:
     time_s, value = part
     if column.mixer:
-        mixed = value @ MIXERS[column.mixer].T * np.asarray(column.factor)
+        mixed = (value * np.asarray(column.factor)) @ MIXERS[column.mixer].T
         return time_s, np.clip(mixed, 0.0, 1.0)  # as what drives the motors does
     return time_s, value * np.asarray(column.factor)
 

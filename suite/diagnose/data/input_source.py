@@ -16,11 +16,19 @@ from suite.diagnose.data.windows import step_s
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
-def rotors_are_input(logs: Sequence[FlightLog], drive: str) -> bool:
-    """Return whether measured rotor speeds are the input, as far as the columns decide.
+def forgets(vehicle: Vehicle) -> bool:
+    """Return whether the rate loop's output follows from the rates of now and the command alone.
+
+    What a firmware's loop (integrators, filters) remembers where a stretch begins is in no log.
+    """
+    return vehicle.controller.kind == "p"
+
+
+def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) -> bool:
+    """Return whether measured rotor speeds are the input, as far as columns and rate loop decide.
 
     Raises:
-        ValueError: for an unknown `drive`, or one that the logs do not allow.
+        ValueError: for an unknown `drive`, or one that the logs or the rate loop do not allow.
     """
     commands = all(log.thrust_cmd is not None and log.rate_cmd_b is not None for log in logs)
     motors = all(log.rotor_speed is not None for log in logs)
@@ -30,7 +38,14 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str) -> bool:
         raise ValueError("some flights have commands only and some rotor speeds only: sort them")
     if (drive == "commands" and not commands) or (drive == "motors" and not motors):
         raise ValueError(f"drive = {drive!r}, but not every flight has them")
-    return drive == "motors" or not commands
+    if not forgets(vehicle) and (drive == "commands" or not motors):
+        raise ValueError(
+            f"{vehicle.name}: no log says what its {vehicle.controller.kind} rate loop remembers "
+            "where a stretch of a flight begins, so that commands cannot drive rollouts; give "
+            "flights with measured rotor speeds (--drive motors), or a vehicle with a controller "
+            "of kind p"
+        )
+    return drive == "motors" or not commands or not forgets(vehicle)
 
 
 def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
@@ -125,7 +126,7 @@ def cut(
     warnings: list[str] = []
     shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
     for number, log in enumerate(logs):
-        starts = _starts(log, stride_s, limits.longest_hole_s)
+        starts = _starts(log, rotor_input, stride_s, limits.longest_hole_s)
         if not starts:
             warnings.append(f"{log.name}: no stretch of {shortest_s:g} s without a hole")
         places += [(number, first) for first in starts]
@@ -146,20 +147,44 @@ def take(windows: FlightWindows, chosen: Array) -> FlightWindows:
     return FlightWindows(*(np.asarray(field)[chosen] for field in windows))
 
 
-def _starts(log: FlightLog, stride_s: float, hole_s: float) -> list[int]:
+def _starts(log: FlightLog, rotor_input: bool, stride_s: float, hole_s: float) -> list[int]:
     time, whole = log.time_s, log.whole
+    driven_s = time[_driven(log, rotor_input)]
     next_s, found = time[0] + BURN_IN_S + HISTORY_S, []
     while True:
         later = np.flatnonzero((time >= next_s - 1e-9) & whole)
         if not len(later) or time[later[0]] + LENGTH_S > time[-1] + 1e-6:
             return found
         first = int(later[0])
-        inside = time[(time >= time[first] - 1e-9) & (time <= time[first] + LENGTH_S + 1e-9)]
-        if len(inside) < 12 or np.diff(inside).max() > hole_s:
-            next_s = time[first] + 0.1
-            continue
-        found.append(first)
-        next_s = time[first] + stride_s
+        begin_s, end_s = time[first], time[first] + LENGTH_S
+        inside = time[(time >= begin_s - 1e-9) & (time <= end_s + 1e-9)]
+        # What drives reaches back: the rotors follow it before the start, and it acts late.
+        back_s = begin_s - BURN_IN_S - HISTORY_S
+        if len(inside) < 12 or _hole(inside, begin_s, end_s) > hole_s:
+            next_s = begin_s + 0.1
+        elif _hole(driven_s, back_s, end_s) > hole_s:
+            next_s = begin_s + 0.1
+        else:
+            found.append(first)
+            next_s = begin_s + stride_s
+
+
+def _driven(log: FlightLog, rotor_input: bool) -> np.ndarray:
+    """Return (T,) bool: rows that say what drives, and the rates that the loop looks at."""
+    if rotor_input:
+        assert log.rotor_speed is not None
+        return np.all(np.isfinite(log.rotor_speed), axis=1)
+    assert log.thrust_cmd is not None and log.rate_cmd_b is not None
+    known = [log.thrust_cmd[:, None], log.rate_cmd_b, log.rate_b]
+    return np.all(np.isfinite(np.concatenate(known, axis=1)), axis=1)
+
+
+def _hole(time_s: np.ndarray, since_s: float, until_s: float) -> float:
+    """Return the longest time [s] without a row, from the last row at or before `since_s` on."""
+    first = max(int(np.searchsorted(time_s, since_s + 1e-9)) - 1, 0)
+    rows = time_s[first : np.searchsorted(time_s, until_s + 1e-9)]
+    held = np.diff(rows, prepend=min(since_s, rows[0]), append=until_s) if len(rows) else [np.inf]
+    return float(np.max(held))
 
 
 class _Drive(NamedTuple):
@@ -236,7 +261,7 @@ def _window(
     middle = begin + 0.5 * (window.edge_s[:-1] + window.edge_s[1:])
     speed = np.zeros((len(middle), 4))
     if log.rotor_speed is not None and rotor_input:
-        speed = _rotors(middle, time, log.rotor_speed, vehicle.rotors.time_constant)
+        speed = _rotors(middle, time, log.rotor_speed, vehicle)
     drop = np.zeros(len(middle))
     if log.voltage is not None and np.isfinite(log.voltage).any():
         first_volt = log.voltage[np.flatnonzero(np.isfinite(log.voltage))[0]]
@@ -289,14 +314,18 @@ def _integral(time: np.ndarray, command: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros((1, 4)), np.cumsum(span[:, None] * command[:-1], axis=0)])
 
 
-def _rotors(
-    at: np.ndarray, time: np.ndarray, speed: np.ndarray, time_constant: float
-) -> np.ndarray:
-    """Return rotor speeds at `at`: between rows along the first-order response to one command."""
+def _rotors(at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicle) -> np.ndarray:
+    """Return rotor speeds at `at` [s].
+
+    Between rows they run along the first-order response to one command. What a firmware's loop
+    asks for changes all the time, by filtered slopes of rates: a smooth curve is nearer then.
+    """
     good = np.flatnonzero(np.isfinite(speed).all(axis=1))
+    if vehicle.controller.kind != "p":
+        return CubicSpline(time[good], speed[good])(at)
     row = np.clip(np.searchsorted(time[good], at, side="right") - 1, 0, len(good) - 2)
     before, after = good[row], good[row + 1]
     span, passed = time[after] - time[before], at - time[before]
-    lag = max(time_constant, 1e-4)
+    lag = max(vehicle.rotors.time_constant, 1e-4)
     share = (1.0 - np.exp(-passed / lag)) / (1.0 - np.exp(-span / lag))
     return speed[before] + share[:, None] * (speed[after] - speed[before])

@@ -72,27 +72,16 @@ def fly_windows(
         start.vel_w + offset[:, 6:9],
         start.rate_b + offset[:, 9:STATE],
     )
-    # Before the start only rates are known.
-    burn_in_rate_b = restored(values, _sample(jnp.swapaxes(windows.burn_in_rate_b, 0, 1))).rate_b
-    speed = wanted_speed(plant, unpacked(command[0]), burn_in_rate_b[0])
-
-    def burn_in_step(carry: Carry, row: Any) -> tuple[Carry, None]:
-        span, acting, rate_b = row
-        carry = look(plant, carry, span, unpacked(acting), rate_b)
-        return turn_rotors(plant, carry, span)[0], None
-
-    # The rates where the loop looks are known here: none has to be carried on.
-    still = jnp.zeros_like(motion.vel_w)
-    carry = Carry(speed, speed, still, Wrench(still, still))
-    first = jax.tree.map(lambda field: field[:burn_in], spans)
-    carry, _ = jax.lax.scan(burn_in_step, carry, (first, command[:burn_in], burn_in_rate_b))
-
     middle_s = 0.5 * (edge_s[:, burn_in:-1] + edge_s[:, burn_in + 1 :])
     rotor_speed = None
     if rotor_input:
         error = offset[:, STATE:].reshape(-1, KNOTS, 4)
         rotor_speed = jnp.asarray(windows.rotor_speed) - jnp.matmul(_hats(middle_s), error)
         rotor_speed = jnp.swapaxes(rotor_speed, 0, 1)
+        begin_speed = rotor_speed[0]
+    else:
+        before = jax.tree.map(lambda field: field[:burn_in], spans)
+        begin_speed = _burned_in(plant, values, before, command[:burn_in], windows)
     inputs = Inputs(
         unpacked(command[burn_in:]),
         rotor_speed,
@@ -101,7 +90,7 @@ def fly_windows(
     )
     spans = jax.tree.map(lambda field: field[burn_in:], spans)
     begin_s = jnp.asarray(windows.start_s)
-    flown = fly(plant, motion, spans, inputs, carry.rotor_speed, begin_s, integrator, feedback)
+    flown = fly(plant, motion, spans, inputs, begin_speed, begin_s, integrator, feedback)
     force_b = jnp.concatenate([flown.acc_b[:1], flown.acc_b])
     along = (flown.motion, flown.rotor_speed, force_b)
     return Flown(*jax.tree.map(lambda field: jnp.moveaxis(field, 0, 1), along))
@@ -149,6 +138,29 @@ def at_knots(flown: Flown, windows: FlightWindows) -> Flown:
     ends = jnp.abs(edge_s[:, None] - knot_s[:, None]).argmin(axis=-1)
     rows = jnp.arange(len(ends))[:, None]
     return jax.tree.map(lambda field: field[rows, ends], flown)
+
+
+def _burned_in(
+    plant: Plant, values: Mapping[str, Any], spans: Steps, command: Any, windows: FlightWindows
+) -> Any:
+    """Return the rotor speeds (B, 4) at the starts, by what was commanded (Q, B, 4) before them.
+
+    The loop must be one that remembers nothing.
+    """
+    # Before the start only rates are known.
+    rates_b = restored(values, _sample(jnp.swapaxes(windows.burn_in_rate_b, 0, 1))).rate_b
+    speed = wanted_speed(plant, unpacked(command[0]), rates_b[0])
+
+    def burn_in_step(carry: Carry, row: Any) -> tuple[Carry, None]:
+        span, acting, rate_b = row
+        carry = look(plant, carry, span, unpacked(acting), rate_b)
+        return turn_rotors(plant, carry, span)[0], None
+
+    # The rates where the loop looks are known here: none has to be carried on.
+    still = jnp.zeros_like(rates_b[0])
+    carry = Carry(speed, speed, still, Wrench(still, still))
+    carry, _ = jax.lax.scan(burn_in_step, carry, (spans, command, rates_b))
+    return carry.rotor_speed
 
 
 def _sample(rate_b: Any, pos_w: Any = None, rot_w: Any = None, vel_w: Any = None) -> Sample:

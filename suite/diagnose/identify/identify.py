@@ -29,6 +29,7 @@ from suite.diagnose.identify.entries import inertia_of, of_force, of_loop, of_to
 from suite.diagnose.identify.fit import Fitted, NothingWhole, Unknown
 from suite.diagnose.identify.flapping import flapping_of
 from suite.diagnose.identify.numbers import Number, told
+from suite.diagnose.identify.start import with_own_numbers
 from suite.diagnose.identify.untold import unasked, untold
 
 ROUNDS = 2
@@ -70,6 +71,7 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
     """
     flights = [grid_of(log) for log in logs]
     drive = drive_of(flights)
+    vehicle = with_own_numbers(vehicle, drive in KNOWN_MOTORS)
     state = _Start(flights, vehicle, drive, tuple(leave))
     if drive not in KNOWN_MOTORS:
         state.loop()
@@ -106,9 +108,7 @@ class _Start:
         if drive == "pwm":
             self.start = with_motors(flights, vehicle)
             self.guess = guess_of(flights, self.start)
-        self.lag_s: float = _value(
-            vehicle, "motor_lag", "time_constant", vehicle.rotors.time_constant
-        )
+        self.lag_s: float = vehicle.rotors.time_constant
         self.delay_s: float = _value(vehicle, "command_delay", "delay", 0.0)
         self.drag = np.asarray(_value(vehicle, "linear_drag", "coefficient", (0.0,) * 3), float)
         self.begun_s = self.lag_s

@@ -14,6 +14,7 @@ from suite.delta.run import flight_files
 from suite.diagnose.fit.parameters import refuse_own_motion
 from suite.diagnose.identify.identify import Identified, identify
 from suite.diagnose.identify.numbers import as_json
+from suite.diagnose.identify.start import unknown_to_the_fits, with_own_numbers
 
 SCHEMA = 1
 PARTS = ("drag", "motors", "inertia", "lag", "loop")
@@ -45,6 +46,12 @@ def identify_files(
     refuse_own_motion(start)
     logs, warnings = read_flights(flight_files(flights), partial=True)
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
+    if beside := unknown_to_the_fits(with_own_numbers(start, True)):
+        warnings = [
+            *warnings,
+            f"{start.name} has {', '.join(beside)} besides: the fits do not know of them, so that "
+            "what is told holds their share, and they stay in the file; start without them",
+        ]
     found = identify(logs, start, leave)
     save_vehicle(found.vehicle, out, _head(found, vehicle))
     return {

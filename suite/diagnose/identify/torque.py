@@ -9,8 +9,15 @@ import numpy as np
 
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.identify.data.drive import delayed, lagged, torque_of
-from suite.diagnose.identify.data.grid import FlightGrid, Windows, blocks_of, over, windows_of
-from suite.diagnose.identify.fit import Fitted, Given, Rows, Unknown, fit
+from suite.diagnose.identify.data.grid import (
+    ROTOR_NOISE,
+    FlightGrid,
+    Windows,
+    blocks_of,
+    over,
+    windows_of,
+)
+from suite.diagnose.identify.fit import TINY, Z95, Fitted, Given, Rows, Unknown, fit
 from suite.diagnose.identify.force import BLOCK_S
 
 WIDTH_S = 0.2
@@ -107,7 +114,77 @@ def fit_torque(
         unknowns = [u._replace(start=best) if u.name == "late" else u for u in unknowns]
         found = fit(misses, unknowns, held, doubted)
         return replace(found, unknowns=tuple(begun))
-    return fit(misses, unknowns, held, doubted)
+    if drive != "rotors":
+        return fit(misses, unknowns, held, doubted)
+
+    def shares(found: Fitted) -> np.ndarray:
+        told = {**fixed, **dict(zip(names, found.value, strict=True))}
+        return _shares_of_noise(
+            lambda flight, windows: _turning(
+                flight, windows, vehicle, inertia, drive, told, thrusts
+            ),
+            flights,
+            [windows for windows, _, _ in prepared],
+        )
+
+    return undiluted(lambda left: fit(misses, unknowns, left, doubted), shares, held)
+
+
+def undiluted(
+    fitted: Callable[[Sequence[str]], Fitted],
+    shares: Callable[[Fitted], np.ndarray],
+    held: Sequence[str],
+) -> Fitted:
+    """Return a fit to measured rotor speeds without what their noise does to its slopes.
+
+    Noise in what drives makes every slope smaller, by its share in the driving torque's variance
+    (errors in variables; Fuller 1987, Sec. 1.1): the inertia seems larger, the yaw torque smaller.
+    The share is known no better than to half of the correction. What stands at a limit, or is in
+    more doubt than it may be, is left as it was.
+
+    Args:
+        fitted: the fit that leaves some numbers as they were.
+        shares: (3,) of noise in the variance of the torque about each axis, in that fit.
+        held: numbers that are left from the first.
+    """
+    held = list(held)
+    while True:
+        found = fitted(held)
+        shift = np.log(np.maximum(1.0 - shares(found), TINY))
+        move = {"inertia_x": shift[0], "inertia_y": shift[1], "yaw": -shift[2]}
+        value, half, covariance = found.value.copy(), found.half_width.copy(), found.covariance
+        covariance = covariance.copy()
+        doubted = []
+        for k, unknown in enumerate(found.unknowns):
+            if unknown.name not in move or not found.has(unknown.name):
+                continue
+            if not unknown.low < value[k] < unknown.high:
+                doubted.append(unknown.name)
+            value[k] += move[unknown.name]
+            doubt = 0.5 * move[unknown.name]
+            covariance[k, k] += doubt**2
+            half[k] = np.hypot(half[k], Z95 * doubt)
+            if half[k] > unknown.room:
+                doubted.append(unknown.name)
+        if not doubted:
+            return replace(found, value=value, half_width=half, covariance=covariance)
+        held += doubted
+
+
+def _shares_of_noise(
+    turning: Callable[[FlightGrid, Windows], np.ndarray],
+    flights: Sequence[FlightGrid],
+    windows: Sequence[Windows],
+) -> np.ndarray:
+    """Return the share (3,) of the rotor speeds' noise in the variance of `turning` (K, 3)."""
+    noise, whole = np.zeros(3), np.zeros(3)
+    for flight, places in zip(flights, windows, strict=True):
+        speed = flight.known["rotor_speed"]
+        other = {**flight.known, "rotor_speed": speed + flight.known[ROTOR_NOISE]}
+        plain, noisy = turning(flight, places), turning(flight._replace(known=other), places)
+        noise += ((noisy - plain) ** 2).sum(axis=0)
+        whole += (plain**2).sum(axis=0)
+    return np.minimum(noise / np.maximum(whole, TINY), 1.0)
 
 
 def _likeliest(

@@ -10,7 +10,7 @@ from policies.formats.delta_file import load_delta
 from suite.common.console import Console
 from suite.delta.fit import FitConfig
 from suite.delta.replay import nominal_model
-from suite.delta.run import fit_delta, split, table
+from suite.delta.run import fit_delta, flight_files, split, table
 from suite.train.config import PointMassConfig
 from tests.support.point_mass_flights import fly
 
@@ -54,3 +54,12 @@ def test_what_cannot_be_split_is_refused():
     for share in (0.0, 1.0, float("nan")):
         with pytest.raises(ValueError, match=f"held_out is {share}"):
             split(log * 2, share, 0)
+
+
+def test_a_flight_that_is_named_twice_counts_once(tmp_path):
+    """It would be fitted and held out, and its errors taken for two flights'."""
+    for name in "ab":
+        (tmp_path / f"{name}.parquet").touch()
+    twice = [tmp_path, tmp_path / "a.parquet", tmp_path / "x" / ".." / "b.parquet"]
+    (tmp_path / "x").mkdir()
+    assert flight_files(twice) == [tmp_path / "a.parquet", tmp_path / "b.parquet"]

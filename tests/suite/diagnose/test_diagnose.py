@@ -27,7 +27,7 @@ from suite.diagnose.verdict.checks import run_checks
 from tests.support.broken_logs import BREAKAGES
 from tests.support.diagnosis_flights import fly
 from tests.support.pendulum import Pendulum
-from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 from tracks.common.files import plain, to_json
 
 LAGGED = with_lag(PLAIN, 0.03)
@@ -54,6 +54,19 @@ def test_flights_of_the_vehicle_itself_have_no_gap():
     found = diagnosis_json(diagnose(flights(LAGGED), LAGGED))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
     assert 0.8 < found["gap"]["before"] < 1.2
+
+
+def test_behind_a_loop_that_remembers_measured_rotors_drive():
+    """What its integrators hold where a stretch begins is in no log."""
+    remembering = with_lag(REMEMBERING, 0.03)
+    whole = diagnosis_json(diagnose(flights(remembering, motors=True), remembering))
+    assert 0.8 < whole["gap"]["before"] < 1.3
+    truth = (0.2, 0.2, 0.1)
+    dragged = with_effects(remembering, linear_drag=(truth,))
+    found = diagnosis_json(diagnose(flights(dragged, motors=True), remembering))
+    assert found["gap"]["before"] > 5.0 and found["gap"]["after"] < 1.3
+    (drag,) = [effect for effect in found["effects"] if effect["name"] == "linear_drag"]
+    np.testing.assert_allclose(drag["parameters"]["coefficient"]["value"], truth, atol=0.03)
 
 
 def test_a_drag_is_named_with_its_value(drag):

@@ -9,15 +9,23 @@ from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
 from suite.diagnose.run_views import only_views
+from tests.support.diagnosis_flights import fly
 from tests.support.real_flights import VEHICLE, flights
+from tests.support.vehicles import PLAIN, REMEMBERING
 
 
 def test_logs_without_what_a_rollout_needs_go_by_views():
     (log,) = flights(1, duration_s=2.0)
-    assert not only_views([log])
-    assert only_views([replace(log, about={"partial": ["quat"]})])
+    assert not only_views([log], VEHICLE)
+    assert only_views([replace(log, about={"partial": ["quat"]})], VEHICLE)
     driven = replace(log, rotor_speed=None, thrust_cmd=None, rate_cmd_b=None)
-    assert only_views([replace(driven, pwm=np.full((len(log.time_s), 4), 0.5))])
+    assert only_views([replace(driven, pwm=np.full((len(log.time_s), 4), 0.5))], VEHICLE)
+
+
+def test_a_loop_that_remembers_goes_by_views_where_no_rotor_speeds_were_measured():
+    commands = fly(PLAIN, 0, duration_s=2.0)
+    assert not only_views([commands], PLAIN) and only_views([commands], REMEMBERING)
+    assert not only_views([fly(PLAIN, 0, duration_s=2.0, motors=True)], REMEMBERING)
 
 
 def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
@@ -27,12 +35,14 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
         for number, log in enumerate(flights(3, seed=seed, speed=1.0, hidden=effects)):
             write_flight(tmp_path / folder / f"{number}.parquet", log)
     words = ["diagnose", str(tmp_path / "new"), "--reference", str(tmp_path / "old"), "--plan",
-             "--vehicle", str(tmp_path / "v.toml"), "--out", str(tmp_path / "out")]  # fmt: skip
+             "--drive", "motors", "--vehicle", str(tmp_path / "v.toml"),
+             "--out", str(tmp_path / "out")]  # fmt: skip
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     names = {name for e in told["effects"] for name in (e["name"], *e["alternatives"])}
     assert "mass_offset" in names and told["views"] and len(told["reference"]) == 3
-    assert any("--plan" in line for line in told["warnings"])
+    for flag in ("--plan", "--drive"):
+        assert any(flag in line for line in told["warnings"])
     for axis in told["gap"]["channels"]["force"].values():
         assert {"before", "after", "noise_floor", "repeatability"} <= set(axis)
     assert json.loads((tmp_path / "out/diagnosis.json").read_text())["verdict"] == told["verdict"]

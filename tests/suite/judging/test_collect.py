@@ -4,8 +4,21 @@ import json
 
 import eval.judging.judge
 import eval.logs.flight_log
+import suite.judging.collect
 from eval.logs.flight_log import read_flight
 from suite import cli
+
+COURSE = """
+[[gates]]
+center = [0.0, 0.0, 1.3]
+width = 1.0
+height = 1.0
+
+[[gates]]
+center = [5.0, 0.0, 1.3]
+width = 1.0
+height = 1.0
+"""
 
 
 def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkeypatch, capfd):
@@ -33,6 +46,35 @@ def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkey
     assert cli.main([*args, "--json"]) == 0
     assert [trial.seed for trial in flown] == [8]
     assert json.loads(capfd.readouterr().out)["flights"] == found["flights"]
+
+
+def test_flights_of_another_course_or_code_are_not_taken_for_its_own(
+    pilots, tmp_path, monkeypatch, capfd
+):
+    track, out = tmp_path / "course.toml", tmp_path / "flights"
+    args = ["collect", "--policy", pilots["diver"], "--track", str(track), "--out", str(out)]
+    track.write_text(COURSE)
+    assert cli.main(args) == 0
+    track.write_text(f"# in other words\n{COURSE}")
+    assert cli.main(args) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(suite.judging.collect, "git_commit", lambda: "another")
+        assert cli.main(args) == 2
+    assert "another version of the code" in capfd.readouterr().err
+    track.write_text(COURSE.replace("1.0", "1.1"))
+    assert cli.main(args) == 2
+    assert "another collection" in capfd.readouterr().err
+
+
+def test_tracks_whose_logs_would_have_one_name_are_refused(pilots, tmp_path, capfd):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "course.toml").write_text(COURSE)
+    tracks = ",".join(str(tmp_path / name / "course.toml") for name in "ab")
+    args = ["collect", "--policy", pilots["diver"], "--track", tracks]
+    assert cli.main([*args, "--out", str(tmp_path / "out")]) == 2
+    assert "more than one is called 'course'" in capfd.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_flight_of_under_a_second_is_no_log(pilots, tmp_path, capfd):

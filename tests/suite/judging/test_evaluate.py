@@ -62,6 +62,28 @@ def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkey
     assert again == whole
 
 
+def test_trials_flown_before_under_another_label_are_the_same_policys(
+    pilots, tmp_path, monkeypatch
+):
+    """Alone a policy is called by its name, beside a namesake by its path."""
+    args = ["--track", "zigzag", "--trials", "2", "--policy", pilots["diver"]]
+    fly = eval.judging.judge.fly
+
+    def one_only(policy, trials, vehicle, world, options, on_result, **rest):
+        def keep(result, flight):
+            on_result(result, flight)
+            raise KeyboardInterrupt
+
+        return fly(policy, trials, vehicle, world, options, keep, **rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(eval.judging.judge, "fly", one_only)
+        assert _eval(tmp_path / "out", *args) == 130
+    assert _eval(tmp_path / "out", *args, "--policy", pilots["diver2"]) == 0
+    rows = read_trials(tmp_path / "out" / "trials.parquet")
+    assert [row.policy for row in rows] == [pilots[p] for p in ("diver", "diver2") for _ in "ab"]
+
+
 def test_a_journal_of_something_else_is_not_mixed_in(pilots, tmp_path, monkeypatch, capsys):
     def interrupted(*args, **rest):
         raise KeyboardInterrupt

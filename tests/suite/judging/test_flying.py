@@ -6,17 +6,21 @@ from pathlib import Path
 import pytest
 
 from eval.judging.results import read_trials
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite import cli
 from suite.judging.flying import (
     cost_of,
     flying_needs,
     labels,
     load_flier,
+    read_course,
     trial_list,
     who_flies,
     workers_for,
 )
+from suite.judging.requests import Evaluation
 from tests.support.engines import STAND_IN
+from tests.support.vehicles import with_effects
 from tracks.common.work.travel import pack
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -40,6 +44,20 @@ def test_a_track_file_is_flown_once_a_seed(pilots, tmp_path):
     assert _eval(tmp_path / "out", *args) == 0
     (row,) = read_trials(tmp_path / "out" / "trials.parquet")
     assert (row.track, row.difficulty, row.ended_by) == (track, 0, "collision")
+
+
+def test_where_nothing_acts_by_chance_a_track_file_is_flown_once(tmp_path):
+    """Further seeds are the same flight, and would make the interval of a rate too narrow."""
+    track = str(ROOT / "tracks" / "examples" / "yard.toml")
+    course = read_course(Evaluation(track=f"{track},zigzag", difficulty="0", trials=3))
+    assert [t.seed for t in course.trials if t.track == track] == [0]
+    assert len(course.trials) == 4
+    (note,) = course.notes
+    assert "flown once, not 3 times" in note
+    gusts = tmp_path / "gusts.toml"
+    save_vehicle(with_effects(load_vehicle("reference"), gusts=(1.0, 5.0)), gusts, "for a test")
+    course = read_course(Evaluation(track=track, difficulty="0", trials=3, vehicle=str(gusts)))
+    assert len(course.trials) == 3 and not course.notes
 
 
 def test_more_trials_take_more_processes_up_to_what_there_is(monkeypatch):

@@ -53,8 +53,18 @@ def acting_rotors(log: FlightLog, vehicle: Vehicle) -> ActingRotors | None:
 
 
 def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
-    """Return the speeds that follow `wanted` (N, 4), each held until the next row."""
+    """Return the speeds that follow `wanted` (N, 4), each held until the next row.
+
+    They do so after the vehicle's delay, by its lag.
+    """
+    effects = vehicle.effects
+    if "command_delay" in effects:
+        since = log.time_s - float(effects["command_delay"].delay)
+        row = np.searchsorted(log.time_s, since + 1e-9, side="right") - 1
+        wanted = wanted[np.maximum(row, 0)]
     lag = vehicle.rotors.time_constant
+    if "motor_lag" in effects:
+        lag = float(effects["motor_lag"].time_constant)
     if lag <= 0.0:
         return wanted
     left = np.exp(-np.diff(log.time_s) / lag)[:, None]

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from eval.importers import import_log
-from eval.importers.checks.attitude import body_turns
-from eval.importers.checks.motion import check_velocity
+from eval.importers.checks.attitude import body_turns, check_attitude
+from eval.importers.checks.motion import check_frames, check_velocity
 from eval.importers.checks.units import check_units
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, Signal
@@ -173,3 +173,24 @@ def test_a_velocity_in_centimetres_is_told_by_the_path():
     (finding,) = check_velocity(rows, fix=True)
     assert finding.level == "corrected" and "in world axes and cm/s" in finding.text
     np.testing.assert_allclose(rows["vel"], vel, rtol=1e-12)
+
+
+def test_commanded_torques_and_attitudes_turn_with_what_they_are_held_against():
+    good = flight(noise=0.0)
+    good |= {"cmd_quat": good["quat"], "cmd_torque": good["rate"]}
+    body = {name: good[name] @ FLIP for name in ("rate", "acc", "cmd_rate", "cmd_torque")}
+    turned = {name: good[name] * [1, 1, -1, -1] for name in ("quat", "cmd_quat")}
+    rolled = {name: good[name][:, [1, 2, 3, 0]] for name in ("quat", "cmd_quat")}
+    world = {name: good[name] @ FLIP for name in ("pos", "vel")}
+    for check, rows in ((check_frames, good | body | turned | world),
+                        (check_attitude, good | body | rolled)):  # fmt: skip
+        assert [finding.level for finding in check(rows, True)] == ["corrected"]
+        for name in ("cmd_torque", "cmd_quat", "quat", "rate"):
+            np.testing.assert_allclose(rows[name], good[name], atol=1e-12)
+
+
+def test_without_positions_units_are_told_by_the_attitude_alone():
+    good = flight(noise=0.0)
+    signals = {n: Signal(good["time"], good[n]) for n in ("quat", "rate", "vel")}
+    _, (finding,) = check_units(Recording("log", signals), True)
+    assert finding.level == "ok" and "position" not in finding.text

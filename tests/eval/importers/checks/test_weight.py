@@ -33,6 +33,15 @@ def test_a_factor_with_a_name_is_put_right(factor, words):
     np.testing.assert_allclose(given["motor"], HOVER * factor)
 
 
+@pytest.mark.parametrize("factor", [6.5, 11.0, 11.5, 10.2])
+def test_a_factor_between_two_names_is_left_to_its_owner(factor):
+    """By either the speeds would look well; the wrong one would be off by a sixth or less."""
+    given = rows(factor)
+    finding = check_weight(given, PLAIN, True)[0]
+    assert finding.level == "doubt" and " or " in finding.text
+    np.testing.assert_allclose(given["motor"], HOVER * factor)
+
+
 def test_a_factor_without_a_name_is_a_doubt():
     assert check_weight(rows(2.5), PLAIN, True)[0].level == "doubt"
     assert check_weight(rows(), None, True)[0].level == "note"

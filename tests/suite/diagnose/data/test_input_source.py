@@ -7,7 +7,7 @@ import pytest
 
 from suite.diagnose.data.input_source import another_controller, rotors_are_input
 from tests.support.diagnosis_flights import fly
-from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)
 
@@ -29,9 +29,18 @@ def test_the_columns_decide_what_can_be_the_input():
     log = fly(LAGGED, 0, duration_s=2.0, motors=True)
     no_motors = replace(log, rotor_speed=None)
     no_commands = replace(log, thrust_cmd=None, rate_cmd_b=None)
-    assert not rotors_are_input([log], "auto") and rotors_are_input([log], "motors")
-    assert rotors_are_input([log, no_commands], "auto")
+    assert not rotors_are_input([log], "auto", LAGGED)
+    assert rotors_are_input([log], "motors", LAGGED)
+    assert rotors_are_input([log, no_commands], "auto", LAGGED)
     with pytest.raises(ValueError, match="not every flight"):
-        rotors_are_input([log, no_motors], "motors")
+        rotors_are_input([log, no_motors], "motors", LAGGED)
     with pytest.raises(ValueError, match="auto, commands, motors"):
-        rotors_are_input([log], "wheels")
+        rotors_are_input([log], "wheels", LAGGED)
+
+
+def test_commands_drive_no_loop_that_remembers():
+    log = fly(LAGGED, 0, duration_s=2.0, motors=True)
+    assert rotors_are_input([log], "auto", REMEMBERING)
+    for given, drive in ((log, "commands"), (replace(log, rotor_speed=None), "auto")):
+        with pytest.raises(ValueError, match="crazyflie rate loop remembers"):
+            rotors_are_input([given], drive, REMEMBERING)

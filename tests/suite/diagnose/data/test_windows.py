@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut, take
 from suite.diagnose.thresholds import Thresholds
@@ -71,5 +72,19 @@ def test_a_hole_is_stepped_over_and_a_log_of_holes_is_named():
     holed = replace(log, **arrays)
     windows, _ = cut([holed], PLAIN, False)
     assert windows is not None and windows.start_s.min() > 1.1
+    assert windows.start_s.min() > 1.15 + BURN_IN_S, "the rotors follow commands before it"
     none, warnings = cut([holed], PLAIN, False, limits=Thresholds(longest_hole_s=1e-3))
     assert none is None and warnings == [f"{log.name}: no stretch of 1.3 s without a hole"]
+
+
+@pytest.mark.parametrize("rotor_input", [False, True])
+def test_what_drives_must_be_known_all_the_way(rotor_input):
+    """A row is there, but not what drives: between two that say it, it would be made up."""
+    log = fly(PLAIN, 0, duration_s=4.0, motors=True)
+    name = "rotor_speed" if rotor_input else "rate_cmd_b"
+    lost = np.array(getattr(log, name))
+    lost[(log.time_s > 0.8) & (log.time_s < 1.15)] = np.nan
+    windows, _ = cut([replace(log, **{name: lost})], PLAIN, rotor_input)
+    assert windows is not None and windows.start_s.min() > 1.15 + BURN_IN_S
+    other = cut([replace(log, **{name: lost})], PLAIN, not rotor_input)[0]
+    assert other is not None and other.start_s.min() < 0.5

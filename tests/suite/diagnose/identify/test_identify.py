@@ -9,6 +9,7 @@ import pytest
 from eval.judging.statistics import wilson
 from suite.diagnose.identify.identify import identify
 from suite.diagnose.identify.numbers import as_json
+from suite.diagnose.plans.fleets import Fleet, logs_of
 from tests.support import identified as known
 
 TRUE = {
@@ -49,6 +50,23 @@ def test_what_flights_tell_is_near_the_truth(drive, least):
     assert found.drive == drive
     assert len(off) >= least
     assert np.max(np.abs(list(off.values()))) < 2.5
+
+
+@pytest.mark.parametrize("noise", [2.0, 4.0])
+def test_noise_of_the_rotor_speeds_makes_no_body_heavier_to_turn(noise):
+    """Without a chirp they say little of the inertia: less than its own noise, and then nothing."""
+    fleet = Fleet(known.truth(), known.WAYS[:3])
+    for seed in range(4):
+        logs = logs_of(
+            fleet,
+            known.recordings(known.WAYS[:3]),
+            "rotors",
+            np.random.default_rng(seed),
+            sensors=replace(known.SENSORS, rotor=noise),
+        )
+        (entry,) = [n for n in identify(logs, known.start()).numbers if n.key == "inertia"]
+        for value, true, span in zip(entry.value, TRUE["inertia"], entry.ci95, strict=True):
+            assert span is None or abs(np.log(value / true)) < 0.2
 
 
 @pytest.fixture(scope="module")

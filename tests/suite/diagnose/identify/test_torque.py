@@ -5,7 +5,14 @@ import pytest
 
 from suite.diagnose.identify.data.drive import delayed, lagged
 from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
-from suite.diagnose.identify.torque import fit_rotor_lag, inertia_ratio, lag_and_delay, unknowns_of
+from suite.diagnose.identify.fit import Fitted
+from suite.diagnose.identify.torque import (
+    fit_rotor_lag,
+    inertia_ratio,
+    lag_and_delay,
+    undiluted,
+    unknowns_of,
+)
 
 
 @pytest.mark.parametrize(
@@ -18,6 +25,27 @@ from suite.diagnose.identify.torque import fit_rotor_lag, inertia_ratio, lag_and
 )
 def test_what_is_looked_for(drive, names):
     assert [unknown.name for unknown in unknowns_of(drive, 0.03, 0.0)] == names
+
+
+def _found(value, held=()):
+    unknowns = [u for u in unknowns_of("rotors", 0.03, 0.0) if u.name in ("inertia_x", "yaw")]
+    half = np.array([np.nan if u.name in held else 0.1 for u in unknowns])
+    return Fitted(tuple(unknowns), np.array(value), half, 0.0025 * np.eye(2), tuple(held))
+
+
+def test_the_share_of_noise_is_taken_off_and_doubted_by_half():
+    found = undiluted(lambda held: _found([0.5, -0.2], held), lambda _: np.array([0.2, 0, 0.1]), [])
+    np.testing.assert_allclose(found.value, [0.5 + np.log(0.8), -0.2 - np.log(0.9)])
+    doubt = 0.5 * np.log([0.8, 0.9])
+    np.testing.assert_allclose(found.half_width, np.hypot(0.1, 1.96 * doubt))
+    np.testing.assert_allclose(np.diag(found.covariance), 0.0025 + doubt**2)
+
+
+@pytest.mark.parametrize(("value", "noise"), [(2.0, 0.0), (0.5, 0.5), (0.5, 1.0)])
+def test_what_is_at_its_limit_or_mostly_noise_is_not_told(value, noise):
+    shares = np.array([noise, 0.0, 0.0])
+    found = undiluted(lambda held: _found([value, -0.2], held), lambda _: shares, [])
+    assert found.untold == ("inertia_x",) and found.has("yaw")
 
 
 def test_rotors_behind_their_commands_tell_lag_and_delay():

@@ -15,6 +15,7 @@ from suite.diagnose.views.data.rows import rows_of
 from suite.diagnose.views.data.view import FORCE, TORQUE, smoothed
 from suite.diagnose.views.data.weak_form import weak_form
 from tests.support.real_flights import VEHICLE, flights
+from tests.support.vehicles import with_effects
 
 
 def level(time_s, vel_w, **columns):
@@ -69,6 +70,20 @@ def test_motor_commands_give_the_speeds_of_the_vehicles_map_and_lag():
     assert lagged is not None
     speed = lagged.speed[:, 0]
     after = speed[np.searchsorted(time_s, 1.0 + VEHICLE.rotors.time_constant)]
+    assert after == pytest.approx(speed[0] + (1 - np.exp(-1)) * (speed[-1] - speed[0]), rel=0.02)
+
+
+def test_delay_and_lag_of_the_vehicle_file_are_those_of_its_effects():
+    time_s = np.arange(0.0, 2.0, 0.01)
+    step = np.where(time_s[:, None] < 1.0, 0.3, 0.6) * np.ones(4)
+    log = level(time_s, np.zeros((200, 3)), pwm=step)
+    vehicle = replace(VEHICLE, motors=MotorMap((0.0, 8.0), 3.7, 0.0))
+    slow = with_effects(vehicle, motor_lag=(0.1,), command_delay=(0.05,))
+    lagged = acting_rotors(log, slow)
+    assert lagged is not None
+    speed = lagged.speed[:, 0]
+    assert np.ptp(speed[time_s < 1.045]) == 0.0
+    after = speed[np.searchsorted(time_s, 1.15 - 1e-9)]
     assert after == pytest.approx(speed[0] + (1 - np.exp(-1)) * (speed[-1] - speed[0]), rel=0.02)
 
 
