@@ -71,6 +71,24 @@ def typical_variance(energy: np.ndarray, freedom: np.ndarray | int) -> np.ndarra
     return np.median(energy / freedom / (1.0 - 2.0 / (9.0 * freedom)) ** 3, axis=0)
 
 
+def noise_like(speed: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
+    """Return a draw of noise (T, R) as large as that of each rotor's `speed`; NaN where that is.
+
+    What it does to a sum over rows theirs does as well. Noise is what a cubic over few rows leaves.
+    """
+    block, degree = limits.rotor_noise_rows, limits.noise_degree
+    rows = len(speed) // block * block
+    blocks = speed[:rows].reshape(-1, block, speed.shape[1])
+    blocks = blocks[np.isfinite(blocks).all(axis=(1, 2))]
+    if not len(blocks):
+        return np.zeros_like(speed)
+    basis = np.linalg.qr(_powers(np.arange(block, dtype=float), degree))[0]
+    left = blocks - np.einsum("rp,qp,bqm->brm", basis, basis, blocks)
+    sigma = np.sqrt(typical_variance((left**2).sum(axis=1), block - degree - 1))
+    draw = sigma * np.random.default_rng(0).standard_normal(speed.shape)
+    return np.where(np.isfinite(speed), draw, np.nan)
+
+
 def _powers(time_s: np.ndarray, degree: int) -> np.ndarray:
     span = max(float(time_s[-1] - time_s[0]), 1e-9)
     return np.vander((time_s - time_s.mean()) / span, degree + 1)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.data.noise import typical_variance
+from suite.diagnose.data.noise import noise_like
 from tracks.geometry.rotation import quat_to_rot
 
 STEP_S = 0.004
@@ -25,8 +25,6 @@ HOLE_STEPS = 4.0
 ROTOR_NOISE = "rotor_noise"
 """A draw of noise as large as that of the rotor speeds' rows: what it does to a window theirs does
 as well."""
-NOISE_ROWS = 8
-"""Rows over which a cubic is taken off rotor speeds; what is left is noise."""
 VOLTAGE_S = 0.04
 """The voltage's noise is averaged over about this [s]."""
 
@@ -77,7 +75,7 @@ def grid_of(log: FlightLog) -> FlightGrid:
         if values is not None and np.isfinite(values).any():
             known[name] = _joined(time_s, values, grid)
     if "rotor_speed" in known and log.rotor_speed is not None:
-        known[ROTOR_NOISE] = _joined(time_s, _noise_like(log.rotor_speed), grid)
+        known[ROTOR_NOISE] = _joined(time_s, noise_like(log.rotor_speed), grid)
     if np.isfinite(log.quat_wxyz).any():
         known["rot_w"] = quat_to_rot(_attitude(time_s, log.quat_wxyz, grid))
         if "rate_b" not in known:
@@ -141,20 +139,6 @@ def _joined(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndar
     out = np.stack([np.interp(grid, t, column) for column in v.T], axis=1)
     out[_in_hole(t, grid)] = np.nan
     return out
-
-
-def _noise_like(speed: np.ndarray) -> np.ndarray:
-    """Return noise (T, 4) as large as that of each rotor's `speed`; NaN where that is."""
-    rows = len(speed) // NOISE_ROWS * NOISE_ROWS
-    blocks = speed[:rows].reshape(-1, NOISE_ROWS, 4)
-    blocks = blocks[np.isfinite(blocks).all(axis=(1, 2))]
-    if not len(blocks):
-        return np.zeros_like(speed)
-    basis = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, NOISE_ROWS), 4))[0]
-    left = blocks - np.einsum("rp,qp,bqm->brm", basis, basis, blocks)
-    sigma = np.sqrt(typical_variance((left**2).sum(axis=1), NOISE_ROWS - 4))
-    draw = sigma * np.random.default_rng(0).standard_normal(speed.shape)
-    return np.where(np.isfinite(speed), draw, np.nan)
 
 
 def _attitude(time_s: np.ndarray, quat: np.ndarray, grid: np.ndarray) -> np.ndarray:

@@ -8,12 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.mixer import mixer_matrix
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.views.data.completed import completed
-from suite.diagnose.views.data.rotors import acting_rotors
+from suite.diagnose.views.data.rotors import ActingRotors, acting_rotors
 from suite.diagnose.views.data.rows import FlightRows, rows_of
-from suite.diagnose.views.data.view import FORCE, TORQUE, SmoothedFlight, View, smoothed
+from suite.diagnose.views.data.view import (
+    FORCE,
+    TORQUE,
+    SmoothedFlight,
+    View,
+    calibrated,
+    smoothed,
+)
 
 SLOW_WIDTH_S = 1.0
 """Width of the bumps where rates come from a path, which tells them as means over a second [s]."""
@@ -60,6 +68,11 @@ def ready(
         slow = any("rate" in log.partial for log in logs)
         views.append(replace(TORQUE, width_s=SLOW_WIDTH_S) if slow else TORQUE)
     parts = {view.name: [smoothed(view, one, limits) for one in rows] for view in views}
+    if TORQUE.name in parts:
+        parts[TORQUE.name] = [
+            _calibrated(flight, one, vehicle)
+            for flight, one in zip(parts[TORQUE.name], acting, strict=True)
+        ]
     for number, log in enumerate(logs):
         if not len(parts[FORCE.name][number].form.middle_s):
             raise ValueError(
@@ -74,6 +87,26 @@ def ready(
     )
 
 
+def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) -> SmoothedFlight:
+    if rotors.noise is None:
+        return flight
+    speed, noise = np.nan_to_num(rotors.speed), np.nan_to_num(rotors.noise)
+    turned, noisy = (_turning(vehicle, given) for given in (speed, speed + noise))
+    return calibrated(flight, turned, noisy - turned)
+
+
+def _turning(vehicle: Vehicle, speed: np.ndarray) -> np.ndarray:
+    """Return the angular accelerations (N, 3) [rad/s^2] that rotors at `speed` (N, 4) make."""
+    rotors = vehicle.rotors
+    twist = rotors.torque_coefficient / rotors.thrust_coefficient
+    torque_b = (
+        rotors.thrust_coefficient
+        * speed**2
+        @ mixer_matrix(np.asarray(rotors.position), np.asarray(rotors.spin), twist)[1:].T
+    )
+    return torque_b / np.asarray(vehicle.inertia)
+
+
 def parted(
     flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
 ) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]]]:
@@ -86,10 +119,12 @@ def parted(
         )
     first, last = {}, {}
     for view in flights.views:
-        rows = flights.smoothed[view.name][0].rows
+        whole = flights.smoothed[view.name][0]
+        rows, credible = whole.rows, whole.credible
         early = rows.time_s <= limits.lone_fitted_share * rows.time_s[-1]
-        first[view.name] = [smoothed(view, _only(rows, early), limits)]
-        last[view.name] = [smoothed(view, _only(rows, ~early), limits)]
+        for part, chosen in ((first, early), (last, ~early)):
+            some = smoothed(view, _only(rows, chosen), limits)
+            part[view.name] = [some._replace(credible=credible)]
     return first, last
 
 

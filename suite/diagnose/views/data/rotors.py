@@ -11,6 +11,7 @@ from eval.quadrotor.mixer import mix
 from eval.quadrotor.plant import nominal_quadrotor
 from eval.vehicles.motors import motor_speed
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.resample import interpolate
 
 
@@ -23,6 +24,8 @@ class ActingRotors(NamedTuple):
     """For people."""
     each: bool
     """Whether each rotor's own is known; of a collective thrust only their sum is."""
+    noise: np.ndarray | None = None
+    """(N, 4) a draw of noise as large as the speed's own [rad/s]; None where none was measured."""
 
 
 def acting_rotors(log: FlightLog, vehicle: Vehicle) -> ActingRotors | None:
@@ -31,7 +34,8 @@ def acting_rotors(log: FlightLog, vehicle: Vehicle) -> ActingRotors | None:
     What was asked for is followed by the vehicle's lag.
     """
     if log.rotor_speed is not None:
-        return ActingRotors(log.rotor_speed, "measured rotor speeds", True)
+        noise = noise_like(log.rotor_speed)
+        return ActingRotors(log.rotor_speed, "measured rotor speeds", True, noise)
     if log.rotor_speed_cmd is not None:
         return ActingRotors(_lagged(log, vehicle, log.rotor_speed_cmd), "motor commands", True)
     if log.pwm is not None and vehicle.motors is not None:

@@ -37,6 +37,7 @@ def compare(
         value = mean @ forces.value[:, view.columns]
         slope = forces.slope[:, view.columns].reshape(len(forces.slope), -1)
         slope = (mean @ slope).reshape(count, 3, -1)
+        value, slope = (_believed(part, flight.credible) for part in (value, slope))
         residual = flight.measured - value
         if view.in_world:
             to_body = np.swapaxes(flight.rows.rot_w[flight.form.middle_row], 1, 2)
@@ -46,3 +47,11 @@ def compare(
         residual[:, dumb], slope[:, dumb] = 0.0, 0.0
         parts.append(ViewData(np.full(count, number), flight.form.middle_s, value, residual, slope))
     return ViewData(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+
+
+def _believed(series: np.ndarray, credible: np.ndarray) -> np.ndarray:
+    """Return `series` (M, 3, ...) with as much of its changes as is `credible` (3,)."""
+    if not len(series) or (credible == 1.0).all():
+        return series
+    mean = series.mean(axis=0)
+    return mean + credible.reshape(3, *[1] * (series.ndim - 2)) * (series - mean)

@@ -92,3 +92,10 @@ def test_a_wind_is_named_alone_where_the_file_has_the_drag():
     logs = flights(4, headings=(0.3,), **{**SLOW, "constant_wind": ((1.5, -2.0, 0.0),)})
     found, _ = names(logs, with_effects(VEHICLE, linear_drag=(SIDE,)))
     assert set(found) == {"constant_wind"} and not any("+" in n for n in found["constant_wind"])
+
+
+def test_noise_of_the_rotor_speeds_is_no_inertia_and_no_thrust():
+    """Noise in what drives makes every slope smaller, as more inertia would."""
+    for seed, speed in ((202, 3.0), (204, 1.5)):
+        found = diagnose_by_views(flights(4, seed=seed, speed=speed), VEHICLE)
+        assert found.verdict == "no_gap"

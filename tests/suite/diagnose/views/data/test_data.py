@@ -138,3 +138,24 @@ def test_the_measured_side_of_a_view_is_a_mean_acceleration():
     vel_w = np.stack([1.5 * time_s, 0.0 * time_s, -0.5 * time_s], axis=1)
     rows = rows_of(level(time_s, vel_w), VEHICLE, np.full((200, 4), hover_speed()))
     assert np.allclose(smoothed(FORCE, rows).measured, [1.5, 0.0, -0.5])
+
+
+def test_a_model_is_believed_as_far_as_its_rotors_are_measured():
+    """By the share of noise in what its torque changes by; a quiet rotor's is believed whole."""
+    rng = np.random.default_rng(0)
+    time_s = np.arange(0.0, 20.0, 0.01)
+    swing = np.sin(2.0 * np.pi * 1.5 * time_s)
+    true = 900.0 + 4.0 * swing[:, None] * [1.0, 1.0, -1.0, -1.0]
+    log = level(time_s, np.zeros((len(time_s), 3)))
+    for sigma, least, most in ((0.0, 0.99, 1.0), (6.0, 0.6, 0.95)):
+        speed = true + sigma * rng.standard_normal(true.shape)
+        (flight,) = ready([replace(log, rotor_speed=speed)], VEHICLE).smoothed["torque"]
+        truth, seen = (flight.form.mean @ _about_x(part) for part in (true, speed))
+        slope = np.sum(truth * seen) / np.sum(seen**2)
+        assert least <= flight.credible[0] <= most
+        assert flight.credible[0] == pytest.approx(slope, abs=0.05)
+
+
+def _about_x(speed):
+    torque = speed**2 @ np.asarray(VEHICLE.rotors.position)[:, 1]
+    return torque - torque.mean()
