@@ -24,12 +24,12 @@ from suite.diagnose.identify.data.drive import (
     with_motors,
 )
 from suite.diagnose.identify.data.grid import FlightGrid, grid_of
+from suite.diagnose.identify.data.start import with_own_numbers
 from suite.diagnose.identify.doubts import doubted
 from suite.diagnose.identify.entries import inertia_of, of_force, of_loop, of_torque, put
 from suite.diagnose.identify.fit import Fitted, NothingWhole, Unknown
 from suite.diagnose.identify.flapping import flapping_of
 from suite.diagnose.identify.numbers import Number, told
-from suite.diagnose.identify.start import with_own_numbers
 from suite.diagnose.identify.untold import unasked, untold
 
 ROUNDS = 2

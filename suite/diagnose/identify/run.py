@@ -12,9 +12,9 @@ from suite.common.console import Console
 from suite.common.provenance import stamp
 from suite.delta.run import flight_files
 from suite.diagnose.fit.parameters import refuse_own_motion
+from suite.diagnose.identify.data.start import unknown_to_the_fits, with_own_numbers
 from suite.diagnose.identify.identify import Identified, identify
 from suite.diagnose.identify.numbers import as_json
-from suite.diagnose.identify.start import unknown_to_the_fits, with_own_numbers
 
 SCHEMA = 1
 PARTS = ("drag", "motors", "inertia", "lag", "loop")

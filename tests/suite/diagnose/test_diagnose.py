@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from eval.effects import EFFECTS, nameable_effects
 from eval.logs.flight_log import write_flight
+from eval.quadrotor.loops import KINDS
 from suite.cli import main
 from suite.common.report import html
 from suite.diagnose.diagnose import diagnose
@@ -67,6 +68,28 @@ def test_behind_a_loop_that_remembers_measured_rotors_drive():
     assert found["gap"]["before"] > 5.0 and found["gap"]["after"] < 1.3
     (drag,) = [effect for effect in found["effects"] if effect["name"] == "linear_drag"]
     np.testing.assert_allclose(drag["parameters"]["coefficient"]["value"], truth, atol=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_behind_firmware_rate_loops_little_is_named_where_nothing_is_hidden(kind, capsys):
+    """And what is hidden is; docs/results.md has what it says."""
+    controller = replace(REMEMBERING.controller, kind=kind, settings=KINDS[kind].Settings())
+    nominal = with_lag(replace(REMEMBERING, controller=controller), 0.03)
+
+    def names(seed, **effects):
+        true = with_effects(nominal, **effects)
+        found = diagnosis_json(diagnose(flights(true, seed=seed, motors=True), nominal))
+        with capsys.disabled():
+            print(kind, seed, effects, found["verdict"], found["effects"])
+        return {effect["name"]: effect["parameters"] for effect in found["effects"]}
+
+    assert sum(bool(names(seed)) for seed in range(100, 160, 10)) <= 1
+    for seed in (100, 110, 120):
+        mass = names(seed, mass_offset=(0.05,))["mass_offset"]["offset"]["value"]
+        assert mass == pytest.approx(0.05, rel=0.1)
+        drag = names(seed, linear_drag=((0.2, 0.2, 0.1),))["linear_drag"]["coefficient"]["value"]
+        np.testing.assert_allclose(drag, (0.2, 0.2, 0.1), atol=0.03)
 
 
 def test_a_drag_is_named_with_its_value(drag):
