@@ -160,9 +160,8 @@ def _starts(log: FlightLog, rotor_input: bool, stride_s: float, hole_s: float) -
         inside = time[(time >= begin_s - 1e-9) & (time <= end_s + 1e-9)]
         # What drives reaches back: the rotors follow it before the start, and it acts late.
         back_s = begin_s - BURN_IN_S - HISTORY_S
-        if len(inside) < 12 or _hole(inside, begin_s, end_s) > hole_s:
-            next_s = begin_s + 0.1
-        elif _hole(driven_s, back_s, end_s) > hole_s:
+        hole = max(_hole(inside, begin_s, end_s), _hole(driven_s, back_s, end_s))
+        if len(inside) < 12 or hole > hole_s:
             next_s = begin_s + 0.1
         else:
             found.append(first)

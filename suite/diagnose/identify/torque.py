@@ -152,19 +152,17 @@ def undiluted(
         found = fitted(held)
         shift = np.log(np.maximum(1.0 - shares(found), TINY))
         move = {"inertia_x": shift[0], "inertia_y": shift[1], "yaw": -shift[2]}
-        value, half, covariance = found.value.copy(), found.half_width.copy(), found.covariance
-        covariance = covariance.copy()
-        doubted = []
+        value, half = found.value.copy(), found.half_width.copy()
+        covariance, doubted = found.covariance.copy(), []
         for k, unknown in enumerate(found.unknowns):
             if unknown.name not in move or not found.has(unknown.name):
                 continue
-            if not unknown.low < value[k] < unknown.high:
-                doubted.append(unknown.name)
+            inside = unknown.low < value[k] < unknown.high
             value[k] += move[unknown.name]
             doubt = 0.5 * move[unknown.name]
             covariance[k, k] += doubt**2
             half[k] = np.hypot(half[k], Z95 * doubt)
-            if half[k] > unknown.room:
+            if not inside or half[k] > unknown.room:
                 doubted.append(unknown.name)
         if not doubted:
             return replace(found, value=value, half_width=half, covariance=covariance)
