@@ -11,7 +11,7 @@ from eval.quadrotor.vehicle_file import save_vehicle
 from eval.vehicles.vehicle import Vehicle
 from suite.common.console import Console
 from suite.common.report import write_report
-from suite.diagnose.data.input_source import forgets
+from suite.diagnose.data.windows import remembers
 from suite.diagnose.report.views_json import views_json
 from suite.diagnose.report.views_page import views_page
 from suite.diagnose.views.by_views import diagnose_by_views
@@ -26,8 +26,7 @@ def only_views(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
     loop that remembers.
     """
     return any(
-        log.partial
-        or (log.rotor_speed is None and (log.rate_cmd_b is None or not forgets(vehicle)))
+        log.partial or (log.rotor_speed is None and (log.rate_cmd_b is None or remembers(vehicle)))
         for log in logs
     )
 

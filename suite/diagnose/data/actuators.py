@@ -184,7 +184,7 @@ def _mismatch(
     nominal = followed([part.demand(0.0) for part in stretches], lag)
     fitted = followed([part.demand(delay) for part in stretches], time_constant)
     scale = scales(fitted)
-    thrust, turn = _wrench_difference(measured, nominal, vehicle)
+    thrust, turn = wrench_difference(measured, nominal, vehicle)
     return ActuatorMismatch(
         asked_by=asked_by,
         rms=_rms(measured - nominal),
@@ -204,7 +204,7 @@ def _follow(asked: np.ndarray, row: np.ndarray, dt: float, time_constant: float)
     return np.concatenate([asked[:1], follow_lag(asked, dt, time_constant)])[row]
 
 
-def _wrench_difference(
+def wrench_difference(
     measured: np.ndarray, asked: np.ndarray, vehicle: Vehicle
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return thrust over mass (N,) and angular acceleration (N, 3) of measured minus asked."""

@@ -12,16 +12,8 @@ from eval.quadrotor.plant import make_plant
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.actuators import rate_loop_demand
 from suite.diagnose.data.resample import follow_lag
-from suite.diagnose.data.windows import step_s
+from suite.diagnose.data.windows import remembers, step_s
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-
-
-def forgets(vehicle: Vehicle) -> bool:
-    """Return whether the rate loop's output follows from the rates of now and the command alone.
-
-    What a firmware's loop (integrators, filters) remembers where a stretch begins is in no log.
-    """
-    return vehicle.controller.kind == "p"
 
 
 def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) -> bool:
@@ -38,14 +30,14 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) ->
         raise ValueError("some flights have commands only and some rotor speeds only: sort them")
     if (drive == "commands" and not commands) or (drive == "motors" and not motors):
         raise ValueError(f"drive = {drive!r}, but not every flight has them")
-    if not forgets(vehicle) and (drive == "commands" or not motors):
+    if remembers(vehicle) and (drive == "commands" or not motors):
         raise ValueError(
             f"{vehicle.name}: no log says what its {vehicle.controller.kind} rate loop remembers "
             "where a stretch of a flight begins, so that commands cannot drive rollouts; give "
             "flights with measured rotor speeds (--drive motors), or a vehicle with a controller "
             "of kind p"
         )
-    return drive == "motors" or not commands or not forgets(vehicle)
+    return drive == "motors" or not commands or remembers(vehicle)
 
 
 def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:

@@ -14,6 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.loops import NOMINAL
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.resample import interpolate
 from suite.diagnose.data.steps import LONGEST_S, StepGrid, padded_grid, step_grid, with_lost_rows
@@ -101,6 +102,14 @@ class FlightWindows(NamedTuple):
 def step_s(vehicle: Vehicle) -> float:
     """Return about the length of a step [s]: the rate loop's period, at least 2 ms."""
     return max(1.0 / vehicle.controller.frequency, LONGEST_S)
+
+
+def remembers(vehicle: Vehicle) -> bool:
+    """Return whether the rate loop is a firmware's, with integrators and filters.
+
+    What it remembers where a stretch of a flight begins is in no log.
+    """
+    return vehicle.controller.kind != NOMINAL
 
 
 def cut(
@@ -320,7 +329,7 @@ def _rotors(at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicl
     asks for changes all the time, by filtered slopes of rates: a smooth curve is nearer then.
     """
     good = np.flatnonzero(np.isfinite(speed).all(axis=1))
-    if vehicle.controller.kind != "p":
+    if remembers(vehicle):
         return CubicSpline(time[good], speed[good])(at)
     row = np.clip(np.searchsorted(time[good], at, side="right") - 1, 0, len(good) - 2)
     before, after = good[row], good[row + 1]

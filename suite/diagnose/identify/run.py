@@ -12,7 +12,7 @@ from suite.common.console import Console
 from suite.common.provenance import stamp
 from suite.delta.run import flight_files
 from suite.diagnose.fit.parameters import refuse_own_motion
-from suite.diagnose.identify.data.start import unknown_to_the_fits, with_own_numbers
+from suite.diagnose.identify.data.start import unknown_to_the_fits
 from suite.diagnose.identify.identify import Identified, identify
 from suite.diagnose.identify.numbers import as_json
 
@@ -46,7 +46,7 @@ def identify_files(
     refuse_own_motion(start)
     logs, warnings = read_flights(flight_files(flights), partial=True)
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
-    if beside := unknown_to_the_fits(with_own_numbers(start, True)):
+    if beside := unknown_to_the_fits(start):
         warnings = [
             *warnings,
             f"{start.name} has {', '.join(beside)} besides: the fits do not know of them, so that "

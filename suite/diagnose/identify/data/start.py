@@ -8,55 +8,51 @@ from types import MappingProxyType
 
 import numpy as np
 
+from eval.quadrotor.plant import make_plant
 from eval.vehicles.vehicle import Vehicle
 
+OWN = ("motor_lag", "inertia_scale", "rate_gain")
+"""Effects that scale or replace a number which is fitted."""
 FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
 """Effects that are entries of what is found, and start from where the file has them."""
 
 
 def with_own_numbers(vehicle: Vehicle, known_motors: bool) -> Vehicle:
-    """Return `vehicle` without the effects that scale or replace a number which is fitted.
+    """Return `vehicle` with the numbers that its effects scale or replace, without these.
 
     It flies as before. Left beside the number that flights tell they would count twice.
 
     Args:
         vehicle: as it was given.
-        known_motors: the motors' own thrust is fitted, and no scale of what was commanded.
+        known_motors: the motors' own thrust is fitted, and no scale of what was commanded, so that
+            the effect of that name is one of these as well.
     """
-    effects = dict(vehicle.effects)
-    rotors, motors, inertia = vehicle.rotors, vehicle.motors, np.asarray(vehicle.inertia)
-    controller = vehicle.controller
-    if lag := effects.pop("motor_lag", None):
-        rotors = replace(rotors, time_constant=float(lag.time_constant))
-    if scaled := effects.pop("inertia_scale", None):
-        inertia = inertia * np.asarray(scaled.scale)
-    if gain := effects.pop("rate_gain", None):
-        scale = np.asarray(gain.scale) * np.asarray(controller.rate_gain)
-        controller = replace(controller, rate_gain=_three(scale))
-    if known_motors and (thrust := effects.pop("thrust_scale", None)):
-        scale = float(thrust.scale)
-        rotors = replace(
-            rotors,
-            thrust_coefficient=scale * rotors.thrust_coefficient,
-        )
-        if motors is not None:
-            first, second = motors.thrust
-            motors = replace(motors, thrust=(scale * first, scale * second))
+    names = (*OWN, "thrust_scale") if known_motors else OWN
+    own = {name: values for name, values in vehicle.effects.items() if name in names}
+    if not own:
+        return vehicle
+    rotors, motors = vehicle.rotors, vehicle.motors
+    true = make_plant(vehicle, 1.0 / vehicle.controller.frequency, own).constants
+    push = float(true.thrust_coefficient[0])
+    if motors is not None:
+        first, second = np.asarray(motors.thrust) * (push / rotors.thrust_coefficient)
+        motors = replace(motors, thrust=(float(first), float(second)))
+    rotors = replace(rotors, thrust_coefficient=push, time_constant=float(true.time_constant))
     return replace(
         vehicle,
-        inertia=_three(inertia),
+        inertia=_three(true.inertia),
         rotors=rotors,
         motors=motors,
-        controller=controller,
-        effects=MappingProxyType(effects),
+        controller=replace(vehicle.controller, rate_gain=_three(true.rate_gain)),
+        effects=MappingProxyType({n: v for n, v in vehicle.effects.items() if n not in own}),
     )
 
 
 def unknown_to_the_fits(vehicle: Vehicle) -> Sequence[str]:
     """Return the effects of a start that no fit takes into account, and that stay in its file."""
-    return [name for name in vehicle.effects if name not in FITTED]
+    return [name for name in vehicle.effects if name not in (*OWN, *FITTED)]
 
 
 def _three(values: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = np.broadcast_to(values, 3)
+    x, y, z = values
     return float(x), float(y), float(z)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from eval.quadrotor.mixer import mixer_matrix
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.actuators import wrench_difference
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.views.data.completed import completed
 from suite.diagnose.views.data.rotors import ActingRotors, acting_rotors
@@ -91,20 +91,9 @@ def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) 
     if rotors.noise is None:
         return flight
     speed, noise = np.nan_to_num(rotors.speed), np.nan_to_num(rotors.noise)
-    turned, noisy = (_turning(vehicle, given) for given in (speed, speed + noise))
-    return calibrated(flight, turned, noisy - turned)
-
-
-def _turning(vehicle: Vehicle, speed: np.ndarray) -> np.ndarray:
-    """Return the angular accelerations (N, 3) [rad/s^2] that rotors at `speed` (N, 4) make."""
-    rotors = vehicle.rotors
-    twist = rotors.torque_coefficient / rotors.thrust_coefficient
-    torque_b = (
-        rotors.thrust_coefficient
-        * speed**2
-        @ mixer_matrix(np.asarray(rotors.position), np.asarray(rotors.spin), twist)[1:].T
-    )
-    return torque_b / np.asarray(vehicle.inertia)
+    _, turned = wrench_difference(speed, np.zeros_like(speed), vehicle)
+    _, noisy = wrench_difference(speed + noise, speed, vehicle)
+    return calibrated(flight, turned, noisy)
 
 
 def parted(

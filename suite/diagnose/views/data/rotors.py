@@ -8,11 +8,12 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mix
-from eval.quadrotor.plant import nominal_quadrotor
+from eval.quadrotor.plant import make_plant, nominal_quadrotor
 from eval.vehicles.motors import motor_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.resample import interpolate
+from suite.diagnose.data.steps import LONGEST_S
 
 
 class ActingRotors(NamedTuple):
@@ -61,14 +62,11 @@ def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
 
     They do so after the vehicle's delay, by its lag.
     """
-    effects = vehicle.effects
-    if "command_delay" in effects:
-        since = log.time_s - float(effects["command_delay"].delay)
-        row = np.searchsorted(log.time_s, since + 1e-9, side="right") - 1
-        wanted = wanted[np.maximum(row, 0)]
-    lag = vehicle.rotors.time_constant
-    if "motor_lag" in effects:
-        lag = float(effects["motor_lag"].time_constant)
+    constants = make_plant(vehicle, LONGEST_S).constants
+    since = log.time_s - float(constants.delay)
+    row = np.searchsorted(log.time_s, since + 1e-9, side="right") - 1
+    wanted = wanted[np.maximum(row, 0)]  # with its gaps
+    lag = float(constants.time_constant)
     if lag <= 0.0:
         return wanted
     left = np.exp(-np.diff(log.time_s) / lag)[:, None]
