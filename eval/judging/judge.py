@@ -34,7 +34,7 @@ from eval.worlds.trial import (
     TrialSpec,
     track_of,
 )
-from policies.observation import observe
+from policies.observation import View, observe
 from policies.policy import Policy
 from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import check_family
@@ -271,11 +271,11 @@ class _Slots:
     def _decide_and_fly(self) -> None:
         """Ask the policy once and fly its answers, but late ones, until its next decision."""
         spec, flying = self._policy.spec, self._index >= 0
-        seen = self._world.view(flying)
+        seen = self._look(flying)
         if self._delays:
             seen = self._delays.see(seen, self._fresh, flying)
         if self._sensors:
-            seen = self._sensors.see(seen, self._world.progress.gates, flying)
+            seen = self._sensors.see(seen, flying)
         state, image = observe(spec, seen, self._action_b)
         state = np.where(flying[:, None], state, 0).astype(np.float32)
         image = image.astype(np.float32)
@@ -302,10 +302,17 @@ class _Slots:
             part = np.minimum(steps, moment.pause)
             self._advance(part - done)
             done = part
-            view = self._world.view(moment.images & flying)
+            view = self._look(flying, moment.images & flying)
             for aged, due in moment.taken:
                 aged.take(due, view)
         self._advance(steps - done)
+
+    def _look(self, flying: np.ndarray, images: np.ndarray | None = None) -> View:
+        """Return what there is to see now, gates as the map has them; images of all that fly."""
+        view = self._world.view(flying if images is None else images)
+        if not self._sensors:
+            return view
+        return self._sensors.misplace(view, self._world.progress.gates, flying)
 
     def _advance(self, steps: np.ndarray) -> None:
         for row in self._world.advance(self._action_b, steps, bool(self._recorder)):

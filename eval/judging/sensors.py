@@ -117,33 +117,42 @@ class Sensors:
         self._walk[slot] = generator_of(trial, STATE)
         self._is_new[slot] = True
 
-    def see(self, truth: View, gate: np.ndarray, wanted: np.ndarray) -> View:
-        """Return what the sensors show of `truth`; call it once an observation.
+    def misplace(self, truth: View, gate: np.ndarray, wanted: np.ndarray) -> View:
+        """Return `truth` with the gates where the trial's map has them.
 
         Args:
             truth: what there is to see in each slot.
-            gate: (N,) number of each slot's next gate.
+            gate: (N,) number of each slot's next gate, at the time of `truth`.
+            wanted: (N,) bool, the slots that fly; the others' rows stay as they are.
+        """
+        if not self._noise.gate_m:
+            return truth
+        gate_w, second_w = np.array(truth.gate_w, float), np.array(truth.second_w, float)
+        for slot in np.flatnonzero(wanted).tolist():
+            shift, last = self._shift_w[slot], len(self._shift_w[slot]) - 1
+            gate_w[slot] += shift[min(int(gate[slot]), last)]
+            second_w[slot] += shift[min(int(gate[slot]) + 1, last)]
+        return truth._replace(gate_w=gate_w, second_w=second_w)
+
+    def see(self, mapped: View, wanted: np.ndarray) -> View:
+        """Return what the sensors show, whose errors walk on; call it once an observation.
+
+        Args:
+            mapped: what there is to see in each slot, with gates as the map has them (`misplace`).
             wanted: (N,) bool, the slots that fly; the others' rows stay as they are.
         """
         noise, slots = self._noise, np.flatnonzero(wanted).tolist()
-        seen = truth
+        seen = mapped
         if noise.inverse_depth:
-            seen = seen._replace(depth_m=self._images(truth.depth_m, slots))
-        if noise.gate_m:
-            gate_w, second_w = np.array(truth.gate_w, float), np.array(truth.second_w, float)
-            for slot in slots:
-                shift, last = self._shift_w[slot], len(self._shift_w[slot]) - 1
-                gate_w[slot] += shift[min(int(gate[slot]), last)]
-                second_w[slot] += shift[min(int(gate[slot]) + 1, last)]
-            seen = seen._replace(gate_w=gate_w, second_w=second_w)
+            seen = seen._replace(depth_m=self._images(mapped.depth_m, slots))
         if noise.of_state:
             self._estimate(slots)
             error = np.where(wanted[:, None], self._error, 0.0)
             turn = exp_rot(noise.attitude_rad * error[:, 6:])
-            axes = [to_world(truth.rot_w, turn[..., axis]) for axis in range(3)]
+            axes = [to_world(mapped.rot_w, turn[..., axis]) for axis in range(3)]
             seen = seen._replace(
-                pos_w=truth.pos_w + noise.pos_m * error[:, :3],
-                vel_w=truth.vel_w + noise.vel * error[:, 3:6],
+                pos_w=mapped.pos_w + noise.pos_m * error[:, :3],
+                vel_w=mapped.vel_w + noise.vel * error[:, 3:6],
                 rot_w=np.stack(axes, axis=-1),
             )
         return seen

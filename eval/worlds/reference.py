@@ -114,7 +114,8 @@ def fly_trial(
                 motion.pos_w, motion.rot_w, motion.vel_w, gate_w, second_w, axis_w, depth[None]
             )
             if sensors:
-                seen = sensors.see(seen, np.array([passed]), np.array([True]))
+                wanted = np.array([True])
+                seen = sensors.see(sensors.misplace(seen, np.array([passed]), wanted), wanted)
             state, image = observe(spec, seen, action_b)
             fresh = np.full(rows, decisions == 0)
             inputs = (_padded(x, rows) for x in (state, image))

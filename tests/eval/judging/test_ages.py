@@ -12,11 +12,12 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
 from policies.observation import View
 from policies.spec import PolicySpec
-from tests.support.pilots import Pursuit
+from tests.support.pilots import Pursuit, Scripted
 
 VEHICLE = load_vehicle("reference")
 TRIALS = [TrialSpec("zigzag", 0, seed) for seed in range(3)]
 RULES = Rules(time_limit_s=1.5)
+SPEC = PolicySpec(rate_hz=25.0)
 
 
 DT, PERIOD_S = 0.002, 0.066
@@ -126,22 +127,29 @@ def test_which_images_are_lost_is_set_by_the_trial():
     assert np.array_equal(lost([TRIALS[1], TRIALS[0]]), [other, one])
 
 
-class Watcher(Pursuit):
-    """Keeps what it was given."""
+class Watcher:
+    """Keeps what a pilot is given and what it answers."""
 
-    given: list
+    def __init__(self, pilot):
+        self.pilot, self.spec, self.name = pilot, pilot.spec, pilot.name
+        self.start, self.given, self.answers_b = pilot.start, [], []
 
     def act(self, hidden, state, image, fresh):
         self.given.append((state.copy(), image.copy()))
-        return super().act(hidden, state, image, fresh)
+        action_b, hidden = self.pilot.act(hidden, state, image, fresh)
+        self.answers_b.append(action_b[0])
+        return action_b, hidden
+
+
+def watched(pilot, noise, trials=TRIALS[:1], slots=1, rules=RULES):
+    watcher = Watcher(pilot)
+    options = JudgeOptions(slots=slots, workers=1, rules=rules, noise=noise)
+    return fly(watcher, trials, VEHICLE, options=options), watcher
 
 
 def given(noise, trials=TRIALS[:1], slots=1):
-    pilot = Watcher(spec=PolicySpec(rate_hz=25.0))
-    pilot.given = []
-    options = JudgeOptions(slots=slots, workers=1, rules=RULES, noise=noise)
-    results = fly(pilot, trials, VEHICLE, options=options)
-    return results, pilot.given
+    results, watcher = watched(Pursuit(spec=SPEC), noise, trials, slots)
+    return results, watcher.given
 
 
 def test_in_the_judge_an_age_of_a_period_shows_the_decision_before():
@@ -154,6 +162,18 @@ def test_in_the_judge_an_age_of_a_period_shows_the_decision_before():
     assert not np.array_equal(truth[1][0][:, :9], truth[0][0][:, :9])
     _, dim = given(SensorNoise(image_age_s=0.04))
     assert np.array_equal(dim[1][1], truth[0][1]) and np.array_equal(dim[1][0], truth[1][0])
+
+
+def test_an_old_state_has_the_misplaced_gate_that_was_next_then():
+    rules = Rules(time_limit_s=4.0)
+    (result,), watcher = watched(Pursuit(spec=SPEC), SensorNoise(), rules=rules)
+    assert result.gates_passed >= 2, "the flight is to pass gates"
+    same = Scripted(np.array(watcher.answers_b), spec=SPEC)
+    prompt, late = (
+        np.stack([state[0, :9] for state, _ in watched(same, noise, rules=rules)[1].given])
+        for noise in (SensorNoise(gate_m=0.3), SensorNoise(gate_m=0.3, state_age_s=0.12))
+    )
+    assert np.array_equal(late[3:], prompt[:-3])
 
 
 def test_a_late_trials_outcome_is_set_by_the_trial_alone():

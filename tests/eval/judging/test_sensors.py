@@ -37,7 +37,8 @@ def watched(noise, trials, times, gate=0, **more):
     for slot, trial in enumerate(trials):
         eyes.start(slot, trial, 8)
     every = np.ones(len(trials), bool)
-    return [eyes.see(view(len(trials), **more), every * gate, every) for _ in range(times)]
+    mapped = eyes.misplace(view(len(trials), **more), every * gate, every)
+    return [eyes.see(mapped, every) for _ in range(times)]
 
 
 def many(count):
@@ -45,10 +46,9 @@ def many(count):
 
 
 def test_no_noise_is_the_truth_itself(monkeypatch):
-    truth = view(2)
-    shown = Sensors(SensorNoise(), 2, RATE_HZ, RANGE_M).see(
-        truth, np.zeros(2, int), np.ones(2, bool)
-    )
+    truth, every = view(2), np.ones(2, bool)
+    eyes = Sensors(SensorNoise(), 2, RATE_HZ, RANGE_M)
+    shown = eyes.see(eyes.misplace(truth, np.zeros(2, int), every), every)
     assert all(one is two for one, two in zip(shown, truth, strict=True))
     monkeypatch.setattr(module.Sensors, "see", None)  # a judge without noise has no sensors
     fly(RandomNetwork(), TRIALS[:1], VEHICLE, options=JudgeOptions(rules=Rules(time_limit_s=0.2)))
@@ -133,8 +133,8 @@ def test_slots_that_do_not_fly_draw_nothing():
     eyes = Sensors(noise, 2, RATE_HZ, RANGE_M)
     for slot, trial in enumerate(many(2)):
         eyes.start(slot, trial, 8)
-    eyes.see(view(2), np.zeros(2, int), np.array([True, False]))
-    late = eyes.see(view(2), np.zeros(2, int), np.array([False, True]))
+    eyes.see(view(2), np.array([True, False]))
+    late = eyes.see(view(2), np.array([False, True]))
     first = watched(noise, many(2), 1)[0]
     assert np.array_equal(late.pos_w[1], first.pos_w[1])
     assert np.array_equal(late.depth_m[1], first.depth_m[1])
