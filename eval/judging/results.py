@@ -156,10 +156,10 @@ class Journal:
                 ) from error
             if result is not None:
                 self.done[result.trial] = result
-            elif not isinstance(entry, dict) or entry.get("about") != about:
+            elif other := _differing(entry, about):
                 raise ValueError(
-                    f"{self.path}: holds trials of another policy, vehicle, world or option; "
-                    "give another --out or move the file away"
+                    f"{self.path}: holds trials flown otherwise ({other}); give another --out or "
+                    "move the file away"
                 )
             keep += len(line)
         return keep
@@ -192,6 +192,16 @@ class Journal:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _differing(entry: Any, about: dict[str, Any]) -> str:
+    """Say in what a journal's first line is about something else; nothing: in nothing."""
+    was = entry.get("about") if isinstance(entry, dict) else None
+    if not isinstance(was, dict):
+        return "it does not say how"
+    names = sorted(name for name in was.keys() | about.keys()
+                   if name not in was or name not in about or was[name] != about[name])  # fmt: skip
+    return ", ".join(f"another {name}" for name in names)
 
 
 def _result(entry: Any) -> TrialResult:

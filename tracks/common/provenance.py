@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -14,25 +15,29 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 @functools.cache
 def git_commit() -> str | None:
-    """Return the commit this code comes from, with "-dirty" where tracked files differ from it.
+    """Return the commit this code comes from, and what became of it since.
 
-    A checkout is asked through git; a wheel carries the commit it was built from. None where
-    neither knows (a copy without history). A repository that merely surrounds the installed
-    package is not asked.
+    Where tracked files differ from the commit, "-dirty-" and 8 digits of their differences follow,
+    so that two states of the code never share a name. A checkout is asked through git; a wheel
+    carries the commit it was built from. None where neither knows (a copy without history). A
+    repository that merely surrounds the installed package is not asked.
     """
     baked = Path(__file__).with_name("built_from.txt")
     if baked.is_file():
         return baked.read_text(encoding="utf-8").strip() or None
     if not (_ROOT / ".git").exists():
         return None
-    ask = ["git", "-C", str(_ROOT), "describe", "--always", "--dirty", "--abbrev=40"]
     try:
-        answer = subprocess.run(
-            [*ask, "--exclude=*"], capture_output=True, text=True, timeout=10, check=True
-        )
+        commit = _git(_ROOT, "rev-parse", "HEAD").decode().strip()
+        changes = _git(_ROOT, "diff", "HEAD", "--binary", "--no-ext-diff", "--no-textconv")
     except (OSError, subprocess.SubprocessError):
         return None
-    return answer.stdout.strip() or None
+    return f"{commit}-dirty-{hashlib.sha256(changes).hexdigest()[:8]}" if changes else commit
+
+
+def _git(root: Path, *what: str) -> bytes:
+    asked = ["git", "-C", str(root), *what]
+    return subprocess.run(asked, capture_output=True, timeout=10, check=True).stdout
 
 
 def stamp(schema: int, seed: int | None) -> dict[str, Any]:

@@ -73,9 +73,9 @@ def test_journal_cut_within_its_first_line_starts_again(tmp_path):
 
 def test_journal_of_something_else_is_refused(tmp_path):
     path = tmp_path / JOURNAL
-    Journal(path, {"policy": "ours"}).close()
-    with pytest.raises(ValueError, match="another policy"):
-        Journal(path, {"policy": "theirs"})
+    Journal(path, {"policy": "ours", "world": "mujoco"}).close()
+    with pytest.raises(ValueError, match=r"otherwise \(another git_commit, another policy\); give"):
+        Journal(path, {"policy": "theirs", "world": "mujoco", "git_commit": None})
     path.write_text(path.read_text() + "{}\n")
     with pytest.raises(ValueError, match="line 2"):
-        Journal(path, {"policy": "ours"})
+        Journal(path, {"policy": "ours", "world": "mujoco"})
