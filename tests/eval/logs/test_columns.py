@@ -1,9 +1,6 @@
 """A log that breaks a rule is refused with file, column, row and reason."""
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet
 import pytest
 
 from eval.logs.columns import GROUPS
@@ -12,30 +9,7 @@ from eval.logs.flight_log import (
     log_from_columns,
     read_flight,
 )
-
-KINDS = ("parquet", "csv")
-STATE = ("time", "pos", "quat", "rate")
-
-
-def columns(rows=150, groups=(*STATE, "vel", "cmd_thrust", "cmd_rate")):
-    """The columns of a well-formed log."""
-    rng = np.random.default_rng(0)
-    made: dict[str, np.ndarray] = {
-        name: rng.normal(size=rows) for group in groups for name in GROUPS[group]
-    }
-    made["time"] = np.arange(rows) / 100
-    quat = rng.normal(size=(rows, 4))
-    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
-    return made | dict(zip(GROUPS["quat"], quat.T, strict=True))
-
-
-def write_table(path, table, metadata=None):
-    arrow = pa.table({name: pa.array(values) for name, values in table.items()})
-    if path.suffix == ".parquet":
-        pyarrow.parquet.write_table(arrow.replace_schema_metadata(metadata), path)
-    else:
-        pyarrow.csv.write_csv(arrow, path)
-    return path
+from tests.support.log_tables import KINDS, STATE, columns, write_table
 
 
 @pytest.mark.parametrize("groups", [("motor",), ("cmd_thrust", "cmd_rate"), ("motor", "acc")])

@@ -3,17 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
 from scipy.spatial.transform import Rotation
 
-from eval.logs.columns import GROUPS
 from eval.logs.flight_log import (
-    FlightLog,
     FlightLogError,
-    columns_from_log,
     log_from_columns,
     log_from_flight,
     read_flight,
@@ -21,37 +17,7 @@ from eval.logs.flight_log import (
     write_flight,
 )
 from tests.support.flights import small_track, smooth_flight
-
-KINDS = ("parquet", "csv")
-STATE = ("time", "pos", "quat", "rate")
-
-
-def columns(rows=150, groups=(*STATE, "vel", "cmd_thrust", "cmd_rate")):
-    """The columns of a well-formed log."""
-    rng = np.random.default_rng(0)
-    made: dict[str, np.ndarray] = {
-        name: rng.normal(size=rows) for group in groups for name in GROUPS[group]
-    }
-    made["time"] = np.arange(rows) / 100
-    quat = rng.normal(size=(rows, 4))
-    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
-    return made | dict(zip(GROUPS["quat"], quat.T, strict=True))
-
-
-def write_table(path, table, metadata=None):
-    arrow = pa.table({name: pa.array(values) for name, values in table.items()})
-    if path.suffix == ".parquet":
-        pyarrow.parquet.write_table(arrow.replace_schema_metadata(metadata), path)
-    else:
-        pyarrow.csv.write_csv(arrow, path)
-    return path
-
-
-def assert_same(one: FlightLog, other: FlightLog):
-    a, b = columns_from_log(one), columns_from_log(other)
-    assert list(a) == list(b)
-    for name in a:
-        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+from tests.support.log_tables import KINDS, assert_same, columns, write_table
 
 
 @pytest.mark.parametrize("kind", KINDS)

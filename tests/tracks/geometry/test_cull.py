@@ -2,52 +2,17 @@
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from tests.support.scene_poses import POSES, batch, free_poses, model_of
 from tracks.families import MAX_COUNTS, make_track
-from tracks.formats.mujoco_scene import add_scene
 from tracks.geometry.camera import Camera, pixel_rays_b
 from tracks.geometry.depth import depth_image
-from tracks.geometry.scene import Boxes, Scene, counts, stack
-from tracks.track import Track
+from tracks.geometry.scene import Boxes, counts
 
 CAMERA = Camera()
 RAYS = pixel_rays_b(CAMERA)
-POSES = 12
 render = jax.jit(depth_image, static_argnames=("range_m", "limits"))
-
-
-def model_of(track: Track) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    spec = mujoco.MjSpec()
-    add_scene(spec, track.scene, track.names, track.mesh_sizes)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    return model, data
-
-
-def free_poses(model, data, track: Track, rng, n=POSES):
-    """Return poses around the track that lie in no solid, tilted any way up to 60 degrees."""
-    low, high = track.scene.gates.center_w.min(0) - 3, track.scene.gates.center_w.max(0) + 3
-    low[2], high[2] = 0.2, 4
-    pos_w = []
-    six_ways = np.concatenate([np.eye(3), -np.eye(3)])
-    while len(pos_w) < n:
-        pos = rng.uniform(low, high)
-        geom = np.zeros(1, np.int32)
-        ahead = [mujoco.mj_ray(model, data, pos, d, None, True, -1, geom) for d in six_ways]
-        # A ray that starts inside a solid meets its wall from within, both ways.
-        if min(d for d in [*ahead, np.inf] if d >= 0) > 0.6:
-            pos_w.append(pos)
-    angle = rng.uniform([-np.pi, -1, -1], [np.pi, 1, 1], (n, 3))
-    return np.array(pos_w), Rotation.from_euler("ZYX", angle).as_matrix()
-
-
-def batch(track: Track, n: int, to=None) -> Scene:
-    to = counts(track.scene) if to is None else to
-    return jax.tree.map(jnp.asarray, stack([track.scene] * n, to))
 
 
 def test_culling_that_keeps_enough_changes_nothing():
