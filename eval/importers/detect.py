@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from eval.importers.formats import FORMATS
-from eval.importers.head import read_head
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
+from eval.logs.head import read_head
 
 
 def detect(path: Path, options: ImportOptions) -> str:

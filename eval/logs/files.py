@@ -18,8 +18,8 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from eval.logs.columns import KNOWN, FlightLogError
+from eval.logs.head import read_head
 from tracks.common.files import replacing_file
-from tracks.input.reading import LOG_BYTES, InputError, check_file
 
 METADATA = "flight"
 """Parquet metadata key and CSV column of the JSON text."""
@@ -38,18 +38,7 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[st
     Raises:
         FlightLogError: where the file is missing, empty, corrupt or neither Parquet nor CSV.
     """
-    try:
-        check_file(path, LOG_BYTES)
-        with path.open("rb") as file:
-            head = file.read(4096)
-    except OSError as error:
-        reason = f"cannot be read: {error.strerror or error}"
-        raise FlightLogError(str(path), None, None, reason) from None
-    except InputError as error:
-        reason = str(error).removeprefix(f"{path}: ")
-        raise FlightLogError(str(path), None, None, reason) from None
-    if not head:
-        raise FlightLogError(str(path), None, None, "the file is empty; record or copy it again")
+    head = read_head(path)
     if head.startswith(PARQUET_MAGIC):
         return _read_parquet(path)
     if path.suffix.lower() in (".parquet", ".pq"):

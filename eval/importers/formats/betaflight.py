@@ -19,11 +19,11 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.findings import Finding
 from eval.importers.formats.table import numbers
-from eval.importers.head import first_line
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
 from eval.logs.files import read_columns
+from eval.logs.head import first_line
 
 SUMMARY = "CSV of blackbox_decode; needs --pose"
 MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))

@@ -23,12 +23,12 @@ from zlib import crc32
 import numpy as np
 
 from eval.importers.findings import Finding
-from eval.importers.head import read_head
 from eval.importers.mapping.apply import recording_of
 from eval.importers.mapping.file import read_map
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError
+from eval.logs.head import read_head
 from tracks.common.names import closest
 
 SUMMARY = "log of the Crazyflie's micro SD card deck"

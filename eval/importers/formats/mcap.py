@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from eval.importers.findings import Finding
-from eval.importers.head import read_head
 from eval.importers.options import ImportOptions
 from eval.importers.rows import in_world
 from eval.importers.signals import Recording, Signal, collect
 from eval.logs.columns import FlightLogError
+from eval.logs.head import read_head
 from tracks.common.toml_table import read_toml
 
 SUMMARY = "MCAP with ROS 2 messages (pip install 'diffracing-suite[mcap]')"

@@ -27,10 +27,10 @@ import numpy as np
 
 from eval.importers.findings import Finding
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, turn
-from eval.importers.head import read_head
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
+from eval.logs.head import read_head
 
 SUMMARY = "PX4 ULog (.ulg)"
 ULOG = b"ULog\x01\x12\x35"

@@ -25,7 +25,7 @@ def read_head(path: Path) -> bytes:
         reason = str(error).removeprefix(f"{path}: ")
         raise FlightLogError(str(path), None, None, reason) from None
     if not head:
-        raise FlightLogError(str(path), None, None, "the file is empty")
+        raise FlightLogError(str(path), None, None, "the file is empty; record or copy it again")
     return head
 
 

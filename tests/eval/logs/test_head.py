@@ -2,8 +2,8 @@
 
 import pytest
 
-from eval.importers.head import first_line, read_head
 from eval.logs.columns import FlightLogError
+from eval.logs.head import first_line, read_head
 
 
 def test_a_head_is_the_first_bytes_only(tmp_path):
