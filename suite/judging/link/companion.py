@@ -155,10 +155,12 @@ class Companion:
             self._begun_s = state.time_s
             self._heading_w = level_heading(quat_to_rot(state.quat_wxyz)[None])
             self._event("begun")
+        # At the first state by the autopilot's own period: the judge's heading begins so.
+        since_s = state.time_s - self._last.time_s if self._last else 1.0 / ATTITUDE_HZ
         self._count_gates(state)
         if self.gate == len(self._gates.center_w):
             return self._hand_over(FINISHED)
-        return self._fly(state)
+        return self._fly(state, since_s)
 
     def _count_gates(self, state: State) -> None:
         if self._last is not None:
@@ -167,7 +169,7 @@ class Companion:
             self.gate += bool(passed)
         self._last = state
 
-    def _fly(self, state: State) -> list[bytes]:
+    def _fly(self, state: State, since_s: float) -> list[bytes]:
         decided = self._is_due(state)
         rot_w = quat_to_rot(state.quat_wxyz)[None]
         image_age_s = self._clock() - self._depth_at
@@ -178,7 +180,7 @@ class Companion:
         if self.over:
             return [self._wire.encoded(Note(f"policy hands over: {self.over}"))]
         to_gate_w = self._gates.center_w[None, self.gate] - state.pos_w
-        self._heading_w = blend_heading(self._heading_w, to_gate_w, 1.0 / ATTITUDE_HZ)
+        self._heading_w = blend_heading(self._heading_w, to_gate_w, since_s)
         force_w = action_to_force(self._action_b, rot_w)
         command = attitude_command(self._vehicle.controller, force_w, rot_w, self._heading_w)
         thrust, rate_b = float(command.thrust[0]), command.rate_b[0]

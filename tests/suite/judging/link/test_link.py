@@ -181,6 +181,21 @@ def test_late_answers_are_not_flown_and_hand_over_where_they_go_on(bench):
     assert one.companion.late_answers == 3
 
 
+def test_the_heading_turns_as_fast_whatever_the_rate_of_states(bench):
+    aside = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+    wanted = []
+    for rate_hz in (50, 100, 250):
+        one = bench(Steady((0.0, 0.0, 0.0)))
+        one.show()
+        for k in range(rate_hz // 5 + 1):
+            one.now = 100.0 + k / rate_hz
+            one.tell(one.state(quat_wxyz=aside))
+        wanted.append(one.companion.rows[-1].rate_b)
+    assert abs(wanted[0][2]) > 0.5, "the gate is not ahead"
+    assert wanted[0] == pytest.approx(wanted[1], rel=1e-6)
+    assert wanted[2] == pytest.approx(wanted[1], rel=1e-6)
+
+
 def test_what_a_gap_between_states_missed_is_counted_and_not_made_up_for(bench):
     one = bench(Steady((0.0, 0.0, 0.0), spec=PolicySpec(rate_hz=50.0)))
     one.show()
