@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.support.known_flight import fly, ned, ned_quat
-from tests.support.ros_messages import DEFINITIONS, IMU, ODOMETRY, TARGET
+from tests.support.ros_messages import ACTUATORS, DEFINITIONS, IMU, ODOMETRY, TARGET
 
 
 class UlogWriter:
@@ -282,7 +282,7 @@ def write_mcap(
     motion=True,
     source=fly,
 ):
-    """ROS 2: odometry (twist in the body), imu and mavros' attitude target, CDR in MCAP."""
+    """ROS 2: odometry (twist in the body), imu, mavros' attitude target and motors, in MCAP."""
     from mcap_ros2.writer import Writer
 
     origin = 1_700_000_000 * 10**9
@@ -338,5 +338,9 @@ def write_mcap(
                 "thrust": float(truth.thrust[k] / full_thrust),
             }
             writer.write_message("/target", schema, message, origin + round(t * 1e9))
+        schema = writer.register_msgdef("actuator_msgs/msg/Actuators", ACTUATORS + DEFINITIONS)
+        for k, t in enumerate(truth.time):
+            message = {"header": header(t), "velocity": [float(speed) for speed in truth.motor[k]]}
+            writer.write_message("/motors", schema, message, origin + round(t * 1e9))
         writer.finish()
     return path

@@ -61,3 +61,8 @@ geometry_msgs/Quaternion orientation
 geometry_msgs/Vector3 body_rate
 float32 thrust
 """
+ACTUATORS = """std_msgs/Header header
+float64[] position
+float64[] velocity
+float64[] normalized
+"""

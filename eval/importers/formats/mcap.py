@@ -2,7 +2,7 @@
 
 ROS's worlds are z-up and its bodies forward-left-up; quaternions are xyzw. The velocity of an
 Odometry is in its child frame, the body. A mapping file's [topics] says which topic to take where
-several hold the same kind of message.
+several hold the same kind of message, its `[frames] motors` where the motors are.
 
 | kind | messages |
 |---|---|
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from eval.importers.findings import Finding
+from eval.importers.mapping.file import motor_side_of
 from eval.importers.options import ImportOptions
 from eval.importers.rows import in_world
 from eval.importers.signals import Recording, Signal, collect
@@ -57,7 +58,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     """
     if not detect(read_head(path), options):
         raise FlightLogError(str(path), None, None, "not an MCAP file (its first bytes differ)")
-    told = _topics(options.map)
+    told, motor_side = _told(options.map)
     found = _messages(path)
     messages: dict[str, list[tuple[int, Any]]] = {}
     findings: list[Finding] = []
@@ -78,20 +79,24 @@ def read(path: Path, options: ImportOptions) -> Recording:
         reason = f"topic {told[missing[0]]!r} of the mapping is not there"
         raise FlightLogError(str(path), None, None, reason)
     signals, more = _signals(messages, str(path))
-    return Recording(str(path), signals, (*findings, *more))
+    return Recording(str(path), signals, (*findings, *more), motor_side)
 
 
-def _topics(map_path: Path | None) -> dict[str, str]:
+def _told(map_path: Path | None) -> tuple[dict[str, str], tuple[tuple[float, float], ...] | None]:
+    """Return the topics that a mapping file chooses, by kind, and where it has the motors."""
     if map_path is None:
-        return {}
-    top = read_toml(map_path)
-    told = {}
+        return {}, None
+    top, topics, motor_side = read_toml(map_path), {}, None
     if top.has("topics"):
         table = top.table("topics")
-        told = {kind: table.text(kind) for kind in KINDS if table.has(kind)}
+        topics = {kind: table.text(kind) for kind in KINDS if table.has(kind)}
+        table.close()
+    if top.has("frames"):
+        table = top.table("frames")
+        motor_side = motor_side_of(table)
         table.close()
     top.close()
-    return told
+    return topics, motor_side
 
 
 def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, Any]]]:

@@ -151,8 +151,7 @@ def read_map(path: Path) -> LogMap:
         frames = top.table("frames")
         world = _choice(frames, "world", WORLDS)
         body = _choice(frames, "body", BODIES)
-        if frames.has("motors"):
-            side = tuple((float(x), float(y)) for x, y in frames.points("motors", 2, 4))[:4]
+        side = motor_side_of(frames)
         frames.close()
     columns = {}
     for signal in UNITS:
@@ -169,6 +168,17 @@ def read_map(path: Path) -> LogMap:
     top.has("topics")  # of MCAP files; see mcap.py
     top.close()
     return LogMap(columns, world, body, side, optional, keep, beside, mass_key)
+
+
+def motor_side_of(frames: Table) -> tuple[tuple[float, float], ...] | None:
+    """Return where the table `[frames]` has the file's motors 1 to 4; None where it does not say.
+
+    Raises:
+        ValueError: where that is no four points.
+    """
+    if not frames.has("motors"):
+        return None
+    return tuple((float(x), float(y)) for x, y in frames.points("motors", 2, 4))[:4]
 
 
 def own_map(columns: Mapping[str, np.ndarray]) -> LogMap:

@@ -41,6 +41,20 @@ def test_mcap_topics_are_chosen_by_a_map(tmp_path):
         import_log(path, None, ImportOptions(map=chosen))
 
 
+def test_mcap_motors_are_put_in_order_by_a_map(tmp_path):
+    path, chosen = made.write_mcap(tmp_path / "log.mcap", span=(0, 4)), tmp_path / "map.toml"
+    plain, _ = import_log(path, None, FULL)
+    near(np.asarray(plain.rotor_speed)[::4], known_flight.fly(plain.time_s[::4]).motor, 1e-6)
+    # The file's motors 1 to 4: front left, rear left, rear right, front right.
+    chosen.write_text("[frames]\nmotors = [[1, 1], [-1, 1], [-1, -1], [1, -1]]\n")
+    log, findings = import_log(path, None, ImportOptions(map=chosen, full_thrust=30.0))
+    assert np.array_equal(log.rotor_speed, np.asarray(plain.rotor_speed)[:, ::-1], equal_nan=True)
+    assert "the file's 4, 3, 2, 1" in text(findings, "motors")
+    chosen.write_text('[frames]\nworld = "ned"\n')
+    with pytest.raises(ValueError, match=r"'world' in \[frames\] is unknown"):
+        import_log(path, None, ImportOptions(map=chosen))
+
+
 def test_mcap_that_is_cut_or_lacks_motion(tmp_path):
     whole = made.write_mcap(tmp_path / "log.mcap", span=(0, 2))
     cut = tmp_path / "cut.mcap"
