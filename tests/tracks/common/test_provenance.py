@@ -24,8 +24,8 @@ def checkout(tmp_path, monkeypatch):
 
 
 def test_what_differs_from_the_commit_is_in_its_name(checkout):
-    def name():
-        return provenance.git_commit.__wrapped__()
+    def name() -> str:
+        return provenance.git_commit.__wrapped__() or ""
 
     clean = name()
     assert len(clean) == 40
