@@ -1,8 +1,8 @@
 """Write a policy of your own in torch, export it, and load it as the judge does.
 
-It has no memory and does not look at the image: it flies at the next gate's centre and brakes
+It has no memory: it flies at the next gate's centre, slower where something is near, and brakes
 sideways. Run: python examples/bring_your_own_policy.py [FOLDER]; then
-`suite eval --policy FOLDER/to_the_gate.pt2 --trust`.
+`suite eval --policy FOLDER/to_the_gate.onnx`.
 """
 
 from __future__ import annotations
@@ -10,41 +10,68 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
+import warnings
 from pathlib import Path
 
 import numpy as np
+import onnx
 import torch
 
 from policies.policy import load_policy
 
 
 class ToTheGate(torch.nn.Module):
-    """Wanted acceleration towards a speed of 3 m/s in the direction of the gate."""
+    """Wanted acceleration towards a speed of 1 to 3 m/s in the direction of the gate."""
 
     def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
         """Return the action (batch, 3) [m/s^2] in body axes."""
         vel_b, gate_b = state[:, 0:3], state[:, 6:9]
         direction_b = gate_b / gate_b.norm(dim=1, keepdim=True).clamp(min=0.1)
-        return 2.0 * (3.0 * direction_b - vel_b)
+        near = image.amax(dim=(1, 2)).clamp(0.0, 2.0)[:, None]  # 0: nothing within 5 m
+        return 2.0 * ((3.0 - near) * direction_b - vel_b)
+
+
+EXAMPLE = (torch.zeros(2, 12), torch.zeros(2, 24, 32))
+# What it expects of the world travels with it; keys that are left out take the defaults.
+LABEL = json.dumps({"spec": {"rate_hz": 50.0, "camera": {"pitch_deg": 20.0}}})
+
+
+def write_onnx(module: torch.nn.Module, path: Path) -> None:
+    """Write the module as ONNX, which needs no trust; every input must be used, or torch drops it.
+
+    Torch's other exporter, without `dynamo=False`, needs the package onnxscript.
+    """
+    names = ["state", "image", "action"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of this exporter
+        torch.onnx.export(module, EXAMPLE, str(path), dynamo=False, input_names=names[:2],
+                          output_names=names[2:], dynamic_axes={n: {0: "batch"} for n in names},
+                          )  # fmt: skip
+    model = onnx.load(path)
+    onnx.helper.set_model_props(model, {"policy.json": LABEL})
+    onnx.save(model, path)
+
+
+def write_torch(module: torch.nn.Module, path: Path) -> None:
+    """Write the module as a torch program, which is code: it is loaded with `--trust` only."""
+    batch = {0: torch.export.Dim("batch")}
+    program = torch.export.export(module, EXAMPLE, dynamic_shapes=(batch, batch))
+    torch.export.save(program, path, extra_files={"policy.json": LABEL})
 
 
 def main(folder: Path) -> None:
-    """Export the policy to `folder` and ask it for one action."""
-    example = (torch.zeros(2, 12), torch.zeros(2, 24, 32))
-    batch = {0: torch.export.Dim("batch")}
-    program = torch.export.export(ToTheGate().eval(), example, dynamic_shapes=(batch, batch))
-    # What it expects of the world travels with it; keys that are left out take the defaults.
-    label = json.dumps({"spec": {"rate_hz": 50.0, "camera": {"pitch_deg": 20.0}}})
-    path = folder / "to_the_gate.pt2"
-    torch.export.save(program, path, extra_files={"policy.json": label})
-
-    policy = load_policy(path, trust=True)  # a .pt2 holds code; this one is ours
+    """Export the policy to `folder` in both ways, and ask each for one action."""
+    module = ToTheGate().eval()
+    write_onnx(module, folder / "to_the_gate.onnx")
+    write_torch(module, folder / "to_the_gate.pt2")
     state = np.zeros((1, 12), np.float32)
     state[0, 5] = 1.0  # level: world z is body z
     state[0, 6:9] = [4.0, 3.0, 0.0]  # the gate is 5 m away, ahead and to the left
     image = np.full((1, 24, 32), -0.3, np.float32)  # nothing within the camera's range
-    action, _ = policy.act(policy.start(1), state, image, np.array([True]))
-    print(f"{policy.name} at {policy.spec.rate_hz:g} Hz: action {action[0].tolist()} m/s^2")
+    for name in ("to_the_gate.onnx", "to_the_gate.pt2"):
+        policy = load_policy(folder / name, trust=name.endswith(".pt2"))  # this one is ours
+        action, _ = policy.act(policy.start(1), state, image, np.array([True]))
+        print(f"{name} at {policy.spec.rate_hz:g} Hz: action {action[0].tolist()} m/s^2")
 
 
 if __name__ == "__main__":

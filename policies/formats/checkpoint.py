@@ -207,6 +207,10 @@ def _read(path: Path, most_bytes: int) -> bytes:
     try:
         return read_bytes(path, most_bytes)
     except FileNotFoundError:
+        inside = path.parent / "policy"
+        if (inside / CONFIG).is_file():
+            text = f"{path.parent}: a training's folder; its policy is {inside}"
+            raise PolicyError(text) from None
         raise PolicyError(
             f"{path}: missing; a checkpoint is a folder with {WEIGHTS} and {CONFIG}"
         ) from None

@@ -30,6 +30,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for a name that is not in the catalogue.
     """
     from eval.effects import EFFECTS, find_effect
+    from eval.effects.interface import at
+    from eval.quadrotor.vehicle_file import load_vehicle
 
     if not config.name:
         width = max(map(len, EFFECTS))
@@ -40,12 +42,19 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     console.say(f"{effect.name}: {effect.summary}")
     console.say(f"  {effect.equation}")
     console.say(f"  source: {effect.source}")
+    vehicle = load_vehicle("reference")
     for parameter in effect.parameters:
         count = f" x {parameter.size}" if parameter.size else ""
         low, high = parameter.typical
-        given = "" if parameter.required else ", may be left out"
+        neutral = at(parameter.neutral, vehicle)
+        off = f" off {neutral:g}" if neutral and not parameter.whole else ""
+        by_vehicle = any(map(callable, (parameter.low, parameter.high, parameter.neutral)))
+        whose = f" (vehicle {vehicle.name})" if by_vehicle else ""
+        given = "" if parameter.required else "; may be left out"
+        least, most = at(parameter.low, vehicle), at(parameter.high, vehicle)
         console.say(
-            f"  {parameter.name}{count} [{parameter.unit}]: usually {low:g} to {high:g}{given}"
+            f"  {parameter.name}{count} [{parameter.unit}]: usually {low:g} to {high:g}{off}; "
+            f"allowed {least:g} to {most:g}{whose}{given}"
         )
     return {"effects": {effect.name: _facts(effect)}}
 
@@ -60,6 +69,8 @@ def _facts(effect: Effect) -> dict[str, Any]:
                 "unit": p.unit,
                 "components": p.size or 1,
                 "typical": p.typical,
+                "low": None if callable(p.low) else p.low,
+                "high": None if callable(p.high) else p.high,
                 "required": p.required,
             }
             for p in effect.parameters

@@ -13,7 +13,7 @@ from suite.common.running.hosts import Joined, join, member
 from suite.common.work import Silent
 from suite.train.config import TrainConfig, check
 from suite.train.overrides import override
-from suite.train.presets import chosen_model, preset, with_iterations
+from suite.train.presets import chosen_model, doubt_of, preset, with_iterations
 from tracks.common.files import plain
 from tracks.input.ranges import Iterations, Seed
 
@@ -90,6 +90,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.train.run import started_from, train
 
     resolved = resolve(config)
+    if config.from_ is None and (doubt := doubt_of(config.preset, "--from")):
+        console.note(doubt)
     params, delta = None, None
     if config.from_ is not None:
         params = started_from(config.from_, resolved.spec)

@@ -111,6 +111,11 @@ def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec]]:
     from suite.judging.requests import Evaluation
 
     folder = Path(config.run)
+    if any(folder.glob("journal-*.jsonl")):
+        raise ValueError(
+            f"{folder}: this suite eval is not finished; give its command again to fly the rest, "
+            "then view it"
+        )
     if not (folder / "trials.parquet").is_file():
         evaluation = Evaluation(
             policies=(config.run,),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -80,8 +79,16 @@ def diagnose_files(
         "--integrator": integrator != "auto",
     }
     unused = [f"{flag} is of rollouts: left out" for flag, given in asked.items() if given]
-    told = [*warnings, *unused]
-    by_views = partial(diagnose_views, logs, before, vehicle, out, console, SCHEMA, seed, told)
+
+    def noted(found: dict[str, Any]) -> dict[str, Any]:
+        for warning in found["warnings"][len(warnings) :]:
+            console.note(f"warning: {warning}")
+        return found
+
+    def by_views() -> dict[str, Any]:
+        told = [*warnings, *unused]
+        return noted(diagnose_views(logs, before, vehicle, out, console, SCHEMA, seed, told))
+
     if before or only_views(logs, vehicle):
         return by_views()
     try:
@@ -120,4 +127,4 @@ def diagnose_files(
     toml = (out / "vehicle.toml").read_text(encoding="utf-8")
     write_report(out / "report.html", page(result, found, checks, toml, files))
     write_json(out / "diagnosis.json", found)
-    return found
+    return noted(found)

@@ -101,6 +101,7 @@ def _fly_missing(
 ) -> None:
     """Fly what `rows` lacks; write each log and note the flight as it ends."""
     from eval.judging.judge import JudgeOptions, Record, fly
+    from eval.worlds.trial import Rules
 
     missing = [trial for trial in course.trials if trial not in rows]
     workers = workers_for(len(missing), workers, collection.world)
@@ -124,7 +125,7 @@ def _fly_missing(
                 missing,
                 course.vehicle,
                 collection.world,
-                JudgeOptions(workers=workers),
+                JudgeOptions(workers=workers, rules=Rules(time_limit_s=collection.time_limit_s)),
                 keep,
                 Record(depth=False),
                 course.tracks,

@@ -114,6 +114,7 @@ def _fly_one(
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, fly
     from eval.judging.results import Journal
+    from eval.worlds.trial import Rules
 
     label = flier.label
     about = {
@@ -123,9 +124,14 @@ def _fly_one(
         "vehicle": course.vehicle,
         "world": evaluation.world,
         "deadline_s": evaluation.deadline_s,
+        "time_limit_s": evaluation.time_limit_s,
         "tracks": course.tracks,
     }
-    options = JudgeOptions(workers=workers, limits=ActionLimits(deadline_s=evaluation.deadline_s))
+    options = JudgeOptions(
+        workers=workers,
+        rules=Rules(time_limit_s=evaluation.time_limit_s),
+        limits=ActionLimits(deadline_s=evaluation.deadline_s),
+    )
     with Journal(journal_path, about) as journal:
         missing = journal.missing(course.trials)
         if len(missing) < len(course.trials):

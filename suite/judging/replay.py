@@ -73,8 +73,13 @@ def fly_again(
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, Record, fly
     from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.worlds.trial import track_of
+    from eval.worlds.trial import Rules, track_of
 
+    options = JudgeOptions(
+        workers=1,
+        rules=Rules(time_limit_s=evaluation.time_limit_s),
+        limits=ActionLimits(deadline_s=evaluation.deadline_s),
+    )
     name = policy or (evaluation.policies or (default_policy(),))[0]
     tracks = custom_tracks(parse_tracks(evaluation.track))
     flights: dict[TrialSpec, Flight] = {}
@@ -88,7 +93,7 @@ def fly_again(
         trials,
         load_vehicle(evaluation.vehicle),
         evaluation.world,
-        JudgeOptions(workers=1, limits=ActionLimits(deadline_s=evaluation.deadline_s)),
+        options,
         keep,
         Record(depth=True),
         tracks,

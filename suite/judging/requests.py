@@ -9,6 +9,9 @@ import tyro
 
 from tracks.input.ranges import Range, Seed, Trials
 
+TimeLimit = Annotated[float, Range(0.0, 3600.0, above=True)]
+"""As `eval.worlds.trial.Rules` has it [s]."""
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -32,6 +35,8 @@ class Evaluation:
     world: str = "mujoco"
     """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (another
     simulator; pip install diffracing-suite[rotorpy]), or one of an installed package."""
+    time_limit_s: TimeLimit = 20.0
+    """A trial ends at this time; a long course of your own needs more than the tables' 20 [s]."""
     deadline_s: Annotated[float, Range(0.0, 3600.0, above=True)] | None = None
     """An answer of the policy that takes longer ends the trials that it was for (up to 64, which it
     is asked about at once), as out of time [s]."""
@@ -60,6 +65,8 @@ class Collection:
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str = "mujoco"
+    """As in suite eval."""
+    time_limit_s: TimeLimit = 20.0
     """As in suite eval."""
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """As in suite eval."""

@@ -13,6 +13,12 @@ from tracks.input.ranges import check_ranges, is_finite, shown
 
 T = TypeVar("T")
 
+ABSENT = {
+    "quadrotor": "add --model quad and --vehicle, or take a preset that trains through quadrotors",
+    "fleet": "add --model fleet",
+}
+"""Parts that not every run has -> how a run gets one."""
+
 
 def override(config: T, changes: Iterable[str]) -> T:
     """Return `config` with every change "field.field=value" made, within the fields' ranges.
@@ -37,6 +43,8 @@ def _changed(config: T, path: list[str], text: str, change: str) -> T:
     if name not in names:
         raise unknown_name(f"--set {change}: setting", name, names)
     old = getattr(config, name)
+    if rest and old is None and name in ABSENT:
+        raise ValueError(f"--set {change}: this run has no {name}; {ABSENT[name]}")
     if rest:
         return dataclasses.replace(config, **{name: _changed(old, rest, text, change)})
     if dataclasses.is_dataclass(old):

@@ -262,6 +262,22 @@ PRESETS = {
 }
 """Name -> function that returns the configuration; the docstring is its description."""
 
+TRAIN_ON = ("swift-quad", "swift-30")
+"""Those that are made for a policy that flies already: their steps are small."""
+
+
+def doubt_of(name: str, start: str) -> str | None:
+    """Return what to say of a training by recipe `name` that begins with fresh weights, if any.
+
+    `start` is the option that would name a policy to start from.
+    """
+    if name not in TRAIN_ON:
+        return None
+    return (
+        f"{name} is made to train on a policy that flies: without {start} it begins with fresh "
+        "weights, in small steps"
+    )
+
 
 def preset(name: str) -> TrainConfig:
     """Return the recipe called `name`.

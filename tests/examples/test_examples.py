@@ -17,7 +17,11 @@ EXAMPLES = {
     "own_track": (["."], "2 gates, finished", ["course.toml", "roof.stl", "course.png"]),
     "own_effect": ([], r"0\.0 N/m: 8 gates, finished\n(.*\n)*0\.4 N/m: [0-7] gates", []),
     "diagnose_a_log": (["."], r"verdict: named\ncom_offset\.offset", ["report.html"]),
-    "bring_your_own_policy": (["."], r"at 50 Hz: action \[4\.8\d*, 3\.6", ["to_the_gate.pt2"]),
+    "bring_your_own_policy": (
+        ["."],
+        r"onnx at 50 Hz: action \[4\.8\d*, 3\.6.*\n.*pt2 at 50 Hz: action \[4\.8\d*, 3\.6",
+        ["to_the_gate.onnx", "to_the_gate.pt2"],
+    ),
     "gymnasium_loop": (["1"], r"[1-8] gates, \w+ after", []),
     "quadrotor_gradient": (["3"], r"0\.06000 kg; the truth is 0\.06 kg", []),
 }

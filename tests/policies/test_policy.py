@@ -37,6 +37,12 @@ def test_a_missing_file_is_told_the_nearest_beside(exported):
         load_policy(exported / "nowhere" / "x.onnx")
 
 
+def test_a_trainings_folder_is_told_where_its_policy_is(checkpoint, tmp_path):
+    shutil.copytree(checkpoint, tmp_path / "run" / "policy")
+    with pytest.raises(PolicyError, match=r"run: a training's folder; its policy is .*run/policy$"):
+        load_policy(tmp_path / "run")
+
+
 def test_a_file_inside_a_checkpoint_and_other_kinds_are_pointed_on(checkpoint, tmp_path):
     with pytest.raises(PolicyError, match="give its folder"):
         load_policy(checkpoint / "weights.safetensors")

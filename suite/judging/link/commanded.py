@@ -14,7 +14,7 @@ from suite.judging.link.companion import FINISHED, Companion
 from suite.judging.link.flights import Flight, fly_link, fly_simulated, totals, write_log
 from suite.judging.link.messages import Wire, dialect
 from suite.judging.link.report import delays
-from suite.judging.link.server import COMPANION, VEHICLE
+from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
 from suite.judging.manner import manners
@@ -87,9 +87,10 @@ def _real(
     finally:
         link.close()
     if not companion.rows:
-        raise WorkFailed(
-            f"{address}: no vehicle sent a state (ODOMETRY) and a depth image; see docs/fly.md"
-        )
+        why = f"no vehicle sent a state (ODOMETRY) and a depth image within {WAIT_S:g} s"
+        if companion.over is not None:
+            why = f"handed over before the first set point: {companion.over}"
+        raise WorkFailed(f"{address}: {why}; see docs/fly.md, 'When it hands over'")
     row = {**trial._asdict(), "handed_over": companion.over}
     file = write_log(companion, row, out)
     console.say(f"handed over: {companion.over}; log: {file}")

@@ -5,7 +5,9 @@ import pytest
 from policies import shipped
 from suite import cli
 from suite.commands.train import Config, resolve
+from suite.common.errors import WorkFailed
 from suite.judging.flying import checkpoint_folder
+from suite.train import run
 
 
 def test_an_unknown_preset_is_refused_with_the_names_there_are():
@@ -16,6 +18,23 @@ def test_an_unknown_preset_is_refused_with_the_names_there_are():
 def test_options_become_settings():
     config = resolve(Config(preset="small", seed=4, iterations=7, set=("optimizer.rate=1",)))
     assert (config.seed, config.optimizer.iterations, config.optimizer.rate) == (4, 7, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("preset", "said", "start"), [("swift-30", True, "swift-30"), ("direct", False, "swift-quad")]
+)
+def test_a_recipe_that_trains_on_says_where_nothing_is_trained_on(
+    preset, said, start, tmp_path, monkeypatch, capsys
+):
+    def stop(*args):
+        raise WorkFailed("no training here")
+
+    monkeypatch.setattr(run, "train", stop)
+    assert cli.main(["train", "--preset", preset, "--out", str(tmp_path)]) == 1
+    alone = capsys.readouterr().err
+    assert ("without --from it begins with fresh weights" in alone) == said
+    assert cli.main(["train", "--preset", preset, "--out", str(tmp_path), "--from", start]) == 1
+    assert "without --from" not in capsys.readouterr().err
 
 
 def test_training_goes_on_from_a_shipped_policy_by_its_name(tmp_path, capsys):

@@ -38,11 +38,13 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
              "--drive", "motors", "--vehicle", str(tmp_path / "v.toml"),
              "--out", str(tmp_path / "out")]  # fmt: skip
     assert main([*words, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    said = capsys.readouterr()
+    told = json.loads(said.out)
     names = {name for e in told["effects"] for name in (e["name"], *e["alternatives"])}
     assert "mass_offset" in names and told["views"] and len(told["reference"]) == 3
     for flag in ("--plan", "--drive"):
         assert any(flag in line for line in told["warnings"])
+        assert f"warning: {flag} is of rollouts: left out" in said.err
     for axis in told["gap"]["channels"]["force"].values():
         assert {"before", "after", "noise_floor", "repeatability"} <= set(axis)
     assert json.loads((tmp_path / "out/diagnosis.json").read_text())["verdict"] == told["verdict"]

@@ -28,7 +28,26 @@ def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
     assert "--pick passed" in capfd.readouterr().err
 
 
+def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp_path, capfd):
+    out, limit = tmp_path / "out", ["--time-limit-s", "1.2"]
+    flown = ["--track", "zigzag", "--trials", "1", "--policy", pilots["pursuit"], *limit]
+    assert _eval(out, *flown) == 0
+    (row,) = read_trials(out / "trials.parquet")
+    assert (row.ended_by, row.time_s) == ("timeout", 1.2)
+    assert cli.main(["view", str(out), "--out", str(tmp_path / "seen")]) == 0
+    assert "timeout after 1.2 s" in capfd.readouterr().out
+    assert cli.main(["collect", "--out", str(tmp_path / "logs"), "--difficulty", "0", *flown]) == 0
+    listed = json.loads((tmp_path / "logs" / "flights.json").read_text())
+    assert [flight["time_s"] for flight in listed["flights"]] == [1.2]
+    assert _eval(out, *flown[:-1], "0") == 2
+    assert "--time-limit-s is 0.0, allowed is" in " ".join(capfd.readouterr().err.split())
+
+
 def test_view_of_something_else_is_refused(tmp_path, capsys):
+    (tmp_path / "begun").mkdir()
+    (tmp_path / "begun" / "journal-0.jsonl").write_text("{}\n")
+    assert cli.main(["view", str(tmp_path / "begun")]) == 2
+    assert "not finished; give its command again" in " ".join(capsys.readouterr().err.split())
     (tmp_path / "trials.parquet").write_text("no parquet")
     assert cli.main(["view", str(tmp_path)]) == 2
     assert "run.json" in capsys.readouterr().err

@@ -24,6 +24,8 @@ def test_settings_are_changed_by_name():
         ("los.progress=1", "Did you mean 'loss'"),
         ("loss=1", "has parts, set one of clearance"),
         ("loss.progress.more=1", "'more' is below a setting that has no parts"),
+        ("quadrotor.mass_std=0.1", "this run has no quadrotor; add --model quad"),
+        ("fleet.mass=1", "this run has no fleet; add --model fleet"),
         ("loss.progress", "write FIELD=VALUE"),
         ("loss.progress=fast", "'fast' does not fit, the setting is like"),
         ("episode.batch=3.5", "(int)"),

@@ -13,7 +13,7 @@ from policies.policy import load_policy
 from policies.spec import PolicySpec
 from suite import cli
 from suite.judging.link import commanded, server
-from suite.judging.link.companion import FINISHED, Companion
+from suite.judging.link.companion import Companion
 from suite.judging.link.flights import Flight, fly_link, totals, warm_up, write_log
 from suite.judging.link.frames import turned, turned_quat
 from suite.judging.link.messages import (
@@ -323,6 +323,10 @@ def test_a_link_on_which_nobody_is_ends_by_itself(bench):
     assert not one.companion.rows and one.companion.over is None
 
 
+def told(capsys):
+    return " ".join(capsys.readouterr().err.split())
+
+
 def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     asked = ["fly", "--out", str(tmp_path), "--link", "udpin:127.0.0.1:0"]
     assert cli.main(asked) == 2
@@ -330,12 +334,15 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     assert cli.main([*asked, "--confirm", "--trials", "3"]) == 2
     assert "--link flies one flight" in capsys.readouterr().err
 
-    def finished(companion, link):
-        companion.over = FINISHED
+    def refused(companion, link):
+        companion.over = "outside the box at 0.0, 0.0, -3.0 m"
 
-    monkeypatch.setattr(commanded, "fly_link", finished)
+    monkeypatch.setattr(commanded, "fly_link", lambda companion, link: None)
     assert cli.main([*asked, "--confirm"]) == 1
-    assert "no vehicle sent a state" in capsys.readouterr().err
+    assert "no vehicle sent a state (ODOMETRY) and a depth image within 30 s" in told(capsys)
+    monkeypatch.setattr(commanded, "fly_link", refused)
+    assert cli.main([*asked, "--confirm"]) == 1
+    assert "before the first set point: outside the box at 0.0, 0.0, -3.0 m" in told(capsys)
 
 
 @pytest.mark.slow
