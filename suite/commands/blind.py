@@ -30,7 +30,7 @@ class Config:
     seed: Seed | None = None
     """Of a set of your own, in place of the two."""
     count: Annotated[int, Range(1, 100_000)] | None = None
-    """About how many cases, every kind with its share; all 242 if not given."""
+    """About how many cases, every kind with its share; all 244 if not given."""
     simulator: Literal["mujoco", "rotorpy", "continuous"] = "mujoco"
     """Who flies the cases: rotorpy (pip install diffracing-suite[rotorpy]) and continuous, an
     engine in continuous time that shares no code with the model that fits, make 60."""
