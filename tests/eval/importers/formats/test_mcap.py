@@ -48,7 +48,8 @@ def test_mcap_motors_are_put_in_order_by_a_map(tmp_path):
     # The file's motors 1 to 4: front left, rear left, rear right, front right.
     chosen.write_text("[frames]\nmotors = [[1, 1], [-1, 1], [-1, -1], [1, -1]]\n")
     log, findings = import_log(path, None, ImportOptions(map=chosen, full_thrust=30.0))
-    assert np.array_equal(log.rotor_speed, np.asarray(plain.rotor_speed)[:, ::-1], equal_nan=True)
+    turned = np.asarray(plain.rotor_speed)[:, ::-1]
+    assert np.array_equal(np.asarray(log.rotor_speed), turned, equal_nan=True)
     assert "the file's 4, 3, 2, 1" in text(findings, "motors")
     chosen.write_text('[frames]\nworld = "ned"\n')
     with pytest.raises(ValueError, match=r"'world' in \[frames\] is unknown"):
