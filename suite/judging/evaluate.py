@@ -69,6 +69,7 @@ def evaluate(
         for manner in manners(evaluation.speed, evaluation.monitor)
         for name, policy, label in plain
     ]
+    _refuse_twice([flier.label for flier in fliers])
     count = len(course.trials)
     workers = workers_for(count, workers, evaluation.world)
     flown = count * len(fliers)
@@ -100,6 +101,16 @@ def evaluate(
         console.show(rich_table(grid))
     console.say(f"written: {out / 'trials.parquet'}, table.md, summary.json")
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
+
+
+def _refuse_twice(called: list[str]) -> None:
+    """Refuse two shares of one label, which tables would count as one with twice the trials."""
+    for label in called:
+        if called.count(label) > 1:
+            raise ValueError(
+                f"{label} would be judged twice; give each --policy and each --speed once "
+                "(speeds are told apart by 6 digits)"
+            )
 
 
 def _fly_one(

@@ -3,16 +3,22 @@
 import pytest
 
 import policies.policy
+from policies.spec import PolicySpec
 from tests.support.pilots import Pursuit, Steady
+from tracks.geometry.camera import Camera
+
+OTHER = PolicySpec(camera=Camera(width=36, height=20), speed_input=True)
+"""Not what a vehicle's file says of its camera, and with a speed to be asked for."""
 
 
 @pytest.fixture
 def pilots(monkeypatch, tmp_path):
-    """Make the policy files `pursuit` and `diver`; the other ways to load stay."""
+    """Make a policy file of each pilot; the other ways to load stay."""
     made = {
         "pursuit": Pursuit(),
         "diver": Steady((0.0, 0.0, -8.0), name="diver"),
         "diver2": Steady((1.0, 0.0, -8.0), name="diver"),
+        "other": Steady((0.0, 0.0, -8.0), OTHER, name="other"),
     }
     files = {name: tmp_path / name for name in made}
     for name, file in files.items():
