@@ -125,10 +125,8 @@ def fly(
     for trial in trials:
         if trial.track not in (tracks or {}):
             check_family(trial.track)
-    if world == REFERENCE and record:
-        raise ValueError(
-            "world 'reference' records no flights; record in 'mujoco', which flies alike"
-        )
+    if record:
+        check_records(world)
     task = Task(policy, vehicle, world, options, record, tracks or {})
     results: dict[int, TrialResult] = {}
 
@@ -143,6 +141,18 @@ def fly(
     shares = pieces_of(list(enumerate(trials)), crew(workers), most)
     work_off(partial(fly_share, task), shares, workers, keep)
     return [results[index] for index in range(len(trials))]
+
+
+def check_records(world: str) -> None:
+    """Refuse a world that records no flights.
+
+    Raises:
+        ValueError: with what to do instead.
+    """
+    if world == REFERENCE:
+        raise ValueError(
+            f"world {REFERENCE!r} records no flights; record in 'mujoco', which flies alike"
+        )
 
 
 def pieces_of(

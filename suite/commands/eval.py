@@ -47,6 +47,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.rerun and config.rerun.suffix != ".rrd":
         raise ValueError(f"--rerun {config.rerun}: a recording's name must end in .rrd")
     if config.rerun:
+        from eval.judging.judge import check_records
+
+        check_records(config.flown.world)
         check_place(config.rerun)
     answer = evaluate(config.flown, config.out, console, asked_workers(config.workers))
     if config.rerun:

@@ -53,9 +53,11 @@ def collect(
         ValueError: for anything in `collection` that cannot be used, or where `out` holds the
             flights of another collection.
     """
+    from eval.judging.judge import check_records
     from eval.judging.results import Journal
 
     course, manner = read_course(collection), Manner(speed=collection.speed)
+    check_records(collection.world)
     _refuse_one_name({trial.track for trial in course.trials})
     asked = collection.policy or default_policy()
     policy = load_flier(asked, collection.trust, manner)

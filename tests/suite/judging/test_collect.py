@@ -106,3 +106,10 @@ def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
     said = capfd.readouterr()
     assert "zigzag-0-7.parquet: column rate_x, row 5: 300" in said.err
     assert "1 without a log, 0 of them under 1 s" in said.out
+
+
+def test_a_world_that_records_nothing_leaves_no_journal_in_the_way(pilots, tmp_path, capfd):
+    args = ["collect", "--policy", pilots["diver"], "--out", str(tmp_path / "flights")]
+    assert cli.main([*args, "--world", "reference"]) == 2
+    assert "'reference' records no flights; record in 'mujoco'" in capfd.readouterr().err
+    assert not (tmp_path / "flights").exists()

@@ -108,6 +108,7 @@ def test_a_journal_of_something_else_is_not_mixed_in(pilots, tmp_path, monkeypat
         (["--vehicle", "referense"], "Did you mean 'reference'?"),
         (["--policy", "nobody_we_know"], "nobody_we_know"),
         (["--rerun", "trials.mp4"], "must end in .rrd"),
+        (["--rerun", "trials.rrd", "--world", "reference"], "'reference' records no flights"),
         (["--rerun", "/proc/nowhere/trials.rrd"], "/proc/nowhere"),
     ],
 )
@@ -130,6 +131,15 @@ def test_with_a_monitor_each_policy_flies_twice_on_the_same_trials(pilots, tmp_p
     loaded = load_flier(pilots["diver"], False, Manner(monitored=True))
     make = who_flies(loaded, pilots["diver"], False, 2, Manner(monitored=True))
     assert callable(make) and make().name == "diver+monitor"
+
+
+def test_what_tables_would_take_for_one_is_refused(pilots, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(eval.judging.judge, "fly", None)
+    for speeds in (["0.5", "0.5"], ["0.5", "0.50000001"]):
+        asked = ["--policy", pilots["other"], "--track", "zigzag", "--speed", *speeds]
+        assert _eval(tmp_path / "out", *asked) == 2
+        assert "other@0.5 would be judged twice; give each" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
