@@ -65,14 +65,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     check_place(recording)
     check_place(config.out / "picture.png")
     evaluation, trials = _chosen(config)
-    from eval.quadrotor.vehicle_file import load_vehicle
     from eval.view.picture import write_picture
     from eval.view.recording import write_recording
-    from suite.judging.replay import drone_of, fly_again
+    from suite.judging.replay import fly_again
 
     console.note(f"flying {len(trials)} trials again")
-    rollouts = fly_again(evaluation, trials)
-    write_recording(recording, rollouts, drone_of(load_vehicle(evaluation.vehicle)))
+    rollouts, drone = fly_again(evaluation, trials)
+    write_recording(recording, rollouts, drone)
     written = [recording]
     for rollout in rollouts:
         written.append(write_picture(config.out / f"{_name(rollout)}.png", *rollout))

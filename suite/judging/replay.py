@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.choices import parse_levels, parse_tracks
 from suite.common.console import Console
@@ -16,9 +16,17 @@ from tracks.input.reading import read_json
 
 if TYPE_CHECKING:
     from eval.logs.flight import Flight
-    from eval.vehicles.vehicle import Vehicle
     from eval.view.recording import Drone, Rollout
     from eval.worlds.trial import TrialResult, TrialSpec
+
+
+class Replay(NamedTuple):
+    """Trials flown again."""
+
+    rollouts: list[Rollout]
+    """Track, flight (with the depth images) and result of each."""
+    drone: Drone
+    """How a recording shows who flew: the vehicle, with the policy's camera."""
 
 
 def read_evaluation(folder: Path) -> Evaluation:
@@ -60,10 +68,8 @@ def first_trials(evaluation: Evaluation) -> list[TrialSpec]:
     return trial_list(tracks, levels, 1, evaluation.seed)
 
 
-def fly_again(
-    evaluation: Evaluation, trials: list[TrialSpec], policy: str | None = None
-) -> list[Rollout]:
-    """Return track, flight (with the depth images) and result of each of `trials`.
+def fly_again(evaluation: Evaluation, trials: list[TrialSpec], policy: str | None = None) -> Replay:
+    """Fly `trials` as they were judged.
 
     Args:
         evaluation: what the trials are part of.
@@ -73,6 +79,7 @@ def fly_again(
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, Record, fly
     from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.view.recording import Drone
     from eval.worlds.trial import Rules, track_of
 
     options = JudgeOptions(
@@ -81,6 +88,8 @@ def fly_again(
         limits=ActionLimits(deadline_s=evaluation.deadline_s),
     )
     name = policy or (evaluation.policies or (default_policy(),))[0]
+    flier = load_flier(name, evaluation.trust, manners(evaluation.speed, monitor=False)[0])
+    vehicle = load_vehicle(evaluation.vehicle)
     tracks = custom_tracks(parse_tracks(evaluation.track))
     flights: dict[TrialSpec, Flight] = {}
 
@@ -89,33 +98,27 @@ def fly_again(
             flights[result.trial] = flight
 
     results = fly(
-        load_flier(name, evaluation.trust, manners(evaluation.speed, monitor=False)[0]),
+        flier,
         trials,
-        load_vehicle(evaluation.vehicle),
+        vehicle,
         evaluation.world,
         options,
         keep,
         Record(depth=True),
         tracks,
     )
-    return [
+    rollouts = [
         (track_of(tracks, trial), flights[trial], result)
         for trial, result in zip(trials, results, strict=True)
     ]
-
-
-def drone_of(vehicle: Vehicle) -> Drone:
-    """Return how a recording shows `vehicle`."""
-    from eval.view.recording import Drone
-
-    return Drone(vehicle.body.half_size, vehicle.rotors.position, vehicle.camera)
+    # What is flown with is the policy's camera, whatever the vehicle's file says of one.
+    camera = flier.spec.camera
+    return Replay(rollouts, Drone(vehicle.body.half_size, vehicle.rotors.position, camera))
 
 
 def record_first_trials(evaluation: Evaluation, path: Path, console: Console) -> None:
     """Write a rerun recording of the first trial of every track and level to `path`."""
-    from eval.quadrotor.vehicle_file import load_vehicle
     from eval.view.recording import write_recording
 
-    rollouts = fly_again(evaluation, first_trials(evaluation))
-    write_recording(path, rollouts, drone_of(load_vehicle(evaluation.vehicle)))
+    write_recording(path, *fly_again(evaluation, first_trials(evaluation)))
     console.say(f"written: {path} (open it with: rerun {path})")

@@ -27,7 +27,7 @@ from suite.delta.run import fit_delta, fitting_estimate
 from suite.judging.collect import collect
 from suite.judging.evaluate import evaluate
 from suite.judging.flying import checkpoint_folder, flying_needs, workers_for
-from suite.judging.replay import drone_of, first_trials, fly_again
+from suite.judging.replay import first_trials, fly_again
 from suite.judging.requests import Collection, Evaluation
 from suite.loop.compare import BEFORE
 from suite.loop.config import OWN, DeltaLoopConfig, LoopConfig
@@ -311,14 +311,14 @@ def _replay(run: LoopRun) -> Stage:
         from eval.view.picture import write_grid
         from eval.view.recording import write_recording
 
-        trials, flown = first_trials(ends), []
+        trials, flown, drone = first_trials(ends), [], None
         columns = len(set(trial.difficulty for trial in trials))
         for variant, label, _ in run.loop.shown:
-            rollouts = fly_again(evaluation, trials, str(run.policy(by_name[variant])))
+            policy = str(run.policy(by_name[variant]))
+            rollouts, drone = fly_again(evaluation, trials, policy)
             flown.append([(*pair, result._replace(policy=label)) for *pair, result in rollouts])
             write_grid(folder / f"{variant}.png", flown[-1], columns)
         pairs = [rollout for pair in zip(*flown, strict=True) for rollout in pair]
-        drone = drone_of(load_vehicle(evaluation.vehicle))
         write_recording(folder.parent / "recording.rrd", pairs, drone)
 
     words = "flying a few trials again for the recording and the pictures"

@@ -6,6 +6,7 @@ from eval.judging.results import read_trials
 from suite import cli
 from suite.commands import view
 from suite.judging.manner import Manner, manners
+from tests.support.recordings import columns
 
 
 def _eval(out, *args):
@@ -41,6 +42,17 @@ def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp
     assert [flight["time_s"] for flight in listed["flights"]] == [1.2]
     assert _eval(out, *flown[:-1], "0") == 2
     assert "--time-limit-s is 0.0, allowed is" in " ".join(capfd.readouterr().err.split())
+
+
+def test_a_recording_shows_the_camera_of_who_flew(pilots, tmp_path):
+    seen = tmp_path / "seen"
+    asked = ["view", pilots["other"], "--track", "zigzag", "--count", "1", "--out", str(seen)]
+    assert cli.main(asked) == 0
+    found = columns(seen / "trials.rrd")
+    eye = "/trial_0/world/drone/camera"
+    assert found[eye, "Pinhole:resolution"][1] == [[[36.0, 20.0]]]
+    layout = found[f"{eye}/depth", "DepthImage:format"][1][0][0]
+    assert (layout["width"], layout["height"]) == (36, 20)
 
 
 def test_view_of_something_else_is_refused(tmp_path, capsys):
