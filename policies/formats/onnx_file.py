@@ -74,9 +74,7 @@ def read_checked(path: Path) -> onnx.ModelProto:
             if not onnx.defs.has(node.op_type):
                 raise PolicyError(f"{path}: operator {node.op_type!r} is not in the ONNX standard")
     external = [tensor for tensor in _tensors(proto) if tensor.external_data]
-    size = path.stat().st_size
-    for tensor in external:
-        size += _data_file(path, tensor).stat().st_size
+    size = path.stat().st_size + _external_bytes(path, external)
     if size > MODEL_BYTES:
         raise PolicyError(f"{path}: {size} bytes with its data, allowed are up to {MODEL_BYTES}")
     try:
@@ -111,9 +109,34 @@ def _graph_of(path: Path) -> onnx.ModelProto:
         ) from None
 
 
+def _external_bytes(path: Path, tensors: list[Any]) -> int:
+    """Return how many bytes lie outside: in the files, or, if more, in all tensors together."""
+    sizes, held = {}, 0
+    for tensor in tensors:
+        file = _data_file(path, tensor)
+        sizes[file] = file.stat().st_size
+        # Tensors may share a file's bytes, and each is read into memory by itself.
+        held += _held_bytes(_external(tensor), sizes[file])
+    return max(sum(sizes.values()), held)
+
+
+def _held_bytes(entries: dict[str, Any], size: int) -> int:
+    """Return how many bytes a tensor takes of a file of `size`; all where it does not say."""
+    try:
+        rest = size - int(entries.get("offset", 0))
+        return max(0, min(int(entries.get("length", rest)), rest))
+    except ValueError:
+        return size
+
+
+def _external(tensor: onnx.TensorProto) -> dict[str, Any]:
+    """Return where a tensor's data lie; of a key that stands twice onnx takes the last, too."""
+    return {entry.key: entry.value for entry in tensor.external_data}
+
+
 def _data_file(path: Path, tensor: onnx.TensorProto) -> Path:
     """Return the file that a tensor's data lie in, which is in the same folder."""
-    location = next((e.value for e in tensor.external_data if e.key == "location"), "")
+    location = _external(tensor).get("location", "")
     _check_text(path, location)
     folder = path.resolve().parent
     file = (folder / location).resolve()

@@ -14,8 +14,8 @@ from policies import shipped
 from policies.policy import Policy, load_policy
 
 
-def flown_files(name_or_path: str | Path) -> list[Path]:
-    """Return the files of a policy, of a folder those that fly.
+def flown_files(name_or_path: str | Path) -> dict[str, Path]:
+    """Return the files of a policy, of a folder those that fly, by their path within its folder.
 
     A card or a curve beside them may change and the policy be the same.
     """
@@ -24,20 +24,23 @@ def flown_files(name_or_path: str | Path) -> list[Path]:
     path = shipped.locate(name_or_path)
     if path.is_dir():
         names = (CONFIG, WEIGHTS) if (path / CONFIG).exists() else ("policy.h", "policy.c")
-        return [path / name for name in names if (path / name).is_file()]
+        return {name: path / name for name in names if (path / name).is_file()}
     if path.suffix == ".c":
-        return [path.with_name("policy.h"), path]
+        return {"policy.h": path.with_name("policy.h"), path.name: path}
     if path.suffix == ".onnx":
         from policies.formats.onnx_file import files_of
 
-        return files_of(path)
-    return [path]
+        # Links are followed to the file, whose data lie beside it and not beside a link.
+        whole, *data = files_of(path)
+        home = whole.resolve().parent
+        return {path.name: whole, **{str(file.relative_to(home)): file for file in data}}
+    return {path.name: path}
 
 
 def policy_digest(name_or_path: str | Path) -> str:
     """Return the SHA-256 of the files of a policy that fly, as hex."""
     digest = hashlib.sha256()
-    for file in flown_files(name_or_path):
+    for file in flown_files(name_or_path).values():
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
 
@@ -60,8 +63,8 @@ class PolicyContent:
         """Return the content of a policy that can be loaded here."""
         path = shipped.locate(name_or_path).absolute()
         folder, file = (path, "") if path.is_dir() else (path.parent, path.name)
-        parts = ((entry.absolute(), entry.read_bytes()) for entry in flown_files(name_or_path))
-        files = tuple((str(entry.relative_to(folder)), data) for entry, data in parts)
+        flown = flown_files(name_or_path).items()
+        files = tuple((name, entry.read_bytes()) for name, entry in flown)
         return cls(folder.resolve().name, file, files, trust)
 
     def __call__(self) -> Policy:

@@ -6,6 +6,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from policies.errors import PolicyError
+from policies.formats import onnx_file
 from policies.formats.onnx_file import files_of
 from policies.policy import load_policy
 
@@ -71,12 +72,16 @@ def test_functions_are_refused(tmp_path):
     refused(save(tmp_path, proto), "holds functions")
 
 
-def external(location):
+def external(*locations, **entries):
+    """A model whose one tensor lies at the last of `locations`, with more `entries` of where."""
     tensor = TensorProto()
     tensor.CopyFrom(MATRIX)
     tensor.ClearField("raw_data")
     tensor.data_location = TensorProto.EXTERNAL
-    tensor.external_data.add(key="location", value=location)
+    for location in locations:
+        tensor.external_data.add(key="location", value=location)
+    for key, entry in entries.items():
+        tensor.external_data.add(key=key, value=str(entry))
     return model([PRODUCT], tensors=[tensor])
 
 
@@ -103,9 +108,40 @@ def test_data_beside_the_file_is_read_and_outside_it_is_refused(tmp_path):
     refused(write_raw(path, external("link.bin")), "outside the file's folder")
 
 
-def test_a_file_that_is_too_large_is_refused(exported, monkeypatch):
-    from policies.formats import onnx_file
+def test_of_a_place_that_stands_twice_the_last_is_taken_as_by_onnx(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (folder / "w.bin").write_bytes(MATRIX.raw_data)
+    path = write_raw(folder / "it.onnx", external("none.bin", "w.bin"))
+    assert files_of(path) == [path, folder / "w.bin"]
+    assert load_policy(path).name == "it.onnx"
+    (tmp_path / "w.bin").write_bytes(MATRIX.raw_data)
+    refused(write_raw(path, external("w.bin", "../w.bin")), "outside the file's folder")
 
+
+def test_a_file_of_many_tensors_counts_once_and_bytes_of_many_tensors_count_each(
+    tmp_path, monkeypatch
+):
+    tensors = []
+    for k in range(8):
+        (tensor,) = external("w.bin", offset=k * len(MATRIX.raw_data),
+                             length=len(MATRIX.raw_data)).graph.initializer  # fmt: skip
+        tensor.name = "w" if k == 0 else f"w{k}"
+        tensors.append(tensor)
+    data = MATRIX.raw_data * len(tensors)
+    (tmp_path / "w.bin").write_bytes(data)
+    path = write_raw(tmp_path / "it.onnx", model([PRODUCT], tensors=tensors))
+    monkeypatch.setattr(onnx_file, "MODEL_BYTES", path.stat().st_size + len(data))
+    assert load_policy(path).name == "it.onnx"
+    for tensor in tensors:
+        del tensor.external_data[1:]
+    refused(write_raw(path, model([PRODUCT], tensors=tensors)), "bytes with its data, allowed")
+    tensors[0].external_data.add(key="offset", value="none")
+    monkeypatch.undo()
+    refused(write_raw(path, model([PRODUCT], tensors=tensors)), "breaks the ONNX standard")
+
+
+def test_a_file_that_is_too_large_is_refused(exported, monkeypatch):
     monkeypatch.setattr(onnx_file, "MODEL_BYTES", 1000)
     refused(exported / "tiny.onnx", "allowed are up to 1000")
 

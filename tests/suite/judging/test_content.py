@@ -54,16 +54,36 @@ def test_a_digest_changes_with_any_byte_of_what_flies_and_no_other(tmp_path):
 
 
 def test_a_digest_changes_with_weights_beside_an_onnx_file(tmp_path):
-    onnx = pytest.importorskip("onnx")
-    weights = onnx.numpy_helper.from_array(np.ones(300, np.float32), "w")
-    node = onnx.helper.make_node("Identity", ["w"], ["action"])
-    graph = onnx.helper.make_graph([node], "g", [], [], [weights])
-    path, seen = tmp_path / "it.onnx", []
-    onnx.save(
-        onnx.helper.make_model(graph), path,
-        save_as_external_data=True, location="w.bin", size_threshold=0,
-    )  # fmt: skip
+    path, seen = onnx_file(tmp_path), []
     for scale in (1, 2):
         (tmp_path / "w.bin").write_bytes(np.full(300, scale, np.float32).tobytes())
         seen.append(policy_digest(str(path)))
     assert len(set(seen)) == 2
+
+
+def test_an_onnx_file_behind_a_link_comes_with_its_weights(tmp_path):
+    folder = tmp_path / "real"
+    folder.mkdir()
+    path = onnx_file(folder)
+    (tmp_path / "there").symlink_to(folder)
+    (tmp_path / "mine.onnx").symlink_to(path)
+    whole = {name: (folder / name).read_bytes() for name in ("it.onnx", "w.bin")}
+    content = PolicyContent.of(tmp_path / "there" / "it.onnx")
+    assert (content.name, content.file, dict(content.files)) == ("real", "it.onnx", whole)
+    content = PolicyContent.of(tmp_path / "mine.onnx")
+    assert content.file == "mine.onnx"
+    assert dict(content.files) == {"mine.onnx": whole["it.onnx"], "w.bin": whole["w.bin"]}
+
+
+def onnx_file(folder):
+    """Write it.onnx with its weights beside it in w.bin; return its path."""
+    onnx = pytest.importorskip("onnx")
+    weights = onnx.numpy_helper.from_array(np.ones(300, np.float32), "w")
+    node = onnx.helper.make_node("Identity", ["w"], ["action"])
+    graph = onnx.helper.make_graph([node], "g", [], [], [weights])
+    path = folder / "it.onnx"
+    onnx.save(
+        onnx.helper.make_model(graph), path,
+        save_as_external_data=True, location="w.bin", size_threshold=0,
+    )  # fmt: skip
+    return path
