@@ -9,6 +9,7 @@ from typing import Any, Literal
 import tyro
 
 from suite.common.console import Console
+from tracks.common.files import check_no_input
 from tracks.input.ranges import Seed
 
 
@@ -55,9 +56,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
+    from suite.delta.run import flight_files
     from suite.diagnose.report.parameters_json import components, in_digits
     from suite.diagnose.run import diagnose_files
 
+    check_no_input(config.out / "vehicle.toml", [config.vehicle, config.fly], "--out")
+    for path in flight_files(config.flights) if config.fly else ():
+        check_no_input(config.out / "plan" / "flights" / path.name, [path], "--out")
     result = diagnose_files(
         config.flights,
         config.vehicle,

@@ -9,6 +9,7 @@ from typing import Any
 import tyro
 
 from suite.common.console import Console
+from tracks.common.files import check_no_input
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     if config.out.suffix.lower() != ".toml":
         raise ValueError(f"--out is {str(config.out)!r}; its ending must be .toml")
+    check_no_input(config.out, [config.vehicle], "--out")
     result = identify_files(config.flights, config.vehicle, config.out, config.leave, console)
     console.say(f"driven by {DRIVEN[result['drive']]}")
     for key, entry in result["parameters"].items():

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
+from tracks.common.files import check_no_input
 from tracks.input.ranges import Range
 
 
@@ -111,6 +112,7 @@ def _check(config: Config) -> None:
         raise ValueError(f"--start {config.start:g} --end {config.end}: 0 <= start < end, in s")
     if config.pose_map is not None and config.pose is None:
         raise ValueError("--pose-map describes the file of --pose, which is not given")
+    check_no_input(config.out, [config.file, config.pose], "--out")
 
 
 def _top(speed: Any) -> float:

@@ -14,7 +14,7 @@ from suite.common.work import Silent
 from suite.train.config import TrainConfig, check
 from suite.train.overrides import override
 from suite.train.presets import chosen_model, doubt_of, preset, with_iterations
-from tracks.common.files import plain
+from tracks.common.files import check_no_input, plain
 from tracks.input.ranges import Iterations, Seed
 
 
@@ -85,7 +85,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     import jax
 
+    from policies.formats.checkpoint import CONFIG
     from policies.formats.delta_file import load_delta
+    from policies.shipped import locate
     from suite.delta.corrected import check_corrects
     from suite.train.run import started_from, train
 
@@ -94,6 +96,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.note(doubt)
     params, delta = None, None
     if config.from_ is not None:
+        # What is trained is written to out/policy, which nothing there may yet say is another run.
+        start, trained = locate(config.from_) / CONFIG, config.out / "policy" / CONFIG
+        check_no_input(trained, [start], "--out")
         params = started_from(config.from_, resolved.spec)
     if config.delta is not None:
         stored = load_delta(config.delta)

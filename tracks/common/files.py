@@ -16,7 +16,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -126,6 +126,28 @@ def check_place(path: str | os.PathLike[str]) -> None:
         if final.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(final))
         os.rmdir(tempfile.mkdtemp(prefix=_prefix(final), suffix=PART, dir=final.parent))
+
+
+def check_no_input(
+    path: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str] | None], option: str
+) -> None:
+    """Refuse to write a file that is read as well.
+
+    Args:
+        path: what is to be written.
+        inputs: what is read; names that are no files are passed over.
+        option: what says where `path` is.
+
+    Raises:
+        ValueError: naming the file, and the option to change.
+    """
+    for given in inputs:
+        if given and os.path.exists(given) and os.path.exists(path):
+            if os.path.samefile(given, path):
+                raise ValueError(
+                    f"{option}: {os.fspath(path)} is read, too, and would be written over; give "
+                    f"another {option}"
+                )
 
 
 def sweep_parts(folder: str | os.PathLike[str]) -> list[Path]:

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from policies import shipped
 from suite.common.console import Console
 from suite.judging.deploy.card import CARD, card_text
 from suite.judging.deploy.observed import observed_flights
 from suite.judging.deploy.parity import parity
-from tracks.common.files import write_text
+from tracks.common.files import check_no_input, write_text
 
 
 def export(
@@ -25,6 +26,8 @@ def export(
     from policies.native import native_policy
 
     check_formats(formats, dtype)
+    if "c" in formats:
+        check_no_input(out / CARD, [shipped.locate(policy) / CARD], "--out")
     name, checkpoint = exported_checkpoint(policy)
     observed = None
     if dtype == "int8":

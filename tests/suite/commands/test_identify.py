@@ -34,6 +34,14 @@ def test_a_vehicle_file_comes_out_with_what_was_told(flights, tmp_path, capsys):
     assert len(told["flights"]) == 2
 
 
+def test_the_file_that_is_started_from_is_not_written_over(flights, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    before = (tmp_path / "start.toml").rename("vehicle.toml").read_text()
+    assert cli.main(["identify", str(flights), "--vehicle", "./vehicle.toml"]) == 2
+    assert "vehicle.toml is read, too, and would be written over" in capsys.readouterr().err
+    assert (tmp_path / "vehicle.toml").read_text() == before
+
+
 @pytest.mark.parametrize(
     ("options", "reason"),
     [(["--leave", "wings"], "--leave 'wings': allowed"), (["--out", "v.json"], "must be .toml")],

@@ -47,3 +47,16 @@ def test_bad_options_are_code_2_in_one_line(tmp_path, capsys, options, reason):
     code = cli.main(["import", str(log), *where, *options])
     said = capsys.readouterr().err
     assert code == 2 and reason in said and "Traceback" not in said and not out.exists()
+
+
+def test_a_log_that_is_read_is_not_written_over(tmp_path, capsys):
+    log, pose = made.write_usd(tmp_path / "log00", span=(0, 3)), tmp_path / "pose.csv"
+    pose.write_text("t\n")
+    table = log.rename(tmp_path / "log.csv")
+    for args in (
+        [str(table), "--out", str(table)],
+        [str(table), "--pose", str(pose), "--out", str(pose)],
+    ):
+        assert cli.main(["import", *args]) == 2
+        assert f"{args[-1]} is read, too" in capsys.readouterr().err
+    assert pose.read_text() == "t\n"

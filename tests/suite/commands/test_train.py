@@ -1,5 +1,7 @@
 """The options of the train command become a run's settings."""
 
+import shutil
+
 import pytest
 
 from policies import shipped
@@ -43,3 +45,10 @@ def test_training_goes_on_from_a_shipped_policy_by_its_name(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "--from racr: " in said and "a shipped policy's name (racer, swift" in said
     assert not (tmp_path / "run").exists()
+
+
+def test_the_policy_that_is_trained_on_is_not_written_over(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(run, "train", None)
+    own = shutil.copytree(shipped.folder("racer"), tmp_path / "policy")
+    assert cli.main(["train", "--from", str(own), "--out", str(tmp_path)]) == 2
+    assert "config.json is read, too, and would be written over" in capsys.readouterr().err

@@ -119,3 +119,16 @@ def test_a_file_with_a_load_on_a_line_is_refused_in_one_line(tmp_path, capsys):
     assert main(["diagnose", *line]) == 2
     said = capsys.readouterr().err.strip()
     assert "effects.slung_load" in said and "take it out" in said and "\n" not in said
+
+
+def test_what_is_read_is_not_written_over(tmp_path, capsys):
+    save_vehicle(PLAIN, tmp_path / "vehicle.toml")
+    flown = tmp_path / "plan" / "flights" / "plan_1_circle.parquet"
+    flown.parent.mkdir(parents=True)
+    flown.write_bytes(b"a log")
+    own, out = str(tmp_path / "vehicle.toml"), ["--out", str(tmp_path)]
+    for args in (["--vehicle", own], ["--vehicle", "reference", "--fly", own],
+                 ["--vehicle", "reference", "--fly", "reference"]):  # fmt: skip
+        assert main(["diagnose", str(flown), *args, *out]) == 2
+        said = "plan_1_circle.parquet" if own not in args else "vehicle.toml"
+        assert f"{said} is read, too, and would be written over" in capsys.readouterr().err
