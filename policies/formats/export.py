@@ -47,7 +47,7 @@ def export_policy(
     chosen = list(formats)
     check_formats(chosen, dtype)
     name, checkpoint = exported_checkpoint(name_or_folder)
-    label = embed(checkpoint.spec, name, checkpoint.config["seed"])
+    label = embed(checkpoint.spec, name, checkpoint.seed)
     written = []
     for wanted in chosen:
         if wanted == "c":

@@ -28,6 +28,11 @@ class PolicyCheckpoint:
     config: dict[str, Any]
     """The whole of config.json, "training" among it."""
 
+    @property
+    def seed(self) -> int | None:
+        """The seed of its training; None where its maker does not say."""
+        return self.config.get("seed")
+
 
 def save_policy(
     folder: Path,

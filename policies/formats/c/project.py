@@ -67,7 +67,7 @@ def c_project(
             )
         layers = quantise(params, spec, observed)
         name = f"{name}-int8"
-    label = embed(spec, name, checkpoint.config["seed"])
+    label = embed(spec, name, checkpoint.seed)
     part = Observed(*(x[:VECTORS] for x in observed or drawn(spec, VECTORS)))
     part = part._replace(fresh=np.arange(len(part.state)) == 0)
     if layers is None:

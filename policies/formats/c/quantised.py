@@ -13,10 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from policies.errors import PolicyError
 from policies.formats.c import forward
 from policies.formats.c.arrays import LAYERS, matrices, small_arrays
 from policies.formats.c.forward import Observed
 from policies.spec import PolicySpec
+
+SUM_MOST = 2**31 - 1
+"""Of a layer's integer sums, which C adds up in 32 bits."""
 
 
 class Quantised(NamedTuple):
@@ -37,11 +41,37 @@ class Quantised(NamedTuple):
 def quantise(
     params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
 ) -> dict[str, Quantised]:
-    """Return each of `arrays.LAYERS` with 8 bits, scaled by what `observed` makes of its inputs."""
+    """Return each of `arrays.LAYERS` with 8 bits, scaled by what `observed` makes of its inputs.
+
+    Raises:
+        PolicyError: where a sum of products may leave 32 bits.
+    """
     ranges = input_ranges(params, spec, observed)
-    return {
+    layers = {
         name: _quantised(weight, *ranges[name]) for name, weight in matrices(params, spec).items()
     }
+    for name, layer in layers.items():
+        check_sums(name, layer.weight)
+    return layers
+
+
+def check_sums(name: str, weight: np.ndarray) -> None:
+    """Refuse a layer whose integer sums may leave 32 bits, as those of a large image do.
+
+    Args:
+        name: of the layer.
+        weight: (inputs, outputs) int8.
+
+    Raises:
+        PolicyError: naming the layer, its inputs and what to do.
+    """
+    # The sum of the sizes bounds every partial sum as well; a byte of an input is -128 at most.
+    largest = 128 * int(np.abs(weight.astype(np.int64)).sum(0).max())
+    if largest > SUM_MOST:
+        raise PolicyError(
+            f"layer {name!r}: the sum over its {len(weight)} inputs may reach {largest}, and int8 "
+            f"adds up to {SUM_MOST} at most; export it as float32, or train with a smaller image"
+        )
 
 
 def input_ranges(

@@ -34,11 +34,12 @@ def card_text(
     if found.timing:
         median, p99, most = (f"{1e6 * x:.0f}" for x in found.timing)
         timing = f"median {median} us, 99th percentile {p99} us, longest {most} us (one thread)"
+    seed = "unknown" if checkpoint.seed is None else checkpoint.seed
     rows = (
         ("policy", name),
         ("type", dtype),
         ("checkpoint", f"weights.safetensors, SHA-256 `{checkpoint.config['weights']['sha256']}`"),
-        ("made by", f"diffracing-suite {VERSION}, training seed {checkpoint.config['seed']}"),
+        ("made by", f"diffracing-suite {VERSION}, training seed {seed}"),
         ("rate", f"{spec.rate_hz:g} Hz"),
         ("parity", found.sentence),
         ("a step here", timing),

@@ -1,6 +1,7 @@
 """The checkpoint, the torch program and the ONNX file are one policy."""
 
 import json
+import shutil
 import zipfile
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ import torch
 from policies.errors import PolicyError
 from policies.formats.embedded_spec import KEY
 from policies.formats.export import export_policy
-from policies.formats.policy_file import save_policy
+from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.policy import load_policy
 from tests.policies.conftest import SPEC, lively
 
@@ -47,6 +48,17 @@ def test_the_files_carry_where_they_come_from(exported):
         data = json.loads(text)
         assert {"schema", "suite_version", "git_commit", "seed", "name", "spec"} <= data.keys()
         assert (data["name"], data["seed"]) == ("tiny", 1)
+
+
+def test_a_checkpoint_that_says_no_seed_is_exported_without_one(tmp_path, checkpoint):
+    folder = shutil.copytree(checkpoint, tmp_path / "tiny")
+    config = json.loads((folder / "config.json").read_text())
+    del config["seed"]
+    (folder / "config.json").write_text(json.dumps(config))
+    assert load_policy_checkpoint(folder).seed is None
+    export_policy(folder, tmp_path, ["onnx", "c"])
+    (text,) = (entry.value for entry in onnx.load(tmp_path / "tiny.onnx").metadata_props)
+    assert json.loads(text)["seed"] is None
 
 
 def test_plain_torch_and_plain_onnxruntime_run_the_files_at_any_batch(exported):

@@ -75,6 +75,18 @@ def test_int8_answers_as_worked_out_and_near_the_policy(exports, name):
     assert np.abs(found - native).max() < 0.1 * np.abs(native).max()
 
 
+def test_sums_that_32_bits_do_not_hold_are_refused(exports, monkeypatch):
+    weight = np.full((140_000, 2), 1, np.int8)
+    quantised.check_sums("image", weight)
+    weight[:, 1] = -127
+    with pytest.raises(PolicyError, match="'image': the sum over its 140000 inputs may reach 22"):
+        quantised.check_sums("image", weight)
+    stored = exports["odd"].checkpoint
+    monkeypatch.setattr(quantised, "SUM_MOST", 1000)
+    with pytest.raises(PolicyError, match="adds up to 1000 at most; export it as float32"):
+        c_project(stored, "odd", "int8", drawn(stored.spec, 2))
+
+
 def test_a_row_stands_alone_and_a_fresh_one_has_no_memory(exports):
     policy = load_c(exports["odd"].folder, trust=True)
     observed = drawn(policy.spec, 6, seed=2)

@@ -1,6 +1,8 @@
 """Exports in C with their cards: what is written, how near it is, and how it is timed."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,6 +71,22 @@ def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
     text = card.card_text("racer", "racer", load_policy_checkpoint(folder), "float32", found)
     assert "| racer | zigzag | 0 | 100 | 99 % [95, 100]" in text
     assert "no C compiler" in text and "not measured" in text
+
+
+def test_a_card_of_a_checkpoint_without_a_seed_says_so(folder):
+    found = parity.Parity(0, "", np.nan, np.nan, None)
+    stored = load_policy_checkpoint(folder)
+    config = {key: value for key, value in stored.config.items() if key != "seed"}
+    text = card.card_text("tiny", "tiny", replace(stored, config=config), "float32", found)
+    assert "training seed unknown" in text
+
+
+def test_the_card_of_a_policy_is_not_written_over(tmp_path, folder, capsys):
+    own = shutil.copytree(folder, tmp_path / "own")
+    (own / card.CARD).write_text("mine")
+    assert cli.main(["export", str(own), "--format", "c", "--out", str(own)]) == 2
+    assert "card.md is read, too, and would be written over" in capsys.readouterr().err
+    assert {path.name for path in own.iterdir()} == {*(p.name for p in folder.iterdir()), card.CARD}
 
 
 def test_without_a_compiler_nothing_is_measured_and_it_is_said(folder, tmp_path, monkeypatch):
