@@ -13,6 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from eval.logs.flight import Flight
 from eval.view import colours
@@ -258,6 +259,8 @@ def _outcome(result: TrialResult, short: bool = False) -> str:
 
 def _save(figure: Figure, path: str | Path, dpi: int) -> Path:
     FigureCanvasAgg(figure)
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # a name of a policy or a track may hold dollar signs
     with replacing_file(path) as beside:
         figure.savefig(beside, dpi=dpi)
     return Path(path)

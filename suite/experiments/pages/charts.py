@@ -23,9 +23,11 @@ STYLES = ("-", "--", ":")
 
 def _legend(figure: Figure, axes: Axes, columns: int = 3) -> None:
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
+    legend = figure.legend(
         handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9
     )
+    for text in legend.get_texts():
+        text.set_parse_math(False)  # a policy's name may hold dollar signs
 
 
 def level_chart(cells: Sequence[Tally]) -> bytes:

@@ -1,5 +1,7 @@
 """Pictures show track, path, gates and end."""
 
+from dataclasses import replace
+
 import pytest
 
 from eval.view import colours
@@ -21,6 +23,14 @@ def test_pictures_show_track_path_gates_and_end(tmp_path):
     assert share(hit, colours.AHEAD) > 1e-3 and share(hit, colours.PASSED) > 2e-4
     assert share(bare, colours.START) > 1e-4
     assert bare.size[0] > 600 and bare.size[1] > 250
+
+
+def test_a_name_with_dollar_signs_is_a_name(tmp_path):
+    track, flight, result = rollout()
+    odd = (replace(track, family="a$x^{$"), flight, result._replace(policy="b$\\foo$"))
+    write_picture(tmp_path / "one.png", *odd)
+    write_grid(tmp_path / "grid.png", [odd])
+    assert opened(tmp_path / "one.png").size[0] > 600
 
 
 def test_a_grid_has_a_panel_a_trial(tmp_path):

@@ -63,6 +63,7 @@ def test_charts_are_pictures():
     for made in (
         charts.level_chart(cells),
         charts.cells_chart({"p": cells}),
+        charts.cells_chart({"p$x^{$": cells}),
         charts.gaps_chart({"a": gap}),
     ):
         assert made.startswith(PNG)
