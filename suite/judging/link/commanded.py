@@ -84,15 +84,18 @@ def _real(
         fly_link(companion, link)
     except KeyboardInterrupt:
         companion.over = companion.over or "the operator"
+    except Exception as error:
+        companion.over = f"{type(error).__name__}: {error}"
+        raise
     finally:
         link.close()
+        row = {**trial._asdict(), "handed_over": companion.over}
+        file = write_log(companion, row, out)
     if not companion.rows:
         why = f"no vehicle sent a state (ODOMETRY) and a depth image within {WAIT_S:g} s"
         if companion.over is not None:
             why = f"handed over before the first set point: {companion.over}"
         raise WorkFailed(f"{address}: {why}; see docs/fly.md, 'When it hands over'")
-    row = {**trial._asdict(), "handed_over": companion.over}
-    file = write_log(companion, row, out)
     console.say(f"handed over: {companion.over}; log: {file}")
     _warn_of_missed(companion.missed_decisions, console)
     return {

@@ -1,13 +1,11 @@
 """The companion computer: states and images in, body rates and thrust out, and its watchdog.
 
-It knows the course, keeps its own count of gates, and is driven by what arrives: every state is
-answered with a set point at once, and where the policy's next decision is due it decides first.
+It knows the course, keeps its own count of gates, and is driven by what arrives: the newest state
+is answered with a set point at once, and where the policy's next decision is due it decides first.
 Time is handed in, so that a test can hold the clock.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +21,15 @@ from eval.vehicles.vehicle import Vehicle
 from policies.observation import observe, view_of
 from policies.policy import Policy
 from suite.judging.link.messages import Note, Packet, Picture, SetPoint, State, Wire
-from suite.judging.link.watchdog import Clock, ClockCheck, Limits, box_of, trouble_with_state
+from suite.judging.link.row import Row
+from suite.judging.link.watchdog import (
+    Clock,
+    ClockCheck,
+    Limits,
+    box_of,
+    trouble_between,
+    trouble_with_state,
+)
 from tracks.geometry.crossing import crossing
 from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Gates
@@ -33,28 +39,6 @@ FINISHED = "all gates passed"
 """The reason of a hand-over that is none to worry about."""
 _SLACK_S = 1e-3
 """A decision is due this much before its time: stamps are rounded [s]."""
-
-
-class Row(NamedTuple):
-    """What the companion knew and did at one state."""
-
-    state: State
-    thrust: float
-    """Wanted collective thrust per mass [m/s^2]."""
-    rate_b: np.ndarray
-    """(3,) wanted body rates [rad/s]."""
-    action_b: np.ndarray
-    """(3,) the policy's action in use [m/s^2]."""
-    decided: bool
-    """Whether the policy decided on this state."""
-    gate: int
-    """Number of the next gate."""
-    answered_s: float
-    """From the state's arrival to its set point [s]."""
-    state_age_s: float
-    """From the state's stamp to its set point, where both ends have one clock [s]."""
-    image_age_s: float
-    """From the image's arrival to the set point [s]."""
 
 
 class Companion:
@@ -106,6 +90,7 @@ class Companion:
 
     def receive(self, datagrams: list[bytes]) -> list[bytes]:
         """Return what is to be sent, now that `datagrams` have come (or none have)."""
+        heard_s = self._clock()
         before = self._wire.broken, self._wire.foreign
         messages = self._wire.decoded(datagrams)
         for what, count, was in zip(
@@ -113,16 +98,19 @@ class Companion:
         ):
             if count > was:
                 self._event(f"{count - was} {what} messages left out")
-        out: list[bytes] = []
         for message in messages:
             if isinstance(message, Packet):
                 self._see(message)
-            elif isinstance(message, State):
-                self._heard_at = self._clock()
-                out += self._answer(message)
-        if self.flying and self._clock() - self._heard_at > self._limits.silence_s:
-            out += self._hand_over(f"no state for {self._limits.silence_s:g} s")
-        return out
+        states = [message for message in messages if isinstance(message, State)]
+        silent_s = heard_s - self._heard_at
+        if self.flying and silent_s > self._limits.silence_s:
+            if states:
+                return self._hand_over(f"this computer stood still for {silent_s:.2f} s")
+            return self._hand_over(f"no state for {self._limits.silence_s:g} s")
+        if not states or self.over is not None:
+            return []
+        self._heard_at = heard_s
+        return self._answer(states)
 
     def _event(self, text: str) -> None:
         self.events.append(f"{self._clock():.3f}: {text}")
@@ -138,29 +126,36 @@ class Companion:
         if found is not None:
             self._depth, self._depth_at = found, self._clock()
 
-    def _answer(self, state: State) -> list[bytes]:
-        if self.over is not None:
-            return []
-        trouble = trouble_with_state(state, self._box, self._limits)
-        trouble = trouble or self._clocks.add(state.time_s, self._heard_at)
+    def _answer(self, states: list[State]) -> list[bytes]:
+        """Check the states that have come together, and fly on the newest: no backlog is flown."""
+        for state in states:
+            trouble = trouble_with_state(state, self._box, self._limits)
+            if trouble:
+                return self._hand_over(trouble)
+        states = sorted(states, key=lambda state: state.time_s)
+        trouble = self._clocks.add(states[-1].time_s, self._heard_at)
         if trouble:
             return self._hand_over(trouble)
-        if self._last is not None and state.time_s <= self._last.time_s:
-            return []  # overtaken on the way
-        if self._depth is None:
-            return []
-        if self.rows and self._heard_at - self._depth_at > self._limits.image_age_s:
+        aged = self._heard_at - self._depth_at > self._limits.image_age_s
+        if self.rows and aged:
             return self._hand_over(f"no image for {self._limits.image_age_s:g} s")
-        if not self.rows:
-            self._begun_s = state.time_s
-            self._heading_w = level_heading(quat_to_rot(state.quat_wxyz)[None])
+        if self._depth is None or aged:
+            return []
+        if self._last is None:
+            states = states[-1:]
+            self._begun_s = states[0].time_s
+            self._heading_w = level_heading(quat_to_rot(states[0].quat_wxyz)[None])
             self._event("begun")
-        # At the first state by the autopilot's own period: the judge's heading begins so.
-        since_s = state.time_s - self._last.time_s if self._last else 1.0 / ATTITUDE_HZ
-        self._count_gates(state)
-        if self.gate == len(self._gates.center_w):
-            return self._hand_over(FINISHED)
-        return self._fly(state, since_s)
+        # Others were overtaken on the way.
+        news = [s for s in states if self._last is None or s.time_s > self._last.time_s]
+        for state in news:
+            trouble = self._last and trouble_between(self._last, state, self._limits)
+            if trouble:
+                return self._hand_over(trouble)
+            self._count_gates(state)
+            if self.gate == len(self._gates.center_w):
+                return self._hand_over(FINISHED)
+        return self._fly(news[-1]) if news else []
 
     def _count_gates(self, state: State) -> None:
         if self._last is not None:
@@ -169,16 +164,15 @@ class Companion:
             self.gate += bool(passed)
         self._last = state
 
-    def _fly(self, state: State, since_s: float) -> list[bytes]:
+    def _fly(self, state: State) -> list[bytes]:
+        # At the first state by the autopilot's own period: the judge's heading begins so.
+        since_s = state.time_s - self.rows[-1].state.time_s if self.rows else 1.0 / ATTITUDE_HZ
         decided = self._is_due(state)
         rot_w = quat_to_rot(state.quat_wxyz)[None]
         image_age_s = self._clock() - self._depth_at
-        if decided:
-            self._decide(state, rot_w)
-        if self._late >= self._limits.late_most:
-            return self._hand_over(f"{self._late} late answers in a row")
-        if self.over:
-            return [self._wire.encoded(Note(f"policy hands over: {self.over}"))]
+        trouble = self._decide(state, rot_w) if decided else None
+        if trouble:
+            return self._hand_over(trouble)
         to_gate_w = self._gates.center_w[None, self.gate] - state.pos_w
         self._heading_w = blend_heading(self._heading_w, to_gate_w, since_s)
         force_w = action_to_force(self._action_b, rot_w)
@@ -210,7 +204,8 @@ class Companion:
         self._next = now + 1
         return True
 
-    def _decide(self, state: State, rot_w: np.ndarray) -> None:
+    def _decide(self, state: State, rot_w: np.ndarray) -> str | None:
+        """Let the policy decide; return why to hand over, or None."""
         depth = self._depth
         assert depth is not None
         count = len(self._gates.center_w)
@@ -226,18 +221,23 @@ class Companion:
             np.asarray(x, np.float32) for x in observe(self._policy.spec, view, self._action_b)
         )
         fresh = np.array([self._fresh])
-        answer, self._hidden = self._policy.act(self._hidden, state_b, image, fresh)
-        took_s = self._clock() - self._heard_at
         limits = ActionLimits(deadline_s=self._limits.deadline_s)
-        guarded = guard_action(limits, answer, self._action_b, took_s, self._policy.name)
+        try:
+            answer, self._hidden = self._policy.act(self._hidden, state_b, image, fresh)
+            took_s = self._clock() - self._heard_at
+            guarded = guard_action(limits, answer, self._action_b, took_s, self._policy.name)
+        except Exception as error:  # whatever it is, the vehicle must hear of it
+            return f"the policy failed: {type(error).__name__}: {error}"
         self._action_b, self._fresh = guarded.action_b, False
         late = bool(guarded.late[0])
         self.late_answers += late
         self._late = self._late + 1 if late else 0
         if guarded.bad[0]:
             self.bad_actions += 1
-            self.over = "the policy's answer is not finite"
-            self._event(f"handed over: {self.over}")
+            return "the policy's answer is not finite"
+        if self._late >= self._limits.late_most:
+            return f"{self._late} late answers in a row"
+        return None
 
 
 def _row(gates: Gates, number: int) -> Gates:

@@ -2,7 +2,7 @@
 
 | what | message |
 |---|---|
-| state of the vehicle | ODOMETRY (331): LOCAL_NED, velocity and rates in BODY_FRD |
+| state of the vehicle | ODOMETRY (331): LOCAL_NED, velocity there or in BODY_FRD |
 | depth image | DATA_TRANSMISSION_HANDSHAKE (130) and ENCAPSULATED_DATA (131): a 16-bit PGM in mm |
 | body rates and thrust | SET_ATTITUDE_TARGET (82), attitude ignored, thrust 0 to 1 |
 | what happened | STATUSTEXT (253) |
@@ -25,8 +25,12 @@ from tracks.geometry.rotation import quat_to_rot, to_local, to_world
 
 PACKET = 253
 """Bytes of an image in one message."""
+MOST_PACKETS = 65535
+"""Of one image."""
 IGNORE_ATTITUDE = 128
 """Bit of SET_ATTITUDE_TARGET's type mask."""
+LOCAL_NED, BODY_FRD = 1, 12
+"""MAVLink's numbers of the frames."""
 _HEAD = b"P5\n%d %d\n65535\n"
 
 
@@ -43,6 +47,10 @@ class State(NamedTuple):
     """(3,) [m/s]."""
     rate_b: np.ndarray
     """(3,) [rad/s]."""
+    resets: int = 0
+    """The vehicle's own count of jumps of its estimate."""
+    fault: str = ""
+    """Why it cannot be flown on, as the message itself says."""
 
 
 class SetPoint(NamedTuple):
@@ -108,8 +116,8 @@ class Wire:
             q = turned_quat(message.quat_wxyz)
             vel = turned(to_local(quat_to_rot(message.quat_wxyz), message.vel_w))
             made = mav.odometry_encode(
-                int(message.time_s * 1e6), 1, 12, *turned(message.pos_w), q.tolist(), *vel,
-                *turned(message.rate_b), [0.0] * 21, [0.0] * 21,
+                int(message.time_s * 1e6), LOCAL_NED, BODY_FRD, *turned(message.pos_w), q.tolist(),
+                *vel, *turned(message.rate_b), [0.0] * 21, [0.0] * 21, message.resets,
             )  # fmt: skip
         elif isinstance(message, SetPoint):
             made = mav.set_attitude_target_encode(
@@ -119,7 +127,7 @@ class Wire:
         elif isinstance(message, Note):
             made = mav.statustext_encode(4, message.text.encode("ascii", "replace")[:50])
         elif message.place < 0:
-            width, height, size = np.frombuffer(message.data, np.uint16)
+            width, height, size = np.frombuffer(message.data, np.uint32)
             kind = self._dialect.MAVLINK_DATA_STREAM_IMG_PGM
             numbers = (int(size), int(width), int(height), message.parts)
             made = mav.data_transmission_handshake_encode(kind, *numbers, PACKET, 0)
@@ -150,13 +158,7 @@ class Wire:
     def _ours(self, message: Any) -> list[Message]:
         kind = message.get_type()
         if kind == "ODOMETRY":
-            quat = turned_quat(message.q)
-            norm = float(np.linalg.norm(quat))
-            quat = quat / norm if np.isfinite(norm) and norm > 0.5 else np.full(4, np.nan)
-            vel_w = to_world(quat_to_rot(quat), turned([message.vx, message.vy, message.vz]))
-            rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
-            place = turned([message.x, message.y, message.z])
-            return [State(message.time_usec * 1e-6, place, quat, vel_w, turned(rates))]
+            return [_state_of(message)]
         if kind == "SET_ATTITUDE_TARGET":
             if message.target_system != self._own:
                 self.foreign += 1
@@ -166,11 +168,40 @@ class Wire:
         if kind == "STATUSTEXT":
             return [Note(message.text)]
         if kind == "DATA_TRANSMISSION_HANDSHAKE":
-            sizes = np.array([message.width, message.height, message.size], np.uint16)
+            sizes = np.array([message.width, message.height, message.size], np.uint32)
             return [Packet(-1, message.packets, sizes.tobytes())]
         if kind == "ENCAPSULATED_DATA":
             return [Packet(message.seqnr, 0, bytes(message.data))]
         return []
+
+
+def _state_of(message: Any) -> State:
+    """Return an ODOMETRY as our state.
+
+    Autopilots differ in the frame of the velocity: PX4 sends LOCAL_NED since its version 1.14 and
+    BODY_FRD before.
+    """
+    quat = turned_quat(message.q)
+    norm = float(np.linalg.norm(quat))
+    quat = quat / norm if np.isfinite(norm) and norm > 0.5 else np.full(4, np.nan)
+    vel = turned([message.vx, message.vy, message.vz])
+    fault = ""
+    if message.frame_id != LOCAL_NED or message.child_frame_id not in (LOCAL_NED, BODY_FRD):
+        fault = (
+            f"ODOMETRY in frames {message.frame_id} and {message.child_frame_id}, allowed are "
+            f"{LOCAL_NED} (LOCAL_NED), and {LOCAL_NED} or {BODY_FRD} (BODY_FRD) of the velocity"
+        )
+    elif message.quality < 0:
+        fault = "the vehicle's estimator has failed (ODOMETRY's quality is negative)"
+    return State(
+        time_s=message.time_usec * 1e-6,
+        pos_w=turned([message.x, message.y, message.z]),
+        quat_wxyz=quat,
+        vel_w=to_world(quat_to_rot(quat), vel) if message.child_frame_id == BODY_FRD else vel,
+        rate_b=turned((message.rollspeed, message.pitchspeed, message.yawspeed)),
+        resets=message.reset_counter,
+        fault=fault,
+    )
 
 
 def image_packets(depth_m: np.ndarray, range_m: float) -> list[Packet]:
@@ -179,7 +210,7 @@ def image_packets(depth_m: np.ndarray, range_m: float) -> list[Packet]:
     millimetres = np.where(depth_m < range_m, np.rint(depth_m * 1e3), 0).clip(0, 65535)
     data = _HEAD % (width, height) + millimetres.astype(">u2").tobytes()
     parts = [data[k : k + PACKET] for k in range(0, len(data), PACKET)]
-    sizes = np.array([width, height, len(data)], np.uint16)
+    sizes = np.array([width, height, len(data)], np.uint32)
     first = Packet(-1, len(parts), sizes.tobytes())
     return [first, *(Packet(k, 0, part) for k, part in enumerate(parts))]
 
@@ -188,17 +219,26 @@ class Picture:
     """Packets gathered to images."""
 
     def __init__(self, height: int, width: int, range_m: float) -> None:
-        """Gather images of this size; what the camera does not see counts as `range_m`."""
+        """Gather images of this size; what the camera does not see counts as `range_m`.
+
+        Raises:
+            ValueError: for images that MAVLink's numbers of packets do not reach.
+        """
         self._shape, self._range_m = (height, width), range_m
         self._head = _HEAD % (width, height)
         self._size = len(self._head) + 2 * height * width
+        if self._size > MOST_PACKETS * PACKET:
+            raise ValueError(
+                f"a camera of {height} x {width} pixels: the link carries images of at most "
+                f"{MOST_PACKETS * PACKET // 2} pixels; fly a policy with a smaller one"
+            )
         self._parts: dict[int, bytes] = {}
         self._wanted = 0
 
     def add(self, packet: Packet) -> np.ndarray | None:
         """Return the depth image (H, W) [m] that this packet completes, else None."""
         if packet.place < 0:
-            size = int(np.frombuffer(packet.data, np.uint16)[2])
+            size = int(np.frombuffer(packet.data, np.uint32)[2])
             fits = size == self._size and packet.parts == -(-self._size // PACKET)
             self._parts, self._wanted = {}, packet.parts if fits else 0
             return None

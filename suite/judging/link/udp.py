@@ -16,8 +16,7 @@ class UdpLink:
         """Open an end.
 
         Raises:
-            ValueError: for an address of another form.
-            OSError: where the port is taken or the host unknown.
+            ValueError: for an address of another form, a port that is taken, an unknown host.
         """
         kind, _, place = address.partition(":")
         host, _, port = place.rpartition(":")
@@ -32,10 +31,17 @@ class UdpLink:
         self._socket.setblocking(False)
         self._peer: tuple[str, int] | None = None
         self.strangers = 0
-        resolved = (socket.gethostbyname(host), int(port))
-        if kind == "udpin":
-            self._socket.bind(resolved)
-        else:
+        try:
+            resolved = (socket.gethostbyname(host), int(port))
+            if kind == "udpin":
+                self._socket.bind(resolved)
+        except OSError as error:
+            self._socket.close()
+            raise ValueError(
+                f"--link {address}: {error.strerror or error}; udpin takes an address of this "
+                "machine (0.0.0.0 for all) and a free port above 1023, udpout a host that is known"
+            ) from None
+        if kind == "udpout":
             self._peer = resolved
 
     @property

@@ -12,6 +12,9 @@ from suite.judging.link.messages import State
 from tracks.geometry.rotation import quat_to_rot
 from tracks.input.ranges import Range
 
+DRIFT = 1e-3
+"""Seconds that two clocks drift apart in a second, at most; a quartz does a tenth of it."""
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -32,7 +35,9 @@ class Limits:
     late_most: Annotated[int, Range(1, 1000)] = 5
     """So many late answers in a row."""
     clock_jump_s: Annotated[float, Range(0.01, 100.0)] = 0.2
-    """Largest step of the vehicle's clock against ours, forwards or backwards [s]."""
+    """Largest step of the vehicle's clock against ours, and how late states may become [s]."""
+    jump_m: Annotated[float, Range(0.01, 100.0)] = 0.5
+    """Farthest that a state may lie off where the one before it leads at its speed [m]."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,9 @@ def box_of(points_w: np.ndarray, limits: Limits) -> Box:
 
 def trouble_with_state(state: State, box: Box, limits: Limits) -> str | None:
     """Return why a state is none to fly on from, or None."""
-    numbers = np.concatenate(state[1:])
+    if state.fault:
+        return state.fault
+    numbers = np.concatenate([state.pos_w, state.quat_wxyz, state.vel_w, state.rate_b])
     if not np.isfinite(numbers).all() or not np.isfinite(state.time_s):
         return "state is not finite"
     tilt = float(np.degrees(np.arccos(np.clip(quat_to_rot(state.quat_wxyz)[2, 2], -1, 1))))
@@ -64,25 +71,48 @@ def trouble_with_state(state: State, box: Box, limits: Limits) -> str | None:
     return None
 
 
+def trouble_between(last: State, state: State, limits: Limits) -> str | None:
+    """Return why a state does not follow from the one before it, or None.
+
+    A vehicle does not jump, its estimator does: through a gate that nobody flew through, or back
+    behind one that was passed.
+    """
+    if state.resets != last.resets:
+        return "the vehicle's estimator reset its state"
+    moved_m = float(np.linalg.norm(state.pos_w - last.pos_w))
+    speed = max(float(np.linalg.norm(vel_w)) for vel_w in (last.vel_w, state.vel_w))
+    since_s = state.time_s - last.time_s
+    if moved_m > speed * since_s + limits.jump_m:
+        return f"position jumped by {moved_m:.2f} m in {since_s:.3f} s at {speed:.1f} m/s"
+    return None
+
+
 class ClockCheck:
-    """Whether the vehicle's clock goes as ours does."""
+    """Whether the vehicle's clock goes as ours does, and its states come no later than they did."""
 
     def __init__(self, limits: Limits) -> None:
         self._most = limits.clock_jump_s
         self._offset: float | None = None
+        self._at = 0.0
 
     def add(self, stamp_s: float, now_s: float) -> str | None:
         """Return why a stamp cannot be, or None.
 
-        The offset follows slowly, so that a drift is no jump.
+        What is compared with is the promptest state, let go by no more than clocks drift apart: a
+        delay that creeps in is found as a jump is.
         """
         offset = now_s - stamp_s
         if self._offset is None:
             self._offset = offset
+        else:
+            self._offset += DRIFT * (now_s - self._at)
+        self._at = now_s
         apart = offset - self._offset
-        if abs(apart) > self._most:
+        if apart > self._most:
+            return f"clock jumped by {-apart:+.2f} s, or states are that late"
+        if apart < -self._most:
             return f"clock jumped by {-apart:+.2f} s"
-        self._offset += 0.01 * apart
+        self._offset = min(self._offset, offset)
         return None
 
 

@@ -1,0 +1,265 @@
+"""The companion: what it answers, and when it hands over."""
+
+import numpy as np
+import pytest
+
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import TrialSpec
+from policies.errors import NoAnswer
+from policies.spec import PolicySpec
+from suite.judging.link.flights import write_log
+from suite.judging.link.messages import Note, SetPoint, State, Wire, dialect
+from suite.judging.link.watchdog import Limits
+from tests.support.pilots import Steady
+
+pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
+
+
+def test_a_state_is_answered_with_body_rates_and_thrust(bench):
+    one = bench(Steady((0.0, 0.0, 0.0)))
+    assert one.tell() == []  # nothing is flown blind
+    one.show()
+    (point,) = one.tell(one.state(time_s=one.now + 0.001))
+    hover = 9.81 / load_vehicle("reference").full_thrust
+    assert point.thrust == pytest.approx(hover, rel=1e-3)
+    assert np.abs(point.rate_b[:2]).max() < 1e-6
+
+
+def test_silence_hands_over_and_nothing_is_sent_any_more(bench):
+    one = bench().fly()
+    one.now += 0.085
+    assert one.companion.receive([]) == []
+    one.now += 0.01
+    (note,) = one.wire.decoded(one.companion.receive([]))
+    assert "no state for 0.1 s" in note.text
+    assert one.tell() == [] and not one.companion.flying
+
+
+class Faulty(Steady):
+    """A policy that answers NaN from its third decision on."""
+
+    def act(self, hidden, state, image, fresh):
+        hidden = hidden + 1
+        answer = np.full((1, 3), np.nan if hidden[0, 0] > 2 else 0.0, np.float32)
+        return answer, hidden
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"pos_w": np.array([np.nan, 0.0, 1.0])}, "not finite"),
+        ({"quat_wxyz": np.zeros(4)}, "not finite"),
+        ({"vel_w": np.array([0.0, np.inf, 0.0])}, "not finite"),
+        ({"quat_wxyz": np.array([np.cos(0.8), np.sin(0.8), 0.0, 0.0])}, "tilt 92 deg"),
+        ({"pos_w": np.array([0.0, 500.0, 1.0])}, "outside the box"),
+        ({"pos_w": np.array([0.0, 0.0, -3.0])}, "outside the box"),
+        ({"time_s": 100.9}, "clock jumped by +0.8"),
+        ({"time_s": 98.0}, "clock jumped by -2.0"),
+        ({"pos_w": np.array([0.0, 3.0, 1.0])}, "position jumped by"),
+        ({"resets": 1}, "estimator reset"),
+    ],
+)
+def test_a_state_that_cannot_be_flown_on_hands_over(bench, changed, reason):
+    one = bench().fly()
+    with np.errstate(invalid="ignore"):
+        (note,) = one.tell(one.state(**changed))
+    assert isinstance(note, Note) and "hands over" in note.text
+    assert reason in one.companion.over and reason in one.companion.events[-1]
+
+
+def odometry(quality=0, frames=(1, 12), vel=(2.0, 0.0, 0.0)):
+    """Return a datagram of a vehicle that has turned a quarter to the left, as PX4 counts it."""
+    mav = dialect().MAVLink(None, srcSystem=1, srcComponent=1)
+    left = [np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)]
+    made = mav.odometry_encode(
+        100_000_000, *frames, 0.0, 0.0, -1.0, left, *vel, 0.0, 0.0, 0.0, [0.0] * 21, [0.0] * 21,
+        3, 0, quality,
+    )  # fmt: skip
+    return made.pack(mav)
+
+
+def test_a_velocity_is_in_the_frame_that_its_message_says():
+    for frames, vel_w in (((1, 12), [0.0, 2.0, 0.0]), ((1, 1), [2.0, 0.0, 0.0])):
+        (state,) = Wire(2, 1).decoded([odometry(frames=frames)])
+        assert isinstance(state, State) and state.fault == "" and state.resets == 3
+        np.testing.assert_allclose(state.vel_w, vel_w, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"frames": (20, 12)}, "in frames 20 and 12, allowed are 1"),
+        ({"frames": (1, 8)}, "in frames 1 and 8, allowed are 1"),
+        ({"quality": -1}, "estimator has failed"),
+    ],
+)
+def test_a_state_in_other_frames_or_of_a_failed_estimator_is_not_flown(bench, changed, reason):
+    one = bench()
+    one.show()
+    one.companion.receive([odometry(**changed)])
+    assert reason in one.companion.over
+
+
+def test_of_a_backlog_the_newest_state_is_flown_and_gates_are_counted_in_all(bench):
+    one = bench(Steady((0.0, 0.0, 0.0)))
+    center_w, rot_w = (np.asarray(x[0]) for x in one.track.scene.gates[:2])
+    through = 5.0 * rot_w[:, 0]
+    place = center_w - 0.3 * rot_w[:, 0]
+    one.show()
+    one.tell(one.state(pos_w=place, vel_w=through))
+    backlog = []
+    for k in range(1, 10):
+        one.now += 0.01
+        state = one.state(pos_w=place + 0.01 * k * through, vel_w=through)
+        backlog.append(one.wire.encoded(state))
+    newest = one.now
+    # The newest came first: it was not the oldest that lay in the way.
+    answers = one.wire.decoded(one.companion.receive(backlog[::-1]))
+    assert [type(x) for x in answers] == [SetPoint] and one.companion.flying
+    assert one.companion.rows[-1].state.time_s == pytest.approx(newest, abs=2e-6)
+    assert one.companion.gate == 1 and len(one.companion.rows) == 2
+
+
+def test_a_delay_that_creeps_in_is_found(bench):
+    one = bench().fly(1)
+    begin = one.now
+    while one.companion.flying and one.now < begin + 10.0:
+        one.show()
+        one.tell(one.state(time_s=begin + 0.9 * (one.now - begin)))
+        one.now += 0.01
+    assert "states are that late" in one.companion.over
+    assert one.now - begin == pytest.approx(2.0, abs=0.15)
+
+
+def test_clocks_may_drift_apart(bench):
+    one = bench().fly(1)
+    for drift in (1.0 - 5e-4, 1.0 + 5e-4):
+        begin, stamp = one.now, one.companion.rows[-1].state.time_s + 0.01
+        while one.now < begin + 30.0:
+            one.show()
+            one.tell(one.state(time_s=stamp + drift * (one.now - begin)))
+            one.now += 0.05
+        assert one.companion.flying, one.companion.over
+
+
+def test_a_computer_that_stood_still_hands_over(bench):
+    one = bench().fly()
+    one.now += 0.2
+    (note,) = one.tell()
+    assert isinstance(note, Note)
+    assert one.companion.over == "this computer stood still for 0.21 s"
+
+
+def test_no_flight_begins_on_an_old_image(bench):
+    one = bench()
+    one.show()
+    one.now += 0.6
+    assert one.tell() == [] and one.companion.over is None
+    one.show()
+    one.now += 0.01
+    assert isinstance(one.tell()[0], SetPoint)
+
+
+def test_a_policy_that_fails_hands_over_and_leaves_its_log(bench, tmp_path):
+    class Failing(Steady):
+        def act(self, hidden, state, image, fresh):
+            hidden = hidden + 1
+            if hidden[0, 0] > 120:
+                raise NoAnswer("no answer within 1 s")
+            return np.zeros((1, 3), np.float32), hidden
+
+    one = bench(Failing(spec=PolicySpec(rate_hz=100.0)))
+    for _ in range(3):
+        one.fly(40)
+    (note,) = one.tell()
+    assert isinstance(note, Note)
+    assert one.companion.over == "the policy failed: NoAnswer: no answer within 1 s"
+    assert write_log(one.companion, TrialSpec("zigzag", 0, 0)._asdict(), tmp_path)
+
+
+def test_an_answer_that_is_no_number_hands_over(bench):
+    one = bench(Faulty(spec=PolicySpec(rate_hz=100.0)))
+    one.show()
+    told = []
+    for _ in range(4):
+        told.append(one.tell())
+        one.now += 0.01
+    assert [type(x[0]).__name__ if x else "" for x in told] == ["SetPoint", "SetPoint", "Note", ""]
+    assert one.companion.over == "the policy's answer is not finite"
+
+
+def test_late_answers_are_not_flown_and_hand_over_where_they_go_on(bench):
+    one = bench(limits=Limits(late_most=3))
+
+    class Slow(Steady):
+        def act(self, hidden, state, image, fresh):
+            one.now += 0.05
+            return super().act(hidden, state, image, fresh)
+
+    one.companion._policy = Slow((5.0, 0.0, 0.0), spec=PolicySpec(rate_hz=100.0))
+    one.show()
+    for _ in range(2):
+        assert isinstance(one.tell()[0], SetPoint)
+        one.now += 0.01
+    assert (one.companion.rows[-1].action_b == 0).all()
+    assert isinstance(one.tell()[0], Note)
+    assert one.companion.over == "3 late answers in a row"
+    assert one.companion.late_answers == 3
+
+
+def test_the_heading_turns_as_fast_whatever_the_rate_of_states(bench):
+    aside = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+    wanted = []
+    for rate_hz in (50, 100, 250):
+        one = bench(Steady((0.0, 0.0, 0.0)))
+        one.show()
+        for k in range(rate_hz // 5 + 1):
+            one.now = 100.0 + k / rate_hz
+            one.tell(one.state(quat_wxyz=aside))
+        wanted.append(one.companion.rows[-1].rate_b)
+    assert abs(wanted[0][2]) > 0.5, "the gate is not ahead"
+    assert wanted[0] == pytest.approx(wanted[1], rel=1e-6)
+    assert wanted[2] == pytest.approx(wanted[1], rel=1e-6)
+
+
+def test_what_a_gap_between_states_missed_is_counted_and_not_made_up_for(bench):
+    one = bench(Steady((0.0, 0.0, 0.0), spec=PolicySpec(rate_hz=50.0)))
+    one.show()
+    for gap_s in (0.01, 0.01, 0.01, 0.07, 0.01, 0.01, 0.01):
+        one.tell()
+        one.now += gap_s
+    # States at 0, 10, 20, 30, 100, 110, 120 ms; those of 40, 60 and 80 ms did not come.
+    assert [row.decided for row in one.companion.rows] == [True, False] * 3 + [True]
+    assert one.companion.missed_decisions == 3
+
+
+def test_a_camera_that_stops_hands_over(bench):
+    one = bench().fly(40)
+    assert one.companion.flying
+    for _ in range(20):
+        one.tell()
+        one.now += 0.01
+    assert one.companion.over == "no image for 0.5 s"
+
+
+def test_half_of_the_messages_cut_off_is_flown_on_and_all_of_them_is_silence(bench):
+    one = bench().fly()
+    for k in range(20):
+        datagram = one.wire.encoded(one.state())
+        one.companion.receive([datagram[: len(datagram) - 9 * (k % 2)]])
+        one.now += 0.01
+    assert one.companion.flying and any("broken" in event for event in one.companion.events)
+    for _ in range(12):
+        one.companion.receive([one.wire.encoded(one.state())[:-9]])
+        one.now += 0.01
+    assert one.companion.over == "no state for 0.1 s"
+
+
+def test_another_system_is_not_listened_to(bench):
+    one = bench().fly()
+    other = Wire(9, 2)
+    far = one.state(pos_w=np.array([0.0, 900.0, 1.0]))
+    assert one.companion.receive([other.encoded(far)]) == []
+    assert one.companion.flying and "foreign" in one.companion.events[-1]
+    old = one.state(time_s=one.now - 0.04)
+    assert one.tell(old) == [] and one.companion.flying
