@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import numpy as np
 
 from tracks.common.masks import nowhere
@@ -10,6 +12,21 @@ from tracks.geometry.scene import Array
 
 NEGLIGIBLE = 1e-9
 """Thrusts below this are rounding [N]."""
+
+
+def largest(values: Array) -> Array:
+    """Return the largest of the last axis, one value of the first after the other.
+
+    The gradient of `max` counts the values that equal it and divides by how many: by none, where a
+    compiler works them out twice and rounds differently. That of `maximum` divides by nothing.
+    """
+    xp = values.__array_namespace__()
+    return reduce(xp.maximum, [values[..., k] for k in range(values.shape[-1])])
+
+
+def least(values: Array) -> Array:
+    """Return the least of the last axis, as `largest`."""
+    return -largest(-values)
 
 
 def rate_torque(rate_cmd_b: Array, rate_b: Array, gain: Array, inertia: Array) -> Array:
@@ -59,10 +76,10 @@ def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> A
     if nowhere(outside):
         return exact
 
-    spread = xp.max(level, axis=-1, keepdims=True) - xp.min(level, axis=-1, keepdims=True)
-    level = level * (thrust_max / xp.maximum(spread, thrust_max))
-    lowest = xp.max(-level / per_force, axis=-1)
-    highest = xp.min((thrust_max - level) / per_force, axis=-1)
+    spread = largest(level) - least(level)
+    level = level * (thrust_max / xp.maximum(spread, thrust_max))[..., None]
+    lowest = largest(-level / per_force)
+    highest = least((thrust_max - level) / per_force)
     force = xp.minimum(xp.maximum(force_z, lowest), highest)
     without_yaw = xp.clip(force[..., None] * per_force + level, 0.0, thrust_max)
     room = xp.where(yaw > 0.0, thrust_max - without_yaw, without_yaw)
@@ -70,5 +87,5 @@ def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> A
     # What is asked beyond the room by rounding alone is left to the clip.
     beyond = asked > xp.maximum(room, NEGLIGIBLE)
     share = xp.where(beyond, room / xp.where(beyond, asked, 1.0), 1.0)
-    limited = without_yaw + xp.min(share, axis=-1, keepdims=True) * yaw
+    limited = without_yaw + least(share)[..., None] * yaw
     return xp.where(outside, xp.clip(limited, 0.0, thrust_max), exact)

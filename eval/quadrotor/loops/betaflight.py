@@ -19,6 +19,7 @@ import numpy as np
 
 from eval.quadrotor.loops.filters import PT3_SCALE, pick, pt1
 from eval.quadrotor.loops.layout import Layout
+from eval.quadrotor.mixer import largest, least
 from tracks.geometry.scene import Array
 
 GROUP = ""
@@ -211,7 +212,7 @@ def mixed(gain: Gains, level: Array, turning: Array) -> tuple[Array, Array]:
     roll, pitch, yaw = gain.layout
     add = turning[..., 0, None] * roll + turning[..., 1, None] * pitch
     add = add + turning[..., 2, None] * yaw
-    low, high = xp.min(add, axis=-1), xp.max(add, axis=-1)
+    low, high = least(add), largest(add)
     span = high - low
     fits = xp.maximum(span, 1.0)
     level = xp.minimum(xp.maximum(level, -low / fits), 1.0 - high / fits)

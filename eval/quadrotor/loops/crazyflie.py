@@ -17,6 +17,7 @@ import numpy as np
 
 from eval.quadrotor.loops.filters import Pair, butterworth, pick
 from eval.quadrotor.loops.layout import Layout
+from eval.quadrotor.mixer import largest
 from tracks.geometry.scene import Array
 
 DEG = float(180.0 / np.pi)
@@ -125,8 +126,8 @@ def look(
     out = gain.p * error + gain.i * integral + gain.d * falling + gain.f * wanted
     out = xp.clip(scale * out, -SIGNED, SIGNED)
     motor = throttle[..., None] * FULL + turning(gain.layout, out)
-    over = xp.maximum(xp.max(motor, axis=-1, keepdims=True) - FULL, 0.0)
-    command = xp.clip((motor - over) / FULL, 0.0, 1.0)
+    over = xp.maximum(largest(motor) - FULL, 0.0)
+    command = xp.clip((motor - over[..., None]) / FULL, 0.0, 1.0)
     return State(xp.ones_like(state.started), integral, rate, slope), command
 
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from eval.quadrotor.loops.filters import Pair, butterworth, pick, pt1, settled
 from eval.quadrotor.loops.layout import Layout
+from eval.quadrotor.mixer import largest, least
 from tracks.geometry.scene import Array
 
 GROUP = ""
@@ -217,5 +218,4 @@ def _gain(motor: Array, along: Array, top: float) -> Array:
     by = xp.where(moves, along, 1.0)
     need = xp.where(motor < 0.0, -motor / by, 0.0) + xp.where(motor > top, (top - motor) / by, 0.0)
     need = xp.where(moves, need, 0.0)
-    least = xp.minimum(xp.min(need, axis=-1), 0.0)
-    return least + xp.maximum(xp.max(need, axis=-1), 0.0)
+    return xp.minimum(least(need), 0.0) + xp.maximum(largest(need), 0.0)
