@@ -152,9 +152,10 @@ def test_both_ends_agree_on_the_flight(flown, tmp_path):
 
 
 def test_delays_are_those_of_the_rows():
-    state = State(0.0, *np.zeros((4, 3)))
+    zero = np.zeros(3)
+    state = State(0.0, zero, np.array([1.0, 0.0, 0.0, 0.0]), zero, zero)
     rows = [
-        Row(state, 9.81, np.zeros(3), np.zeros(3), decided, 0, answered_s, 0.004, image_age_s)
+        Row(state, 9.81, zero, zero, decided, 0, answered_s, 0.004, image_age_s)
         for decided, answered_s, image_age_s in [(True, 0.03, 0.01), (False, 0.001, 0.5)]
     ]
     found = delays(rows, 0.02)
