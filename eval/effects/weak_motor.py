@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from eval.effects.interface import Array, Constants, Effect, Parameter
+from tracks.input.ranges import is_finite, shown
 
 
 class WeakMotor(NamedTuple):
@@ -46,8 +47,9 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
     for number, factor in zip(index, scale, strict=True):
         if isinstance(number, bool) or number not in (1, 2, 3, 4) or index.count(number) > 1:
             raise ValueError(f"index = {index}: allowed are different whole numbers from 1 to 4")
-        if isinstance(factor, bool) or not isinstance(factor, (int, float)):
-            raise ValueError(f"scale = {factor!r}: must be a number")
+        number_like = isinstance(factor, (int, float)) and not isinstance(factor, bool)
+        if not number_like or not is_finite(factor):
+            raise ValueError(f"scale = {shown(factor)}: must be a finite number")
         each[int(number) - 1] = float(factor)
     return WeakMotor(tuple(each))
 

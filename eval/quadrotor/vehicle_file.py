@@ -81,7 +81,7 @@ def parse_vehicle(table: Mapping[str, Any]) -> Vehicle:
         ValueError: with the key, the value and what is allowed.
     """
     _known_keys("", table, KEYS)
-    if table.get("schema", SCHEMA) != SCHEMA:
+    if table.get("schema", SCHEMA) is True or table.get("schema", SCHEMA) != SCHEMA:
         raise ValueError(
             f"schema = {shown(table['schema'])}: this version of the suite reads {SCHEMA}"
         )
@@ -224,7 +224,7 @@ def _rotors(table: Mapping[str, Any]) -> Rotors:
 def _controller(table: Mapping[str, Any]) -> Controller:
     where = "controller."
     kind = table.get("kind", NOMINAL)
-    if kind != NOMINAL and kind not in KINDS:
+    if not isinstance(kind, str) or kind not in (NOMINAL, *KINDS):
         allowed = ", ".join((NOMINAL, *KINDS))
         raise ValueError(f"controller.kind = {shown(kind)}: allowed: {allowed}")
     settings, own = None, set()

@@ -77,6 +77,14 @@ def _check_rotors(vehicle: Vehicle) -> None:
             f"rotors.position = {[list(hub) for hub in rotors.position]}: the origin (centre of "
             "mass) must lie between the rotors, so that all of them push up in hover"
         )
+    if vehicle.motors is not None and vehicle.controller.settings is not None:
+        # Behind a firmware's loop a motor gives what its curve says at full command.
+        most = sum(vehicle.motors.thrust)
+        if hover.max() >= most:
+            raise ValueError(
+                f"motors.thrust = {list(vehicle.motors.thrust)}: too weak to hover; a rotor gives "
+                f"{most:.3g} N at full command and {hover.max():.3g} N are needed"
+            )
     if hover.max() >= rotors.thrust_max:
         raise ValueError(
             f"rotors.speed_max = {rotors.speed_max}: too weak to hover; a rotor gives "

@@ -11,6 +11,9 @@ from tracks.input.reading import MESH_BYTES, check_file
 _VOLUME_TOLERANCE = 1e-3
 """A part may miss this share of its convex hull's volume (rounding of stored corners)."""
 
+_FLAT = 1e-9
+"""Volume over that of a cube of the largest extent at which a part counts as flat."""
+
 
 def load_convex_parts(path: Path) -> list[np.ndarray]:
     """Return the connected parts of a mesh file, each as triangles (M, 3, 3) in file units.
@@ -44,7 +47,12 @@ def _check(path: Path, number: int, total: int, part: object) -> None:
     where = f"{path}: part {number} of {total} ({len(part.faces)} triangles)"
     if not part.is_watertight:
         raise ValueError(f"{where} is not closed; close its surface")
-    hull = part.convex_hull.volume
+    try:
+        hull = part.convex_hull.volume
+    except Exception:  # Qhull's own, with a page of text
+        hull = 0.0
+    if not hull > _FLAT * float(part.extents.max()) ** 3:
+        raise ValueError(f"{where} is flat; give it a thickness")
     if abs(abs(part.volume) - hull) > _VOLUME_TOLERANCE * hull:
         raise ValueError(
             f"{where} is not convex: it fills {abs(part.volume) / hull:.0%} of its convex hull, "

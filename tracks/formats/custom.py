@@ -6,6 +6,7 @@ angles in degrees; relative mesh files are looked for beside the TOML file.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -24,6 +25,8 @@ FARTHEST_M = 1e5
 """Of a place from the origin, along each axis: as far as a flight log may go."""
 LEAST_M, MOST_M = 1e-3, 1e5
 """Of a length."""
+_RESERVED = ("ground", "parked", "quadrotor box")
+"""What MuJoCo scenes have of their own."""
 _SINGULAR = {"boxes": "box", "meshes": "mesh"}
 
 
@@ -80,9 +83,10 @@ class _Names:
 
     def __call__(self, table: Table, kind: str, number: int) -> str:
         name = table.text("name", f"{_SINGULAR.get(kind, kind[:-1])} {number}")
-        if name in self._taken or "/" in name or name in ("ground", "parked"):
+        if name in self._taken or name in _RESERVED or "/" in name or not name.isprintable():
+            taken = ", ".join(map(repr, _RESERVED))
             raise table.error(
-                "name", name, "a name no other solid has, without '/', not 'ground' or 'parked'"
+                "name", name, f"a printable name no other solid has, without '/', none of {taken}"
             )
         self._taken.add(name)
         return name
@@ -185,9 +189,9 @@ def _length(table: Table, key: str, default: float = REQUIRED) -> float:
 
 
 def _unit(table: Table, key: str, vector: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vector)
-    if length < 1e-6:
-        raise table.error(key, vector.tolist(), "a vector that is not zero")
+    length = math.hypot(*vector)
+    if not 1e-6 <= length <= 1e6:
+        raise table.error(key, vector.tolist(), "a vector of a length from 1e-06 to 1e+06")
     return vector / length
 
 
@@ -237,6 +241,11 @@ def _sphere(table: Table) -> tuple:
     return _place(table, "center"), _length(table, "radius")
 
 
+def _volume(triangles: np.ndarray) -> float:
+    first, second, third = np.moveaxis(triangles - triangles[0, 0], 1, 0)
+    return float(abs(np.sum(first * np.cross(second, third)))) / 6.0
+
+
 def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
     meshes, labels = [], []
     for number, table in enumerate(top.tables("meshes")):
@@ -247,6 +256,10 @@ def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
         table.close()
         parts = load_convex_parts(file)
         for part, triangles in enumerate(parts):
+            volume_m3 = scale**3 * _volume(triangles)
+            if volume_m3 < LEAST_M**3:
+                allowed = f"one that makes every part at least {LEAST_M**3:g} m^3 large"
+                raise table.error("scale", scale, f"{allowed}; part {part} has {volume_m3:.2g}")
             meshes.append(scale * triangles @ rot.T + position)
             labels.append(name if len(parts) == 1 else f"{name} part {part}")
     return meshes, labels

@@ -143,12 +143,13 @@ def look(
     before = pick(state.started, rate, state.rate)
     slope, accel = butterworth(state.slope, (rate - before) / dt, gain.slope_cutoff_hz, dt)
     error = rate_cmd_b - rate
-    torque = gain.k * (gain.p * error - gain.d * accel + state.integral) + gain.f * rate_cmd_b
+    torque = gain.k * (gain.p * error - gain.d * accel) + state.integral + gain.f * rate_cmd_b
     torque = scale * torque
     # The integral that acts is that of before: it is updated after the torque is known.
     further = xp.where(state.lost * error > 0.0, 0.0, error)
     share = xp.maximum(1.0 - (error / FAST) ** 2, 0.0)
-    added = state.integral + share * gain.i * further * dt
+    # With K in it, as the firmware keeps it: the limit is one of torque.
+    added = state.integral + share * gain.k * gain.i * further * dt
     integral = xp.clip(added, -gain.i_limit, gain.i_limit)
     asked = torque[..., 2:]
     yaw = pt1(pick(state.started, asked, state.yaw), asked, gain.yaw_cutoff_hz, dt)

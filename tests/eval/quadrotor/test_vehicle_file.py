@@ -79,6 +79,15 @@ def test_weak_motor_takes_one_or_several():
     assert parse_vehicle(vehicle_table(vehicle)) == vehicle
 
 
+def test_motors_that_cannot_hover_are_refused_where_a_firmware_drives_them():
+    table = vehicle_table(load_vehicle("crazyflie21"))
+    table["motors"]["thrust"] = [0.0, 0.05]
+    with pytest.raises(
+        ValueError, match=r"motors.thrust = .*too weak to hover; a rotor gives 0.05"
+    ):
+        parse_vehicle(table)
+
+
 REFUSED = [
     ("mass", 0.0, "mass = 0.0.*must be from"),
     ("mass", "heavy", "mass = 'heavy'.*number"),
@@ -87,6 +96,8 @@ REFUSED = [
     ("mass", None, "mass: missing"),
     ("name", "", "name"),
     ("schema", 2, "schema = 2"),
+    ("schema", True, "schema = True"),
+    ("controller.kind", ["px4"], r"controller\.kind = \['px4'\]: allowed: "),
     ("wings", 2, "wings: unknown key.*allowed"),
     ("massa", 2, "massa: unknown key; did you mean 'mass'"),
     ("inertia", [0.001, 0.001], "inertia.*list of 3"),
@@ -121,7 +132,8 @@ REFUSED = [
     ("effects", {"weak_motor": {"index": 5, "scale": 0.9}}, "weak_motor.*from 1 to 4"),
     ("effects", {"weak_motor": {"index": [1, 1], "scale": [0.9, 0.9]}}, "different"),
     ("effects", {"weak_motor": {"index": [1], "scale": 0.9}}, "both numbers or both lists"),
-    ("effects", {"weak_motor": {"index": 1, "scale": "low"}}, "must be a number"),
+    ("effects", {"weak_motor": {"index": 1, "scale": "low"}}, "must be a finite number"),
+    ("effects", {"weak_motor": {"index": 1, "scale": 10**400}}, "scale = 1000.*finite number"),
     ("effects", {"weak_motor": {"index": 1, "scale": -0.5}}, "from 0 to 1.5"),
 ]
 

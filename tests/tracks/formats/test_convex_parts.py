@@ -49,3 +49,16 @@ def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
     (tmp_path / "part.stl").write_bytes(b"nothing of the kind")
     with pytest.raises(ValueError, match="part.stl"):
         load_track(path)
+
+
+def test_flat_and_tiny_meshes_are_refused(tmp_path):
+    path = write(tmp_path, GATE + '[[meshes]]\nfile = "part.stl"\nscale = 1e-4\n')
+    box = trimesh.creation.box((1, 1, 1))
+    box.export(tmp_path / "part.stl")
+    with pytest.raises(ValueError, match=r"scale is 0.0001, allowed is .* part 0 has 1e-12"):
+        load_track(path)
+    trimesh.Trimesh(box.vertices * [1, 1, 0], box.faces, process=False).export(
+        tmp_path / "part.stl"
+    )
+    with pytest.raises(ValueError, match=r"part.stl: part \d of \d .* is flat; give it"):
+        load_track(path)

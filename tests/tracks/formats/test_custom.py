@@ -122,15 +122,24 @@ BAD = {
     "size": (GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[1,1,0]\n", r"boxes\[0\].size is \[1, 1, 0\]"),
     "axis": (
         GATE + "[[capsules]]\ncenter=[0,0,0]\nradius=1\nlength=1\naxis=[0,0,0]\n",
-        "not zero",
+        "of a length from 1e-06",
     ),
-    "quat": (GATE + "quat_wxyz = [0, 0, 0, 0]\n", "quat_wxyz.*not zero"),
+    "quat": (GATE + "quat_wxyz = [0, 0, 0, 0]\n", "quat_wxyz.*of a length from 1e-06"),
+    "large quat": (GATE + "quat_wxyz = [1e200, 0, 0, 0]\n", r"quat_wxyz is .*to 1e\+06"),
     "both rotations": (GATE + "quat_wxyz = [1, 0, 0, 0]\nyaw_deg = 3\n", "key 'yaw_deg'"),
     "twice": (
         GATE + 2 * '[[spheres]]\nname = "x"\ncenter=[0,0,0]\nradius=1\n',
         r"spheres\[1\].name is 'x'",
     ),
     "reserved": (GATE + '[[spheres]]\nname = "ground"\ncenter=[0,0,0]\nradius=1\n', "'ground'"),
+    "MuJoCo's": (
+        GATE + '[[spheres]]\nname = "quadrotor box"\ncenter=[0,0,0]\nradius=1\n',
+        "none of 'ground', 'parked', 'quadrotor box'",
+    ),
+    "not printable": (
+        GATE + '[[spheres]]\nname = "a\\u0000b"\ncenter=[0,0,0]\nradius=1\n',
+        "a printable name",
+    ),
     "start": ("[start]\nposition = [0, 0, -1]\n" + GATE, "start.position.*above the ground"),
     "start in a box": (
         "[start]\nposition = [0, 0, 1]\n" + GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[3,3,3]\n",

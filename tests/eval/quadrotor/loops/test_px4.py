@@ -56,6 +56,16 @@ def test_no_integral_into_saturation():
     np.testing.assert_allclose(after.integral, state.integral)
 
 
+def test_the_integrals_limit_is_one_of_torque():
+    """As much with K = 2: 0.3 of roll, of which roll's 0.707 goes to a motor."""
+    twice = replace(PLAIN, MC_ROLLRATE_K=2.0)
+    state = px4.start((), np)._replace(integral=np.array([0.29999, 0.0, 0.0]))
+    after, _ = look(state, 0.5, [0.2, 0.0, 0.0], [0.0, 0.0, 0.0], twice)
+    assert after.integral[0] == PLAIN.MC_RR_INT_LIM == 0.3
+    _, motor = look(after, 0.5, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], twice)
+    np.testing.assert_allclose(motor, 0.5 + 0.3 * ROOT * RIGHT_LEFT, atol=1e-9)
+
+
 def test_the_thrust_model_is_undone():
     """0.5 u^2 + 0.5 u = 0.375 at u = 0.5."""
     np.testing.assert_allclose(px4.signal(np.asarray(0.5), np.array([0.375, 1.0])), [0.5, 1.0])
