@@ -22,7 +22,7 @@ from eval.judging.sensors import SensorNoise, Sensors, check_noise
 from eval.logs.flight import Flight
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import REFERENCE, World, compiles, world_class
-from eval.worlds.slots import layout_of
+from eval.worlds.slots import fitting, layout_of
 from eval.worlds.trial import (
     DIVERGED,
     ENDINGS,
@@ -138,7 +138,11 @@ def fly(
 
     workers = _workers(task, len(trials))
     most = len(trials) if compiles(world) else MOST_A_PIECE
-    shares = pieces_of(list(enumerate(trials)), crew(workers), most)
+    shares = [
+        share
+        for group in fitting(trials, tracks or {})
+        for share in pieces_of([(number, trials[number]) for number in group], crew(workers), most)
+    ]
     work_off(partial(fly_share, task), shares, workers, keep)
     return [results[index] for index in range(len(trials))]
 

@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 
 from tracks.geometry.clearance import distances
+from tracks.geometry.cull import keep_best
 from tracks.geometry.rotation import to_local, to_world
 from tracks.geometry.scene import Array, Counts, Scene
 
 NEAR = Counts(boxes=12, cylinders=4, capsules=4, spheres=4)
-"""Solids looked at: the nearest of each kind, found anew once a decision of the policy."""
+"""Solids looked at: of each kind those with the nearest surface, found anew once a decision."""
 ROUNDS = 12
 """Projections to and fro; bodies that merely graze one another may be seen a few steps later."""
 REACH = 1.5
@@ -24,6 +25,19 @@ on they may not."""
 CONTACT_M = 1e-3
 """Nearer than this is a contact: as near as the rounds come, and half a step's way at 1 m/s [m]."""
 _KINDS = ("boxes", "cylinders", "capsules", "spheres", "triangles")
+
+
+def near_solids(scene: Scene, pos_w: Array) -> Scene:
+    """Keep the `NEAR` solids of each kind whose surfaces are nearest to pos_w (N, 3).
+
+    Surfaces, as long walls would leave no place to what is near by their bounding spheres.
+    """
+    distance, first, scores = distances(scene, pos_w)[0], 0, {}
+    for kind in NEAR._fields:
+        count = getattr(scene, kind)[0].shape[1]
+        scores[kind] = distance[:, first : first + count]
+        first += count
+    return keep_best(scene, scores, NEAR)
 
 
 def box_distances(

@@ -24,7 +24,7 @@ from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows
-from eval.worlds.collision import CONTACT_M, NEAR, box_distances
+from eval.worlds.collision import CONTACT_M, box_distances, near_solids
 from eval.worlds.engine import start_state
 from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
 from eval.worlds.trial import (
@@ -45,7 +45,6 @@ from policies.observation import View, view_of
 from tracks.common.tree_rows import select
 from tracks.formats.mujoco_scene import GROUND
 from tracks.geometry.camera import Camera, pixel_rays_b
-from tracks.geometry.cull import nearest_solids
 from tracks.geometry.depth import depth_image
 from tracks.geometry.rotation import quat_to_rot, to_world
 from tracks.geometry.scene import Array, Scene, pad, stack
@@ -158,7 +157,7 @@ class MjxWorld:
         loops = start_autopilot(self._autopilot, motion, noise)
         fresh = Flying(qpos, jnp.zeros_like(state.qvel), loops, start_progress(motion.pos_w))
         state = select(started, fresh, state)
-        near = nearest_solids(scene, motion.pos_w, NEAR)
+        near = near_solids(scene, motion.pos_w)
         return self._judge(state, started, jnp.zeros_like(started), course, near)
 
     def _judge(
@@ -246,7 +245,7 @@ class MjxWorld:
         most: int,
         record: bool,
     ) -> tuple[Flying, tuple[Rows, Rows] | None]:
-        near = nearest_solids(scene, state.qpos[:, :3], NEAR)
+        near = near_solids(scene, state.qpos[:, :3])
 
         def one(state: Flying, inputs: tuple[Array, Array | None]) -> tuple[Flying, Any]:
             done, draws = inputs

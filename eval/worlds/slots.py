@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import PurePath
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +37,22 @@ def layout_of(tracks: Iterable[Track]) -> Layout:
     return layout
 
 
+def fitting(trials: Sequence[TrialSpec], tracks: Mapping[str, Track]) -> list[list[int]]:
+    """Return the numbers of trials in groups whose scenes fit into each other's slots.
+
+    A model of MuJoCo is as large as its meshes: a track with meshes is a group of its own.
+
+    Args:
+        trials: what is flown.
+        tracks: those from files.
+    """
+    groups: dict[str, list[int]] = {}
+    for number, trial in enumerate(trials):
+        track = tracks.get(trial.track)
+        groups.setdefault(trial.track if track and track.mesh_sizes else "", []).append(number)
+    return list(groups.values())
+
+
 def empty_course(slots: int, layout: Layout) -> Course:
     """Return the course of slots without a trial, where nothing is judged: room for gates."""
     n, g = slots, layout.gates
@@ -62,8 +79,12 @@ GUSTS, PIXELS, GATES, STATE, LOSSES, STATE_AGES, IMAGE_AGES = range(1, 8)
 
 
 def generator_of(trial: TrialSpec, use: int) -> np.random.Generator:
-    """Return the random numbers of a trial for one use, set by the two alone."""
-    key = [trial.seed, trial.difficulty, *trial.track.encode(), use]
+    """Return the random numbers of a trial for one use, set by the two alone.
+
+    Of a track's file the name counts, however the way to it was written.
+    """
+    name = PurePath(trial.track).name
+    key = [trial.seed, trial.difficulty, *name.encode(), use]
     return np.random.default_rng(np.random.SeedSequence(key))
 
 

@@ -57,7 +57,8 @@ def _gather(solids: Any, index: Array) -> Any:
     return jax.tree.map(pick, solids)
 
 
-def _keep(scene: Scene, scores: dict[str, Array], limits: Counts) -> Scene:
+def keep_best(scene: Scene, scores: dict[str, Array], limits: Counts) -> Scene:
+    """Keep the solids of each kind with the least scores (B, N), at most `limits` of them."""
     kept = {}
     for name, score in scores.items():
         limit = getattr(limits, name)
@@ -72,7 +73,7 @@ def nearest_solids(scene: Scene, pos_w: Array, limits: Counts) -> Scene:
     for name, ball in bounds(scene):
         away = ball.center_w - pos_w[:, None]
         scores[name] = jnp.sqrt((away * away).sum(-1)) - ball.radius
-    return _keep(scene, scores, limits)
+    return keep_best(scene, scores, limits)
 
 
 def visible_solids(
@@ -104,4 +105,4 @@ def visible_solids(
         distance = jnp.sqrt(squared) - ball.radius
         unseen = (outside_cone & (distance > 0)) | (distance > reach)
         scores[name] = jnp.where(unseen, 1e6 + distance, distance)
-    return _keep(scene, scores, limits)
+    return keep_best(scene, scores, limits)

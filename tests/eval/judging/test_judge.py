@@ -12,6 +12,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import straight
 from tests.support.pilots import Pursuit, RandomNetwork, Steady
+from tracks.formats.custom import load_track
 
 VEHICLE = load_vehicle("reference")
 SHORT = Rules(time_limit_s=0.3)
@@ -51,6 +52,16 @@ def test_a_policy_is_asked_for_no_more_rows_than_there_are_trials():
     trials = [TrialSpec("zigzag", 0, seed) for seed in range(3)]
     fly(Counted(), trials, VEHICLE, options=JudgeOptions(rules=SHORT))
     assert set(asked) == {3}
+
+
+def test_tracks_with_meshes_are_flown_beside_others(root):
+    yard = load_track(root / "tracks" / "examples" / "yard.toml")
+    trials = [TrialSpec(name, 0, 0) for name in ("zigzag", "yard", "zigzag")]
+    results = fly(
+        Steady(), trials, VEHICLE, options=JudgeOptions(rules=SHORT), tracks={"yard": yard}
+    )
+    assert [result.track for result in results] == ["zigzag", "yard", "zigzag"]
+    assert results[0] == results[2]
 
 
 @pytest.mark.parametrize("rate_hz", [7.0, 30.0, 100.0, 500.0])

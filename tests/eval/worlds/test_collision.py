@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds.collision import CONTACT_M, box_distances
+from eval.worlds.collision import CONTACT_M, NEAR, box_distances, near_solids
 from eval.worlds.engine import compile_model
 from eval.worlds.slots import layout_of
 from tests.support.courses import straight
 from tracks.families import MAX_COUNTS, make_track
 from tracks.geometry.rotation import exp_rot
-from tracks.geometry.scene import stack
+from tracks.geometry.scene import Boxes, stack
 
 VEHICLE = load_vehicle("reference")
 
@@ -26,6 +26,17 @@ def test_distance_to_a_wall_and_to_the_ground_by_hand(turn, reach):
     found = np.asarray(box_distances(scene, pos_w, rot_w, half_size, middle_b))[0]
     assert found[0] == pytest.approx(2.95 - reach, abs=1e-3)
     assert found[-1] == pytest.approx(1.5 - 0.01 - 0.02)
+
+
+def test_long_walls_far_away_do_not_hide_a_box_near_by():
+    walls = [[0.0, 20.0 + k, 5.0] for k in range(NEAR.boxes)]
+    center_w = np.array([*walls, [1.0, 0.0, 1.0]])
+    half_size = np.array([*[[100.0, 0.1, 5.0]] * NEAR.boxes, [0.1, 0.1, 0.1]])
+    turned = np.tile(np.eye(3), (len(center_w), 1, 1))
+    scene = straight().scene._replace(boxes=Boxes(center_w, turned, half_size))
+    near = near_solids(stack([scene], MAX_COUNTS), np.array([[0.0, 0.0, 1.0]]))
+    assert near.boxes.center_w.shape == (1, NEAR.boxes, 3)
+    np.testing.assert_allclose(near.boxes.center_w[0, 0], center_w[-1])
 
 
 def test_contacts_are_those_of_mujoco():

@@ -1,8 +1,18 @@
 """What a world with slots keeps for each."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from eval.worlds.slots import GATES, empty_course, generator_of, layout_of, noise_of, pad_gates
+from eval.worlds.slots import (
+    GATES,
+    empty_course,
+    fitting,
+    generator_of,
+    layout_of,
+    noise_of,
+    pad_gates,
+)
 from eval.worlds.trial import TrialSpec
 from tests.support.courses import straight
 
@@ -13,6 +23,14 @@ def test_a_layout_holds_every_track():
     layout = layout_of([straight(tuple(range(1, 12)))])
     assert layout.gates == 11 and layout.corners == 4
     assert layout.solids == layout_of([]).solids
+
+
+def test_a_track_with_meshes_is_a_group_of_its_own():
+    plain = straight((1.0, 2.0))
+    tracks = {"a.toml": plain, "m.toml": replace(plain, mesh_sizes=(12,))}
+    trials = [TRIAL._replace(track=name) for name in ("zigzag", "m.toml", "a.toml", "m.toml")]
+    assert fitting(trials, tracks) == [[0, 2], [1, 3]]
+    assert fitting([], {}) == []
 
 
 def test_padding_repeats_the_last_gate():
@@ -33,4 +51,6 @@ def test_a_trials_random_numbers_are_its_own_for_each_use():
     others = TRIAL._replace(seed=8), TRIAL._replace(difficulty=4), TRIAL._replace(track="circular")
     for other in others:
         assert (noise_of(other, 5) != noise_of(TRIAL, 5)).all()
+    here, there = (TRIAL._replace(track=f"{way}own.toml") for way in ("", "./courses/"))
+    np.testing.assert_array_equal(noise_of(here, 5), noise_of(there, 5))
     assert generator_of(TRIAL, GATES).standard_normal() != noise_of(TRIAL, 1)[0, 0]
