@@ -30,10 +30,12 @@ _KINDS = ("boxes", "cylinders", "capsules", "spheres", "triangles")
 def near_solids(scene: Scene, pos_w: Array) -> Scene:
     """Keep the `NEAR` solids of each kind whose surfaces are nearest to pos_w (N, 3).
 
-    Surfaces, as long walls would leave no place to what is near by their bounding spheres.
+    Surfaces, as long walls would leave no place to what is near by their bounding spheres. Meshes
+    are kept whole.
     """
-    distance, first, scores = distances(scene, pos_w)[0], 0, {}
-    for kind in NEAR._fields:
+    solids = scene._replace(triangles=scene.triangles[:, :0])
+    distance, first, scores = distances(solids, pos_w)[0], 0, {}
+    for kind in _KINDS[:-1]:
         count = getattr(scene, kind)[0].shape[1]
         scores[kind] = distance[:, first : first + count]
         first += count

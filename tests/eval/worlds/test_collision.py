@@ -39,6 +39,13 @@ def test_long_walls_far_away_do_not_hide_a_box_near_by():
     np.testing.assert_allclose(near.boxes.center_w[0, 0], center_w[-1])
 
 
+def test_every_triangle_of_a_mesh_is_near():
+    triangles = np.arange(5 * 9.0).reshape(5, 3, 3)
+    scene = straight().scene._replace(triangles=triangles)
+    near = near_solids(stack([scene], MAX_COUNTS._replace(triangles=5)), np.zeros((1, 3)))
+    np.testing.assert_array_equal(near.triangles, triangles[None])
+
+
 def test_contacts_are_those_of_mujoco():
     """Random poses close to solids of every kind: contact there, a distance of nought here."""
     rng = np.random.default_rng(0)
