@@ -37,16 +37,19 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
         if key not in table:
             raise ValueError(f"{key}: missing; needed: index (1 to 4) and scale, numbers or lists")
     index, scale = table["index"], table["scale"]
+    given = f"index = {shown(index)}, scale = {shown(scale)}"
     if isinstance(index, list) != isinstance(scale, list):
-        raise ValueError(f"index = {index}, scale = {scale}: both numbers or both lists")
+        raise ValueError(f"{given}: both numbers or both lists")
     if not isinstance(index, list):
         index, scale = [index], [scale]
     if len(index) != len(scale) or not index:
-        raise ValueError(f"index = {index}, scale = {scale}: one scale for each index")
+        raise ValueError(f"{given}: one scale for each index")
     each = [1.0] * 4
     for number, factor in zip(index, scale, strict=True):
         if isinstance(number, bool) or number not in (1, 2, 3, 4) or index.count(number) > 1:
-            raise ValueError(f"index = {index}: allowed are different whole numbers from 1 to 4")
+            raise ValueError(
+                f"index = {shown(index)}: allowed are different whole numbers from 1 to 4"
+            )
         number_like = isinstance(factor, (int, float)) and not isinstance(factor, bool)
         if not number_like or not is_finite(factor):
             raise ValueError(f"scale = {shown(factor)}: must be a finite number")

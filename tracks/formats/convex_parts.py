@@ -40,6 +40,13 @@ def load_convex_parts(path: Path) -> list[np.ndarray]:
     return [np.asarray(part.triangles, float) for part in parts]
 
 
+def thickness(triangles: np.ndarray) -> float:
+    """Return how far triangles (M, 3, 3) reach along the axis that they spread least along."""
+    corners = triangles.reshape(-1, 3) - triangles.mean(axis=(0, 1))
+    axes = np.linalg.eigh(corners.T @ corners)[1]
+    return float(np.ptp(corners @ axes, axis=0).min())
+
+
 def _check(path: Path, number: int, total: int, part: object) -> None:
     import trimesh
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from tracks.common.toml_table import REQUIRED, Table, read_toml
-from tracks.formats.convex_parts import load_convex_parts
+from tracks.formats.convex_parts import load_convex_parts, thickness
 from tracks.geometry.gates import frame_boxes, rectangle, regular_polygon
 from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
@@ -25,8 +25,13 @@ FARTHEST_M = 1e5
 """Of a place from the origin, along each axis: as far as a flight log may go."""
 LEAST_M, MOST_M = 1e-3, 1e5
 """Of a length."""
-_RESERVED = ("ground", "parked", "quadrotor box")
-"""What MuJoCo scenes have of their own."""
+_RESERVED = (
+    *("ground", "parked", "quadrotor box"),
+    *(f"rotor_{number} {part}" for number in range(1, 5) for part in ("arm", "disk")),
+)
+"""Names of geoms that MuJoCo's models have of their own."""
+_ROUNDING = 0.01
+"""Of a mesh's thickness, as a share."""
 _SINGULAR = {"boxes": "box", "meshes": "mesh"}
 
 
@@ -241,11 +246,6 @@ def _sphere(table: Table) -> tuple:
     return _place(table, "center"), _length(table, "radius")
 
 
-def _volume(triangles: np.ndarray) -> float:
-    first, second, third = np.moveaxis(triangles - triangles[0, 0], 1, 0)
-    return float(abs(np.sum(first * np.cross(second, third)))) / 6.0
-
-
 def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
     meshes, labels = [], []
     for number, table in enumerate(top.tables("meshes")):
@@ -256,10 +256,20 @@ def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
         table.close()
         parts = load_convex_parts(file)
         for part, triangles in enumerate(parts):
-            volume_m3 = scale**3 * _volume(triangles)
-            if volume_m3 < LEAST_M**3:
-                allowed = f"one that makes every part at least {LEAST_M**3:g} m^3 large"
-                raise table.error("scale", scale, f"{allowed}; part {part} has {volume_m3:.2g}")
-            meshes.append(scale * triangles @ rot.T + position)
+            mesh = scale * triangles @ rot.T + position
+            _check_mesh(table, scale, part, mesh)
+            meshes.append(mesh)
             labels.append(name if len(parts) == 1 else f"{name} part {part}")
     return meshes, labels
+
+
+def _check_mesh(table: Table, scale: float, part: int, mesh: np.ndarray) -> None:
+    """Refuse a part (M, 3, 3) in the world that MuJoCo, which stores singles, finds no body."""
+    reach_m = float(np.abs(mesh).max())
+    if not reach_m <= FARTHEST_M:
+        allowed = f"one that leaves every part within {FARTHEST_M:g} m of the origin on each axis"
+        raise table.error("scale", scale, f"{allowed}; part {part} reaches {reach_m:.3g}")
+    thick_m = thickness(mesh.astype(np.float32).astype(float))
+    if thick_m < (1.0 - _ROUNDING) * LEAST_M:
+        allowed = f"one that makes every part at least {LEAST_M:g} m thick where it stands"
+        raise table.error("scale", scale, f"{allowed}; part {part} has {thick_m:.2g}")

@@ -96,7 +96,10 @@ def is_finite(value: float) -> bool:
 
 def shown(value: object) -> str:
     """Return a value for a message, a number of hundreds of digits by its first ones."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no number of more than 4300 digits
+        return "a number of thousands of digits"
     return text if len(text) <= 80 else f"{text[:40]}… ({len(text)} characters)"
 
 

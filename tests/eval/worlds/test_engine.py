@@ -8,6 +8,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.engine import BODY, Eye, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import layout_of
 from tests.support.courses import straight
+from tracks.formats.custom import load_track
 from tracks.geometry.camera import Camera, pixel_rays_b
 
 VEHICLE = load_vehicle("reference")
@@ -30,6 +31,20 @@ def test_the_quadrotor_is_the_first_body_and_starts_at_the_start(wall):
     np.testing.assert_array_equal(motion.rot_w[0], np.eye(3))
     np.testing.assert_array_equal(motion.vel_w[0], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(motion.rate_b[0], [0.1, 0.2, 0.3])
+
+
+def test_no_solid_of_a_file_is_called_as_a_geom_of_the_quadrotor(wall, tmp_path):
+    _, model, _ = wall
+    own = [model.geom(i).name for i in range(model.ngeom) if model.geom_bodyid[i]]
+    assert len(own) == 9
+    for name in own:
+        path = tmp_path / "track.toml"
+        path.write_text(
+            "[[gates]]\ncenter = [0, 0, 2]\nwidth = 1\nheight = 1\n"
+            f'[[spheres]]\nname = "{name}"\ncenter = [5, 5, 5]\nradius = 1\n'
+        )
+        with pytest.raises(ValueError, match=rf"track.toml: spheres\[0\].name is '{name}'"):
+            load_track(path)
 
 
 def test_depth_is_planar_and_ends_at_the_range(wall):

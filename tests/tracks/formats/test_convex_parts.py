@@ -51,11 +51,27 @@ def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
         load_track(path)
 
 
+@pytest.mark.parametrize(
+    ("size", "keys", "said"),
+    [
+        ((1, 1, 1e-7), "", "0.001 m thick .*; part 0 has "),
+        ((1, 1, 1), "scale = 0.002\nposition = [9e4, 9e4, 9e4]", "thick where it stands; part 0"),
+        ((1, 1, 1), "scale = 1e6", r"within 100000 m .*; part 0 reaches 5e\+05"),
+    ],
+)
+def test_meshes_that_mujoco_finds_no_body_are_refused(tmp_path, size, keys, said):
+    """It stores corners as singles: far from the origin a small body is none."""
+    path = write(tmp_path, GATE + f'[[meshes]]\nfile = "part.stl"\n{keys}\n')
+    trimesh.creation.box(size).export(tmp_path / "part.stl")
+    with pytest.raises(ValueError, match=rf"track.toml: meshes\[0\].scale is .* {said}"):
+        load_track(path)
+
+
 def test_flat_and_tiny_meshes_are_refused(tmp_path):
     path = write(tmp_path, GATE + '[[meshes]]\nfile = "part.stl"\nscale = 1e-4\n')
     box = trimesh.creation.box((1, 1, 1))
     box.export(tmp_path / "part.stl")
-    with pytest.raises(ValueError, match=r"scale is 0.0001, allowed is .* part 0 has 1e-12"):
+    with pytest.raises(ValueError, match=r"scale is 0.0001, .* part 0 has 0.0001"):
         load_track(path)
     trimesh.Trimesh(box.vertices * [1, 1, 0], box.faces, process=False).export(
         tmp_path / "part.stl"

@@ -57,6 +57,7 @@ def test_an_option_is_called_as_it_is_written():
 def test_numbers_that_no_float_can_hold_are_shown_short():
     assert not is_finite(10**400) and not is_finite(math.nan) and is_finite(1)
     assert len(shown("x" * 10_000)) < 80
+    assert shown([16**10_000]) == "a number of thousands of digits"
 
 
 def _numbers(cls: type) -> list[str]:
