@@ -26,7 +26,7 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows
 from eval.worlds.collision import CONTACT_M, box_distances, near_solids
 from eval.worlds.engine import start_state
-from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
+from eval.worlds.slots import IDLE, Gusts, Layout, empty_course, pad_gates
 from eval.worlds.trial import (
     DIVERGED,
     FLYING,
@@ -94,7 +94,8 @@ class MjxWorld:
         self._rays_b = jnp.asarray(pixel_rays_b(camera), jnp.float32)
         self._most = 0
         self._has_noise = uses_noise(self._autopilot.plant)
-        self._noise = [np.zeros((1, 3), np.float32)] * slots
+        self._noise = [Gusts(IDLE)] * slots
+        self._start_noise = np.zeros((slots, 3), np.float32) if self._has_noise else None
         self._course = empty_course(slots, layout)
         self._tracks: list[Track | None] = [None] * slots
         self._scene: Scene | None = None
@@ -106,16 +107,13 @@ class MjxWorld:
         progress = start_progress(nothing.pos_w)
         progress = progress._replace(ended=jnp.full(slots, -1, jnp.int32))
         qpos = jnp.tile(jnp.asarray([0.0, 0, 0, 1, 0, 0, 0]), (slots, 1))
-        loops = start_autopilot(self._autopilot, nothing, self._start_noise())
+        loops = start_autopilot(self._autopilot, nothing, self._start_noise)
         self._state = Flying(qpos, jnp.zeros((slots, 6)), loops, progress)
 
     @property
     def progress(self) -> Progress:
         """Where the trial in each slot stands."""
         return jax.tree.map(np.asarray, self._state.progress)
-
-    def _start_noise(self) -> np.ndarray | None:
-        return np.stack([draws[0] for draws in self._noise]) if self._has_noise else None
 
     def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
         """Start trials from (slot, track, trial)."""
@@ -133,14 +131,15 @@ class MjxWorld:
                 field[slot] = value
             self._course.count[slot] = len(track.scene.gates.center_w)
             qpos[slot] = start_state(track)
-            if self._has_noise:
-                steps = round(self._rules.time_limit_s / self.dt) + 2
-                self._noise[slot] = noise_of(trial, steps).astype(np.float32)
+            if self._start_noise is not None:
+                self._noise[slot] = Gusts(trial)
+                self._start_noise[slot] = self._noise[slot].at(0, 1)[0]
         # A copy: on a CPU JAX may go on looking at the array it is given.
         on_device = jax.tree.map(lambda a: jnp.array(a), (self._course, self._scene))
         self._on_device = on_device
+        start_noise = None if self._start_noise is None else self._start_noise.copy()
         self._state = self._start(
-            self._state, jnp.array(qpos), jnp.array(started), self._start_noise(), *on_device
+            self._state, jnp.array(qpos), jnp.array(started), start_noise, *on_device
         )
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -216,11 +215,9 @@ class MjxWorld:
         noise = None
         if self._has_noise:
             first = np.asarray(self._state.progress.step) + 1
-            index = first + np.arange(most)[:, None]
-            noise = np.stack(
-                [draws[np.minimum(index[:, slot], len(draws) - 1)]
-                 for slot, draws in enumerate(self._noise)], axis=1,
-            )  # fmt: skip
+            pairs = zip(first.tolist(), self._noise, strict=True)
+            noise = np.stack([draws.at(step, most) for step, draws in pairs], axis=1)
+            noise = noise.astype(np.float32)
         self._state, rows = self._fly(
             self._state, jnp.asarray(action_b, jnp.float32), jnp.asarray(steps), noise,
             *self._on_device, most, record,

@@ -19,7 +19,7 @@ from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows
 from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
-from eval.worlds.slots import Layout, empty_course, noise_of, pad_gates
+from eval.worlds.slots import IDLE, Gusts, Layout, empty_course, pad_gates
 from eval.worlds.trial import (
     DIVERGED,
     FLYING,
@@ -80,9 +80,9 @@ class SceneSlots(ABC):
         self._progress = start_progress(np.zeros((slots, 3)))
         self._progress = self._progress._replace(ended=np.full(slots, -1, np.int32))
         self._models: list[mujoco.MjModel] = []
-        self._noise: list[np.ndarray] | None = None
+        self._noise: list[Gusts] | None = None
         if uses_noise(self._autopilot.plant):
-            self._noise = [np.zeros((1, 3))] * slots
+            self._noise = [Gusts(IDLE)] * slots
 
     @property
     def progress(self) -> Progress:
@@ -114,8 +114,7 @@ class SceneSlots(ABC):
                 field[slot] = value
             self._course.count[slot] = len(track.scene.gates.center_w)
             if self._noise is not None:
-                steps = round(self._rules.time_limit_s / self.dt) + 2
-                self._noise[slot] = noise_of(trial, steps)
+                self._noise[slot] = Gusts(trial)
         ids = np.array([slot for slot, _, _ in entries], np.int32)
         self._batch.set_models(self._models)
         self._batch.reset(ids, stage=_NOTHING)
@@ -124,12 +123,10 @@ class SceneSlots(ABC):
         self._batch.forward(ids, stage=TO_CONTACTS)
 
         motion = self._motion()
-        noise = None
-        if self._noise is not None:
-            noise = np.stack([draws[0] for draws in self._noise])
-        fresh = start_autopilot(self._autopilot, motion, noise)
         started = np.zeros(self.slots, bool)
         started[ids] = True
+        noise = self._draws(np.where(started, -1, self._progress.step))
+        fresh = start_autopilot(self._autopilot, motion, noise)
         self._loops = packed(select(started, fresh, getattr(self, "_loops", fresh)))
         self._progress = select(started, start_progress(motion.pos_w), self._progress)
         self._judge(started, np.zeros(self.slots, bool))
@@ -224,10 +221,11 @@ class SceneSlots(ABC):
         return rows
 
     def _draws(self, step: np.ndarray) -> np.ndarray | None:
+        """Return the draws (N, 3) that come after `step` (N,), -1 before the start."""
         if self._noise is None:
             return None
-        last = [min(int(k) + 1, len(d) - 1) for k, d in zip(step, self._noise, strict=True)]
-        return np.stack([draws[k] for k, draws in zip(last, self._noise, strict=True)])
+        pairs = zip(step.tolist(), self._noise, strict=True)
+        return np.concatenate([draws.at(k + 1, 1) for k, draws in pairs])
 
     def _rows(self, due: np.ndarray, rotor_speed: np.ndarray) -> list[Rows]:
         if not due.any():

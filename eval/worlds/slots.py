@@ -76,6 +76,10 @@ def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
 
 GUSTS, PIXELS, GATES, STATE, LOSSES, STATE_AGES, IMAGE_AGES = range(1, 8)
 """What a trial's random numbers are for; each use has a stream of its own."""
+GUSTS_AT_ONCE = 1024
+"""Steps whose draws are made together."""
+IDLE = TrialSpec("", 0, 0)
+"""In a slot where none has been loaded."""
 
 
 def generator_of(trial: TrialSpec, use: int) -> np.random.Generator:
@@ -86,6 +90,35 @@ def generator_of(trial: TrialSpec, use: int) -> np.random.Generator:
     name = PurePath(trial.track).name
     key = [trial.seed, trial.difficulty, *name.encode(), use]
     return np.random.default_rng(np.random.SeedSequence(key))
+
+
+class Gusts:
+    """A trial's draws for its gusts, as `noise_of` gives them, drawn as the flight goes on.
+
+    A flight of an hour at 10 kHz would need 0.9 GB at once.
+    """
+
+    def __init__(self, trial: TrialSpec) -> None:
+        self._trial = trial
+        self._rewind()
+
+    def _rewind(self) -> None:
+        self._generator = generator_of(self._trial, GUSTS)
+        self._first, self._rows = 0, np.zeros((0, 3))
+
+    def at(self, step: int, count: int) -> np.ndarray:
+        """Return the draws (count, 3) of the steps from `step` on.
+
+        Going on is cheap; what lies before the last `step` is drawn anew from the start.
+        """
+        if step < self._first:
+            self._rewind()
+        while self._first + len(self._rows) < step + count:
+            passed = min(step - self._first, len(self._rows))
+            more = self._generator.standard_normal((GUSTS_AT_ONCE, 3))
+            self._rows = np.concatenate([self._rows[passed:], more])
+            self._first += passed
+        return self._rows[step - self._first :][:count]
 
 
 def noise_of(trial: TrialSpec, steps: int) -> np.ndarray:

@@ -6,6 +6,8 @@ import numpy as np
 
 from eval.worlds.slots import (
     GATES,
+    GUSTS_AT_ONCE,
+    Gusts,
     empty_course,
     fitting,
     generator_of,
@@ -54,3 +56,15 @@ def test_a_trials_random_numbers_are_its_own_for_each_use():
     here, there = (TRIAL._replace(track=f"{way}own.toml") for way in ("", "./courses/"))
     np.testing.assert_array_equal(noise_of(here, 5), noise_of(there, 5))
     assert generator_of(TRIAL, GATES).standard_normal() != noise_of(TRIAL, 1)[0, 0]
+
+
+def test_gusts_are_drawn_as_the_flight_goes_on():
+    gusts, whole = Gusts(TRIAL), noise_of(TRIAL, 4 * GUSTS_AT_ONCE)
+    last = GUSTS_AT_ONCE - 1
+    for step, count in ((0, 1), (1, 5), (last, 3), (3 * last, 2 * last), (2, 4)):
+        wanted = whole[step : step + count]
+        np.testing.assert_array_equal(gusts.at(step, count)[: len(wanted)], wanted)
+    kept = Gusts(TRIAL)
+    for step in range(0, 100 * GUSTS_AT_ONCE, 50):
+        kept.at(step, 60)
+    assert len(kept._rows) < 3 * GUSTS_AT_ONCE, "an hour's are not kept"
