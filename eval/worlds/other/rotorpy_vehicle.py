@@ -16,6 +16,7 @@ import numpy as np
 
 from eval.effects import EFFECTS, all_values
 from eval.effects.interface import GRAVITY
+from eval.quadrotor.loops import loop_of
 from eval.quadrotor.plant import make_plant
 from eval.vehicles.vehicle import Vehicle
 
@@ -61,7 +62,7 @@ def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[st
         # Its sign is that of the torque on the body, ours that of the rotor's turning.
         "rotor_directions": -np.array(flown.rotors.spin),
         "rotor_speed_min": 0.0,
-        "rotor_speed_max": flown.rotors.speed_max,
+        "rotor_speed_max": _fastest(flown),
         "k_eta": thrust,
         "k_m": float(constants.torque_coefficient[0]),
         "tau_m": max(float(constants.time_constant), shortest_lag_s),
@@ -74,6 +75,16 @@ def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[st
         parameters["k_d"] += 0.5 * (along_x + along_y)
         parameters["k_z"] += along_z
     return parameters
+
+
+def _fastest(vehicle: Vehicle) -> float:
+    """Return the largest speed that the autopilot may ask of a rotor [rad/s].
+
+    Behind a firmware's loop it is what the motors' curve gives at full command.
+    """
+    rotors, loop = vehicle.rotors, loop_of(vehicle)
+    most = 0.0 if loop is None else float(sum(loop.thrust))
+    return max(rotors.speed_max, float(np.sqrt(most / rotors.thrust_coefficient)))
 
 
 def as_flown(vehicle: Vehicle) -> Vehicle:

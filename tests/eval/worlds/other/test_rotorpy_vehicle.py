@@ -9,6 +9,7 @@ from eval.effects import EFFECTS
 from eval.quadrotor.plant import Motion, make_plant
 from eval.quadrotor.rotors import steady
 from eval.quadrotor.stepper import Inputs, wind_and_flow, wrench_on
+from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.other.rotorpy_vehicle import AIR, differences, rotorpy_parameters
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects, with_lag
 
@@ -27,6 +28,16 @@ def test_our_numbers_become_rotorpys():
     assert told["k_eta"] == pytest.approx(1.6e-6) and told["k_m"] == pytest.approx(2.2e-8)
     np.testing.assert_array_equal(told["rotor_directions"], [-1, 1, -1, 1])
     np.testing.assert_allclose(told["rotor_pos"]["r2"], PLAIN.rotors.position[1])
+
+
+def test_motors_behind_a_firmwares_loop_may_turn_as_fast_as_their_curve_says():
+    crazyflie = load_vehicle("crazyflie21")
+    assert crazyflie.motors is not None
+    full = np.sqrt(sum(crazyflie.motors.thrust) / crazyflie.rotors.thrust_coefficient)
+    assert full > crazyflie.rotors.speed_max
+    assert rotorpy_parameters(crazyflie)["rotor_speed_max"] == pytest.approx(full)
+    plain = replace(crazyflie, controller=PLAIN.controller)
+    assert rotorpy_parameters(plain)["rotor_speed_max"] == crazyflie.rotors.speed_max
 
 
 def test_linear_drag_becomes_drag_of_rotors_that_is_the_same_at_hover():
