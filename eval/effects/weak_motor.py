@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from eval.effects.interface import Array, Constants, Effect, Parameter
-from tracks.input.ranges import is_finite, shown
+from tracks.input.ranges import is_number, shown
 
 
 class WeakMotor(NamedTuple):
@@ -50,8 +50,7 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
             raise ValueError(
                 f"index = {shown(index)}: allowed are different whole numbers from 1 to 4"
             )
-        number_like = isinstance(factor, (int, float)) and not isinstance(factor, bool)
-        if not number_like or not is_finite(factor):
+        if not is_number(factor):
             raise ValueError(f"scale = {shown(factor)}: must be a finite number")
         each[int(number) - 1] = float(factor)
     return WeakMotor(tuple(each))

@@ -122,12 +122,13 @@ def fly(
     options = options or JudgeOptions()
     world_class(world)
     check_noise(options.noise)
+    tracks = tracks or {}
     for trial in trials:
-        if trial.track not in (tracks or {}):
+        if trial.track not in tracks:
             check_family(trial.track)
     if record:
         check_records(world)
-    task = Task(policy, vehicle, world, options, record, tracks or {})
+    task = Task(policy, vehicle, world, options, record, tracks)
     results: dict[int, TrialResult] = {}
 
     def keep(piece: int, ended: Ended) -> None:
@@ -140,7 +141,7 @@ def fly(
     most = len(trials) if compiles(world) else MOST_A_PIECE
     shares = [
         share
-        for group in fitting(trials, tracks or {})
+        for group in fitting(trials, tracks)
         for share in pieces_of([(number, trials[number]) for number in group], crew(workers), most)
     ]
     work_off(partial(fly_share, task), shares, workers, keep)

@@ -26,7 +26,8 @@ def largest(values: Array) -> Array:
 
 def least(values: Array) -> Array:
     """Return the least of the last axis, as `largest`."""
-    return -largest(-values)
+    xp = values.__array_namespace__()
+    return reduce(xp.minimum, [values[..., k] for k in range(values.shape[-1])])
 
 
 def rate_torque(rate_cmd_b: Array, rate_b: Array, gain: Array, inertia: Array) -> Array:

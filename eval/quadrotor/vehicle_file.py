@@ -23,7 +23,7 @@ from tracks.common.files import write_text
 from tracks.common.names import LONGEST, closest, unknown_name
 from tracks.common.toml_text import to_toml
 from tracks.geometry.camera import Camera
-from tracks.input.ranges import is_finite, shown
+from tracks.input.ranges import is_number, shown
 from tracks.input.reading import InputError, read_toml, reason
 
 SCHEMA = 1
@@ -81,10 +81,9 @@ def parse_vehicle(table: Mapping[str, Any]) -> Vehicle:
         ValueError: with the key, the value and what is allowed.
     """
     _known_keys("", table, KEYS)
-    if table.get("schema", SCHEMA) is True or table.get("schema", SCHEMA) != SCHEMA:
-        raise ValueError(
-            f"schema = {shown(table['schema'])}: this version of the suite reads {SCHEMA}"
-        )
+    schema = table.get("schema", SCHEMA)
+    if schema is True or schema != SCHEMA:
+        raise ValueError(f"schema = {shown(schema)}: this version of the suite reads {SCHEMA}")
     name = _required("", table, "name")
     if not isinstance(name, str) or not name:
         raise ValueError(f"name = {shown(name)}: must be a text that is not empty")
@@ -330,7 +329,7 @@ def _known_keys(where: str, table: Mapping[str, Any], allowed: Any) -> None:
 
 
 def _number(key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not is_finite(value):
+    if not is_number(value):
         raise ValueError(f"{key} = {shown(value)}: must be a finite number")
     return float(value)
 

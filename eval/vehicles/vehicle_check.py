@@ -8,6 +8,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.mixer import mixer_matrix
+from eval.vehicles.motors import motor_thrust
 from eval.vehicles.vehicle import MotorMap, Vehicle
 
 
@@ -77,19 +78,17 @@ def _check_rotors(vehicle: Vehicle) -> None:
             f"rotors.position = {[list(hub) for hub in rotors.position]}: the origin (centre of "
             "mass) must lie between the rotors, so that all of them push up in hover"
         )
+    given = {f"rotors.speed_max = {rotors.speed_max}": rotors.thrust_max}
     if vehicle.motors is not None and vehicle.controller.settings is not None:
         # Behind a firmware's loop a motor gives what its curve says at full command.
-        most = sum(vehicle.motors.thrust)
+        full = motor_thrust(vehicle.motors, 1.0)
+        given[f"motors.thrust = {list(vehicle.motors.thrust)}"] = full
+    for entry, most in given.items():
         if hover.max() >= most:
             raise ValueError(
-                f"motors.thrust = {list(vehicle.motors.thrust)}: too weak to hover; a rotor gives "
-                f"{most:.3g} N at full command and {hover.max():.3g} N are needed"
+                f"{entry}: too weak to hover; a rotor gives {most:.3g} N and {hover.max():.3g} N "
+                "are needed"
             )
-    if hover.max() >= rotors.thrust_max:
-        raise ValueError(
-            f"rotors.speed_max = {rotors.speed_max}: too weak to hover; a rotor gives "
-            f"{rotors.thrust_max:.3g} N and {hover.max():.3g} N are needed"
-        )
 
 
 def _between(key: str, value: Any, low: float, high: float, unit: str) -> None:

@@ -95,7 +95,6 @@ class MjxWorld:
         self._most = 0
         self._has_noise = uses_noise(self._autopilot.plant)
         self._noise = [Gusts(IDLE)] * slots
-        self._start_noise = np.zeros((slots, 3), np.float32) if self._has_noise else None
         self._course = empty_course(slots, layout)
         self._tracks: list[Track | None] = [None] * slots
         self._scene: Scene | None = None
@@ -107,7 +106,7 @@ class MjxWorld:
         progress = start_progress(nothing.pos_w)
         progress = progress._replace(ended=jnp.full(slots, -1, jnp.int32))
         qpos = jnp.tile(jnp.asarray([0.0, 0, 0, 1, 0, 0, 0]), (slots, 1))
-        loops = start_autopilot(self._autopilot, nothing, self._start_noise)
+        loops = start_autopilot(self._autopilot, nothing, self._no_draws())
         self._state = Flying(qpos, jnp.zeros((slots, 6)), loops, progress)
 
     @property
@@ -115,9 +114,12 @@ class MjxWorld:
         """Where the trial in each slot stands."""
         return jax.tree.map(np.asarray, self._state.progress)
 
+    def _no_draws(self) -> np.ndarray | None:
+        return np.zeros((self.slots, 3), np.float32) if self._has_noise else None
+
     def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
         """Start trials from (slot, track, trial)."""
-        started = np.zeros(self.slots, bool)
+        started, noise = np.zeros(self.slots, bool), self._no_draws()
         qpos = np.array(self._state.qpos)
         for slot, track, trial in entries:
             started[slot], self._tracks[slot] = True, track
@@ -131,15 +133,14 @@ class MjxWorld:
                 field[slot] = value
             self._course.count[slot] = len(track.scene.gates.center_w)
             qpos[slot] = start_state(track)
-            if self._start_noise is not None:
+            if noise is not None:
                 self._noise[slot] = Gusts(trial)
-                self._start_noise[slot] = self._noise[slot].at(0, 1)[0]
+                noise[slot] = self._noise[slot].at(0, 1)[0]
         # A copy: on a CPU JAX may go on looking at the array it is given.
         on_device = jax.tree.map(lambda a: jnp.array(a), (self._course, self._scene))
         self._on_device = on_device
-        start_noise = None if self._start_noise is None else self._start_noise.copy()
         self._state = self._start(
-            self._state, jnp.array(qpos), jnp.array(started), start_noise, *on_device
+            self._state, jnp.array(qpos), jnp.array(started), noise, *on_device
         )
 
     @functools.partial(jax.jit, static_argnums=0)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
 from tracks.common.names import closest
 from tracks.input import reading
-from tracks.input.ranges import is_finite, shown
+from tracks.input.ranges import is_number, shown
 
 REQUIRED: Any = object()
 """In place of a default: the key must be there."""
@@ -59,7 +59,7 @@ class Table:
     ) -> float:
         """Return a finite number greater than `above`, from `least` to `most`."""
         value = self._get(key, default, "a number")
-        if not (_is_number(value) and above < value and least <= value <= most):
+        if not (is_number(value) and above < value and least <= value <= most):
             raise self.error(key, value, "a number" + _limits(above, least, most))
         return float(value)
 
@@ -95,7 +95,7 @@ class Table:
         """Return `size` finite numbers, each from `least` to `most`."""
         value = self._get(key, default, f"{size} numbers")
         good = isinstance(value, list | tuple) and len(value) == size
-        if not good or not all(_is_number(entry) and least <= entry <= most for entry in value):
+        if not good or not all(is_number(entry) and least <= entry <= most for entry in value):
             limits = _limits(-math.inf, least, most)
             raise self.error(key, value, f"a list of {size} numbers{limits and ', each' + limits}")
         return np.array(value, float)
@@ -106,7 +106,7 @@ class Table:
         rows = value if isinstance(value, list) else []
 
         def fits(entry: object) -> bool:
-            return _is_number(entry) and -most <= entry <= most
+            return is_number(entry) and -most <= entry <= most
 
         good = len(rows) >= least and all(
             isinstance(row, list) and len(row) == size and all(map(fits, row)) for row in rows
@@ -152,10 +152,6 @@ class Table:
             where = f"[{self._place}]" if self._place else "the file"
             raise ValueError(f"{self.path}: {where} has no {key!r}; add it ({kind})")
         return default
-
-
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
 
 
 def _limits(above: float, least: float, most: float) -> str:

@@ -15,7 +15,7 @@ import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, TypeGuard, get_args, get_type_hints
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,11 @@ def is_finite(value: float) -> bool:
         return math.isfinite(value)
     except OverflowError:
         return False
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Say whether a value of a file is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
 
 
 def shown(value: object) -> str:

@@ -16,8 +16,8 @@ import numpy as np
 
 from eval.effects import EFFECTS, all_values
 from eval.effects.interface import GRAVITY
-from eval.quadrotor.loops import loop_of
 from eval.quadrotor.plant import make_plant
+from eval.vehicles.motors import motor_speed
 from eval.vehicles.vehicle import Vehicle
 
 AIR: Mapping[str, Callable[[Any, float], Mapping[str, float]]] = {
@@ -82,9 +82,10 @@ def _fastest(vehicle: Vehicle) -> float:
 
     Behind a firmware's loop it is what the motors' curve gives at full command.
     """
-    rotors, loop = vehicle.rotors, loop_of(vehicle)
-    most = 0.0 if loop is None else float(sum(loop.thrust))
-    return max(rotors.speed_max, float(np.sqrt(most / rotors.thrust_coefficient)))
+    most = vehicle.rotors.speed_max
+    if vehicle.motors is None or vehicle.controller.settings is None:
+        return most
+    return max(most, float(motor_speed(vehicle, np.asarray(1.0))))
 
 
 def as_flown(vehicle: Vehicle) -> Vehicle:
