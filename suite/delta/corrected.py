@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from suite.delta.replay import nominal_model
+from suite.delta.windows import RATE_SHARE
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain
 
 POINT, QUAD = "point", "quad"
 """The two models, as `suite train --model` calls them."""
-RATE_SHARE = 0.05
-"""So far may the rate of the fitted flights be off that of a training."""
 
 
 def corrected(dynamics: PointMassConfig | QuadrotorConfig) -> dict[str, Any]:

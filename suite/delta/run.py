@@ -119,6 +119,7 @@ def fit_delta(
         known, held_out = (cut_windows(part, config.horizon_s, config.stride_s) for part in parts)
         words, steps = "fitting the Delta Action Model", 1
         work = partial(fit, config, dynamics)
+    rate_hz = decision_rate(logs)
     steps *= known.action_b.shape[1]
     announce(console, words, fitting_estimate(config, steps, about["model"] == QUAD))
     with console.progress("fitting", config.iterations) as show:
@@ -134,7 +135,7 @@ def fit_delta(
         "curve": result.curve,
     }
     write_run_record(out, config, config.seed)
-    fitted = {**plain(config), **about, "rate_hz": decision_rate(logs)}
+    fitted = {**plain(config), **about, "rate_hz": rate_hz}
     save_delta(out / "delta", result.params, seed=config.seed, fit=fitted)
     write_json(out / "delta.json", plain(summary))
     write_text(out / "table.md", table(result, config.horizon_s))

@@ -13,6 +13,8 @@ from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before
 from tracks.geometry.rotation import quat_to_rot
 
 T = TypeVar("T")
+RATE_SHARE = 0.05
+"""So far may rates of decisions be off each other, as a share, and count as one."""
 HISTORY = 2
 """Decisions before a window whose commands may still be on their way into it."""
 
@@ -116,14 +118,25 @@ def decision_period(time_s: np.ndarray, row_s: float) -> float:
 
 
 def decision_rate(logs: Sequence[FlightLog]) -> float:
-    """Return how often the policy decided in flights with its decisions, their median [Hz]."""
+    """Return how often the policy decided in flights with its decisions, their median [Hz].
+
+    Raises:
+        ValueError: where they differ: the network remembers from one decision to the next.
+    """
     found = []
     for log in logs:
         assert log.policy_step is not None
         at = np.flatnonzero(log.policy_step & log.whole)
         row_s = float(np.median(np.diff(log.time_s)))
         found.append(1.0 / decision_period(log.time_s[at], row_s))
-    return float(np.nanmedian(found))
+    median = float(np.nanmedian(found))
+    for log, rate in zip(logs, found, strict=True):
+        if abs(rate - median) > RATE_SHARE * median:
+            raise ValueError(
+                f"{log.name} has {rate:.3g} decisions a second, and most flights {median:.3g}: the "
+                "Delta Action network remembers from one to the next; fit to flights of one rate"
+            )
+    return median
 
 
 def _longest_gap(period_s: float, row_s: float) -> float:

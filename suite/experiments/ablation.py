@@ -16,6 +16,7 @@ from suite.experiments.pages.document import Place
 from suite.experiments.pages.tables import every_training
 from suite.experiments.study import options, training
 from suite.experiments.study.summary import Summary, summaries
+from suite.train.overrides import check_owned
 from tracks.common.grid import Grid, table
 
 PROGRESS = (0.4, 0.8, 1.6, 3.2)
@@ -129,7 +130,7 @@ def settings(config: Config) -> list[training.Row]:
         ValueError: for a preset, a change or a row that does not exist.
     """
     fixed = ("progress_norm", "projection")
-    options.check_owned(config.set, {f"loss.{name}": "it is compared" for name in fixed})
+    check_owned(config.set, {f"loss.{name}": "it is compared" for name in fixed})
     base = options.four_gate_recipe(config)
 
     def row(key: str, words: str, weight: float, **changes: float) -> training.Row:

@@ -27,6 +27,7 @@ from suite.loop.config import HiddenLoopConfig, resolve
 from suite.loop.hidden_effect import LABELS, MODELS
 from suite.loop.run import run_loop
 from suite.loop.work import read_diagnosis
+from suite.train.overrides import check_owned
 from tracks.common.names import unknown_name
 from tracks.input.ranges import Iterations, Range, Seed, Trials
 from tracks.input.reading import read_json
@@ -118,7 +119,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     policy = config.policy or default_policy()
     config = replace(config, policy=policy)
     owned = {"optimizer.iterations": "give --iterations", "seed": "give --training-seeds"}
-    options.check_owned(config.set, owned)
+    check_owned(config.set, owned)
     for name in config.only:
         if name not in WORLDS:
             raise unknown_name("hidden world", name, WORLDS)
@@ -128,8 +129,16 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     for seed in config.training_seeds:
         for name, hidden in worlds.items():
             true = world_of(simulated, hidden)
+            # Where files lie makes no other loop; a shipped policy's name is its recipe.
+            asked = replace(
+                config,
+                policy=policy if start is None else "",
+                vehicle="",
+                only=(),
+                training_seeds=(seed,),
+            )
             about = {
-                "loop": replace(config, only=(), training_seeds=(seed,)),
+                "loop": asked,
                 "policy": policy_digest(policy),
                 "vehicles": [simulated, true],
                 "code": code_digest(*ROOMS),

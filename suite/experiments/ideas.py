@@ -20,8 +20,10 @@ from suite.experiments.schemes import PROJECTION, PROJECTION_DECAY
 from suite.experiments.study import judging, options, training
 from suite.experiments.study.intervals import Gap, crossed, spread
 from suite.experiments.study.summary import Summary, summaries
+from suite.train.config import TrainConfig
 from suite.train.config import check as check_recipe
 from suite.train.overrides import override
+from suite.train.presets import at_rate
 from tracks.common.grid import Grid, table
 from tracks.input.ranges import Iterations, Range, Seed, Trials
 
@@ -199,6 +201,9 @@ def ideas(config: Config) -> list[training.Row]:
     thirds = f"episode.steps={base.episode.steps // 3}", f"episode.batch={3 * base.episode.batch}"
     value = (f"loss.value={base.loss.progress:g}",)
     live_on, again = "episode.live_on=0.7", "episode.again=0.5"
+    sides = {"width": base.spec.camera.width, "height": base.spec.camera.height}
+    finer = tuple(f"spec.camera.{side}={4 * (3 * n // 8)}" for side, n in sides.items())
+    wider = (f"spec.hidden_size={5 * base.spec.hidden_size // 3}",)
     corners = f"episode.gate_corners={ROUND_CORNERS}"
     rows = {
         "second gate": ("the gate after the next is observed", ("spec.second_gate=True",)),
@@ -218,6 +223,9 @@ def ideas(config: Config) -> list[training.Row]:
         ),
         "live on": ("worlds go on from rollout to rollout", (live_on,)),
         "again": ("crashed worlds go on from before the crash", (again,)),
+        "often": ("twice the decisions, in as many seconds", twice_as_often(base)),
+        "finer image": ("half as many pixels again each way", finer),
+        "wider memory": ("two thirds more units", wider),
         "longer": ("twice the horizon, half the worlds", longer),
         "longer, truncated": ("and gradients that fade twice as fast", (*longer, fading)),
         "L_proj": ("the scalar substitute in the field's place", ("loss.field_gain=0", *scalar)),
@@ -235,6 +243,24 @@ def ideas(config: Config) -> list[training.Row]:
     kept = training.asked_rows(made, config.only, "row")
     recipe = training.Row(RECIPE, "nothing changed", base)
     return [recipe, *(row for row in kept if row.recipe != base)]
+
+
+def twice_as_often(base: TrainConfig) -> tuple[str, ...]:
+    """Return the changes by which `base` decides twice as often, with delays kept in seconds."""
+    often = at_rate(base, 2 * base.spec.rate_hz)
+    # Quadrotors have their delay in seconds already.
+    own = () if base.quadrotor or base.fleet else ("action_delay",)
+    parts = {
+        "spec": ("rate_hz",),
+        "physics": (*own, "state_delay", "image_delay"),
+        "episode": ("steps", "image_stride"),
+    }
+    return tuple(
+        f"{part}.{name}={getattr(getattr(often, part), name)}"
+        for part, names in parts.items()
+        for name in names
+        if getattr(getattr(often, part), name) != getattr(getattr(base, part), name)
+    )
 
 
 def refused_rows(rows: Sequence[training.Row], named: bool) -> dict[str, str]:

@@ -60,6 +60,11 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     rows, vehicle = settings(config), load_vehicle(config.vehicle)
     alone, sweeps = disturbed.asked_conditions(vehicle, config.only)
     trials = judging.trials_of(config)
+    if len(trials) < len(seeds):
+        raise ValueError(
+            f"--trials is {config.trials}, {len(trials)} on all tracks and levels, and they are "
+            f"shared among {len(seeds)} --training-seeds; give more trials or fewer seeds"
+        )
     runs = training.trained(
         training.Study(rows, seeds, may_diverge=False, start=config.from_),
         place.cache, console, place.workers,
@@ -118,11 +123,13 @@ def settings(config: Config) -> Sequence[training.Row]:
     for name in config.without:
         if name not in known:
             raise unknown_name("spread", name, known)
+    fixed = spreads.fixed(recipe)
     return [
-        training.Row(FIXED, "nothing varied", spreads.fixed(recipe)),
+        training.Row(FIXED, "nothing varied", fixed),
         *(
             training.Row(f"{WITHOUT}{name}", f"all but {name}", known[name])
-            for name in config.without or known
+            for name in dict.fromkeys(config.without or known)
+            if known[name] != fixed
         ),
         training.Row(RANDOMISED, "the recipe", recipe),
     ]

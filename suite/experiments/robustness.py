@@ -127,12 +127,13 @@ def _lead(policy: str, effects: Sequence[Tested], grown: Grown) -> str:
     base = effects[0].success(policy)
     text = f"Undisturbed, {policy} succeeds in {percent(base)} of the trials."
     if len(effects) > 1:
-        worst = sorted(effects[1:], key=lambda entry: entry.success(policy).value)[:3]
+        worse = [entry for entry in effects[1:] if entry.success(policy).value < base.value]
+        worst = sorted(worse, key=lambda entry: entry.success(policy).value)[:3]
         each = (
             f"{e.condition.name} ({e.condition.words}) {100 * e.success(policy).value:.0f} %"
             for e in worst
         )
-        text += f" The effects that cost most: {', '.join(each)}."
+        text += f" The effects that cost most: {', '.join(each) or 'none does'}."
     halves = []
     for sweep, points in grown.items():
         lost = [p for p in points if p.success(policy).value < base.value / 2]

@@ -15,6 +15,7 @@ from suite.experiments.pages.tables import every_training
 from suite.experiments.study import options, training
 from suite.experiments.study.intervals import Spread
 from suite.experiments.study.summary import METRICS, Summary, summaries
+from suite.train.overrides import check_owned
 from suite.train.ppo.config import ppo_like
 from tracks.common.grid import Grid, table
 from tracks.input.ranges import Iterations, Range, Trials
@@ -141,7 +142,7 @@ def schemes(config: Config) -> list[training.Row]:
     """
     compared = ("progress_norm", "projection", "projection_decay")
     owned = {f"loss.{name}": "it is compared" for name in compared}
-    options.check_owned(config.set, {"loss.progress": "give --progress", **owned})
+    check_owned(config.set, {"loss.progress": "give --progress", **owned})
     base = options.four_gate_recipe(config)
     loss = replace(base.loss, progress=config.progress, progress_norm=0.0, projection=0.0)
     ours = replace(base, loss=loss)

@@ -90,13 +90,15 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         MEANING,
         Picture(cells_chart(cells), "Success of each training seed, cell by cell."),
     ]
+    spread = ""
+    if len(cells) > 1:
+        spread = f" (standard deviation {100 * found.standard_deviation:.1f} points)"
     report = Report(
         title="The same recipe from several training seeds",
         lead=(
             f"Mean success over the {len(everything) // len(cells)} cells: "
             f"{100 * found.mean:.1f} % over {len(cells)} training seeds, from {100 * low:.1f} to "
-            f"{100 * high:.1f} (standard deviation {100 * found.standard_deviation:.1f} points). "
-            f"The median is {found.median}."
+            f"{100 * high:.1f}{spread}. The median is {found.median}."
         ),
         facts={
             "recipe": "given policies" if config.policies else options.recipe_words(config),
@@ -164,7 +166,8 @@ def _grid(
     over = {"mean": lambda c: float(np.mean(c)), "standard deviation": _std, "least": min,
             "most": max}  # fmt: skip
     lines = [*zip(cells, numbers.tolist(), strict=True)]
-    lines += [(name, [of(column) for column in columns]) for name, of in over.items()]
+    if len(cells) > 1:
+        lines += [(name, [of(column) for column in columns]) for name, of in over.items()]
     finer = ("mean", "standard deviation")
     texts = [
         (name, *(f"{v:.{digits + (k == 0 or name in finer)}f}" for k, v in enumerate(values)))

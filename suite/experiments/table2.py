@@ -24,6 +24,7 @@ from suite.experiments.study.cache import LOOP_ROOMS, code_digest, digest, engin
 from suite.judging.content import policy_digest
 from suite.judging.flying import default_policy
 from suite.loop import compare
+from suite.train.overrides import check_owned
 from tracks.common.grid import Grid, table
 from tracks.families import JUDGED
 from tracks.input.ranges import Range, Seed, Trials
@@ -146,13 +147,20 @@ def variants_of(config: Config, place: Place, console: Console) -> list[TablePol
             "--control-policy name them; give the one or the other"
         )
     policy = config.policy or default_policy()
+    if config.delta_set and not config.delta_iterations:
+        raise ValueError(
+            "--delta-set is of the fine-tuning that --delta-iterations asks for; give that, too"
+        )
     chosen = {OURS: policy, **{name: path for name, path in given.items() if path}}
     if config.delta_iterations:
         from suite.common.console import Quiet
+        from suite.loop.config import by_content
         from suite.loop.run import run_loop
 
         loop = loop_config(config, policy)
-        folder = place.cache / "loops" / digest([loop, code_digest(*LOOP_ROOMS), engines()])
+        folder = (
+            place.cache / "loops" / digest([by_content(loop), code_digest(*LOOP_ROOMS), engines()])
+        )
         run_loop(loop, folder, Quiet(), place.workers)
         chosen[WITH] = str(folder / "tuned-with" / "policy")
         chosen[CONTROL] = str(folder / "tuned-without" / "policy")
@@ -170,7 +178,7 @@ def loop_config(config: Config, policy: str) -> LoopConfig:
     from suite.loop.config import resolve
 
     owned = {"optimizer.iterations": "give --delta-iterations", "seed": "give --seed"}
-    options.check_owned(config.delta_set, owned, "--delta-set")
+    check_owned(config.delta_set, owned, "--delta-set")
     return resolve(
         policy=policy,
         difficulty="0,3,6,9",
@@ -202,7 +210,7 @@ def _sections(
     from suite.experiments.pages.charts import level_chart
 
     everything = [cell for some in cells.values() for cell in some]
-    asides = [] if len(cells) > 1 else [NO_DELTA]
+    asides = [] if WITH in cells else [NO_DELTA]
     yield Section("Beside the paper", [*asides, beside_the_paper(cells), MEANINGS])
     if lines:
         parts = [compare.verdict(lines[-1]), *compare.grids(lines)[:1], compare.CAVEAT]

@@ -57,12 +57,13 @@ DELAY_S = 1 / 30
 """Of the point mass's commands [s]."""
 MEANINGS = (
     f"{POINT}: the trainer's, with a lag of {NOMINAL.lag_mean:g} 1/s, drag of 0.3, 0.3 and 0.9 "
-    f"1/s, commands {1000 * DELAY_S:.0f} ms late, and nothing drawn. {QUADROTOR}: the trainer's, "
-    "of the judged vehicle with its effects, in single precision and fewer, longer steps. Both "
-    "end a trial by the trainer's collisions and show the nearest solids of each kind alone; the "
-    "point mass is the same for every vehicle and cannot tip over, and the quadrotor is looked at "
-    f"for that where a decision ends, not in every step. {JUDGE}: MuJoCo. Minus {JUDGE}: on the "
-    "same trials, in points, with Newcombe's paired 95 % interval."
+    f"1/s, commands {1000 * DELAY_S:.0f} ms late (at most two decisions), and nothing drawn. "
+    f"{QUADROTOR}: the trainer's, of the judged vehicle with its effects, in single precision and "
+    "fewer, longer steps. Both end a trial by the trainer's collisions and show the nearest solids "
+    "of each kind alone; the point mass is the same for every vehicle and cannot tip over, and the "
+    "quadrotor is looked at for that where a decision ends, not in every step. "
+    f"{JUDGE}: MuJoCo. Minus {JUDGE}: on the same trials, in points, with Newcombe's paired 95 % "
+    "interval."
 )
 
 

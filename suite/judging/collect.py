@@ -12,6 +12,7 @@ from suite.common.provenance import write_run_record
 from suite.judging.flying import (
     Course,
     about_policy,
+    by_content,
     default_policy,
     flying_needs,
     load_flier,
@@ -22,7 +23,7 @@ from suite.judging.flying import (
 )
 from suite.judging.manner import Manner
 from suite.judging.requests import Collection
-from tracks.common.files import plain, write_json
+from tracks.common.files import write_json
 from tracks.common.provenance import git_commit, stamp
 from tracks.common.work import Workers
 from tracks.input.reading import read_json
@@ -69,8 +70,9 @@ def collect(
         "tracks": course.tracks,
         "git_commit": git_commit(),
     }
-    rows = _rows_there(out, plain(about))
-    with Journal(out / JOURNAL, about) as journal:
+    same = by_content(about)
+    rows = _rows_there(out, same)
+    with Journal(out / JOURNAL, same) as journal:
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
         _fly_missing(collection, course, policy, out, rows, journal, console, workers)
         found = _write_list(out, about, course, rows)
@@ -184,7 +186,7 @@ def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console)
 
 
 def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, Row]:
-    """Return the rows of an earlier call of the same collection."""
+    """Return the rows of an earlier call of the same collection, told by `by_content`."""
     from eval.worlds.trial import TrialSpec
 
     path = out / LIST
@@ -192,7 +194,7 @@ def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, Row]:
         return {}
     try:
         found = read_json(path)
-        same = {key: found[key] for key in about} == about
+        same = by_content({key: found[key] for key in about}) == about
         rows = {
             TrialSpec(row["track"], row["difficulty"], row["seed"]): row for row in found["flights"]
         }

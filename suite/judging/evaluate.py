@@ -11,6 +11,7 @@ from suite.common.provenance import write_run_record
 from suite.judging.flying import (
     Course,
     about_policy,
+    by_content,
     default_policy,
     flying_needs,
     labels,
@@ -143,7 +144,7 @@ def _fly_one(
         rules=Rules(time_limit_s=evaluation.time_limit_s),
         limits=ActionLimits(deadline_s=evaluation.deadline_s),
     )
-    with Journal(journal_path, about) as journal:
+    with Journal(journal_path, by_content(about)) as journal:
         missing = journal.missing(course.trials)
         if len(missing) < len(course.trials):
             console.note(f"{label}: {len(course.trials) - len(missing)} trials were flown before")

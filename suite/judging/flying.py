@@ -13,6 +13,7 @@ from suite.common.estimate import Estimate
 from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.manner import PLAIN, Manner
 from suite.judging.requests import Collection, Evaluation
+from tracks.common.files import plain
 from tracks.common.work import Workers, crew, usable_cores
 from tracks.input.ranges import check_ranges
 
@@ -226,3 +227,16 @@ def about_policy(name_or_path: str, policy: Policy) -> dict[str, Any]:
         "source": str(name_or_path),
         "sha256": policy_digest(str(name_or_path)),
     }
+
+
+def by_content(about: dict[str, Any]) -> dict[str, Any]:
+    """Return what a journal or a list of flights is about, without where its files lay.
+
+    What they held is there by digest or as it was read, so flights go on where a folder was moved.
+    """
+    about = plain(about)
+    paths = {"policy": ("source",), "collection": ("policy", "vehicle")}
+    for part, keys in paths.items():
+        if isinstance(about.get(part), dict):
+            about[part] = {key: value for key, value in about[part].items() if key not in keys}
+    return about

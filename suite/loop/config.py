@@ -11,7 +11,7 @@ from typing import Annotated
 from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
 from suite.train.config import TrainConfig, check
-from suite.train.overrides import override
+from suite.train.overrides import check_owned, override
 from suite.train.presets import (
     PRESETS,
     at_rate,
@@ -190,21 +190,17 @@ def resolve(
         training = with_iterations(training, iterations)
     simulated = load_vehicle(vehicle)
     digests = {"vehicle": _digest(simulated)}
+    _check_changes(changes, policy, iterations)
     if not delta and world is None:
         raise ValueError("--no-delta: the loop is about the Delta Action Model; give --world, too")
     if world is None:
         training = override(training, changes)
         check(training)
     else:
-        if iterations is not None:
-            raise ValueError(
-                f"--iterations is {iterations}, but with --world nothing is trained from "
-                "scratch; say how long to fine-tune with --finetune-iterations"
-            )
         refuse_own_motion(simulated)
         simulator, world = parse_world(world, vehicle)
         true = load_vehicle(world)
-        if simulated == true and simulator in OWN:
+        if simulated == replace(true, name=simulated.name) and simulator in OWN:
             raise ValueError(
                 f"--world {world} is the simulation's vehicle {vehicle}: nothing is hidden; give a "
                 "vehicle file with an effect more, such as examples/hidden.toml, or another "
@@ -243,6 +239,26 @@ def resolve(
     if world is None:
         return DeltaLoopConfig(training=training, **vars(config))
     return HiddenLoopConfig(world=world, simulator=simulator, delta=delta, **vars(config))
+
+
+def _check_changes(changes: Sequence[str], policy: str | None, iterations: int | None) -> None:
+    """Refuse options of a training where none is made, and settings that the loop sets itself.
+
+    Raises:
+        ValueError: naming the option and what to do instead.
+    """
+    owned = {"seed": "give --seed"}
+    if policy is None:
+        owned["optimizer.iterations"] = "give --iterations"
+    else:
+        owned["optimizer.iterations"] = "give --finetune-iterations"
+        owned["spec"] = "a policy keeps the one that it was trained with"
+        if iterations is not None:
+            raise ValueError(
+                f"--iterations is {iterations}, but with --policy or --world nothing is trained "
+                "from scratch; say how long to fine-tune with --finetune-iterations"
+            )
+    check_owned(changes, owned)
 
 
 def parse_world(text: str, vehicle: str) -> tuple[str, str]:

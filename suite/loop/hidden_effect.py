@@ -127,7 +127,7 @@ def _diagnosis(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Sectio
         "What the diagnosis found in the flights",
         [
             f"Verdict: {diagnosis['verdict']}. Held-out gap {gap['before']:.2f} before, "
-            f"{gap['after']:.2f} after; 1 is the noise floor.",
+            f"{gap['after']:.2f} after; {gap['noise_floor']:.2g} is the noise floor.",
             grid("", headers, rows),
             *what_is_hidden(config),
             Links([("diagnosis/report.html", "the diagnosis's own report")]),

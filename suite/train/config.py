@@ -11,6 +11,9 @@ from policies.spec import PolicySpec, check_network, check_spec
 from suite.train.dynamics.fleet import FleetConfig
 from tracks.input.ranges import Iterations, Range, Seed, Share, check_ranges
 
+COM_STD_MOST, TRIM_STD_MOST = 0.02, 0.2
+"""Most of `QuadrotorConfig.com_std_m` [m] and `trim_std` [N m]."""
+
 
 @dataclass(frozen=True)
 class PointMassConfig:
@@ -71,18 +74,19 @@ class QuadrotorConfig:
     [s]."""
     drag_spread: Annotated[float, Range(0.0, 100.0)] = 0.1
     """Linear drag varies by up to this on each axis either way, and is never negative [1/s]."""
-    delay_spread_s: Share = 0.01
-    """The delay of commands varies by up to this either way, and is never negative [s]."""
+    delay_spread_s: Annotated[float, Range(0.0, 0.1)] = 0.01
+    """The delay of commands varies by up to this either way, within 0 to 0.1 s or, where that is
+    more, the vehicle's own [s]."""
     gain_spread: Share = 0.1
     """The rate loop's gain varies by up to this share either way [1]."""
     wind_std: Annotated[tuple[float, float, float], Range(0.0, 100.0)] = (1.0, 1.0, 0.2)
     """Standard deviation of the constant wind over worlds, around the vehicle's [m/s]."""
     thrust_spread: Share = 0.0
     """The true thrust varies by up to this share of the vehicle's either way [1]."""
-    com_std_m: Annotated[float, Range(0.0, 0.02)] = 0.0
+    com_std_m: Annotated[float, Range(0.0, COM_STD_MOST)] = 0.0
     """Standard deviation of the centre of mass along x and along y, around the vehicle's, cut off
     at twice that [m]."""
-    trim_std: Annotated[float, Range(0.0, 0.2)] = 0.0
+    trim_std: Annotated[float, Range(0.0, TRIM_STD_MOST)] = 0.0
     """Standard deviation of a constant torque about x and about y, around the vehicle's, cut off at
     twice that; about z a fifth of it [N m]."""
 
@@ -211,8 +215,9 @@ class EpisodeConfig:
     tracks, vehicles and places where the policy fails."""
     again_before_s: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (1.0, 2.0)
     """How long before the crash that is, drawn for every world [s]."""
-    gate_corners: Annotated[int, Range(3, 64)] = 4
-    """Corners of the gates' openings: 4 for squares, more for rounder gates of the same width."""
+    gate_corners: Annotated[int, Range(3, 12)] = 4
+    """Corners of the gates' openings: 4 for squares, more for rounder gates of the same width. Each
+    is a bar, and an image shows the nearest 24 bars and plates: two gates of 12 corners."""
     race_share: Share = 0.5
     """Share of worlds in which a policy with `spec.speed_input` is asked for 1; in the others it is
     asked for anything from 0 to 1."""

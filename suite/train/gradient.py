@@ -123,13 +123,15 @@ def make_gradient(
             seen = critic.features(worlds, last.state, last.target)
             rest = last.alive * to_come(config, critic.value(critic_params, seen))
             held = jax.lax.stop_gradient((seen, last.alive, rest))
+            # A world that leaves in the last step passed its last gate, and was not stopped.
             number = jnp.arange(steps)[:, None]
+            stops = (number + 1 >= worlds.stop) & (number + 1 < steps)
             way = Way(
                 seen=jnp.concatenate([records.noted, held[0][None]]),
                 worth=records.worth,
                 alive=jnp.concatenate([records.alive, held[1][None]]),
                 hit=records.hit,
-                stopped=(records.alive > 0) & (number + 1 >= worlds.stop),
+                stopped=(records.alive > 0) & stops,
             )
             terms = {**records.terms, "value": jnp.broadcast_to(held[2], records.alive.shape)}
             return loss + rest.mean(), records._replace(terms=terms, noted=way)

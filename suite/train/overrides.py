@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TypeVar, get_args, get_type_hints
 
 from tracks.common.names import unknown_name
@@ -20,6 +20,11 @@ ABSENT = {
 """Parts that not every run has -> how a run gets one."""
 
 
+UNREAD = ("lag_mean", "lag_std", "drag", "drag_up", "wind_std", "time_step_std", "action_delay",
+          "heading_rate")  # fmt: skip
+"""Settings of `physics` that the point mass alone reads."""
+
+
 def override(config: T, changes: Iterable[str]) -> T:
     """Return `config` with every change "field.field=value" made, within the fields' ranges.
 
@@ -30,9 +35,39 @@ def override(config: T, changes: Iterable[str]) -> T:
         path, separator, text = change.partition("=")
         if not separator:
             raise ValueError(f"--set {shown(change)}: write FIELD=VALUE, such as loss.progress=0.4")
-        config = _changed(config, path.strip().split("."), text.strip(), shown(change))
+        keys = path.strip().split(".")
+        _check_read(config, keys, shown(change))
+        config = _changed(config, keys, text.strip(), shown(change))
         check_ranges(config, f"--set {shown(change)}: ")
     return config
+
+
+def _check_read(config: object, keys: list[str], change: str) -> None:
+    """Refuse a setting of the point mass where quadrotors fly, which have their own."""
+    flown = [part for part in ABSENT if getattr(config, part, None) is not None]
+    if flown and keys[0] == "physics" and set(keys) & set(UNREAD):
+        raise ValueError(
+            f"--set {change}: {'.'.join(keys)} is of the point mass, and this run goes through "
+            f"quadrotors; set one of {flown[0]}.*, or add --model point"
+        )
+
+
+def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = "--set") -> None:
+    """Refuse changes, as --set takes them, of settings that a command sets itself.
+
+    Args:
+        changes: SETTING=VALUE each.
+        owned: what to do instead, by a setting's path; that of a part stands for all below it.
+        option: that gave the changes.
+
+    Raises:
+        ValueError: naming the setting and what to do instead.
+    """
+    for change in changes:
+        path = change.partition("=")[0].strip()
+        for mine, words in owned.items():
+            if path == mine or path.startswith(f"{mine}."):
+                raise ValueError(f"{option} {shown(change)}: this command sets {path}; {words}")
 
 
 def _changed(config: T, path: list[str], text: str, change: str) -> T:
@@ -64,6 +99,8 @@ def _value(old: object, text: str, change: str) -> object:
     # Nested a thousand times it is none of ours, whichever way the parser gives up.
     except (ValueError, SyntaxError, MemoryError, RecursionError):
         value = text
+    if isinstance(old, float) and value == "inf":
+        return math.inf
     if isinstance(old, tuple) and isinstance(value, (tuple, list)) and len(value) == len(old):
         return tuple(_value(a, repr(b), change) for a, b in zip(old, value, strict=True))
     if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):

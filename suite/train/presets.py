@@ -8,6 +8,8 @@ from dataclasses import replace
 from eval.vehicles.vehicle import Vehicle
 from policies.spec import PolicySpec
 from suite.train.config import (
+    COM_STD_MOST,
+    TRIM_STD_MOST,
     EpisodeConfig,
     LossConfig,
     OptimizerConfig,
@@ -202,12 +204,32 @@ def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
 def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:
     """Return `config` through the quadrotor of `vehicle`, which varies as the recipe's own does.
 
+    Spreads of the centre of mass and of the trim go with the vehicle's size: what is little for a
+    racer is more torque than a palm-sized quadrotor has.
+
     Raises:
         ValueError: where the policy decides faster than the vehicle's controller runs.
     """
     check_decides_in_time(config.spec, vehicle)
     own = config.quadrotor or QuadrotorConfig(vehicle)
-    return replace(config, quadrotor=replace(own, vehicle=vehicle), fleet=None)
+    arm, inertia = (of(vehicle) / of(own.vehicle) for of in (_arm_m, _inertia))
+    own = replace(
+        own,
+        vehicle=vehicle,
+        com_std_m=min(arm * own.com_std_m, COM_STD_MOST),
+        trim_std=min(inertia * own.trim_std, TRIM_STD_MOST),
+    )
+    return replace(config, quadrotor=own, fleet=None)
+
+
+def _arm_m(vehicle: Vehicle) -> float:
+    """Return how far hubs lie from the origin along x and y, on the mean [m]."""
+    return sum(math.hypot(x, y) for x, y, _ in vehicle.rotors.position) / 4
+
+
+def _inertia(vehicle: Vehicle) -> float:
+    """Return the mean of the inertias about x and y [kg m^2]."""
+    return (vehicle.inertia[0] + vehicle.inertia[1]) / 2
 
 
 def with_fleet(config: TrainConfig) -> TrainConfig:

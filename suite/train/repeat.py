@@ -216,7 +216,8 @@ def _check_finite(iteration: int, row: dict[str, float], folder: Path) -> None:
     if bad:
         raise WorkFailed(
             f"training diverged at iteration {iteration}: {', '.join(bad)} not finite. The last "
-            f"finite state is in {folder / 'state'}; lower optimizer.rate or set optimizer.clip"
+            f"finite state is in {folder / 'state'}; lower optimizer.rate or set optimizer.clip, "
+            "or where that was at once narrow what varies: a vehicle may tumble without end"
         )
 
 

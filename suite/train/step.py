@@ -22,6 +22,9 @@ NEAR = Counts(boxes=8, cylinders=4, capsules=3, spheres=3)
 BEYOND_M = 10.0
 """After the last gate the target is this far behind it, so that nothing is gained by braking; with
 `episode.finish` that is for the one step that passes the gate."""
+TIPPING = 0.05
+"""So near to level body z points where the probability to fly on begins to fall, of a trial that
+ends beyond [1]."""
 APPROACH_FREE_M = 0.3
 """So far off its axis a gate is still flown at straight [m]."""
 
@@ -151,14 +154,18 @@ def make_step(
     path_w = before.pos_w[:, None] + share[:, None] * (after.pos_w - before.pos_w)[:, None]
     distance, away_w = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path_w), NEAR)
     gap = gap_beyond(config, distance, away_w, path_w)
+    up = after.rot_w[:, 2, 2]
     if config.survival > 0.0:
-        survival = survival * jnp.where(crashed, 1.0, flown_on(config, gap))
+        on = flown_on(config, gap)
+        if config.tilt > 0.0:
+            on = on * jax.nn.sigmoid(up / TIPPING)
+        survival = survival * jnp.where(crashed, 1.0, on)
     return Step(
         pos_w=after.pos_w,
         vel_w=after.vel_w,
         acc_w=after.acc_w,
         jerk_w=(after.acc_w - before.acc_w) / worlds.constants.time_step[:, None],
-        up=after.rot_w[:, 2, 2],
+        up=up,
         gap=gap,
         away_w=away_w,
         goal_w=goal_w,

@@ -11,6 +11,9 @@ from tracks.common.names import unknown_name
 
 T = TypeVar("T")
 
+PREFIX = "diffracing_suite."
+"""Of the entry points' groups of all tables."""
+
 
 class Registry(Mapping[str, T]):
     """What stands under each name: our own first, then what was added.
@@ -116,6 +119,16 @@ class Registry(Mapping[str, T]):
         if wrong:
             raise ValueError(f"{self._kind} {name!r} ({origin}): {wrong}")
         return value
+
+
+def added_entries() -> list[EntryPoint]:
+    """Return what installed packages add to any of our tables, in one order."""
+    groups = sorted(group for group in _installed().groups if group.startswith(PREFIX))
+    return [
+        entry
+        for group in groups
+        for entry in sorted(_installed().select(group=group), key=lambda e: e.name)
+    ]
 
 
 @cache

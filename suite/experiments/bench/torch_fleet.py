@@ -100,10 +100,12 @@ def fly(
     rate, trim = body.loop[..., 0], body.loop[..., 2]
     limit = vehicle.turn_max
     wanted = vehicle.rate_gain * (acting[:, 1:] - rate) + trim
-    wanted = torch.minimum(torch.maximum(wanted, -limit), limit)
+    share = (wanted[:, :2] / limit[:, :2]).abs().sum(-1)
+    turn = wanted[:, :2] / share.clamp(min=1.0)[:, None]
+    yaw = torch.minimum(torch.maximum(wanted[:, 2:], -limit[:, 2:]), limit[:, 2:])
+    wanted = torch.cat([turn, yaw], -1)
     rate_cmd = rate + (wanted - trim) / vehicle.rate_gain
-    level = 0.5 * (wanted[:, :2] / limit[:, :2]).abs().sum(-1)
-    level = level.clamp(max=0.5) * vehicle.thrust_max
+    level = 0.5 * share.clamp(max=1.0) * vehicle.thrust_max
     thrust = torch.minimum(torch.maximum(acting[:, 0], level), vehicle.thrust_max - level)
     root = thrust[:, None].clamp(min=1e-12).sqrt()
     lag = vehicle.rotor_lag[:, None]

@@ -149,10 +149,11 @@ def lead(rows: Sequence[Row]) -> str:
         found = over.success.get(policy)
         return "-" if found is None else f"{100 * found.value:.0f} %"
 
+    told = "There" if over.named in (0, over.loops) else "In those"
     text = (
-        f"Hidden worlds: {len(worlds)}, loops: {over.loops}. There {rate(BEFORE)} succeed, of "
-        f"{rate(NOMINAL)} where nothing is hidden. The diagnosis names something in {over.named} "
-        f"of {over.loops}."
+        f"Hidden worlds: {len(worlds)}, loops: {over.loops}. The diagnosis names something in "
+        f"{over.named} of {over.loops}. {told} {rate(BEFORE)} succeed, of {rate(NOMINAL)} where "
+        "nothing is hidden."
     )
     if NAMED not in over.success:
         return text
@@ -232,11 +233,11 @@ def named_grid(came: Sequence[Came], words: Mapping[str, str]) -> Grid:
                 one.diagnosis["verdict"],
                 named_effects(one.diagnosis) or "nothing",
                 "; ".join(values),
-                f"{gap['before']:.2f}, {gap['after']:.2f}",
+                f"{gap['before']:.2f}, {gap['after']:.2f}, {gap['noise_floor']:.2f}",
             ]
         )
     headers = ["hidden", "what", "training seed", "verdict", "named", "values"]
-    return table([*headers, "held-out gap before, after"], lines)
+    return table([*headers, "held-out gap before, after, noise floor"], lines)
 
 
 def errors_grid(came: Sequence[Came]) -> Grid:

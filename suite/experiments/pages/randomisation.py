@@ -81,8 +81,10 @@ def worth_of(
 def compare(name: str, entries: Sequence[Tested], sizes: Sequence[int]) -> Worth:
     """Return the recipe against the setting `name` over all of `entries` together."""
     other, recipe = (np.array([e.won(each) for e in entries]) for each in (name, RANDOMISED))
-    first, second = (wilson(int(won.sum()), won.size) for won in (other, recipe))
-    apart = recipe.mean(axis=0) - other.mean(axis=0)
+    # A trial counts once, with its mean over conditions, under which all fly the same trials.
+    other, recipe = other.mean(axis=0), recipe.mean(axis=0)
+    first, second = (wilson(float(won.sum()), won.size) for won in (other, recipe))
+    apart = recipe - other
     return Worth((first, second), nested(np.split(apart, np.cumsum(sizes)[:-1])))
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import hashlib
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from suite.common.provenance import machine, package_versions
 from tracks.common.files import to_json
+from tracks.common.registry import added_entries
 
 ROOT = Path(__file__).resolve().parents[3]
 NO_RESULT = ("view", "importers", "envs")
@@ -48,7 +50,34 @@ def code_digest(*rooms: str) -> str:
 
 @functools.cache
 def engines() -> dict[str, str | None]:
-    """Return what else can change a number: processor, and versions of what computes."""
+    """Return what else can change a number: processor, versions and what other packages add."""
     versions = package_versions()
-    names = ("numpy", "jax", "jaxlib", "mujoco", "mujoco-mjx", "torch", "onnxruntime", "rotorpy")
-    return {"processor": machine()["processor"], **{name: versions[name] for name in names}}
+    names = ("numpy", "scipy", "jax", "jaxlib", "optax", "mujoco", "mujoco-mjx", "torch")
+    return {
+        "processor": machine()["processor"],
+        **{name: versions[name] for name in (*names, "onnxruntime", "rotorpy")},
+        "added": added_digest(),
+    }
+
+
+def added_digest() -> str | None:
+    """Return 16 hex digits for the effects, tracks and worlds of other packages; None: none."""
+    sums = hashlib.sha256()
+    entries = added_entries()
+    for entry in entries:
+        sums.update(f"{entry.group}\0{entry.name}\0{entry.value}\0".encode())
+        for path in _sources(entry.module.partition(".")[0]):
+            sums.update(path.name.encode() + b"\0" + path.read_bytes())
+    return sums.hexdigest()[:16] if entries else None
+
+
+def _sources(module: str) -> list[Path]:
+    """Return the source files of a module or a package; none where it is not there."""
+    spec = find_spec(module)
+    if spec is None:
+        return []
+    folders = spec.submodule_search_locations or ()
+    files = [path for folder in folders for path in Path(folder).rglob("*.py")]
+    if not files and spec.origin is not None:
+        files = [Path(spec.origin)]
+    return sorted(path for path in files if path.is_file())

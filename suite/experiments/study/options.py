@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 from suite.common.choices import parse_levels
 from suite.train.config import TrainConfig
 from suite.train.config import check as check_recipe
+from suite.train.overrides import check_owned, override
 from tracks.input.ranges import Iterations, Range, Seed, Trials, check_ranges
 
 GATES = 4
@@ -65,30 +66,12 @@ def _check_unseen(option: str, seed: int, training_seeds: Sequence[int]) -> None
         )
 
 
-def check_owned(changes: Sequence[str], owned: Mapping[str, str], option: str = "--set") -> None:
-    """Refuse changes, as --set takes them, of settings that an experiment sets itself.
-
-    Args:
-        changes: SETTING=VALUE each.
-        owned: what to do instead, by a setting's path.
-        option: that gave the changes.
-
-    Raises:
-        ValueError: naming the setting and what to do instead.
-    """
-    for change in changes:
-        path = change.partition("=")[0].strip()
-        if path in owned:
-            raise ValueError(f"{option} {change!r}: this experiment sets {path}; {owned[path]}")
-
-
 def asked_recipe(config: Any) -> TrainConfig:
     """Return --preset with --set and, unless it is None, --iterations.
 
     Raises:
         ValueError: for a preset or a change that does not exist.
     """
-    from suite.train.overrides import override
     from suite.train.presets import preset, with_iterations
 
     recipe = override(preset(config.preset), config.set)

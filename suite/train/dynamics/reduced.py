@@ -191,10 +191,14 @@ def fly(
     # What the mixer cannot give is not asked for: a rate nearer to the one there is.
     rate, trim = body.loop[..., 0], body.loop[..., 2]
     gain, limit = vehicle.rate_gain, vehicle.turn_max
-    wanted = jnp.clip(gain * (acting[:, 1:] - rate) + trim, -limit, limit)
+    wanted = gain * (acting[:, 1:] - rate) + trim
+    # Roll and pitch are scaled together, yaw alone.
+    share = jnp.abs(wanted[:, :2] / limit[:, :2]).sum(-1)
+    turn = wanted[:, :2] / jnp.maximum(share, 1.0)[:, None]
+    yaw = jnp.clip(wanted[:, 2:], -limit[:, 2:], limit[:, 2:])
+    wanted = jnp.concatenate([turn, yaw], axis=-1)
     rate_cmd = rate + (wanted - trim) / gain
-    level = 0.5 * jnp.abs(wanted[:, :2] / limit[:, :2]).sum(-1)
-    level = jnp.minimum(level, 0.5) * vehicle.thrust_max
+    level = 0.5 * jnp.minimum(share, 1.0) * vehicle.thrust_max
     thrust = jnp.clip(acting[:, 0], level, vehicle.thrust_max - level)
     root = speed_command(thrust[:, None], 1.0)
     rotors = follow(body.thrust_root, root, vehicle.rotor_lag, dt[:, 0])

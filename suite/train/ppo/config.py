@@ -67,7 +67,7 @@ class PpoConfig:
     """Width of the critic's two hidden layers."""
     critic_rate: Annotated[float, Range(0.0, 10.0)] = 1e-3
     """Adam's learning rate of the critic."""
-    critic_epochs: Annotated[int, Range(0, 10_000)] = 16
+    critic_epochs: Annotated[int, Range(1, 10_000)] = 16
     """Passes of the critic over a rollout; it sees no images, so they cost little."""
 
     @property

@@ -76,7 +76,7 @@ def make_reward(
             avoid=avoid + CLOSING * losses.collide(weights, step),
             smooth=smooth + JERK * losses.jerk(weights, step),
             passing=PASS * step.passed,
-            progress=-PROGRESS * losses.progress(weights, step),
+            progress=PROGRESS * losses.speed_to_goal(step),
         )
         return terms, step.clearance, step.passed
 

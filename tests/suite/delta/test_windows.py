@@ -65,4 +65,13 @@ def test_the_period_of_decisions_that_stand_on_rows_is_that_of_the_policy(rate_h
 
 
 def test_the_rate_of_flights_is_that_of_their_policy():
-    assert decision_rate(fly(nominal_model(PointMassConfig()), 2)) == pytest.approx(30.0, rel=1e-3)
+    logs = fly(nominal_model(PointMassConfig()), 3)
+    assert decision_rate(logs) == pytest.approx(30.0, rel=1e-3)
+    first, rest = logs[0], logs[1:]
+    assert first.policy_step is not None
+    steps = np.cumsum(first.policy_step) - 1
+    thin = replace(
+        first, extra={**first.extra, "policy_step": first.policy_step & (steps % 2 == 0)}
+    )
+    with pytest.raises(ValueError, match=r"has 15 decisions a second, and most flights 30"):
+        decision_rate([thin, *rest])

@@ -38,8 +38,9 @@ def loops(monkeypatch):
             folder.mkdir(parents=True, exist_ok=True)
             write_trials(folder / "trials.parquet", four_trials(won, config.seed), {})
         (out / "diagnosis").mkdir(exist_ok=True)
-        found = {"verdict": "unknown" if blind else "named", "effects": [] if blind else [EFFECT],
-                 "gap": {"before": 5.0, "after": 5.0 if blind else 1.0}}  # fmt: skip
+        gap = {"before": 5.0, "after": 5.0 if blind else 1.0, "noise_floor": 1.0}
+        named = {"verdict": "named", "effects": [EFFECT], "gap": gap}
+        found = {**named, "verdict": "unknown", "effects": []} if blind else named
         (out / "diagnosis" / "diagnosis.json").write_text(json.dumps(found))
         (out / "diagnosis" / "stage.json").write_text("{}")
         if blind:
@@ -101,7 +102,7 @@ def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeyp
     ("args", "words"),
     [
         (["--only", "weak roter"], "Did you mean 'weak rotor'?"),
-        (["--set", "seed=3"], "this experiment sets seed; give --training-seeds"),
+        (["--set", "seed=3"], "this command sets seed; give --training-seeds"),
         (["--trials", "1001"], "--trials is 1001, allowed is 1 to 1000"),
     ],
 )

@@ -37,6 +37,24 @@ def test_every_row_is_the_recipe_with_its_changes():
     assert [row.key for row in ideas(Config(only=("longer",)))] == ["recipe", "longer"]
 
 
+@pytest.mark.parametrize("preset", ["small", "direct", "paper"])
+def test_deciding_twice_as_often_keeps_the_seconds(preset: str):
+    asked = Config(preset=preset, set=(), only=("often", "finer image", "wider memory"))
+    base, often, finer, wider = (row.recipe for row in ideas(asked))
+    assert often.spec.rate_hz == 2 * base.spec.rate_hz
+    for name in ("steps", "image_stride"):
+        assert getattr(often.episode, name) == 2 * getattr(base.episode, name)
+    for name in ("state_delay", "image_delay"):
+        assert getattr(often.physics, name) == 2 * getattr(base.physics, name)
+    # The point mass holds two decisions of delay at most; quadrotors have theirs in seconds.
+    longest = base.physics.action_delay[1]
+    wanted = longest if base.quadrotor else min(2.0, 2 * longest)
+    assert often.physics.action_delay[1] == wanted
+    assert (finer.spec.camera.width, finer.spec.camera.height) == (48, 36)
+    assert finer.episode == wider.episode == base.episode
+    assert wider.spec.hidden_size == 320
+
+
 def test_a_change_that_the_recipe_has_already_is_no_row():
     keys = {row.key for row in ideas(Config(preset="swift"))}
     assert not keys & {"second gate", "gate axis", "pass first", "finish", "heights"}

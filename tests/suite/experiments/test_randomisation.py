@@ -9,7 +9,17 @@ ARGS = ["randomisation", "--only", "thrust_scale", "--trials", "2", "--difficult
 
 @pytest.mark.slow
 def test_all_settings_of_every_seed_fly_the_same_share(sky, made, tmp_path):
-    args = [*ARGS, "--training-seeds", "3", "5", "--iterations", "7", "--without", "thrust"]
+    args = [
+        *ARGS,
+        "--training-seeds",
+        "3",
+        "5",
+        "--iterations",
+        "7",
+        "--without",
+        "thrust",
+        "thrust",
+    ]
     assert reproduce(tmp_path, *args) == 0
     drawn = [(c.seed, c.quadrotor.thrust_spread, c.quadrotor.mass_std) for c in made]
     assert drawn == [
@@ -43,6 +53,10 @@ def test_all_settings_of_every_seed_fly_the_same_share(sky, made, tmp_path):
         (["--training-seeds", "1", "1"], "--training-seeds is 1 1"),
         (["--iterations", "0"], "--iterations is 0"),
         (["--workers", "99"], "--workers is 99"),
+        (
+            ["--training-seeds", *"0123456"],
+            "6 on all tracks and levels, and they are shared among 7",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_trained(

@@ -97,8 +97,8 @@ def test_curves_first_times_and_sentences_by_hand():
         (["--only", "pop"], "Did you mean 'ppo'?"),
         (["--worlds", "6"], "--worlds is 6, allowed with PPO are multiples of its 4 minibatches"),
         (["--measurements", "0"], "--measurements is 0"),
-        (["--set", "loss.progress=1.2"], "this experiment sets loss.progress; give --progress"),
-        (["--set", "loss.projection=1"], "this experiment sets loss.projection; it is compared"),
+        (["--set", "loss.progress=1.2"], "this command sets loss.progress; give --progress"),
+        (["--set", "loss.projection=1"], "this command sets loss.projection; it is compared"),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_trained(args, words, tmp_path, capsys):

@@ -1,6 +1,7 @@
 """suite collect: logs that read back, and flights that are none."""
 
 import json
+import shutil
 
 import eval.judging.judge
 import eval.logs.flight_log
@@ -64,6 +65,21 @@ def test_flights_of_another_course_or_code_are_not_taken_for_its_own(
     track.write_text(COURSE.replace("1.0", "1.1"))
     assert cli.main(args) == 2
     assert "another collection" in capfd.readouterr().err
+
+
+def test_flights_are_the_same_where_policy_and_vehicle_were_moved(
+    pilots, tmp_path, monkeypatch, root
+):
+    vehicle, out = tmp_path / "mine.toml", tmp_path / "flights"
+    shutil.copy(root / "eval" / "vehicles" / "racer5.toml", vehicle)
+    args = ["collect", "--policy", pilots["diver"], "--track", "zigzag", "--difficulty", "0"]
+    args += ["--trials", "1", "--out", str(out), "--vehicle"]
+    assert cli.main([*args, str(vehicle)]) == 0
+    moved = vehicle.rename(tmp_path / "moved.toml")
+    monkeypatch.setattr(eval.judging.judge, "fly", None)
+    assert cli.main([*args, str(moved)]) == 0, "nothing is flown again"
+    moved.write_text(moved.read_text().replace("mass = 0.75", "mass = 0.76"))
+    assert cli.main([*args, str(moved)]) == 2
 
 
 def test_tracks_whose_logs_would_have_one_name_are_refused(pilots, tmp_path, capfd):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from eval.quadrotor.vehicle_file import save_vehicle
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.worlds.other import rotorpy as rotorpy_world
 from policies import shipped
 from suite import cli
@@ -38,6 +38,11 @@ EXAMPLE = "examples/hidden.toml"
         (["--fit-iterations", "0"], "--fit-iterations is 0"),
         (["--set", "loss.progres=1"], "Did you mean 'progress'?"),
         (["--no-delta"], "--no-delta: the loop is about the Delta Action Model"),
+        (["--set", "seed=5"], "this command sets seed; give --seed"),
+        (["--set", "optimizer.iterations=5"], "give --iterations"),
+        (["--policy", "racer", "--set", "optimizer.iterations=5"], "give --finetune-iterations"),
+        (["--policy", "racer", "--set", "spec.rate_hz=30"], "sets spec.rate_hz; a policy keeps"),
+        (["--policy", "racer", "--iterations", "5"], "--iterations is 5, but with --policy or"),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_written(args, words, tmp_path, capsys):
@@ -71,6 +76,15 @@ def test_what_cannot_be_hidden_is_said_before_anything_is_written(
     said = capsys.readouterr().err
     assert words in said and len(said.strip().splitlines()) == 1
     assert not out.exists()
+
+
+def test_a_copy_under_another_name_hides_nothing(tmp_path, root):
+    copy = tmp_path / "copy.toml"
+    text = (root / "eval" / "vehicles" / "racer5.toml").read_text(encoding="utf-8")
+    copy.write_text(text.replace('name = "racer5"', 'name = "another"'), encoding="utf-8")
+    assert load_vehicle(copy) != load_vehicle("racer5")
+    with pytest.raises(ValueError, match="nothing is hidden"):
+        resolve(recipe="small", vehicle="racer5", world=str(copy))
 
 
 def test_a_load_on_a_line_may_be_hidden_but_not_known(tmp_path, monkeypatch, root):

@@ -46,7 +46,7 @@ def answer(effects):
     return {
         "verdict": "named" if effects else "unknown",
         "effects": effects,
-        "gap": {"before": 9.0, "after": 1.1},
+        "gap": {"before": 9.0, "after": 1.1, "noise_floor": 1.0},
         "unexplained": {"share": 0.0, "where": None},
     }
 

@@ -16,9 +16,10 @@ from suite import cli
 from suite.loop.compare import CAVEAT, VARIANTS
 from tests.support.loops import Small
 
-ARGS = ["--preset", "small", "--track", "zigzag", "--difficulty", "0", "--trials", "3"]
-ARGS += ["--flights", "3", "--iterations", "3", "--finetune-iterations", "2"]
-ARGS += ["--fit-iterations", "3", "--seed", "4", "--set", "episode.batch=2"]
+TUNED = ["--preset", "small", "--track", "zigzag", "--difficulty", "0", "--trials", "3"]
+TUNED += ["--flights", "3", "--finetune-iterations", "2", "--fit-iterations", "3"]
+TUNED += ["--seed", "4", "--set", "episode.batch=2"]
+ARGS = [*TUNED, "--iterations", "3"]
 STAGES = ["train", "eval-before", "flights", "delta", "tuned-without", "tuned-with"]
 STAGES += ["eval-without", "eval-with", "replays"]
 
@@ -129,10 +130,22 @@ def test_another_configuration_is_refused(whole, monkeypatch, capfd):
     assert not small.flown and not small.trained
 
 
+def test_a_loop_goes_on_where_its_folder_was_moved(whole, tmp_path, monkeypatch):
+    """In the middle of judging, and of recording: what was flown counts."""
+    given, small = whole[0] / "train" / "policy", Small(monkeypatch)
+    args = ["loop", *TUNED, "--policy", str(given), "--out"]
+    for place, flown in (("one", 1), ("two", 4), ("three", 6)):
+        small.stop_after = ("fly", flown)
+        assert cli.main([*args, str(tmp_path / place)]) == 130
+        assert len(small.flown) == flown
+        (tmp_path / place).rename(tmp_path / {"one": "two", "two": "three"}.get(place, "end"))
+    assert len(set(small.flown)) == 6, "three judged, three recorded, none twice"
+
+
 def test_a_given_policy_is_not_trained(whole, tmp_path, monkeypatch):
     given, out = whole[0] / "train" / "policy", tmp_path / "out"
     small = Small(monkeypatch)
     small.stop_after = ("fly", 1)
-    assert cli.main(["loop", *ARGS, "--policy", str(given), "--out", str(out)]) == 130
+    assert cli.main(["loop", *TUNED, "--policy", str(given), "--out", str(out)]) == 130
     assert not small.trained and not (out / "train").exists()
     assert (out / "given" / "policy" / WEIGHTS).read_bytes() == (given / WEIGHTS).read_bytes()

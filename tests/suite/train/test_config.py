@@ -34,7 +34,7 @@ def test_a_configuration_can_be_kept_as_json_with_every_setting():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"gate_corners": 2}, "episode.gate_corners is 2, allowed is 3 to 64"),
+        ({"gate_corners": 2}, "episode.gate_corners is 2, allowed is 3 to 12"),
         ({"height_spread": -1.0}, "episode.height_spread is -1.0, allowed is 0 to 100"),
         ({"height_spread": float("nan")}, "episode.height_spread is nan"),
         ({"batch": 0}, "episode.batch is 0, allowed is 1 to 1000000"),

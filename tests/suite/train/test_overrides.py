@@ -1,9 +1,12 @@
 """Settings changed by name."""
 
+import math
+
 import pytest
 
 from suite.train.config import TrainConfig
-from suite.train.overrides import override
+from suite.train.overrides import check_owned, override
+from suite.train.presets import preset, with_fleet
 
 
 def test_settings_are_changed_by_name():
@@ -15,6 +18,28 @@ def test_settings_are_changed_by_name():
     assert isinstance(whole, float) and whole == 1.0
     camera = override(TrainConfig(), ["spec.camera.width=48"]).spec.camera
     assert camera.width == 48 and camera.height == TrainConfig().spec.camera.height
+
+
+def test_a_limit_may_be_none():
+    assert override(TrainConfig(), ["loss.crash_depth_m=inf"]).loss.crash_depth_m == math.inf
+    with pytest.raises(ValueError, match=r"loss\.progress is inf, allowed is"):
+        override(TrainConfig(), ["loss.progress=inf"])
+
+
+def test_what_only_the_point_mass_reads_is_refused_through_quadrotors():
+    run = preset("direct")
+    for change in ("physics.wind_std=(3,3,1)", "physics.action_delay=(0,2)"):
+        with pytest.raises(ValueError, match=r"is of the point mass.*set one of quadrotor\."):
+            override(run, [change])
+    assert override(run, ["physics.image_delay=2"]).physics.image_delay == 2
+    with pytest.raises(ValueError, match=r"set one of fleet\."):
+        override(with_fleet(run), ["physics.drag=(0,1)"])
+
+
+def test_what_a_command_sets_itself_is_refused_with_what_to_do_instead():
+    check_owned(["loss.progress=1"], {"loss.prog": "", "spec": ""})
+    with pytest.raises(ValueError, match=r"--set 'spec.rate_hz=30': this command sets spec"):
+        check_owned(["spec.rate_hz=30"], {"spec": "take another policy"})
 
 
 @pytest.mark.parametrize(

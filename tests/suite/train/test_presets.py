@@ -44,7 +44,15 @@ def test_swift_quad_varies_its_quadrotors_widely_around_any_vehicle_that_is_aske
     assert own.quadrotor is not None and own.quadrotor.vehicle.name == "racer5"
     other = chosen_model(own, "quad", "crazyflie21").quadrotor
     assert other is not None and other.vehicle.name == "crazyflie21"
-    assert replace(other, vehicle=own.quadrotor.vehicle) == own.quadrotor
+    # What is a torque or a length goes with the vehicle's, all else is the recipe's.
+    small, racer = other.vehicle.inertia, own.quadrotor.vehicle.inertia
+    share = (small[0] + small[1]) / (racer[0] + racer[1])
+    assert other.trim_std == pytest.approx(share * own.quadrotor.trim_std) and share < 0.01
+    assert 0.2 < other.com_std_m / own.quadrotor.com_std_m < 0.5
+    sizes = {"trim_std": own.quadrotor.trim_std, "com_std_m": own.quadrotor.com_std_m}
+    assert replace(other, vehicle=own.quadrotor.vehicle, **sizes) == own.quadrotor
+    again = chosen_model(own, "quad", "racer5")
+    assert again == own, "to the bit"
     assert chosen_model(own, "point", None).quadrotor is None
     assert chosen_model(own, "fleet", None).quadrotor is None
 

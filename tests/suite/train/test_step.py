@@ -28,6 +28,24 @@ def test_the_point_before_the_gate_that_progress_is_measured_to(place_g, shift):
     assert approach_shift(LossConfig(), jnp.array([place_g])) == 0.0
 
 
+def test_tipping_over_lowers_the_odds_to_fly_on_where_it_ends_a_world():
+    worlds = boxes_worlds(small_config(3))
+    body = point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w)
+    lean = jnp.asarray([0.0, 0.5 * np.pi, np.pi])
+    zero, one = jnp.zeros(3), jnp.ones(3)
+    rows = [[jnp.cos(lean), zero, jnp.sin(lean)], [zero, one, zero],
+            [-jnp.sin(lean), zero, jnp.cos(lean)]]  # fmt: skip
+    leaning = body._replace(rot_w=jnp.stack([jnp.stack(row, -1) for row in rows], -2))
+
+    def odds(**weights):
+        config = LossConfig(survival=1.0, **weights)
+        return np.asarray(make_step(config, worlds, body, leaning, jnp.zeros(3, int)).survival)
+
+    upright, level, over = odds(tilt=40.0) / odds()
+    assert upright == pytest.approx(1.0, abs=1e-6) and level == pytest.approx(0.5, abs=1e-4)
+    assert over < 1e-6
+
+
 def test_past_the_last_gate_the_point_to_fly_to_lies_behind_it():
     worlds = boxes_worlds(small_config(3))
     gates, rows = worlds.scene.gates, np.arange(3)

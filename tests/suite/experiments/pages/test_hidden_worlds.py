@@ -36,12 +36,14 @@ def test_worlds_of_one_training_seed_add_no_trials():
 
 def test_the_lead_says_what_gained_and_where_nothing_is_named_only_what_was_lost():
     said = lead(rows_of([came(seed, WON) for seed in range(3)]))
-    assert "loops: 3. There 50 % succeed, of 100 %" in said and "in 3 of 3." in said
+    assert "loops: 3. The diagnosis names something in 3 of 3. There 50 %" in said
     assert "The named effect gains in: a." in said and "loses" not in said
     worse = lead(rows_of([came(seed, {**WON, NAMED: 0}) for seed in range(3)]))
     assert "The named effect gains in: none; loses in: a." in worse
     silent = lead(rows_of([came(0, WON, named=False)]))
-    assert silent.endswith("in 0 of 1.")
+    assert "in 0 of 1. There 50 %" in silent and silent.endswith("where nothing is hidden.")
+    lost = came(1, {**WON, "before": 0}, named=False)
+    assert "in 1 of 2. In those 50 %" in lead(rows_of([came(0, WON), lost]))
 
 
 def test_what_is_named_is_told_in_as_many_digits_as_mean_something():
@@ -50,8 +52,8 @@ def test_what_is_named_is_told_in_as_many_digits_as_mean_something():
     found = {
         "effects": [{"name": "com_offset", "alternatives": [], "parameters": values}],
         "verdict": "named",
-        "gap": {"before": 7.123, "after": 1.0},
+        "gap": {"before": 7.123, "after": 1.0, "noise_floor": 1.0},
     }
     ((*_, named, told, gap),) = named_grid([Came("a", 0, {}, found, {})], {"a": "moved"}).rows
-    assert named.text == "com_offset" and gap.text == "7.12, 1.00"
+    assert named.text == "com_offset" and gap.text == "7.12, 1.00, 1.00"
     assert told.text == "com_offset offset 1 [m]: 0.012"

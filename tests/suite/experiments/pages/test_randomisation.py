@@ -41,7 +41,7 @@ def worth(*entries):
 def test_a_trials_conditions_are_one_draw():
     windy = under("wind", randomised=HALF)
     once, often = (worth(*[windy] * count)[FIXED][ALL] for count in (1, 5))
-    assert once.gap == often.gap
+    assert once.gap == often.gap and once.rates == often.rates
     assert often.gap.difference.value == 0.5 and often.gap.of_seeds == [0.5] * 3
     assert often.gap.difference.low == pytest.approx(0.33, abs=0.06)
     assert often.rates[1].value == 0.5 and often.rates[0].value == 0

@@ -119,5 +119,5 @@ def test_a_world_that_was_stopped_or_has_crashed_has_nothing_to_come(judged):
     assert way.seen.shape == (7, 4, critic.FEATURES) and way.alive.shape == (7, 4)
     assert list(way.hit[0]) == [False, True, False, False] and way.hit.sum() == 1
     assert list(way.alive.sum(0)) == [7, 1, 2, 7]
-    # Where a rollout ends the loss goes on, so what is said there changes no return.
-    assert [list(np.flatnonzero(row)) for row in way.stopped.T] == [[5], [], [1], [5]]
+    # To reach the rollout's end is not to be stopped: what leaves there passed its last gate.
+    assert [list(np.flatnonzero(row)) for row in way.stopped.T] == [[], [], [1], []]

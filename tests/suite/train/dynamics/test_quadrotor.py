@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS
-from eval.quadrotor.vehicle_file import load_vehicle
+from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import Rules, TrialSpec
@@ -18,7 +18,7 @@ from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
 from suite.train.dynamics.quadrotor import QuadrotorParams, quadrotor_dynamics, substeps
 from suite.train.gradient import make_gradient
-from suite.train.presets import preset
+from suite.train.presets import preset, with_quadrotor
 from suite.train.rollout import make_rollout
 from suite.train.worlds import sample_worlds
 from tests.support.courses import straight
@@ -154,6 +154,16 @@ def test_long_steps_change_a_flight_by_far_less_than_what_is_drawn(float64):
     long, drawn = fly_trainer(config, actions, 30.0)[0], np.roll(fine, 1, axis=1)
     assert substeps(config, 1 / 30)[:2] == (2, 2)
     assert 0 < off(long) < 0.02 * off(drawn)
+
+
+@pytest.mark.parametrize("name", shipped_vehicles())
+def test_the_default_recipe_draws_vehicles_that_fly(name):
+    """Around any shipped vehicle: a second of mild actions tips none over."""
+    config = with_quadrotor(preset("direct"), load_vehicle(name)).quadrotor
+    assert config is not None
+    actions = 0.5 * lively_actions(15, batch=64)
+    pos_w, rot_w, _ = fly_trainer(config, actions, 15.0)
+    assert np.isfinite(pos_w).all() and rot_w[..., 2, 2].min() > 0.5
 
 
 def test_no_vehicle_is_drawn_lighter_than_the_catalogue_knows():

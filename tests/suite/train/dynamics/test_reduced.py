@@ -142,6 +142,23 @@ def test_a_vehicle_gives_what_its_rotors_have_and_no_more():
     assert rise == pytest.approx(13.0 - 9.81, rel=1e-3)
 
 
+def test_roll_and_pitch_share_what_the_rotors_have():
+    """Four rotors in an X that give one of them all they can have nothing for the other."""
+    vehicle = one_vehicle(turn_max=[50.0, 50.0, 20.0], delay=0.0)
+    params, still = reduced.prepare(vehicle, 3), jnp.zeros((1, 3))
+    ahead, dt = jnp.asarray([[1.0, 0.0, 0.0]]), jnp.full((1, 1), PERIOD / 3)
+    body = reduced.start(params, still, still, ahead)
+
+    def turned(*action):
+        """Return the rates about x and y after a step towards a lean of more than is to be had."""
+        after = reduced.fly(body, params, jnp.asarray([action]), ahead, dt)
+        return np.abs(np.asarray(after.loop)[0, :2, 0])
+
+    alone, both = turned(0.0, 30.0, 0.0), turned(30.0, 30.0, 0.0)
+    np.testing.assert_allclose(both, alone[0] / 2, rtol=1e-4)
+    assert alone[0] > 0.1 and alone[1] < 1e-5
+
+
 @pytest.mark.slow
 def test_gradients_are_those_of_the_flight():
     """With respect to the actions of 4 decisions, in double precision."""

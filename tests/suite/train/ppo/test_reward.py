@@ -38,11 +38,12 @@ def body_at(pos_w, vel_w=(0.0, 0, 0), acc_w=(0.0, 0, 0)):
     return point_mass.start(pos, vel, jnp.asarray([[1.0, 0, 0]]))._replace(acc_w=acc)
 
 
-def rewarded(before, body, sphere_w=(0, 0, 90), target=0, config=CONFIG):
+def rewarded(before, body, sphere_w=(0, 0, 90), target=0, config=CONFIG, wanted=None):
     """Return (terms as numbers by name, their sum, clearance, passed) of the step."""
-    terms, clearance, passed = make_reward(config)(
-        worlds_with(sphere_w), before, body, jnp.asarray([target])
-    )
+    worlds = worlds_with(sphere_w)
+    if wanted is not None:
+        worlds = worlds._replace(wanted=jnp.asarray([wanted]))
+    terms, clearance, passed = make_reward(config)(worlds, before, body, jnp.asarray([target]))
     named = {name: float(term[0]) for name, term in terms._asdict().items()}
     return named, float(terms.total()[0]), float(clearance[0]), bool(passed[0])
 
@@ -107,9 +108,10 @@ def test_a_trainings_own_weights_change_nothing():
     own = LossConfig(
         clearance=1.0, collide=7.0, acceleration=1.0, jerk=1.0, progress=9.0, progress_norm=3.0,
         projection=2.0, approach_m=1.0, pass_first=True, barrier_height=5.0, field_gain=0.0,
-        crash_depth_m=1.0, **shared,
+        crash_depth_m=1.0, speed_range=(0.1, 0.2), survival=3.0, tilt=2.0, **shared,
     )  # fmt: skip
     near = (-2.9, 0.9, 50)
-    assert rewarded(before, body, near, config=replace(CONFIG, loss=own)) == rewarded(
-        before, body, near
-    )
+    changed = replace(CONFIG, loss=own)
+    assert rewarded(before, body, near, config=changed) == rewarded(before, body, near)
+    careful = rewarded(before, body, near, config=changed, wanted=0.1)
+    assert careful == rewarded(before, body, near), "nor how fast a policy is asked to fly"
