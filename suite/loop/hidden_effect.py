@@ -174,8 +174,8 @@ def _delta(out: Path) -> Section:
     headers = ["held-out flights, after 1 s", "position error [m]", "velocity error [m/s]"]
     words = (
         "Recorded actions are flown again through the differentiable quadrotor; the flights are "
-        "as measured, so the noise of the start is in every row. The diagnosis, which corrected the "
-        "vehicle, has seen some of these flights; no Delta Action Model has."
+        "as measured, so the noise of the start is in every row. The diagnosis, which corrected "
+        "the vehicle, has seen some of these flights; no Delta Action Model has."
     )
     return Section("Delta Action Models on held-out flights", [words, Grid("", headers, rows)])
 
