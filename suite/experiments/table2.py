@@ -158,9 +158,8 @@ def variants_of(config: Config, place: Place, console: Console) -> list[TablePol
         from suite.loop.run import run_loop
 
         loop = loop_config(config, policy)
-        folder = (
-            place.cache / "loops" / digest([by_content(loop), code_digest(*LOOP_ROOMS), engines()])
-        )
+        about = [by_content(loop), code_digest(*LOOP_ROOMS), engines()]
+        folder = place.cache / "loops" / digest(about)
         run_loop(loop, folder, Quiet(), place.workers)
         chosen[WITH] = str(folder / "tuned-with" / "policy")
         chosen[CONTROL] = str(folder / "tuned-without" / "policy")
