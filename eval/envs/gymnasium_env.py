@@ -95,9 +95,9 @@ class RaceEnv(gymnasium.Env):
         race = self._race
         if race is None:
             raise RuntimeError("call reset() before step()")
-        reward = race.advance(
-            self._data, ACTION_LIMIT * np.asarray(action, float), race.steps_a_decision
-        )
+        # Beyond the space there is nothing; what is no number stays one, for the guard to refuse.
+        action_b = ACTION_LIMIT * np.clip(np.asarray(action, float), -1.0, 1.0)
+        reward = race.advance(self._data, action_b, race.steps_a_decision)
         info = {"gates": int(race.progress.gates[0]), "ended_by": race.ended_by}
         truncated = race.ended_by == "timeout"
         terminated = race.ended_by is not None and not truncated

@@ -8,12 +8,15 @@ from policies.errors import PolicyError
 from policies.formats.spec_json import spec_from_json, spec_to_json
 from policies.spec import PolicySpec
 from tracks.common.files import to_json
+from tracks.common.names import unknown_name
 from tracks.common.provenance import stamp
 from tracks.input.reading import InputError, parse_json
 
 KEY = "policy.json"
 """Name of the extra file in a torch archive, and of the metadata entry in ONNX."""
 SCHEMA = 1
+KEYS = ("schema", "suite_version", "git_commit", "seed", "name", "spec")
+"""Of the object; what a policy says of itself stands under `spec`."""
 
 
 def embed(spec: PolicySpec, name: str, seed: int | None) -> str:
@@ -41,4 +44,7 @@ def extract(text: str | bytes | None, where: str) -> PolicySpec:
         raise PolicyError(f"{error}; write it again") from None
     if not isinstance(data, dict) or data.get("schema", SCHEMA) != SCHEMA:
         raise PolicyError(f"{where}: expected an object with schema {SCHEMA}; update the suite")
+    for key in data:
+        if key not in KEYS:
+            raise PolicyError(f"{where}: {unknown_name('key', key, KEYS)}")
     return spec_from_json(data.get("spec", {}), f"{where}: spec")

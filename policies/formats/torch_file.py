@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from policies.block_policy import BlockPolicy, Model, proven
-from policies.errors import PolicyError
+from policies.errors import NeedsTrust, PolicyError
 from policies.formats.apart.process import Apart
 from policies.formats.embedded_spec import KEY, extract
 from policies.formats.program_inputs import INPUTS, check_inputs, inputs_message
@@ -55,7 +55,7 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
 
 def _loaded(path: Path, kind: str, words: str, trust: bool) -> Apart:
     if not trust:
-        raise PolicyError(
+        raise NeedsTrust(
             f"{path}: {words} can run any code of its maker's while torch loads it; if you trust "
             "who made the file, pass --trust; a policy to be shared needs none as .onnx "
             "(torch.onnx.export; suite export for one of ours)"

@@ -38,7 +38,8 @@ class Config:
     fly: str | None = None
     """Fly the plan in simulation with this vehicle (a file or a shipped name); write its logs."""
     recording: bool = True
-    """Whether the held-out flights, measured and simulated, become a recording for rerun."""
+    """Write the held-out flights, measured and simulated, as a recording for rerun; --no-recording
+    leaves it out."""
     seed: Seed = 0
     """Seed of the null's draws, of the intervals' and of simulated noise."""
     json: bool = False

@@ -49,8 +49,8 @@ class Config:
     """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with small; with
     --world 400, or 200."""
     delta: bool = True
-    """With --world: fit Delta Action Models, too, and fine-tune under them. Half the time goes
-    there."""
+    """With --world: Delta Action Models as well, and fine-tunings under them, which take half the
+    time; --no-delta leaves them out."""
     set: tuple[str, ...] = ()
     """Change settings of the recipe by name, such as loss.progress=0.4 episode.batch=128."""
     out: Path = Path("runs/loop")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -48,7 +48,8 @@ class Config:
     gif: bool = False
     """Also write a small GIF of the first trial, for a page."""
     trust: bool = False
-    """Also load policy files that can run code on this machine."""
+    """Also load policy files that can run code on this machine; a run's own, too, are not loaded
+    without."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -116,6 +117,11 @@ def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec]]:
             "then view it"
         )
     if not (folder / "trials.parquet").is_file():
+        if config.pick != "first":
+            raise ValueError(
+                f"--pick is {config.pick}, but {folder} is no run of suite eval whose trials have "
+                "ended; leave it out"
+            )
         evaluation = Evaluation(
             policies=(config.run,),
             track=config.track,
@@ -128,7 +134,15 @@ def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec]]:
         return evaluation, first_trials(evaluation)[: config.count]
     from eval.judging.results import read_trials
 
-    evaluation = read_evaluation(folder)
+    for name in ("track", "difficulty", "vehicle", "seed", "speed"):
+        given = getattr(config, name)
+        if given != getattr(Config, name):
+            raise ValueError(
+                f"--{name} is {given}, but {folder} is a run, whose trials are flown again as they "
+                "were; leave it out, or give a policy in the place of the run"
+            )
+    # What a folder says of itself is no reason to trust what it names.
+    evaluation = replace(read_evaluation(folder), trust=config.trust)
     results = read_trials(folder / "trials.parquet")
     results = [result for result in results if result.policy == results[0].policy]
     if config.pick != "first":

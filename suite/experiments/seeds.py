@@ -12,7 +12,6 @@ import tyro
 
 from eval.judging.tables import Tally
 from eval.quadrotor.vehicle_file import load_vehicle
-from policies.policy import load_policy
 from suite.common.console import Console, duration
 from suite.common.report import Picture, Report, Section
 from suite.experiments.pages.document import Place
@@ -134,7 +133,7 @@ def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:
         for path, within in zip(config.policies, inside, strict=True)
     ]
     for path in chosen:
-        load_policy(path)
+        judging.name_of(path)
     names = labels(config.policies, [Path(path).name for path in config.policies])
     return dict(zip(names, chosen, strict=True))
 

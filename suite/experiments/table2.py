@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from eval.judging.tables import Tally, percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialResult
-from policies.policy import load_policy
 from suite.common.choices import LEVELS
 from suite.common.console import Console
 from suite.common.report import Picture, Report, Section
@@ -166,7 +165,7 @@ def variants_of(config: Config, place: Place, console: Console) -> list[TablePol
     made = f"{policy}, fine-tuned by suite loop in {config.delta_iterations} gradient steps"
     variants = []
     for name, path in chosen.items():
-        load_policy(path)
+        judging.name_of(path)
         label = made if config.delta_iterations and name != OURS else path
         variants.append(TablePolicy(name, path, f"{label}, SHA-256 {policy_digest(path)[:16]}"))
     return variants

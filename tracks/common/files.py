@@ -23,6 +23,8 @@ from typing import Any
 
 PART = ".part"
 """Ending of what is being written, or what a killed process left of it."""
+PART_NAME = re.compile(r"\.(.+?)-(?:(\d+)-)?[a-z0-9_]{8}\.part")
+"""Of it: what it becomes, and the process that makes it."""
 SWEPT_DEPTH = 4
 """Folders within each other that are looked through for it."""
 
@@ -91,6 +93,8 @@ def recover_folder(path: str | os.PathLike[str]) -> None:
     if final.exists():
         return
     for part in final.parent.glob(f".{glob.escape(final.name)}-*.part"):
+        if _is_being_written(part.name):
+            continue
         if (part / "replaced").is_dir() and (part / final.name).is_dir():
             os.replace(part / final.name, final)
             shutil.rmtree(part, ignore_errors=True)
@@ -162,8 +166,8 @@ def sweep_parts(folder: str | os.PathLike[str]) -> list[Path]:
         depth = os.path.relpath(place, start).count(os.sep)
         for name in [name for name in names if name.startswith(".") and name.endswith(PART)]:
             names.remove(name)
-            match = re.fullmatch(r"\.(.+?)-(?:(\d+)-)?[a-z0-9_]{8}\.part", name)
-            if match and not (match[2] and _is_alive(int(match[2]))):
+            match = PART_NAME.fullmatch(name)
+            if match and not _is_being_written(name):
                 recover_folder(Path(place, match[1]))
                 shutil.rmtree(Path(place, name), ignore_errors=True)
                 swept.append(Path(place, name))
@@ -175,6 +179,12 @@ def sweep_parts(folder: str | os.PathLike[str]) -> list[Path]:
 def _prefix(final: Path) -> str:
     # Who writes it stands in the name, so that another process can tell whether it still does.
     return f".{final.name}-{os.getpid()}-"
+
+
+def _is_being_written(part: str) -> bool:
+    """Return whether the process that made a part, by its name, may still be writing it."""
+    match = PART_NAME.fullmatch(part)
+    return bool(match and match[2] and _is_alive(int(match[2])))
 
 
 def _is_alive(process: int) -> bool:

@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from policies.errors import PolicyError
+from policies.errors import NeedsTrust, PolicyError
 from policies.formats.apart.process import ANSWER_BYTES, Apart
 from policies.formats.c.compiler import compiled_library
 from policies.formats.embedded_spec import extract
@@ -64,7 +64,7 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
     """
     file = path / "policy.c" if path.is_dir() else path
     if not trust:
-        raise PolicyError(
+        raise NeedsTrust(
             f"{file}: C is compiled and run on this machine and can do anything; if you trust who "
             "made the file, pass --trust; a policy to be shared needs none as .onnx"
         )

@@ -106,11 +106,12 @@ def fly(autopilot: Autopilot, course: Course, spline: Spline, passed_s: Array, t
         action_b = action(ask, motion.pos_w, motion.rot_w, motion.vel_w)
         state = attitude_step(autopilot, state, motion, action_b, gate_w, count)
 
-        def physics(carry: Any, none: None) -> tuple[Any, None]:
-            now, body, _ = step(autopilot.plant, *carry, inputs=Inputs(state.command), time_s=0.0)
-            return (now, body), none
+        def physics(carry: Any, later: Array) -> tuple[Any, None]:
+            inputs, at_s = Inputs(state.command), (count + later) * autopilot.dt
+            now, body, _ = step(autopilot.plant, *carry, inputs=inputs, time_s=at_s)
+            return (now, body), None
 
-        (plant, motion), _ = jax.lax.scan(physics, (state.plant, motion), length=every)
+        (plant, motion), _ = jax.lax.scan(physics, (state.plant, motion), jnp.arange(every))
         state = state._replace(plant=plant)
         return (state, motion), (motion.pos_w[0], motion.vel_w[0], motion.rot_w[0, 2, 2])
 

@@ -21,6 +21,7 @@ from eval.judging.sensors import SensorNoise
 from eval.judging.tables import Tally, summarise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult, TrialSpec
+from policies.errors import NeedsTrust, PolicyError
 from policies.policy import Policy, load_policy
 from suite.common.choices import parse_levels
 from suite.common.console import Console
@@ -142,9 +143,24 @@ def judged_cells(
     }
 
 
+def name_of(policy: str) -> str:
+    """Return what a policy that a document is to fly calls itself.
+
+    Raises:
+        PolicyError: where it cannot be loaded, or loading it can run its maker's code.
+    """
+    try:
+        return load_policy(policy).name
+    except NeedsTrust:
+        raise PolicyError(
+            f"{policy}: loading it can run its maker's code, which suite reproduce does of no "
+            "policy; give a checkpoint's folder or an .onnx file, or fly it with suite eval"
+        ) from None
+
+
 def named_policies(asked: Sequence[str]) -> dict[str, str]:
     """Return the policies that are asked for by what tables call them."""
-    return dict(zip(labels(asked, [load_policy(path).name for path in asked]), asked, strict=True))
+    return dict(zip(labels(asked, [name_of(path) for path in asked]), asked, strict=True))
 
 
 def policy_facts(policies: Mapping[str, str]) -> dict[str, str]:

@@ -30,6 +30,8 @@ class Leg(NamedTuple):
 
 def legs(flight: Flight) -> list[Leg]:
     """Return every leg that ended at its gate, in order."""
+    if not len(flight.time_s):
+        return []
     speed = np.linalg.norm(flight.vel_w, axis=-1)
     ahead = np.unwrap(_kept(np.arctan2(flight.vel_w[:, 1], flight.vel_w[:, 0]), speed > STANDS))
     step_m = np.linalg.norm(np.diff(flight.pos_w, axis=0), axis=-1)

@@ -131,6 +131,14 @@ def test_nonsense_actions_do_not_break_it():
         assert np.isfinite(observation["state"]).all() and np.isfinite(reward)
 
 
+def test_an_action_beyond_the_space_is_its_nearest_within():
+    env, seen = RaceEnv("zigzag", 0, 0), []
+    for ahead in (1.0, 1.7):
+        env.reset(seed=0)
+        seen.append(env.step(np.array([ahead, 0.2, 0.3], np.float32))[0]["state"])
+    assert np.array_equal(*seen)
+
+
 def test_the_second_gate_and_the_direction_are_shown_where_asked_for():
     env = RaceEnv("zigzag", 0, 1, spec=PolicySpec(second_gate=True, gate_axis=True))
     seen, _ = env.reset(seed=0)

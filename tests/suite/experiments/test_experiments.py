@@ -40,6 +40,8 @@ def test_an_experiment_that_does_not_exist_is_code_2(capsys):
         (["table2", "--delta-policy", "nowhere/policy"], "nowhere/policy: no such file"),
         (["table2", "--delta-policy", "x", "--delta-iterations", "3"], "give the one or the other"),
         (["table2", "--vehicle", "referense"], "Did you mean 'reference'?"),
+        (["table2", "--delta-set", "loss.progress=1"], "give that, too"),
+        (["worlds", "--policy", "{folder}/mine.pt2"], "suite reproduce does of no policy"),
         (["robustness", "--only", "linear_darg"], "Did you mean 'linear_drag'?"),
         (["robustness", "--policy", "racer", "--policy", "racer"], "given twice"),
         (["seeds", "--preset", "smal"], "Did you mean 'small'?"),
@@ -49,7 +51,10 @@ def test_an_experiment_that_does_not_exist_is_code_2(capsys):
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_flown(args, words, sky, tmp_path, capsys):
-    assert reproduce(tmp_path, *args) == 2
+    program, place = tmp_path / "mine.pt2", tmp_path / "place"
+    program.touch()
+    place.mkdir()
+    assert reproduce(place, *(arg.format(folder=tmp_path) for arg in args)) == 2
     said = capsys.readouterr().err
     assert words in said and len(said.strip().splitlines()) == 1
-    assert not sky.flown and not list(tmp_path.iterdir())
+    assert not sky.flown and not list(place.iterdir())

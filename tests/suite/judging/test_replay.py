@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from eval.judging.results import read_trials
 from suite import cli
 from suite.commands import view
@@ -27,6 +29,40 @@ def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
     assert said["trials"][0]["time_s"] == rows[0].time_s
     assert cli.main([*view, "--pick", "passed"]) == 2
     assert "--pick passed" in capfd.readouterr().err
+
+
+def test_a_run_does_not_say_itself_that_it_is_to_be_trusted(tmp_path, capsys):
+    """What `suite view` is given may come from anywhere, and name a program."""
+    out, program = tmp_path / "out", tmp_path / "policy.c"
+    assert _eval(out, "--track", "zigzag", "--trials", "1", "--time-limit-s", "0.1") == 0
+    program.write_text("this is no C, and nobody is to compile it")
+    record = json.loads((out / "run.json").read_text())
+    record["config"] |= {"policies": [str(program)], "trust": True}
+    (out / "run.json").write_text(json.dumps(record))
+    capsys.readouterr()
+    assert cli.main(["view", str(out), "--out", str(tmp_path / "seen")]) == 2
+    assert "if you trust who made the file, pass --trust" in capsys.readouterr().err
+    assert cli.main(["view", str(out), "--out", str(tmp_path / "seen"), "--trust"]) == 2
+    assert "pass --trust" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--seed", "3"], "--seed is 3, but"),
+        (["--speed", "0.5"], "--speed is 0.5, but"),
+        (["--track", "zigzag"], "flown again as they were"),
+    ],
+)
+def test_options_of_a_policy_are_refused_for_a_run(args, words, tmp_path, capsys):
+    (tmp_path / "trials.parquet").touch()
+    assert cli.main(["view", str(tmp_path), *args]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_policy_has_no_trials_that_failed_yet(capsys, tmp_path):
+    assert cli.main(["view", "swift-30", "--pick", "failed", "--out", str(tmp_path)]) == 2
+    assert "--pick is failed, but swift-30 is no run" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp_path, capfd):

@@ -129,6 +129,14 @@ def test_a_whole_folder_that_a_kill_left_aside_is_put_in_place(tmp_path):
     assert (tmp_path / "state" / "new").exists() and not part.exists()
 
 
+def test_a_reader_takes_no_folder_from_who_is_putting_it_in_place(tmp_path):
+    part = tmp_path / f".state-{os.getpid()}-abcdefgh.part"
+    for name in ("replaced", "state"):
+        (part / name).mkdir(parents=True)
+    files.recover_folder(tmp_path / "state")
+    assert (part / "state").exists() and not (tmp_path / "state").exists()
+
+
 def test_a_place_is_tried_before_the_work_and_left_as_it_was(tmp_path):
     files.check_place(tmp_path / "a" / "b" / "c.rrd")
     assert not list(tmp_path.iterdir())

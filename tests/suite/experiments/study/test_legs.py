@@ -19,6 +19,8 @@ def test_a_straight_flight_and_a_circle_before_a_gate():
     assert turned.pop(2).turns == pytest.approx(1.0, abs=0.05)
     assert legs(around)[2].path_m == pytest.approx(STEP_M + 2 * np.pi * RADIUS_M, rel=0.03)
     assert max(leg.turns for leg in turned.values()) < 0.05
+    rows = {name: getattr(straight, name)[:0] for name in ("time_s", "pos_w", "vel_w", "gate")}
+    assert legs(straight._replace(**rows)) == [], "a flight that ended where it began"
 
 
 def test_a_start_from_rest_counts_as_no_turn_and_no_halt():
