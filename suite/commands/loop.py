@@ -28,10 +28,11 @@ class Config:
     difficulty: str = "0,3"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials | None = None
-    """Trials of each policy on every track at every level; by default 50, or 20 with small."""
+    """Trials of each policy on every track at every level; by default 50, or 20 with small; with
+    --world 25, or 20."""
     flights: Trials | None = None
     """Recorded flights on every track at every level; by default 20, or 8 with small; with --world
-    5, or 3."""
+    3."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     world: str | None = None
@@ -43,11 +44,11 @@ class Config:
     iterations: Iterations | None = None
     """Gradient steps of the training, instead of the preset's."""
     finetune_iterations: Iterations | None = None
-    """Gradient steps of each fine-tuning; by default a quarter of the recipe's; with --world 200,
+    """Gradient steps of each fine-tuning; by default a quarter of the recipe's; with --world 60,
     or 100 with small."""
     fit_iterations: Iterations | None = None
     """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with small; with
-    --world 400, or 200."""
+    --world 200."""
     delta: bool = True
     """With --world: Delta Action Models as well, and fine-tunings under them, which take half the
     time; --no-delta leaves them out."""

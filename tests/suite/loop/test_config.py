@@ -114,8 +114,8 @@ def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
     assert (loop.recorded_from, loop.cells, loop.true_vehicle) == (100_003, 6, "reference")
     hidden = resolve(recipe="swift", world=EXAMPLE)
     assert isinstance(hidden, HiddenLoopConfig)
-    assert (hidden.trials, hidden.flights, hidden.fit.iterations) == (50, 5, 400)
-    assert hidden.tuning.optimizer.iterations == 200 and hidden.tuning.quadrotor is not None
+    assert (hidden.trials, hidden.flights, hidden.fit.iterations) == (25, 3, 200)
+    assert hidden.tuning.optimizer.iterations == 60 and hidden.tuning.quadrotor is not None
     assert hidden.true_vehicle == EXAMPLE and hidden.policy == shipped.DEFAULT
     assert set(hidden.digests) == {"vehicle", "world", "policy"}
 
