@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtri
 from scipy.optimize import minimize, minimize_scalar
 
 from suite.diagnose.data.noise import noise_of, typical_variance
@@ -132,7 +133,9 @@ def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray
     matrix = _correlation(np.asarray(windows.row_s), *noise.coloured[name])
     both = seen[:, :, None] & seen[:, None]
     matrix = np.where(both, matrix, np.eye(matrix.shape[-1]))
-    return np.linalg.inv(np.linalg.cholesky(matrix))
+    lower = np.linalg.cholesky(matrix)
+    # A general inverse takes two to five times as long.
+    return np.array([dtrtri(one, lower=1)[0] for one in lower]).reshape(lower.shape)
 
 
 def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray:

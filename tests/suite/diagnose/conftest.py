@@ -1,11 +1,22 @@
-"""One diagnosis of a hidden drag, for the tests of what is said of it."""
+"""One diagnosis of a hidden drag, for the tests of what is said of it; code here is optimised."""
 
+import jax
 import pytest
 
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.verdict.checks import run_checks
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
+
+
+def pytest_runtest_setup():
+    """Optimise what is compiled from here on: diagnoses run for longer than they compile."""
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+def pytest_runtest_teardown():
+    """Compile for other tests as tests/conftest.py says."""
+    jax.config.update("jax_disable_most_optimizations", True)
 
 
 @pytest.fixture(scope="session")
