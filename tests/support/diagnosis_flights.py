@@ -8,7 +8,7 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Command, Motion, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
-from tracks.geometry.rotation import quat_to_rot
+from tracks.geometry.rotation import quat_to_rot, to_local, to_world
 
 NOISE = {"pos": 0.002, "att": 0.004, "vel": 0.02, "rate": 0.02, "motor": 4.0, "acc": 0.15}
 EVERY = 5
@@ -51,48 +51,97 @@ def track(at, yaw, t, motion):
     return Command(np.asarray(thrust), np.clip([8.0, 8.0, 4.0] * vee, -6, 6))
 
 
-def fly(
-    vehicle,
-    seed,
+def fly(vehicle, seed, duration_s=10.0, speed=5.0, *args, extra=None, heading=None, **options):
+    """Return the log of one flight of the true `vehicle`; see `fly_all`."""
+    extras = None if extra is None else [extra]
+    headings = None if heading is None else [heading]
+    return fly_all(
+        [vehicle], [seed], duration_s, speed, *args, extras=extras, headings=headings, **options
+    )[0]
+
+
+def fly_all(
+    vehicles,
+    seeds,
     duration_s=10.0,
     speed=5.0,
     noise=1.0,
     motors=False,
     acc=False,
-    extra=None,
-    heading=None,
+    extras=None,
+    headings=None,
 ):
-    """Return the log of one flight of the true `vehicle`.
+    """Return the logs of flights side by side, one a seed.
 
-    `extra(motion, t)` gives an acceleration in the world that no effect of the catalogue makes;
-    with a `heading` [rad] the vehicle keeps it.
+    There is a vehicle a flight, which differ in the values of their effects alone. `extras` are
+    functions (motion, t), one a flight, of an acceleration in the world that no effect of the
+    catalogue makes; with `headings` [rad] the vehicles keep one each.
     """
-    rng = np.random.default_rng(seed)
-    dt = 1.0 / vehicle.controller.frequency
-    model = compile_quadrotor(mujoco.MjSpec(), vehicle, dt)
-    data = mujoco.MjData(model)
-    at, yaw_rate = reference(rng, speed), rng.uniform(-0.8, 0.8)
-    plant = make_plant(vehicle, dt)
-    draw = uses_noise(plant)
-    state = hover_state(plant, (), noise=rng.standard_normal(3) if draw else None)
-    data.qpos[:3], data.qvel[:3] = at(0.0)[:2]
-    rows, command, force = [], Command(np.zeros(()), np.zeros(3)), np.zeros(3)
+    rngs, dt = (
+        [np.random.default_rng(seed) for seed in seeds],
+        1.0 / vehicles[0].controller.frequency,
+    )
+    models = [compile_quadrotor(mujoco.MjSpec(), vehicle, dt) for vehicle in vehicles]
+    datas = [mujoco.MjData(model) for model in models]
+    curves = [(reference(rng, speed), rng.uniform(-0.8, 0.8)) for rng in rngs]
+    plant = make_plant(vehicles[0], dt, together([vehicle.effects for vehicle in vehicles]))
+    draws = uses_noise(plant)
+    gusts = np.array([rng.standard_normal(3) for rng in rngs]) if draws else None
+    state = hover_state(plant, (len(seeds),), noise=gusts)
+    for data, (at, _) in zip(datas, curves, strict=True):
+        data.qpos[:3], data.qvel[:3] = at(0.0)[:2]
+    rows, force, push = [], np.zeros((len(seeds), 3)), np.zeros((len(seeds), 3))
     for k in range(round(duration_s / dt) + 1):
-        rot = quat_to_rot(data.qpos[3:].copy())
-        motion = Motion(data.qpos[:3].copy(), rot, data.qvel[:3].copy(), data.qvel[3:].copy())
+        qpos, qvel = np.array([d.qpos for d in datas]), np.array([d.qvel for d in datas])
+        motion = Motion(qpos[:, :3], quat_to_rot(qpos[:, 3:]), qvel[:, :3], qvel[:, 3:])
+        each = [Motion(*parts) for parts in zip(*motion, strict=True)] if extras else []
         if k % EVERY == 0:
-            yaw = yaw_rate * k * dt if heading is None else heading
-            command = track(at, yaw, k * dt, motion)
-            rows.append(np.concatenate([[k * dt], data.qpos, data.qvel, [command.thrust],
-                                        command.rate_b, state.rotor_speed, force]))  # fmt: skip
-        inputs = Inputs(command, noise=rng.standard_normal(3) if draw else None)
-        state, wrench = plant_step(plant, state, motion, inputs, k * dt)
-        push = np.zeros(3) if extra is None else extra(motion, k * dt)
-        force = wrench.force_b / plant.constants.mass + rot.T @ push
-        data.qfrc_applied[:3] = rot @ wrench.force_b + push * plant.constants.mass
-        data.qfrc_applied[3:] = wrench.torque_b
-        mujoco.mj_step(model, data)
-    table = np.array(rows)
+            each = each or [Motion(*parts) for parts in zip(*motion, strict=True)]
+            yaws = headings or [rate * k * dt for _, rate in curves]
+            told = [
+                track(at, yaw, k * dt, one)
+                for (at, _), yaw, one in zip(curves, yaws, each, strict=True)
+            ]
+            command = Command(*map(np.array, zip(*told, strict=True)))
+            rows.append(np.column_stack([np.full(len(seeds), k * dt), qpos, qvel, command.thrust,
+                                         command.rate_b, state.rotor_speed, force]))  # fmt: skip
+        gusts = np.array([rng.standard_normal(3) for rng in rngs]) if draws else None
+        state, wrench = plant_step(plant, state, motion, Inputs(command, noise=gusts), k * dt)
+        if extras:
+            push = np.array([extra(one, k * dt) for extra, one in zip(extras, each, strict=True)])
+        mass, rot = plant.constants.mass, motion.rot_w
+        force = wrench.force_b / mass[..., None] + to_local(rot, push)
+        applied = np.concatenate(
+            [to_world(rot, wrench.force_b) + push * mass[..., None], wrench.torque_b], axis=-1
+        )
+        for model, data, one in zip(models, datas, applied, strict=True):
+            data.qfrc_applied[:] = one
+            mujoco.mj_step(model, data)
+    tables = np.array(rows)
+    return [
+        logged(vehicle, seed, rng, tables[:, number], dt, noise, motors, acc)
+        for number, (vehicle, seed, rng) in enumerate(zip(vehicles, seeds, rngs, strict=True))
+    ]
+
+
+def together(effects):
+    """Return effects by name of several vehicles as one's, with an axis more where they differ."""
+    first, *others = effects
+    assert all(list(one) == list(first) for one in others)
+
+    def stacked(*values):
+        arrays = [np.asarray(value, float) for value in values]
+        same = all(np.array_equal(arrays[0], one) for one in arrays)
+        return values[0] if same else np.stack(arrays)
+
+    return {
+        name: type(value)(*map(stacked, *(one[name] for one in effects)))
+        for name, value in first.items()
+    }
+
+
+def logged(vehicle, seed, rng, table, dt, noise, motors, acc):
+    """Return the rows of a flight as a log with noise."""
     columns = {
         "time_s": table[:, 0], "pos_w": table[:, 1:4], "quat_wxyz": table[:, 4:8],
         "vel_w": table[:, 8:11], "rate_b": table[:, 11:14],

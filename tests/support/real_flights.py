@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import fly_all
 from tests.support.pendulum import Pendulum
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -34,17 +34,16 @@ def flights(
     keep one each, in turn; a `load` of so many kg hangs on a line of so many metres.
     """
     effects = {**(hidden or {}), **effects}
-    rng, logs = np.random.default_rng(seed), []
-    for number in range(count):
+    rng, vehicles, swings = np.random.default_rng(seed), [], []
+    for _ in range(count):
         own = tuple((trim * TRIM * rng.standard_normal(3)).tolist())
-        true = with_effects(VEHICLE, **effects, torque_trim=(own,))
-        swing = None
+        vehicles.append(with_effects(VEHICLE, **effects, torque_trim=(own,)))
         if load is not None:
-            swing = Pendulum(*load, VEHICLE.mass, tuple(rng.uniform(-0.25, 0.25, 2).tolist()))
-        heading = headings[number % len(headings)] if headings else None
-        log = fly(
-            true, 100 * seed + number, duration_s, speed, noise, motors=True, extra=swing,
-            heading=heading,
-        )  # fmt: skip
-        logs.append(replace(log, about={}))
-    return logs
+            lean = tuple(rng.uniform(-0.25, 0.25, 2).tolist())
+            swings.append(Pendulum(*load, VEHICLE.mass, lean))
+    kept = [headings[number % len(headings)] for number in range(count)] if headings else None
+    seeds = range(100 * seed, 100 * seed + count)
+    logs = fly_all(
+        vehicles, seeds, duration_s, speed, noise, motors=True, extras=swings, headings=kept
+    )
+    return [replace(log, about={}) for log in logs]

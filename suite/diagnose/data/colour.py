@@ -13,8 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg import get_lapack_funcs, solve_triangular
 from scipy.optimize import minimize, minimize_scalar
 
 from suite.diagnose.data.noise import noise_of, typical_variance
@@ -135,7 +134,8 @@ def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray
     matrix = np.where(both, matrix, np.eye(matrix.shape[-1]))
     lower = np.linalg.cholesky(matrix)
     # A general inverse takes two to five times as long.
-    return np.array([dtrtri(one, lower=1)[0] for one in lower]).reshape(lower.shape)
+    (inverse,) = get_lapack_funcs(("trtri",), (lower,))
+    return np.array([inverse(one, lower=1)[0] for one in lower]).reshape(lower.shape)
 
 
 def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.verdict.checks import run_checks
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 
@@ -24,7 +24,7 @@ def drag():
     """Return the diagnosis of three flights with a drag that the vehicle file lacks."""
     given = with_lag(PLAIN, 0.03)
     truth = with_effects(given, linear_drag=((0.15, 0.15, 0.05),))
-    logs = [fly(truth, seed, duration_s=5.0, motors=True) for seed in range(3)]
+    logs = fly_all([truth] * 3, range(3), duration_s=5.0, motors=True)
     return diagnose(logs, given, "commands")
 
 

@@ -26,7 +26,7 @@ from suite.diagnose.report.page import page
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.checks import run_checks
 from tests.support.broken_logs import BREAKAGES
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.pendulum import Pendulum
 from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 from tracks.common.files import plain, to_json
@@ -41,7 +41,7 @@ CASES = {
 
 
 def flights(vehicle, seed=0, count=3, **options):
-    return [fly(vehicle, seed + k, duration_s=7.0, **options) for k in range(count)]
+    return fly_all([vehicle] * count, range(seed, seed + count), duration_s=7.0, **options)
 
 
 def within(entry, truth):
@@ -124,7 +124,7 @@ def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
     def swing(motion, t):
         return np.array([0.8 * np.sin(2 * np.pi * 1.3 * t), 0.8 * np.cos(2 * np.pi * 1.1 * t), 0.0])
 
-    found = diagnosis_json(diagnose(flights(LAGGED, extra=swing), LAGGED))
+    found = diagnosis_json(diagnose(flights(LAGGED, extras=[swing] * 3), LAGGED))
     assert found["verdict"] in ("unknown", "partly")
 
 
@@ -135,10 +135,8 @@ SIDE = {"linear_drag": ((0.25, 0.45, 0.1),), "constant_wind": ((0.4, -0.5, 0.0),
 def blown(*headings):
     """Return what is named of flights that hardly move, with what could stand in its place."""
     truth = with_effects(LAGGED, **SIDE)
-    logs = [
-        fly(truth, 50 + k, 6.0, speed=0.2, noise=2.0, heading=heading)
-        for k, heading in enumerate(headings)
-    ]
+    each = range(50, 50 + len(headings))
+    logs = fly_all([truth] * len(each), each, 6.0, speed=0.2, noise=2.0, headings=headings)
     found = diagnosis_json(diagnose(logs, LAGGED))
     return {effect["name"]: set(effect["alternatives"]) for effect in found["effects"]}
 
@@ -175,10 +173,8 @@ def test_a_payload_is_its_mass_and_where_it_sits(ways):
 
 @pytest.mark.slow
 def test_a_load_on_a_line_is_said_to_swing():
-    logs = [
-        fly(LAGGED, seed, 8.0, speed=1.5, extra=Pendulum(0.08, 0.5, LAGGED.mass))
-        for seed in range(3)
-    ]
+    loads = [Pendulum(0.08, 0.5, LAGGED.mass) for _ in range(3)]
+    logs = fly_all([LAGGED] * 3, range(3), 8.0, speed=1.5, extras=loads)
     # Without names, for the search takes longer than what is asked here.
     found = diagnosis_json(diagnose(logs, LAGGED, limits=Thresholds(most_names=0)))
     assert found["verdict"] == "unknown"
@@ -214,7 +210,7 @@ VERDICTS = ("no_gap", "named", "partly", "unknown")
 
 @pytest.fixture(scope="module")
 def sound():
-    return [fly(TRUTH, seed, duration_s=5.0, motors=True) for seed in range(3)]
+    return fly_all([TRUTH] * 3, range(3), duration_s=5.0, motors=True)
 
 
 def outcome(logs, drive="commands"):

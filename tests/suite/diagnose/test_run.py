@@ -14,7 +14,7 @@ import pytest
 from eval.logs.flight_log import read_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import fly_all
 from tests.support.recordings import columns
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -36,10 +36,8 @@ def diagnosed(tmp_path_factory):
     """A diagnosis of a drag with rotor speeds in the logs, by the command line."""
     folder = tmp_path_factory.mktemp("diagnosis")
     truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
-    paths = [
-        str(write_flight(folder / f"{k}.parquet", fly(truth, k, duration_s=6.0, motors=True)))
-        for k in range(3)
-    ]
+    logs = fly_all([truth] * 3, range(3), duration_s=6.0, motors=True)
+    paths = [str(write_flight(folder / f"{k}.parquet", log)) for k, log in enumerate(logs)]
     bad = folder / "bad.csv"
     bad.write_text("time,pos_x\n0,1\n", encoding="utf-8")
     save_vehicle(LAGGED, folder / "v.toml")

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.actuators import actuator_mismatches
-from tests.support.diagnosis_flights import NOISE, fly
+from tests.support.diagnosis_flights import NOISE, fly, fly_all
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)
 
 
 def apart(truth, given=LAGGED):
-    logs = [fly(truth, seed, duration_s=4.0, motors=True) for seed in range(2)]
+    logs = fly_all([truth] * 2, range(2), duration_s=4.0, motors=True)
     (found,) = actuator_mismatches(logs, given)
     return found
 
@@ -36,7 +36,7 @@ def test_lag_and_delay_are_told_apart():
 
 
 def test_a_rotor_that_does_not_reach_its_speed_is_seen():
-    logs = [fly(LAGGED, seed, duration_s=4.0, motors=True) for seed in range(2)]
+    logs = fly_all([LAGGED] * 2, range(2), duration_s=4.0, motors=True)
     pairs = [(log, log.rotor_speed, log.thrust_cmd) for log in logs]
     slow = [
         replace(log, rotor_speed=speed * [1.0, 0.97, 1.0, 1.0])

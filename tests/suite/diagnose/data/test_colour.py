@@ -11,7 +11,7 @@ from suite.diagnose.data.colour import (
     measured_noise,
 )
 from suite.diagnose.data.windows import SLICES, cut
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN
 
 GROUP = "attitude"
@@ -19,7 +19,7 @@ GROUP = "attitude"
 
 @pytest.fixture(scope="module")
 def windows():
-    found, _ = cut([fly(PLAIN, seed, duration_s=8.0) for seed in range(3)], PLAIN, False)
+    found, _ = cut(fly_all([PLAIN] * 3, range(3), duration_s=8.0), PLAIN, False)
     assert found is not None
     return found
 

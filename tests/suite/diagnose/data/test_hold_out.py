@@ -1,13 +1,11 @@
 """Held out is what can be spared."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from suite.diagnose.data.hold_out import choose_held_out
 from suite.diagnose.data.windows import cut
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)
@@ -15,7 +13,7 @@ LAGGED = with_lag(PLAIN, 0.03)
 
 @pytest.fixture(scope="module")
 def three():
-    logs = [replace(fly(LAGGED, k, duration_s=4.0), name=f"flight_{k}") for k in range(3)]
+    logs = fly_all([LAGGED] * 3, range(3), duration_s=4.0)
     windows, _ = cut(logs, LAGGED, False)
     return logs, windows
 

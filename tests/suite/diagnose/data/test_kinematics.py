@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.kinematics import check_kinematics, facts_of
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.vehicles import PLAIN, with_effects
 
 HALF_STEP_S = 0.001
@@ -12,7 +12,7 @@ HALF_STEP_S = 0.001
 
 
 def flights(vehicle, count=3):
-    return [fly(vehicle, seed, duration_s=5.0) for seed in range(count)]
+    return fly_all([vehicle] * count, range(count), duration_s=5.0)
 
 
 def test_a_clean_log_has_no_faults():

@@ -20,7 +20,7 @@ from suite.diagnose.fit.whitening import (
     whiten,
     whitened_residual,
 )
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)
@@ -32,7 +32,7 @@ NEEDED = ("acc_b", "command")
 def flown():
     """Return a model, windows with a drag that it lacks, and their slopes along everything."""
     truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
-    windows, _ = cut([fly(truth, seed, duration_s=4.0) for seed in range(3)], LAGGED, False)
+    windows, _ = cut(fly_all([truth] * 3, range(3), duration_s=4.0), LAGGED, False)
     assert windows is not None
     model = RolloutModel(LAGGED, SPACE, rotor_input=False, voltage=False)
     begin = start_estimate(model, windows)

@@ -8,13 +8,20 @@ import numpy as np
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
+from policies.networks import network
 from suite.train.beyond import carried
 from suite.train.config import QuadrotorConfig
-from suite.train.gradient import make_gradient
-from suite.train.rollout import make_start
+from suite.train.rollout import make_rollout, make_start
 from tests.support.training import KEY, SPEC, boxes_worlds, fresh_params, small_config
 
 ALIKE = {"depth_noise": 0.0, "fov_scale": (1.0, 1.0)}
+
+
+def flown(config, params):
+    """Return fly(worlds) -> the records of a rollout, without its gradient."""
+    rollout = make_rollout(config)
+    still = jnp.zeros((config.episode.steps, config.episode.batch, config.spec.hidden_size))
+    return jax.jit(lambda worlds: rollout(params, still, worlds, KEY, network.encode)[1])
 
 
 @pytest.mark.parametrize("model", ["point", "late", "quadrotor"])
@@ -27,18 +34,16 @@ def test_two_rollouts_of_worlds_that_live_on_are_one_of_twice_the_length(model):
     worlds, params = jax.tree.map(jnp.asarray, boxes_worlds(config)), fresh_params(lively=3.0)
     # In the air and at speed: nothing crashes within half a second.
     worlds = worlds._replace(pos_w=worlds.pos_w + jnp.asarray([0.0, 0.0, 20.0]))
-    whole = jax.jit(make_gradient(longer))(params, worlds._replace(stop=np.full(4, 6)), KEY, None)[
-        2
-    ]
-    gradient = jax.jit(make_gradient(config))
-    first = gradient(params, worlds, KEY, None)[2]
+    whole = flown(longer, params)(worlds._replace(stop=np.full(4, 6)))
+    fly = flown(config, params)
+    first = fly(worlds)
     left = carried.carried_over(config, KEY, worlds, first.after, first.hit)
     assert np.all(left.begun)
     fresh = jax.tree.map(jnp.asarray, boxes_worlds(config, 1))
-    second = gradient(params, carried.taken_over(config, fresh, left), KEY, None)[2]
-    flown = np.concatenate([first.pos_w, second.pos_w])
-    np.testing.assert_allclose(flown, whole.pos_w, atol=1e-5)
-    assert np.ptp(flown[3:], axis=0).max() > 0.01, "they move"
+    second = fly(carried.taken_over(config, fresh, left))
+    pos_w = np.concatenate([first.pos_w, second.pos_w])
+    np.testing.assert_allclose(pos_w, whole.pos_w, atol=1e-5)
+    assert np.ptp(pos_w[3:], axis=0).max() > 0.01, "they move"
 
 
 def after_of(config, steps, crash_at):
