@@ -24,6 +24,13 @@ class Thresholds:
     """Left out after each hole where lags are fitted, for the same reason [s]."""
     longest_lag_s: float = 0.15
     """Slowest motors that are thought of [s]."""
+    lag_followed_share: float = 0.99
+    """Commands tell the rotors' lag where they give this share of how the speeds change, with it:
+    where speeds change little, noise of the rates in what is asked for looks like a lag [1]."""
+    lag_closed_share: float = 0.25
+    """And where it closes this share of the squared error that the vehicle's lag leaves [1]."""
+    lag_least_flights: int = 3
+    """Flights that tell it must be as many."""
     longest_delay_s: float = 0.06
     """Latest commands that are thought of [s]."""
     delays_tried: int = 9

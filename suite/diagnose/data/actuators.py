@@ -41,6 +41,8 @@ class ActuatorMismatch(NamedTuple):
     """Measured over asked, by rotor, beside that lag and delay."""
     rms_fitted: float
     """Of what they leave [rad/s]."""
+    rms_own: float
+    """The same with the vehicle file's lag, beside the delay that fits best with that [rad/s]."""
     thrust: tuple[float, float]
     """Mean and spread of measured minus asked collective thrust, over nominal mass [m/s^2]."""
     turn: tuple[tuple[float, float], ...]
@@ -156,13 +158,16 @@ def _mismatch(
     def scales(speed: np.ndarray) -> np.ndarray:
         return (speed * measured).sum(0) / np.maximum((speed**2).sum(0), 1e-9)
 
+    def left(asked: Sequence[np.ndarray], time_constant: float) -> float:
+        speed = followed(asked, time_constant)
+        return float(((measured - scales(speed) * speed) ** 2).mean())
+
     def best_lag(delay: float) -> tuple[float, float]:
         """Return the mean squared error that the best lag leaves, and the lag."""
         asked = [part.demand(delay) for part in stretches]
 
         def cost(time_constant: float) -> float:
-            speed = followed(asked, time_constant)
-            return float(((measured - scales(speed) * speed) ** 2).mean())
+            return left(asked, time_constant)
 
         options = {"xatol": 1e-4}
         best = minimize_scalar(
@@ -170,17 +175,9 @@ def _mismatch(
         )
         return min((float(best.fun), float(best.x)), (cost(0.0), 0.0))
 
-    tried = np.linspace(0.0, limits.longest_delay_s, limits.delays_tried)
-    place = int(np.argmin([best_lag(delay)[0] for delay in tried]))
-    near = (tried[max(place - 1, 0)], tried[min(place + 1, limits.delays_tried - 1)])
-    options = {"xatol": 2e-4}
-    refined = minimize_scalar(
-        lambda delay: best_lag(delay)[0], bounds=near, method="bounded", options=options
-    )
-    delay = float(refined.x)
-    if best_lag(0.0)[0] <= float(refined.fun):
-        delay = 0.0
+    delay, _ = _least(lambda delay: best_lag(delay)[0], limits)
     _, time_constant = best_lag(delay)
+    _, own = _least(lambda delay: left([part.demand(delay) for part in stretches], lag), limits)
     nominal = followed([part.demand(0.0) for part in stretches], lag)
     fitted = followed([part.demand(delay) for part in stretches], time_constant)
     scale = scales(fitted)
@@ -193,9 +190,21 @@ def _mismatch(
         delay=delay,
         scale=tuple(float(s) for s in scale),
         rms_fitted=_rms(measured - scale * fitted),
+        rms_own=float(np.sqrt(own)),
         thrust=(float(thrust.mean()), float(thrust.std())),
         turn=tuple((float(t.mean()), float(t.std())) for t in turn.T),
     )
+
+
+def _least(cost: Callable[[float], float], limits: Thresholds) -> tuple[float, float]:
+    """Return the delay of the commands that costs least [s], and what it costs."""
+    tried = np.linspace(0.0, limits.longest_delay_s, limits.delays_tried)
+    place = int(np.argmin([cost(delay) for delay in tried]))
+    near = (tried[max(place - 1, 0)], tried[min(place + 1, limits.delays_tried - 1)])
+    options = {"xatol": 2e-4}
+    refined = minimize_scalar(cost, bounds=near, method="bounded", options=options)
+    best, none = float(refined.fun), cost(0.0)
+    return (0.0, none) if none <= best else (float(refined.x), best)
 
 
 def _follow(asked: np.ndarray, row: np.ndarray, dt: float, time_constant: float) -> np.ndarray:

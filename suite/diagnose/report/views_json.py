@@ -13,6 +13,8 @@ from suite.diagnose.report.parameters_json import parameters_json
 from suite.diagnose.views.by_views import ViewResult, ViewsDiagnosis
 from suite.diagnose.views.fit.search import ViewName
 from suite.diagnose.views.judged import gap_without
+from suite.diagnose.views.rotor_lag import NAME as LAG
+from suite.diagnose.views.rotor_lag import RotorLag
 
 MEASURE = (
     "RMS over the axes of what the model leaves of {about} on held-out flights [{unit}], both "
@@ -56,7 +58,10 @@ def headline(found: ViewsDiagnosis) -> str:
     """Return the answer in a sentence."""
     gap, view = found.main.gap, found.main.view
     could = gap.share(gap.explainable)
+    late = _late(found)
     if not found.named:
+        if late:
+            return late.strip()
         if found.verdict == "no_gap":
             what = "has changed" if found.references else "is missing"
             return f"Nothing that the flights agree on {what}."
@@ -74,7 +79,18 @@ def headline(found: ViewsDiagnosis) -> str:
     return (
         f"{names}{since}: the {view.name} on held-out flights is {gap.rms(gap.after):.3g} instead "
         f"of {gap.rms(gap.before):.3g} {view.unit} off; of what any model could close of its "
-        f"changes within a flight here, {100 * min(share, 1.0):.0f} %.{swings}"
+        f"changes within a flight here, {100 * min(share, 1.0):.0f} %.{swings}{late}"
+    )
+
+
+def _late(found: ViewsDiagnosis) -> str:
+    """Return what is said of the rotors' lag, "" where it is the vehicle's."""
+    if found.lag is None:
+        return ""
+    lag = found.lag
+    return (
+        f" {LAG}: the rotors follow their commands with a time constant of "
+        f"{lag.time_constant:.3g} s instead of {lag.known:.3g} s."
     )
 
 
@@ -83,7 +99,21 @@ def effects_json(found: ViewsDiagnosis) -> list[dict[str, Any]]:
     effects = {}
     for result, name in found.named:
         effects.setdefault((result.view.name, name.candidate.name), (result, []))[1].append(name)
-    return [_effect(found, result, names) for result, names in effects.values()]
+    told = [_effect(found, result, names) for result, names in effects.values()]
+    return told if found.lag is None else [*told, _lag_effect(found.lag)]
+
+
+def _lag_effect(lag: RotorLag) -> dict[str, Any]:
+    low, high = lag.time_constant - lag.half_width, lag.time_constant + lag.half_width
+    entry = {"value": lag.time_constant, "unit": "s", "ci95": [max(low, 0.0), high]}
+    return {
+        "name": LAG,
+        "alternatives": [],
+        "parameters": {"time_constant": entry},
+        "gap_removed": lag.closed,
+        "p_value": lag.p_value,
+        "view": "commands",
+    }
 
 
 def _effect(found: ViewsDiagnosis, result: ViewResult, names: Sequence[ViewName]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.hold_out import choose_held_out
@@ -29,6 +30,8 @@ from suite.diagnose.views.fit.reference import (
 from suite.diagnose.views.fit.search import ViewName, ViewSearch, search_view
 from suite.diagnose.views.fit.weigh import weights_of
 from suite.diagnose.views.judged import ViewGap, judge
+from suite.diagnose.views.rotor_lag import NAME as LAG
+from suite.diagnose.views.rotor_lag import RotorLag, another_lag
 from suite.diagnose.views.swing import Swing, swing_left
 
 
@@ -69,6 +72,8 @@ class ViewsDiagnosis:
     seconds: float
     swing: Swing | None = None
     """In what the force view leaves with its names."""
+    lag: RotorLag | None = None
+    """Of the rotors, where it is not the given vehicle's."""
 
     @property
     def main(self) -> ViewResult:
@@ -150,18 +155,22 @@ def diagnose_by_views(
         if result.view.name == FORCE.name and not references:
             every = ViewTask(result.view, model, flights.smoothed[FORCE.name], limits)
             swing = swing_left(every, result.search.last.theta)
+    lag = None if references else another_lag(logs, vehicle, limits)
+    if lag:
+        say(f"commands and rotor speeds: {LAG}, {lag.time_constant:.3g} s")
     return ViewsDiagnosis(
-        verdict=_verdict(results, swing, limits),
+        verdict=_verdict(results, swing, lag, limits),
         results=results,
         space=space,
         flights=flights,
         held_out=held_names,
-        vehicle=_with_names(vehicle, space, results),
+        vehicle=_with_names(vehicle, space, results, lag),
         spread=spread,
         references=tuple(log.name for log in references),
         warnings=warnings,
         seconds=time.monotonic() - began,
         swing=swing,
+        lag=lag,
     )
 
 
@@ -258,23 +267,32 @@ def _relative(result: ViewResult, name: ViewName) -> float:
     return float(np.mean([result.half_width[i] for i in at]) / max(away.mean(), 1e-12))
 
 
-def _verdict(results: Sequence[ViewResult], swing: Swing | None, limits: Thresholds) -> str:
+def _verdict(
+    results: Sequence[ViewResult], swing: Swing | None, lag: RotorLag | None, limits: Thresholds
+) -> str:
     """Return what is said of the gap: what is named is judged by the views that name something.
 
-    Nothing that is fitted swings.
+    Nothing that is fitted swings. A lag of the rotors is in no view.
     """
     named = [one for one in results if one.names]
     if swing:
-        return "partly" if named else "unknown"
+        return "partly" if named or lag else "unknown"
     if named:
         left = [one.gap.share(one.gap.left) for one in named]
         return "named" if max(left) <= limits.view_left_share else "partly"
     could = [one.gap.share(one.gap.explainable) for one in results]
-    return "unknown" if max(could) > limits.view_left_share else "no_gap"
+    if max(could) > limits.view_left_share:
+        return "partly" if lag else "unknown"
+    return "named" if lag else "no_gap"
 
 
-def _with_names(vehicle: Vehicle, space: ParameterSpace, results: Sequence[ViewResult]) -> Vehicle:
-    """Return `vehicle` with the names of all views in place of what it has of them."""
+def _with_names(
+    vehicle: Vehicle,
+    space: ParameterSpace,
+    results: Sequence[ViewResult],
+    lag: RotorLag | None,
+) -> Vehicle:
+    """Return `vehicle` with what was named, the lag too, in place of what it has of it."""
     theta = space.array("start")
     names = []
     for one in results:
@@ -282,4 +300,5 @@ def _with_names(vehicle: Vehicle, space: ParameterSpace, results: Sequence[ViewR
             at = list(name.candidate.indices)
             theta[at] = one.search.last.theta[at]
             names.append(name.candidate.name)
-    return with_fitted(vehicle, space, theta, names)
+    besides = {LAG: EFFECTS[LAG].values(lag.time_constant)} if lag else None
+    return with_fitted(vehicle, space, theta, names, besides)
