@@ -39,11 +39,9 @@ def another_lag(
 ) -> RotorLag | None:
     """Return the rotors' lag where commands and measured rotor speeds say that it is another one.
 
-    The nominal rate loop must explain the speeds in every flight: a firmware's integrators and
-    filters are no lag.
-
     Args:
-        logs: flights; those without commands or rotor speeds do not count.
+        logs: flights; those do not count that are without commands or rotor speeds, or in which the
+            nominal rate loop does not explain the speeds: a firmware's filters are no lag.
         vehicle: what a simulation uses.
         limits: from where on flights tell it.
     """
@@ -53,8 +51,8 @@ def another_lag(
     known = vehicle.rotors.time_constant if own is None else float(own.time_constant)
     vehicle = replace(vehicle, rotors=replace(vehicle.rotors, time_constant=known))
     told = [_asked_by_loop(log, vehicle, limits) for log in logs]
-    found = [one for one in told if one is not None]
-    if len(found) < limits.lag_least_flights or any(_missed(one, limits) for one in found):
+    found = [one for one in told if one is not None and _explains(one, limits)]
+    if len(found) < limits.lag_least_flights:
         return None
     lags = np.array([one.time_constant for one in found])
     step = 0.5 * step_s(vehicle)
@@ -83,5 +81,5 @@ def _asked_by_loop(log: FlightLog, vehicle: Vehicle, limits: Thresholds) -> Actu
     return next((one for one in found if one.asked_by == "nominal rate loop"), None)
 
 
-def _missed(one: ActuatorMismatch, limits: Thresholds) -> bool:
-    return one.rms_fitted**2 > (1.0 - limits.lag_followed_share) * one.spread**2
+def _explains(one: ActuatorMismatch, limits: Thresholds) -> bool:
+    return one.rms_fitted**2 <= (1.0 - limits.lag_followed_share) * one.spread**2

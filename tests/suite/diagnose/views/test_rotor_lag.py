@@ -46,6 +46,8 @@ def test_a_lag_that_the_vehicle_has_is_not_named(slow):
 def test_flights_that_cannot_tell_are_left_alone(slow):
     assert another_lag(slow, GIVEN) is not None
     assert another_lag(slow[:2], GIVEN) is None, "two flights"
+    calm = fly_all([GIVEN], [7], duration_s=3.0, speed=0.3, motors=True)
+    assert another_lag([*slow, *calm], GIVEN) == another_lag(slow, GIVEN), "speeds hardly change"
     assert another_lag([replace(log, rotor_speed=None) for log in slow], GIVEN) is None
     assert another_lag(slow, with_lag(REMEMBERING, 0.03)) is None, "a loop that remembers"
     rng = np.random.default_rng(0)
