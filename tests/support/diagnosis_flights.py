@@ -90,7 +90,8 @@ def fly_all(
     state = hover_state(plant, (len(seeds),), noise=gusts)
     for data, (at, _) in zip(datas, curves, strict=True):
         data.qpos[:3], data.qvel[:3] = at(0.0)[:2]
-    rows, force, push = [], np.zeros((len(seeds), 3)), np.zeros((len(seeds), 3))
+    rows, command = [], Command(np.zeros(len(seeds)), np.zeros((len(seeds), 3)))
+    force, push = np.zeros((len(seeds), 3)), np.zeros((len(seeds), 3))
     for k in range(round(duration_s / dt) + 1):
         qpos, qvel = np.array([d.qpos for d in datas]), np.array([d.qvel for d in datas])
         motion = Motion(qpos[:, :3], quat_to_rot(qpos[:, 3:]), qvel[:, :3], qvel[:, 3:])
