@@ -60,7 +60,7 @@ def headline(found: ViewsDiagnosis) -> str:
     could = gap.share(gap.explainable)
     late = _late(found)
     if not found.named:
-        if late:
+        if found.verdict == "named":
             return late.strip()
         if found.verdict == "no_gap":
             what = "has changed" if found.references else "is missing"
@@ -68,7 +68,7 @@ def headline(found: ViewsDiagnosis) -> str:
         swings = f"It {found.swing.words}. " if found.swing else ""
         return (
             f"{swings}No effect that flights can tell explains it; a black box closes "
-            f"{100 * could:.0f} % of the variance of the {view.name}."
+            f"{100 * could:.0f} % of the variance of the {view.name}.{late}"
         )
     names = " and ".join(
         " or ".join([name.candidate.label, *name.rivals]) for _, name in found.named

@@ -1,8 +1,11 @@
 """What the JSON says of real flights."""
 
+from dataclasses import replace
+
 import pytest
 
 from suite.diagnose.report.views_json import MEASURE, effects_json, headline, views_json
+from suite.diagnose.views.rotor_lag import RotorLag
 from tracks.common.files import plain
 
 
@@ -23,3 +26,17 @@ def test_the_json_has_every_axis_and_says_nothing_twice(by_views):
     assert told["gap"]["before"] == pytest.approx(whole)
     assert told["gap"]["measure"].startswith(MEASURE.split("{")[0])
     assert told["headline"] == headline(by_views) and "linear_drag" in headline(by_views)
+
+
+def test_a_lag_is_said_beside_what_is_left(by_views):
+    nothing = tuple(replace(one, names=()) for one in by_views.results)
+    lag = RotorLag(0.06, 0.03, 0.001, 0.9, 0.001)
+    late = "with a time constant of 0.06 s instead of 0.03 s."
+    left = headline(replace(by_views, results=nothing, lag=lag, verdict="partly"))
+    assert "No effect that flights can tell" in left and left.endswith(late)
+    alone = headline(replace(by_views, results=nothing, lag=lag, verdict="named"))
+    assert alone.startswith("motor_lag") and alone.endswith(late)
+    (only,) = effects_json(replace(by_views, results=nothing, lag=lag))
+    entry = only["parameters"]["time_constant"]
+    assert (entry["unit"], entry["value"]) == ("s", 0.06)
+    assert entry["ci95"] == pytest.approx([0.059, 0.061])
