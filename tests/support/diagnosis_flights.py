@@ -51,13 +51,9 @@ def track(at, yaw, t, motion):
     return Command(np.asarray(thrust), np.clip([8.0, 8.0, 4.0] * vee, -6, 6))
 
 
-def fly(vehicle, seed, duration_s=10.0, speed=5.0, *args, extra=None, heading=None, **options):
+def fly(vehicle, seed, *args, **options):
     """Return the log of one flight of the true `vehicle`; see `fly_all`."""
-    extras = None if extra is None else [extra]
-    headings = None if heading is None else [heading]
-    return fly_all(
-        [vehicle], [seed], duration_s, speed, *args, extras=extras, headings=headings, **options
-    )[0]
+    return fly_all([vehicle], [seed], *args, **options)[0]
 
 
 def fly_all(
@@ -77,10 +73,8 @@ def fly_all(
     functions (motion, t), one a flight, of an acceleration in the world that no effect of the
     catalogue makes; with `headings` [rad] the vehicles keep one each.
     """
-    rngs, dt = (
-        [np.random.default_rng(seed) for seed in seeds],
-        1.0 / vehicles[0].controller.frequency,
-    )
+    rngs = [np.random.default_rng(seed) for seed in seeds]
+    dt = 1.0 / vehicles[0].controller.frequency
     models = [compile_quadrotor(mujoco.MjSpec(), vehicle, dt) for vehicle in vehicles]
     datas = [mujoco.MjData(model) for model in models]
     curves = [(reference(rng, speed), rng.uniform(-0.8, 0.8)) for rng in rngs]
@@ -95,9 +89,9 @@ def fly_all(
     for k in range(round(duration_s / dt) + 1):
         qpos, qvel = np.array([d.qpos for d in datas]), np.array([d.qvel for d in datas])
         motion = Motion(qpos[:, :3], quat_to_rot(qpos[:, 3:]), qvel[:, :3], qvel[:, 3:])
-        each = [Motion(*parts) for parts in zip(*motion, strict=True)] if extras else []
+        looked = extras or k % EVERY == 0
+        each = [Motion(*parts) for parts in zip(*motion, strict=True)] if looked else []
         if k % EVERY == 0:
-            each = each or [Motion(*parts) for parts in zip(*motion, strict=True)]
             yaws = headings or [rate * k * dt for _, rate in curves]
             told = [
                 track(at, yaw, k * dt, one)

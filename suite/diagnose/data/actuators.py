@@ -9,6 +9,7 @@ logged commands, and the nominal lag follows them.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -164,11 +165,7 @@ def _mismatch(
 
     def best_lag(delay: float) -> tuple[float, float]:
         """Return the mean squared error that the best lag leaves, and the lag."""
-        asked = [part.demand(delay) for part in stretches]
-
-        def cost(time_constant: float) -> float:
-            return left(asked, time_constant)
-
+        cost = partial(left, [part.demand(delay) for part in stretches])
         options = {"xatol": 1e-4}
         best = minimize_scalar(
             cost, bounds=(0.0, limits.longest_lag_s), method="bounded", options=options

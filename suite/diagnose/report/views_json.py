@@ -13,8 +13,7 @@ from suite.diagnose.report.parameters_json import parameters_json
 from suite.diagnose.views.by_views import ViewResult, ViewsDiagnosis
 from suite.diagnose.views.fit.search import ViewName
 from suite.diagnose.views.judged import gap_without
-from suite.diagnose.views.rotor_lag import NAME as LAG
-from suite.diagnose.views.rotor_lag import RotorLag
+from suite.diagnose.views.rotor_lag import LAG, RotorLag
 
 MEASURE = (
     "RMS over the axes of what the model leaves of {about} on held-out flights [{unit}], both "
@@ -100,16 +99,17 @@ def effects_json(found: ViewsDiagnosis) -> list[dict[str, Any]]:
     for result, name in found.named:
         effects.setdefault((result.view.name, name.candidate.name), (result, []))[1].append(name)
     told = [_effect(found, result, names) for result, names in effects.values()]
-    return told if found.lag is None else [*told, _lag_effect(found.lag)]
+    return told if found.lag is None else [*told, _lag_effect(found, found.lag)]
 
 
-def _lag_effect(lag: RotorLag) -> dict[str, Any]:
-    low, high = lag.time_constant - lag.half_width, lag.time_constant + lag.half_width
-    entry = {"value": lag.time_constant, "unit": "s", "ci95": [max(low, 0.0), high]}
+def _lag_effect(found: ViewsDiagnosis, lag: RotorLag) -> dict[str, Any]:
+    (index,) = (i for i, entry in enumerate(found.space.entries) if entry.effect == LAG)
+    theta = found.space.array("start")
+    theta[index] = lag.time_constant
     return {
         "name": LAG,
         "alternatives": [],
-        "parameters": {"time_constant": entry},
+        "parameters": parameters_json(found.space, LAG, [index], theta, {index: lag.half_width}),
         "gap_removed": lag.closed,
         "p_value": lag.p_value,
         "view": "commands",

@@ -30,8 +30,7 @@ from suite.diagnose.views.fit.reference import (
 from suite.diagnose.views.fit.search import ViewName, ViewSearch, search_view
 from suite.diagnose.views.fit.weigh import weights_of
 from suite.diagnose.views.judged import ViewGap, judge
-from suite.diagnose.views.rotor_lag import NAME as LAG
-from suite.diagnose.views.rotor_lag import RotorLag, another_lag
+from suite.diagnose.views.rotor_lag import LAG, RotorLag, another_lag
 from suite.diagnose.views.swing import Swing, swing_left
 
 

@@ -15,7 +15,7 @@ from suite.diagnose.data.actuators import ActuatorMismatch, actuator_mismatches
 from suite.diagnose.data.windows import remembers, step_s
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
-NAME = "motor_lag"
+LAG = "motor_lag"
 """The effect that is named."""
 
 
@@ -47,7 +47,7 @@ def another_lag(
     """
     if remembers(vehicle):
         return None
-    own = vehicle.effects.get(NAME)
+    own = vehicle.effects.get(LAG)
     known = vehicle.rotors.time_constant if own is None else float(own.time_constant)
     vehicle = replace(vehicle, rotors=replace(vehicle.rotors, time_constant=known))
     told = [_asked_by_loop(log, vehicle, limits) for log in logs]

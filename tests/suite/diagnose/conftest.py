@@ -1,5 +1,7 @@
 """One diagnosis of a hidden drag, for the tests of what is said of it; code here is optimised."""
 
+import os
+
 import jax
 import pytest
 
@@ -8,6 +10,9 @@ from suite.diagnose.verdict.checks import run_checks
 from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
+UNOPTIMISED = os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] != "0"
+"""As tests/conftest.py, or who calls, says."""
+
 
 def pytest_runtest_setup():
     """Optimise what is compiled from here on: diagnoses run for longer than they compile."""
@@ -15,8 +20,8 @@ def pytest_runtest_setup():
 
 
 def pytest_runtest_teardown():
-    """Compile for other tests as tests/conftest.py says."""
-    jax.config.update("jax_disable_most_optimizations", True)
+    """Compile for other tests as before."""
+    jax.config.update("jax_disable_most_optimizations", UNOPTIMISED)
 
 
 @pytest.fixture(scope="session")
