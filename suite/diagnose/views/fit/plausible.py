@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from eval.effects import EFFECTS
-from suite.diagnose.fit.parameters import Candidate, ParameterSpace
+from eval.effects.interface import Parameter
+from suite.diagnose.fit.parameters import Candidate, FittedNumber, ParameterSpace
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
@@ -23,8 +24,8 @@ def implausible(
     told = []
     for index in candidate.indices:
         entry = space.entries[index]
-        parameter = next(p for p in EFFECTS[entry.effect].parameters if p.name == entry.parameter)
-        away = abs(theta[index] - (0.0 if parameter.whole else _neutral(parameter, entry.start)))
+        parameter = _parameter(entry)
+        away = abs(theta[index] - (0.0 if parameter.whole else _neutral(entry)))
         if away > limits.implausible_times * parameter.typical[1]:
             place = "" if entry.component is None else f" {entry.component + 1}"
             told.append(
@@ -36,14 +37,17 @@ def implausible(
 def at_bound(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> bool:
     """Return whether a number of `candidate` has run to an end of what is physical.
 
-    An end at which nothing acts, as that of a drag, is none.
+    An end at which nothing acts is none: a drag that the vehicle file has may turn out not to be.
     """
-    at = list(candidate.indices)
-    low, high, value = space.array("low")[at], space.array("high")[at], theta[at]
-    close = 1e-6 * (high - low)
-    start = space.array("start")[at]
-    ends = ((value <= low + close) & (low != start)) | ((value >= high - close) & (high != start))
-    return bool(ends.any())
+    for index in candidate.indices:
+        entry, value = space.entries[index], theta[index]
+        close = 1e-6 * (entry.high - entry.low)
+        sound = (entry.start, _neutral(entry))
+        if value <= entry.low + close and entry.low not in sound:
+            return True
+        if value >= entry.high - close and entry.high not in sound:
+            return True
+    return False
 
 
 def usual_first(
@@ -59,7 +63,11 @@ def usual_first(
     return far, len(effects), min(list(EFFECTS).index(name) for name in effects)
 
 
-def _neutral(parameter: object, start: float) -> float:
+def _parameter(entry: FittedNumber) -> Parameter:
+    return next(p for p in EFFECTS[entry.effect].parameters if p.name == entry.parameter)
+
+
+def _neutral(entry: FittedNumber) -> float:
     """Return the value with which nothing acts; that of the file where it hangs on the vehicle."""
-    neutral = getattr(parameter, "neutral", start)
-    return start if callable(neutral) else float(neutral)
+    neutral = _parameter(entry).neutral
+    return entry.start if callable(neutral) else float(neutral)

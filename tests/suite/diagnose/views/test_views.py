@@ -33,6 +33,13 @@ def test_what_was_judged_can_be_judged_again(found):
     assert np.allclose(again.after, one.gap.after)
 
 
+def test_a_drag_that_only_the_file_has_is_named_and_goes():
+    found = diagnose_by_views(flights(4), with_effects(VEHICLE, linear_drag=(DRAG,)))
+    assert [name.candidate.name for _, name in found.named] == ["linear_drag"]
+    assert found.verdict == "named"
+    assert found.vehicle.effects["linear_drag"].coefficient == pytest.approx((0, 0, 0), abs=0.05)
+
+
 def test_the_vehicle_itself_has_no_gap():
     none = diagnose_by_views(flights(3, seed=2), VEHICLE)
     assert (none.verdict, none.named) == ("no_gap", [])
