@@ -101,7 +101,13 @@ def search_view(task: ViewTask, among: Sequence[Candidate], seed: int = 0) -> Vi
         named += _parts(task, name, named, now, among, seed)
         weighed = named[-1] if not name.candidate.parts else None
         named, now = _without_idle(task, named, now, weighed, seed)
-    return ViewSearch(task, tuple(named), first, now)
+    return ViewSearch(task, _not_named_themselves(named), first, now)
+
+
+def _not_named_themselves(named: Sequence[ViewName]) -> tuple[ViewName, ...]:
+    """Return the names without rivals that turned out to be there as well."""
+    there = {one.candidate.name for one in named}
+    return tuple(replace(n, rivals=tuple(r for r in n.rivals if r not in there)) for n in named)
 
 
 def _next_name(

@@ -40,6 +40,17 @@ def test_a_drag_that_only_the_file_has_is_named_and_goes():
     assert found.vehicle.effects["linear_drag"].coefficient == pytest.approx((0, 0, 0), abs=0.05)
 
 
+def test_a_drag_of_the_file_makes_way_for_what_rotors_do_and_none_stands_for_another():
+    hidden = {"rotor_drag": 7.8e-5, "translational_lift": 0.027, "inflow": 1.5e-4}
+    logs = flights(4, speed=4.0, **{name: (value,) for name, value in hidden.items()})
+    rivals, found = names(logs, with_effects(VEHICLE, linear_drag=((0.18, 0.18, 0.72),)))
+    assert rivals == {name: set() for name in ("linear_drag", *hidden)}
+    effects = found.vehicle.effects
+    assert effects["linear_drag"].coefficient == pytest.approx((0, 0, 0), abs=0.1)
+    for name, value in hidden.items():
+        assert effects[name].coefficient == pytest.approx(value, rel=0.1)
+
+
 def test_the_vehicle_itself_has_no_gap():
     none = diagnose_by_views(flights(3, seed=2), VEHICLE)
     assert (none.verdict, none.named) == ("no_gap", [])
