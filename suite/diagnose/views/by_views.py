@@ -221,9 +221,15 @@ def _confirmed(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...],
     kept, warnings = [], []
     for one in results:
         gap = one.gap
-        if one.names and gap.rms(gap.after) >= gap.rms(gap.before):
+        # Each flight's own trim weighs more on a lighter body: what is closed within flights counts
+        # as well, unless means are all that is looked at.
+        within = float((gap.closed * gap.variance).sum())
+        worse = gap.rms(gap.after) >= gap.rms(gap.before)
+        if one.names and worse and (one.held.means or within <= 0.0):
             labels = ", ".join(name.candidate.label for name in one.names)
-            warnings.append(f"{labels}: withdrawn, held-out flights are no better for it")
+            warnings.append(
+                f"{one.view.name}: {labels}: withdrawn, held-out flights are no better for it"
+            )
             nothing = replace(one.search, named=(), last=one.search.first)
             gap = judge(nothing, one.held, gap.floor)
             one = replace(one, search=nothing, gap=gap, names=(), half_width={})

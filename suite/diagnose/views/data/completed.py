@@ -1,9 +1,10 @@
 """What a partial log lacks, from what it has: a quadrotor's path says how it leaned and turned.
 
-Thrust is along body z, and in slow flight nearly all of the force besides gravity: so the body's z
-axis is that of the path's acceleration less gravity, and its turning that of this axis
-(differential flatness; Mellinger and Kumar 2011). The yaw is taken for none. A force across the
-thrust cannot be told then, and rates only as means over a second.
+Rates are those of the attitude. Where that is lacking as well: thrust is along body z, and in slow
+flight nearly all of the force besides gravity, so the body's z axis is that of the path's
+acceleration less gravity, and its turning that of this axis (differential flatness; Mellinger and
+Kumar 2011). The yaw is taken for none. A force across the thrust cannot be told then, and rates
+only as means over a second.
 """
 
 from __future__ import annotations
@@ -23,20 +24,18 @@ SMOOTH_S = 0.1
 
 
 def completed(log: FlightLog) -> FlightLog:
-    """Return `log` with attitude and rates from its path where it lacks them.
+    """Return `log` with the attitude from its path and the rates from the attitude, if it has none.
 
     Raises:
         ValueError: for a log without positions.
     """
     if "pos" in log.partial:
         raise ValueError(f"{log.name}: no position: nothing says how it moved")
-    if not {"quat", "rate"} & set(log.partial):
-        return log
-    rot_w = _leaning(log)
-    changed = {"quat_wxyz": np.asarray(rot_to_quat(rot_w))} if "quat" in log.partial else {}
+    if "quat" in log.partial:
+        log = replace(log, quat_wxyz=np.asarray(rot_to_quat(_leaning(log))))
     if "rate" in log.partial:
-        changed["rate_b"] = _turning(log.time_s, rot_w)
-    return replace(log, **changed)
+        log = replace(log, rate_b=_turning(log.time_s, log.rot_w))
+    return log
 
 
 def _leaning(log: FlightLog) -> np.ndarray:

@@ -137,7 +137,7 @@ def fitted_beside(
     at, space = [*beside, *candidate.indices], task.model.space
     lent = [number for number in block.lent if number in candidate.indices]
     if not candidate.parts or not lent:
-        rounds = task.limits.bilinear_rounds if acts_through(candidate) else 1
+        rounds = task.limits.bilinear_rounds if acts_through(candidate) else None
         return fitted(task, now, at, rounds)
     columns = sorted({*beside, *block.columns_of(candidate)})
     change, told = along_numbers(block, now.theta, space, columns)

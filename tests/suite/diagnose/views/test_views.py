@@ -1,5 +1,7 @@
 """Diagnoses by views, end to end: names, gaps, what a black box could do, reports, errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,13 +44,45 @@ def test_a_drag_that_only_the_file_has_is_named_and_goes():
 
 def test_a_drag_of_the_file_makes_way_for_what_rotors_do_and_none_stands_for_another():
     hidden = {"rotor_drag": 7.8e-5, "translational_lift": 0.027, "inflow": 1.5e-4}
-    logs = flights(4, speed=4.0, **{name: (value,) for name, value in hidden.items()})
+    logs = flights(4, speed=4.0, hidden={name: (value,) for name, value in hidden.items()})
     rivals, found = names(logs, with_effects(VEHICLE, linear_drag=((0.18, 0.18, 0.72),)))
     assert rivals == {name: set() for name in ("linear_drag", *hidden)}
     effects = found.vehicle.effects
     assert effects["linear_drag"].coefficient == pytest.approx((0, 0, 0), abs=0.1)
     for name, value in hidden.items():
         assert effects[name].coefficient == pytest.approx(value, rel=0.1)
+
+
+def test_an_inertia_stands_though_each_flights_trim_weighs_more_on_it():
+    logs = flights(4, seed=9, speed=4.0, inertia_scale=((0.8, 0.8, 0.8),))
+    found = diagnose_by_views(logs, VEHICLE)
+    assert [name.candidate.name for _, name in found.named] == ["inertia_scale"]
+    assert found.vehicle.effects["inertia_scale"].scale == pytest.approx((0.8, 0.8, 0.8), abs=0.02)
+    torque = found.main.gap
+    assert torque.rms(torque.after) > torque.rms(torque.before)  # of means of flights
+
+
+def test_a_slow_effect_is_no_noise_with_a_memory_however_long_the_flights():
+    logs = flights(4, seed=6, duration_s=40.0, battery_sag=(0.002, 0.0))
+    found = diagnose_by_views(logs, VEHICLE)
+    ((_, name),) = found.named
+    assert name.candidate.name == "battery_sag" and 0.8 < name.share < 1.0
+    assert found.vehicle.effects["battery_sag"].rate == pytest.approx(0.002, rel=0.05)
+
+
+def test_a_mass_is_an_alternative_of_a_thrust_though_it_is_not_linear():
+    logs = flights(4, seed=8, speed=4.0)
+    rivals, _ = names(logs, with_effects(VEHICLE, mass_offset=(0.15,)))
+    assert rivals.keys() | set().union(*rivals.values()) >= {"thrust_scale", "mass_offset"}
+
+
+def test_rates_that_a_log_lacks_are_those_of_its_attitude():
+    blind = [
+        replace(log, rate_b=np.full_like(log.rate_b, np.nan), about={"partial": ["rate"]})
+        for log in flights(4, seed=5)
+    ]
+    found = diagnose_by_views(blind, VEHICLE)
+    assert (found.verdict, found.named) == ("no_gap", [])
 
 
 def test_the_vehicle_itself_has_no_gap():
