@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before
+from suite.delta.burn_in import BURN_IN_S, BurnIn, as_long, burn_in_before
 from tracks.geometry.rotation import quat_to_rot
 
 T = TypeVar("T")
@@ -66,20 +66,20 @@ def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -
     parts = [window for log in logs for window in _flight_windows(log, duration_s, stride_s)]
     refuse_none(parts, logs, duration_s)
     steps = min(len(part.action_b) for part in parts)
-    back = min(len(part.burn_in.seen) for part in parts)
 
-    def alike(part: PointMassWindows) -> PointMassWindows:
-        """Cut a window to as many decisions, and its burn-in to the latest, as all have."""
+    def alike(part: PointMassWindows, burn_in: BurnIn) -> PointMassWindows:
+        """Cut a window to as many decisions as all have."""
         return part._replace(
             pos_w=part.pos_w[: steps + 1],
             vel_w=part.vel_w[: steps + 1],
             heading_w=part.heading_w[: steps + 1],
             action_b=part.action_b[:steps],
             time_step=part.time_step[:steps],
-            burn_in=BurnIn(*(array[len(array) - back :] for array in part.burn_in)),
+            burn_in=burn_in,
         )
 
-    return stacked([alike(part) for part in parts])
+    burn_ins = as_long([part.burn_in for part in parts])
+    return stacked(list(map(alike, parts, burn_ins)))
 
 
 def refuse_none(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: float) -> None:
