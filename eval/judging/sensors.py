@@ -46,7 +46,8 @@ class SensorNoise:
     """Both ages are means then: each decision's is drawn evenly from up to this share less to as
     much more, that of the state and that of the image apart [1]."""
     image_loss: float = 0.0
-    """Share of the images that do not come; the one before is seen again [1]."""
+    """Share of the images that do not come; the one before is seen again, with
+    noise of its own where images have some [1]."""
 
     @property
     def is_late(self) -> bool:

@@ -194,8 +194,9 @@ def resolve(
     if not delta and world is None:
         raise ValueError("--no-delta: the loop is about the Delta Action Model; give --world, too")
     if world is None:
-        training = override(training, changes)
-        check(training)
+        if policy is None:
+            training = override(training, changes)
+            check(training)
     else:
         refuse_own_motion(simulated)
         simulator, world = parse_world(world, vehicle)

@@ -178,7 +178,9 @@ def _measure(run: LoopRun) -> Stage:
         try:
             files = measure(run.out / "flights", folder, run.config.seed)
         except ValueError as error:
-            raise WorkFailed(f"{error}; record more flights (--flights)") from error
+            raise WorkFailed(
+                f"{error}; record more flights (--flights) with another --out"
+            ) from error
         chosen = [file.name for file in enough(files, DIAGNOSED_S)]
         write_json(folder / "diagnosed.json", {"files": chosen})
 

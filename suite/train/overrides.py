@@ -14,8 +14,9 @@ from tracks.input.ranges import check_ranges, is_finite, shown
 T = TypeVar("T")
 
 ABSENT = {
-    "quadrotor": "add --model quad and --vehicle, or take a preset that trains through quadrotors",
-    "fleet": "add --model fleet",
+    "quadrotor": "take a preset that trains through quadrotors (suite train: or add --model quad "
+    "and --vehicle)",
+    "fleet": "suite train has one with --model fleet",
 }
 """Parts that not every run has -> how a run gets one."""
 
@@ -48,7 +49,7 @@ def _check_read(config: object, keys: list[str], change: str) -> None:
     if flown and keys[0] == "physics" and set(keys) & set(UNREAD):
         raise ValueError(
             f"--set {change}: {'.'.join(keys)} is of the point mass, and this run goes through "
-            f"quadrotors; set one of {flown[0]}.*, or add --model point"
+            f"quadrotors; set one of {flown[0]}.* (suite train: or add --model point)"
         )
 
 

@@ -142,6 +142,14 @@ def test_settings_are_of_the_fine_tuning_where_a_policy_is_given():
     assert (trained.optimizer.rate, trained.episode.easy_until) == (pytest.approx(3e-5), 0.0)
 
 
+def test_settings_are_checked_at_the_rate_that_is_fine_tuned():
+    """A policy of 30 Hz has 180 steps where the recipe has 90, which 4 does not divide."""
+    changes = ("episode.image_stride=4",)
+    assert resolve(policy="swift-30", recipe="swift", changes=changes).tuning.episode.steps == 180
+    with pytest.raises(ValueError, match=r"divisors of episode.steps \(90\)"):
+        resolve(recipe="swift", changes=changes)
+
+
 def test_where_files_lie_makes_no_other_loop(root, monkeypatch, tmp_path):
     monkeypatch.chdir(root)
     moved = tmp_path / "hidden.toml"
