@@ -8,7 +8,6 @@ before nobody knows there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -52,15 +51,6 @@ def burn_in_before(
         inputs[count - (first - start) :] = np.concatenate(before, axis=-1)
         seen[count - (first - start) :] = 1.0
     return BurnIn(inputs, seen)
-
-
-def as_long(burn_ins: Sequence[BurnIn]) -> list[BurnIn]:
-    """Return the burn-ins (W, ...) of windows cut to the latest decisions, as many as all have.
-
-    Flights whose decisions lie a little closer have more of them in the same time.
-    """
-    count = min(len(one.seen) for one in burn_ins)
-    return [BurnIn(*(array[len(array) - count :] for array in one)) for one in burn_ins]
 
 
 def forgotten(burn_in: BurnIn, share: float) -> BurnIn:

@@ -17,7 +17,7 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.stepper import hover_state
 from policies.networks import delta_network
-from suite.delta.burn_in import BURN_IN_S, BurnIn, as_long, burn_in_before, state_after
+from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before, state_after
 from suite.delta.windows import decision_period, refuse_none, stacked
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics.quadrotor import (
@@ -102,9 +102,7 @@ def cut_quadrotor_windows(
         for window in _flight_windows(log, cut, length, row_s, duration_s, stride_s)
     ]
     refuse_none(found, logs, duration_s)
-    burn_ins = as_long([window.burn_in for window in found])
-    alike = [window._replace(burn_in=one) for window, one in zip(found, burn_ins, strict=True)]
-    return stacked(alike), cut
+    return stacked(found), cut
 
 
 def _flight_windows(

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from suite.delta.burn_in import BURN_IN_S, BurnIn, as_long, burn_in_before
+from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before
 from tracks.geometry.rotation import quat_to_rot
 
 T = TypeVar("T")
@@ -67,7 +67,7 @@ def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -
     refuse_none(parts, logs, duration_s)
     steps = min(len(part.action_b) for part in parts)
 
-    def alike(part: PointMassWindows, burn_in: BurnIn) -> PointMassWindows:
+    def alike(part: PointMassWindows) -> PointMassWindows:
         """Cut a window to as many decisions as all have."""
         return part._replace(
             pos_w=part.pos_w[: steps + 1],
@@ -75,11 +75,9 @@ def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -
             heading_w=part.heading_w[: steps + 1],
             action_b=part.action_b[:steps],
             time_step=part.time_step[:steps],
-            burn_in=burn_in,
         )
 
-    burn_ins = as_long([part.burn_in for part in parts])
-    return stacked(list(map(alike, parts, burn_ins)))
+    return stacked([alike(part) for part in parts])
 
 
 def refuse_none(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: float) -> None:
@@ -97,8 +95,18 @@ def refuse_none(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: f
 
 
 def stacked(windows: Sequence[T]) -> T:
-    """Return windows of one shape along a new first axis, as 32-bit numbers."""
-    return jax.tree.map(lambda *arrays: np.stack(arrays).astype(np.float32), *windows)
+    """Return windows of one shape along a new first axis, as 32-bit numbers.
+
+    Their burn-ins are cut to the latest decisions, as many as all have: flights whose decisions lie
+    a little closer have more of them in the same time.
+    """
+    parts: Sequence[Any] = windows
+    back = min(len(part.burn_in.seen) for part in parts)
+    alike = [
+        part._replace(burn_in=BurnIn(*(array[len(array) - back :] for array in part.burn_in)))
+        for part in parts
+    ]
+    return jax.tree.map(lambda *arrays: np.stack(arrays).astype(np.float32), *alike)
 
 
 def decision_period(time_s: np.ndarray, row_s: float) -> float:

@@ -193,11 +193,10 @@ def resolve(
     _check_changes(changes, policy, iterations)
     if not delta and world is None:
         raise ValueError("--no-delta: the loop is about the Delta Action Model; give --world, too")
-    if world is None:
-        if policy is None:
-            training = override(training, changes)
-            check(training)
-    else:
+    if world is None and policy is None:
+        training = override(training, changes)
+        check(training)
+    if world is not None:
         refuse_own_motion(simulated)
         simulator, world = parse_world(world, vehicle)
         true = load_vehicle(world)

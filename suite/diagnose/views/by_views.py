@@ -223,9 +223,8 @@ def _confirmed(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...],
         gap = one.gap
         # Each flight's own trim weighs more on a lighter body: what is closed within flights counts
         # as well, unless means are all that is looked at.
-        within = float((gap.closed * gap.variance).sum())
         worse = gap.rms(gap.after) >= gap.rms(gap.before)
-        if one.names and worse and (one.held.means or within <= 0.0):
+        if one.names and worse and (one.held.means or gap.share(gap.closed) <= 0.0):
             labels = ", ".join(name.candidate.label for name in one.names)
             warnings.append(
                 f"{one.view.name}: {labels}: withdrawn, held-out flights are no better for it"

@@ -20,7 +20,13 @@ from suite.diagnose.views.data.view import SmoothedFlight, View
 from suite.diagnose.views.fit.by_flight import means_of, units_of
 from suite.diagnose.views.fit.compare import ViewData, compare
 from suite.diagnose.views.fit.model import ForceModel
-from suite.diagnose.views.fit.weigh import Weights, blocks_of, equations_of
+from suite.diagnose.views.fit.weigh import (
+    Weights,
+    blocks_of,
+    equations_of,
+    weighed,
+    weights_of,
+)
 
 MANY = 1000
 """Degrees of freedom of what all moments tell."""
@@ -164,6 +170,16 @@ def chi2_by_flight(task: ViewTask, found: ViewEquations, indices: Sequence[int])
         whole = found.block.chi2[inside].sum() - 2.0 * pull @ moved + moved @ own @ moved
         chi2.append(float(whole))
     return np.array(chi2)
+
+
+def share_taken(task: ViewTask, now: ViewEquations, then: ViewEquations) -> float:
+    """Return the share of the squared error of `now` that `then` takes away.
+
+    Weighed by the noise that `then` leaves: by that of `now` a slow effect is noise with a memory.
+    """
+    noise = weights_of(then.data, task.limits)
+    left, had = (float((weighed(one.data, noise)[0] ** 2).sum()) for one in (then, now))
+    return 1.0 - left / had
 
 
 def half_widths(found: ViewEquations, indices: Sequence[int]) -> np.ndarray:

@@ -25,6 +25,7 @@ from suite.diagnose.views.fit.equations import (
     fitted_beside,
     left_of,
     look,
+    share_taken,
     with_lent,
 )
 from suite.diagnose.views.fit.plausible import at_bound, usual_first
@@ -138,7 +139,7 @@ def _next_name(
         gains = before - chi2_by_flight(task, then, at)
         if at_bound(task.model.space, then.theta, score.candidate):
             continue  # that is no fit
-        share = _share_taken(task, now, then)
+        share = share_taken(task, now, then)
         if (
             flights_agree(gains)
             and share >= task.limits.least_view_share
@@ -163,16 +164,6 @@ def _next_name(
             rivals.pop(name.candidate.name, None)
             return replace(name, rivals=tuple(rivals)), last
     return None
-
-
-def _share_taken(task: ViewTask, now: ViewEquations, then: ViewEquations) -> float:
-    """Return the share of the squared error of `now` that `then` takes away.
-
-    Weighed by the noise that `then` leaves: by that of `now` a slow effect is noise with a memory.
-    """
-    noise = weights_of(then.data, task.limits)
-    left, had = (float(look(task, one.theta, noise).block.chi2.sum()) for one in (then, now))
-    return 1.0 - left / had
 
 
 def _parts(
