@@ -95,7 +95,8 @@ def load(
         family: of the track.
         level: 0 to 9.
         seed: of the track.
-        track: flown instead of the family's.
+        track: flown instead of the family's; gusts are drawn by its name, which the judge does by
+            its file's.
         vehicle: what flies; `eval/vehicles/reference.toml` where it is left out.
         spec: rate, camera and encoding of the observation; the rate is met to a whole number of
             physics steps.

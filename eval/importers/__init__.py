@@ -53,4 +53,10 @@ def import_log(
     told = options or ImportOptions()
     file = Path(path)
     name = format or detect(file, told)
-    return ImportedLog(*assemble(FORMATS.find(name).read(file, told), name, told))
+    reader = FORMATS.find(name)
+    if told.map is not None and not getattr(reader, "TAKES_MAP", True):
+        raise ValueError(
+            f"{file} is read as {name!r}, whose names are known: leave --map out, or say "
+            "--format table if it is a table that --map describes"
+        )
+    return ImportedLog(*assemble(reader.read(file, told), name, told))

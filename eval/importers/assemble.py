@@ -113,13 +113,8 @@ def _need(recording: Recording, partial: bool) -> None:
 def _flight(
     recording: Recording, options: ImportOptions
 ) -> tuple[tuple[float, float], list[Finding]]:
-    """Return the first and the last time to keep [s]; what the user cuts is not cut here."""
-    if not options.trim or (options.start_s > 0.0 and options.end_s is not None):
-        return (-np.inf, np.inf), []
-    (start, stop), findings = airborne(recording)
-    start = -np.inf if options.start_s > 0.0 else start
-    stop = np.inf if options.end_s is not None else stop
-    return (start, stop), findings
+    """Return the first and the last time in the air [s]; all of it where the ground is kept."""
+    return airborne(recording) if options.trim else ((-np.inf, np.inf), [])
 
 
 def _checks(rows: dict[str, np.ndarray], fix: bool) -> list[Finding]:

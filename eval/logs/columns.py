@@ -91,6 +91,10 @@ class FlightLogError(ValueError):
         where = [part for part in (column and f"column {column}", row and f"row {row}") if part]
         super().__init__(": ".join([name, ", ".join(where), reason] if where else [name, reason]))
 
+    def __reduce__(self) -> tuple[type[FlightLogError], tuple[object, ...]]:
+        """Let it travel between processes whole."""
+        return type(self), (self.name, self.column, self.row, self.reason)
+
 
 def check_columns(
     columns: Mapping[str, np.ndarray], name: str, partial: bool = False
@@ -206,6 +210,9 @@ def _numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
     values = np.asarray(values)
     if values.ndim == 1 and values.dtype.kind in "fiub":
         return values.astype(np.float64)
+    if values.dtype.kind in "Mm":
+        reason = f"a date or a span ({values.dtype}); write it as a number in the column's unit"
+        raise FlightLogError(name, column, None, reason)
     numbers = np.full(len(values), np.nan)
     for k, value in enumerate(values):
         try:

@@ -19,7 +19,7 @@ from tracks.common.tree_rows import packed, select
 from tracks.geometry.scene import Array
 
 ATTITUDE_HZ = 100.0
-"""Frequency of the attitude loop and of flight logs [Hz]."""
+"""Frequency of the attitude loop and of flight logs, as near as whole steps allow [Hz]."""
 
 
 @dataclass(frozen=True)

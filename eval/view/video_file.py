@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -83,8 +84,10 @@ def write_gif(
         indexed.append(frame.quantize(palette=palette, dither=Image.Dither.NONE))
         if on_frame is not None:
             on_frame(number)
-    duration = round(1000 / fps)
-    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
+    # A GIF counts in hundredths of a second: frames are not all shown as long, and none is lost.
+    ends = [10 * round(100 * number / fps) for number in range(len(indexed) + 1)]
+    durations = [end - start for start, end in itertools.pairwise(ends)]
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=durations, loop=0)
 
 
 def _palette(frame: Image.Image, swatches: np.ndarray | None) -> Image.Image:

@@ -29,7 +29,7 @@ def _value(value: Any) -> str:
     if isinstance(value, int):
         return str(value)
     if isinstance(value, float):
-        return repr(value)
+        return repr(float(value))  # numpy's own floats say their type besides
     if isinstance(value, str):
         # TOML's basic strings take JSON's escapes, except that DEL must be escaped as well.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -96,6 +96,14 @@ class _Names:
         self._taken.add(name)
         return name
 
+    def part(self, table: Table, name: str, part: int) -> str:
+        """Return the name of a part of the solid `name`."""
+        label = f"{name} part {part}"
+        if label in self._taken:
+            raise table.error("name", name, f"one whose parts are not named as others: {label!r}")
+        self._taken.add(label)
+        return label
+
 
 def _read(
     top: Table, kind: str, read: Callable[[Table], tuple], names: _Names
@@ -259,7 +267,7 @@ def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
             mesh = scale * triangles @ rot.T + position
             _check_mesh(table, scale, part, mesh)
             meshes.append(mesh)
-            labels.append(name if len(parts) == 1 else f"{name} part {part}")
+            labels.append(name if len(parts) == 1 else names.part(table, name, part))
     return meshes, labels
 
 

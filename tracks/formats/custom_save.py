@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tracks.common.files import replacing_file, write_text
+from tracks.common.toml_text import to_toml
 from tracks.geometry.rotation import rot_to_quat
 from tracks.geometry.scene import Array, Scene
 from tracks.track import Track
@@ -30,7 +30,7 @@ def save_track(track: Track, path: str | os.PathLike[str]) -> None:
     boxes, cylinders, capsules, spheres, meshes = split
     yaw_deg = float(np.rad2deg(track.start_yaw))
     text = [
-        f"# {track.family}, level {track.level}, seed {track.seed}",
+        f"# level {track.level}, seed {track.seed}",
         _line("schema", 1),
         _line("name", track.family),
         "",
@@ -85,9 +85,9 @@ def _table(kind: str, **values: object) -> list[str]:
 
 
 def _line(key: str, value: object) -> str:
-    """Return one `key = value`; JSON's numbers, texts and lists are TOML's."""
+    """Return one `key = value`."""
     plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-    return f"{key} = {json.dumps(plain, ensure_ascii=False)}"
+    return to_toml({key: plain}).rstrip("\n")
 
 
 def _write_obj(path: Path, triangles: np.ndarray) -> None:

@@ -18,6 +18,7 @@ class Format(Protocol):
     """A module (or an object) that reads one format.
 
     One that takes whatever has columns says `ASKED_LAST = True`: the others are asked before it.
+    One to which a mapping file says nothing says `TAKES_MAP = False`.
     """
 
     SUMMARY: str

@@ -75,7 +75,8 @@ def _time(
         there = ", ".join(list(columns)[:12])
         reason = f"no column for the time; {hint}. There are: {there}"
         raise FlightLogError(name, "time", None, reason)
-    column = mapping.columns["time"][0]
+    asked = mapping.columns["time"]
+    column = next((c for c in asked if c.names[0] in columns), asked[0])
     values = numbers(columns, column.names[0], name)
     if len(values) and values.dtype.kind in "iu" and abs(int(values[0])) > 2**52:
         # Unix times in nanoseconds do not fit a float64: take the first away while whole.

@@ -54,7 +54,7 @@ def recording_of(
                 continue
             first = next(c for c in alternatives[0].names if find((c,)) is None)
             raise FlightLogError(name, first, None, missing(first))
-        taken[signal], parts[signal] = column, _values(part, column)
+        taken[signal], parts[signal] = column, _values(part, column, name)
     about, findings = _beside(path, mapping)
     parts.pop("time", None)
     for angles, quat in (("euler", "quat"), ("cmd_euler", "cmd_quat")):
@@ -91,8 +91,12 @@ def _first(
     return alternatives[0], None
 
 
-def _values(part: Part, column: Column) -> Part:
+def _values(part: Part, column: Column, name: str) -> Part:
     time_s, value = part
+    if value.shape[1] != len(column.factor):
+        wanted = f"give {len(column.factor)} columns, or one whose cells hold as many"
+        reason = f"{value.shape[1]} a row for a signal of {len(column.factor)} numbers; {wanted}"
+        raise FlightLogError(name, column.names[0], None, reason)
     if column.mixer:
         mixed = (value * np.asarray(column.factor)) @ MIXERS[column.mixer].T
         return time_s, np.clip(mixed, 0.0, 1.0)  # as what drives the motors does

@@ -16,7 +16,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.checks.units import TIMES
 from eval.importers.frames import BODIES, WORLDS
-from eval.logs.columns import GROUPS
+from eval.logs.columns import GROUPS, KNOWN
 from tracks.common.names import unknown_name
 from tracks.common.toml_table import Table, read_toml
 
@@ -161,10 +161,15 @@ def read_map(path: Path) -> LogMap:
     if top.has("about"):
         about = top.table("about")
         beside = about.text("file")
+        _check_placeholders(about, beside)
         mass_key = about.text("mass") if about.has("mass") else ""
         about.close()
     optional = top.has("optional") and _choice(top, "optional", ("no", "yes")) == "yes"
     keep = tuple(top.texts("keep")) if top.has("keep") else ()
+    ours = [name for name in keep if name in KNOWN or name == "throttle"]
+    if ours:
+        allowed = f"columns whose names are not a flight log's own, as {ours[0]!r} is"
+        raise top.error("keep", list(keep), allowed)
     top.has("topics")  # of MCAP files; see mcap.py
     top.close()
     return LogMap(columns, world, body, side, optional, keep, beside, mass_key)
@@ -178,7 +183,10 @@ def motor_side_of(frames: Table) -> tuple[tuple[float, float], ...] | None:
     """
     if not frames.has("motors"):
         return None
-    return tuple((float(x), float(y)) for x, y in frames.points("motors", 2, 4))[:4]
+    points = frames.points("motors", 2, 4)
+    if not all(np.hypot(x, y) > 0.0 for x, y in points):
+        raise frames.error("motors", [list(p) for p in points], "four points off the middle")
+    return tuple((float(x), float(y)) for x, y in points)[:4]
 
 
 def own_map(columns: Mapping[str, np.ndarray]) -> LogMap:
@@ -191,6 +199,13 @@ def own_map(columns: Mapping[str, np.ndarray]) -> LogMap:
     if "throttle" in columns:
         there["throttle"] = (Column(("throttle",), (1.0,)),)
     return LogMap(there)
+
+
+def _check_placeholders(about: Table, name: str) -> None:
+    try:
+        name.format(stem="", number="")
+    except (KeyError, IndexError, ValueError, AttributeError):
+        raise about.error("file", name, "a name with {stem} and {number} alone in braces") from None
 
 
 def _alternatives(signal: str, top: Table) -> tuple[Column, ...]:

@@ -1,5 +1,7 @@
 """A recording becomes a checked flight log, or is refused for what it lacks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,23 @@ def test_a_recording_becomes_a_log_that_says_where_it_is_from():
         "vehicle": "plain",
     }
     assert log.about["findings"] == [finding._asdict() for finding in findings]
+
+
+def test_start_and_end_cut_more_than_the_time_on_the_ground():
+    parts = dict(recording().signals)
+    del parts["cmd_thrust"], parts["cmd_rate"]
+    time_s = parts["pos"].time_s
+    flying = (time_s > 0.4) & (time_s < 1.7)
+    height = np.where(flying, 1.0, 0.0)[:, None] * [0.0, 0.0, 1.0]
+    parts["pos"] = Signal(time_s, height)
+    parts["motor"] = Signal(time_s, np.where(flying, 800.0, 50.0)[:, None] * np.ones(4))
+    asked = ImportOptions(fix=False, start_s=0.1, end_s=1.6)
+    log, findings = assemble(Recording("log", parts), "made", asked)
+    assert any("before take-off and the" in f.text for f in findings)
+    assert log.rotor_speed is not None and log.rotor_speed.min() > 400.0
+    assert log.duration_s == pytest.approx(1.2, abs=0.05)
+    kept, _ = assemble(Recording("log", parts), "made", replace(asked, trim=False))
+    assert kept.duration_s == pytest.approx(1.5, abs=0.02)
 
 
 @pytest.mark.parametrize(

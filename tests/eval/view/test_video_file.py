@@ -13,6 +13,7 @@ from eval.view.video import (
     video_frames,
     write_video,
 )
+from eval.view.video_file import write_gif
 from tests.support.flights import rollout
 
 SMALL = VideoOptions(size=(160, 96), fps=10, hold_s=0.3)
@@ -53,6 +54,14 @@ def test_a_video_plays_the_whole_flight(tmp_path, kind):
     for number in (0, expected // 2, expected - 1):
         error = np.abs(frames[number].astype(int) - np.asarray(painted[number]).astype(int))
         assert error.mean() < 6
+
+
+def test_a_gif_is_as_long_as_its_frames_at_any_rate(tmp_path):
+    frames = [Image.new("RGB", (8, 8), (20 * k, 0, 0)) for k in range(12)]
+    write_gif(tmp_path / "a.gif", frames, 12)
+    with Image.open(tmp_path / "a.gif") as video:
+        lasting = [frame.info["duration"] for frame in ImageSequence.Iterator(video)]
+    assert sum(lasting) == 1000
 
 
 def test_a_video_that_fails_or_is_interrupted_leaves_nothing(tmp_path, monkeypatch):

@@ -178,6 +178,16 @@ def test_a_start_inside_a_mesh_is_refused_however_it_is_wound(tmp_path):
     assert load_track(path).start_pos_w[0] == 0.6
 
 
+def test_parts_of_a_mesh_have_names_of_their_own(tmp_path):
+    parts = [trimesh.creation.box((1, 1, 1)).apply_translation([x, 0, 0]) for x in (0, 3)]
+    trimesh.util.concatenate(parts).export(tmp_path / "two.obj")
+    mesh = '[[meshes]]\nname = "A"\nfile = "two.obj"\nposition = [0, 9, 1]\n'
+    assert load_track(write(tmp_path, GATE + mesh)).names[-2:] == ("A part 0", "A part 1")
+    box = '[[boxes]]\nname = "A part 0"\ncenter = [0, -9, 1]\nsize = [1, 1, 1]\n'
+    with pytest.raises(ValueError, match=r"meshes\[0\].name is 'A'.*as others: 'A part 0'"):
+        load_track(write(tmp_path, GATE + box + mesh))
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ValueError, match="none.toml: cannot be read"):
         load_track(tmp_path / "none.toml")

@@ -35,3 +35,13 @@ def test_meshes_and_polygons_come_back(tmp_path, root):
 
     middles = [np.sort(t.scene.triangles.mean(1), axis=0) for t in (track, again)]
     assert np.allclose(*middles, rtol=0, atol=1e-7)
+
+
+def test_names_come_back_whatever_they_hold(tmp_path):
+    gate = "[[gates]]\ncenter = [0, 0, 1.5]\nwidth = 1.0\nheight = 1.0\n"
+    box = gate + '[[boxes]]\nname = "a \u00e9 \\\\ \\" b"\ncenter = [0, 0, 9]\nsize = [1, 1, 1]\n'
+    (tmp_path / "a.toml").write_text('name = "x\\u007fy"\n' + box, encoding="utf-8")
+    track = load_track(tmp_path / "a.toml")
+    save_track(track, tmp_path / "b.toml")
+    again = load_track(tmp_path / "b.toml")
+    assert (again.family, again.names) == (track.family, track.names)

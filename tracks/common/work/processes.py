@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from tracks.common.work.cores import core_shares, usable_cores
-from tracks.common.work.travel import WorkerDied, pack, unpack
+from tracks.common.work.travel import Failure, WorkerDied, failure, pack, raised, unpack
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -126,11 +126,14 @@ def _collect(
             except BrokenProcessPool:
                 again(process, entry)
                 continue
+            found = unpack(results)
+            if isinstance(found, Failure):
+                raise raised(found)
             if more:
                 ask(process, entry, anew=False)
             else:
                 begin(process)
-            for result in unpack(results):
+            for result in found:
                 keep(entry.number, result)
 
 
@@ -139,17 +142,23 @@ _results: Iterator[Any] = iter(())
 
 
 def _work_on(packed: bytes | None = None) -> tuple[bytes, bool]:
-    """Return the next results of the piece, of a new one where it is given; more to come?"""
+    """Return the next results of the piece, of a new one where it is given; more to come?
+
+    What goes wrong is returned: an error that does not travel would end this process.
+    """
     global _results
-    if packed is not None:
-        work, piece = unpack(packed)
-        _results = iter(work(piece))
-    found, until = [], time.monotonic() + REPORT_S
-    for result in _results:
-        found.append(result)
-        if time.monotonic() > until:
-            return pack(found), True
-    return pack(found), False
+    try:
+        if packed is not None:
+            work, piece = unpack(packed)
+            _results = iter(work(piece))
+        found, until = [], time.monotonic() + REPORT_S
+        for result in _results:
+            found.append(result)
+            if time.monotonic() > until:
+                return pack(found), True
+        return pack(found), False
+    except Exception as error:
+        return pack(failure(error)), False
 
 
 def _start(cores: list[int]) -> None:

@@ -19,7 +19,7 @@ class WorkerDied(RuntimeError):
 
 
 class Failure(NamedTuple):
-    """An error that another machine's work ended with."""
+    """An error that work elsewhere ended with."""
 
     error: Exception
     """Itself."""
@@ -72,7 +72,8 @@ def failure(error: Exception) -> Failure:
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
-        error = RuntimeError(f"{type(error).__name__}: {error}")
+        kind = ValueError if isinstance(error, ValueError) else RuntimeError
+        error = kind(f"{type(error).__name__}: {error}")
     error.__traceback__ = None
     return Failure(error, lines, ROOT)
 

@@ -61,6 +61,8 @@ def test_betaflight_alone_asks_for_a_pose(tmp_path):
     path = made.write_blackbox(tmp_path / "log.csv", span=(0, 2))
     with pytest.raises(FlightLogError, match="no position and no attitude; --pose"):
         import_log(path)
+    with pytest.raises(ValueError, match="read as 'betaflight', .* leave --map out, or say --form"):
+        import_log(path, None, ImportOptions(map=tmp_path / "mine.toml", partial=True))
     raw = tmp_path / "LOG00001.BFL"
     raw.write_bytes(b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n\0\1")
     with pytest.raises(FlightLogError, match="run blackbox_decode"):

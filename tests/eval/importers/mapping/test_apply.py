@@ -193,3 +193,22 @@ def test_a_broken_list_is_refused_by_row(tmp_path, truth, cell, reason):
     columns["p"][4] = cell
     with pytest.raises(FlightLogError, match=f"column p, row 5: .*{reason}"):
         imported(tmp_path, POSE, columns, partial=True)
+
+
+@pytest.mark.parametrize(("cell", "count"), [("1.0", 1), ("[1 2]", 2)])
+def test_cells_that_hold_too_few_numbers_for_a_signal_are_refused(tmp_path, truth, cell, count):
+    columns = parts(truth) | {"p": [cell] * len(truth.time)}
+    with pytest.raises(FlightLogError, match=f"column p: {count} a row .* 3 numbers; give 3 col"):
+        imported(tmp_path, POSE, columns, partial=True)
+
+
+def test_the_first_time_that_is_there_counts(tmp_path, truth):
+    again = HEAD.replace("[time]", '[[time]]\ncolumn = "stamp"\n[[time]]')
+    assert again != HEAD
+    (tmp_path / "map.toml").write_text(again + POSE)
+    columns = parts(truth)
+    rows = [",".join(columns), *(",".join(row) for row in zip(*columns.values(), strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    told = ImportOptions(map=tmp_path / "map.toml", partial=True)
+    log, _ = import_log(tmp_path / "log.csv", "table", told)
+    assert log.duration_s == pytest.approx(truth.time[-1] - truth.time[0], abs=0.02)

@@ -27,6 +27,10 @@ def test_every_shipped_mapping_is_read_by_its_name():
         ('[pos]\ncolumn = "a"\nsource = "gps"', "pos.source is 'gps', allowed is 'mocap'"),
         ('[pos]\ncolumn = "a"\nscale = -1.0', "pos.scale is -1.0"),
         ("[frames]\nmotors = [[1, 1]]", "frames.motors"),
+        ("[frames]\nmotors = [[1, 1], [0, 0], [1, -1], [-1, -1]]", "motors is .*off the middle"),
+        ('[about]\nfile = "{log}.yaml"', "about.file is '{log}.yaml'.*{stem} and {number} alone"),
+        ('[about]\nfile = "{stem.yaml"', "about.file is .*{stem} and {number} alone"),
+        ('keep = ["other", "motor_1"]', "keep is .*not a flight log's own, as 'motor_1' is"),
         ('optional = "maybe"', "optional is 'maybe', allowed is 'no' or 'yes'"),
     ],
 )

@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 import pytest
 
+from eval.logs.columns import FlightLogError
 from tracks.common.work import WorkerDied, core_shares, work_off
 
 CORES = sorted(os.sched_getaffinity(0))
@@ -22,12 +23,23 @@ def tens(piece):
         yield item, 10 * item, os.getpid()
 
 
+class Own(ValueError):
+    """One that cannot be made of what it says, so that it cannot travel."""
+
+    def __init__(self, name, value):
+        super().__init__(f"{name} is {value}")
+
+
 def gone_wrong(how, piece):
     yield "before"
     if how == "refuse":
         raise ValueError("wrong policy file")
     if how == "break":
         raise ZeroDivisionError
+    if how == "log":
+        raise FlightLogError("a.csv", "time", 3, "goes back")
+    if how == "own":
+        raise Own("x", 1)
     os.kill(os.getpid(), signal.SIGKILL) if how == "killed" else os._exit(9)
 
 
@@ -69,6 +81,8 @@ def test_every_result_comes_with_the_number_of_its_piece(workers):
     [
         ("refuse", ValueError, "^wrong policy file$"),
         ("break", ZeroDivisionError, None),
+        ("log", FlightLogError, "^a.csv: column time, row 3: goes back$"),
+        ("own", ValueError, "^Own: x is 1$"),
         ("die", WorkerDied, "exit code 9.*fewer processes"),
         ("killed", WorkerDied, "exit code -9.*fewer processes"),
     ],
