@@ -36,7 +36,7 @@ MEANING = (
     "whatever gates were passed. A trial ends at a collision, at its last gate or at its time. "
     "v_max: the median over trials of each one's largest speed until its end; the paper does not "
     "say over what its maximum is taken.",
-    "Trials fly the training's dynamics (the point mass with each world's own constants), from "
+    "Trials fly the training's dynamics (each world with its own constants), from "
     "standing start on worlds that no training has seen, the same for all. A collision is what the "
     "trainer takes for one: the same code finds the nearest solid to the points of each step's "
     "path, and closer than the body's radius is a collision.",

@@ -223,7 +223,10 @@ def ideas(config: Config) -> list[training.Row]:
         ),
         "live on": ("worlds go on from rollout to rollout", (live_on,)),
         "again": ("crashed worlds go on from before the crash", (again,)),
-        "often": ("twice the decisions, in as many seconds", twice_as_often(base)),
+        "often": (
+            "twice the decisions, in as many seconds; a point mass is 2 late at most",
+            twice_as_often(base),
+        ),
         "finer image": ("half as many pixels again each way", finer),
         "wider memory": ("two thirds more units", wider),
         "longer": ("twice the horizon, half the worlds", longer),

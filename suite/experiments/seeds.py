@@ -12,6 +12,7 @@ import tyro
 
 from eval.judging.tables import Tally
 from eval.quadrotor.vehicle_file import load_vehicle
+from policies.shipped import locate
 from suite.common.console import Console, duration
 from suite.common.report import Picture, Report, Section
 from suite.experiments.pages.document import Place
@@ -102,7 +103,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         facts={
             "recipe": "given policies" if config.policies else options.recipe_words(config),
             **{
-                name: f"SHA-256 {policy_digest(path)[:16]}, {_trained(Path(path))}"
+                name: f"SHA-256 {policy_digest(path)[:16]}, {_trained(locate(path))}"
                 for name, path in policies.items()
             },
             "vehicle": config.vehicle,

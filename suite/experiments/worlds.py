@@ -86,6 +86,9 @@ def columns(config: Config) -> list[Column]:
         ValueError: for a world that there is not, or that lacks a package.
     """
     vehicle = load_vehicle(config.vehicle)
+    twice = next((name for name in config.world if config.world.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"--world {twice} is given twice; give each world once")
     found = [Column(BASE, BASE, vehicle)]
     for name in config.world or (ROUNDING, "rotorpy"):
         world = world_class(name)
@@ -111,7 +114,8 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         for name, policy in policies.items()
         for column in flown_in
     }
-    results = judging.flown(orders, place.cache, console, "flying in every world")
+    what = "flying in every world"
+    results = judging.flown(orders, place.cache, console, what, place.workers)
     changed = changes(names, flown_in, results)
     report = Report(
         title="Worlds: the same trials in other simulators",

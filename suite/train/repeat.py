@@ -128,6 +128,11 @@ def repeat(
             write_run_record(folder, run.config, run.seed, goes_on=done > 0)
         state = _iterate(method, run, state, console, watch)
     rows = curve.read(folder)
+    if not rows:
+        raise ValueError(
+            f"{folder} holds a finished training without its curve, metrics.jsonl: put that back, "
+            f"use {folder / 'policy'} as it is, or give another --out"
+        )
     last = rows[-max(1, len(rows) // 10) :]
     means = {key: float(np.mean([row[key] for row in last])) for key in last[0]}
     return Outcome(folder / "policy", int(state.iteration), means)

@@ -85,11 +85,13 @@ def four_gate_recipe(config: FourGates) -> TrainConfig:
     """Return the recipe that `config` asks for on tracks of four gates.
 
     Raises:
-        ValueError: for a preset or a change that does not exist.
+        ValueError: for a preset or a change that does not exist, or no field: that is compared.
     """
     owned = {"episode.batch": "give --worlds", "optimizer.iterations": "give --iterations"}
     check_owned(config.set, {**owned, "episode.gates": f"all fly {GATES}, as in the paper"})
     base = asked_recipe(config)
+    if base.loss.field_gain == 0.0:
+        raise ValueError("loss.field_gain is 0, allowed is a number above: the field is compared")
     return replace(base, episode=replace(base.episode, gates=GATES, batch=config.worlds))
 
 

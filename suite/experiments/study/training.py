@@ -63,7 +63,7 @@ class Trained(NamedTuple):
     """Its key."""
     seed: int
     policy: str
-    """The checkpoint's folder, which is not there where the training diverged."""
+    """The checkpoint's folder; where the training diverged, its last finite one."""
     seconds: float
     """Spent on gradient steps after those that compile [s]."""
     compile_s: float

@@ -77,7 +77,7 @@ def scored(
 
 
 def validation_worlds(config: TrainConfig, trials: int, seed: int, seconds: float) -> TrainConfig:
-    """Return `config` with the worlds of a validation: all from rest, for a fixed time.
+    """Return `config` with the worlds of a validation: all from rest, at full speed, for a time.
 
     Tracks, obstacles and the spread of the dynamics stay those of the training. Its field of view,
     which all worlds of an iteration share, is the camera's.
@@ -89,6 +89,7 @@ def validation_worlds(config: TrainConfig, trials: int, seed: int, seconds: floa
         easy_until=0.0,
         rest_share=1.0,
         stop_from=1.0,
+        race_share=1.0,
     )
     physics = replace(config.physics, fov_scale=(1.0, 1.0))
     return replace(config, seed=seed, episode=episode, physics=physics)

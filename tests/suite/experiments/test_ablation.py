@@ -143,6 +143,10 @@ def test_the_field_is_compared_at_the_same_weight():
         (["--set", "episode.batch=9"], "this command sets episode.batch; give --worlds"),
         (["--set", "episode.gates=6"], "this command sets episode.gates; all fly 4"),
         (["--set", "loss.projection=3"], "this command sets loss.projection; it is compared"),
+        (
+            ["--set", "loss.field_gain=0"],
+            "loss.field_gain is 0, allowed is a number above: the field",
+        ),
         (["--trials", "0"], "--trials is 0"),
         (["--seconds", "0"], "--seconds is 0"),
     ],

@@ -99,6 +99,10 @@ def test_curves_first_times_and_sentences_by_hand():
         (["--measurements", "0"], "--measurements is 0"),
         (["--set", "loss.progress=1.2"], "this command sets loss.progress; give --progress"),
         (["--set", "loss.projection=1"], "this command sets loss.projection; it is compared"),
+        (
+            ["--set", "loss.field_gain=0"],
+            "loss.field_gain is 0, allowed is a number above: the field",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_trained(args, words, tmp_path, capsys):

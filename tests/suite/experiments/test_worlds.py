@@ -50,6 +50,8 @@ def test_a_world_that_flies_as_mujoco_does_is_refused(sky, tmp_path, capsys):
     assert "--world reference: flies as mujoco does" in capsys.readouterr().err
     assert reproduce(tmp_path, "worlds", "--world", "rotorpi") == 2
     assert "Did you mean 'rotorpy'?" in capsys.readouterr().err
+    assert reproduce(tmp_path, "worlds", "--world", "mjx", "--world", "mjx") == 2
+    assert "--world mjx is given twice" in capsys.readouterr().err
     assert not sky.flown
 
 

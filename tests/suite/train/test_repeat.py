@@ -73,6 +73,13 @@ def test_the_outcome_is_of_the_last_tenth_and_the_policy_is_measured_on_the_way(
     assert len(seen) == 6, "a finished run is neither repeated nor measured again"
 
 
+def test_a_finished_run_without_its_curve_says_so(tmp_path):
+    repeat(counting(), run_in(tmp_path), FRESH, Console(), watch_of([]))
+    (tmp_path / "metrics.jsonl").unlink()
+    with pytest.raises(ValueError, match=r"without its curve, metrics\.jsonl: put that back, use"):
+        repeat(counting(), run_in(tmp_path), FRESH, Console(), watch_of([]))
+
+
 def test_a_stopped_run_goes_on_with_its_curve_and_its_measurements(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         repeat(counting(stop=6), run_in(tmp_path), FRESH, Console(), watch_of([]))

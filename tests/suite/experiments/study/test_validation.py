@@ -1,5 +1,6 @@
 """The validation on worlds built by hand: who coasts through, who must hit, and when it ends."""
 
+from dataclasses import replace
 from functools import cache
 
 import jax.numpy as jnp
@@ -99,6 +100,13 @@ def test_worlds_are_fresh_fixed_and_all_at_rest():
     assert (one.fov_scale == 1).all()
     trained = sample_worlds(validation_worlds(CONFIG, 5, CONFIG.seed, 2.0), 0)
     assert not np.array_equal(one.pos_w, trained.pos_w)
+
+
+def test_a_policy_that_takes_a_speed_is_asked_for_its_own():
+    spec = replace(CONFIG.spec, speed_input=True)
+    asked = replace(CONFIG, spec=spec, episode=replace(CONFIG.episode, race_share=0.5))
+    worlds = sample_worlds(validation_worlds(asked, 40, 9, 2.0), 0)
+    assert np.all(np.asarray(worlds.wanted) == spec.speed)
 
 
 def test_a_trainings_own_seed_is_refused():
