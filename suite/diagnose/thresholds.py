@@ -163,8 +163,12 @@ class Thresholds:
     gain_doubt: float = 0.5
     """Share of a change by which the vehicle file may be wrong along an axis: inertia, arms and the
     rotors' torque are known no better where nobody identified them [1]."""
+    spread_freedom: int = 4
+    """Degrees of freedom for which the spread of all axes counts beside an axis's own [1]."""
     change_p_value: float = 0.02
-    """Chance of a false name of a change, over all candidates."""
+    """Chance of a false name of a change, over all candidates and views."""
+    change_draws: int = 9999
+    """Draws of what chance does to all candidates of a change at once."""
     swing_periods_s: tuple[float, float] = (0.6, 3.5)
     """Periods of pendulums of 0.1 to 3 m [s]."""
     swing_p_value: float = 0.001

@@ -160,8 +160,8 @@ def _agreement(found: ViewsDiagnosis) -> list[Part]:
         parts.append(
             f"The {len(found.references)} reference flights differ as though each rotor's thrust "
             f"were off by {100 * found.spread.share:.1f} % from flight to flight "
-            f"({found.spread.freedom} degrees of freedom). A change is named where it stands out "
-            "of that."
+            f"({found.spread.freedom} degrees of freedom); along an axis its own differences count "
+            "beside that. A change is named where it stands out of them."
         )
     return parts or ["Nothing was named on which flights could agree."]
 

@@ -15,18 +15,14 @@ from suite.diagnose.data.hold_out import choose_held_out
 from suite.diagnose.fit.composites import composites
 from suite.diagnose.fit.parameters import ParameterSpace, candidates, make_space, with_fitted
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.views.change.motion_change import search_motion_change
+from suite.diagnose.views.change.reference import changed_task, search_change
+from suite.diagnose.views.change.rotor_spread import RotorSpread, rotor_spread
 from suite.diagnose.views.data.flights import ViewFlights, parted, ready
 from suite.diagnose.views.data.view import FORCE, View
 from suite.diagnose.views.fit.equations import ViewTask, half_widths, left_of, look
 from suite.diagnose.views.fit.model import ForceModel
-from suite.diagnose.views.fit.motion_change import search_motion_change
 from suite.diagnose.views.fit.plausible import implausible
-from suite.diagnose.views.fit.reference import (
-    RotorSpread,
-    changed_task,
-    rotor_spread,
-    search_change,
-)
 from suite.diagnose.views.fit.search import ViewName, ViewSearch, search_view
 from suite.diagnose.views.fit.weigh import weights_of
 from suite.diagnose.views.judged import ViewGap, judge
@@ -125,7 +121,7 @@ def diagnose_by_views(
     for view in flights.views:
         task = ViewTask(view, model, fitted[view.name], limits)
         if known and spread:
-            found = search_change(known[view.name], task.flights, spread, among)
+            found = search_change(known[view.name], task.flights, spread, among, seed)
             apart = changed_task(known[view.name], found.first.theta, held[view.name])
             apart = apart._replace(means=True)
             if whole and not found.named:

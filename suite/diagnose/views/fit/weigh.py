@@ -2,7 +2,9 @@
 
 An unchanged vehicle flies each time with a slightly other trim, so that each flight's mean of each
 axis is a draw of its own: a random effect (Laird and Ware 1982). Rows are made independent of it by
-taking off a share of their flight's mean (quasi-demeaning; Fuller and Battese 1973).
+taking off a share of their flight's mean (quasi-demeaning; Fuller and Battese 1973). What all
+flights are judged from is off by a draw, too, which is the same for all: there a share of the mean
+of all goes.
 """
 
 from __future__ import annotations
@@ -26,6 +28,9 @@ class Weights(NamedTuple):
     """(3,) how many neighbouring moments tell as much as one that is independent."""
     trim: np.ndarray
     """(3,) standard deviation of flights' means; infinite where too few flights can tell."""
+    base: np.ndarray | None = None
+    """(3,) standard deviation of what all flights are judged from, where only their means count;
+    None where that is known."""
 
 
 def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
@@ -68,8 +73,20 @@ def weighed(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
         share = 1.0 - np.sqrt(own / (own + weights.trim**2))
         residual[rows] -= share * residual[rows].mean(axis=0)
         slope[rows] -= share[:, None] * slope[rows].mean(axis=0)
+    if weights.base is not None:
+        share = _share_of_all(len(residual), weights)
+        residual -= share * residual.mean(axis=0)
+        slope -= share[:, None] * slope.mean(axis=0)
     unit = weights.scatter * np.sqrt(weights.memory)
     return residual / unit, slope / unit[:, None]
+
+
+def _share_of_all(count: int, weights: Weights) -> np.ndarray:
+    """Return the share (3,) of the mean of `count` flights' means that what they share makes up."""
+    own = weights.scatter**2 * weights.memory + weights.trim**2
+    shared = count * np.asarray(weights.base) ** 2
+    told = np.isfinite(own)  # an axis of which flights' means tell nothing has no row to take from
+    return np.where(told, 1.0 - np.sqrt(1.0 / (1.0 + shared / np.where(told, own, 1.0))), 0.0)
 
 
 def blocks_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> np.ndarray:

@@ -19,7 +19,6 @@ from suite.diagnose.views.fit.equations import (
 )
 from suite.diagnose.views.fit.model import ForceModel
 from suite.diagnose.views.fit.plausible import at_bound, implausible, usual_first
-from suite.diagnose.views.fit.reference import rotor_spread, search_change
 from suite.diagnose.views.fit.search import search_view
 from suite.diagnose.views.fit.weigh import Weights, blocks_of, equations_of, weighed, weights_of
 from tests.support.real_flights import VEHICLE, flights
@@ -133,28 +132,6 @@ def test_a_flight_is_judged_by_what_the_others_say(dragged):
     first = look(task, start, weights_of(data))
     gains = chi2_by_flight(task, first, []) - chi2_by_flight(task, first, drag)
     assert gains.shape == (4,) and (gains > 0.0).all()
-
-
-def changes(logs, references):
-    among, found = candidates(SPACE, False, ()), {}
-    before = [task_of(references, view) for view in (FORCE, TORQUE)]
-    after = [task_of(logs, view) for view in (FORCE, TORQUE)]
-    spread = rotor_spread([*before, *after])
-    for reference, task in zip(before, after, strict=True):
-        search = search_change(reference, task.flights, spread, among)
-        found[task.view.name] = [name.candidate.label for name in search.named]
-    return found
-
-
-def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong():
-    wrong = {"thrust_scale": (0.9,), "linear_drag": (DRAG,)}
-    references = flights(3, seed=5, speed=1.0, **wrong)
-    weak = flights(3, seed=6, speed=1.0, weak_motor=((1.0, 1.0, 0.8, 1.0),), **wrong)
-    assert "weak_motor 3" in changes(weak, references)["torque"]
-    assert changes(flights(3, seed=7, speed=1.0, **wrong), references) == {
-        "force": [],
-        "torque": [],
-    }
 
 
 def test_sizes_beyond_three_times_the_usual_are_implausible():

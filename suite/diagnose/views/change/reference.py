@@ -1,24 +1,23 @@
 """What has changed since other flights of a vehicle, beyond how those differ among themselves.
 
 The vehicle file need not be right: what the reference flights leave of it, on average and with the
-velocity, is carried along. How much flights of an unchanged vehicle differ is taken from them too:
-as though each rotor's thrust were off by a little of its own each time, so that few flights tell it
-along all axes at once. A change is named where it is large beside that (F test; Fisher 1925), after
-Bonferroni over all candidates.
+velocity, is carried along. How much flights of an unchanged vehicle differ is taken from them too
+(`rotor_spread`); the reference flights' mean is off by it as well, for all others alike. A change
+is named where it is large beside that, for all candidates together (`chance`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as fisher
 
 from eval.effects import EFFECTS
 from suite.diagnose.fit.normal_equations import gauss_newton_step
 from suite.diagnose.fit.parameters import Candidate, indices_of
 from suite.diagnose.fit.rivals import flights_agree
+from suite.diagnose.views.change.chance import chance_of
+from suite.diagnose.views.change.rotor_spread import RotorSpread, rotor_gain
 from suite.diagnose.views.data.view import SmoothedFlight
 from suite.diagnose.views.fit.by_flight import centred, means_of
 from suite.diagnose.views.fit.compare import compare
@@ -32,17 +31,7 @@ from suite.diagnose.views.fit.equations import (
 )
 from suite.diagnose.views.fit.plausible import at_bound, implausible
 from suite.diagnose.views.fit.search import ViewName, ViewSearch, view_candidates
-from suite.diagnose.views.fit.weigh import Weights, weights_of
-
-
-@dataclass(frozen=True)
-class RotorSpread:
-    """How flights of one unchanged vehicle differ."""
-
-    share: float
-    """Standard deviation of a rotor's thrust from flight to flight [1]."""
-    freedom: int
-    """Degrees of freedom that it was estimated with."""
+from suite.diagnose.views.fit.weigh import Weights, weighed, weights_of
 
 
 def flown_in(task: ViewTask, theta: np.ndarray) -> np.ndarray:
@@ -59,29 +48,6 @@ def flown_in(task: ViewTask, theta: np.ndarray) -> np.ndarray:
     data = compare(task.view, task.model, theta, task.flights)
     flown = np.concatenate([np.concatenate(motion), data.value], axis=1)
     return centred(flown, data.flight)
-
-
-def rotor_gain(task: ViewTask) -> np.ndarray:
-    """Return what a rotor's own change of thrust does along each axis (3,), all four together."""
-    space = task.model.space
-    at = [i for i, entry in enumerate(space.entries) if entry.effect == "weak_motor"]
-    slope = left_of(task, space.array("start")).slope[..., at].mean(axis=0)
-    return np.sqrt((slope**2).sum(axis=1))
-
-
-def rotor_spread(sets: Sequence[ViewTask]) -> RotorSpread:
-    """Return how flights differ within each of `sets`: the reference's and the others', by view."""
-    square, freedom = 0.0, 0
-    for task in sets:
-        data, gain = left_of(task, task.model.space.array("start")), rotor_gain(task)
-        means = means_of(data.residual, data.flight)
-        axes = gain > task.limits.least_rotor_gain * gain.max()
-        if task.view.in_world:
-            axes &= np.arange(3) == 2  # across the thrust rotors do nothing
-        away = (means - means.mean(axis=0))[:, axes] / gain[axes]
-        square += float((away**2).sum())
-        freedom += int(axes.sum()) * (len(means) - 1)
-    return RotorSpread(float(np.sqrt(square / max(freedom, 1))), freedom)
 
 
 BALANCE = {"force": (("thrust_scale",),), "torque": (("com_offset",), ("torque_trim",))}
@@ -124,8 +90,12 @@ def search_change(
     flights: Sequence[SmoothedFlight],
     spread: RotorSpread,
     among: Sequence[Candidate],
+    seed: int = 0,
 ) -> ViewSearch:
-    """Return which of `among` explain what has changed since the flights of `reference`."""
+    """Return which of `among` explain what has changed since the flights of `reference`.
+
+    `seed` is of the draws of what chance does.
+    """
     start = in_balance(reference)
     task, count = changed_task(reference, start, flights), len(reference.flights)
     gain = rotor_gain(task)
@@ -135,16 +105,18 @@ def search_change(
     alone = weights.scatter * np.sqrt(weights.memory / moments)
     weights = weights._replace(scatter=alone, memory=np.ones(3))
     task = task._replace(means=True)
-    trim = spread.share * gain
+    trim = spread.along[task.view.name] * gain
     if task.view.in_world:
         trim[:2] = np.inf  # an attitude's trim, of which few flights tell too little
-    weights = weights._replace(trim=trim * np.sqrt(1.0 + 1.0 / count))
+    base = np.where(np.isfinite(trim), trim, 0.0) / np.sqrt(count)
+    weights = weights._replace(trim=trim, base=base)
     first = now = look(task, start, weights)
     among = view_candidates(among, first)
     doubted = weights._replace(trim=np.hypot(trim, task.limits.gain_doubt * _mean_change(first)))
+    sizes = spread.sizes(task.view.name, task.limits.change_draws, seed)
     named: list[ViewName] = []
     while len(named) < task.limits.most_names:
-        found = _next_change(task, now, doubted, named, among, spread.freedom)
+        found = _next_change(task, now, doubted, named, among, sizes, len(spread.along), seed)
         if found is None:
             break
         name, now = found  # what is left is no finding where a gain may be off: doubted from here
@@ -163,11 +135,14 @@ def _next_change(
     doubted: Weights,
     named: Sequence[ViewName],
     among: Sequence[Candidate],
-    freedom: int,
+    sizes: np.ndarray,
+    views: int,
+    seed: int,
 ) -> tuple[ViewName, ViewEquations] | None:
     """Return the change that stands out most beside `named`, and the equations with it.
 
-    Which one it is, is judged by weights that doubt the vehicle file's gains.
+    Which one it is, is judged by weights that doubt the vehicle file's gains. `sizes` (D, 3) are
+    draws of `RotorSpread.sizes`, and of `views` views each has its share of the chance.
     """
     beside, space = indices_of([n.candidate for n in named]), task.model.space
     left = [c for c in among if not set(c.indices) & set(beside)]
@@ -181,13 +156,16 @@ def _next_change(
             hessian[np.ix_(at, at)], gradient[at], now.theta, space, at.tolist()
         )[1]
 
-    without, tried = fall(beside), []
-    for candidate in left:
-        size = len(candidate.indices)
-        gain = fall([*beside, *candidate.indices]) - without
-        p_value = float(fisher.sf(max(gain, 0.0) / size, size, max(freedom, 1))) * len(left)
-        if p_value <= task.limits.change_p_value:
-            tried.append((gain - 2.0 * size, candidate, min(p_value, 1.0)))
+    without = fall(beside)
+    gains = [fall([*beside, *candidate.indices]) - without for candidate in left]
+    slope = weighed(now.data, now.weights)[1]
+    groups = [candidate.indices for candidate in left]
+    p_values = [views * p for p in chance_of(gains, slope, groups, beside, sizes, seed)]
+    tried = [
+        (gain - 2.0 * len(candidate.indices), candidate, p_value)
+        for gain, candidate, p_value in zip(gains, left, p_values, strict=True)
+        if p_value <= task.limits.change_p_value
+    ]
     if not tried:
         return None
     most = max(gain for gain, *_ in tried)

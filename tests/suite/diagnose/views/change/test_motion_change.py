@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from suite.diagnose.fit.parameters import candidates, make_space
+from suite.diagnose.views.change.motion_change import (
+    own_changes,
+    search_motion_change,
+    within_flights,
+)
 from suite.diagnose.views.data.flights import ready
 from suite.diagnose.views.data.view import FORCE
 from suite.diagnose.views.fit.compare import ViewData
 from suite.diagnose.views.fit.equations import ViewTask
 from suite.diagnose.views.fit.model import ForceModel
-from suite.diagnose.views.fit.motion_change import (
-    own_changes,
-    search_motion_change,
-    within_flights,
-)
 from tests.support.real_flights import VEHICLE, flights
 
 SPACE = make_space(VEHICLE)

@@ -16,11 +16,11 @@ from scipy.stats import ttest_ind
 
 from suite.diagnose.fit.parameters import Candidate
 from suite.diagnose.fit.rivals import flights_agree
+from suite.diagnose.views.change.reference import in_balance
 from suite.diagnose.views.fit.by_flight import centred
 from suite.diagnose.views.fit.compare import ViewData
 from suite.diagnose.views.fit.equations import ViewTask, left_of, look
 from suite.diagnose.views.fit.plausible import at_bound, usual_first
-from suite.diagnose.views.fit.reference import in_balance
 from suite.diagnose.views.fit.search import ViewName, ViewSearch, view_candidates
 from suite.diagnose.views.fit.weigh import weights_of
 

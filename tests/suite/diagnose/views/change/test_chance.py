@@ -1,0 +1,69 @@
+"""How often chance makes the best of all candidates of a change stand out as much."""
+
+import numpy as np
+import pytest
+
+from suite.diagnose.views.change.chance import chance_of
+from suite.diagnose.views.fit.compare import ViewData
+from suite.diagnose.views.fit.weigh import Weights, weighed
+
+FREEDOM = 12
+SIZES = np.random.default_rng(0).chisquare(FREEDOM, (1999, 3)) / FREEDOM
+
+
+def told(slope, groups, truth=0.0, beside=(), seed=0):
+    """Return p-values and gains of `groups` where what is left is noise and `truth` of column 0."""
+    rng = np.random.default_rng(seed)
+    size = np.sqrt(rng.chisquare(FREEDOM, 3) / FREEDOM)
+    left = (rng.standard_normal(slope.shape[:2]) / size + truth * slope[..., 0]).ravel()
+
+    def fall(columns):
+        if not columns:
+            return 0.0
+        rows = slope.reshape(-1, slope.shape[-1])[:, list(columns)]
+        return float(left @ rows @ np.linalg.pinv(rows) @ left)
+
+    without = fall(beside)
+    gains = [fall([*beside, *group]) - without for group in groups]
+    return chance_of(gains, slope, groups, beside, SIZES, seed=1), gains
+
+
+def names_by_chance(slope, groups, **asked):
+    return np.mean([min(told(slope, groups, seed=k, **asked)[0]) <= 0.1 for k in range(400)])
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.99])
+def test_chance_names_as_often_as_it_is_allowed_however_alike_candidates_are(alike):
+    rng = np.random.default_rng(5)
+    common = rng.standard_normal((6, 3, 1))
+    slope = alike * common + (1.0 - alike) * rng.standard_normal((6, 3, 10))
+    assert names_by_chance(slope, [(k,) for k in range(10)]) == pytest.approx(0.1, abs=0.045)
+    several = [(0,), (1, 2, 3), (4, 5), (6,)]
+    assert names_by_chance(slope, several, beside=(9,)) == pytest.approx(0.1, abs=0.045)
+
+
+def test_candidates_that_are_one_cost_as_much_as_one_and_others_more():
+    slope = np.random.default_rng(6).standard_normal((6, 3, 10))
+    one, gains = told(slope, [(0,)], truth=0.8)
+    twins, _ = told(np.repeat(slope[..., :1], 10, axis=-1), [(k,) for k in range(10)], truth=0.8)
+    others, others_gains = told(slope, [(k,) for k in range(10)], truth=0.8)
+    assert others_gains[0] == pytest.approx(gains[0])
+    assert twins == pytest.approx(one * 10)
+    assert 3.0 * one[0] < others[0] < 15.0 * one[0]
+
+
+def test_what_all_flights_are_judged_from_is_off_for_all_alike():
+    rng, few, many = np.random.default_rng(7), 2, 8
+    weights = Weights(np.full(3, 1e-3), np.ones(3), np.ones(3), np.full(3, 1.0 / np.sqrt(few)))
+    unknown = weights._replace(trim=np.array([1.0, np.inf, 1.0]))
+    sums = {"told": [], "taken as known": []}
+    for _ in range(2000):
+        base = rng.standard_normal((few, 3)).mean(axis=0)
+        residual = rng.standard_normal((many, 3)) - base
+        data = ViewData(np.arange(many), np.zeros(many), residual, residual, np.ones((many, 3, 1)))
+        for key, told_by in (("told", weights), ("taken as known", weights._replace(base=None))):
+            white, slope = weighed(data, told_by)
+            sums[key].append((white * slope[..., 0]).sum(axis=0) / np.sqrt((slope**2).sum((0, 2))))
+        assert np.all(weighed(data, unknown)[0][:, 1] == 0.0)
+    assert np.std(sums["told"], axis=0) == pytest.approx(np.ones(3), rel=0.06)
+    assert np.std(sums["taken as known"], axis=0).min() > 2.0  # the square root of 1 + 8 / 2
