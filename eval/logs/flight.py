@@ -12,7 +12,7 @@ class Flight(NamedTuple):
 
     Row k holds what was measured at `time_s[k]` before the command of row k acts; that command
     holds until `time_s[k + 1]`. The last row is the state at the end of the trial; its command is
-    the one that would have come next, or the last one flown where the trial ended inside a period.
+    the last one flown.
     """
 
     time_s: np.ndarray
