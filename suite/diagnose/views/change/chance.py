@@ -36,6 +36,7 @@ def chance_of(
     noise = np.random.default_rng(seed).standard_normal((draws, len(slope), 3))
     noise = (noise / np.sqrt(sizes)[:, None]).reshape(draws, -1)
     slope = slope.reshape(-1, slope.shape[-1])
+    slope = slope / np.maximum(np.linalg.norm(slope, axis=0), 1e-300)
     known = _directions(slope[:, list(beside)])
     free = slope - known @ (known.T @ slope)
     least = np.ones(draws)
@@ -54,8 +55,6 @@ def _alone(gain: np.ndarray | float, size: int) -> np.ndarray:
 
 
 def _directions(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (M, R) of what `columns` (M, K), of any size each, span."""
-    length = np.linalg.norm(columns, axis=0)
-    columns = columns[:, length > 1e-12] / length[length > 1e-12]
+    """Return an orthonormal basis (M, R) of what `columns` (M, K), of unit size or none, span."""
     left, value, _ = np.linalg.svd(columns, full_matrices=False)
     return left[:, value > 1e-6]

@@ -8,7 +8,7 @@ from suite.diagnose.views.fit.compare import ViewData
 from suite.diagnose.views.fit.weigh import Weights, weighed
 
 FREEDOM = 12
-SIZES = np.random.default_rng(0).chisquare(FREEDOM, (1999, 3)) / FREEDOM
+SIZES = np.random.default_rng(0).chisquare(FREEDOM, (999, 3)) / FREEDOM
 
 
 def told(slope, groups, truth=0.0, beside=(), seed=0):
@@ -29,7 +29,7 @@ def told(slope, groups, truth=0.0, beside=(), seed=0):
 
 
 def names_by_chance(slope, groups, **asked):
-    return np.mean([min(told(slope, groups, seed=k, **asked)[0]) <= 0.1 for k in range(400)])
+    return np.mean([min(told(slope, groups, seed=k, **asked)[0]) <= 0.1 for k in range(250)])
 
 
 @pytest.mark.parametrize("alike", [0.0, 0.99])
@@ -37,9 +37,9 @@ def test_chance_names_as_often_as_it_is_allowed_however_alike_candidates_are(ali
     rng = np.random.default_rng(5)
     common = rng.standard_normal((6, 3, 1))
     slope = alike * common + (1.0 - alike) * rng.standard_normal((6, 3, 10))
-    assert names_by_chance(slope, [(k,) for k in range(10)]) == pytest.approx(0.1, abs=0.045)
+    assert names_by_chance(slope, [(k,) for k in range(10)]) == pytest.approx(0.1, abs=0.055)
     several = [(0,), (1, 2, 3), (4, 5), (6,)]
-    assert names_by_chance(slope, several, beside=(9,)) == pytest.approx(0.1, abs=0.045)
+    assert names_by_chance(slope, several, beside=(9,)) == pytest.approx(0.1, abs=0.055)
 
 
 def test_candidates_that_are_one_cost_as_much_as_one_and_others_more():
@@ -50,6 +50,13 @@ def test_candidates_that_are_one_cost_as_much_as_one_and_others_more():
     assert others_gains[0] == pytest.approx(gains[0])
     assert twins == pytest.approx(one * 10)
     assert 3.0 * one[0] < others[0] < 15.0 * one[0]
+
+
+def test_what_is_fitted_anyhow_counts_no_more():
+    slope = np.random.default_rng(8).standard_normal((6, 3, 3)) * [1e6, 1.0, 1e-6]
+    slope[..., 2] = 0.3 * slope[..., 0]
+    same, apart = chance_of([1.0, 1.0], slope, [(2,), (1,)], (0,), SIZES, seed=1)
+    assert same == apart == chance_of([1.0], slope, [(1,)], (0,), SIZES, seed=1)[0]
 
 
 def test_what_all_flights_are_judged_from_is_off_for_all_alike():
