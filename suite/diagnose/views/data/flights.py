@@ -65,7 +65,7 @@ def ready(
     if any("quat" in log.partial for log in logs):
         views = [replace(FORCE, axes=(2,))]
     if all(one.each for one in acting):
-        slow = any("rate" in log.partial for log in logs)
+        slow = any({"quat", "rate"} <= set(log.partial) for log in logs)
         views.append(replace(TORQUE, width_s=SLOW_WIDTH_S) if slow else TORQUE)
     parts = {view.name: [smoothed(view, one, limits) for one in rows] for view in views}
     if TORQUE.name in parts:

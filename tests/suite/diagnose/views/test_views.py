@@ -76,13 +76,22 @@ def test_a_mass_is_an_alternative_of_a_thrust_though_it_is_not_linear():
     assert rivals.keys() | set().union(*rivals.values()) >= {"thrust_scale", "mass_offset"}
 
 
-def test_rates_that_a_log_lacks_are_those_of_its_attitude():
-    blind = [
+def without_gyro(logs):
+    return [
         replace(log, rate_b=np.full_like(log.rate_b, np.nan), about={"partial": ["rate"]})
-        for log in flights(4, seed=5)
+        for log in logs
     ]
-    found = diagnose_by_views(blind, VEHICLE)
+
+
+def test_rates_that_a_log_lacks_are_those_of_its_attitude():
+    found = diagnose_by_views(without_gyro(flights(4, seed=5)), VEHICLE)
     assert (found.verdict, found.named) == ("no_gap", [])
+
+
+def test_an_attitude_alone_tells_the_torque_as_finely_as_a_gyro():
+    moved = flights(4, seed=5, com_offset=((0.006, -0.002, 0.0),))
+    found = diagnose_by_views(without_gyro(moved), VEHICLE)
+    assert [name.candidate.name for _, name in found.named] == ["com_offset"]
 
 
 def test_the_vehicle_itself_has_no_gap():
