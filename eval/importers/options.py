@@ -28,9 +28,9 @@ class ImportOptions:
     rate_hz: float = 250.0
     """At most this many rows a second; faster signals are smoothed over a row's period."""
     start_s: float = 0.0
-    """Leave out what is earlier than this after the first row [s]."""
+    """Leave out what is earlier than this after the file's first sample, ground or not [s]."""
     end_s: float | None = None
-    """Leave out what is later than this after the first row [s]."""
+    """Leave out what is later than this after the file's first sample, ground or not [s]."""
     source: str = ""
     """Take the pose from `mocap` or `estimate` where a file holds both; empty: as the mapping has
     them in order."""

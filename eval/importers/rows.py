@@ -113,6 +113,11 @@ def row_times(
             for name, s in zip(NEEDED, needed, strict=True)
         )
         reason = f"no time at which position, attitude and gyro are all there ({spans})"
+        if inside.any():
+            reason = (
+                f"--start and --end leave nothing of {base[inside][0] - first:.1f} to "
+                f"{base[inside][-1] - first:.1f} s; they count from the file's first sample"
+            )
         raise FlightLogError(recording.name, "time", None, reason)
     return time_s
 

@@ -106,6 +106,8 @@ class FlightLog:
         parts = [self.pos_w, self.quat_wxyz, self.vel_w, self.rate_b]
         if self.thrust_cmd is not None and self.rate_cmd_b is not None:
             parts += [self.thrust_cmd[:, None], self.rate_cmd_b]
+        elif self.thrust_cmd is not None and self.torque_cmd_b is not None:
+            parts += [self.thrust_cmd[:, None], self.torque_cmd_b]
         elif self.rotor_speed is not None:
             parts.append(self.rotor_speed)
         elif self.pwm is not None:

@@ -43,9 +43,9 @@ class Config:
     rate: Annotated[float, Range(1.0, 10_000.0)] = 250.0
     """At most this many rows a second."""
     start: Annotated[float, Range(0.0, 1e9)] = 0.0
-    """Leave out what is earlier [s after the first row]."""
+    """Leave out what is earlier [s after the file's first sample, on the ground or not]."""
     end: Annotated[float, Range(0.0, 1e9)] | None = None
-    """Leave out what is later [s after the first row]."""
+    """Leave out what is later [s after the file's first sample, on the ground or not]."""
     keep_ground: bool = False
     """Keep the time before take-off and after landing."""
     partial: bool = False

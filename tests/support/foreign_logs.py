@@ -281,6 +281,7 @@ def write_mcap(
     full_thrust=30.0,
     motion=True,
     source=fly,
+    mask=0,
 ):
     """ROS 2: odometry (twist in the body), imu, mavros' attitude target and motors, in MCAP."""
     from mcap_ros2.writer import Writer
@@ -332,8 +333,8 @@ def write_mcap(
         for k, t in enumerate(truth.time):
             message = {
                 "header": header(t),
-                "type_mask": 0,
-                "orientation": quaternion([1, 0, 0, 0]),
+                "type_mask": mask,
+                "orientation": quaternion(truth.quat[k]),
                 "body_rate": xyz(truth.cmd_rate[k]),
                 "thrust": float(truth.thrust[k] / full_thrust),
             }

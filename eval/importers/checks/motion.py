@@ -131,8 +131,11 @@ def check_rate_command(rows: dict[str, np.ndarray], fix: bool) -> list[Finding]:
     command, rate = rows["cmd_rate"], rows["rate"]
     both = np.isfinite(command).all(axis=1) & np.isfinite(rate).all(axis=1)
     command, rate = command[both], rate[both]
-    if len(rate) < 30 or min(_rms(command), _rms(rate)) == 0:
+    if len(rate) < 30:
         return [Finding("note", "rate command", "too few to check")]
+    if min(_rms(command), _rms(rate)) == 0:
+        still = "it" if _rms(command) == 0 else "the gyro"
+        return [Finding("note", "rate command", f"{still} is 0 throughout")]
     alike = float(np.sum(command * rate) / np.sqrt(np.sum(command**2) * np.sum(rate**2)))
     ratio = _rms(command) / _rms(rate)
     figures = f"{ratio:.2g} times the gyro, correlation {alike:.2f}"

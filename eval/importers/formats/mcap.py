@@ -42,6 +42,8 @@ KINDS: dict[str, tuple[str, ...]] = {
     "battery": ("sensor_msgs/BatteryState",),
 }
 """Kind of message -> types that hold it, `/msg/` left out."""
+IGNORE_RATES, IGNORE_THRUST, IGNORE_ATTITUDE = 7, 64, 128
+"""Bits of `AttitudeTarget.type_mask` (MAVLink's ATTITUDE_TARGET_TYPEMASK)."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
@@ -159,8 +161,9 @@ def _signals(
     take("rate", "imu", lambda m: _xyz(m.angular_velocity))
     take("rate", "odometry", lambda m: _xyz(m.twist.twist.angular))
     take("acc", "imu", lambda m: _xyz(m.linear_acceleration))
-    take("cmd_rate", "command", lambda m: _xyz(m.body_rate))
-    take("throttle", "command", lambda m: [m.thrust])
+    take("cmd_rate", "command", lambda m: _unless(m, IGNORE_RATES, _xyz(m.body_rate)))
+    take("cmd_quat", "command", lambda m: _unless(m, IGNORE_ATTITUDE, _wxyz(m.orientation)))
+    take("throttle", "command", lambda m: _unless(m, IGNORE_THRUST, [m.thrust]))
     take("motor", "motors", _speeds)
     take("voltage", "battery", lambda m: [m.voltage])
     signals, findings = collect(parts, name)
@@ -175,6 +178,11 @@ def _xyz(vector: Any) -> list[float]:
 
 def _wxyz(quat: Any) -> list[float]:
     return [quat.w, quat.x, quat.y, quat.z]
+
+
+def _unless(message: Any, ignored: int, value: list[float]) -> list[float]:
+    """Return `value`, NaN where the message's mask says that it is to be ignored."""
+    return [float("nan")] * len(value) if message.type_mask & ignored else value
 
 
 def _speeds(message: Any) -> list[float]:

@@ -175,9 +175,11 @@ def _beside(path: Path, mapping: LogMap) -> tuple[dict[str, Any], list[Finding]]
         key, colon, value = line.partition(":")
         if colon and value.strip():
             about[key.strip()] = _number_or_text(value.strip())
-    if mapping.mass_key and isinstance(about.get(mapping.mass_key), float):
-        about["mass"] = about[mapping.mass_key]
-    return about, [Finding("note", "file", f"{file.name} is beside it; read with it")]
+    found: dict[str, Any] = {"beside": about}
+    mass = about.get(mapping.mass_key) if mapping.mass_key else None
+    if isinstance(mass, float) and mass > 0.0:
+        found["mass"] = mass
+    return found, [Finding("note", "file", f"{file.name} is beside it; read with it")]
 
 
 def _number_or_text(text: str) -> float | str:

@@ -103,7 +103,9 @@ def fly(
         seen = _rows(row, now[:, 0], state)
         # Before the row's command acts, as a sensor would have it.
         body.begin_row(now, speed)
-        accs[row] = body.forces(state, speed, now, body.blowing)[0] / quadrotor.mass
+        force_b = body.forces(state, speed, now, body.blowing)[0]
+        pushed_b = pushes[plan.block[row] - 1] if row else np.zeros((count, 3))
+        accs[row] = (force_b + pushed_b) / quadrotor.mass
         volts[row] = battery.full_v - body.drop(now, speed)[:, 0]
         commands[row], actings[row] = pilot(seen)
         for step in range(plan.block[row], plan.block[row + 1]):

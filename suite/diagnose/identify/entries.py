@@ -184,7 +184,8 @@ def put(vehicle: Vehicle, entry: Number) -> Vehicle:
         low, high = at(parameter.low, vehicle), at(parameter.high, vehicle)
         kept = [min(max(v, low), high) for v in value]
         if name == "command_delay" and kept[0] <= 0.0:
-            return vehicle
+            others = {n: v for n, v in vehicle.effects.items() if n != name}
+            return replace(vehicle, effects=MappingProxyType(others))
         values = effect.values(tuple(kept) if parameter.size else kept[0])
         return replace(vehicle, effects=MappingProxyType({**vehicle.effects, name: values}))
     if not table:

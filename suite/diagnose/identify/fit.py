@@ -297,16 +297,18 @@ def _errors(
         widest = np.where(differ, np.maximum(widest, wide), widest)
     # What white noise of this size makes of it: where that is far more, the equations are blind.
     widest = np.maximum(widest, BLIND * Z95 * np.sqrt(np.diag(inverse)))
-    floor = np.array([unknowns[k].floor for k in free])
-    widest = np.sqrt(widest**2 + floor**2)
     most = np.array([np.inf if k in told else Z95 * unknowns[k].room for k in free])
     widest = np.minimum(widest, most)
+    # The method's own errors are no part of what the noise makes alike in two numbers.
+    floor = np.array([unknowns[k].floor for k in free])
+    floor = np.minimum(floor, np.sqrt(most**2 - widest**2))
     sd = np.sqrt(np.diag(blocks))
     alike = blocks / np.maximum(np.outer(sd, sd), 1e-30)
     np.fill_diagonal(alike, 1.0)
     # What was given moves the numbers by so much.
     follow = inverse @ whole[np.ix_(free, taken)]
-    found = alike * np.outer(widest, widest) / Z95**2 + follow @ given.covariance @ follow.T
+    noise = (alike * np.outer(widest, widest) + np.diag(floor**2)) / Z95**2
+    found = noise + follow @ given.covariance @ follow.T
     covariance = np.zeros((total, total))
     covariance[np.ix_(free, free)] = found
     covariance[np.ix_(taken, taken)] = given.covariance

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from eval.logs.flight_log import (
+    FlightLog,
     FlightLogError,
     log_from_columns,
     log_from_flight,
@@ -97,3 +98,19 @@ def test_one_bad_flight_among_many_is_named_and_all_bad_is_an_error(tmp_path):
     assert str(bad) in str(caught.value)
     with pytest.raises(FlightLogError, match="no file"):
         read_flights([])
+
+
+def test_a_row_that_lacks_a_torque_is_not_whole():
+    still, up = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
+    torque = np.array([[0.0, 0.0, 0.0], [0.0, np.nan, 0.0], [0.0, 0.0, 0.0]])
+    log = FlightLog(
+        "made",
+        np.arange(3.0),
+        still,
+        up,
+        still,
+        still,
+        thrust_cmd=np.array([9.0, 9.0, np.nan]),
+        torque_cmd_b=torque,
+    )
+    np.testing.assert_array_equal(log.whole, [True, False, False])

@@ -167,13 +167,21 @@ def _turning(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    good = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-    t = time_s[good]
-    # A grid point on a row's own stamp has that row's command, whatever was rounded.
-    at = np.searchsorted(t, grid + 1e-6, side="right") - 1
-    out = np.array(values[good][np.clip(at, 0, None)], dtype=float)
-    out[(at < 0) | _in_hole(t, grid)] = np.nan
-    return out
+    """Return what is held from row to row as its means from grid point to grid point.
+
+    A row's stamp is mostly between two of them: taken at the points it would come late.
+    """
+    wide = values.reshape(len(values), -1)
+    good = np.isfinite(wide).all(axis=1)
+    t, v = time_s[good], np.asarray(wide[good], dtype=float)
+    whole = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(np.diff(t)[:, None] * v[:-1], 0)])
+    edge = np.append(grid, grid[-1] + STEP_S)
+    at = np.searchsorted(t, edge + 1e-9, side="right") - 1
+    row = np.clip(at, 0, None)
+    total = whole[row] + (edge - t[row])[:, None] * v[row]
+    out = np.diff(total, axis=0) / STEP_S
+    out[(at[:-1] < 0) | _in_hole(t, grid)] = np.nan
+    return out.reshape(len(grid), *values.shape[1:])
 
 
 def _in_hole(t: np.ndarray, grid: np.ndarray) -> np.ndarray:

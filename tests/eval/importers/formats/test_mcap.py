@@ -9,6 +9,7 @@ from eval.logs.columns import FlightLogError
 from tests.support import foreign_logs as made
 from tests.support import known_flight
 from tests.support.imported import levels, near, quat_off, text
+from tests.support.vehicles import PLAIN
 
 FULL = ImportOptions(full_thrust=30.0)
 
@@ -25,6 +26,17 @@ def test_mcap_equals_the_flight(tmp_path):
     near(np.asarray(log.thrust_cmd)[::2], truth.thrust[::2], 1e-5)
     assert "/odom_slow" in text(findings, "topics")
     assert {"corrected", "doubt"}.isdisjoint(levels(findings).values())
+
+
+def test_what_an_attitude_target_says_to_ignore_is_no_command(tmp_path):
+    path = made.write_mcap(tmp_path / "log.mcap", span=(0, 4), mask=7)
+    log, _ = import_log(path, None, FULL)
+    assert log.rate_cmd_b is None and log.rotor_speed is not None
+    log, _ = import_log(path, None, ImportOptions(full_thrust=30.0, vehicle=PLAIN))
+    assert log.rate_cmd_b is not None and log.thrust_cmd is not None
+    whole = made.write_mcap(tmp_path / "none.mcap", span=(0, 4), mask=7 + 64 + 128)
+    log, _ = import_log(whole, None, FULL)
+    assert log.rate_cmd_b is None and log.thrust_cmd is None
 
 
 def test_mcap_topics_are_chosen_by_a_map(tmp_path):

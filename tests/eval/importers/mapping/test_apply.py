@@ -109,7 +109,12 @@ mass = "mass"
     log, _ = imported(tmp_path, mapping, columns)
     near(log.thrust_cmd, truth.thrust, 1e-9)
     near(log.torque_cmd_b, truth.rate * 1e-3, 1e-12)
-    assert log.about["motors"] == "standard"
+    assert log.about["beside"] == {"motors": "standard", "mass": 0.5} and log.about["mass"] == 0.5
+    (tmp_path / "info7.yaml").write_text("integrator: euler\npartial: no\nmass: 0\n")
+    with pytest.raises(FlightLogError, match="nothing says the mass"):
+        imported(tmp_path, mapping, columns)
+    other, _ = imported(tmp_path, mapping, columns, mass=0.5)
+    assert other.integrator is None and not other.partial
     log, _ = imported(tmp_path, mapping, columns, vehicle=PLAIN)
     near(log.thrust_cmd, 0.5 * truth.thrust / PLAIN.mass, 1e-9)
     assert log.rate_cmd_b is None

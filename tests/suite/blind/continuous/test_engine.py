@@ -127,6 +127,8 @@ def test_a_push_is_felt_and_kept():
 
     run = flown(PLAIN, [0.0, 0.5], [(HOVER, 0, 0, 0)], push=push)
     assert run.state[-1, 0, VEL][0] == pytest.approx(0.5) and run.push_b[3, 0, 0] == 0.75
+    many = flown(PLAIN, [0.0, 0.1, 0.2, 0.3], [(HOVER, 0, 0, 0)] * 3, push=push)
+    assert many.acc_b[1:, 0, 0] == pytest.approx(np.full(2, 0.75 / PLAIN.mass))
 
 
 def test_the_accelerometer_is_that_of_before_the_command_and_the_voltage_falls():

@@ -5,7 +5,7 @@ import numpy as np
 from suite.diagnose.identify.data.drive import MotorGuess
 from suite.diagnose.identify.entries import inertia_of, motors_of, put
 from suite.diagnose.identify.numbers import Number
-from tests.support.vehicles import PLAIN
+from tests.support.vehicles import PLAIN, with_effects
 
 
 def test_motors_push_alike_at_any_nominal_voltage():
@@ -29,3 +29,10 @@ def test_what_was_told_is_put_in_and_the_rest_stays():
     assert put(PLAIN, lag._replace(ci95=[None])) == PLAIN
     drag = Number("effects.linear_drag.coefficient", "1/s", [0.3, -0.1, 0.0], [(0.2, 0.4)] * 3)
     assert put(PLAIN, drag).effects["linear_drag"].coefficient == (0.3, 0.0, 0.0)
+
+
+def test_a_delay_that_flights_deny_goes():
+    late = with_effects(PLAIN, command_delay=(0.03,), linear_drag=((0.1, 0.1, 0.1),))
+    none = Number("effects.command_delay.delay", "s", [-0.001], [(-0.002, 0.0)])
+    assert set(put(late, none).effects) == {"linear_drag"}
+    assert put(late, none._replace(ci95=[None])) == late

@@ -69,6 +69,27 @@ def test_what_is_given_widens_what_hangs_on_it():
     np.testing.assert_allclose(found.give("given", "none").covariance, [[0.01]])
 
 
+def test_the_methods_own_errors_do_not_go_out_of_a_difference():
+    rng, made = np.random.default_rng(0), []
+    for _ in range(4):
+        x = rng.normal(size=200)
+        near = x + 0.2 * rng.normal(size=200)
+        made.append((x, near, 2.0 * x - 1.0 * near + 0.01 * rng.normal(size=200)))
+    block = np.arange(200) // 10
+
+    def misses(value):
+        return [Rows((y - value[0] * x - value[1] * n)[:, None], block, NONE) for x, n, y in made]
+
+    numbers = [SLOPE._replace(floor=0.5), Unknown("other", 0.0, -9.0, 9.0, 1.0, 1e-3, 0.5)]
+    found = fit(misses, numbers)
+    both = found.covariance
+    assert both[0, 1] < 0.0 < both[0, 0] and np.sqrt(both[0, 0]) == pytest.approx(
+        0.5 / 1.96, rel=0.01
+    )
+    total = both[0, 0] + both[1, 1] + 2.0 * both[0, 1]
+    assert np.sqrt(total) == pytest.approx(np.sqrt(2.0) * 0.5 / 1.96, rel=0.01)
+
+
 def test_intervals_of_few_blocks_are_as_much_wider_as_students_t():
     few, many = (
         [fit(flights([2.0], count=count, seed=k), [SLOPE]).half_width[0] for k in range(60)]

@@ -53,6 +53,19 @@ def test_commands_hold_until_the_next_row_and_measurements_are_joined():
     assert not flight.has("voltage")
 
 
+def test_a_command_counts_from_its_stamp_wherever_that_is_on_the_grid():
+    rng = np.random.default_rng(0)
+    time_s = np.concatenate([[0.0], np.cumsum(rng.uniform(0.004, 0.012, 400))])
+    still, up = np.zeros((401, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (401, 1))
+    asked = rng.standard_normal((401, 4))
+    log = FlightLog("made", time_s, still, up, still, still, pwm=asked)
+    held = grid_of(log).known["pwm"]
+    for k in (0, 17, 100, 250):
+        fine = STEP_S * (k + (np.arange(4000) + 0.5) / 4000)
+        mean = asked[np.searchsorted(time_s, fine, side="right") - 1].mean(axis=0)
+        np.testing.assert_allclose(held[k], mean, atol=2e-3)
+
+
 def test_rates_that_are_not_logged_come_of_the_attitude():
     time_s = np.arange(0.0, 2.0, 0.01)
     half = 0.5 * 0.8 * time_s
