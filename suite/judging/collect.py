@@ -17,6 +17,7 @@ from suite.judging.flying import (
     flying_needs,
     load_flier,
     read_course,
+    refuse_one_name,
     say_notes,
     who_flies,
     workers_for,
@@ -59,7 +60,7 @@ def collect(
 
     course, manner = read_course(collection), Manner(speed=collection.speed)
     check_records(collection.world)
-    _refuse_one_name({trial.track for trial in course.trials})
+    refuse_one_name({trial.track for trial in course.trials})
     asked = collection.policy or default_policy()
     policy = load_flier(asked, collection.trust, manner)
     out = Path(out)
@@ -154,17 +155,6 @@ def _row(out: Path, result: TrialResult) -> Row | None:
         if not (out / name).is_file():
             return None
     return {"file": name, **result._asdict()}
-
-
-def _refuse_one_name(tracks: set[str]) -> None:
-    """Refuse tracks whose logs would be written over each other."""
-    stems = [Path(track).stem for track in tracks]
-    for stem in stems:
-        if stems.count(stem) > 1:
-            raise ValueError(
-                f"--track: more than one is called {stem!r}, and logs are named after their track; "
-                "rename a file, or collect them into folders of their own"
-            )
 
 
 def _log_name(result: TrialResult) -> str:

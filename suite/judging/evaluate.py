@@ -78,10 +78,9 @@ def evaluate(
     announce(console, what, flying_needs(flown, workers, evaluation.world))
     say_notes(console, evaluation.world, course)
     results: list[TrialResult] = []
-    journals: list[Path] = []
     for number, flier in enumerate(fliers):
-        journals.append(out / f"journal-{number}.jsonl")
-        results += _fly_one(evaluation, course, flier, workers, journals[-1], console)
+        journal = out / f"journal-{number}.jsonl"
+        results += _fly_one(evaluation, course, flier, workers, journal, console)
     summary = {
         **summarise(results),
         "judged": evaluation,
@@ -96,7 +95,7 @@ def evaluate(
         seed=evaluation.seed,
     )
     write_run_record(out, evaluation, evaluation.seed)
-    for journal in journals:
+    for journal in out.glob("journal-*.jsonl"):  # those of an earlier command are done with, too
         journal.unlink()
     for grid in grids(summary):
         console.show(rich_table(grid))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -111,8 +111,8 @@ class Course(NamedTuple):
     """What else a person is told, in sentences."""
 
 
-def read_course(wanted: Evaluation | Collection) -> Course:
-    """Return what is to be flown.
+def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Course:
+    """Return what is to be flown; in `real_time` no two flights are alike, whatever acts.
 
     Raises:
         ValueError: for an unknown world or track, too few trials, or a bad track or vehicle file.
@@ -127,7 +127,7 @@ def read_course(wanted: Evaluation | Collection) -> Course:
     vehicle = load_vehicle(wanted.vehicle)
     flown_otherwise, notes = differences(wanted.world, vehicle), list[str]()
     levels, tracks = parse_levels(wanted.difficulty), custom_tracks(names)
-    once = not any(EFFECTS[name].random for name in vehicle.effects)
+    once = not (real_time or any(EFFECTS[name].random for name in vehicle.effects))
     if once and wanted.trials > 1:
         notes = [
             f"{name}: flown once, not {wanted.trials} times: a track from a file and a vehicle on "
@@ -136,6 +136,17 @@ def read_course(wanted: Evaluation | Collection) -> Course:
         ]
     trials = trial_list(names, levels, wanted.trials, wanted.seed, once)
     return Course(trials, tracks, vehicle, flown_otherwise, notes)
+
+
+def refuse_one_name(tracks: Iterable[str]) -> None:
+    """Refuse tracks whose logs would be written over each other."""
+    stems = [Path(track).stem for track in tracks]
+    for stem in stems:
+        if stems.count(stem) > 1:
+            raise ValueError(
+                f"--track: more than one is called {stem!r}, and logs are named after their track; "
+                "rename a file, or give each an --out of its own"
+            )
 
 
 def say_notes(console: Console, world: str, course: Course) -> None:

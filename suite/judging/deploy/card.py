@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from policies import shipped
@@ -62,7 +63,8 @@ def _success(asked: str) -> str:
     first = whole.index(lines[0])
     last = next((k for k in range(first, len(whole)) if not whole[k].startswith("|")), len(whole))
     table = "\n".join(whole[first:last])
+    spans = " with 95 % intervals" if re.search(r"\[\d", table) else ""
     return (
-        "Success of the policy that it came from, by its card, with 95 % intervals "
+        f"Success of the policy that it came from, by its card{spans} "
         f"(`suite eval --policy . --trust` flies the export):\n\n{table}\n"
     )

@@ -9,7 +9,14 @@ from typing import Any
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.provenance import write_run_record
-from suite.judging.flying import Course, about_policy, default_policy, load_flier, read_course
+from suite.judging.flying import (
+    Course,
+    about_policy,
+    default_policy,
+    load_flier,
+    read_course,
+    refuse_one_name,
+)
 from suite.judging.link.companion import FINISHED, Companion
 from suite.judging.link.flights import Flight, fly_link, fly_simulated, totals, write_log
 from suite.judging.link.messages import Wire, dialect
@@ -36,7 +43,8 @@ def fly_commanded(
         WorkFailed: where pymavlink is missing, or no vehicle answered.
     """
     dialect()
-    course = read_course(asked)
+    course = read_course(asked, real_time=True)
+    refuse_one_name({trial.track for trial in course.trials})
     name = policy or default_policy()
     loaded = load_flier(name, asked.trust, manners(asked.speed, monitor=False)[0])
     out.mkdir(parents=True, exist_ok=True)
@@ -74,6 +82,8 @@ def _real(
             f"--link flies one flight, and {len(course.trials)} are asked for; give one track, "
             "one level and --trials 1"
         )
+    if (out / FLY).is_file():
+        raise ValueError(f"--out {out} holds an earlier flight; give each one a folder of its own")
     (trial,) = course.trials
     warm_up(policy)
     link, wire = UdpLink(address), Wire(COMPANION, VEHICLE)
@@ -83,9 +93,9 @@ def _real(
     try:
         fly_link(companion, link)
     except KeyboardInterrupt:
-        companion.over = companion.over or "the operator"
+        link.send(companion.end("the operator"))
     except Exception as error:
-        companion.over = f"{type(error).__name__}: {error}"
+        link.send(companion.end(f"{type(error).__name__}: {error}"))
         raise
     finally:
         link.close()

@@ -112,6 +112,10 @@ class Companion:
         self._heard_at = heard_s
         return self._answer(states)
 
+    def end(self, reason: str) -> list[bytes]:
+        """Return the datagrams that hand over for `reason`, none where that has happened."""
+        return self._hand_over(reason) if self.over is None else []
+
     def _event(self, text: str) -> None:
         self.events.append(f"{self._clock():.3f}: {text}")
 

@@ -79,7 +79,9 @@ def test_trials_flown_before_under_another_label_are_the_same_policys(
     with monkeypatch.context() as patch:
         patch.setattr(eval.judging.judge, "fly", one_only)
         assert _eval(tmp_path / "out", *args) == 130
+    (tmp_path / "out" / "journal-2.jsonl").write_text("of a command with more policies\n")
     assert _eval(tmp_path / "out", *args, "--policy", pilots["diver2"]) == 0
+    assert not list((tmp_path / "out").glob("journal-*.jsonl")), "suite view takes it for finished"
     rows = read_trials(tmp_path / "out" / "trials.parquet")
     assert [row.policy for row in rows] == [pilots[p] for p in ("diver", "diver2") for _ in "ab"]
 

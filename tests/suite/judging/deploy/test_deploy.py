@@ -69,6 +69,8 @@ def test_what_cannot_be_exported_is_refused(folder, tmp_path, capsys):
 def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
     found = parity.Parity(0, "", np.nan, np.nan, None)
     text = card.card_text("racer", "racer", load_policy_checkpoint(folder), "float32", found)
+    asked = card.card_text("swift-30", "swift-30", load_policy_checkpoint(folder), "float32", found)
+    assert "95 % intervals" in text and "95 % intervals" not in asked
     assert "| racer | zigzag | 0 | 100 | 98 % [93, 99]" in text
     assert "no C compiler" in text and "not measured" in text
 

@@ -1,6 +1,7 @@
 """The link: what travels, when the companion hands over, and a flight with both ends."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.policy import load_policy
 from suite import cli
+from suite.judging.flying import read_course
 from suite.judging.link import commanded, server
 from suite.judging.link.companion import Companion
 from suite.judging.link.flights import Flight, fly_link, totals, warm_up, write_log
@@ -29,6 +31,7 @@ from suite.judging.link.row import Row
 from suite.judging.link.simulated import LOST_S, SimulatedVehicle
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
+from suite.judging.requests import Evaluation
 from tests.support.pilots import Pursuit
 from tracks.geometry.rotation import quat_to_rot
 
@@ -232,6 +235,35 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(commanded, "fly_link", refused)
     assert cli.main([*asked, "--confirm"]) == 1
     assert "before the first set point: outside the box at 0.0, 0.0, -3.0 m" in told(capsys)
+
+
+def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
+    capsys, tmp_path, monkeypatch
+):
+    asked = ["fly", "--out", str(tmp_path), "--link", "udpin:127.0.0.1:0", "--confirm"]
+    sent = []
+
+    def ended(companion, link):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commanded, "fly_link", ended)
+    monkeypatch.setattr(UdpLink, "send", lambda self, datagrams: sent.extend(datagrams))
+    assert cli.main(asked) == 1
+    assert "the operator" in told(capsys) and len(sent) == 1 and b"the operator" in sent[0]
+    (tmp_path / "fly.json").write_text("{}")
+    assert cli.main(asked) == 2
+    assert "holds an earlier flight" in told(capsys)
+
+
+def test_real_time_flies_a_track_file_as_often_as_is_asked(root, tmp_path, capsys):
+    yard = root / "tracks" / "examples" / "yard.toml"
+    asked = Evaluation(track=str(yard), trials=3)
+    assert len(read_course(asked).trials) == 1
+    assert [trial.seed for trial in read_course(asked, real_time=True).trials] == [0, 1, 2]
+    shutil.copytree(yard.parent, tmp_path / "other")
+    both = f"{yard},{tmp_path / 'other' / 'yard.toml'}"
+    assert cli.main(["fly", "--track", both, "--out", str(tmp_path / "out")]) == 2
+    assert "more than one is called 'yard'" in told(capsys)
 
 
 @pytest.mark.slow
