@@ -82,7 +82,7 @@ def _real(
             f"--link flies one flight, and {len(course.trials)} are asked for; give one track, "
             "one level and --trials 1"
         )
-    if (out / FLY).is_file():
+    if (out / FLY).is_file() or any(out.glob("*.parquet")):
         raise ValueError(f"--out {out} holds an earlier flight; give each one a folder of its own")
     (trial,) = course.trials
     warm_up(policy)

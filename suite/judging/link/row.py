@@ -28,4 +28,4 @@ class Row(NamedTuple):
     state_age_s: float
     """From the state's stamp to its set point, where both ends have one clock [s]."""
     image_age_s: float
-    """From the image's arrival to the set point [s]."""
+    """From the image's arrival to the decision [s]."""

@@ -250,7 +250,7 @@ def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
     monkeypatch.setattr(UdpLink, "send", lambda self, datagrams: sent.extend(datagrams))
     assert cli.main(asked) == 1
     assert "the operator" in told(capsys) and len(sent) == 1 and b"the operator" in sent[0]
-    (tmp_path / "fly.json").write_text("{}")
+    (tmp_path / "zigzag-0-0.parquet").write_text("the log of a flight that ended by an error")
     assert cli.main(asked) == 2
     assert "holds an earlier flight" in told(capsys)
 
