@@ -108,16 +108,17 @@ def row_times(
     inside = (base >= within[0]) & (base <= within[1])
     time_s = base[inside & (base >= first + start_s) & (base <= stop)][::every]
     if len(time_s) < 2:
-        spans = ", ".join(
-            f"{name} from {s.time_s[0]:.3f} to {s.time_s[-1]:.3f} s"
-            for name, s in zip(NEEDED, needed, strict=True)
-        )
-        reason = f"no time at which position, attitude and gyro are all there ({spans})"
         if inside.any():
             reason = (
                 f"--start and --end leave nothing of {base[inside][0] - first:.1f} to "
                 f"{base[inside][-1] - first:.1f} s; they count from the file's first sample"
             )
+        else:
+            spans = ", ".join(
+                f"{name} from {s.time_s[0]:.3f} to {s.time_s[-1]:.3f} s"
+                for name, s in zip(NEEDED, needed, strict=True)
+            )
+            reason = f"no time at which position, attitude and gyro are all there ({spans})"
         raise FlightLogError(recording.name, "time", None, reason)
     return time_s
 

@@ -16,6 +16,7 @@ from suite.judging.flying import (
     default_policy,
     flying_needs,
     load_flier,
+    log_name,
     read_course,
     refuse_one_name,
     say_notes,
@@ -151,14 +152,10 @@ def _row(out: Path, result: TrialResult) -> Row | None:
     """Return the row of a flight that was noted; None where its log is not there."""
     name = None
     if result.time_s >= DURATION_MIN:
-        name = _log_name(result)
+        name = log_name(result.track, result.difficulty, result.seed)
         if not (out / name).is_file():
             return None
     return {"file": name, **result._asdict()}
-
-
-def _log_name(result: TrialResult) -> str:
-    return f"{Path(result.track).stem}-{result.difficulty}-{result.seed}.parquet"
 
 
 def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console) -> str | None:
@@ -166,7 +163,7 @@ def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console)
     from eval.logs.columns import FlightLogError
     from eval.logs.flight_log import log_from_flight, write_flight
 
-    name = _log_name(result)
+    name = log_name(result.track, result.difficulty, result.seed)
     try:
         write_flight(out / name, log_from_flight(flight, name))
     except FlightLogError as error:

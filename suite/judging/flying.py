@@ -138,6 +138,11 @@ def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Cou
     return Course(trials, tracks, vehicle, flown_otherwise, notes)
 
 
+def log_name(track: str, difficulty: int, seed: int) -> str:
+    """Return what the log of a trial is called."""
+    return f"{Path(track).stem}-{difficulty}-{seed}.parquet"
+
+
 def refuse_one_name(tracks: Iterable[str]) -> None:
     """Refuse tracks whose logs would be written over each other."""
     stems = [Path(track).stem for track in tracks]

@@ -17,7 +17,7 @@ from eval.worlds.trial import TrialSpec, track_of
 from policies.observation import Observation
 from policies.policy import Policy
 from suite.common.console import Console
-from suite.judging.flying import Course
+from suite.judging.flying import Course, log_name
 from suite.judging.link.companion import FINISHED, Companion
 from suite.judging.link.messages import Wire
 from suite.judging.link.report import delays, log_of
@@ -138,7 +138,7 @@ def fly_link(
 def write_log(companion: Companion, about: dict[str, Any], out: Path) -> str | None:
     """Write a flight's log into `out` and return its name; None where it is too short for one."""
     log = log_of(companion, about)
-    name = f"{Path(str(about['track'])).stem}-{about['difficulty']}-{about['seed']}.parquet"
+    name = log_name(about["track"], about["difficulty"], about["seed"])
     try:
         if log is not None:
             write_flight(out / name, log)

@@ -13,13 +13,13 @@ from tracks.common.toml_text import to_toml
 from tracks.common.version import VERSION
 
 KEYS = st.text("abcdefgh_", min_size=1, max_size=6)
-VALUES = st.one_of(
+ENTRIES = st.one_of(
     st.booleans(),
-    st.integers(-(2**53), 2**53),
-    st.floats(allow_nan=False, allow_infinity=False),
+    st.integers(-(2**60), 2**60),
+    st.floats(allow_nan=False),
     st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
-    st.lists(st.integers(-9, 9), max_size=4),
 )
+VALUES = ENTRIES | st.lists(ENTRIES, max_size=4)
 TABLES = st.recursive(
     st.dictionaries(KEYS, VALUES, max_size=4),
     lambda inside: st.dictionaries(KEYS, st.one_of(VALUES, inside), max_size=4),

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from eval.importers.rows import held
+from eval.importers.signals import Signal
 from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.noise import noise_like
 from tracks.geometry.rotation import quat_to_rot
@@ -171,16 +173,11 @@ def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarra
 
     A row's stamp is mostly between two of them: taken at the points it would come late.
     """
-    wide = values.reshape(len(values), -1)
+    wide = np.asarray(values.reshape(len(values), -1), dtype=float)
     good = np.isfinite(wide).all(axis=1)
-    t, v = time_s[good], np.asarray(wide[good], dtype=float)
-    whole = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(np.diff(t)[:, None] * v[:-1], 0)])
-    edge = np.append(grid, grid[-1] + STEP_S)
-    at = np.searchsorted(t, edge + 1e-9, side="right") - 1
-    row = np.clip(at, 0, None)
-    total = whole[row] + (edge - t[row])[:, None] * v[row]
-    out = np.diff(total, axis=0) / STEP_S
-    out[(at[:-1] < 0) | _in_hole(t, grid)] = np.nan
+    rows = Signal(time_s[good], wide[good])
+    out = held(rows, np.append(grid, grid[-1] + STEP_S))[:-1]
+    out[_in_hole(rows.time_s, grid)] = np.nan
     return out.reshape(len(grid), *values.shape[1:])
 
 

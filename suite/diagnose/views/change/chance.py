@@ -19,7 +19,7 @@ def chance_of(
     groups: Sequence[Sequence[int]],
     beside: Sequence[int],
     sizes: np.ndarray,
-    seed: int,
+    rng: np.random.Generator,
 ) -> list[float]:
     """Return how often any group gains as much by chance, for the gain of each.
 
@@ -30,10 +30,10 @@ def chance_of(
         beside: columns that are fitted anyhow.
         sizes: (D, 3) draws of the estimate of each axis's variance over the true one; the smallest
             p-value is one in as many.
-        seed: of the draws.
+        rng: of the noise; what `sizes` were drawn by may go on, but not begin again.
     """
     draws = len(sizes)
-    noise = np.random.default_rng(seed).standard_normal((draws, len(slope), 3))
+    noise = rng.standard_normal((draws, len(slope), 3))
     noise = (noise / np.sqrt(sizes)[:, None]).reshape(draws, -1)
     slope = slope.reshape(-1, slope.shape[-1])
     slope = slope / np.maximum(np.linalg.norm(slope, axis=0), 1e-300)

@@ -98,10 +98,10 @@ def search_change(
     """
     start = in_balance(reference)
     task, count = changed_task(reference, start, flights), len(reference.flights)
-    gain = rotor_gain(task)
-    weights = weights_of(left_of(task, start), task.limits)
+    gain, left = rotor_gain(task), left_of(task, start)
+    weights = weights_of(left, task.limits)
     # What changes within a flight is the model's flaw as well as the vehicle's: means are judged.
-    moments = np.unique(left_of(task, start).flight, return_counts=True)[1].mean()
+    moments = np.unique(left.flight, return_counts=True)[1].mean()
     alone = weights.scatter * np.sqrt(weights.memory / moments)
     weights = weights._replace(scatter=alone, memory=np.ones(3))
     task = task._replace(means=True)
@@ -113,10 +113,9 @@ def search_change(
     first = now = look(task, start, weights)
     among = view_candidates(among, first)
     doubted = weights._replace(trim=np.hypot(trim, task.limits.gain_doubt * _mean_change(first)))
-    sizes = spread.sizes(task.view.name, task.limits.change_draws, seed)
-    named: list[ViewName] = []
+    named, rng = list[ViewName](), np.random.default_rng(seed)
     while len(named) < task.limits.most_names:
-        found = _next_change(task, now, doubted, named, among, sizes, len(spread.along), seed)
+        found = _next_change(task, now, doubted, named, among, spread, rng)
         if found is None:
             break
         name, now = found  # what is left is no finding where a gain may be off: doubted from here
@@ -135,14 +134,12 @@ def _next_change(
     doubted: Weights,
     named: Sequence[ViewName],
     among: Sequence[Candidate],
-    sizes: np.ndarray,
-    views: int,
-    seed: int,
+    spread: RotorSpread,
+    rng: np.random.Generator,
 ) -> tuple[ViewName, ViewEquations] | None:
     """Return the change that stands out most beside `named`, and the equations with it.
 
-    Which one it is, is judged by weights that doubt the vehicle file's gains. `sizes` (D, 3) are
-    draws of `RotorSpread.sizes`, and of `views` views each has its share of the chance.
+    Which one it is, is judged by weights that doubt the vehicle file's gains.
     """
     beside, space = indices_of([n.candidate for n in named]), task.model.space
     left = [c for c in among if not set(c.indices) & set(beside)]
@@ -160,7 +157,10 @@ def _next_change(
     gains = [fall([*beside, *candidate.indices]) - without for candidate in left]
     slope = weighed(now.data, now.weights)[1]
     groups = [candidate.indices for candidate in left]
-    p_values = [views * p for p in chance_of(gains, slope, groups, beside, sizes, seed)]
+    sizes = spread.sizes(task.view.name, task.limits.change_draws, rng)
+    # Each view has its share of the chance.
+    views = len(spread.along)
+    p_values = [views * p for p in chance_of(gains, slope, groups, beside, sizes, rng)]
     tried = [
         (gain - 2.0 * len(candidate.indices), candidate, p_value)
         for gain, candidate, p_value in zip(gains, left, p_values, strict=True)

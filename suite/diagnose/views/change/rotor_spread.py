@@ -32,15 +32,13 @@ class RotorSpread:
     prior: int
     """Degrees of freedom for which the spread of all axes counts beside an axis's own."""
 
-    def sizes(self, view: str, draws: int, seed: int) -> np.ndarray:
+    def sizes(self, view: str, draws: int, rng: np.random.Generator) -> np.ndarray:
         """Return draws (D, 3) of the square of `along` over the true one, where all axes are alike.
 
         Where it comes out small, changes come out large.
         """
         freedom = np.concatenate(list(self.freedom_along.values()))
-        square = np.random.default_rng(seed).chisquare(
-            np.maximum(freedom, 1e-9), (draws, len(freedom))
-        )
+        square = rng.chisquare(np.maximum(freedom, 1e-9), (draws, len(freedom)))
         pooled = square.sum(axis=1, keepdims=True) / max(self.freedom, 1)
         at = 3 * list(self.freedom_along).index(view) + np.arange(3)
         return _moderated(pooled, square[:, at], freedom[at], self.prior)

@@ -74,19 +74,13 @@ def weighed(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
         residual[rows] -= share * residual[rows].mean(axis=0)
         slope[rows] -= share[:, None] * slope[rows].mean(axis=0)
     if weights.base is not None:
-        share = _share_of_all(len(residual), weights)
+        # Where flights' means tell nothing this is 0.
+        own = weights.scatter**2 * weights.memory + weights.trim**2
+        share = 1.0 - 1.0 / np.sqrt(1.0 + len(residual) * weights.base**2 / own)
         residual -= share * residual.mean(axis=0)
         slope -= share[:, None] * slope.mean(axis=0)
     unit = weights.scatter * np.sqrt(weights.memory)
     return residual / unit, slope / unit[:, None]
-
-
-def _share_of_all(count: int, weights: Weights) -> np.ndarray:
-    """Return the share (3,) of the mean of `count` flights' means that what they share makes up."""
-    own = weights.scatter**2 * weights.memory + weights.trim**2
-    shared = count * np.asarray(weights.base) ** 2
-    told = np.isfinite(own)  # an axis of which flights' means tell nothing has no row to take from
-    return np.where(told, 1.0 - np.sqrt(1.0 / (1.0 + shared / np.where(told, own, 1.0))), 0.0)
 
 
 def blocks_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> np.ndarray:

@@ -65,7 +65,9 @@ def test_an_axis_along_which_flights_are_alike_counts_for_itself_beside_the_othe
 
 def test_sizes_are_drawn_as_the_spread_is_estimated():
     spread = RotorSpread(0.01, 8, {}, {"force": np.array([0, 0, 2]), "torque": np.full(3, 2)}, 4)
-    sizes = {view: spread.sizes(view, 20000, seed=1) for view in ("force", "torque")}
+    sizes = {
+        view: spread.sizes(view, 20000, np.random.default_rng(1)) for view in ("force", "torque")
+    }
     assert sizes["force"].mean(axis=0) == pytest.approx(np.ones(3), rel=0.02)
     # Axes that nothing is told of have the spread of all: a chi-square of 8 degrees over 8.
     assert sizes["force"][:, 0].var() == pytest.approx(2.0 / 8.0, rel=0.05)
