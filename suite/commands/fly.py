@@ -10,7 +10,7 @@ import tyro
 
 from suite.common.console import Console
 from suite.judging.link.watchdog import Limits
-from suite.judging.requests import Evaluation
+from suite.judging.requests import Evaluation, TimeLimit
 from tracks.input.ranges import Range, Seed, Trials
 
 
@@ -31,6 +31,8 @@ class Config:
     """Seed of the first trial."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
+    time_limit_s: TimeLimit = 20.0
+    """A simulated flight ends at this time [s]."""
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """How fast a policy that takes it as an input is asked to fly, 0 (careful) to 1 (a race);
     without it as its card says."""
@@ -69,6 +71,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         trials=config.trials,
         seed=config.seed,
         vehicle=config.vehicle,
+        time_limit_s=config.time_limit_s,
         trust=config.trust,
         speed=() if config.speed is None else (config.speed,),
     )

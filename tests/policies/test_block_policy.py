@@ -7,8 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from policies.block_policy import BlockPolicy, proven
-from policies.errors import PolicyError
+from policies.block_policy import BlockPolicy, for_one_row, proven
+from policies.errors import NoAnswer, PolicyError
 from policies.policy import load_policy
 from policies.spec import PolicySpec
 
@@ -82,6 +82,30 @@ def test_a_model_whose_rows_lean_on_each_other_is_fed_one_by_one(model, block):
     action, _ = policy.act(policy.start(20), state, image, none)
     turned, _ = policy.act(policy.start(20), state[::-1], image[::-1], none)
     assert action[::-1].tobytes() == turned.tobytes()
+
+
+def test_for_one_vehicle_a_row_goes_alone_and_its_answer_is_that_of_the_block(policy):
+    hidden, state, image = observe(1, 1)
+    alone = for_one_row(policy)
+    if alone is not policy:
+        assert (alone.block, alone.rows) == (1, 1)
+    none = np.zeros(1, bool)
+    found, wanted = (p.act(hidden, state, image, none) for p in (alone, policy))
+    for value, expected in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(value, expected, atol=1e-4 * max(1, np.abs(expected).max()))
+
+
+def test_a_checkpoint_takes_one_row_and_what_answers_it_otherwise_keeps_its_block(checkpoint):
+    assert for_one_row(load_policy(checkpoint)).block == 1
+
+    def fixed(state, image, hidden):
+        if len(state) != 7:
+            raise NoAnswer("7 rows, please")
+        return state[:, :3], hidden
+
+    for model in (fixed, neighbour_dependent):
+        policy = BlockPolicy("x", PolicySpec(), model, (0,), 7, 7)
+        assert for_one_row(policy) is policy
 
 
 def test_a_model_that_rolls_dice_or_has_wrong_outputs_is_refused():

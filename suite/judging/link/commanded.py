@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from eval.worlds.trial import Rules
+from policies.block_policy import BlockPolicy, for_one_row
+from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.provenance import write_run_record
@@ -33,6 +37,20 @@ from tracks.common.provenance import stamp
 FLY = "fly.json"
 
 
+@dataclass(frozen=True)
+class LinkFlights:
+    """What is flown over a link, as run.json has it."""
+
+    evaluation: Evaluation
+    """The trials."""
+    policy: dict[str, Any]
+    """Name, source and digest of who flies."""
+    limits: Limits
+    """Of the watchdog."""
+    link: str
+    """The address, or "simulated"."""
+
+
 def fly_commanded(
     asked: Evaluation, policy: str, link: str, limits: Limits, out: Path, console: Console
 ) -> dict[str, Any]:
@@ -47,32 +65,45 @@ def fly_commanded(
     refuse_one_name({trial.track for trial in course.trials})
     name = policy or default_policy()
     loaded = load_flier(name, asked.trust, manners(asked.speed, monitor=False)[0])
+    flier = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
+    rules = Rules(time_limit_s=asked.time_limit_s)
+    # Before the flights: what the judge refuses is not flown.
+    judged = [] if link else _judged(loaded, course, rules)
     out.mkdir(parents=True, exist_ok=True)
-    about = {"policy": about_policy(name, loaded), "limits": limits, "link": link or "simulated"}
+    flown = LinkFlights(asked, about_policy(name, loaded), limits, link or "simulated")
+    interrupt = None
     if link:
-        found = _real(loaded, course, link, limits, out, console)
+        found = _real(flier, course, link, limits, out, console)
     else:
-        flights = fly_simulated(loaded, course, limits, out, console)
-        judged = _judged(loaded, course)
-        found = {**totals(flights, limits), "judge_successes": judged}
+        flights: list[Flight] = []
+        try:
+            for flight in fly_simulated(flier, course, rules, limits, out, console):
+                flights.append(flight)
+        except KeyboardInterrupt as error:
+            interrupt = error
+        found = {**totals(flights, limits), "judge_successes": sum(judged[: len(flights)])}
         found["flights"] = [flight.row for flight in flights]
         _show(found, flights, console)
+    about = {"policy": flown.policy, "limits": limits, "link": flown.link}
     answer = {**stamp(1, asked.seed), **about, **found}
     write_json(out / FLY, answer)
-    write_run_record(out, asked, asked.seed)
+    write_run_record(out, flown, asked.seed)
+    if interrupt is not None:
+        raise interrupt
     return {**answer, "out": str(out)}
 
 
-def _judged(policy: Any, course: Course) -> int:
+def _judged(policy: Policy, course: Course, rules: Rules) -> list[bool]:
+    """Return whether the judge's flight of each trial succeeds."""
     from eval.judging.judge import JudgeOptions, fly
 
-    options = JudgeOptions(slots=min(16, len(course.trials)), workers=1)
+    options = JudgeOptions(slots=min(16, len(course.trials)), workers=1, rules=rules)
     results = fly(policy, course.trials, course.vehicle, options=options, tracks=course.tracks)
-    return sum(result.success for result in results)
+    return [result.success for result in results]
 
 
 def _real(
-    policy: Any, course: Course, address: str, limits: Limits, out: Path, console: Console
+    policy: Policy, course: Course, address: str, limits: Limits, out: Path, console: Console
 ) -> dict[str, Any]:
     from eval.worlds.trial import track_of
     from suite.judging.link.flights import warm_up
@@ -86,7 +117,8 @@ def _real(
         raise ValueError(f"--out {out} holds an earlier flight; give each one a folder of its own")
     (trial,) = course.trials
     warm_up(policy)
-    link, wire = UdpLink(address), Wire(COMPANION, VEHICLE)
+    wire = Wire(COMPANION, VEHICLE)
+    link = UdpLink(address, wire.speaks)
     track = track_of(course.tracks, trial)
     companion = Companion(policy, track, course.vehicle, wire, time.monotonic, limits)
     console.say(f"waiting for states and images on {address}; Ctrl-C hands over")
@@ -105,8 +137,12 @@ def _real(
         why = f"no vehicle sent a state (ODOMETRY) and a depth image within {WAIT_S:g} s"
         if companion.over is not None:
             why = f"handed over before the first set point: {companion.over}"
+        elif companion.misfit:
+            why += f" ({companion.misfit})"
         raise WorkFailed(f"{address}: {why}; see docs/fly.md, 'When it hands over'")
     console.say(f"handed over: {companion.over}; log: {file}")
+    if link.strangers:
+        console.note(f"{link.strangers} datagrams of others than the vehicle were left out")
     _warn_of_missed(companion.missed_decisions, console)
     return {
         **delays(companion.rows, limits.deadline_s),
@@ -114,6 +150,7 @@ def _real(
         "missed_decisions": companion.missed_decisions,
         "gates_passed": companion.gate,
         "success": companion.over == FINISHED,
+        "strangers": link.strangers,
         "flights": [{**row, "file": file}],
     }
 
@@ -151,6 +188,6 @@ def _show(found: dict[str, Any], flights: list[Flight], console: Console) -> Non
 def _warn_of_missed(count: int, console: Console) -> None:
     if count:
         console.note(
-            f"warning: {count} decisions were missed, as no state came in their time; send states "
-            "(ODOMETRY) several times as often as the policy decides"
+            f"warning: {count} decisions were missed: no state came in their time (send ODOMETRY "
+            "several times as often as the policy decides), or an answer of the policy took so long"
         )

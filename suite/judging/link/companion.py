@@ -20,7 +20,7 @@ from eval.quadrotor.autopilot import ATTITUDE_HZ
 from eval.vehicles.vehicle import Vehicle
 from policies.observation import observe, view_of
 from policies.policy import Policy
-from suite.judging.link.messages import Note, Packet, Picture, SetPoint, State, Wire
+from suite.judging.link.messages import Alive, Note, Packet, Picture, SetPoint, State, Wire
 from suite.judging.link.row import Row
 from suite.judging.link.watchdog import (
     Clock,
@@ -88,6 +88,17 @@ class Companion:
         """Whether it has begun and not handed over."""
         return bool(self.rows) and self.over is None
 
+    @property
+    def misfit(self) -> str:
+        """What to say of depth images of another size than the policy's; empty without any."""
+        if self._picture.misfit is None:
+            return ""
+        camera, (width, height) = self._policy.spec.camera, self._picture.misfit
+        return (
+            f"depth images of {width} x {height} pixels left out: the policy's are "
+            f"{camera.width} x {camera.height}"
+        )
+
     def receive(self, datagrams: list[bytes]) -> list[bytes]:
         """Return what is to be sent, now that `datagrams` have come (or none have)."""
         heard_s = self._clock()
@@ -112,6 +123,10 @@ class Companion:
         self._heard_at = heard_s
         return self._answer(states)
 
+    def alive(self) -> bytes:
+        """Return the datagram that says that this end is there."""
+        return self._wire.encoded(Alive())
+
     def end(self, reason: str) -> list[bytes]:
         """Return the datagrams that hand over for `reason`, none where that has happened."""
         return self._hand_over(reason) if self.over is None else []
@@ -126,7 +141,9 @@ class Companion:
         return [self._wire.encoded(Note(f"policy hands over: {reason}"))]
 
     def _see(self, packet: Packet) -> None:
-        found = self._picture.add(packet)
+        known, found = self._picture.misfit, self._picture.add(packet)
+        if self._picture.misfit != known:
+            self._event(self.misfit)
         if found is not None:
             self._depth, self._depth_at = found, self._clock()
 

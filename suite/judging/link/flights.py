@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 
 from eval.logs.columns import FlightLogError
 from eval.logs.flight_log import write_flight
-from eval.worlds.trial import TrialSpec, track_of
+from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.observation import Observation
 from policies.policy import Policy
 from suite.common.console import Console
@@ -25,8 +26,9 @@ from suite.judging.link.row import Row
 from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S, Request, VehicleProcess
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
-from tracks.track import Track
 
+ALIVE_S = 1.0
+"""How often a companion says that it is there [s]."""
 POLL_S = 0.002
 """How often the watchdog looks where nothing comes [s]."""
 AFTER_S = 0.5
@@ -53,41 +55,39 @@ def warm_up(policy: Policy) -> None:
 
 
 def fly_simulated(
-    policy: Policy, course: Course, limits: Limits, out: Path, console: Console
-) -> list[Flight]:
+    policy: Policy, course: Course, rules: Rules, limits: Limits, out: Path, console: Console
+) -> Iterator[Flight]:
     """Fly every trial of `course` against a simulated vehicle on the loopback, in real time."""
     warm_up(policy)
-    vehicle, flights = VehicleProcess(), []
+    vehicle, done = VehicleProcess(), 0
     try:
         with console.progress("flights", len(course.trials)) as update:
-            for trial in course.trials:
-                track = track_of(course.tracks, trial)
-                flights.append(_one(policy, track, trial, course, limits, out, vehicle))
-                done = sum(flight.row["success"] for flight in flights)
-                update(len(flights), f"{done} of {len(flights)} finished")
+            for number, trial in enumerate(course.trials, 1):
+                flight = _one(policy, trial, course, rules, limits, out, vehicle)
+                yield flight
+                done += flight.row["success"]
+                update(number, f"{done} of {number} finished")
     finally:
         vehicle.close()
-    return flights
 
 
 def _one(
     policy: Policy,
-    track: Track,
     trial: TrialSpec,
     course: Course,
+    rules: Rules,
     limits: Limits,
     out: Path,
     vehicle: VehicleProcess,
 ) -> Flight:
-    link = UdpLink("udpin:127.0.0.1:0")
+    wire, track = Wire(COMPANION, VEHICLE), track_of(course.tracks, trial)
+    link = UdpLink("udpin:127.0.0.1:0", wire.speaks)
     try:
-        wire = Wire(COMPANION, VEHICLE)
         companion = Companion(policy, track, course.vehicle, wire, time.monotonic, limits)
         address = f"udpout:127.0.0.1:{link.port}"
         spec = policy.spec
-        vehicle.start(
-            Request(track, trial, course.vehicle, spec.camera, spec.rate_hz, address, policy.name)
-        )
+        flown_by = (spec.camera, spec.rate_hz, address, policy.name)
+        vehicle.start(Request(track, trial, course.vehicle, rules, *flown_by))
         flown = None
         with _no_collection():
             while flown is None and companion.over is None:
@@ -127,9 +127,12 @@ def fly_link(
     Where no vehicle is heard of within `wait_s`, it ends as well. An interrupt hands over at once:
     no set point is sent any more.
     """
-    begin = clock()
+    begin, called = clock(), -math.inf
     with _no_collection():
         while companion.over is None:
+            if clock() - called > ALIVE_S:
+                link.send([companion.alive()])
+                called = clock()
             exchange(companion, link)
             if not companion.rows and clock() - begin > wait_s:
                 return

@@ -6,6 +6,7 @@
 | depth image | DATA_TRANSMISSION_HANDSHAKE (130) and ENCAPSULATED_DATA (131): a 16-bit PGM in mm |
 | body rates and thrust | SET_ATTITUDE_TARGET (82), attitude ignored, thrust 0 to 1 |
 | what happened | STATUSTEXT (253) |
+| that the companion is there | HEARTBEAT (0) |
 
 MAVLink has no message for depth images (OBSTACLE_DISTANCE is 72 distances in a plane). Its image
 transmission is made for small pictures, and 24 x 32 pixels fit into seven packets; a packet that
@@ -68,6 +69,10 @@ class Note(NamedTuple):
     text: str
 
 
+class Alive(NamedTuple):
+    """That the companion computer is there: a vehicle that waits to be called hears of it so."""
+
+
 class Packet(NamedTuple):
     """A part of an image: its place among `parts`, or -1 for the announcement."""
 
@@ -76,7 +81,7 @@ class Packet(NamedTuple):
     data: bytes
 
 
-Message = State | SetPoint | Note | Packet
+Message = State | SetPoint | Note | Alive | Packet
 
 
 def dialect() -> Any:
@@ -126,6 +131,10 @@ class Wire:
             )  # fmt: skip
         elif isinstance(message, Note):
             made = mav.statustext_encode(4, message.text.encode("ascii", "replace")[:50])
+        elif isinstance(message, Alive):
+            kind = self._dialect.MAV_TYPE_ONBOARD_CONTROLLER
+            none, active = self._dialect.MAV_AUTOPILOT_INVALID, self._dialect.MAV_STATE_ACTIVE
+            made = mav.heartbeat_encode(kind, none, 0, 0, active)
         elif message.place < 0:
             width, height, size = np.frombuffer(message.data, np.uint32)
             kind = self._dialect.MAVLINK_DATA_STREAM_IMG_PGM
@@ -135,6 +144,15 @@ class Wire:
             data = message.data.ljust(PACKET, b"\0")
             made = mav.encapsulated_data_encode(message.place, list(data))
         return made.pack(mav)
+
+    def speaks(self, datagram: bytes) -> bool:
+        """Say whether a datagram is of whom this end listens to."""
+        parser = self._dialect.MAVLink(None)
+        parser.robust_parsing = True
+        return any(
+            message.get_type() != "BAD_DATA" and message.get_srcSystem() == self._other
+            for message in parser.parse_buffer(datagram) or []
+        )
 
     def decoded(self, datagrams: Iterable[bytes]) -> list[Message]:
         """Return what arrived, in order."""
@@ -234,14 +252,20 @@ class Picture:
             )
         self._parts: dict[int, bytes] = {}
         self._wanted = 0
+        self.misfit: tuple[int, int] | None = None
+        """Width and height of the last image that was announced and is of another size."""
 
     def add(self, packet: Packet) -> np.ndarray | None:
         """Return the depth image (H, W) [m] that this packet completes, else None."""
         if packet.place < 0:
-            size = int(np.frombuffer(packet.data, np.uint32)[2])
+            width, height, size = (int(x) for x in np.frombuffer(packet.data, np.uint32))
             fits = size == self._size and packet.parts == -(-self._size // PACKET)
             self._parts, self._wanted = {}, packet.parts if fits else 0
+            if (height, width) != self._shape:
+                self.misfit = (width, height)
             return None
+        if packet.place in self._parts:  # of the next image, whose announcement was lost
+            self._parts, self._wanted = {}, 0
         if packet.place >= self._wanted:
             return None
         self._parts[packet.place] = packet.data

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 import time
 from multiprocessing.connection import Connection
 from typing import NamedTuple
 
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.trial import TrialResult, TrialSpec
+from eval.worlds.trial import Rules, TrialResult, TrialSpec
 from suite.common.errors import WorkFailed
 from suite.judging.link.messages import Wire
 from suite.judging.link.simulated import SimulatedVehicle
@@ -31,6 +32,7 @@ class Request(NamedTuple):
     track: Track
     trial: TrialSpec
     vehicle: Vehicle
+    rules: Rules
     camera: Camera
     image_hz: float
     address: str
@@ -86,10 +88,12 @@ class VehicleProcess:
 
 def serve(pipe: Connection) -> None:
     """Be the process: fly what is asked for until the pipe closes."""
+    # Ctrl-C goes to the terminal's whole group; when to end is the companion's to say.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:
             request = pipe.recv()
-        except (EOFError, KeyboardInterrupt):
+        except EOFError:
             return
         if isinstance(request, Request):
             pipe.send(fly_in_real_time(request, pipe))
@@ -101,8 +105,9 @@ def fly_in_real_time(request: Request, pipe: Connection) -> Flown:
     try:
         wire = Wire(VEHICLE, COMPANION)
         vehicle = SimulatedVehicle(
-            request.track, request.trial, request.vehicle, request.camera, request.image_hz, wire
-        )
+            request.track, request.trial, request.vehicle, request.camera, request.image_hz, wire,
+            request.rules,
+        )  # fmt: skip
         begin, due, slips = time.monotonic(), time.monotonic(), 0
         while not vehicle.over and not pipe.poll():
             due += vehicle.dt

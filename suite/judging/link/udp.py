@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import socket
+from collections.abc import Callable
 
 MOST_BYTES = 2048
 """Of a datagram; a MAVLink message has 280 at most."""
@@ -12,8 +13,12 @@ MOST_BYTES = 2048
 class UdpLink:
     """One end of a link. One that waits answers whoever called first, and nobody else."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, speaks: Callable[[bytes], bool] = lambda _: True) -> None:
         """Open an end.
+
+        Args:
+            address: udpin:HOST:PORT or udpout:HOST:PORT.
+            speaks: whether a datagram is a call; who sends another one does not take the link.
 
         Raises:
             ValueError: for an address of another form, a port that is taken, an unknown host.
@@ -30,7 +35,9 @@ class UdpLink:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._peer: tuple[str, int] | None = None
+        self._speaks = speaks
         self.strangers = 0
+        """Datagrams of others, which were left out."""
         try:
             resolved = (socket.gethostbyname(host), int(port))
             if kind == "udpin":
@@ -61,7 +68,8 @@ class UdpLink:
                 return found
             except OSError:  # the other end is gone, and its machine said so
                 continue
-            self._peer = self._peer or sender
+            if self._peer is None and self._speaks(data):
+                self._peer = sender
             if sender == self._peer:
                 found.append(data)
             else:

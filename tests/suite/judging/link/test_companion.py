@@ -263,3 +263,14 @@ def test_another_system_is_not_listened_to(bench):
     assert one.companion.flying and "foreign" in one.companion.events[-1]
     old = one.state(time_s=one.now - 0.04)
     assert one.tell(old) == [] and one.companion.flying
+
+
+def test_depth_images_of_another_size_are_said_once(bench):
+    one = bench()
+    one.image = np.full((48, 64), 5.0)
+    for _ in range(3):
+        one.show()
+    assert one.tell() == []
+    said = [event for event in one.companion.events if "depth images" in event]
+    assert len(said) == 1 and "64 x 48 pixels left out: the policy's are 32 x 24" in said[0]
+    assert one.companion.misfit in said[0]

@@ -88,6 +88,10 @@ def test_an_image_comes_whole_or_not_at_all():
     assert len(seen(sent[:3] + sent)) == 1
     assert seen(sent, height=20) == []
     assert seen([companion.encoded(Packet(3, 0, b"x"))]) == []
+    # The end of one and the announcement of the next are lost: no image is made of two.
+    later = [vehicle.encoded(packet) for packet in image_packets(depth + 1.0, 20.0)]
+    assert seen(sent[:6] + sent[7:] + later[1:]) == []
+    assert len(seen(sent[:6] + later)) == 1
 
 
 def test_what_is_cut_off_or_of_another_system_is_left_out_and_counted(bench):
@@ -196,6 +200,24 @@ def test_datagrams_are_taken_from_one_caller(bench):
     finally:
         first.close()
         second.close()
+
+
+def test_who_does_not_speak_for_the_vehicle_does_not_take_the_link(bench):
+    waiting = UdpLink("udpin:127.0.0.1:0", bench().companion._wire.speaks)
+    stranger, other, vehicle = (UdpLink(f"udpout:127.0.0.1:{waiting.port}") for _ in range(3))
+    try:
+        stranger.send([b"anybody there?"])
+        other.send([Wire(9, 2).encoded(bench().state())])
+        assert waiting.receive(1.0) == [] and waiting.receive(0.2) == []
+        said = Wire(1, 2).encoded(bench().state())
+        vehicle.send([said])
+        assert waiting.receive(1.0) == [said] and waiting.strangers == 2
+    finally:
+        for link in (waiting, stranger, other, vehicle):
+            link.close()
+
+
+def test_addresses_that_cannot_be_are_refused():
     taken = UdpLink("udpin:127.0.0.1:0")
     wrong = ["tcp:1.2.3.4:5", "udpin:14550", "udpin:127.0.0.1:99999", "udpin:203.0.113.1:14550"]
     for address in (*wrong, f"udpin:127.0.0.1:{taken.port}", "udpout:no host of this name:14550"):
@@ -213,6 +235,20 @@ def test_a_link_on_which_nobody_is_ends_by_itself(bench):
     finally:
         link.close()
     assert not one.companion.rows and one.companion.over is None
+
+
+def test_a_vehicle_that_waits_to_be_called_is_called(bench):
+    one = bench()
+    vehicle = UdpLink("udpin:127.0.0.1:0")
+    link, times = UdpLink(f"udpout:127.0.0.1:{vehicle.port}"), iter(np.arange(0.0, 100.0, 0.3))
+    try:
+        fly_link(one.companion, link, clock=lambda: next(times), wait_s=3.0)
+        heard = vehicle.receive(1.0)
+        assert 2 <= len(heard) <= 4 and all(Wire(1, 2).speaks(datagram) for datagram in heard)
+        assert Wire(1, 2).decoded(heard) == []
+    finally:
+        link.close()
+        vehicle.close()
 
 
 def told(capsys):
@@ -253,6 +289,33 @@ def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
     (tmp_path / "zigzag-0-0.parquet").write_text("the log of a flight that ended by an error")
     assert cli.main(asked) == 2
     assert "holds an earlier flight" in told(capsys)
+
+
+def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first(
+    capsys, tmp_path, monkeypatch
+):
+    row = {"success": True, "handed_over": None, "seed": 0}
+    row |= dict.fromkeys(("vehicle_slips", "late_actions", "missed_decisions"), 0)
+
+    def interrupted(policy, course, *_):
+        assert policy.block == 1
+        yield Flight(row, [])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commanded, "fly_simulated", interrupted)
+    asked = ["fly", "--policy", "swift", "--trials", "2", "--time-limit-s", "0.2"]
+    assert cli.main([*asked, "--out", str(tmp_path / "a")]) == 130
+    answer = json.loads((tmp_path / "a" / "fly.json").read_text())
+    assert (answer["trials"], answer["successes"], answer["judge_successes"]) == (1, 1, 0)
+    config = json.loads((tmp_path / "a" / "run.json").read_text())["config"]
+    assert config["policy"]["name"] == "swift" and config["limits"]["silence_s"] == 0.1
+    assert config["link"] == "simulated" and config["evaluation"]["time_limit_s"] == 0.2
+    capsys.readouterr()
+    fast = load_policy("swift")
+    fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0))
+    monkeypatch.setattr(commanded, "load_flier", lambda *_: fast)
+    assert cli.main([*asked, "--out", str(tmp_path / "b")]) == 2
+    assert "decides at 2000 Hz" in told(capsys) and not (tmp_path / "b").exists()
 
 
 def test_real_time_flies_a_track_file_as_often_as_is_asked(root, tmp_path, capsys):
