@@ -96,7 +96,8 @@ def test_for_one_vehicle_a_row_goes_alone_and_its_answer_is_that_of_the_block(po
 
 
 def test_a_checkpoint_takes_one_row_and_what_answers_it_otherwise_keeps_its_block(checkpoint):
-    assert for_one_row(load_policy(checkpoint)).block == 1
+    loaded = load_policy(checkpoint)
+    assert isinstance(loaded, BlockPolicy) and for_one_row(loaded).block == 1
 
     def fixed(state, image, hidden):
         if len(state) != 7:

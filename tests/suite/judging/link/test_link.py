@@ -10,6 +10,7 @@ import pytest
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec, track_of
+from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
 from suite import cli
 from suite.judging.flying import read_course
@@ -312,6 +313,7 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
     assert config["link"] == "simulated" and config["evaluation"]["time_limit_s"] == 0.2
     capsys.readouterr()
     fast = load_policy("swift")
+    assert isinstance(fast, BlockPolicy)
     fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0))
     monkeypatch.setattr(commanded, "load_flier", lambda *_: fast)
     assert cli.main([*asked, "--out", str(tmp_path / "b")]) == 2
