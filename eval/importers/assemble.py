@@ -87,8 +87,8 @@ def assemble(
         )
         raise FlightLogError(recording.name, None, None, reason)
     about = {
-        **recording.about,
         "source": format,
+        **{key: value for key, value in recording.about.items() if key != "partial"},
         "imported_from": recording.name.replace("\\", "/").rsplit("/", 1)[-1],
         "findings": [finding._asdict() for finding in findings],
     }

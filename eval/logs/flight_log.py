@@ -255,6 +255,19 @@ def columns_from_log(log: FlightLog) -> dict[str, np.ndarray]:
     return columns
 
 
+def told_about(text: str | None, name: str) -> tuple[dict[str, Any], list[str]]:
+    """Return what the metadata's JSON text says of a flight, and warnings; {} without a text."""
+    if text is None:
+        return {}, []
+    try:
+        about = parse_json(text, name)
+    except InputError:
+        about = None
+    if not isinstance(about, dict):
+        return {}, [f"{name}: metadata `flight` is not a JSON object; ignored"]
+    return about, []
+
+
 def read_flight(path: str | Path, partial: bool = False) -> FlightLog:
     """Read a flight from a Parquet or CSV file; a partial one only where `partial` says so.
 
@@ -263,15 +276,8 @@ def read_flight(path: str | Path, partial: bool = False) -> FlightLog:
             the column, the first bad row (counted from 1) and the reason.
     """
     columns, text, warnings = read_columns(Path(path))
-    about: Any = {}
-    if text is not None:
-        try:
-            about = parse_json(text, str(path))
-        except InputError:
-            about = None
-        if not isinstance(about, dict):
-            warnings.append(f"{path}: metadata `flight` is not a JSON object; ignored")
-            about = {}
+    about, more = told_about(text, str(path))
+    warnings += more
     log = log_from_columns(columns, about, str(path))
     if log.partial and not partial:
         reason = f"a partial log, without {', '.join(log.partial)}; this command needs whole ones"

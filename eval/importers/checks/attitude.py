@@ -7,6 +7,8 @@ body, gyro in the attitude's body frame or turned over (forward-right-down).
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from eval.importers.findings import Finding
@@ -29,6 +31,8 @@ good, and better than a bad one by the third, is overwhelming evidence."""
 
 _ORDERS = {"wxyz": [0, 1, 2, 3], "xyzw": [3, 0, 1, 2]}
 """What the file's order must have been -> where w, x, y, z are among what was read as wxyz."""
+READINGS = tuple(itertools.product(_ORDERS, (False, True), (False, True)))
+"""(order, whether it maps world to body, whether the gyro is turned over); first what was given."""
 
 
 def body_turns(
@@ -55,10 +59,8 @@ def check_attitude(rows: dict[str, np.ndarray], fix: bool) -> list[Finding]:
         text = f"rates of {size:.2g} rad/s are too small to check the attitude by"
         return [Finding("note", "attitude", text)]
     residual = {
-        (order, inverse, turned): _residual(time_s, _read(quat, order, inverse), rate, turned)
-        for order in _ORDERS
-        for inverse in (False, True)
-        for turned in (False, True)
+        (order, inverse, turned): _residual(time_s, as_read(quat, order, inverse), rate, turned)
+        for order, inverse, turned in READINGS
     }
     given = residual["wxyz", False, False]
     best = min(residual, key=lambda reading: residual[reading])
@@ -77,9 +79,9 @@ def check_attitude(rows: dict[str, np.ndarray], fix: bool) -> list[Finding]:
     text = f"{figures}, but by {100 * residual[best]:.0f} % if " + " and ".join(words)
     if not fix:
         return [Finding("doubt", "attitude", text + "; left as it is")]
-    rows["quat"] = _read(quat, order, inverse)
+    rows["quat"] = as_read(quat, order, inverse)
     if "cmd_quat" in rows:  # written as what it is held against
-        rows["cmd_quat"] = _read(rows["cmd_quat"], order, inverse)
+        rows["cmd_quat"] = as_read(rows["cmd_quat"], order, inverse)
     if turned:
         for name in BODY_VECTORS:
             if name in rows:
@@ -95,7 +97,8 @@ def _spans(time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return after, duration < 1.5 * count * step, duration
 
 
-def _read(quat: np.ndarray, order: str, inverse: bool) -> np.ndarray:
+def as_read(quat: np.ndarray, order: str, inverse: bool) -> np.ndarray:
+    """Return quaternions (N, 4) that were read as wxyz, body to world, as of another reading."""
     ordered = quat[:, _ORDERS[order]]
     return conjugate(ordered) if inverse else ordered
 

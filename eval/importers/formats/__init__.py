@@ -18,7 +18,8 @@ class Format(Protocol):
     """A module (or an object) that reads one format.
 
     One that takes whatever has columns says `ASKED_LAST = True`: the others are asked before it.
-    One to which a mapping file says nothing says `TAKES_MAP = False`.
+    One to which a mapping file says nothing says `TAKES_MAP = False`, one whose pose is of one
+    source `TAKES_SOURCE = False`.
     """
 
     SUMMARY: str

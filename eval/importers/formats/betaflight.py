@@ -26,7 +26,7 @@ from eval.logs.files import read_columns
 from eval.logs.head import first_line
 
 SUMMARY = "CSV of blackbox_decode; needs --pose"
-TAKES_MAP = False
+TAKES_MAP = TAKES_SOURCE = False
 MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 """Motors 1 to 4 (x forward, y left): rear right, front right, rear left, front left."""
 DEG = np.pi / 180.0

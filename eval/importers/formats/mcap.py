@@ -32,6 +32,7 @@ from eval.logs.head import read_head
 from tracks.common.toml_table import read_toml
 
 SUMMARY = "MCAP with ROS 2 messages (pip install 'diffracing-suite[mcap]')"
+TAKES_SOURCE = False
 MCAP = b"\x89MCAP0\r\n"
 KINDS: dict[str, tuple[str, ...]] = {
     "odometry": ("nav_msgs/Odometry",),

@@ -33,7 +33,7 @@ from eval.logs.columns import FlightLogError
 from eval.logs.head import read_head
 
 SUMMARY = "PX4 ULog (.ulg)"
-TAKES_MAP = False
+TAKES_MAP = TAKES_SOURCE = False
 ULOG = b"ULog\x01\x12\x35"
 TOPICS = (
     "vehicle_attitude",

@@ -21,6 +21,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError
 from eval.logs.files import read_columns
+from eval.logs.flight_log import told_about
 from eval.logs.head import first_line
 from tracks.common.names import closest
 
@@ -50,9 +51,12 @@ def read(path: Path, options: ImportOptions) -> Recording:
 def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Recording:
     """Return what the table at `path` holds, read as the mapping at `map_path` says; see `read`."""
     told = None if map_path is None else read_map(map_path)
-    columns, _, warnings = read_columns(path)
+    columns, text, warnings = read_columns(path)
     mapping = told or own_map(columns)
-    name = str(path)
+    name, about = str(path), {}
+    if told is None:  # a log of ours says how it was flown
+        about, more = told_about(text, name)
+        warnings += more
     time_s = _time(columns, mapping, name, map_path is not None)
 
     def find(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -64,7 +68,8 @@ def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Rec
 
     recording = recording_of(path, mapping, find, lambda c: _missing(columns, c), options)
     notes = tuple(Finding("note", "file", text) for text in warnings)
-    return replace(recording, findings=(*notes, *recording.findings))
+    about |= recording.about
+    return replace(recording, findings=(*notes, *recording.findings), about=about)
 
 
 def _time(

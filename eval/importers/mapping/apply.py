@@ -45,8 +45,14 @@ def recording_of(
 
     Raises:
         FlightLogError: for a column that the mapping needs and the file lacks.
+        ValueError: for an asked source where the mapping knows of none.
     """
     name, parts, taken = str(path), {}, {}
+    if options.source and not any(c.source for each in mapping.columns.values() for c in each):
+        raise ValueError(
+            f"--source {options.source}: the mapping of {name} says of no signal where it is from; "
+            'leave it out, or let the mapping say source = "mocap" and "estimate"'
+        )
     for signal, alternatives in mapping.columns.items():
         column, part = _first(signal, alternatives, find, options.source, name)
         if part is None:

@@ -17,6 +17,7 @@ from eval.effects.interface import GRAVITY
 from eval.importers.checks.units import TIMES
 from eval.importers.frames import BODIES, WORLDS
 from eval.logs.columns import GROUPS, KNOWN
+from eval.logs.files import METADATA
 from tracks.common.names import unknown_name
 from tracks.common.toml_table import Table, read_toml
 
@@ -166,7 +167,7 @@ def read_map(path: Path) -> LogMap:
         about.close()
     optional = top.has("optional") and _choice(top, "optional", ("no", "yes")) == "yes"
     keep = tuple(top.texts("keep")) if top.has("keep") else ()
-    ours = [name for name in keep if name in KNOWN or name == "throttle"]
+    ours = [name for name in keep if name in KNOWN or name in ("throttle", METADATA)]
     if ours:
         allowed = f"columns whose names are not a flight log's own, as {ours[0]!r} is"
         raise top.error("keep", list(keep), allowed)

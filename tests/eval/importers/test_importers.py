@@ -1,5 +1,6 @@
 """An import as a whole: what is read can be written, and is cut where that is asked for."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,15 @@ def test_an_import_can_be_written_and_read_back(tmp_path):
     assert again.about["imported_from"] == "log00" and again.about["findings"]
 
 
+def test_a_log_of_ours_keeps_what_it_says_of_itself(tmp_path):
+    log, _ = import_log(made.write_usd(tmp_path / "log00"), None, FULL)
+    told = {"integrator": "euler", "step_s": 0.002, "seed": 7, "partial": ["motor"]}
+    path = write_flight(tmp_path / "ours.parquet", replace(log, about={**log.about, **told}))
+    again, _ = import_log(path)
+    assert (again.integrator, again.step_s, again.about["seed"]) == ("euler", 0.002, 7)
+    assert again.partial == () and again.about["source"] == log.about["source"]
+
+
 def test_start_and_end_cut_the_flight(tmp_path):
     path = made.write_usd(tmp_path / "log00")
     log, _ = import_log(path, None, ImportOptions(full_thrust=30.0, start_s=2.0, end_s=5.0))
@@ -30,6 +40,15 @@ def test_start_and_end_cut_the_flight(tmp_path):
     near(log.pos_w, known_flight.fly(log.time_s + 2.0).pos, 1e-5)
     with pytest.raises(FlightLogError, match="--start and --end leave nothing of .* first sample"):
         import_log(path, None, ImportOptions(start_s=50.0))
+
+
+def test_a_source_is_asked_of_what_knows_of_sources(tmp_path):
+    asked = replace(FULL, source="mocap")
+    ours = write_flight(tmp_path / "ours.csv", import_log(made.write_usd(tmp_path / "log00"))[0])
+    with pytest.raises(ValueError, match="--source mocap: the mapping of .* says of no signal"):
+        import_log(ours, None, asked)
+    with pytest.raises(ValueError, match="'px4', whose pose is of one source: leave --source"):
+        import_log(made.write_ulog(tmp_path / "log.ulg"), None, asked)
 
 
 LOGS = Path(__file__).resolve().parents[4] / "shared" / "real_logs"

@@ -1,9 +1,13 @@
 """A late pose is found within its error and moved; one on time is left where it is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from eval.importers.checks.attitude import READINGS, as_read
 from eval.importers.checks.delay import check_delay, delay_of
+from eval.importers.frames import HALF_TURN
 from eval.importers.signals import Recording, Signal
 from tests.support import known_flight
 
@@ -51,3 +55,17 @@ def test_the_standard_error_is_that_of_the_delay():
         assert found is not None
         off.append((found[0] - 0.01) / found[1])
     assert 0.4 < np.sqrt(np.mean(np.square(off))) < 2.0
+
+
+@pytest.mark.parametrize("reading", READINGS[1:])
+def test_a_late_pose_is_moved_however_its_attitude_is_written(reading):
+    order, inverse, turned = reading
+    late = recording(0.03)
+    quat, rate = late.signals["quat"], late.signals["rate"]
+    value = as_read(quat.value, "wxyz", inverse)
+    value = value[:, [1, 2, 3, 0]] if order == "xyzw" else value
+    gyro = rate.value * HALF_TURN if turned else rate.value
+    written = {"quat": quat._replace(value=value), "rate": rate._replace(value=gyro)}
+    moved, findings = check_delay(replace(late, signals={**late.signals, **written}), True)
+    assert findings[0].level == "corrected"
+    assert abs(moved.signals["pos"].time_s[0]) < 1e-3

@@ -30,6 +30,7 @@ def test_every_shipped_mapping_is_read_by_its_name():
         ("[frames]\nmotors = [[1, 1], [0, 0], [1, -1], [-1, -1]]", "motors is .*off the middle"),
         ('[about]\nfile = "{log}.yaml"', "about.file is '{log}.yaml'.*{stem} and {number} alone"),
         ('[about]\nfile = "{stem.yaml"', "about.file is .*{stem} and {number} alone"),
+        ('keep = ["flight"]', "keep is .*not a flight log's own, as 'flight' is"),
         ('keep = ["other", "motor_1"]', "keep is .*not a flight log's own, as 'motor_1' is"),
         ('optional = "maybe"', "optional is 'maybe', allowed is 'no' or 'yes'"),
     ],
