@@ -58,8 +58,8 @@ def check_inputs(
         if not free:
             raise PolicyError(
                 f"{where}: input {name!r} has shape {shapes[name]}, expected (batch, "
-                f"{', '.join(map(str, expected))}); the camera's size, second_gate and gate_axis "
-                f"stand in {KEY}"
+                f"{', '.join(map(str, expected))}); the camera's size, second_gate, gate_axis "
+                f"and speed_input stand in {KEY}"
             )
     return block, tuple(hidden)
 

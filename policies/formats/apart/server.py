@@ -171,7 +171,10 @@ def serve(source: IO[bytes], answers: IO[bytes]) -> None:
     name, load = KINDS[head["kind"]]
     engine = importlib.import_module(name)
     # The engine's own libraries are not the model's: torch's alone may be gigabytes of addresses.
-    resource.setrlimit(resource.RLIMIT_AS, (_addresses() + head["memory_bytes"],) * 2)
+    most, (_, allowed) = _addresses() + head["memory_bytes"], resource.getrlimit(resource.RLIMIT_AS)
+    if allowed != resource.RLIM_INFINITY:
+        most = min(most, allowed)
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
     try:
         about, run = load(engine, bytes(model), head["label"])
     except Exception as error:  # onnxruntime's own exceptions share no public base

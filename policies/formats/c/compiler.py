@@ -25,8 +25,19 @@ COMPILE_S = 600.0
 
 
 def find_compiler() -> list[str] | None:
-    """Return the C compiler's command: what CC says, or cc; None where there is none."""
-    words = shlex.split(os.environ.get("CC", "cc")) or ["cc"]
+    """Return the C compiler's command: what CC says, or cc; None where there is none.
+
+    Raises:
+        PolicyError: where CC is no command line.
+    """
+    told = os.environ.get("CC", "cc")
+    try:
+        words = shlex.split(told) or ["cc"]
+    except ValueError as error:
+        raise PolicyError(
+            f"CC is {told!r} in the environment, no command line ({error}); set it to a compiler, "
+            "such as gcc, or unset it"
+        ) from None
     return words if shutil.which(words[0]) else None
 
 

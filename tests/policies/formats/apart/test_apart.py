@@ -4,6 +4,7 @@ import gc
 import os
 import signal
 import subprocess
+import sys
 import time
 
 import numpy as np
@@ -109,6 +110,21 @@ def test_a_model_that_wants_all_memory_is_refused(tmp_path):
     large = numpy_helper.from_array(np.array([2**24, 1, 12], np.int64), "large")
     with pytest.raises(PolicyError, match="it.onnx: .*(fails while it runs|come to an end)"):
         load_policy(_save(tmp_path, _proto(nodes, [W, large])))
+
+
+def test_a_limit_that_this_process_is_under_stays_the_models(tmp_path):
+    path = tmp_path / "policy.onnx"
+    onnx.save(PLAIN, path)
+    # Below what the engine has already and may have besides.
+    script = (
+        "import resource, sys; from policies.formats.apart.process import Apart, MEMORY_BYTES\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))\n"
+        "print(Apart(open(sys.argv[1], 'rb').read(), 'here', 'onnx').inputs[0].name)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == ["state"], done.stderr
 
 
 def test_a_model_that_fails_while_it_runs_is_one_line(tmp_path):

@@ -128,6 +128,9 @@ def test_what_cannot_be_compiled_is_said_in_plain_words(exports, tmp_path, monke
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(PolicyError, match="no C compiler"):
         load_c(exports["odd"].folder, trust=True)
+    monkeypatch.setenv("CC", "gcc '-O2")
+    with pytest.raises(PolicyError, match="CC is .* no command line .No closing quotation"):
+        load_c(exports["odd"].folder, trust=True)
 
 
 FOREIGN = """
