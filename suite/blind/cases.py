@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -84,7 +85,10 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 
     Args:
         seed: of the set.
-        count: about how many; all if not given.
+        count: about how many; every kind keeps its share, and at least one. All if not given.
+
+    Raises:
+        ValueError: for a count below 1.
     """
     rng = np.random.default_rng([seed, 1])
     drawn: list[tuple[str, tuple[str, ...], float]] = [
@@ -94,12 +98,17 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
         first, second = (str(name) for name in rng.choice(ROTORPY_EFFECTS, 2, replace=False))
         drawn.append(("pair", (first, second), MULTIPLES[1]))
     drawn += [("null", (), 0.0)] * ROTORPY_FULL["null"]
+    share, of_kind = _share_of(count, len(drawn)), Counter(kind for kind, *_ in drawn)
+    left = {kind: max(round(share * number), 1) for kind, number in of_kind.items()}
     cases = {}
-    for i, index in enumerate(rng.permutation(len(drawn))[: count or len(drawn)]):
+    for index in rng.permutation(len(drawn)):
         kind, hidden, multiple = drawn[index]
+        if not left[kind]:
+            continue
+        left[kind] -= 1
         sensors = str(rng.choice(["capture", "estimator", "full"]))
         number = (seed, 50_000 + int(index))
-        cases[f"case_{i + 1:03d}"] = Case(
+        cases[f"case_{len(cases) + 1:03d}"] = Case(
             kind, hidden, multiple, "bare", sensors, number, simulator=ROTORPY
         )
     return cases

@@ -15,8 +15,9 @@ from typing import Any
 
 from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import save_vehicle
+from eval.worlds import world_class
 from suite.blind.build import Built, build
-from suite.blind.cases import DRAWERS, MUJOCO, Case
+from suite.blind.cases import DRAWERS, MUJOCO, ROTORPY, Case
 from suite.blind.oracle.strength import TABLE
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
@@ -59,11 +60,14 @@ def make_set(
         workers: who makes cases; this process if None.
 
     Raises:
-        ValueError: where `out` holds a set of another seed, count, simulator or table of strengths.
+        ValueError: where `out` holds a set of another seed, count, simulator or table of strengths,
+            or the simulator is not installed; nothing is written then.
     """
+    if simulator == ROTORPY:
+        world_class(ROTORPY)
+    cases = DRAWERS[simulator](seed, count)
     about = {"seed": seed, "count": count, "simulator": simulator, "strengths": _hash(TABLE)}
     _same_set(out, about)
-    cases = DRAWERS[simulator](seed, count)
     missing = {
         name: case
         for name, case in cases.items()

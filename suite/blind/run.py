@@ -18,6 +18,8 @@ from tracks.common.work import Workers
 
 Diagnose = Callable[[Sequence[Path], Path, Path], None]
 """Takes flight logs, the vehicle file and an output folder, and writes `diagnosis.json` there."""
+TIMED, FAILED = "seconds.json", "error.json"
+"""What a case's folder has in the end: how long the diagnosis took, or why it failed."""
 CRASHED = 500
 """Characters of an error that are kept."""
 
@@ -40,7 +42,7 @@ def run_set(
     jobs = [
         Job(name, results / name, out / "cases" / name)
         for name in names
-        if not (results / name / "seconds.json").is_file()
+        if not (results / name / TIMED).is_file()
     ]
     with console.progress("diagnoses", len(names)) as update:
         if workers is None or workers == 1:
@@ -49,7 +51,7 @@ def run_set(
                 update(done + 1, job.task)
         else:
             all_done(partial(_one, diagnose), jobs, workers, console, "diagnoses")
-    return sum((results / name / "seconds.json").is_file() for name in names)
+    return sum((results / name / TIMED).is_file() for name in names)
 
 
 def _one(diagnose: Diagnose, job: Job, console: Console) -> None:
@@ -57,7 +59,7 @@ def _one(diagnose: Diagnose, job: Job, console: Console) -> None:
     case, folder = job.reads, job.folder
     assert case is not None
     flights = sorted(case.glob("flight_*.parquet"), key=lambda path: int(path.stem.split("_")[1]))
-    error = folder / "error.json"
+    error = folder / FAILED
     start = time.perf_counter()
     try:
         diagnose(flights, case / "vehicle.toml", folder)
@@ -67,7 +69,7 @@ def _one(diagnose: Diagnose, job: Job, console: Console) -> None:
         write_json(error, {"error": f"{type(reason).__name__}: {reason}"[:CRASHED]})
         return
     error.unlink(missing_ok=True)
-    write_json(folder / "seconds.json", {"seconds": time.perf_counter() - start})
+    write_json(folder / TIMED, {"seconds": time.perf_counter() - start})
 
 
 def by_command(flights: Sequence[Path], vehicle: Path, out: Path) -> None:

@@ -17,6 +17,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from suite.blind.cases import MULTIPLES, ROTORPY
 from suite.blind.hubs import damping_of_hubs, is_of_hubs
 from suite.blind.make import load_manifest, open_answers, simulator_of
+from suite.blind.run import FAILED, TIMED
 from suite.diagnose.fit.parameters import effects_in
 from tracks.common.files import write_json, write_text
 from tracks.common.provenance import stamp
@@ -119,25 +120,35 @@ def score_case(
 
 
 def score_set(out: Path, results: Path | None = None) -> list[Verdict]:
-    """Return all cases of the set in `out`, scored against its answers.
+    """Return the cases of the set in `out` that were run, scored against its answers.
 
     Raises:
-        ValueError: where the set is not what was made.
+        ValueError: where the set is not what was made, or none of it was run.
     """
     folder = results or out / "results"
     scored, in_rotorpy = [], simulator_of(out) == ROTORPY
     for name, answer in open_answers(out).items():
+        if not any((folder / name / mark).is_file() for mark in (TIMED, FAILED)):
+            continue
         hubs = None
         if in_rotorpy:
             vehicle = load_vehicle(str(out / "cases" / name / "vehicle.toml"))
             hubs = damping_of_hubs(answer["effects"], vehicle)
         diagnosis = _read(folder / name / "diagnosis.json")
-        timing = _read(folder / name / "seconds.json")
+        timing = _read(folder / name / TIMED)
         # Without its time a diagnosis did not end well, whatever it left behind.
         good = diagnosis if timing else None
         seconds = timing["seconds"] if timing else None
         scored.append(score_case(name, answer, good, seconds, hubs))
+    if not scored:
+        raise ValueError(f"{folder}: no case was diagnosed yet; do that with `suite blind run`")
     return scored
+
+
+def not_run(out: Path, verdicts: Sequence[Verdict]) -> list[str]:
+    """Return the cases of the set in `out` that are not among those scored."""
+    scored = {v.case for v in verdicts}
+    return [name for name in load_manifest(out).cases if name not in scored]
 
 
 def shares(verdicts: Sequence[Verdict]) -> list[Share]:
@@ -145,6 +156,8 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
     by = {kind: [v for v in verdicts if v.kind == kind] for kind in {v.kind for v in verdicts}}
     single, null = by.get("single", []), by.get("null", [])
     told = ("unknown", "partly")
+    # A failed one names nothing, which is no merit.
+    ended = [v for v in verdicts if v.verdict != "failed"]
     by_chance = {name for name, effect in EFFECTS.items() if effect.random}
     gaps = [v for v in verdicts
             if v.found and not by_chance & set(v.hidden) and v.gap_ratio is not None]  # fmt: skip
@@ -162,7 +175,11 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
         *_beside_hubs("single", single),
         ("single effects: named, others perhaps too", [v.found for v in single], ""),
         ("single effects: verdict `named`", [v.verdict == "named" for v in single], ""),
-        ("nulls: something named", [bool(v.named) for v in null], "at most 2 of 100"),
+        (
+            "nulls: something named",
+            [bool(v.named) for v in ended if v.kind == "null"],
+            "at most 2 of 100",
+        ),
         ("nulls: verdict `no_gap`", [v.verdict == "no_gap" for v in null], ""),
         (
             "outside the catalogue: `unknown` or `partly`",
@@ -174,7 +191,7 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
         *_beside_hubs("pair", by.get("pair", [])),
         ("inseparable: the right set", [v.exact for v in by.get("blurred", [])], "95 %"),
         ("the same with separating flights", [v.exact for v in by.get("separated", [])], "95 %"),
-        ("cases with a spurious extra name", [v.extra > 0 for v in verdicts if v.hidden], ""),
+        ("cases with a spurious extra name", [v.extra > 0 for v in ended if v.hidden], ""),
         ("95 % intervals that hold the truth", intervals, "90-98 %"),
         (
             f"gap after within {GAP_LIMIT} of the noise floor, where named",
@@ -213,6 +230,10 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
             f"| {v.case} | {v.kind} | {', '.join(v.hidden) or '–'} | {v.multiple:.1f} "
             f"| {v.verdict} | {named} |"
         )
+    waiting = not_run(out, verdicts)
+    if waiting:
+        count = len(waiting) + len(verdicts)
+        lines += ["", f"Not run yet, so in none of these numbers: {len(waiting)} of {count} cases."]
     failed = load_manifest(out).failed
     if failed:
         lines += ["", f"Not made: {', '.join(failed)}."]
@@ -222,6 +243,7 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
         **stamp(SCHEMA, None),
         "shares": counted,
         "seconds_median": median(times) if times else None,
+        "not_run": waiting,
         "cases": verdicts,
     }
     write_json(out / "table.json", summary)

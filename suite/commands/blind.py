@@ -30,7 +30,8 @@ class Config:
     seed: Seed | None = None
     """Of a set of your own, in place of the two."""
     count: Annotated[int, Range(1, 100_000)] | None = None
-    """About how many cases, every kind with its share; all 244 if not given."""
+    """About how many cases, every kind with its share, at least one; if not given all 244, or 60 of
+    another simulator."""
     simulator: Literal["mujoco", "rotorpy", "continuous"] = "mujoco"
     """Who flies the cases: rotorpy (pip install diffracing-suite[rotorpy]) and continuous, an
     engine in continuous time that shares no code with the model that fits, make 60."""
@@ -43,6 +44,18 @@ class Config:
     """Print one JSON object to standard output and nothing else."""
 
 
+TAKEN = {
+    "out": ("make", "run", "score"),
+    "set": ("make",),
+    "seed": ("make",),
+    "count": ("make",),
+    "simulator": ("make",),
+    "effects": ("plan",),
+    "workers": ("make", "run"),
+}
+"""Which of the command's works take an option."""
+
+
 def written(config: Config) -> list[Path]:
     """Return the folders that the command writes into."""
     return [config.out] if config.what in ("make", "run") else []
@@ -52,8 +65,17 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Do `config.what`.
 
     Raises:
-        ValueError: for a folder that holds another set, or names that are not in the catalogue.
+        ValueError: for an option of another work, a folder that holds another set, or names that
+            are not in the catalogue.
     """
+    for name, works in TAKEN.items():
+        given = getattr(config, name)
+        if config.what not in works and given != getattr(Config, name):
+            shown = " ".join(given) if isinstance(given, tuple) else given
+            raise ValueError(
+                f"--{name} is {shown}, but `suite blind {config.what}` does not take it, only "
+                f"{' and '.join(works)}; leave it out"
+            )
     workers = asked_workers(config.workers, whole_cores=True)
     if config.what == "plan":
         return _plan(config, console)
@@ -75,12 +97,17 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         done = run_set(config.out, by_command, console, workers=workers)
         console.say(f"{done} cases diagnosed; score them with `suite blind score`")
         return {"diagnosed": done, "out": str(config.out)}
-    from suite.blind.score import report, score_set, shares
+    from suite.blind.score import not_run, report, score_set, shares
     from tracks.common.files import plain
 
     verdicts = score_set(config.out)
     console.say(report(config.out, verdicts))
-    return {"out": str(config.out), "shares": plain(shares(verdicts)), "cases": plain(verdicts)}
+    return {
+        "out": str(config.out),
+        "shares": plain(shares(verdicts)),
+        "not_run": not_run(config.out, verdicts),
+        "cases": plain(verdicts),
+    }
 
 
 def _made(manifest: Manifest, config: Config, console: Console) -> dict[str, Any]:

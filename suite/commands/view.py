@@ -65,13 +65,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError(f"--rerun {recording}: a recording's name must end in .rrd")
     check_place(recording)
     check_place(config.out / "picture.png")
-    evaluation, trials = _chosen(config)
+    evaluation, trials, judged = _chosen(config)
     from eval.view.picture import write_picture
     from eval.view.recording import write_recording
     from suite.judging.replay import fly_again
 
     console.note(f"flying {len(trials)} trials again")
-    rollouts, drone = fly_again(evaluation, trials)
+    rollouts, drone = fly_again(evaluation, trials, judged=judged)
     write_recording(recording, rollouts, drone)
     written = [recording]
     for rollout in rollouts:
@@ -106,8 +106,9 @@ def _name(rollout: Rollout) -> str:
     return f"{Path(result.track).stem}-{result.difficulty}-{result.seed}"
 
 
-def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec]]:
-    from suite.judging.replay import first_trials, read_evaluation
+def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[str, str] | None]:
+    """Return what is flown, which trials of it, and of a run the digests of what was judged."""
+    from suite.judging.replay import first_trials, read_digests, read_evaluation
     from suite.judging.requests import Evaluation
 
     folder = Path(config.run)
@@ -131,7 +132,7 @@ def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec]]:
             trust=config.trust,
             speed=() if config.speed is None else (config.speed,),
         )
-        return evaluation, first_trials(evaluation)[: config.count]
+        return evaluation, first_trials(evaluation)[: config.count], None
     from eval.judging.results import read_trials
 
     for name in ("track", "difficulty", "vehicle", "seed", "speed"):
@@ -149,4 +150,5 @@ def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec]]:
         results = [result for result in results if result.success == (config.pick == "passed")]
     if not results:
         raise ValueError(f"--pick {config.pick}: {folder} holds no such trial")
-    return evaluation, [result.trial for result in results[: config.count]]
+    trials = [result.trial for result in results[: config.count]]
+    return evaluation, trials, read_digests(folder)

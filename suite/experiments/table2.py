@@ -153,11 +153,11 @@ def variants_of(config: Config, place: Place, console: Console) -> list[TablePol
     chosen = {OURS: policy, **{name: path for name, path in given.items() if path}}
     if config.delta_iterations:
         from suite.common.console import Quiet
-        from suite.loop.config import by_content
+        from suite.loop.config import loop_by_content
         from suite.loop.run import run_loop
 
         loop = loop_config(config, policy)
-        about = [by_content(loop), code_digest(*LOOP_ROOMS), engines()]
+        about = [loop_by_content(loop), code_digest(*LOOP_ROOMS), engines()]
         folder = place.cache / "loops" / digest(about)
         run_loop(loop, folder, Quiet(), place.workers)
         chosen[WITH] = str(folder / "tuned-with" / "policy")

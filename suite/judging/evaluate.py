@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,13 +25,17 @@ from suite.judging.flying import (
 )
 from suite.judging.manner import Manner, manners
 from suite.judging.requests import Evaluation
+from tracks.common.files import to_json
 from tracks.common.grid import rich_table
 from tracks.common.provenance import stamp
 from tracks.common.work import Workers
 
 if TYPE_CHECKING:
+    from eval.judging.results import Journal
+    from eval.vehicles.vehicle import Vehicle
     from eval.worlds.trial import TrialResult
     from policies.policy import Policy
+    from tracks.track import Track
 
 
 class Flier(NamedTuple):
@@ -73,18 +79,19 @@ def evaluate(
     _refuse_twice([flier.label for flier in fliers])
     count = len(course.trials)
     workers = workers_for(count, workers, evaluation.world)
+    journals = _open_journals(evaluation, course, fliers, out)
     flown = count * len(fliers)
     what = f"{flown} trials in the {evaluation.world} world"
     announce(console, what, flying_needs(flown, workers, evaluation.world))
     say_notes(console, evaluation.world, course)
     results: list[TrialResult] = []
-    for number, flier in enumerate(fliers):
-        journal = out / f"journal-{number}.jsonl"
+    for flier, journal in zip(fliers, journals, strict=True):
         results += _fly_one(evaluation, course, flier, workers, journal, console)
     summary = {
         **summarise(results),
         "judged": evaluation,
         "policies": [about_policy(flier.source, flier.policy) for flier in fliers],
+        "sha256": file_digests(course.vehicle, course.tracks),
         "flown_otherwise": course.differences,
     }
     write_results(
@@ -103,6 +110,20 @@ def evaluate(
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
 
 
+def file_digests(vehicle: Vehicle, tracks: Mapping[str, Track]) -> dict[str, str]:
+    """Return the SHA-256 of what a file may describe, as it was read, by what it is.
+
+    Not of the file's bytes: a comment in it may change and the flights be the same.
+    """
+    from eval.quadrotor.vehicle_file import vehicle_table
+
+    parts: dict[str, object] = {"vehicle": vehicle_table(vehicle)}
+    parts |= {f"track {name}": track for name, track in tracks.items()}
+    return {
+        what: hashlib.sha256(to_json(part).encode()).hexdigest() for what, part in parts.items()
+    }
+
+
 def _refuse_twice(called: list[str]) -> None:
     """Refuse two shares of one label, which tables would count as one with twice the trials."""
     for label in called:
@@ -113,37 +134,53 @@ def _refuse_twice(called: list[str]) -> None:
             )
 
 
+def _open_journals(
+    evaluation: Evaluation, course: Course, fliers: Sequence[Flier], out: Path
+) -> list[Journal]:
+    """Return the journal in `out` of each of `fliers`.
+
+    Raises:
+        ValueError: where one is there that is about something else; none is made then.
+    """
+    from eval.judging.results import Journal
+
+    paths = [out / f"journal-{number}.jsonl" for number in range(len(fliers))]
+    opened = {}
+    for path, flier in sorted(zip(paths, fliers, strict=True), key=lambda one: not one[0].exists()):
+        about = {
+            **stamp(1, None),
+            "policy": about_policy(flier.source, flier.policy),
+            "speed": flier.manner.speed,
+            "vehicle": course.vehicle,
+            "world": evaluation.world,
+            "deadline_s": evaluation.deadline_s,
+            "time_limit_s": evaluation.time_limit_s,
+            "tracks": course.tracks,
+        }
+        opened[path] = Journal(path, by_content(about))
+    return [opened[path] for path in paths]
+
+
 def _fly_one(
     evaluation: Evaluation,
     course: Course,
     flier: Flier,
     workers: Workers,
-    journal_path: Path,
+    journal: Journal,
     console: Console,
 ) -> list[TrialResult]:
     """Return the results of one policy in the trials' order."""
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, fly
-    from eval.judging.results import Journal
     from eval.worlds.trial import Rules
 
     label = flier.label
-    about = {
-        **stamp(1, None),
-        "policy": about_policy(flier.source, flier.policy),
-        "speed": flier.manner.speed,
-        "vehicle": course.vehicle,
-        "world": evaluation.world,
-        "deadline_s": evaluation.deadline_s,
-        "time_limit_s": evaluation.time_limit_s,
-        "tracks": course.tracks,
-    }
     options = JudgeOptions(
         workers=workers,
         rules=Rules(time_limit_s=evaluation.time_limit_s),
         limits=ActionLimits(deadline_s=evaluation.deadline_s),
     )
-    with Journal(journal_path, by_content(about)) as journal:
+    with journal:
         missing = journal.missing(course.trials)
         if len(missing) < len(course.trials):
             console.note(f"{label}: {len(course.trials) - len(missing)} trials were flown before")

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.choices import parse_levels, parse_tracks
 from suite.common.console import Console
-from suite.judging.flying import custom_tracks, default_policy, load_flier, trial_list
+from suite.judging.evaluate import file_digests
+from suite.judging.flying import (
+    about_policy,
+    custom_tracks,
+    default_policy,
+    load_flier,
+    trial_list,
+)
 from suite.judging.manner import manners
 from suite.judging.requests import Evaluation
 from tracks.input.ranges import check_ranges, shown
@@ -54,12 +62,33 @@ def read_evaluation(folder: Path) -> Evaluation:
     asked = Evaluation(**{**config, "policies": tuple(policies), "speed": tuple(speeds)})
     for name, value in vars(asked).items():
         default = getattr(Evaluation, name)
-        # Those that are None by default are numbers.
-        kind = (int, float, type(None)) if default is None else type(default)
+        # Those that are None by default are numbers, and JSON's are whole where Python's was.
+        kind: type | tuple[type, ...] = type(default)
+        if default is None or isinstance(default, float):
+            kind = (int, float, type(default))
         if not isinstance(value, kind) or (isinstance(value, bool) and default is not False):
             raise ValueError(f"{path}: {name} is {shown(value)}, expected one like {default!r}")
     check_ranges(asked, f"{path}: ")
     return asked
+
+
+def read_digests(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of what `suite eval --out folder` flew first, as `fly_again` takes it.
+
+    Raises:
+        ValueError: where `folder` does not say it.
+    """
+    path = folder / "summary.json"
+    try:
+        summary = read_json(path)
+        first = summary["policies"][0]["sha256"]
+        # Those of earlier versions say it of policies alone.
+        return {"policy": str(first), **dict(summary.get("sha256", {}))}
+    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path}: does not say which policy was judged ({error}); give the command of suite "
+            "eval again with another --out, then view that"
+        ) from error
 
 
 def first_trials(evaluation: Evaluation) -> list[TrialSpec]:
@@ -68,13 +97,22 @@ def first_trials(evaluation: Evaluation) -> list[TrialSpec]:
     return trial_list(tracks, levels, 1, evaluation.seed)
 
 
-def fly_again(evaluation: Evaluation, trials: list[TrialSpec], policy: str | None = None) -> Replay:
+def fly_again(
+    evaluation: Evaluation,
+    trials: list[TrialSpec],
+    policy: str | None = None,
+    judged: Mapping[str, str] | None = None,
+) -> Replay:
     """Fly `trials` as they were judged.
 
     Args:
         evaluation: what the trials are part of.
         trials: which.
         policy: one of the evaluation's; its first if None.
+        judged: the SHA-256 of what flew, as `read_digests` has it; None compares nothing.
+
+    Raises:
+        ValueError: where the policy, the vehicle or a track is not what was judged.
     """
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, Record, fly
@@ -91,6 +129,9 @@ def fly_again(evaluation: Evaluation, trials: list[TrialSpec], policy: str | Non
     flier = load_flier(name, evaluation.trust, manners(evaluation.speed, monitor=False)[0])
     vehicle = load_vehicle(evaluation.vehicle)
     tracks = custom_tracks(parse_tracks(evaluation.track))
+    if judged is not None:
+        digests = {"policy": about_policy(name, flier)["sha256"], **file_digests(vehicle, tracks)}
+        _refuse_changed({"policy": name, "vehicle": evaluation.vehicle}, digests, judged)
     flights: dict[TrialSpec, Flight] = {}
 
     def keep(result: TrialResult, flight: Flight | None) -> None:
@@ -114,6 +155,20 @@ def fly_again(evaluation: Evaluation, trials: list[TrialSpec], policy: str | Non
     # What is flown with is the policy's camera, whatever the vehicle's file says of one.
     camera = flier.spec.camera
     return Replay(rollouts, Drone(vehicle.body.half_size, vehicle.rotors.position, camera))
+
+
+def _refuse_changed(
+    sources: Mapping[str, str], digests: Mapping[str, str], judged: Mapping[str, str]
+) -> None:
+    """Refuse what is not what was judged: its flights would be others."""
+    for what, digest in digests.items():
+        if judged.get(what, digest) != digest:
+            called = f"{what} {sources[what]}" if what in sources else what
+            raise ValueError(
+                f"{called}: has changed since these trials were judged, so they would be flown "
+                "otherwise; put back what was judged, or give the command of suite eval again with "
+                "another --out, then view that"
+            )
 
 
 def record_first_trials(evaluation: Evaluation, path: Path, console: Console) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+from policies import shipped
 from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
 from suite.train.config import TrainConfig, check
@@ -127,19 +128,23 @@ class HiddenLoopConfig(LoopConfig):
         return self.simulator
 
 
-def by_content(config: LoopConfig) -> LoopConfig:
+def loop_by_content(config: LoopConfig) -> LoopConfig:
     """Return the loop without where its files lie: what they hold is in `digests`.
 
-    So a loop that is moved, or called from another folder or machine, is no other loop.
+    So a loop that is moved, or called from another folder or machine, is no other loop. A name
+    means what it means to who loads it: a shipped policy's goes before a folder called so, a
+    vehicle's after a file.
     """
 
-    def name(given: str) -> str:
-        return "a file" if Path(given).exists() else given
+    def vehicle(given: str) -> str:
+        return "a file" if Path(given).is_file() else given
 
-    policy = None if config.policy is None else name(config.policy)
-    config = replace(config, policy=policy, vehicle=name(config.vehicle))
+    policy = config.policy
+    if policy is not None and policy not in shipped.names():
+        policy = "a file"
+    config = replace(config, policy=policy, vehicle=vehicle(config.vehicle))
     if isinstance(config, HiddenLoopConfig):
-        return replace(config, world=name(config.world))
+        return replace(config, world=vehicle(config.world))
     return config
 
 
@@ -193,6 +198,11 @@ def resolve(
     _check_changes(changes, policy, iterations)
     if not delta and world is None:
         raise ValueError("--no-delta: the loop is about the Delta Action Model; give --world, too")
+    if not delta and fit_iterations is not None:
+        raise ValueError(
+            f"--fit-iterations is {fit_iterations}, but with --no-delta no Delta Action Model is "
+            "fitted; leave one of the two out"
+        )
     if world is None and policy is None:
         training = override(training, changes)
         check(training)

@@ -13,7 +13,7 @@ from eval.judging.results import read_trials
 from suite.common.console import Console
 from suite.common.stages import claim, do_stages
 from suite.loop import delta_action, hidden_effect
-from suite.loop.config import HiddenLoopConfig, LoopConfig, by_content
+from suite.loop.config import HiddenLoopConfig, LoopConfig, loop_by_content
 from suite.loop.report import write_loop_report
 from suite.loop.work import LoopRun, plan
 from tracks.common.files import plain, write_json, write_text
@@ -47,7 +47,7 @@ def run_loop(
     if isinstance(config, HiddenLoopConfig):
         loop = hidden_effect.LOOP if config.delta else hidden_effect.WITHOUT_DELTA
     run = LoopRun(loop, config, Path(out), console, workers)
-    claim(run.out, by_content(config), config.seed)
+    claim(run.out, loop_by_content(config), config.seed)
     seconds = do_stages(run.out, plan(run), console, f"the loop, to {run.out}")
     return _conclude(run, seconds)
 

@@ -8,10 +8,16 @@ from typing import Any
 
 from policies import shipped
 from suite.common.console import Console
+from suite.judging.content import policy_digest
 from suite.judging.deploy.card import CARD, card_text
 from suite.judging.deploy.observed import observed_flights
 from suite.judging.deploy.parity import parity
-from tracks.common.files import check_no_input, write_text
+from tracks.common.files import check_no_input, write_json, write_text
+from tracks.common.provenance import stamp
+from tracks.input.reading import read_json
+
+NOTE = "exports.json"
+"""Name of the file in the output folder that says which policy each export there is of."""
 
 
 def export(
@@ -20,7 +26,8 @@ def export(
     """Write a policy of ours in `formats`; C with a card of its parity and its time a step.
 
     Raises:
-        ValueError: where the policy is not ours, or a format or type is unknown.
+        ValueError: where the policy is not ours, a format or type is unknown, or another policy's
+            export would be written over.
     """
     from policies.formats.export import check_formats, export_policy, exported_checkpoint
     from policies.native import native_policy
@@ -29,6 +36,8 @@ def export(
     if "c" in formats:
         check_no_input(out / CARD, [shipped.locate(policy) / CARD], "--out")
     name, checkpoint = exported_checkpoint(policy)
+    files = {"torch": f"{name}.pt2", "onnx": f"{name}.onnx", "c": "policy.c"}
+    _claim(policy, out, [files[wanted] for wanted in formats], checkpoint.seed)
     observed = None
     if dtype == "int8":
         console.note("flying 10 random tracks to measure the activations")
@@ -40,3 +49,34 @@ def export(
     console.say(found.sentence)
     write_text(out / CARD, card_text(policy, name, checkpoint, dtype, found))
     return {"written": [*written, out / CARD], "parity": found}
+
+
+def _claim(policy: str, out: Path, files: Sequence[str], seed: int | None) -> None:
+    """Note that `files` in `out` are of `policy`, or refuse to write over another's.
+
+    A checkpoint is called by its folder, which is policy/ in every training, and C by no name.
+
+    Raises:
+        ValueError: naming the file and what to do.
+    """
+    source, digest = str(shipped.locate(policy).resolve()), policy_digest(policy)
+    noted = _noted(out / NOTE)
+    for file in files:
+        was = noted.get(file, {})
+        if (out / file).exists() and source != was.get("source") and digest != was.get("sha256"):
+            whose = was.get("source", "a policy that is not noted")
+            raise ValueError(
+                f"--out {out}: {file} there is of {whose} and would be written over by that of "
+                f"{policy}; give another --out, or move the file away"
+            )
+        noted[file] = {"source": source, "sha256": digest}
+    write_json(out / NOTE, {**stamp(1, seed), "files": noted})
+
+
+def _noted(path: Path) -> dict[str, dict[str, str]]:
+    if not path.is_file():
+        return {}
+    try:
+        return {file: dict(entry) for file, entry in read_json(path)["files"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: not a note of exports ({error}); move it away") from error

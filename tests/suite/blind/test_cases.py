@@ -62,6 +62,19 @@ def test_the_continuous_set_has_its_numbers_and_each_single_effect_once():
 
 
 @pytest.mark.parametrize("simulator", DRAWERS)
+def test_a_few_cases_are_of_every_kind(simulator):
+    draw = DRAWERS[simulator]
+    whole = Counter(case.kind for case in draw(1, None).values())
+    for count in (1, 12):
+        few = Counter(case.kind for case in draw(1, count).values())
+        share = count / whole.total()
+        assert few == {kind: max(round(share * n), 1) for kind, n in whole.items()}
+    assert draw(1, whole.total()) == draw(1, 10**5) == draw(1, None)
+    with pytest.raises(ValueError, match="count = 0: must be at least 1"):
+        draw(1, 0)
+
+
+@pytest.mark.parametrize("simulator", DRAWERS)
 def test_an_effect_that_no_flight_can_tell_is_never_drawn(simulator, monkeypatch):
     """Sets that are published stay what they are, whatever such effects the catalogue gains."""
     draw = DRAWERS[simulator]

@@ -1,11 +1,13 @@
 """Sets of cases: made, locked and resumed."""
 
 import json
+import sys
 
 import pytest
 
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
+from suite import cli
 from suite.blind import make as make_module
 from suite.blind.build import build
 from suite.blind.make import make_set, open_answers
@@ -47,3 +49,16 @@ def test_a_set_goes_on_where_it_stopped(small_set, monkeypatch):
     assert again["answers"] == manifest["answers"]
     with pytest.raises(ValueError, match="another --out"):
         make_set(small_set, 6, None, Console())
+
+
+def test_without_its_simulator_nothing_is_begun(tmp_path, monkeypatch, capsys):
+    """A folder that says whose set it is would be refused for another's."""
+    monkeypatch.setitem(sys.modules, "torchdiffeq", None)
+    out = tmp_path / "out"
+    assert cli.main(["blind", "make", "--simulator", "rotorpy", "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'diffracing-suite[rotorpy]'" in said and len(said.splitlines()) == 1
+    assert not out.exists()
+    with pytest.raises(ValueError, match="count = 0"):
+        make_set(out, 5, 0, Console())
+    assert not out.exists()

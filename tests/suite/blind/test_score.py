@@ -129,6 +129,21 @@ def test_the_table_counts_and_the_files_are_written(tmp_path):
     assert json.loads((tmp_path / "table.json").read_text())["seconds_median"] == 2.0
 
 
+def test_a_diagnosis_that_failed_is_not_one_that_rightly_named_nothing():
+    verdicts = [
+        score_case("a", NULL, said(verdict="no_gap"), 1.0),
+        score_case("b", NULL, said(effect("inflow")), 1.0),
+        score_case("c", NULL, None, None),
+        score_case("d", TRUTH, None, None),
+    ]
+    lines = {s.what: (s.count, s.of) for s in shares(verdicts)}
+    assert lines["nulls: something named"] == (1, 2)
+    assert lines["nulls: verdict `no_gap`"] == (1, 3)
+    assert lines["single effects: named, nothing else"] == (0, 1)
+    assert "cases with a spurious extra name" not in lines, "nothing was named where it failed"
+    assert lines["diagnosis failed"] == (2, 4)
+
+
 def test_damping_by_moving_hubs_is_there_where_its_size_is_right():
     hidden = {"kind": "single", "effects": [{**TRUTH["effects"][0], "name": "rotor_drag"}]}
     drag, hubs = effect("rotor_drag", "linear_drag"), np.array([0.0, 0.0, 0.05])

@@ -16,7 +16,7 @@ from suite.common.running.apart import Job
 from suite.experiments import hidden_worlds
 from suite.experiments.hidden_worlds import WORLDS, Asked, Config, loop_of, world_of
 from suite.experiments.pages.hidden_worlds import ALL
-from suite.loop.config import by_content
+from suite.loop.config import loop_by_content
 from suite.loop.hidden_effect import CONTROL, NAMED, NOMINAL
 from tests.support.documents import page, reproduce
 from tests.support.loops import EFFECT, WON, four_trials
@@ -82,10 +82,10 @@ def test_a_loop_needs_none_of_our_files_where_it_runs(tmp_path):
     save_vehicle(load_vehicle("racer5"), vehicle)
     config = Config(policy=str(mine), vehicle=str(vehicle))
     asked = Asked(config, "weak rotor", 0, load_vehicle(str(vehicle)))
-    here = by_content(loop_of(Job(asked, tmp_path / "here", mine)))
+    here = loop_by_content(loop_of(Job(asked, tmp_path / "here", mine)))
     shutil.move(mine, tmp_path / "reads")
     vehicle.unlink()
-    there = by_content(loop_of(Job(asked, tmp_path / "there", tmp_path / "reads")))
+    there = loop_by_content(loop_of(Job(asked, tmp_path / "there", tmp_path / "reads")))
     assert here == there and set(here.digests) == {"policy", "vehicle", "world"}
 
 

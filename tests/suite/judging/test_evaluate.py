@@ -98,6 +98,28 @@ def test_a_journal_of_something_else_is_not_mixed_in(pilots, tmp_path, monkeypat
     assert "another --out" in capsys.readouterr().err
 
 
+def test_a_later_policys_journal_is_looked_at_before_the_first_flight(
+    pilots, tmp_path, monkeypatch, capsys
+):
+    """The first policy's trials may take hours."""
+
+    def interrupted(policy, *args, **rest):
+        if policy.name == "other":
+            raise KeyboardInterrupt
+        return fly(policy, *args, **rest)
+
+    fly, asked = eval.judging.judge.fly, ["--track", "zigzag", "--trials", "1", "--policy"]
+    with monkeypatch.context() as patch:
+        patch.setattr(eval.judging.judge, "fly", interrupted)
+        out = tmp_path / "out"
+        assert _eval(out, *asked, pilots["diver"], "--policy", pilots["other"]) == 130
+    (out / "journal-0.jsonl").unlink()
+    monkeypatch.setattr(eval.judging.judge, "fly", None)
+    assert _eval(out, *asked, pilots["diver"], "--policy", pilots["pursuit"]) == 2
+    assert "journal-1.jsonl: holds trials flown otherwise" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["journal-1.jsonl"]
+
+
 @pytest.mark.parametrize(
     ("args", "words"),
     [

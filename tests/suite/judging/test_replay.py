@@ -1,13 +1,20 @@
 """suite view flies judged trials again."""
 
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 
+import eval.judging.judge
 from eval.judging.results import read_trials
 from suite import cli
 from suite.commands import view
+from suite.common.console import Quiet
+from suite.judging.evaluate import evaluate
 from suite.judging.manner import Manner, manners
+from suite.judging.replay import read_evaluation
+from suite.judging.requests import Evaluation
 from tests.support.recordings import columns
 
 
@@ -29,6 +36,62 @@ def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
     assert said["trials"][0]["time_s"] == rows[0].time_s
     assert cli.main([*view, "--pick", "passed"]) == 2
     assert "--pick passed" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("what", "was", "now"),
+    [
+        ("policy", "diver", "another"),
+        ("vehicle", "mass = 0.75", "mass = 0.85"),
+        ("track", "width = 1.1", "width = 1.2"),
+    ],
+)
+def test_a_run_whose_files_have_changed_is_not_flown_again(
+    what, was, now, pilots, tmp_path, root, monkeypatch, capsys
+):
+    """It would show flights that nobody judged."""
+    files = {"policy": Path(pilots["diver"])}
+    files["vehicle"] = Path(shutil.copy(root / "eval/vehicles/racer5.toml", tmp_path))
+    files["track"] = shutil.copytree(root / "tracks/examples", tmp_path / "tracks") / "yard.toml"
+    flown = [text for name, file in files.items() for text in (f"--{name}", str(file))]
+    out = tmp_path / "out"
+    assert _eval(out, *flown, "--trials", "1", "--time-limit-s", "0.5") == 0
+    view, old = ["view", str(out), "--out", str(tmp_path / "seen")], files[what].read_text()
+    assert was in old
+    if what != "policy":
+        files[what].write_text(f"# a comment\n{old}")
+    assert cli.main(view) == 0
+    files[what].write_text(old.replace(was, now, 1))
+    capsys.readouterr()
+    monkeypatch.setattr(eval.judging.judge, "fly", None)
+    assert cli.main(view) == 2
+    said = capsys.readouterr().err
+    assert f"{what} {files[what]}: has changed since these trials were judged" in said
+    assert "put back what was judged" in said
+
+
+def test_a_run_of_an_earlier_version_is_held_to_its_policy(pilots, tmp_path, capsys):
+    out, path = tmp_path / "out", tmp_path / "out" / "summary.json"
+    flown = ["--policy", pilots["diver"], "--track", "zigzag", "--trials", "1"]
+    assert _eval(out, *flown) == 0
+    summary = json.loads(path.read_text())
+    del summary["sha256"]
+    path.write_text(json.dumps(summary))
+    view = ["view", str(out), "--out", str(tmp_path / "seen")]
+    assert cli.main(view) == 0
+    path.write_text(json.dumps({**summary, "policies": []}))
+    assert cli.main(view) == 2
+    assert "does not say which policy was judged" in capsys.readouterr().err
+    path.write_text(json.dumps({**summary, "policies": [{"sha256": "another"}]}))
+    assert cli.main(view) == 2
+    assert f"policy {pilots['diver']}: has changed" in capsys.readouterr().err
+
+
+def test_a_run_from_python_with_a_whole_number_of_seconds_is_seen_again(pilots, tmp_path):
+    asked = Evaluation((pilots["diver"],), track="zigzag", trials=1, time_limit_s=1)
+    evaluate(asked, tmp_path / "out", Quiet())
+    assert read_evaluation(tmp_path / "out") == asked
+    assert cli.main(["view", str(tmp_path / "out"), "--out", str(tmp_path / "seen")]) == 0
 
 
 def test_a_run_does_not_say_itself_that_it_is_to_be_trusted(tmp_path, capsys):
@@ -102,7 +165,7 @@ def test_view_of_something_else_is_refused(tmp_path, capsys):
 
 
 def test_view_asks_a_policy_for_a_speed(capsys, tmp_path):
-    evaluation, _ = view._chosen(view.Config(run="swift-30", speed=0.4))
+    evaluation, *_ = view._chosen(view.Config(run="swift-30", speed=0.4))
     assert manners(evaluation.speed, monitor=False) == [Manner(speed=0.4)]
     asked = ["view", "--out", str(tmp_path), "--difficulty", "0", "--speed"]
     assert cli.main([*asked, "0.4", "swift"]) == 2

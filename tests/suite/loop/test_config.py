@@ -1,5 +1,7 @@
 """What a loop's options come to, and what is refused before anything is written."""
 
+import shutil
+
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
@@ -9,7 +11,7 @@ from suite import cli
 from suite.loop.config import (
     DeltaLoopConfig,
     HiddenLoopConfig,
-    by_content,
+    loop_by_content,
     parse_world,
     recipe_of,
     resolve,
@@ -61,6 +63,7 @@ def test_what_cannot_be_used_is_said_before_anything_is_written(args, words, tmp
         (["--world", "mjx"], "nothing is hidden"),
         (["--world", "mujoco:nowhere.toml"], "nowhere.toml: no such file"),
         (["--world", EXAMPLE, "--iterations", "5"], "--finetune-iterations"),
+        (["--world", EXAMPLE, "--no-delta", "--fit-iterations", "5"], "--fit-iterations is 5, but"),
         (["--world", EXAMPLE, "--policy", "nobody.onnx"], "needs a checkpoint's folder"),
         (["--world", EXAMPLE, "--track", "my.toml"], "cannot be held apart"),
         (["--world", EXAMPLE, "--flights", "0"], "--flights is 0"),
@@ -155,10 +158,30 @@ def test_where_files_lie_makes_no_other_loop(root, monkeypatch, tmp_path):
     moved = tmp_path / "hidden.toml"
     moved.write_bytes((root / EXAMPLE).read_bytes())
     here, there = (resolve(recipe="small", world=str(path)) for path in (EXAMPLE, moved))
-    assert here != there and by_content(here) == by_content(there)
+    assert here != there and loop_by_content(here) == loop_by_content(there)
     other = tmp_path / "other" / "hidden.toml"
     save_vehicle(with_effects(com_offset=((0.005, 0.0, 0.0),)), other)
-    assert by_content(resolve(recipe="small", world=str(other))) != by_content(here)
+    assert loop_by_content(resolve(recipe="small", world=str(other))) != loop_by_content(here)
+
+
+def test_a_folder_called_like_something_shipped_makes_no_other_loop(tmp_path, monkeypatch):
+    """It is not what is loaded, and may come between an interruption and the same command again."""
+    monkeypatch.chdir(tmp_path)
+
+    def asked():
+        return loop_by_content(resolve(recipe="small", policy="racer", world="racer5"))
+
+    begun = asked()
+    for name in ("racer", "racer5", "reference"):
+        (tmp_path / name).mkdir()
+    assert asked() == begun
+    for name in ("racer", "racer5"):
+        (tmp_path / name).rmdir()
+    shutil.copytree(shipped.folder("racer"), tmp_path / "mine")
+    save_vehicle(load_vehicle("racer5"), tmp_path / "racer5")
+    own = loop_by_content(resolve(recipe="small", policy="mine", world="racer5"))
+    assert isinstance(own, HiddenLoopConfig) and own.digests == begun.digests
+    assert (own.policy, own.world, own.vehicle) == ("a file", "a file", "reference")
 
 
 @pytest.fixture

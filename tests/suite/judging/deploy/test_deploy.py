@@ -10,11 +10,12 @@ import pytest
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import find_compiler
 from policies.formats.c.project import drawn
-from policies.formats.policy_file import load_policy_checkpoint
+from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.policy import load_policy
 from policies.spec import PolicySpec
 from suite import cli
 from suite.judging.deploy import card, exporting, latency, observed, parity
+from tests.policies.conftest import SPEC, lively
 from tests.support.pilots import Steady
 from tests.support.small_policy import small_checkpoint
 
@@ -38,7 +39,7 @@ def test_the_command_writes_c_and_a_card_that_says_how_near_it_is(folder, tmp_pa
     answer = json.loads(capsys.readouterr().out)
     assert answer["parity"]["steps"] == 1000 and answer["parity"]["worst"] <= 1e-4
     names = {"policy.h", "policy.c", "vectors.h", "main.c", "CMakeLists.txt", card.CARD}
-    assert {path.name for path in tmp_path.iterdir()} == names
+    assert {path.name for path in tmp_path.iterdir()} == {*names, exporting.NOTE}
     text = (tmp_path / card.CARD).read_text()
     digest = json.loads((folder / "config.json").read_text())["weights"]["sha256"]
     for said in ("| policy | tiny |", digest, "| licence | Apache-2.0", "Success: not known"):
@@ -64,6 +65,40 @@ def test_what_cannot_be_exported_is_refused(folder, tmp_path, capsys):
         assert cli.main(["export", str(folder), "--out", str(tmp_path), *args]) == 2
         assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("wanted", "file"), [("onnx", "policy.onnx"), ("c", "policy.c")])
+def test_an_export_of_another_policy_is_not_written_over(
+    wanted, file, folder, tmp_path, monkeypatch, capsys
+):
+    """Every training's policy is called policy, and C's files are called so whatever they are."""
+    pytest.importorskip("onnx")
+    monkeypatch.setenv("CC", "no-such-compiler")
+    one, other = (tmp_path / run / "policy" for run in "ab")
+    out = tmp_path / "out"
+
+    def export(policy):
+        return cli.main(["export", str(policy), "--format", wanted, "--out", str(out)])
+
+    shutil.copytree(folder, one)
+    save_policy(other, lively(SPEC, 3), SPEC, seed=1)
+    assert export(one) == export(one) == 0
+    kept = (out / file).read_bytes()
+    capsys.readouterr()
+    assert export(other) == 2
+    said = capsys.readouterr().err
+    assert f"{file} there is of {one} and would be written over by that of {other}" in said
+    assert (out / file).read_bytes() == kept
+    shutil.rmtree(one)
+    shutil.copytree(other, one)
+    assert export(one) == 0, "trained on, it is the same policy's"
+    assert export(other) == 0, "and now that of its content, too"
+    (out / exporting.NOTE).unlink()
+    assert export(other) == 2
+    assert f"{file} there is of a policy that is not noted" in capsys.readouterr().err
+    (out / exporting.NOTE).write_text("[]")
+    assert export(other) == 2
+    assert "not a note of exports" in capsys.readouterr().err
 
 
 def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
