@@ -48,13 +48,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     console.say(f"driven by {DRIVEN[result['drive']]}")
     for key, entry in result["parameters"].items():
         values, spans = entry["value"], entry["ci95"]
-        # What yaws follows what rolls and pitches.
-        left = "goes with the others" if key == "inertia" else "as it was"
         if not isinstance(values, list):
             values, spans = [values], [spans]
+        # What yaws follows what rolls and pitches; of these at least one was told, then.
+        left = {2: "goes with the others"} if key == "inertia" else {}
         shown = [
-            f"{v:.4g} ({s[0]:.4g} to {s[1]:.4g})" if s else f"{v:.4g} ({left})"
-            for v, s in zip(values, spans, strict=True)
+            f"{v:.4g} ({s[0]:.4g} to {s[1]:.4g})" if s else f"{v:.4g} ({left.get(k, 'as it was')})"
+            for k, (v, s) in enumerate(zip(values, spans, strict=True))
         ]
         console.say(f"  {key}: {', '.join(shown)} {entry['unit']}")
     for text in result["untold"]:

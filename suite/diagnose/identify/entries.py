@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -12,11 +12,14 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.effects.interface import at
 from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.identify import force
 from suite.diagnose.identify.data.drive import MotorGuess
 from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.numbers import Number, number
 from suite.diagnose.identify.torque import inertia_ratio
+
+DELAY = "effects.command_delay.delay"
 
 
 def inertia_of(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
@@ -150,11 +153,14 @@ def of_loop(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
     if "late" in names:
         entries.append(
             number(
-                "effects.command_delay.delay",
+                DELAY,
                 "s",
                 fitted,
                 lambda n: np.array([n["late"] - n.get("lag", lag_s)]),
                 [("late",)],
+                # With a lag in doubt it is as much in doubt, however well their sum is told: the
+                # file keeps the sum.
+                fitted.unknowns[fitted.index("late")].room,
             )
         )
     if "gain_x" in names:
@@ -171,25 +177,71 @@ def of_loop(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
     return entries
 
 
+def enter(vehicle: Vehicle, entries: Iterable[Number]) -> tuple[Vehicle, list[Number], list[str]]:
+    """Return the vehicle with what was told, the entries as it has them, and how these differ.
+
+    A delay that flights deny is no entry of the vehicle.
+    """
+    numbers, notes = [], []
+    for entry in entries:
+        held = allowed(vehicle, entry)
+        vehicle = put(vehicle, held)
+        gone = (
+            entry.key == DELAY and held.value == [0.0] and (entry.follows or entry.ci95 != [None])
+        )
+        if not gone:
+            numbers.append(held)
+        for k, span in enumerate(entry.ci95):
+            was, now = entry.value[k], held.value[k]
+            if span is None or was == now:
+                continue
+            part = f"[{k}]" if len(entry.value) > 1 else ""
+            then = "the file has none" if gone else f"the file has {now:.4g}, the nearest it may"
+            said = f"{was:.4g} ({span[0]:.4g} to {span[1]:.4g}) {entry.unit}"
+            notes.append(f"{entry.key}{part}: these flights say {said}; {then}")
+    return vehicle, numbers, notes
+
+
+def allowed(vehicle: Vehicle, entry: Number) -> Number:
+    """Return an entry with the values nearest to its own that a file may hold.
+
+    Its intervals stay what the flights say.
+    """
+    table, _, _ = entry.key.rpartition(".")
+    if not table.startswith("effects."):
+        return entry
+    parameter = EFFECTS[table.removeprefix("effects.")].parameters[0]
+    low, high = at(parameter.low, vehicle), at(parameter.high, vehicle)
+    return entry._replace(value=[min(max(v, low), high) for v in entry.value])
+
+
 def put(vehicle: Vehicle, entry: Number) -> Vehicle:
-    """Return the vehicle with what was told of an entry; the rest of it stays."""
-    if all(span is None for span in entry.ci95):
+    """Return the vehicle with what was told of an `allowed` entry; the rest of it stays."""
+    if all(span is None for span in entry.ci95) and not entry.follows:
         return vehicle
-    value = tuple(entry.value)
+    changed = tuple(entry.value) if len(entry.value) > 1 else entry.value[0]
     table, _, key = entry.key.rpartition(".")
     if table.startswith("effects."):
         name = table.removeprefix("effects.")
-        effect = EFFECTS[name]
-        parameter = effect.parameters[0]
-        low, high = at(parameter.low, vehicle), at(parameter.high, vehicle)
-        kept = [min(max(v, low), high) for v in value]
-        if name == "command_delay" and kept[0] <= 0.0:
-            others = {n: v for n, v in vehicle.effects.items() if n != name}
-            return replace(vehicle, effects=MappingProxyType(others))
-        values = effect.values(tuple(kept) if parameter.size else kept[0])
-        return replace(vehicle, effects=MappingProxyType({**vehicle.effects, name: values}))
+        effects = {**vehicle.effects, name: EFFECTS[name].values(changed)}
+        if entry.key == DELAY and changed == 0.0:
+            del effects[name]
+        return replace(vehicle, effects=MappingProxyType(effects))
     if not table:
         return vehicle
-    part = getattr(vehicle, table)
-    changed = value if len(value) > 1 else entry.value[0]
-    return replace(vehicle, **{table: replace(part, **{key: changed})})
+    return replace(vehicle, **{table: replace(getattr(vehicle, table), **{key: changed})})
+
+
+def fast_enough(vehicle: Vehicle, speeds: Sequence[np.ndarray]) -> Vehicle:
+    """Return a vehicle that its rotors hold up, as they did in flights with these measured speeds.
+
+    Where its `speed_max` is too low for that it becomes the highest speed of the flights, but for
+    one in a hundred, as telemetry may be wild.
+    """
+    try:
+        check_vehicle(vehicle)
+    except ValueError:
+        fastest = float(np.nanpercentile(np.concatenate(speeds), 99.0))
+        if fastest > vehicle.rotors.speed_max:
+            return replace(vehicle, rotors=replace(vehicle.rotors, speed_max=fastest))
+    return vehicle

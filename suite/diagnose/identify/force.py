@@ -35,7 +35,12 @@ LEVEL = np.array([True, True, False])
 
 
 def unknowns_of(
-    drive: str, guess: MotorGuess, voltage: bool, drag: Sequence[float], leaning: bool = False
+    drive: str,
+    guess: MotorGuess,
+    voltage: bool,
+    drag: Sequence[float],
+    leaning: bool = False,
+    scale: float = 0.0,
 ) -> list[Unknown]:
     """Return the numbers of the force; their starts are those of the vehicle file.
 
@@ -45,9 +50,10 @@ def unknowns_of(
         voltage: whether the flights have one.
         drag: of the vehicle file [1/s].
         leaning: whether no flight has an attitude.
+        scale: logarithm of the thrust's scale in the vehicle file.
     """
     floor = 0.004 if leaning else 0.001
-    unknowns = [Unknown("thrust", 0.0, -2.0, 2.0, 0.25, 1e-3, floor)]
+    unknowns = [Unknown("thrust", scale, -2.0, 2.0, 0.25, 1e-3, floor)]
     if drive == "pwm":
         unknowns.append(Unknown("curve", guess.curve, -0.1, 1.0, 0.35, 1e-2, 0.02))
         if voltage:

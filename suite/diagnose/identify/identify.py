@@ -6,7 +6,7 @@ in both. Mass is never fitted: scaling it together with inertia and thrust chang
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,16 +21,24 @@ from suite.diagnose.identify.data.drive import (
     guess_of,
     motor_thrusts,
     rotor_thrusts,
+    with_battery,
     with_motors,
 )
 from suite.diagnose.identify.data.grid import FlightGrid, grid_of
 from suite.diagnose.identify.data.start import with_own_numbers
 from suite.diagnose.identify.doubts import doubted
-from suite.diagnose.identify.entries import inertia_of, of_force, of_loop, of_torque, put
+from suite.diagnose.identify.entries import (
+    enter,
+    fast_enough,
+    inertia_of,
+    of_force,
+    of_loop,
+    of_torque,
+)
 from suite.diagnose.identify.fit import Fitted, NothingWhole, Unknown
 from suite.diagnose.identify.flapping import flapping_of
 from suite.diagnose.identify.numbers import Number, told
-from suite.diagnose.identify.untold import unasked, untold
+from suite.diagnose.identify.untold import beside, unasked, untold
 
 ROUNDS = 2
 """Force and torque in turn."""
@@ -56,6 +64,8 @@ class Identified:
     """Root mean square of what is left of force per mass and angular acceleration, per axis."""
     flights: tuple[str, ...]
     """Names of those that were used."""
+    notes: tuple[str, ...] = ()
+    """What was done with these flights that the numbers do not show, in words."""
 
 
 def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] = ()) -> Identified:
@@ -71,7 +81,7 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
     """
     flights = [grid_of(log) for log in logs]
     drive = drive_of(flights)
-    vehicle = with_own_numbers(vehicle, drive in KNOWN_MOTORS)
+    given, vehicle = vehicle, with_own_numbers(vehicle, drive in KNOWN_MOTORS)
     state = _Start(flights, vehicle, drive, tuple(leave))
     if drive not in KNOWN_MOTORS:
         state.loop()
@@ -80,21 +90,32 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
         state.torque()
     if drive in KNOWN_MOTORS:
         state.loop()
-    if not state.fitted and not leave:
-        raise ValueError(
-            f"{', '.join(flight.name for flight in flights)}: no stretch of a second with "
-            "positions or body rates beside what drove it; import them again and read what it says"
-        )
-    found = state.done()
+    if not state.fitted:
+        names = ", ".join(flight.name for flight in flights)
+        if not leave:
+            raise ValueError(
+                f"{names}: no stretch of a second with positions or body rates beside what drove "
+                "it; import them again and read what it says"
+            )
+        lacking = "; ".join(state.lacking()) or "no stretch of a second with what it needs"
+        raise ValueError(f"{names}: nothing is told beside {', '.join(leave)}: {lacking}")
+    found = state.done(given)
     if drive not in KNOWN_MOTORS or "drag" in leave or not {"force", "torque"} <= {*state.fitted}:
         return found
     force_fit, torque_fit = state.fitted["force"], state.fitted["torque"]
     others = doubted(found.vehicle, state.start, drive, state.guess, force_fit, torque_fit)
-    entry = flapping_of(logs, found.vehicle, others)
+    entry = flapping_of(
+        [log for log in logs if log.name not in state.unheard], found.vehicle, others
+    )
     if entry is None:
         return found
-    vehicle = put(found.vehicle, entry)
-    return replace(found, vehicle=vehicle, numbers=(*found.numbers, entry))
+    vehicle, numbers, notes = enter(found.vehicle, [entry])
+    return replace(
+        found,
+        vehicle=vehicle,
+        numbers=(*found.numbers, *numbers),
+        notes=(*found.notes, *notes),
+    )
 
 
 class _Start:
@@ -106,14 +127,20 @@ class _Start:
         self.flights, self.start, self.drive, self.leave = flights, vehicle, drive, leave
         self.guess = MotorGuess(0.0, 0.0, 0.0, 1.0, 1.0)
         if drive == "pwm":
-            self.start = with_motors(flights, vehicle)
+            if vehicle.motors is None or "motors" not in leave:
+                self.start = with_motors(flights, vehicle)
             self.guess = guess_of(flights, self.start)
         self.lag_s: float = vehicle.rotors.time_constant
         self.delay_s: float = _value(vehicle, "command_delay", "delay", 0.0)
         self.drag = np.asarray(_value(vehicle, "linear_drag", "coefficient", (0.0,) * 3), float)
         self.begun_s = self.lag_s
         self.fitted: dict[str, Fitted] = {}
-        self.scale = 0.0
+        self.broken: set[str] = set()
+        """Fits for which no stretch was whole."""
+        self.unheard: set[str] = set()
+        """Names of flights without a voltage, where others have one."""
+        self.begun_scale = float(np.log(_value(vehicle, "thrust_scale", "scale", 1.0)))
+        self.scale = self.begun_scale
 
     def force(self) -> None:
         flights = [f for f in self.flights if f.has("vel_w") or f.has("pos_w")]
@@ -122,15 +149,19 @@ class _Start:
         flights = [flight for flight in flights if leaning or flight.has("rot_w")]
         if not flights:
             return
+        flights = self.heard(flights)
         voltage = all(flight.has("voltage") for flight in flights)
-        unknowns = force.unknowns_of(self.drive, self.guess, voltage, self.drag.tolist(), leaning)
+        begun = (self.drag.tolist(), leaning, self.begun_scale)
+        unknowns = force.unknowns_of(self.drive, self.guess, voltage, *begun)
         left = {"drag": ("drag_",), "motors": ("thrust", "curve", "battery")}
         unknowns = _without(unknowns, left, self.leave)
-        told_drag = {f"drag_{a}": d for a, d in zip("xyz", self.drag, strict=True)}
+        fixed = {f"drag_{a}": d for a, d in zip("xyz", self.drag, strict=True)}
+        fixed["thrust"] = self.begun_scale
         if not unknowns:
             return
-        try:
-            found = force.fit_force(
+        found = self.tried(
+            "force",
+            lambda: force.fit_force(
                 flights,
                 self.start,
                 self.drive,
@@ -138,12 +169,27 @@ class _Start:
                 unknowns,
                 self.lag_s,
                 self.delay_s,
-                told_drag,
-            )
+                fixed,
+            ),
+        )
+        if found is not None:
+            self.fitted["force"] = found
+            self.scale = told(found).get("thrust", self.begun_scale)
+
+    def heard(self, flights: list[FlightGrid]) -> list[FlightGrid]:
+        """Return those that tell what motors give, and remember who the others are."""
+        kept = with_battery(flights, self.drive)
+        if len(kept) < len(flights):
+            self.unheard |= {flight.name for flight in flights if not flight.has("voltage")}
+        return kept
+
+    def tried(self, name: str, fitted: Callable[[], Fitted]) -> Fitted | None:
+        """Return a fit; None where no stretch is whole, which is remembered by its name."""
+        try:
+            return fitted()
         except NothingWhole:
-            return
-        self.fitted["force"] = found
-        self.scale = told(found).get("thrust", 0.0)
+            self.broken.add(name)
+            return None
 
     def thrusts(
         self, flight: FlightGrid, lag_s: float, delay_s: float, numbers: Mapping[str, float]
@@ -162,6 +208,7 @@ class _Start:
         unknowns = _without(unknowns, left, self.leave)
         if not unknowns:
             return
+        flights = self.heard(flights)
         given, doubted = self.lags(), None
         if "force" in self.fitted and self.drive in KNOWN_MOTORS:
             given |= told(self.fitted["force"])
@@ -172,9 +219,8 @@ class _Start:
                 flights, self.start, self.drive, unknowns, self.thrusts, given, held, doubted
             )
 
-        try:
-            found = fitted(unknowns)
-        except NothingWhole:
+        found = self.tried("torque", lambda: fitted(unknowns))
+        if found is None:
             return
         if found.has("lag") and told(found)["lag"] < NO_LAG_S < self.begun_s:
             # No rotor follows at once: what blurs the commands in the log hides its lag.
@@ -186,9 +232,13 @@ class _Start:
     def loop(self) -> None:
         """Fit the nominal rate loop, and measured rotor speeds behind commanded ones."""
         both = torque.lag_and_delay(self.lag_s, self.delay_s)
-        commanded = [f for f in self.flights if f.has("rotor_speed", "rotor_speed_cmd")]
+        rotors = ("rotor_speed", "rotor_speed_cmd")
+        # Speeds that were asked for in turn are blurred, which would be taken for a lag.
+        commanded = [f for f in self.flights if f.has(*rotors) and not {*rotors} & {*f.in_turn}]
         if commanded and "lag" not in self.leave:
-            self.keep("rotors", torque.fit_rotor_lag(commanded, both))
+            found = self.tried("rotors", lambda: torque.fit_rotor_lag(commanded, both))
+            if found is not None:
+                self.keep("rotors", found)
         flown = [f for f in self.flights if f.has("rate_b", "rate_cmd_b")]
         if not flown or self.start.controller.kind != "p" or "loop" in self.leave:
             return
@@ -199,7 +249,11 @@ class _Start:
         wanted = [u for u in both if not known or (doubted and u.name in doubted.names)]
         besides = [*loop.couplings(self.start), *loop.air_torques(flown)]
         unknowns = [*loop.gains(), *besides, *wanted]
-        self.keep("loop", loop.fit_loop(flown, self.start, unknowns, self.lags(), doubted))
+        found = self.tried(
+            "loop", lambda: loop.fit_loop(flown, self.start, unknowns, self.lags(), doubted)
+        )
+        if found is not None:
+            self.keep("loop", found)
 
     def lags(self) -> dict[str, float]:
         return {"lag": self.lag_s, "late": self.lag_s + self.delay_s}
@@ -214,35 +268,45 @@ class _Start:
         x, y, z = inertia_of(self.start, numbers)
         return float(x), float(y), float(z)
 
-    def done(self) -> Identified:
-        vehicle, numbers = self.start, []
+    def lacking(self) -> list[str]:
+        return unasked(self.flights, self.start, self.drive, self.fitted, self.leave, self.broken)
+
+    def done(self, given: Vehicle) -> Identified:
+        """Return what was found, from the vehicle that was `given`."""
+        entries = []
         if "force" in self.fitted:
-            numbers += of_force(self.start, self.drive, self.guess, self.fitted["force"])
+            entries += of_force(self.start, self.drive, self.guess, self.fitted["force"])
         if "torque" in self.fitted:
-            numbers += of_torque(
+            entries += of_torque(
                 self.start, self.drive, self.fitted["torque"], self.scale, self.lag_s
             )
         for name in ("rotors", "loop"):
             if name in self.fitted:
-                numbers += of_loop(self.start, self.fitted[name], self.lag_s)
+                entries += of_loop(self.start, self.fitted[name], self.lag_s)
         kept: dict[str, Number] = {}
-        for entry in numbers:
+        for entry in entries:
             # What a later fit tells is told better: it sees the rotors themselves.
             if entry.key not in kept or any(span is not None for span in entry.ci95):
                 kept[entry.key] = entry
-        for entry in kept.values():
-            vehicle = put(vehicle, entry)
+        vehicle, numbers, notes = enter(self.start, kept.values())
         if "torque" in self.fitted and self.drive != "rates":
             vehicle = replace(vehicle, inertia=self.inertia())
-        lacking = unasked(self.flights, self.start, self.drive, self.fitted, self.leave)
-        lacking = (*untold(self.fitted), *lacking)
+        if self.drive == "rotors":
+            vehicle = fast_enough(vehicle, [f.known["rotor_speed"] for f in self.flights])
         left = {
             name: [float(v) for v in self.fitted[name].left]
             for name in ("force", "torque")
             if name in self.fitted
         }
-        names = tuple(flight.name for flight in self.flights)
-        return Identified(vehicle, tuple(kept.values()), lacking, self.drive, left, names)
+        return Identified(
+            vehicle,
+            tuple(numbers),
+            (*untold(self.fitted, kept), *self.lacking()),
+            self.drive,
+            left,
+            tuple(flight.name for flight in self.flights),
+            (*beside(self.flights, self.unheard, given, vehicle), *notes),
+        )
 
 
 def _value(vehicle: Vehicle, effect: str, key: str, otherwise: Any) -> Any:

@@ -19,6 +19,8 @@ class Number(NamedTuple):
     value: list[float]
     ci95: list[tuple[float, float] | None]
     """Of each component; None where it was left as it was."""
+    follows: bool = False
+    """Not told and in the file all the same: a sum was told, and this is what the rest leaves."""
 
 
 Derived = Callable[[Mapping[str, float]], np.ndarray]
@@ -31,7 +33,12 @@ def told(fitted: Fitted) -> dict[str, float]:
 
 
 def number(
-    key: str, unit: str, fitted: Fitted, derived: Derived, needs: Sequence[Sequence[str]]
+    key: str,
+    unit: str,
+    fitted: Fitted,
+    derived: Derived,
+    needs: Sequence[Sequence[str]],
+    room: float = np.inf,
 ) -> Number:
     """Return an entry of the file, its intervals from the fit's by the slopes of `derived`.
 
@@ -41,6 +48,8 @@ def number(
         fitted: the fit.
         derived: the values.
         needs: for each value, the numbers of which one at least must have been told.
+        room: a value whose interval reaches further than this to either side is not told, and
+            follows what else its numbers tell.
     """
     names = [unknown.name for unknown in fitted.unknowns]
     value = np.atleast_1d(derived(told(fitted)))
@@ -52,11 +61,13 @@ def number(
         change = np.atleast_1d(derived(up)) - np.atleast_1d(derived(down))
         slopes[:, k] = change / (2.0 * unknown.step)
     half = Z95 * np.sqrt(np.maximum(np.einsum("vi,ij,vj->v", slopes, fitted.covariance, slopes), 0))
-    spans: list[tuple[float, float] | None] = []
-    for v, h, need in zip(value, half, needs, strict=True):
-        seen = any(fitted.has(name) for name in need if name in names)
-        spans.append((float(v - h), float(v + h)) if seen else None)
-    return Number(key, unit, [float(v) for v in value], spans)
+    seen = [any(fitted.has(name) for name in need if name in names) for need in needs]
+    spans = [
+        (float(v - h), float(v + h)) if there and h <= room else None
+        for v, h, there in zip(value, half, seen, strict=True)
+    ]
+    follows = any(there and span is None for there, span in zip(seen, spans, strict=True))
+    return Number(key, unit, [float(v) for v in value], spans, follows)
 
 
 def as_json(numbers: Sequence[Number]) -> dict[str, Any]:

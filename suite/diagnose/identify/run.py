@@ -42,6 +42,8 @@ def identify_files(
     for part in leave:
         if part not in PARTS:
             raise ValueError(f"--leave {part!r}: allowed: {', '.join(PARTS)}")
+    if set(PARTS) <= set(leave):
+        raise ValueError(f"--leave {' '.join(leave)}: nothing remains to look for")
     start = load_vehicle(vehicle)
     refuse_own_motion(start)
     logs, warnings = read_flights(flight_files(flights), partial=True)
@@ -53,7 +55,11 @@ def identify_files(
             "what is told holds their share, and they stay in the file; start without them",
         ]
     found = identify(logs, start, leave)
-    save_vehicle(found.vehicle, out, _head(found, vehicle))
+    head = _head(found, vehicle)
+    try:
+        save_vehicle(found.vehicle, out, head)
+    except ValueError as error:
+        raise ValueError(f"{out}: not written: {error}\n{head}") from error
     return {
         "vehicle": str(out),
         "start": vehicle,
@@ -62,7 +68,7 @@ def identify_files(
         "untold": list(found.untold),
         "left": found.left,
         "flights": list(found.flights),
-        "warnings": warnings,
+        "warnings": [*warnings, *found.notes],
         **stamp(SCHEMA, None),
     }
 
@@ -79,5 +85,5 @@ def _head(found: Identified, start: str) -> str:
             if span is not None:
                 between = f"{span[0]:.4g} to {span[1]:.4g} {entry.unit}"
                 lines.append(f"{entry.key}{part} = {value:.4g}: {between}")
-    lines += [f"left as it was: {text}" for text in found.untold]
+    lines += [f"not told: {text}" for text in found.untold]
     return "\n".join(lines)

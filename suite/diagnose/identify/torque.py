@@ -196,6 +196,8 @@ def _likeliest(
         value[late] = max(trial, 0.0)
         score = 0.0
         for rows, (_, turned, _) in zip(misses(value), prepared, strict=True):
+            if not len(turned):
+                continue
             model = turned - rows.value
             centred = model - np.median(model, axis=0), turned - np.median(turned, axis=0)
             size = np.sqrt((centred[0] ** 2).sum(axis=0) * (centred[1] ** 2).sum(axis=0))

@@ -42,6 +42,26 @@ def test_the_file_that_is_started_from_is_not_written_over(flights, tmp_path, mo
     assert (tmp_path / "vehicle.toml").read_text() == before
 
 
+def test_an_inertia_that_was_not_told_is_as_it_was_but_for_what_goes_with_the_others(
+    tmp_path, monkeypatch, capsys
+):
+    inertia = {"value": [2.5, 2.0, 4.0], "unit": "kg m^2", "ci95": [[2.0, 3.0], None, None]}
+    drag = {"value": [0.3, 0.0, 0.0], "unit": "1/s", "ci95": [[0.2, 0.4], None, None]}
+    found = {
+        "drive": "pwm",
+        "parameters": {"inertia": inertia, "effects.linear_drag.coefficient": drag},
+        "untold": [],
+        "warnings": ["of a note"],
+    }
+    monkeypatch.setattr("suite.diagnose.identify.run.identify_files", lambda *_: found)
+    line = ["identify", "none", "--vehicle", "reference", "--out", str(tmp_path / "v.toml")]
+    assert cli.main(line) == 0
+    said = "".join(capsys.readouterr())
+    assert "inertia: 2.5 (2 to 3), 2 (as it was), 4 (goes with the others) kg m^2" in said
+    assert "coefficient: 0.3 (0.2 to 0.4), 0 (as it was), 0 (as it was) 1/s" in said
+    assert "warning: of a note" in said
+
+
 @pytest.mark.parametrize(
     ("options", "reason"),
     [(["--leave", "wings"], "--leave 'wings': allowed"), (["--out", "v.json"], "must be .toml")],

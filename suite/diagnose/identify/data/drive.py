@@ -49,12 +49,29 @@ def drive_of(flights: Sequence[FlightGrid]) -> str:
     )
 
 
+def with_battery(flights: Sequence[FlightGrid], drive: str) -> list[FlightGrid]:
+    """Return those whose motors' thrust is known as well as it can be.
+
+    What motors give hangs on the battery: where some flights have its voltage, the others only blur
+    what these tell.
+    """
+    have = [flight for flight in flights if flight.has("voltage")]
+    return have if have and drive == "pwm" else list(flights)
+
+
 def with_motors(flights: Sequence[FlightGrid], vehicle: Vehicle) -> Vehicle:
-    """Return the vehicle with `[motors]`: full speed at full command where it had none."""
-    if vehicle.motors is not None:
+    """Return the vehicle with `[motors]`: full speed at full command where it had none.
+
+    Flights without a voltage give them an exponent of 0. With that the nominal voltage says
+    nothing, so that it may as well be the usual one of flights that have one.
+    """
+    motors = vehicle.motors
+    if motors is None:
+        exponent = 1.0 if any(flight.has("voltage") for flight in flights) else 0.0
+        motors = MotorMap((0.0, vehicle.rotors.thrust_max), 1.0, exponent)
+    elif motors.voltage_exponent:
         return vehicle
-    volts = _volts(flights, 1.0)
-    return replace(vehicle, motors=MotorMap((0.0, vehicle.rotors.thrust_max), volts))
+    return replace(vehicle, motors=replace(motors, voltage=_volts(flights, motors.voltage)))
 
 
 def _volts(flights: Sequence[FlightGrid], otherwise: float) -> float:

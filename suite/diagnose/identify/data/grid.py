@@ -39,6 +39,8 @@ class FlightGrid(NamedTuple):
     """(G,)."""
     known: dict[str, np.ndarray]
     """Signals (G, ...) by name: rot_w, vel_w, pos_w, rate_b, and what drives."""
+    in_turn: tuple[str, ...] = ()
+    """Those of which a row has some columns only, as of motors that are asked one after another."""
 
     def has(self, *names: str) -> bool:
         """Return whether these signals are there."""
@@ -68,34 +70,36 @@ def grid_of(log: FlightLog) -> FlightGrid:
     time_s = log.time_s - log.time_s[0]
     grid = np.arange(0.0, time_s[-1], STEP_S)
     known: dict[str, np.ndarray] = {}
-    for name, values in (
-        ("pos_w", log.pos_w),
-        ("vel_w", None if log.velocity_derived else log.vel_w),
-        ("rate_b", log.rate_b),
-        ("rotor_speed", log.rotor_speed),
-    ):
-        if values is not None and np.isfinite(values).any():
-            known[name] = _joined(time_s, values, grid)
-    if "rotor_speed" in known and log.rotor_speed is not None:
-        known[ROTOR_NOISE] = _joined(time_s, noise_like(log.rotor_speed), grid)
-    if np.isfinite(log.quat_wxyz).any():
+    measured = {
+        "pos_w": log.pos_w,
+        "vel_w": None if log.velocity_derived else log.vel_w,
+        "rate_b": log.rate_b,
+        "rotor_speed": log.rotor_speed,
+    }
+    asked = {
+        "pwm": log.pwm,
+        "thrust_cmd": log.thrust_cmd,
+        "rate_cmd_b": log.rate_cmd_b,
+        "torque_cmd_b": log.torque_cmd_b,
+        "rotor_speed_cmd": log.rotor_speed_cmd,
+    }
+    there = {name: v for name, v in (measured | asked).items() if v is not None and _enough(v)}
+    in_turn = tuple(name for name, values in there.items() if _whole_rows(values) < 2)
+    for name, values in there.items():
+        known[name] = (_joined if name in measured else _held)(time_s, values, grid)
+    if "rotor_speed" in there:
+        noise = _noise(there["rotor_speed"], "rotor_speed" in in_turn)
+        known[ROTOR_NOISE] = _joined(time_s, noise, grid)
+    if _whole_rows(log.quat_wxyz) > 1:
         known["rot_w"] = quat_to_rot(_attitude(time_s, log.quat_wxyz, grid))
-        if "rate_b" not in known:
-            known["rate_b"] = _joined(time_s, _turning(time_s, log.quat_wxyz), grid)
-    if log.voltage is not None and np.isfinite(log.voltage).any():
+        turning = _turning(time_s, log.quat_wxyz)
+        if "rate_b" not in known and _enough(turning):
+            known["rate_b"] = _joined(time_s, turning, grid)
+    if log.voltage is not None and _enough(log.voltage):
         good = np.isfinite(log.voltage)
         volts = np.interp(grid, time_s[good], log.voltage[good])
         known["voltage"] = _smoothed(volts, round(VOLTAGE_S / STEP_S))
-    for name, values in (
-        ("pwm", log.pwm),
-        ("thrust_cmd", log.thrust_cmd),
-        ("rate_cmd_b", log.rate_cmd_b),
-        ("torque_cmd_b", log.torque_cmd_b),
-        ("rotor_speed_cmd", log.rotor_speed_cmd),
-    ):
-        if values is not None and np.isfinite(values).any():
-            known[name] = _held(time_s, values, grid)
-    return FlightGrid(log.name, grid, known)
+    return FlightGrid(log.name, grid, known, in_turn)
 
 
 def windows_of(flight: FlightGrid, width_s: float, needs: Sequence[str]) -> Windows:
@@ -135,11 +139,34 @@ def blocks_of(flight: FlightGrid, windows: Windows, length_s: float) -> np.ndarr
     return (flight.time_s[windows.middle] / length_s).astype(int)
 
 
+def _enough(values: np.ndarray) -> bool:
+    """Return whether every column has two rows at least, between which something is known."""
+    return bool(np.all(np.isfinite(values).sum(axis=0) > 1))
+
+
+def _whole_rows(values: np.ndarray) -> int:
+    return int(np.isfinite(values.reshape(len(values), -1)).all(axis=1).sum())
+
+
+def _noise(speed: np.ndarray, in_turn: bool) -> np.ndarray:
+    """Return a draw of the noise (T, 4) of rotor speeds; of those logged in turn by own rows."""
+    if not in_turn:
+        return noise_like(speed)
+    own = [np.flatnonzero(np.isfinite(column)) for column in speed.T]
+    count = min(len(rows) for rows in own)
+    at = np.stack([rows[:count] for rows in own], axis=1)
+    out = np.where(np.isfinite(speed), 0.0, np.nan)
+    np.put_along_axis(out, at, noise_like(np.take_along_axis(speed, at, axis=0)), axis=0)
+    return out
+
+
 def _joined(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    good = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-    t, v = time_s[good], values[good]
-    out = np.stack([np.interp(grid, t, column) for column in v.T], axis=1)
-    out[_in_hole(t, grid)] = np.nan
+    """Return `values` (T, C) joined by lines, each column over the rows that have it."""
+    out = np.empty((len(grid), values.shape[1]))
+    for k, column in enumerate(values.T):
+        good = np.isfinite(column)
+        out[:, k] = np.interp(grid, time_s[good], column[good])
+        out[_in_hole(time_s[good], grid), k] = np.nan
     return out
 
 
@@ -174,10 +201,12 @@ def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarra
     A row's stamp is mostly between two of them: taken at the points it would come late.
     """
     wide = np.asarray(values.reshape(len(values), -1), dtype=float)
-    good = np.isfinite(wide).all(axis=1)
-    rows = Signal(time_s[good], wide[good])
-    out = held(rows, np.append(grid, grid[-1] + STEP_S))[:-1]
-    out[_in_hole(rows.time_s, grid)] = np.nan
+    ends, out = np.append(grid, grid[-1] + STEP_S), np.empty((len(grid), wide.shape[1]))
+    for k, column in enumerate(wide.T):
+        good = np.isfinite(column)
+        rows = Signal(time_s[good], column[good, None])
+        out[:, k] = held(rows, ends)[:-1, 0]
+        out[_in_hole(rows.time_s, grid), k] = np.nan
     return out.reshape(len(grid), *values.shape[1:])
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from eval.quadrotor.plant import make_plant
 from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle_check import check_vehicle
 
 OWN = ("motor_lag", "inertia_scale", "rate_gain")
 """Effects that scale or replace a number which is fitted."""
@@ -26,6 +27,9 @@ def with_own_numbers(vehicle: Vehicle, known_motors: bool) -> Vehicle:
         vehicle: as it was given.
         known_motors: the motors' own thrust is fitted, and no scale of what was commanded, so that
             the effect of that name is one of these as well.
+
+    Raises:
+        ValueError: where no file may hold such numbers, as of rotors that are too weak to hover.
     """
     names = (*OWN, "thrust_scale") if known_motors else OWN
     own = {name: values for name, values in vehicle.effects.items() if name in names}
@@ -38,14 +42,19 @@ def with_own_numbers(vehicle: Vehicle, known_motors: bool) -> Vehicle:
         first, second = np.asarray(motors.thrust) * (push / rotors.thrust_coefficient)
         motors = replace(motors, thrust=(float(first), float(second)))
     rotors = replace(rotors, thrust_coefficient=push, time_constant=float(true.time_constant))
-    return replace(
+    found = replace(
         vehicle,
-        inertia=_three(true.inertia),
         rotors=rotors,
         motors=motors,
         controller=replace(vehicle.controller, rate_gain=_three(true.rate_gain)),
         effects=MappingProxyType({n: v for n, v in vehicle.effects.items() if n not in own}),
     )
+    try:
+        # The scale of the inertia may be more than a body can have; the fit makes it possible.
+        check_vehicle(found)
+    except ValueError as error:
+        raise ValueError(f"{vehicle.name} with its {', '.join(own)}: {error}") from error
+    return replace(found, inertia=_three(true.inertia))
 
 
 def unknown_to_the_fits(vehicle: Vehicle) -> Sequence[str]:

@@ -28,6 +28,11 @@ def test_the_curve_and_the_battery_are_looked_for_under_motor_commands_only():
     assert names == ["thrust", "drag_x", "drag_y", "drag_z"]
 
 
+def test_the_thrust_starts_from_the_scale_of_the_vehicle_file():
+    (thrust, *_) = unknowns_of("rates", NONE, False, [0.0, 0.0, 0.0], scale=np.log(0.8))
+    assert thrust.name == "thrust" and np.exp(thrust.start) == pytest.approx(0.8)
+
+
 def leaning(*, attitude, speed=0.0):
     """Two seconds of a constant pull of 2 m/s^2 along x under thrust, by rotors of 1000 rad/s."""
     time_s = STEP_S * np.arange(500)

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from eval.judging.statistics import wilson
+from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.identify.identify import identify
 from suite.diagnose.identify.numbers import as_json
 from suite.diagnose.plans.fleets import Fleet, logs_of
 from tests.support import identified as known
+from tests.support.vehicles import with_effects
 
 TRUE = {
     "motors.thrust": known.MOTORS.thrust,
@@ -42,7 +44,7 @@ def pulls(found):
 
 
 @pytest.mark.parametrize(
-    ("drive", "least"), [("rates", 9), ("pwm", 8), ("rotors", 7), ("torques", 7)]
+    ("drive", "least"), [("rates", 9), ("pwm", 7), ("rotors", 7), ("torques", 6)]
 )
 def test_what_flights_tell_is_near_the_truth(drive, least):
     found = identify(known.logs(drive, 0), known.start())
@@ -164,3 +166,143 @@ def test_flights_that_hold_nothing_are_refused_with_what_they_lack():
     logs = without(known.logs("pwm", 0), "pos_w", "vel_w", "quat_wxyz", "rate_b")
     with pytest.raises(ValueError, match="flight_0, .*: no stretch of a second with positions"):
         identify(logs, known.start())
+
+
+def cut(logs, name, rows=5):
+    """The logs with this column for so many rows only."""
+    found = []
+    for log in logs:
+        values = np.array(getattr(log, name), dtype=float)
+        values[rows:] = np.nan
+        found.append(replace(log, **{name: values}))
+    return found
+
+
+def without_voltage(logs):
+    return [replace(log, voltage=None) for log in logs]
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_file_from_flights_with_or_without_a_voltage_starts_flights_with_or_without(first):
+    with_it = known.logs("pwm", 0)
+    bare = replace(known.start(), motors=None)
+    begun = identify(with_it if first else without_voltage(with_it), bare)
+    motors = begun.vehicle.motors
+    assert motors is not None and (motors.voltage_exponent > 0.0) == first
+    later = identify(with_it, begun.vehicle)
+    assert {key for key, _ in motor_pulls(later)} == {"thrust", "voltage_exponent"}
+    assert np.max(np.abs(list(motor_pulls(later).values()))) < 2.5
+    again = identify(without_voltage(with_it), begun.vehicle)
+    assert "motors.thrust" in as_json(again.numbers)
+    after = again.vehicle.motors
+    assert after is not None and after == replace(motors, thrust=after.thrust)
+    (line,) = [text for text in again.untold if text.startswith("voltage_exponent")]
+    assert ("taken for that at 16.4" in line) == first
+
+
+def motor_pulls(found):
+    """How many half-widths the motors are off at the nominal voltage that they have now."""
+    motors, off = found.vehicle.motors, {}
+    per = (motors.voltage / known.MOTORS.voltage) ** known.MOTORS.voltage_exponent
+    first, second = known.MOTORS.thrust
+    true = {
+        "thrust": (first * per, second * per**2),
+        "voltage_exponent": (known.MOTORS.voltage_exponent,),
+    }
+    for entry in found.numbers:
+        table, _, key = entry.key.partition(".")
+        for k, span in enumerate(entry.ci95 if table == "motors" else ()):
+            off[key, k] = (entry.value[k] - true[key][k]) / (0.5 * (span[1] - span[0]))
+    return off
+
+
+def test_what_lag_and_delay_make_together_does_not_pass_for_a_delay():
+    found = identify(known.logs("pwm", 0), known.start())
+    assert "effects.command_delay.delay" not in as_json(found.numbers)
+    # Their sum is told, and the file has it, however its lag shares it.
+    rest = found.vehicle.effects["command_delay"].delay
+    together = known.vehicle().rotors.time_constant + known.DELAY
+    assert found.vehicle.rotors.time_constant + rest == pytest.approx(together, abs=0.004)
+    assert any(line.startswith("command_delay: only that it and") for line in found.untold)
+
+
+@pytest.mark.parametrize(
+    ("drive", "column", "told", "line"),
+    [
+        ("rates", "rate_cmd_b", "effects.thrust_scale.scale", "rate_gain: these logs have no"),
+        ("rotors", "rotor_speed_cmd", "inertia", "time_constant and command_delay: these logs"),
+    ],
+)
+def test_commands_that_stop_early_leave_untold_what_needs_them(drive, column, told, line):
+    found = identify(cut(known.logs(drive, 0), column), known.start())
+    assert told in as_json(found.numbers)
+    assert any(text.startswith(line) and "with both" in text for text in found.untold)
+
+
+def test_a_flight_whose_commands_stop_early_takes_nothing_from_the_others():
+    logs = known.logs("pwm", 0)
+    found = as_json(identify([*logs[:3], *cut(logs[3:], "pwm")], known.start()).numbers)
+    alone = as_json(identify(logs[:3], known.start()).numbers)
+    assert set(found) == set(alone)
+    for key, entry in found.items():
+        np.testing.assert_allclose(entry["value"], alone[key]["value"], rtol=1e-3)
+
+
+def test_rotors_that_are_logged_in_turn_tell_all_but_their_lag():
+    logs = []
+    for log in known.logs("rotors", 0):
+        turn = np.arange(len(log.time_s))[:, None] % 4 == np.arange(4)
+        speed = np.asarray(log.rotor_speed)
+        logs.append(replace(log, rotor_speed=np.where(turn, speed, np.nan)))
+    found = identify(logs, known.start())
+    off = pulls(found)
+    assert {key for key, _ in off} >= {"rotors.thrust_coefficient", "inertia"}
+    assert np.max(np.abs(list(off.values()))) < 2.5
+    assert not {"rotors.time_constant", "effects.command_delay.delay"} & {key for key, _ in off}
+    assert any("all four in every row" in line for line in found.untold)
+    assert sum("no row has all columns of rotor_speed" in note for note in found.notes) == 4
+
+
+@pytest.mark.parametrize("drive", ["rates", "thrust", "torques"])
+def test_a_scale_of_the_thrust_that_is_left_alone_counts(drive):
+    fleet = Fleet(known.truth(), known.WAYS, scale=0.8)
+    rng = np.random.default_rng(0)
+    logs = logs_of(fleet, known.recordings(), drive, rng, sensors=known.SENSORS)
+    begun = with_effects(known.start(), thrust_scale=(0.8,))
+    found = identify(logs, begun, leave=("motors",))
+    assert found.vehicle.effects["thrust_scale"].scale == 0.8
+    (drag,) = [n for n in found.numbers if n.key == "effects.linear_drag.coefficient"]
+    for value, true, span in zip(drag.value, known.DRAG, drag.ci95, strict=True):
+        assert span is not None and span[1] - span[0] < 0.1
+        assert value == pytest.approx(true, abs=0.03)
+
+
+def test_a_speed_that_is_too_low_to_hover_is_that_of_the_flights():
+    begun = known.start()
+    rotors = replace(begun.rotors, thrust_coefficient=3.2e-6, speed_max=1000.0)
+    found = identify(known.logs("rotors", 0), replace(begun, rotors=rotors))
+    check_vehicle(found.vehicle)
+    assert 1100.0 < found.vehicle.rotors.speed_max < known.vehicle().rotors.speed_max
+    assert any(note.startswith("rotors.speed_max = ") for note in found.notes)
+
+
+def test_flights_without_a_voltage_leave_the_motors_to_those_that_have_one():
+    logs = known.logs("pwm", 0)
+    found = identify([*logs[:3], *without_voltage(logs[3:])], known.start())
+    off = pulls(found)
+    assert {key for key, _ in off} >= {"motors.thrust", "motors.voltage_exponent"}
+    assert np.max(np.abs(list(off.values()))) < 2.5
+    (note,) = found.notes
+    assert note.startswith("no voltage in flight_3: ")
+    alone = as_json(identify(logs[:3], known.start()).numbers)
+    for key, entry in as_json(found.numbers).items():
+        np.testing.assert_allclose(entry["value"], alone[key]["value"], rtol=1e-3)
+
+
+def test_what_cannot_be_compared_is_refused_with_parts_left_alone_as_well():
+    logs = without(known.logs("pwm", 0), "pos_w", "vel_w", "quat_wxyz", "rate_b")
+    with pytest.raises(ValueError, match="nothing is told beside drag: thrust and drag: these"):
+        identify(logs, known.start(), leave=("drag",))
+    others = ("drag", "motors", "inertia", "lag")
+    with pytest.raises(ValueError, match="beside drag, .*: rate_gain: these logs have no comm"):
+        identify(known.logs("pwm", 0), known.start(), leave=others)

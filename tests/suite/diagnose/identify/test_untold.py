@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from eval.vehicles.vehicle import MotorMap
 from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
+from suite.diagnose.identify.entries import DELAY
 from suite.diagnose.identify.fit import Fitted, Unknown
-from suite.diagnose.identify.untold import unasked, untold
+from suite.diagnose.identify.numbers import Number
+from suite.diagnose.identify.untold import beside, unasked, untold
 from tests.support.vehicles import PLAIN
 
 
@@ -23,7 +26,20 @@ def found(*names, left=()):
 
 def test_what_one_fit_leaves_and_another_tells_is_told():
     fitted = {"torque": found("lag", "late", left=["lag", "late"]), "loop": found("lag")}
-    assert [line.split(":")[0] for line in untold(fitted)] == ["command_delay"]
+    entries = {DELAY: Number(DELAY, "s", [0.0], [None])}
+    assert [line.split(":")[0] for line in untold(fitted, entries)] == ["command_delay"]
+
+
+def test_what_lag_and_delay_make_together_is_said_where_neither_is_told():
+    fitted = {"torque": found("late", "lag", left=["lag"])}
+    fitted["torque"].value[:] = [0.042, 0.03]
+    lines = untold(fitted, {DELAY: Number(DELAY, "s", [0.012], [None], True)})
+    assert lines[-1] == (
+        "command_delay: only that it and the rotors' lag make 0.042 s together; of that the file's "
+        "lag leaves 0.012 s, which is its delay"
+    )
+    (line,) = untold(fitted, {DELAY: Number(DELAY, "s", [0.012], [(0.01, 0.014)])})
+    assert line.startswith("time_constant")
 
 
 FORCE = {"force": found("thrust", "drag_x", "drag_y", "drag_z")}
@@ -57,3 +73,48 @@ def test_a_firmwares_loop_is_not_fitted():
     loop = replace(PLAIN, controller=replace(PLAIN.controller, kind="px4"))
     (line,) = unasked([flight("pwm", "voltage")], loop, "pwm", FORCE | TORQUE, [])
     assert line == "the rate loop: settings of a px4 loop are not fitted"
+
+
+BOTH = "these logs have no stretch with both"
+
+
+@pytest.mark.parametrize(
+    ("drive", "fitted", "broken", "words"),
+    [
+        ("pwm", {}, ["force", "torque"], ["thrust and drag", "inertia and torque_coefficient",
+                                          "time_constant and command_delay"]),
+        ("rotors", FORCE | {"torque": found("inertia_x")}, ["rotors"],
+         ["time_constant and command_delay"]),
+        ("rates", FORCE | TORQUE, ["loop"], ["rate_gain"]),
+    ],
+)  # fmt: skip
+def test_columns_that_never_go_on_together_are_said(drive, fitted, broken, words):
+    leave = [] if "loop" in broken else ["loop"]
+    signals = ["pwm", "voltage", "rotor_speed", "rate_b", "rate_cmd_b"]
+    lines = unasked([flight(*signals)], PLAIN, drive, fitted, leave, broken)
+    assert [line.split(f": {BOTH}")[0] for line in lines] == words
+
+
+@pytest.mark.parametrize(
+    ("exponent", "said"), [(0.0, "it is 0, so that none counts"), (1.2, "taken for that at 16 V")]
+)
+def test_without_a_voltage_it_is_said_which_one_counts(exponent, said):
+    vehicle = replace(PLAIN, motors=MotorMap((1.0, 4.0), 16.0, exponent))
+    (line,) = unasked([flight("pwm")], vehicle, "pwm", FORCE | TORQUE, ["loop"])
+    assert line.startswith("voltage_exponent: these logs have no voltage") and line.endswith(said)
+
+
+def test_what_was_done_with_the_flights_is_said():
+    turns = flight("rotor_speed", "voltage")._replace(in_turn=("rotor_speed",))
+    after = replace(
+        PLAIN,
+        motors=MotorMap((1.0, 4.0), 15.2),
+        rotors=replace(PLAIN.rotors, speed_max=2500.0),
+    )
+    words = ["made: no row has all columns of rotor_speed", "no voltage in a, b: what hangs",
+             "motors.voltage = 15.2 V, the usual", "rotors.speed_max = 2500 rad/s"]  # fmt: skip
+    lines = beside([turns], {"b", "a"}, PLAIN, after)
+    assert len(lines) == len(words)
+    for line, word in zip(lines, words, strict=True):
+        assert line.startswith(word)
+    assert beside([flight("rotor_speed")], (), after, after) == []

@@ -1,8 +1,11 @@
 """Lag and delay of held commands, thrusts by command and voltage, and what drives flights."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from eval.vehicles.vehicle import MotorMap
 from suite.diagnose.identify.data.drive import (
     MotorGuess,
     delayed,
@@ -10,6 +13,8 @@ from suite.diagnose.identify.data.drive import (
     lagged,
     motor_thrusts,
     torque_of,
+    with_battery,
+    with_motors,
 )
 from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
 from tests.support.vehicles import PLAIN
@@ -35,6 +40,35 @@ def test_each_rotor_turns_the_body_its_way():
     torque = torque_of(PLAIN, np.array([[1.0, 0.0, 0.0, 0.0]]))[0]
     x, y, _ = PLAIN.rotors.position[0]
     np.testing.assert_allclose(torque[:2], [y, -x])
+
+
+def flown(name, volts=None):
+    signals: dict[str, np.ndarray] = {"pwm": np.full((400, 4), 0.5)}
+    if volts is not None:
+        signals["voltage"] = np.full(400, volts)
+    return FlightGrid(name, TIME, signals)
+
+
+def test_motors_begin_at_full_speed_and_at_the_voltage_that_the_flights_have_if_any():
+    found = with_motors([flown("one", 15.0)], PLAIN).motors
+    assert found == MotorMap((0.0, PLAIN.rotors.thrust_max), 15.0, 1.0)
+    bare = with_motors([flown("one")], PLAIN)
+    assert bare.motors is not None and bare.motors.voltage_exponent == 0.0
+
+
+def test_a_nominal_voltage_counts_only_with_an_exponent():
+    for exponent, voltage in ((0.0, 15.0), (1.2, 16.0)):
+        begun = replace(PLAIN, motors=MotorMap((1.0, 4.0), 16.0, exponent))
+        found = with_motors([flown("one", 15.0)], begun).motors
+        assert found == MotorMap((1.0, 4.0), voltage, exponent)
+        assert with_motors([flown("one")], begun) == begun
+
+
+def test_where_some_flights_have_a_voltage_the_others_say_nothing_of_what_motors_give():
+    with_it, without = flown("one", 15.0), flown("other")
+    assert [flight.name for flight in with_battery([with_it, without], "pwm")] == ["one"]
+    assert len(with_battery([without, without], "pwm")) == 2
+    assert len(with_battery([with_it, without], "rotors")) == 2
 
 
 def test_flights_that_share_no_drive_are_refused():

@@ -1,9 +1,17 @@
 """Windows are exact on lines and parabolas; commands hold, holes stay holes."""
 
 import numpy as np
+import pytest
 
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.identify.data.grid import STEP_S, FlightGrid, grid_of, over, windows_of
+from suite.diagnose.identify.data.grid import (
+    ROTOR_NOISE,
+    STEP_S,
+    FlightGrid,
+    grid_of,
+    over,
+    windows_of,
+)
 
 
 def grid(values):
@@ -76,3 +84,59 @@ def test_rates_that_are_not_logged_come_of_the_attitude():
     known = np.asarray(np.isfinite(rate_b).all(axis=1))
     assert known[10:-10].all()
     np.testing.assert_allclose(rate_b[known], np.tile([0.8, 0.0, 0.0], (known.sum(), 1)), atol=1e-9)
+
+
+COUNT = 400
+SECONDS = 0.01 * np.arange(COUNT)
+
+
+def logged(**signals):
+    still, up = np.zeros((COUNT, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1))
+    whole = {"pos_w": still, "quat_wxyz": up, "vel_w": still, "rate_b": still}
+    return FlightLog("made", SECONDS, **{**whole, **signals})
+
+
+def in_turn(values):
+    """Values of which every row has one column only."""
+    count, width = values.shape
+    return np.where(np.arange(count)[:, None] % width == np.arange(width), values, np.nan)
+
+
+def test_motors_that_are_logged_in_turn_are_each_taken_by_their_own_rows():
+    ramp = np.add.outer(100.0 * SECONDS, [0.0, 10.0, 20.0, 30.0])
+    flight = grid_of(logged(rotor_speed=in_turn(ramp), pwm=in_turn(np.full((COUNT, 4), 0.5))))
+    assert flight.in_turn == ("rotor_speed", "pwm")
+    known = flight.known["rotor_speed"]
+    good = np.asarray(np.isfinite(known).all(axis=1))
+    assert good[10:-10].all()
+    wanted = np.add.outer(100.0 * flight.time_s[good], [0.0, 10.0, 20.0, 30.0])
+    np.testing.assert_allclose(known[good], wanted)
+    np.testing.assert_allclose(flight.known["pwm"][10:-10], 0.5)
+    assert grid_of(logged(rotor_speed=ramp)).in_turn == ()
+
+
+def test_motors_in_turn_are_as_noisy_as_they_are():
+    rng = np.random.default_rng(0)
+    speed = in_turn(1000.0 + 8.0 * rng.standard_normal((COUNT, 4)))
+    noise = grid_of(logged(rotor_speed=speed)).known[ROTOR_NOISE]
+    assert np.isfinite(noise[10:-10]).all()
+    # On the grid it is joined by lines, which leaves two thirds of the variance.
+    assert np.nanstd(noise) == pytest.approx(8.0 * np.sqrt(2.0 / 3.0), rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "name", ["pos_w", "vel_w", "rate_b", "rotor_speed", "pwm", "rate_cmd_b", "thrust_cmd"]
+)
+def test_a_signal_of_one_row_is_none(name):
+    width = {"rotor_speed": (4,), "pwm": (4,), "thrust_cmd": ()}.get(name, (3,))
+    values = np.full((COUNT, *width), np.nan)
+    values[0] = 1.0
+    # Rates that are not logged come of the attitude.
+    level = np.full((COUNT, 4), np.nan)
+    assert not grid_of(logged(**{"quat_wxyz": level, name: values})).has(name)
+
+
+def test_an_attitude_or_a_voltage_of_one_row_is_none():
+    quat, volts = np.full((COUNT, 4), np.nan), np.full(COUNT, np.nan)
+    quat[0], volts[0] = [1.0, 0.0, 0.0, 0.0], 15.0
+    assert not {"rot_w", "voltage"} & {*grid_of(logged(quat_wxyz=quat, voltage=volts)).known}

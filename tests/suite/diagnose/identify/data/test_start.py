@@ -39,6 +39,14 @@ def test_a_scale_of_commanded_thrust_stays_where_no_motor_is_known():
     assert "thrust_scale" in with_own_numbers(SAID, False).effects
 
 
+def test_a_scale_with_which_it_could_not_hover_is_refused_before_the_work():
+    weak = with_effects(PLAIN, thrust_scale=(0.3,))
+    slow = replace(weak, rotors=replace(weak.rotors, speed_max=1500.0))
+    with pytest.raises(ValueError, match="plain with its thrust_scale: .*too weak to hover"):
+        with_own_numbers(slow, True)
+    assert with_own_numbers(slow, False) == slow
+
+
 @pytest.mark.parametrize("drive", ["rates", "pwm"])
 def test_it_makes_no_difference_how_the_start_says_a_number(drive):
     plain = known.start()
