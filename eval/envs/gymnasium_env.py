@@ -97,7 +97,7 @@ class RaceEnv(gymnasium.Env):
             raise RuntimeError("call reset() before step()")
         # Beyond the space there is nothing; what is no number stays one, for the guard to refuse.
         action_b = ACTION_LIMIT * np.clip(np.asarray(action, float), -1.0, 1.0)
-        reward = race.advance(self._data, action_b, race.steps_a_decision)
+        reward = race.advance(self._data, action_b, race.steps_to_decision())
         info = {"gates": int(race.progress.gates[0]), "ended_by": race.ended_by}
         truncated = race.ended_by == "timeout"
         terminated = race.ended_by is not None and not truncated

@@ -50,7 +50,9 @@ class Race:
         self.autopilot = make_autopilot(vehicle)
         layout = layout_of([track])
         self.model = compile_model(track, vehicle, self.autopilot.dt, layout.solids)
-        self.steps_a_decision = max(1, round(1 / (spec.rate_hz * self.autopilot.dt)))
+        self._period = 1 / (spec.rate_hz * self.autopilot.dt)
+        self.steps_a_decision = max(1, round(self._period))
+        """Physics steps of a period, rounded; `steps_to_decision` keeps the rate instead."""
         self._start = start_state(track)
         gates = Gates(*(np.asarray(field)[None] for field in track.scene.gates))
         self._course = Course(gates, np.array([gates.center_w.shape[1]], np.int32))
@@ -58,11 +60,12 @@ class Race:
         if uses_noise(self.autopilot.plant):
             trial = TrialSpec(track.family, track.level, track.seed)
             steps = round(rules.time_limit_s / self.autopilot.dt)
-            self._draws = noise_of(trial, steps + self.steps_a_decision + 2)
+            self._draws = noise_of(trial, steps + self.steps_a_decision + 3)
         self._eye = Eye(spec.camera)
         self._loops: AutopilotState
         self.progress: Progress
         self.action_b = np.zeros((1, 3))
+        self._decisions = 0
 
     @property
     def ended_by(self) -> str | None:
@@ -78,8 +81,16 @@ class Race:
         noise = None if self._draws is None else self._draws[:1]
         self._loops = start_autopilot(self.autopilot, motion, noise)
         self.progress = start_progress(motion.pos_w)
-        self.action_b = np.zeros((1, 3))
+        self.action_b, self._decisions = np.zeros((1, 3)), 0
         self._judge(data, bad_wrench=False)
+
+    def steps_to_decision(self) -> int:
+        """Return the physics steps until the next decision, spaced as by the judge.
+
+        At 30 Hz and 500 Hz of physics these are 17, 16 and 17 in turn.
+        """
+        ends = np.rint(np.array([self._decisions, self._decisions + 1]) * self._period)
+        return max(1, int(ends[1] - ends[0]))
 
     def advance(self, data: mujoco.MjData, action_b: np.ndarray, steps: int) -> float:
         """Fly `action_b` (3,) [m/s^2] for physics steps, or until the end; return the reward.
@@ -90,6 +101,7 @@ class Race:
         answer = np.asarray(action_b, float)[None]
         guarded = guard_action(limits, answer, self.action_b, 0.0, "of the environment's user")
         self.action_b = guarded.action_b
+        self._decisions += 1
         reward = 0.0
         for _ in range(steps):
             if self.progress.ended[0] != FLYING:

@@ -196,6 +196,7 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     policy = task.policy if _is_policy(task.policy) else task.policy()
     options = task.options
     if task.world == REFERENCE:
+        _check_rate(policy, task.vehicle, 1.0 / task.vehicle.controller.frequency)
         for index, trial in share:
             result = world_class(REFERENCE)(
                 policy, trial, track_of(task.tracks, trial), task.vehicle, options.rules,
@@ -212,6 +213,16 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     yield from _Slots(task, policy, world).run(share)
 
 
+def _check_rate(policy: Policy, vehicle: Vehicle, dt: float) -> None:
+    """Refuse a policy that decides faster than the physics step by `dt` [s]."""
+    rate = policy.spec.rate_hz
+    if not 0 < rate <= 1 / dt * (1 + 1e-9):
+        raise ValueError(
+            f"policy {policy.name!r} decides at {rate:g} Hz; allowed is more than 0 and up to the "
+            f"{1 / dt:g} Hz of vehicle {vehicle.name!r}'s controller.frequency"
+        )
+
+
 def _stepping(world: World) -> dict[str, Any]:
     """Return what a log says of how `world` steps; nothing where it does not say."""
     integrator = getattr(world, "integrator", None)
@@ -223,11 +234,7 @@ class _Slots:
 
     def __init__(self, task: Task, policy: Policy, world: World) -> None:
         rate = policy.spec.rate_hz
-        if not 0 < rate <= 1 / world.dt * (1 + 1e-9):
-            raise ValueError(
-                f"policy {policy.name!r} decides at {rate:g} Hz; allowed is more than 0 and up to "
-                f"the {1 / world.dt:g} Hz of vehicle {task.vehicle.name!r}'s controller.frequency"
-            )
+        _check_rate(policy, task.vehicle, world.dt)
         self._task, self._policy, self._world = task, policy, world
         self._steps_a_decision = 1 / (rate * world.dt)
         n = world.slots

@@ -226,7 +226,7 @@ def _drone_faces(pos_w: np.ndarray, rot_w: np.ndarray) -> Faces:
 
 def _paint_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:
     """Paint what the policy saw at the right, below a line that says what it is."""
-    size = (width, width * depth_m.shape[0] // depth_m.shape[1])
+    size = (width, max(1, width * depth_m.shape[0] // depth_m.shape[1]))
     small = Image.fromarray(colours.depth_colours(depth_m, DEPTH_RANGE_M))
     corner = (frame.width - width, (frame.height - size[1]) // 2)
     frame.paste(small.resize(size, Image.Resampling.NEAREST), corner)

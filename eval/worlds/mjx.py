@@ -24,7 +24,7 @@ from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows
-from eval.worlds.collision import CONTACT_M, box_distances, near_solids
+from eval.worlds.collision import NEAR_STEPS, box_distances, near_solids
 from eval.worlds.engine import start_state
 from eval.worlds.slots import IDLE, Gusts, Layout, empty_course, pad_gates
 from eval.worlds.trial import (
@@ -52,6 +52,10 @@ from tracks.track import Track
 
 with contextlib.redirect_stdout(io.StringIO()):  # its import prints what optional parts are missing
     from mujoco import mjx
+
+
+FARTHEST_M = 1000.0
+"""From the world's origin along an axis: there a float32's step is 0.06 mm [m]."""
 
 
 class Flying(NamedTuple):
@@ -118,7 +122,13 @@ class MjxWorld:
         return np.zeros((self.slots, 3), np.float32) if self._has_noise else None
 
     def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
-        """Start trials from (slot, track, trial)."""
+        """Start trials from (slot, track, trial).
+
+        Raises:
+            ValueError: for a track so far from the origin that float32 does not tell its steps.
+        """
+        for _, track, _ in entries:
+            _check_near(track)
         started, noise = np.zeros(self.slots, bool), self._no_draws()
         qpos = np.array(self._state.qpos)
         for slot, track, trial in entries:
@@ -168,8 +178,7 @@ class MjxWorld:
         diverged = bad | has_diverged(self._rules, motion)
         pos_w, rot_w, _, _ = motion
         distance = box_distances(near, pos_w, rot_w, self._half_size, self._middle_b)
-        is_ground = jnp.arange(distance.shape[1]) == distance.shape[1] - 1
-        contact = (distance <= jnp.where(is_ground, 0, CONTACT_M)).any(-1)
+        contact = (distance <= 0.0).any(-1)
         verdict = judge_state(
             self._rules, state.progress, course, self.dt, motion, contact, diverged
         )
@@ -245,8 +254,15 @@ class MjxWorld:
     ) -> tuple[Flying, tuple[Rows, Rows] | None]:
         near = near_solids(scene, state.qpos[:, :3])
 
-        def one(state: Flying, inputs: tuple[Array, Array | None]) -> tuple[Flying, Any]:
-            done, draws = inputs
+        def one(
+            carry: tuple[Flying, Scene], inputs: tuple[Array, Array | None]
+        ) -> tuple[tuple[Flying, Scene], Any]:
+            (state, near), (done, draws) = carry, inputs
+            near = jax.lax.cond(
+                (done > 0) & (done % NEAR_STEPS == 0),
+                lambda: near_solids(scene, state.qpos[:, :3]),
+                lambda: near,
+            )
             flying = (steps > done) & (state.progress.ended == FLYING)
             motion, step = _motion(state.qpos, state.qvel), state.progress.step
             gate_w = next_centre(course, state.progress.gates)
@@ -267,16 +283,17 @@ class MjxWorld:
             )
             after = self._judge(moved, flying, bad, course, near)
             if not record:
-                return after, None
+                return (after, near), None
             before = state._replace(loops=loops)
             due = flying & (step % self._autopilot.attitude_every == 0)
             ended = flying & (after.progress.ended != FLYING) & (after.progress.ended != DIVERGED)
-            return after, (
+            return (after, near), (
                 self._rows(due, before, state.loops.plant.rotor_speed),
                 self._rows(ended, after, loops.plant.rotor_speed),
             )
 
-        return jax.lax.scan(one, state, (jnp.arange(most), noise))
+        (state, _), rows = jax.lax.scan(one, (state, near), (jnp.arange(most), noise))
+        return state, rows
 
     def _integrate(self, qpos: Array, qvel: Array, applied: Array) -> tuple[Array, Array]:
         """Return the state after one step of the free body."""
@@ -299,6 +316,17 @@ class MjxWorld:
 
 
 _box_distances = jax.jit(box_distances)
+
+
+def _check_near(track: Track) -> None:
+    places_w = np.vstack([track.scene.gates.center_w, np.reshape(track.start_pos_w, (1, 3))])
+    farthest = float(np.abs(places_w).max())
+    if farthest > FARTHEST_M:
+        raise ValueError(
+            f"track {track.family!r} reaches {farthest:.0f} m from the origin; world 'mjx' is of "
+            f"single precision and flies up to {FARTHEST_M:.0f} m: move the track nearer, or fly "
+            "in 'mujoco'"
+        )
 
 
 def _motion(qpos: Array, qvel: Array) -> Motion:

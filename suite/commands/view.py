@@ -68,7 +68,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     evaluation, trials, judged = _chosen(config)
     from eval.view.picture import write_picture
     from eval.view.recording import write_recording
+    from suite.judging.flying import refuse_one_name
     from suite.judging.replay import fly_again
+
+    refuse_one_name({trial.track for trial in trials})
 
     console.note(f"flying {len(trials)} trials again")
     rollouts, drone = fly_again(evaluation, trials, judged=judged)

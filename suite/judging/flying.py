@@ -144,13 +144,13 @@ def log_name(track: str, difficulty: int, seed: int) -> str:
 
 
 def refuse_one_name(tracks: Iterable[str]) -> None:
-    """Refuse tracks whose logs would be written over each other."""
+    """Refuse tracks whose logs or pictures would be written over each other."""
     stems = [Path(track).stem for track in tracks]
     for stem in stems:
         if stems.count(stem) > 1:
             raise ValueError(
-                f"--track: more than one is called {stem!r}, and logs are named after their track; "
-                "rename a file, or give each an --out of its own"
+                f"--track: more than one is called {stem!r}, and what is written is named after "
+                "its track; rename a file, or give each an --out of its own"
             )
 
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tracks.input.reading import MESH_BYTES, check_file
+
+if TYPE_CHECKING:
+    import trimesh
 
 _VOLUME_TOLERANCE = 1e-3
 """A part may miss this share of its convex hull's volume (rounding of stored corners)."""
@@ -14,9 +18,15 @@ _VOLUME_TOLERANCE = 1e-3
 _FLAT = 1e-9
 """Volume over that of a cube of the largest extent at which a part counts as flat."""
 
+_SLIVER = 1e-12
+"""A triangle's area over that of a square of its part's largest extent at which it is none."""
+
 
 def load_convex_parts(path: Path) -> list[np.ndarray]:
     """Return the connected parts of a mesh file, each as triangles (M, 3, 3) in file units.
+
+    Objects of an OBJ file or a scene are looked at one by one, so that they may touch. Triangles
+    without an area are left out: they have no side, and a distance to them means nothing.
 
     Raises:
         ValueError: where the file cannot be read, or a part is open or not convex, naming both.
@@ -27,17 +37,26 @@ def load_convex_parts(path: Path) -> list[np.ndarray]:
     if not path.exists():
         raise ValueError(f"{path}: no such mesh file")
     check_file(path, MESH_BYTES)
+    options: dict[str, Any] = {"split_objects": True} if path.suffix.lower() == ".obj" else {}
     try:
-        mesh = trimesh.load_mesh(path)
+        found = trimesh.load_scene(path, **options).dump()
     except Exception as error:  # the loaders raise whatever they like on a damaged file
         raise ValueError(f"{path}: cannot be read as a mesh ({error})") from None
-    if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+    meshes = [mesh for mesh in found if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    if not meshes or not all(np.isfinite(mesh.vertices).all() for mesh in meshes):
         raise ValueError(f"{path}: holds no triangles or corners that are not finite")
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    parts = mesh.split(only_watertight=False, repair=False)
+    parts = []
+    for mesh in meshes:
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        parts += mesh.split(only_watertight=False, repair=False)
     for number, part in enumerate(parts):
         _check(path, number, len(parts), part)
-    return [np.asarray(part.triangles, float) for part in parts]
+    return [_with_area(part) for part in parts]
+
+
+def _with_area(part: trimesh.Trimesh) -> np.ndarray:
+    least = _SLIVER * float(part.extents.max()) ** 2
+    return np.asarray(part.triangles, float)[part.area_faces > least]
 
 
 def thickness(triangles: np.ndarray) -> float:
@@ -53,7 +72,10 @@ def _check(path: Path, number: int, total: int, part: object) -> None:
     assert isinstance(part, trimesh.Trimesh)
     where = f"{path}: part {number} of {total} ({len(part.faces)} triangles)"
     if not part.is_watertight:
-        raise ValueError(f"{where} is not closed; close its surface")
+        raise ValueError(
+            f"{where} is not closed; close its surface (parts that touch "
+            "need to be objects of their own in an OBJ file, or files of their own)"
+        )
     try:
         hull = part.convex_hull.volume
     except Exception:  # Qhull's own, with a page of text

@@ -166,6 +166,9 @@ def _convex(table: Table, polygon: np.ndarray) -> np.ndarray:
     turn = np.arctan2(
         side[:, 0] * after[:, 1] - side[:, 1] * after[:, 0], np.sum(side * after, axis=-1)
     )
+    if np.linalg.norm(side, axis=-1).min() < LEAST_M:
+        allowed = f"sides of {LEAST_M:g} m at least"
+        raise table.error("polygon", polygon.tolist(), allowed)
     same_way = (turn > 1e-6).all() or (turn < -1e-6).all()
     if not same_way or not np.isclose(abs(turn.sum()), 2 * np.pi):
         allowed = "the corners [y, z] of a convex polygon in order, no three of them in line"

@@ -53,7 +53,8 @@ def _capsule(rods: Rods, point_w: Array) -> tuple[Array, Array]:
     return length - rods.radius, _direction(away, length)
 
 
-def _cylinder(rods: Rods, point_w: Array) -> tuple[Array, Array]:
+def to_cylinders(rods: Rods, point_w: Array) -> tuple[Array, Array]:
+    """Return the signed distances to flat-ended rods and the directions away; see `distances`."""
     away = point_w[..., None, :] - rods.center_w
     along = (away * rods.axis_w).sum(-1)
     radial = away - along[..., None] * rods.axis_w
@@ -109,7 +110,7 @@ def distances(scene: Scene, point_w: Array) -> tuple[Array, Array]:
     """
     kinds = [
         (_box, scene.boxes, scene.boxes.center_w),
-        (_cylinder, scene.cylinders, scene.cylinders.center_w),
+        (to_cylinders, scene.cylinders, scene.cylinders.center_w),
         (_capsule, scene.capsules, scene.capsules.center_w),
         (_sphere, scene.spheres, scene.spheres.center_w),
         (_triangle, scene.triangles, scene.triangles[..., 0]),

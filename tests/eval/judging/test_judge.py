@@ -28,8 +28,9 @@ def test_unknown_names_are_refused_before_anything_flies():
 @pytest.mark.parametrize("rate_hz", [0.0, -5.0, 501.0])
 def test_a_policy_that_cannot_keep_time_is_refused(rate_hz):
     policy = Steady(spec=PolicySpec(rate_hz=rate_hz))
-    with pytest.raises(ValueError, match="decides at"):
-        fly(policy, [TrialSpec("zigzag", 0, 0)], VEHICLE)
+    for world in ("mujoco", "reference"):
+        with pytest.raises(ValueError, match="decides at"):
+            fly(policy, [TrialSpec("zigzag", 0, 0)], VEHICLE, world)
 
 
 def test_the_reference_world_records_nothing():

@@ -1,4 +1,4 @@
-"""Collisions by signed distance: distances worked by hand, and contacts as MuJoCo finds them."""
+"""Collisions: distances worked by hand, and contacts as MuJoCo finds them."""
 
 import jax
 import mujoco
@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds.collision import CONTACT_M, NEAR, box_distances, near_solids
+from eval.worlds.collision import NEAR, box_distances, near_solids
 from eval.worlds.engine import compile_model
 from eval.worlds.slots import layout_of
 from tests.support.courses import straight
 from tracks.families import MAX_COUNTS, make_track
 from tracks.geometry.rotation import exp_rot
-from tracks.geometry.scene import Boxes, stack
+from tracks.geometry.scene import Boxes, Rods, Spheres, counts, stack
 
 VEHICLE = load_vehicle("reference")
 
@@ -80,6 +80,93 @@ def test_contacts_are_those_of_mujoco():
     found = jax.jit(box_distances)(
         batch, pos.astype(np.float32), rot.astype(np.float32), half, np.zeros(3, np.float32)
     )
-    found = (np.asarray(found) <= CONTACT_M).any(-1)
+    found = (np.asarray(found) <= 0.0).any(-1)
     assert 0.2 < hits.mean() < 0.8
-    assert (hits == found).mean() > 0.98
+    assert (hits == found).mean() > 0.995
+
+
+GEOM = mujoco.mjtGeom
+SOLIDS = {
+    "a wall": (GEOM.mjGEOM_BOX, (5.0, 0.05, 3.0)),
+    "a bar": (GEOM.mjGEOM_BOX, (0.6, 0.05, 0.05)),
+    "a plate": (GEOM.mjGEOM_BOX, (0.4, 0.4, 0.03)),
+    "a pole": (GEOM.mjGEOM_CYLINDER, (0.05, 1.5)),
+    "a disc": (GEOM.mjGEOM_CYLINDER, (0.5, 0.03)),
+    "a pillar": (GEOM.mjGEOM_CAPSULE, (0.1, 1.0)),
+    "a needle": (GEOM.mjGEOM_CAPSULE, (0.02, 1.5)),
+    "a ball": (GEOM.mjGEOM_SPHERE, (0.3,)),
+    "a mesh": (GEOM.mjGEOM_MESH, (0.6, 0.3, 0.2)),
+}
+
+
+def alone(geom, size):
+    """Return a scene with one solid in the origin, 50 m above the ground."""
+    at = np.array([[0.0, 0.0, 50.0]])
+    scene = straight().scene
+    rods = Rods(at, np.array([[0.0, 0.0, 1.0]]), np.array(size[:1]), np.array(size[-1:]))
+    if geom == GEOM.mjGEOM_BOX:
+        return scene._replace(boxes=Boxes(at, np.eye(3)[None], np.array([size])))
+    if geom == GEOM.mjGEOM_MESH:
+        return scene._replace(triangles=wedge(size) + at)
+    if geom == GEOM.mjGEOM_SPHERE:
+        return scene._replace(spheres=Spheres(at, np.array(size)))
+    kind = "cylinders" if geom == GEOM.mjGEOM_CYLINDER else "capsules"
+    return scene._replace(**{kind: rods})
+
+
+def wedge(size):
+    """Return the triangles of a tetrahedron that fills half a box."""
+    corners = np.array([[-1, -1, -1], [1, -1, -1], [-1, 1, -1], [1, 1, 1]]) * np.array(size)
+    return corners[[[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]]
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_no_contact_is_missed_and_none_made_up(name):
+    """Bodies about each solid's surface: what only grazes may be told otherwise, 1 mm deep."""
+    geom, size = SOLIDS[name]
+    half_size = np.array([0.12, 0.09, 0.03])
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body()
+    body.add_freejoint()
+    body.add_geom(type=GEOM.mjGEOM_BOX, size=half_size)
+    about = {"type": geom, "pos": [0.0, 0.0, 50.0]}
+    if geom == GEOM.mjGEOM_MESH:
+        corners = wedge(size).reshape(-1, 3)
+        spec.add_mesh(name="wedge", uservert=np.unique(corners, axis=0).ravel().tolist())
+        geom_of = spec.worldbody.add_geom(meshname="wedge", **about)
+    else:
+        geom_of = spec.worldbody.add_geom(size=[*size, 0.0, 0.0][:3], **about)
+    geom_of.margin = 2e-3  # so that what is 1 mm beside is told as well
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    rng, n = np.random.default_rng(1), 400
+    round_kind = geom in (GEOM.mjGEOM_CYLINDER, GEOM.mjGEOM_CAPSULE)
+    long = size[-1] + size[0] * (geom == GEOM.mjGEOM_CAPSULE)
+    reach = np.array([size[0], size[0], long]) if round_kind else np.resize(size, 3)
+    pos = rng.uniform(-1, 1, (n, 3)) * (reach + 0.12)
+    face = rng.integers(3, size=n)
+    pos[np.arange(n), face] = rng.choice([-1, 1], n) * (reach[face] + rng.uniform(0, 0.15, n))
+    pos[:, 2] += 50.0
+    quat = rng.normal(size=(n, 4))
+    gap, rot = np.full(n, 0.01), np.zeros((n, 3, 3))
+    for k in range(n):
+        data.qpos[:3], data.qpos[3:] = pos[k], quat[k]
+        mujoco.mj_step1(model, data)
+        gap[k] = min((contact.dist for contact in data.contact[: data.ncon]), default=0.01)
+        rot[k] = data.xmat[1].reshape(3, 3)
+    scene = alone(geom, size)
+    batch = jax.tree.map(lambda a: np.repeat(a, n, 0), stack([scene], counts(scene)))
+    found = np.asarray(
+        jax.jit(box_distances)(
+            *jax.tree.map(np.float32, (batch, pos, rot, half_size, np.zeros(3))),
+        )
+    )
+    found = found[:, :-1].min(-1)
+    met = found <= 0.0
+    assert 0.05 < met.mean() < 0.7
+    deep, apart = gap < -1e-3, gap > 1.5e-3
+    if geom == GEOM.mjGEOM_CAPSULE:  # MuJoCo may miss one whose axis goes through the body
+        apart &= found > 1e-5 - size[0]
+    # A cylinder's rounds may leave some mm of its rim.
+    missed = deep & ~met & (gap < (-6e-3 if geom == GEOM.mjGEOM_CYLINDER else 0.0))
+    assert not missed.any() and not (apart & met).any()

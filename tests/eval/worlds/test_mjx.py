@@ -1,6 +1,7 @@
 """The world mjx against the world mujoco."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +10,12 @@ from eval.effects.slung_load import SlungLoad
 from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import with_effects
+from eval.worlds.collision import NEAR
 from eval.worlds.trial import Rules, TrialSpec
-from tests.support.pilots import Pursuit
+from policies.spec import PolicySpec
+from tests.support.courses import straight
+from tests.support.pilots import Pursuit, Steady
+from tracks.geometry.scene import Boxes
 
 VEHICLE = load_vehicle("reference")
 POSITION_TOLERANCE_M = 2e-4
@@ -63,6 +68,38 @@ def test_ends_agree_on_a_few(few):
     assert [r.ended_by for r in ours] == [r.ended_by for r in theirs]
     assert [r.collided_with for r in ours] == [r.collided_with for r in theirs]
     assert [r.gates_passed for r in ours] == [r.gates_passed for r in theirs]
+
+
+def small_boxes(track, count):
+    """Return a track with small boxes about its start, all of them nearer than its wall."""
+    angle = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+    around = np.stack([-1.0 + 0.0 * angle, np.cos(angle), np.sin(angle)], 1)
+    boxes = track.scene.boxes
+    boxes = Boxes(
+        np.vstack([boxes.center_w, track.start_pos_w + around]),
+        np.vstack([boxes.rot_w, np.tile(np.eye(3), (count, 1, 1))]),
+        np.vstack([boxes.half_size, np.full((count, 3), 0.05)]),
+    )
+    names = (*track.names, *(f"box {k}" for k in range(count)))
+    return replace(track, scene=track.scene._replace(boxes=boxes), names=names)
+
+
+def test_who_decides_rarely_meets_what_was_not_near_when_it_decided():
+    track = small_boxes(straight((20.0, 30.0), wall_at=6.0), 2 * NEAR.boxes)
+    pilot = Steady((4.0, 0.0, 1.6), PolicySpec(rate_hz=1.0))
+    tracks, rules = {"t.toml": track}, Rules(time_limit_s=2.5)
+    trial, options = TrialSpec("t.toml", 0, 0), JudgeOptions(slots=1, workers=1, rules=rules)
+    (ours,), (theirs,) = (
+        fly(pilot, [trial], VEHICLE, world, options, tracks=tracks) for world in ("mujoco", "mjx")
+    )
+    assert ours.collided_with == theirs.collided_with == "the wall"
+    assert ours.pos_x == pytest.approx(theirs.pos_x, abs=0.01)
+
+
+def test_a_track_beyond_single_precision_is_refused():
+    track = straight((2.0, 4.0, 1500.0))
+    with pytest.raises(ValueError, match="'straight' reaches 1500 m .* single precision"):
+        fly(Steady(), [TrialSpec("t.toml", 0, 0)], VEHICLE, "mjx", tracks={"t.toml": track})
 
 
 @pytest.mark.slow

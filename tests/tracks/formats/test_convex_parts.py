@@ -33,6 +33,43 @@ def test_meshes_come_from_any_common_file(tmp_path, suffix):
     )
 
 
+def as_objects(meshes):
+    """Return an OBJ file's text with an object for each mesh, as a decomposition writes it."""
+    lines, first = [], 1
+    for number, mesh in enumerate(meshes):
+        lines += [f"o part {number}", *("v {} {} {}".format(*v) for v in mesh.vertices)]
+        lines += ["f {} {} {}".format(*(face + first)) for face in mesh.faces]
+        first += len(mesh.vertices)
+    return "\n".join(lines) + "\n"
+
+
+def test_parts_that_touch_are_objects_of_their_own(tmp_path):
+    left, right = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 2, 1))
+    right.apply_translation([1, 0, 0])
+    path = write(tmp_path, GATE + '[[meshes]]\nfile = "two.obj"\nposition = [0, 0, 1]\n')
+    (tmp_path / "two.obj").write_text(as_objects([left, right]))
+    assert load_track(path).mesh_sizes == (12, 12)
+
+
+def test_a_triangle_without_an_area_is_none(tmp_path):
+    """An edge is split by a point that only one of its two triangles knows: a sliver closes it."""
+    box = trimesh.creation.box((1, 1, 1))
+    (a, b, c), rest = box.faces[0], box.faces[1:]
+    middle = len(box.vertices)
+    vertices = np.vstack([box.vertices, box.vertices[[a, b]].mean(0)])
+    faces = np.vstack([rest, [[a, middle, c], [middle, b, c], [a, b, middle]]])
+    sliced = trimesh.Trimesh(vertices, faces, process=False)
+    assert sliced.is_watertight and sliced.area_faces.min() == 0.0
+    sliced.export(tmp_path / "box.ply")
+    path = write(tmp_path, GATE + '[[meshes]]\nfile = "box.ply"\nposition = [0, 20, 1]\n')
+    triangles = load_track(path).scene.triangles
+    sides = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    assert len(triangles) == 13 and np.linalg.norm(sides, axis=1).min() > 0.1
+    inside = "\n[start]\nposition = [0, 20, 1]\n"
+    with pytest.raises(ValueError, match=r"start.position is \[0.0, 20.0, 1.0\]"):
+        load_track(write(tmp_path, path.read_text() + inside))
+
+
 def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
     path = write(tmp_path, GATE + '[[meshes]]\nfile = "part.stl"\n')
     good = trimesh.creation.box((1, 1, 1))

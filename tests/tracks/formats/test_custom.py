@@ -113,6 +113,12 @@ BAD = {
         GATE.replace("width = 1.0\nheight = 1.0", "polygon = [[1, -1], [2, -1], [2, 1], [1, 1]]"),
         "around",
     ),
+    "polygon of no size": (
+        GATE.replace(
+            "width = 1.0\nheight = 1.0", "polygon = [[0, 1e-10], [1e-10, -1e-10], [-1e-10, -1e-10]]"
+        ),
+        "polygon is.*sides of 0.001 m at least",
+    ),
     "flat polygon": (
         GATE.replace("width = 1.0\nheight = 1.0", "polygon = [[0, 1], [0, 2]]"),
         "list of 3 or more",
