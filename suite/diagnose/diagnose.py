@@ -149,7 +149,7 @@ def _diagnose(
         after = measure(model, found.estimate.theta, held, found.noise, limits)
         if worse(before, after, limits=limits):
             warnings.append("what was found on the fitted flights does not hold on held-out ones")
-            found, after = without_names(model, found), before
+            found, after = without_names(model, found, limits), before
     found, after, without, gone = confirmed(model, found, held, (before, after), limits)
     warnings += [f"{label}: withdrawn, held-out flights are no better for it" for label in gone]
     residual, turbulence = _left_over(model, found, seed, limits)
@@ -160,7 +160,7 @@ def _diagnose(
         verdict, turbulence = with_swing(verdict, swing.words, bool(found.named)), None
     if turbulence and found.named and not worse(after, before, limits=limits):
         # Wind that lasts from one stretch to the next looks like many a steady number.
-        found, after = without_names(model, found), before
+        found, after = without_names(model, found, limits), before
         residual, turbulence = _left_over(model, found, seed, limits)
         verdict = verdict_on(found, residual, (before, after), rotor_input, limits)
     if turbulence:
@@ -168,7 +168,7 @@ def _diagnose(
     if verdict.label == "unknown" and found.named:
         labels = ", ".join(candidate.label for candidate in found.candidates)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
-        found, after = without_names(model, found), before
+        found, after = without_names(model, found, limits), before
     return Diagnosis(
         verdict=verdict,
         search=found,

@@ -332,18 +332,8 @@ def check(config: TrainConfig) -> None:
 
 
 def _check_beyond(config: TrainConfig) -> None:
-    """Refuse what comes after a rollout where nothing asks for it, crashes or lasts long enough."""
+    """Refuse what comes after a rollout where nothing crashes or no rollout is long enough."""
     loss, episode = config.loss, config.episode
-    if loss.value == 0.0 and config.critic != CriticConfig():
-        raise ValueError(
-            "critic.* is set, and no critic learns where loss.value is 0; set loss.value as well, "
-            "such as to 1"
-        )
-    if episode.again == 0.0 and episode.again_before_s != EpisodeConfig.again_before_s:
-        raise ValueError(
-            "episode.again_before_s is set, and no world begins again where episode.again is 0; "
-            "set episode.again as well, such as to 0.5"
-        )
     for name, value in (("loss.value", loss.value), ("episode.again", episode.again)):
         if value > 0.0 and math.isinf(loss.crash_depth_m):
             raise ValueError(

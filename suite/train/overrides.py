@@ -24,6 +24,17 @@ ABSENT = {
 UNREAD = ("lag_mean", "lag_std", "drag", "drag_up", "wind_std", "time_step_std", "action_delay",
           "heading_rate")  # fmt: skip
 """Settings of `physics` that the point mass alone reads."""
+NEEDS = {
+    "critic": "loss.value",
+    "loss.projection_decay": "loss.projection",
+    "loss.speed_range": "spec.speed_input",
+    "loss.survival_width_m": "loss.survival",
+    "loss.tilt_from_deg": "loss.tilt",
+    "episode.again_before_s": "episode.again",
+    "episode.race_share": "spec.speed_input",
+    "episode.stop_from": "episode.rest_share",
+}
+"""Settings, or parts, that do nothing where another is 0 or False."""
 
 
 def override(config: T, changes: Iterable[str]) -> T:
@@ -32,7 +43,8 @@ def override(config: T, changes: Iterable[str]) -> T:
     Raises:
         ValueError: naming the setting, what is wrong with it and what is allowed.
     """
-    for change in changes:
+    made = list(changes)
+    for change in made:
         path, separator, text = change.partition("=")
         if not separator:
             raise ValueError(f"--set {shown(change)}: write FIELD=VALUE, such as loss.progress=0.4")
@@ -40,7 +52,22 @@ def override(config: T, changes: Iterable[str]) -> T:
         _check_read(config, keys, shown(change))
         config = _changed(config, keys, text.strip(), shown(change))
         check_ranges(config, f"--set {shown(change)}: ")
+    for change in made:
+        _check_heard(config, change.partition("=")[0].strip(), shown(change))
     return config
+
+
+def _check_heard(config: object, path: str, change: str) -> None:
+    """Refuse a setting that another one keeps from doing anything."""
+    for name, need in NEEDS.items():
+        part, _, field = need.partition(".")
+        if path == name or path.startswith(f"{name}."):
+            value = getattr(getattr(config, part, None), field, None)
+            if value is not None and not value:
+                raise ValueError(
+                    f"--set {change}: {path} does nothing where {need} is {value!r}; set that as "
+                    "well, or leave this out"
+                )
 
 
 def _check_read(config: object, keys: list[str], change: str) -> None:

@@ -18,7 +18,7 @@ from suite.diagnose.fit.parameters import Candidate, effects_in, indices_of
 from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.fit.search import SearchResult, refitted
 from suite.diagnose.fit.whitening import make_whitening
-from suite.diagnose.thresholds import Thresholds
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.gap import HEADLINE_S, Gap, measure, true_starts
 
 
@@ -60,7 +60,7 @@ def confirmed(
             found = refitted(model, found, kept, limits)
             kept = _acting(found)
         if not kept:
-            return without_names(model, found), before, {}, gone
+            return without_names(model, found, limits), before, {}, gone
         if len(kept) < len(found.named):
             gone += [one.candidate.label for one in found.named if one not in kept]
             found = refitted(model, found, kept, limits)
@@ -68,9 +68,19 @@ def confirmed(
     return found, after, {}, gone
 
 
-def without_names(model: RolloutModel, found: SearchResult) -> SearchResult:
-    """Return `found` with nothing named, at the numbers of the vehicle file."""
-    return replace(found, named=(), estimate=start_estimate(model, found.windows), explained=0.0)
+def without_names(
+    model: RolloutModel, found: SearchResult, limits: Thresholds = THRESHOLDS
+) -> SearchResult:
+    """Return `found` with nothing named, at the numbers of the vehicle file.
+
+    What is left over is that of these numbers, and not of those that explained a part of it.
+    """
+    begin = start_estimate(model, found.windows)
+    estimate, left = fit(model, found.windows, found.whitening, begin, [], limits=limits)
+    judged = left
+    if found.off:
+        _, judged = fit(model, found.windows, found.judging, estimate, [], limits=limits)
+    return replace(found, named=(), estimate=estimate, equations=left, judged=judged, explained=0.0)
 
 
 def control(

@@ -127,6 +127,10 @@ def _apart(
     def act(carry: Any, motion: Motion, inputs: Inputs, index: Any) -> tuple[Any, Any]:
         assert inputs.command is not None
         thrust = inputs.command.thrust
+        if inputs.rotor_speed is not None:  # these drive then, and no command may be there
+            nominal = model.given.nominal
+            force = nominal.thrust_coefficient * (inputs.rotor_speed**2).sum(-1)
+            thrust = force / nominal.mass
 
         def decide(_: Any) -> Any:
             row3 = motion.rot_w[:, 2]

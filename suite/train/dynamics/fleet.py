@@ -166,10 +166,12 @@ def draw_vehicles(
 
     inertia = off(drawn(config.inertia_scale, 3), 1.0)
     rate_gain, attitude_gain = drawn(config.rate_gain), drawn(config.attitude_gain)
-    rate_gain = axes(rate_gain, YAW_GAIN * rate_gain) / inertia
     integrates = rng.uniform(size=batch) < config.integral_share
     integral = drawn(config.integral) * integrates
     thrust, mass = off(drawn(config.thrust_scale), 1.0), off(drawn(config.mass_scale), 1.0)
+    # Rotors that push less turn the body less about x and y; what yaws is their drag.
+    agile = axes(thrust, np.ones(batch)) / inertia
+    rate_gain = agile * axes(rate_gain, YAW_GAIN * rate_gain)
     # A force F at the distance d from the centre of mass turns by m d x F / J = d x F / (m k^2).
     radius = drawn(config.gyration_m)
     com = off(normal(config.com_offset_m, 2), 0.0)
@@ -185,7 +187,7 @@ def draw_vehicles(
         integral_gain=rate_gain * integral[:, None],
         attitude_gain=axes(attitude_gain, YAW_ATTITUDE * attitude_gain),
         rate_max=np.repeat(drawn(config.rate_max)[:, None], 3, 1),
-        turn_max=axes(drawn(config.turn_max), drawn(config.yaw_turn_max)),
+        turn_max=agile * axes(drawn(config.turn_max), drawn(config.yaw_turn_max)),
         turn_by_thrust=lever,
         trim=trim,
         drag=np.concatenate([drawn(config.drag, 2), drawn(config.drag_up, 1)], -1),

@@ -8,7 +8,6 @@ import pytest
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.common.console import Console
 from suite.train.config import QuadrotorConfig, TrainConfig, check
-from suite.train.overrides import override
 from suite.train.presets import PRESETS, preset
 from suite.train.run import train
 from tests.support.training import small_config
@@ -57,15 +56,6 @@ def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
     with pytest.raises(ValueError, match=words):
         train(small_config(**changes), tmp_path / "run", Console())
     assert not list(tmp_path.iterdir())
-
-
-def test_settings_of_what_a_run_does_not_have_are_refused():
-    run = TrainConfig()
-    with pytest.raises(ValueError, match="no critic learns where loss.value is 0"):
-        check(override(run, ["critic.size=64"]))
-    check(override(run, ["critic.size=64", "loss.value=1.2"]))
-    with pytest.raises(ValueError, match="no world begins again where episode.again is 0"):
-        check(override(run, ["episode.again_before_s=0.5,1.0"]))
 
 
 @pytest.mark.parametrize("seed", [-1, 2**32])

@@ -36,6 +36,23 @@ def test_what_only_the_point_mass_reads_is_refused_through_quadrotors():
         override(with_fleet(run), ["physics.drag=(0,1)"])
 
 
+@pytest.mark.parametrize(
+    ("change", "need", "given"),
+    [
+        ("critic.size=64", "loss.value", "1.2"),
+        ("loss.tilt_from_deg=30", "loss.tilt", "40"),
+        ("loss.speed_range=(3, 9)", "spec.speed_input", "True"),
+        ("episode.again_before_s=(0.5, 1)", "episode.again", "0.5"),
+    ],
+)
+def test_what_would_do_nothing_is_refused(change, need, given):
+    run = preset("racer")
+    with pytest.raises(ValueError, match=rf"does nothing where {need} is (0|False)"):
+        override(run, [change])
+    # In whatever order they are given.
+    assert override(run, [change, f"{need}={given}"]) == override(run, [f"{need}={given}", change])
+
+
 def test_what_a_command_sets_itself_is_refused_with_what_to_do_instead():
     check_owned(["loss.progress=1"], {"loss.prog": "", "spec": ""})
     with pytest.raises(ValueError, match=r"--set 'spec.rate_hz=30': this command sets spec"):

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from suite.diagnose.fit.rivals import NamedEffect
-from suite.diagnose.verdict.confirmation import confirmed
+from suite.diagnose.verdict.confirmation import confirmed, without_names
 from suite.diagnose.verdict.gap import measure
+from suite.diagnose.verdict.verdict import verdict_on
 
 
 def spoilt(drag, steps):
@@ -52,3 +53,17 @@ def test_where_the_model_lacks_something_a_name_must_take_away_a_share_of_the_re
 def test_one_that_they_could_not_show_stays(drag):
     _, (kept, _, _, gone) = judged(drag, spoilt(drag, 1e-4))
     assert gone == [] and "torque_trim" in [one.label for one in kept.candidates]
+
+
+def test_what_was_withdrawn_has_explained_nothing(drag):
+    """A gap that a withdrawn name had closed is there again: `unknown`, not `no_gap`."""
+
+    def loudness(found):
+        return found.equations.slow_energy.sum() / found.whitening.slow_freedom.sum()
+
+    bare = without_names(drag.model, drag.search, drag.limits)
+    assert bare.named == () and bare.explained == 0.0
+    assert loudness(drag.search) < 1.5 and loudness(bare) > 3.0
+    quiet = drag.residual._replace(shapes=[], coloured={})
+    gaps = (drag.before, drag.before)
+    assert verdict_on(bare, quiet, gaps, rotor_input=True, limits=drag.limits).label == "unknown"

@@ -45,6 +45,21 @@ def test_a_network_that_was_not_fitted_changes_nothing(few):
     assert plain.rms > 2.0
 
 
+def test_where_measured_rotors_drive_it_sees_their_thrust():
+    """A log of motors has no commands: what stands in their place must not count."""
+    windows, _ = cut([fly(TRUTH, 0, duration_s=7.0, motors=True)], LAGGED, True, 0.5)
+    assert windows is not None and np.asarray(windows.rotor_speed).any()
+    windows = take(windows, np.arange(BATCH))
+    model = RolloutModel(LAGGED, make_space(LAGGED), True, False)
+    params = {name: np.asarray(value) for name, value in _start(0).items()}
+    params["output.weight"] = 0.1 * np.random.default_rng(0).normal(
+        size=params["output.weight"].shape
+    )
+    other = windows._replace(command=np.full_like(windows.command, 3.0))
+    gaps = [black_box_gap(model, params, each, WHITE).score for each in (windows, other)]
+    np.testing.assert_allclose(*gaps, rtol=1e-9)
+
+
 def test_its_output_pushes_the_body(few):
     model, windows = few
     theta = model.space.array("start")

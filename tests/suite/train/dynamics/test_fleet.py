@@ -45,6 +45,14 @@ def test_only_faulty_vehicles_are_not_what_their_controllers_believe():
     np.testing.assert_allclose(sound[:, 0], sound[:, 1], err_msg="the same inertia on each axis")
 
 
+def test_weak_rotors_turn_the_body_less_but_about_z():
+    config = replace(WHOLE, inertia_scale=(1.25, 1.25), thrust_scale=(0.85, 0.85))
+    weak, sound = drawn(config), drawn(replace(config, fault_share=0.0))
+    for name in ("rate_gain", "turn_max"):
+        ratio = getattr(weak, name) / getattr(sound, name)
+        np.testing.assert_allclose(ratio, np.broadcast_to([0.68, 0.68, 0.8], ratio.shape))
+
+
 def test_a_centre_of_mass_10_mm_to_the_left_rolls_a_5_inch_racer_to_the_right():
     """0.75 kg that hover: 7.36 N on the arm of 10 mm, over 0.0025 kg m^2."""
     config = replace(WHOLE, gyration_m=(0.05773503, 0.05773503), com_offset_m=0.01)

@@ -33,18 +33,20 @@ def described(vehicle, batch):
     arm, f_max = np.abs(np.asarray(rotors.position)[0]), rotors.thrust_max
     offset = np.asarray(effects["com_offset"].offset) if "com_offset" in effects else np.zeros(3)
     scale = np.asarray(effects["rate_gain"].scale) if "rate_gain" in effects else np.ones(3)
+    thrust = effects["thrust_scale"].scale if "thrust_scale" in effects else 1.0
+    weak = np.array([thrust, thrust, 1.0])
     twist = rotors.torque_coefficient / rotors.thrust_coefficient
     one = Vehicles(
         time_step=np.float64(PERIOD),
         thrust_max=np.float64(4 * f_max / vehicle.mass),
-        force_scale=np.float64(1.0),
+        force_scale=np.float64(thrust),
         rotor_lag=np.float64(rotors.time_constant),
         delay=np.float64(effects["command_delay"].delay),
-        rate_gain=scale * vehicle.controller.rate_gain,
+        rate_gain=weak * scale * vehicle.controller.rate_gain,
         integral_gain=np.zeros(3),
         attitude_gain=np.asarray(vehicle.controller.attitude_gain),
         rate_max=np.asarray(vehicle.controller.rate_max),
-        turn_max=2 * f_max * np.array([arm[1], arm[0], twist]) / inertia,
+        turn_max=2 * f_max * weak * np.array([arm[1], arm[0], twist]) / inertia,
         turn_by_thrust=np.array([-offset[1], offset[0], 0.0]) * vehicle.mass / inertia,
         trim=np.zeros(3),
         drag=np.asarray(effects["linear_drag"].coefficient),
@@ -79,10 +81,18 @@ def flown(params, actions, steps):
     ("vehicle", "steps", "allowed_m"),
     [
         (with_effects(with_lag(PLAIN, 0.02), **{**STILL, "command_delay": (0.0,)}), 5, 0.01),
+        (
+            with_effects(
+                with_lag(PLAIN, 0.02),
+                **{**STILL, "command_delay": (0.0,), "thrust_scale": (0.85,)},
+            ),
+            5,
+            0.01,
+        ),
         (with_effects(with_lag(PLAIN, 0.02), **BENT), 3, 0.1),
         (load_vehicle("reference"), 3, 0.1),
     ],
-    ids=["without-delay", "bent", "reference"],
+    ids=["without-delay", "weak", "bent", "reference"],
 )
 def test_it_flies_what_the_judge_flies_to_a_hands_breadth(vehicle, steps, allowed_m):
     """2 s of up to 4 m/s^2 that turn around: metres of way.
