@@ -1,7 +1,7 @@
 """A small painter of flat-shaded triangles and lines, so that a video needs no GPU and no GL.
 
 Faces are drawn from the farthest to the nearest (the painter's algorithm; Newell et al. 1972),
-which is right for the small convex solids of a track but for rare overlaps.
+which is right for small faces but for rare overlaps; large ones are cut up before.
 """
 
 from __future__ import annotations
@@ -21,6 +21,12 @@ FOG_M = 45.0
 FOG_SHARE = 0.65
 SKY, GROUND, GRID = (232, 238, 245), (214, 217, 212), (200, 204, 200)
 GRID_REACH_M = 24
+
+
+LONGEST_M = 2.0
+"""Sides of faces that are longer are cut: a floor's middle is far from what stands on it [m]."""
+MOST_FACES = 6000
+"""No more are made by cutting, whatever their sides."""
 
 
 class Viewpoint(NamedTuple):
@@ -53,6 +59,23 @@ class Lines(NamedTuple):
     colour: np.ndarray
     """(L, 3) 0-255."""
     width_m: float
+
+
+def cut_up(corners_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return triangles (F, 3, 3) cut until no side is long, and of which each is a part, (F',)."""
+    whose = np.arange(len(corners_w))
+    while True:
+        sides = np.linalg.norm(corners_w - np.roll(corners_w, -1, axis=1), axis=-1)
+        long = np.flatnonzero(sides.max(axis=1, initial=0.0) > LONGEST_M)
+        if not len(long) or len(corners_w) + len(long) > MOST_FACES:
+            return corners_w, whose
+        turn = (sides[long].argmax(axis=1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(np.take_along_axis(corners_w[long], turn[..., None], axis=1), 1, 0)
+        middle = 0.5 * (a + b)
+        halves = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
+        keep = np.delete(np.arange(len(corners_w)), long)
+        corners_w = np.concatenate([corners_w[keep], halves])
+        whose = np.concatenate([whose[keep], whose[long], whose[long]])
 
 
 def look_at(

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from eval.logs.flight import Flight
 from eval.view import colours
-from eval.view.scene3d import SKY, Faces, Lines, look_at, paint
+from eval.view.scene3d import SKY, Faces, Lines, cut_up, look_at, paint
 from eval.view.solids import track_solids
 from eval.view.video_file import write_gif, write_mp4
 from eval.worlds.trial import TrialResult
@@ -119,6 +119,8 @@ def video_frames(
         [-1 if solid.gate is None else solid.gate for solid in solids],
         [len(solid.faces) for solid in solids],
     )
+    corners, whose = cut_up(corners)
+    gate = gate[whose]
     times = frame_times(flight, options)
     speed = np.linalg.norm(flight.vel_w, axis=1)
     top = colours.top_speed(speed)

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from eval.view.scene3d import Faces, Lines, look_at, paint, to_camera, to_pixels
+from eval.view.scene3d import (
+    LONGEST_M,
+    MOST_FACES,
+    Faces,
+    Lines,
+    cut_up,
+    look_at,
+    paint,
+    to_camera,
+    to_pixels,
+)
 
 NO_LINES = Lines(np.zeros((0, 2, 3)), np.zeros((0, 3)), 0.01)
 
@@ -30,3 +40,41 @@ def test_painted_solids_stand_where_a_pinhole_puts_them_and_the_near_hides_the_f
     assert not (np.asarray(paint(view, behind, NO_LINES)).astype(int)[..., 0] > 250).any()
     around = Faces(sheet * 0.1 + [-0.05, 0, 0.9], red)  # behind the eye
     paint(view, around, NO_LINES)
+
+
+def sheet_and_box():
+    """A floor of 30 m by 30 m, and a box of 1 m on it, 8 m ahead: what faces the eye of it."""
+    x0, x1, y0, y1 = -15.0, 15.0, -15.0, 15.0
+    floor = [[[x0, y0, 0], [x1, y0, 0], [x1, y1, 0]], [[x0, y0, 0], [x1, y1, 0], [x0, y1, 0]]]
+    front = [[[8, 1, 0], [8, -1, 1], [8, 1, 1]], [[8, 1, 0], [8, -1, 0], [8, -1, 1]]]
+    return np.array(floor, float), np.array(front, float)
+
+
+def test_a_large_floor_does_not_hide_what_stands_on_it():
+    floor, front = sheet_and_box()
+    view = look_at(np.array([-1.0, 0.0, 1.8]), np.array([8.0, 0.0, 0.5]), 60.0, (200, 100))
+    red, blue = [255.0, 0.0, 0.0], [0.0, 0.0, 255.0]
+    seen = []
+    for cut in (False, True):
+        parts = cut_up(floor)[0] if cut else floor
+        colour = np.array([blue] * len(parts) + [red] * 2)
+        painted = paint(view, Faces(np.concatenate([parts, front]), colour), NO_LINES)
+        pixels = np.asarray(painted).astype(int)
+        seen.append(int((pixels[..., 0] > 1.5 * pixels[..., 2]).sum()))
+    assert seen[1] > 500 and seen[1] > 1.5 * seen[0]
+
+
+def test_what_is_cut_up_covers_the_same_and_knows_whose_it_was():
+    floor, front = sheet_and_box()
+    corners = np.concatenate([front, floor])
+    parts, whose = cut_up(corners)
+    side = np.linalg.norm(parts - np.roll(parts, -1, axis=1), axis=-1)
+    assert side.max() <= LONGEST_M and (whose == 0).sum() >= 1
+
+    def areas(triangles):
+        cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        return cross / 2  # with its direction: the winding stays
+
+    for number, whole in enumerate(areas(corners)):
+        np.testing.assert_allclose(areas(parts[whose == number]).sum(0), whole, atol=1e-9)
+    assert len(cut_up(1e4 * floor)[0]) <= MOST_FACES
