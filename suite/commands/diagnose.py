@@ -62,7 +62,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.diagnose.run import diagnose_files
 
     check_no_input(config.out / "vehicle.toml", [config.vehicle, config.fly], "--out")
-    for path in flight_files(config.flights) if config.fly else ():
+    for path in flight_files(config.flights) if config.fly or config.plan else ():
         check_no_input(config.out / "plan" / "flights" / path.name, [path], "--out")
     result = diagnose_files(
         config.flights,

@@ -77,6 +77,22 @@ def split(
     )
 
 
+def long_enough(logs: Sequence[FlightLog], horizon_s: float) -> tuple[list[FlightLog], list[str]]:
+    """Return the flights that last for a window, and what to say of the others.
+
+    All come back where fewer than two do: who cuts them says what they lack.
+    """
+    needed_s = horizon_s + 2.0 / decision_rate(logs)
+    long = [log for log in logs if log.duration_s >= needed_s]
+    if len(long) < 2:
+        return list(logs), []
+    return long, [
+        f"{log.name}: left out, it lasts {log.duration_s:.2f} s and a window {horizon_s:g} s"
+        for log in logs
+        if log.duration_s < needed_s
+    ]
+
+
 def fit_delta(
     config: FitConfig,
     dynamics: PointMassConfig | QuadrotorConfig,
@@ -97,7 +113,8 @@ def fit_delta(
         ValueError: where the logs cannot be used.
     """
     logs, warnings = read_flights(flight_files(paths))
-    for warning in warnings:
+    logs, short = long_enough(logs, config.horizon_s)
+    for warning in [*warnings, *short]:
         console.note(f"warning: {warning}")
     parts, about = split(logs, config.held_out, config.seed), corrected(dynamics)
     work: Callable[[Any, Any, Callable[[int, str], None]], DeltaFit]

@@ -106,6 +106,13 @@ def _diagnose(
     """Return the diagnosis with bodies that `integrator` moves."""
     rotor_input, warnings = rotors_are_input(logs, drive, vehicle), list[str]()
     if drive == "auto" and not rotor_input and another_controller(logs, vehicle, limits):
+        without = [log.name for log in logs if log.rotor_speed is None]
+        if without:
+            raise ValueError(
+                "the nominal rate loop does not give the rotor speeds that some flights have, and "
+                f"{', '.join(without)} has none to drive by: diagnose the others alone, or with "
+                "--drive commands all by what was commanded"
+            )
         warnings.append("the nominal rate loop does not give the measured rotor speeds; they drive")
         rotor_input = True
     space = make_space(vehicle)
@@ -169,6 +176,12 @@ def _diagnose(
         labels = ", ".join(candidate.label for candidate in found.candidates)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
         found, after = without_names(model, found, limits), before
+        residual, _ = _left_over(model, found, seed, limits)
+        bare = verdict_on(found, residual, (before, before), rotor_input, limits)
+        verdict = Verdict("unknown", 1.0, bare.where or verdict.where)
+        swing = _swing(logs, vehicle, voltage, found, limits) if swing else None
+        if swing:
+            verdict = with_swing(verdict, swing.words, False)
     return Diagnosis(
         verdict=verdict,
         search=found,
@@ -237,7 +250,10 @@ def _swing(
     limits: Thresholds,
 ) -> Swing | None:
     """Return the swing in what translation under the measured attitude leaves of `found`."""
-    flights = ready(logs, vehicle, limits).smoothed[FORCE.name]
+    try:
+        flights = ready(logs, vehicle, limits).smoothed[FORCE.name]
+    except ValueError:  # rollouts need other stretches than this look, which is one more
+        return None
     model = ForceModel(vehicle, make_space(vehicle), voltage)
     return swing_left(ViewTask(FORCE, model, flights, limits), found.estimate.theta)
 

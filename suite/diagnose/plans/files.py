@@ -17,6 +17,7 @@ import numpy as np
 from suite.diagnose.plans.trajectory import Trajectory
 from tracks.common.files import write_json, write_text
 from tracks.common.provenance import stamp
+from tracks.input.reading import read_json
 
 SCHEMA = 1
 """Version of plan.json."""
@@ -29,6 +30,23 @@ COLUMNS = (
 )
 """Of a CSV: s, m, m/s, m/s^2 in the world, and rad about world z."""
 NAME = "plan.json"
+KEYS = ("file", "flown")
+"""Of a flight in it: its set points, and its log where it was flown in simulation."""
+
+
+def remove_plan(folder: Path) -> None:
+    """Remove what an earlier plan.json in `folder` lists, and itself; other files stay."""
+    path = folder / NAME
+    if not path.is_file():
+        return
+    try:
+        listed = [flight.get(key) for flight in read_json(path)["flights"] for key in KEYS]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return  # none of ours; it is written over
+    for name in listed:
+        if isinstance(name, str) and (folder / name).resolve().is_relative_to(folder.resolve()):
+            (folder / name).unlink(missing_ok=True)
+    path.unlink()
 
 
 def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from eval.logs.flight_log import write_flight
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.windows import SLICES
-from suite.diagnose.plans.files import NAME, SCHEMA, write_plan
+from suite.diagnose.plans.files import NAME, SCHEMA, remove_plan, write_plan
 from suite.diagnose.plans.follow import FlightFailed
 from suite.diagnose.plans.sensors import Sensors, log_of
 from suite.diagnose.plans.separating import plan_for, separations_of
@@ -58,7 +58,11 @@ def ways_for(found: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
 
 
 def write_plan_of(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Write the plan that follows from `found`; return it, with no flights where none is needed."""
+    """Write the plan that follows from `found`; return it, with no flights where none is needed.
+
+    An earlier plan in `folder` goes, with its simulated logs, so that nobody takes them for these.
+    """
+    remove_plan(folder)
     ways, words = ways_for(found)
     if not ways:
         return {"flights": [], "words": ["Nothing is left to tell apart: no flight is planned."]}

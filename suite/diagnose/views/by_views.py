@@ -108,12 +108,13 @@ def diagnose_by_views(
     """
     began = time.monotonic()
     flights = ready(logs, vehicle, limits)
+    logs = [logs[k] for k in flights.kept]
     space = make_space(vehicle)
     voltage = all(log.voltage is not None for log in [*logs, *references])
     model = ForceModel(vehicle, space, voltage)
     among = candidates(space, voltage, ())
     whole = not any(log.partial for log in [*logs, *references])
-    known, spread = _reference_tasks(flights, model, vehicle, references, limits)
+    known, spread, left_out = _reference_tasks(flights, model, vehicle, references, limits)
     say(f"views: {', '.join(view.about for view in flights.views)}; by {flights.source}")
     held_numbers, held_names = _held(logs, flights, model, limits)
     fitted, held = parted(flights, held_numbers, limits)
@@ -138,9 +139,9 @@ def diagnose_by_views(
         told = ", ".join(name.candidate.label for name in found.named) or "nothing"
         say(f"{view.name}: {told}; {100 * gap.share(gap.closed):.0f} % of the variance closed, "
             f"{100 * gap.share(gap.explainable):.0f} % by a black box")  # fmt: skip
-    results, warnings = _confirmed(tuple(results))
+    results, withdrawn = _confirmed(tuple(results))
     results, told = _one_cause(results)
-    warnings += told
+    warnings = [*flights.notes, *left_out, *withdrawn, *told]
     for result in results:
         for name in result.names:
             far = implausible(space, result.search.last.theta, name.candidate, limits)
@@ -175,16 +176,21 @@ def _reference_tasks(
     vehicle: Vehicle,
     references: Sequence[FlightLog],
     limits: Thresholds,
-) -> tuple[dict[str, ViewTask], RotorSpread | None]:
-    """Return the reference flights' task by view, and how they differ."""
+) -> tuple[dict[str, ViewTask], RotorSpread | None, tuple[str, ...]]:
+    """Return the reference flights' task by view, how they differ, and which were left out."""
     if not references:
-        return {}, None
-    if len(references) < 2:
-        raise ValueError(
-            f"--reference has {len(references)} flight; at least 2 are needed, better 3: how "
-            "flights of one vehicle differ is taken from them"
-        )
+        return {}, None, ()
     before = ready(references, vehicle, limits)
+    if len(before.names) < 2:
+        raise ValueError(
+            "; ".join(
+                [
+                    f"--reference has {len(before.names)} flight; at least 2 are needed, better 3: "
+                    "how flights of one vehicle differ is taken from them",
+                    *before.notes,
+                ]
+            )
+        )
     if before.views != flights.views or before.source != flights.source:
         raise ValueError(
             f"the reference flights are driven by {before.source} and allow "
@@ -196,7 +202,7 @@ def _reference_tasks(
         for view in flights.views
     }
     after = [task._replace(flights=flights.smoothed[name]) for name, task in tasks.items()]
-    return tasks, rotor_spread([*tasks.values(), *after])
+    return tasks, rotor_spread([*tasks.values(), *after]), before.notes
 
 
 def _held(

@@ -10,7 +10,7 @@ from policies.formats.delta_file import load_delta
 from suite.common.console import Console
 from suite.delta.fit import FitConfig
 from suite.delta.replay import nominal_model
-from suite.delta.run import fit_delta, flight_files, split, table
+from suite.delta.run import fit_delta, flight_files, long_enough, split, table
 from suite.train.config import PointMassConfig
 from tests.support.point_mass_flights import fly
 
@@ -45,6 +45,16 @@ def test_a_split_has_no_overlap_and_leaves_nobody_out(share):
     assert [log.name for log in split(logs, 0.5, 0)[1]] != [
         log.name for log in split(logs, 0.5, 1)[1]
     ]
+
+
+def test_a_flight_shorter_than_a_window_is_not_what_is_held_out():
+    logs = fly(nominal_model(PointMassConfig()), 3, seconds=1.5)
+    crash = fly(nominal_model(PointMassConfig()), 1, seconds=0.8)[0]
+    crash = replace(crash, name="crash")
+    kept, words = long_enough([*logs, crash], 1.0)
+    assert [log.name for log in kept] == [log.name for log in logs]
+    assert words == ["crash: left out, it lasts 0.77 s and a window 1 s"]
+    assert long_enough([logs[0], crash], 1.0) == ([logs[0], crash], [])
 
 
 def test_what_cannot_be_split_is_refused():

@@ -124,8 +124,16 @@ def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
     def swing(motion, t):
         return np.array([0.8 * np.sin(2 * np.pi * 1.3 * t), 0.8 * np.cos(2 * np.pi * 1.1 * t), 0.0])
 
-    found = diagnosis_json(diagnose(flights(LAGGED, extras=[swing] * 3), LAGGED))
-    assert found["verdict"] in ("unknown", "partly")
+    # With a drag beside it, which is named first and leaves too much to stand.
+    truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
+    logs = flights(truth, extras=[swing] * 3)
+    limits = Thresholds(unexplained_share=0.0)
+    found = diagnosis_json(diagnose(logs, LAGGED, limits=limits))
+    assert found["verdict"] == "unknown" and found["effects"] == []
+    assert any(text.startswith("nearest in the catalogue") for text in found["warnings"])
+    # What is left is what nothing that was withdrawn has taken away.
+    assert found["unexplained"]["share"] == 1.0 and found["unexplained"]["where"]
+    assert found["gap"]["after"] == found["gap"]["before"]
 
 
 SIDE = {"linear_drag": ((0.25, 0.45, 0.1),), "constant_wind": ((0.4, -0.5, 0.0),)}
@@ -195,6 +203,14 @@ def test_what_drives_the_model_must_be_in_every_log():
     log = replace(fly(LAGGED, 0, duration_s=2.0), thrust_cmd=None, rate_cmd_b=None)
     with pytest.raises(ValueError, match="sort"):
         diagnose([log, fly(LAGGED, 1, duration_s=2.0)], LAGGED)
+
+
+def test_where_another_controller_flew_every_log_needs_rotor_speeds(monkeypatch):
+    monkeypatch.setattr("suite.diagnose.diagnose.another_controller", lambda *_: True)
+    logs = [fly(LAGGED, seed, duration_s=2.0, motors=seed > 0) for seed in range(2)]
+    without = next(log.name for log in logs if log.rotor_speed is None)
+    with pytest.raises(ValueError, match=f"{without} has none to drive by: diagnose the others"):
+        diagnose(logs, LAGGED)
 
 
 def test_thresholds_are_those_that_are_given():

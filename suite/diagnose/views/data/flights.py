@@ -22,6 +22,7 @@ from suite.diagnose.views.data.view import (
     calibrated,
     smoothed,
 )
+from suite.diagnose.views.data.weak_form import LEAST_ROWS
 
 SLOW_WIDTH_S = 1.0
 """Width of the bumps where rates come from a path, which tells them as means over a second [s]."""
@@ -41,15 +42,19 @@ class ViewFlights:
     """By view: what the velocity's or the rates' noise makes of an acceleration, (3,)."""
     source: str
     """What is taken for the rotors' speeds."""
+    kept: tuple[int, ...] = ()
+    """Numbers of the logs that these flights are of; others have no stretch."""
+    notes: tuple[str, ...] = ()
+    """What was left out, in words."""
 
 
 def ready(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> ViewFlights:
-    """Return `logs` for the views that all of them allow.
+    """Return those of `logs` that have a stretch, for the views that all of them allow.
 
     Raises:
-        ValueError: where a log has nothing that turns or pushes, or none of it has a stretch.
+        ValueError: where a log has nothing that turns or pushes, or none has a stretch.
     """
     rotors = [acting_rotors(log, vehicle) for log in logs]
     for log, one in zip(logs, rotors, strict=True):
@@ -73,17 +78,32 @@ def ready(
             _calibrated(flight, one, vehicle)
             for flight, one in zip(parts[TORQUE.name], acting, strict=True)
         ]
-    for number, log in enumerate(logs):
-        if not len(parts[FORCE.name][number].form.middle_s):
-            raise ValueError(
-                f"{log.name}: no stretch of {FORCE.width_s:g} s in flight without a hole"
+    kept = [k for k, flight in enumerate(parts[FORCE.name]) if len(flight.form.middle_s)]
+    without = f"no stretch of {FORCE.width_s:g} s in flight without a hole"
+    if not kept:
+        raise ValueError(f"{', '.join(log.name for log in logs)}: {without}")
+    notes = [f"{log.name}: {without}" for k, log in enumerate(logs) if k not in kept]
+    parts = {name: [flights[k] for k in kept] for name, flights in parts.items()}
+    for view in views[1:]:
+        empty = [
+            logs[k].name
+            for k, flight in zip(kept, parts[view.name], strict=True)
+            if not len(flight.form.middle_s)
+        ]
+        if empty:
+            notes.append(
+                f"{view.name}: not looked at, as {', '.join(empty)} has no {view.width_s:g} s "
+                f"with {LEAST_ROWS} rows; log faster"
             )
+            views, parts = views[:1], {FORCE.name: parts[FORCE.name]}
     return ViewFlights(
         tuple(views),
-        tuple(log.name for log in logs),
+        tuple(logs[k].name for k in kept),
         parts,
         {view.name: _floor(view, parts[view.name]) for view in views},
         acting[0].source,
+        tuple(kept),
+        tuple(notes),
     )
 
 
@@ -99,7 +119,11 @@ def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) 
 def parted(
     flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
 ) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]]]:
-    """Return the fitted flights and the `held` ones by view; of a lone flight its first part."""
+    """Return the fitted flights and the `held` ones by view; of a lone flight its first part.
+
+    Raises:
+        ValueError: for a lone flight that is too short to part.
+    """
     if len(flights.names) > 1:
         inside = [k for k in range(len(flights.names)) if k not in held]
         return (
@@ -107,12 +131,18 @@ def parted(
             {name: [part[k] for k in held] for name, part in flights.smoothed.items()},
         )
     first, last = {}, {}
+    # Of what was flown: a log may begin or end on the ground.
+    flown_s = flights.smoothed[FORCE.name][0].form.middle_s
+    until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
     for view in flights.views:
         whole = flights.smoothed[view.name][0]
         rows, credible = whole.rows, whole.credible
-        early = rows.time_s <= limits.lone_fitted_share * rows.time_s[-1]
+        early = rows.time_s <= until_s
         for part, chosen in ((first, early), (last, ~early)):
             some = smoothed(view, _only(rows, chosen), limits)
+            if not len(some.form.middle_s):
+                (name,) = flights.names
+                raise ValueError(f"{name}: too short to hold a part of it out; fly longer")
             part[view.name] = [some._replace(credible=credible)]
     return first, last
 

@@ -63,7 +63,8 @@ def weak_form(time_s: np.ndarray, good: np.ndarray, width_s: float, hole_s: floa
 
     share, weight = np.concatenate(shares), 0.5 * np.concatenate(spans)
     centres = np.array(kept)
-    nearest = np.abs(time_s[:, None] - centres[None]).argmin(axis=0)
+    after = np.clip(np.searchsorted(time_s, centres), 1, len(time_s) - 1)
+    nearest = after - (centres - time_s[after - 1] <= time_s[after] - centres)
     return WeakForm(centres, nearest, matrix(-share, share), matrix(weight, weight))
 
 

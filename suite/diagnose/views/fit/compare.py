@@ -35,8 +35,8 @@ def compare(
         forces: RowForces = model.at(theta, flight.rows)
         mean, count = flight.form.mean, len(flight.form.middle_s)
         value = mean @ forces.value[:, view.columns]
-        slope = forces.slope[:, view.columns].reshape(len(forces.slope), -1)
-        slope = (mean @ slope).reshape(count, 3, -1)
+        slope = forces.slope[:, view.columns]
+        slope = (mean @ slope.reshape(len(slope), -1)).reshape(count, *slope.shape[1:])
         value, slope = (_believed(part, flight.credible) for part in (value, slope))
         residual = flight.measured - value
         if view.in_world:

@@ -57,6 +57,25 @@ def test_nothing_is_written_where_nothing_is_left_to_tell(tmp_path):
     assert plan["flights"] == [] and not (tmp_path / "plan").exists()
 
 
+def test_an_earlier_plan_goes_and_what_is_not_of_it_stays(tmp_path):
+    folder = tmp_path / "plan"
+    plan = write_plan(folder, [Trajectory("hover", 3.0), Trajectory("punches", 3.0)], [])
+    flown = fly_plan(plan, SIGMA, LAGGED, LAGGED, folder, 3)
+    own = folder / "flights" / "my_own.parquet"
+    own.write_bytes(b"a real flight")
+    outside = tmp_path / "outside.csv"
+    outside.write_text("not the plan's to remove")
+    listed = json.loads((folder / "plan.json").read_text())
+    listed["flights"][0]["file"] = "../outside.csv"
+    (folder / "plan.json").write_text(json.dumps(listed))
+    write_plan_of({"effects": []}, folder)
+    assert not (folder / "plan.json").exists()
+    assert not any((folder / flight["flown"]).exists() for flight in flown["flights"])
+    assert own.exists() and outside.exists()
+    (folder / "plan.json").write_text("[]")
+    assert write_plan_of(SET, folder)["flights"]
+
+
 def test_advice_is_that_of_the_plans():
     assert advice("linear_drag", "rotor_drag").startswith("linear_drag from rotor_drag: ")
     assert OTHERWISE not in advice("linear_drag", "rotor_drag")

@@ -1,5 +1,6 @@
 """What views are made of: weak accelerations, acting rotors, rows in flight, completed logs."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -131,6 +132,68 @@ def test_a_lone_flights_end_is_held_out():
     last = fitted[FORCE.name][0].form.middle_s.max()
     assert held[FORCE.name][0].form.middle_s.min() > last
     assert last < THRESHOLDS.lone_fitted_share * 8.0
+
+
+def on_the_ground(log, before_s, after_s):
+    """Return a log with time on the ground before and after what was flown, rotors at rest."""
+    assert log.rotor_speed is not None
+    step = float(np.median(np.diff(log.time_s)))
+    first, last = round(before_s / step), round(after_s / step)
+    count = len(log.time_s)
+    rows = np.concatenate([np.zeros(first, int), np.arange(count), np.full(last, count - 1)])
+    flown = (np.arange(len(rows)) >= first) & (np.arange(len(rows)) < first + count)
+    still = np.where(flown[:, None], log.vel_w[rows], 0.0)
+    speed = np.where(flown[:, None], log.rotor_speed[rows], 0.0)
+    return replace(log, time_s=step * np.arange(len(rows)), pos_w=log.pos_w[rows],
+                   quat_wxyz=log.quat_wxyz[rows], vel_w=still, rate_b=log.rate_b[rows],
+                   rotor_speed=speed, thrust_cmd=None, rate_cmd_b=None, voltage=None)  # fmt: skip
+
+
+@pytest.mark.parametrize("ground_s", [(0.0, 6.0), (30.0, 0.0)])
+def test_of_a_lone_flight_that_stood_on_the_ground_a_part_of_what_flew_is_held_out(ground_s):
+    (log,) = flights(1)
+    fitted, held = parted(ready([on_the_ground(log, *ground_s)], VEHICLE), [])
+    for name in (FORCE.name, TORQUE.name):
+        first, last = (len(part[name][0].form.middle_s) for part in (fitted, held))
+        assert first / (first + last) == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.1)
+
+
+def test_a_log_without_a_stretch_is_left_out_and_ends_nothing_but_what_has_no_other():
+    good, other = flights(2)
+    bad = replace(other, name="all holes", rotor_speed=np.full_like(other.rotor_speed, np.nan))
+    found = ready([bad, good], VEHICLE)
+    assert found.names == (good.name,) and found.kept == (1,)
+    assert [len(part) for part in found.smoothed.values()] == [1, 1]
+    assert found.notes == ("all holes: no stretch of 0.2 s in flight without a hole",)
+    with pytest.raises(ValueError, match="all holes: no stretch"):
+        ready([bad], VEHICLE)
+
+
+def test_logs_too_slow_for_the_torque_are_looked_at_by_their_force():
+    rows = slice(None, None, 4)
+    slow = [
+        replace(log, time_s=log.time_s[rows], pos_w=log.pos_w[rows],
+                quat_wxyz=log.quat_wxyz[rows], vel_w=log.vel_w[rows], rate_b=log.rate_b[rows],
+                rotor_speed=np.asarray(log.rotor_speed)[rows], thrust_cmd=None, rate_cmd_b=None,
+                voltage=None)
+        for log in flights(2)
+    ]  # fmt: skip
+    assert np.diff(slow[0].time_s)[0] == pytest.approx(0.04)
+    found = ready(slow, VEHICLE)
+    assert found.views == (FORCE,) and set(found.smoothed) == {FORCE.name}
+    assert found.notes[0].startswith("torque: not looked at, as") and "log faster" in found.notes[0]
+
+
+def test_the_row_nearest_to_a_bump_takes_no_memory_by_the_square_of_a_flight():
+    time_s = np.sort(np.random.default_rng(1).uniform(0.0, 300.0, 60_000))
+    tracemalloc.start()
+    form = weak_form(time_s, np.ones(len(time_s), bool), 0.2, 0.1)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2e8
+    some = slice(None, None, 200)
+    apart = np.abs(time_s[:, None] - form.middle_s[some])
+    np.testing.assert_array_equal(form.middle_row[some], apart.argmin(axis=0))
 
 
 def test_the_measured_side_of_a_view_is_a_mean_acceleration():
