@@ -79,10 +79,10 @@ def evaluate(
     _refuse_twice([flier.label for flier in fliers])
     count = len(course.trials)
     workers = workers_for(count, workers, evaluation.world)
-    journals = _open_journals(evaluation, course, fliers, out)
     flown = count * len(fliers)
-    what = f"{flown} trials in the {evaluation.world} world"
-    announce(console, what, flying_needs(flown, workers, evaluation.world))
+    needs = flying_needs(flown, workers, evaluation.world)
+    journals = _open_journals(evaluation, course, fliers, out)
+    announce(console, f"{flown} trials in the {evaluation.world} world", needs)
     say_notes(console, evaluation.world, course)
     results: list[TrialResult] = []
     for flier, journal in zip(fliers, journals, strict=True):

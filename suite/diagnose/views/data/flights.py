@@ -141,7 +141,7 @@ def parted(
         for part, chosen in ((first, early), (last, ~early)):
             some = smoothed(view, _only(rows, chosen), limits)
             if not len(some.form.middle_s):
-                (name,) = flights.names
+                name = "".join(flights.names)
                 raise ValueError(f"{name}: too short to hold a part of it out; fly longer")
             part[view.name] = [some._replace(credible=credible)]
     return first, last
