@@ -61,6 +61,7 @@ def write_torch(module: torch.nn.Module, path: Path) -> None:
 
 def main(folder: Path) -> None:
     """Export the policy to `folder` in both ways, and ask each for one action."""
+    folder.mkdir(parents=True, exist_ok=True)
     module = ToTheGate().eval()
     write_onnx(module, folder / "to_the_gate.onnx")
     write_torch(module, folder / "to_the_gate.pt2")
@@ -71,7 +72,7 @@ def main(folder: Path) -> None:
     for name in ("to_the_gate.onnx", "to_the_gate.pt2"):
         policy = load_policy(folder / name, trust=name.endswith(".pt2"))  # this one is ours
         action, _ = policy.act(policy.start(1), state, image, np.array([True]))
-        print(f"{name} at {policy.spec.rate_hz:g} Hz: action {action[0].tolist()} m/s^2")
+        print(f"{folder / name} at {policy.spec.rate_hz:g} Hz: action {action[0].tolist()} m/s^2")
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ yaw_deg = 30.0
 
 def main(folder: Path) -> None:
     """Write course.toml, roof.stl and course.png to `folder`, and fly the course once."""
+    folder.mkdir(parents=True, exist_ok=True)
     corners = [(x, y, 0.0) for x in (-1, 1) for y in (-0.5, 0.5)] + [(-1, 0, 1.2), (1, 0, 1.2)]
     trimesh.PointCloud(corners).convex_hull.export(folder / "roof.stl")
     path = folder / "course.toml"
@@ -54,6 +55,7 @@ def main(folder: Path) -> None:
     track = load_track(path)
     print(f"{track.family}: {len(track.scene.gates.center_w)} gates; solids: {set(track.names)}")
     write_picture(folder / "course.png", track)
+    print(f"written: {path} and {folder / 'course.png'}")
     (result,) = fly(
         load_policy("swift"),
         [TrialSpec(str(path), difficulty=0, seed=0)],

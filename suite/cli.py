@@ -100,6 +100,8 @@ def _dispatch(args: list[str]) -> int:
         print(f"suite {VERSION}")
         return DONE
     name, *rest = args
+    if name.startswith("-"):
+        raise ValueError(f"{name}: options come after a command: suite eval {name}")
     if name not in COMMANDS:
         from tracks.common.names import unknown_name
 

@@ -80,9 +80,32 @@ def run_record(config: Any, seed: int | None) -> dict[str, Any]:
         "packages": package_versions(),
         "machine": machine(),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "config_type": f"{type(config).__module__}.{type(config).__qualname__}",
+        "config_type": _kind_of(config),
         "config": config,
     }
+
+
+def _kind_of(config: Any) -> str:
+    return f"{type(config).__module__}.{type(config).__qualname__}"
+
+
+def refuse_other_run(folder: str | os.PathLike[str], config: Any) -> None:
+    """Refuse a folder that holds a run of another kind, whose record would be written over.
+
+    Raises:
+        ValueError: naming the folder and what made it.
+    """
+    path = Path(folder) / "run.json"
+    try:
+        before = read_json(path)
+        kind, command = before["config_type"], " ".join(map(str, before["command"][:2]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if kind != _kind_of(config):
+        raise ValueError(
+            f"{folder} holds a run of another kind (made by {command}), whose run.json would be "
+            "written over; give another --out"
+        )
 
 
 def write_run_record(

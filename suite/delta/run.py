@@ -13,7 +13,7 @@ from eval.logs.flight_log import FlightLog, read_flights
 from policies.formats.delta_file import save_delta
 from suite.common.console import Console
 from suite.common.estimate import Estimate, announce
-from suite.common.provenance import write_run_record
+from suite.common.provenance import refuse_other_run, write_run_record
 from suite.delta.corrected import QUAD, corrected
 from suite.delta.fit import DeltaFit, FitConfig, PointMassFit, ReplayErrors, fit, fit_network
 from suite.delta.windows import cut_windows, decision_rate
@@ -112,6 +112,7 @@ def fit_delta(
     Raises:
         ValueError: where the logs cannot be used.
     """
+    refuse_other_run(out, config)
     logs, warnings = read_flights(flight_files(paths))
     logs, short = long_enough(logs, config.horizon_s)
     for warning in [*warnings, *short]:

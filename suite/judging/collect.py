@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from eval.logs.columns import DURATION_MIN
 from suite.common.console import Console
 from suite.common.estimate import announce
-from suite.common.provenance import write_run_record
+from suite.common.provenance import refuse_other_run, write_run_record
 from suite.judging.flying import (
     Course,
     about_policy,
@@ -65,6 +65,7 @@ def collect(
     asked = collection.policy or default_policy()
     policy = load_flier(asked, collection.trust, manner)
     out = Path(out)
+    refuse_other_run(out, collection)
     about = {
         "collection": collection,
         "policy": about_policy(asked, policy),

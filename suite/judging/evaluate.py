@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.console import Console
 from suite.common.estimate import announce
-from suite.common.provenance import write_run_record
+from suite.common.provenance import refuse_other_run, write_run_record
 from suite.judging.flying import (
     Course,
     about_policy,
@@ -68,6 +68,7 @@ def evaluate(
     from eval.judging.tables import grids, markdown_table, summarise
 
     course, out = read_course(evaluation), Path(out)
+    refuse_other_run(out, evaluation)
     asked = tuple(evaluation.policies or (default_policy(),))
     policies = [load_flier(name, evaluation.trust) for name in asked]
     plain = list(zip(asked, policies, labels(asked, [p.name for p in policies]), strict=True))
@@ -79,6 +80,8 @@ def evaluate(
     _refuse_twice([flier.label for flier in fliers])
     count = len(course.trials)
     workers = workers_for(count, workers, evaluation.world)
+    if (out / "trials.parquet").is_file():
+        console.note(f"{out} holds an evaluation; its results will be written over")
     flown = count * len(fliers)
     needs = flying_needs(flown, workers, evaluation.world)
     journals = _open_journals(evaluation, course, fliers, out)

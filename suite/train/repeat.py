@@ -30,7 +30,7 @@ from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.estimate import Estimate, announce
-from suite.common.provenance import write_run_record
+from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.running import hosts
 from suite.train.worlds import Worlds
 from tracks.common.files import recover_folder
@@ -116,6 +116,7 @@ def repeat(
     """
     folder = run.folder
     if hosts.writes():
+        refuse_other_run(folder, run.config)
         fresh = _resume(run, fresh)
     state = jax.device_put(hosts.from_the_first(fresh), run.place)
     done = int(state.iteration)

@@ -103,6 +103,11 @@ def test_asking_for_a_commands_help_imports_nothing_slow(name):
     assert done.returncode == 0, done.stderr
 
 
+def test_an_option_before_the_command_is_told_where_it_goes(capsys):
+    assert cli.main(["--json", "eval"]) == 2
+    assert "options come after a command: suite eval --json" in capsys.readouterr().err
+
+
 def test_an_unknown_command_gets_the_nearest_and_code_2(capsys):
     assert cli.main(["inof"]) == 2
     said = capsys.readouterr()

@@ -19,9 +19,15 @@ def closest(name: str, allowed: Iterable[str]) -> str | None:
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> ValueError:
     """Return (not raise) the error for `name` where only `allowed` names of `kind` exist.
 
-    The message gives the name, the nearest one if any is near, and the whole list.
+    The message gives the name, the nearest one or those that hold it, and the whole list.
     """
     allowed = list(allowed)
-    guess = closest(name, allowed)
-    meant = f" Did you mean {guess!r}?" if guess else ""
+    near = [guess] if (guess := closest(name, allowed)) else _holding(name, allowed)
+    meant = f" Did you mean {', '.join(map(repr, near))}?" if near else ""
     return ValueError(f"unknown {kind} {name[:LONGEST]!r}.{meant} Known: {', '.join(allowed)}.")
+
+
+def _holding(name: str, allowed: list[str]) -> list[str]:
+    """Return those of `allowed` that hold `name` as a part, where they are few."""
+    found = [entry for entry in allowed if len(name) > 2 and name.lower() in entry.lower()]
+    return found if len(found) < 5 else []

@@ -58,16 +58,19 @@ def gains_chart(
 def disagreement_chart(found: Disagreement) -> bytes:
     """Return errors of 0.5 s rollouts over their noise floor, against what was flown."""
     figure = Figure(figsize=(11.0, 7.4), layout="constrained")
-    grid = figure.subplots(len(STATE_GROUPS), len(UNITS), sharey="row", squeeze=False)
+    # Three channels each; what no log measured has nothing to show.
+    each = found.before[HORIZON].reshape(-1, len(STATE_GROUPS), 3)
+    shown = np.flatnonzero(np.isfinite(each).any(axis=(0, 2)))
+    grid = figure.subplots(len(shown), len(UNITS), sharey="row", squeeze=False)
     for column, (condition, unit) in enumerate(UNITS.items()):
         edges = found.edges[condition]
         middle = 0.5 * (edges[1:] + edges[:-1])
         for label, colour, over in _before_after(found.before, found.after):
             rows = by_group(binned(found, over, condition)[0][HORIZON])
-            for axes, line in zip(grid[:, column], rows.T, strict=True):
+            for axes, line in zip(grid[:, column], rows.T[shown], strict=True):
                 axes.plot(middle, line, "o-", ms=3.5, lw=1.5, color=colour, label=label)
         grid[-1][column].set_xlabel(f"{condition} [{unit}]", fontsize=9)
-    for row, group in enumerate(STATE_GROUPS):
+    for row, group in enumerate(STATE_GROUPS[k] for k in shown):
         for axes in grid[row]:
             axes.axhline(1.0, color=FLOOR, lw=0.8, ls=":")
             axes.set_yscale("log")

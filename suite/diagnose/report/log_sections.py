@@ -70,7 +70,7 @@ def _faults(diagnosis: Diagnosis) -> Grid:
         (
             s.candidate.label,
             f"{s.gain:.1f}",
-            f"{s.p_value:.3f}",
+            f"{s.p_value:.4f}",
             "named" if s.candidate.name in named else "not named",
         )
         for s in diagnosis.search.first

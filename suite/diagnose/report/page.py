@@ -119,11 +119,17 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
     return [*words, grid("", headers, rows, note)]
 
 
+LEAST_FLOOR = 1e-9
+"""A noise floor below this is that of what no log measured, in any unit."""
+
+
 def _disagreement(found: Mapping[str, Any], checks: Checks) -> Section:
     rows = []
     for horizon, groups in found["gap"]["channels"].items():
         for group, values in groups.items():
             floor = values["noise_floor"]
+            if floor < LEAST_FLOOR:
+                continue
             row = cells(horizon, f"{group} [{UNITS[group]}]")
             for key in ("before", "after"):
                 tone = "good" if key == "after" and values[key] < 1.2 * floor else ""
@@ -168,7 +174,7 @@ def _candidates(diagnosis: Diagnosis) -> Section:
     named = {candidate.label for candidate in diagnosis.search.candidates}
     chance = scores[0].chance if scores else None
     rows = [
-        f"{s.candidate.label:32}{s.gain:>12.1f}{s.p_value:>8.3f}  "
+        f"{s.candidate.label:32}{s.gain:>12.1f}{s.p_value:>8.4f}  "
         + ("named" if s.candidate.label in named else "")
         for s in scores
     ]

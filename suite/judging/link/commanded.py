@@ -12,7 +12,7 @@ from policies.block_policy import BlockPolicy, for_one_row
 from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.common.provenance import write_run_record
+from suite.common.provenance import refuse_other_run, write_run_record
 from suite.judging.flying import (
     Course,
     about_policy,
@@ -65,12 +65,13 @@ def fly_commanded(
     refuse_one_name({trial.track for trial in course.trials})
     name = policy or default_policy()
     loaded = load_flier(name, asked.trust, manners(asked.speed, monitor=False)[0])
+    flown = LinkFlights(asked, about_policy(name, loaded), limits, link or "simulated")
     flier = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
+    refuse_other_run(out, flown)
     rules = Rules(time_limit_s=asked.time_limit_s)
     # Before the flights: what the judge refuses is not flown.
     judged = [] if link else _judged(loaded, course, rules)
     out.mkdir(parents=True, exist_ok=True)
-    flown = LinkFlights(asked, about_policy(name, loaded), limits, link or "simulated")
     interrupt = None
     if link:
         found = _real(flier, course, link, limits, out, console)

@@ -119,6 +119,8 @@ def fly_in_real_time(request: Request, pipe: Connection) -> Flown:
             if not vehicle.begun and now - begin > WAIT_S:
                 break
             link.send(vehicle.step(link.receive(), clock_s=due))
+        # A companion that was kept waiting may have handed over meanwhile, which ends the loop.
+        slips += not vehicle.over and time.monotonic() - due > SLIP_S + vehicle.dt
     finally:
         link.close()
     return Flown(vehicle.result(request.policy), slips)

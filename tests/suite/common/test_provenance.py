@@ -2,8 +2,11 @@
 
 import json
 
+import pytest
+
 from suite.common.estimate import Estimate
-from suite.common.provenance import run_record, write_run_record
+from suite.common.provenance import refuse_other_run, run_record, write_run_record
+from suite.judging.requests import Collection, Evaluation
 
 
 def test_a_run_record_holds_what_is_needed_to_repeat_it(tmp_path):
@@ -14,6 +17,16 @@ def test_a_run_record_holds_what_is_needed_to_repeat_it(tmp_path):
     assert record["seed"] == 3 and record["schema"] == 1
     assert set(record) >= {"suite_version", "git_commit", "python", "packages", "machine"}
     assert run_record(config, None)["config_type"] == "suite.common.estimate.Estimate"
+
+
+def test_a_folder_of_another_kind_of_run_is_refused(tmp_path):
+    refuse_other_run(tmp_path, Evaluation())  # nothing is there
+    write_run_record(tmp_path, Evaluation(), 0)
+    refuse_other_run(tmp_path, Evaluation(trials=3))
+    with pytest.raises(ValueError, match="holds a run of another kind .* give another --out"):
+        refuse_other_run(tmp_path, Collection())
+    (tmp_path / "run.json").write_text("[]")
+    refuse_other_run(tmp_path, Collection())  # none of ours
 
 
 def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch):

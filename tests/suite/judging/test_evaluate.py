@@ -37,6 +37,20 @@ def test_eval_writes_the_tables_and_says_them(pilots, tmp_path, capfd):
     assert set(header) >= {"schema", "suite_version", "git_commit", "seed"}
 
 
+def test_what_a_folder_holds_is_not_written_over_without_a_word(pilots, tmp_path, capsys):
+    asked = ["--track", "zigzag", "--policy", pilots["diver"]]
+    assert _eval(tmp_path, *asked, "--trials", "1") == 0
+    assert "written over" not in capsys.readouterr().err
+    assert _eval(tmp_path, *asked, "--trials", "2") == 0
+    assert "holds an evaluation; its results will be written over" in _told(capsys)
+    assert cli.main(["collect", "--out", str(tmp_path), "--policy", pilots["diver"]]) == 2
+    assert "holds a run of another kind" in _told(capsys)
+
+
+def _told(capsys):
+    return " ".join(capsys.readouterr().err.split())
+
+
 def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkeypatch, capfd):
     args = ["--track", "circular,zigzag", "--trials", "2", "--policy", pilots["pursuit"]]
     assert _eval(tmp_path / "whole", *args) == 0

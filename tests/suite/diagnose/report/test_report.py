@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from suite.common.report import html
 from suite.diagnose.report.cells import cells, grid, short_name
@@ -15,7 +16,7 @@ from suite.diagnose.report.charts import (
 )
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
-from suite.diagnose.report.page import page
+from suite.diagnose.report.page import _disagreement, page
 from suite.diagnose.report.parameters_json import components
 from suite.diagnose.report.recording import write_rollouts
 from suite.diagnose.report.result_sections import held_out_section, residual_section
@@ -93,6 +94,30 @@ def test_sections_show_the_numbers(drag, drag_checks, found):
     assert "too few stretches" in str(held[-1])
     tables = [part for part in held if isinstance(part, Grid)]
     assert texts(tables[0])[-1][0] == "with what was named" and len(tables) == 2
+
+
+def test_what_no_log_measured_is_neither_in_the_table_nor_in_the_picture(
+    drag, drag_checks, found, monkeypatch
+):
+    gap = {horizon: {**groups, "velocity": {"before": 0.0, "after": 0.0, "noise_floor": 1e-12}}
+           for horizon, groups in found["gap"]["channels"].items()}  # fmt: skip
+    lacks = {**found, "gap": {**found["gap"], "channels": gap}}
+    (table,) = [g for g in _disagreement(lacks, drag_checks).parts if isinstance(g, Grid)]
+    assert not any("velocity" in row[1] for row in texts(table)) and len(table.rows) > 3
+    rows = []
+    subplots = Figure.subplots
+
+    def counted(self, count=1, *args, **options):
+        rows.append(count)
+        return subplots(self, count, *args, **options)
+
+    monkeypatch.setattr(Figure, "subplots", counted)
+    before, after = (x.copy() for x in (drag_checks.disagreement.before,
+                                        drag_checks.disagreement.after))  # fmt: skip
+    before[..., 6:9] = after[..., 6:9] = np.nan
+    disagreement_chart(drag_checks.disagreement._replace(before=before, after=after))
+    disagreement_chart(drag_checks.disagreement)
+    assert rows == [3, 4]
 
 
 def test_charts_are_pictures(drag, drag_checks):
