@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 
@@ -24,6 +26,7 @@ from eval.worlds.trial import (
     next_centre,
     next_gate,
     start_progress,
+    steps_to_next,
 )
 from policies.observation import observe, view_of
 from policies.spec import PolicySpec
@@ -60,7 +63,7 @@ class Race:
         if uses_noise(self.autopilot.plant):
             trial = TrialSpec(track.family, track.level, track.seed)
             steps = round(rules.time_limit_s / self.autopilot.dt)
-            self._draws = noise_of(trial, steps + self.steps_a_decision + 3)
+            self._draws = noise_of(trial, steps + math.ceil(self._period) + 2)
         self._eye = Eye(spec.camera)
         self._loops: AutopilotState
         self.progress: Progress
@@ -85,12 +88,8 @@ class Race:
         self._judge(data, bad_wrench=False)
 
     def steps_to_decision(self) -> int:
-        """Return the physics steps until the next decision, spaced as by the judge.
-
-        At 30 Hz and 500 Hz of physics these are 17, 16 and 17 in turn.
-        """
-        ends = np.rint(np.array([self._decisions, self._decisions + 1]) * self._period)
-        return max(1, int(ends[1] - ends[0]))
+        """Return the physics steps until the next decision, spaced as by the judge."""
+        return max(1, int(steps_to_next(np.array(self._decisions), self._period)))
 
     def advance(self, data: mujoco.MjData, action_b: np.ndarray, steps: int) -> float:
         """Fly `action_b` (3,) [m/s^2] for physics steps, or until the end; return the reward.

@@ -60,11 +60,11 @@ def import_log(
             f"{file} is read as {name!r}, whose names are known: leave --map out, or say "
             "--format table if it is a table that --map describes"
         )
-    if told.source and told.pose is None and not getattr(reader, "TAKES_SOURCE", True):
-        raise ValueError(
-            f"{file} is read as {name!r}, whose pose is of one source: leave --source "
-            f"{told.source} out"
-        )
     # Where the pose is another file's, the source is that one's.
     own = told if told.pose is None else replace(told, source="")
+    if own.source and not getattr(reader, "TAKES_SOURCE", True):
+        raise ValueError(
+            f"{file} is read as {name!r}, whose pose is of one source: leave --source "
+            f"{own.source} out"
+        )
     return ImportedLog(*assemble(reader.read(file, own), name, told))

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from eval.importers.checks.attitude import as_read
 from eval.importers.checks.units import TIMES
 from eval.importers.findings import Finding
 from eval.importers.formats.table import read_table
@@ -37,11 +38,11 @@ ALIKE = 0.6
 SURE = 0.9
 """Correlation above which a reading of the quaternion is taken without trying others."""
 READINGS = (
-    ("xyzw", [3, 0, 1, 2], False),
-    ("world to body", [0, 1, 2, 3], True),
-    ("xyzw and world to body", [3, 0, 1, 2], True),
+    ("xyzw", "xyzw", False),
+    ("world to body", "wxyz", True),
+    ("xyzw and world to body", "xyzw", True),
 )
-"""What the attitude may be instead: words, where w, x, y, z are, and whether it is inverse."""
+"""What the attitude may be instead: words, its order, and whether it is inverse."""
 USUAL_STEP_S = 1.0 / 150.0
 """Cameras and trackers give 30 to 1000 poses a second."""
 LONG_S = 7200.0
@@ -134,8 +135,7 @@ def _best_reading(
     if given.correlation > SURE:
         return quat, given, []
     for words, order, inverse in READINGS:
-        value = quat.value[:, order]
-        other = Signal(quat.time_s, conjugate(value) if inverse else value)
+        other = Signal(quat.time_s, as_read(quat.value, order, inverse))
         found = align(other, rate, pose.name)
         if fix and found.correlation > SURE:
             text = f"it turns as the gyro does only if it is {words}"

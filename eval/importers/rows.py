@@ -134,19 +134,19 @@ def own_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarra
         time_s: (T,) of the rows, on the recording's clock [s].
     """
     row_step, found = median_step(time_s), {}
-    anchor = _nearest(time_s, recording.signals[slowest(recording)].time_s)
+    anchor = nearest(time_s, recording.signals[slowest(recording)].time_s)
     for name in SPARSE:
         samples = recording.signals.get(name)
         if samples is None:
             continue
         step = median_step(samples.time_s)
         if step <= SLOWER * row_step:
-            far = np.abs(samples.time_s[_nearest(samples.time_s, time_s)] - time_s) > LOST * step
+            far = np.abs(samples.time_s[nearest(samples.time_s, time_s)] - time_s) > LOST * step
             if name == "vel" and far.any():
                 found[name] = ~far
             continue
-        row = _nearest(time_s, samples.time_s)
-        close = anchor[_nearest(time_s[anchor], samples.time_s)]
+        row = nearest(time_s, samples.time_s)
+        close = anchor[nearest(time_s[anchor], samples.time_s)]
         near = np.abs(time_s[close] - samples.time_s) <= 0.5 * median_step(samples.time_s)
         inside = np.abs(time_s[row] - samples.time_s) <= row_step
         found[name] = np.zeros(len(time_s), dtype=bool)
@@ -154,8 +154,8 @@ def own_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarra
     return found
 
 
-def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return the places in `times` that are nearest to `wanted`."""
+def nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return the places in increasing `times` that are nearest to `wanted`, the earlier of two."""
     after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
     return np.where(wanted - times[after - 1] <= times[after] - wanted, after - 1, after)
 

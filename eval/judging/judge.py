@@ -32,6 +32,7 @@ from eval.worlds.trial import (
     Rules,
     TrialResult,
     TrialSpec,
+    steps_to_next,
     track_of,
 )
 from policies.observation import View, observe
@@ -312,8 +313,7 @@ class _Slots:
         self._fresh[:] = False
         if self._recorder:
             self._recorder.decided(np.flatnonzero(flying), self._action_b, seen.depth_m)
-        next_at = np.rint((self._decision + 1) * self._steps_a_decision)
-        steps = (next_at - np.rint(self._decision * self._steps_a_decision)).astype(int)
+        steps = steps_to_next(self._decision, self._steps_a_decision)
         self._decision += 1
         self._fly_steps(np.where(flying, steps, 0), flying)
 

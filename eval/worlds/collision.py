@@ -99,9 +99,14 @@ def box_distances(
     return jnp.concatenate(found, axis=-1)
 
 
+def _out(point: Array, half_size: Array) -> Array:
+    """Return the way to points (..., 3) from what of the box is nearest, 0 inside."""
+    return point - jnp.clip(point, -half_size, half_size)
+
+
 def _beyond(point: Array, half_size: Array) -> Array:
     """Return the distances (...) of points (..., 3) from the box, 0 inside."""
-    out = point - jnp.clip(point, -half_size, half_size)
+    out = _out(point, half_size)
     return jnp.sqrt((out * out).sum(-1))
 
 
@@ -169,8 +174,7 @@ def _from_capsules(rods: Rods, half_size: Array) -> Array:
         low, high = ends
         middle = 0.5 * (low + high)
         point = rods.center_w + middle[..., None] * rods.axis_w
-        out = point - jnp.clip(point, -half_size, half_size)
-        grows = (out * rods.axis_w).sum(-1) > 0.0
+        grows = (_out(point, half_size) * rods.axis_w).sum(-1) > 0.0
         return jnp.where(grows, low, middle), jnp.where(grows, middle, high)
 
     ends = (-rods.half_length, rods.half_length)

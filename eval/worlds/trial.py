@@ -137,6 +137,15 @@ class Progress(NamedTuple):
     """(N, 3) position at the last state judged [m]."""
 
 
+def steps_to_next(decision: Array, period: float) -> Array:
+    """Return the physics steps from each decision, by its number, to the next; whole ones.
+
+    A `period` of 16.7 steps, as that of 30 Hz at 500 Hz of physics, is 17, 16 and 17 in turn.
+    """
+    xp = decision.__array_namespace__()
+    return (xp.rint((decision + 1) * period) - xp.rint(decision * period)).astype(int)
+
+
 def start_progress(pos_w: Array) -> Progress:
     """Return the progress of trials about to start at pos_w (N, 3)."""
     xp = pos_w.__array_namespace__()

@@ -56,13 +56,18 @@ def export_policy(
             texts = c_project(checkpoint, name, dtype, observed).files
             files = {file: text.encode() for file, text in texts.items()}
         else:
-            suffix, write = _WRITERS[wanted]
-            files = {f"{name}{suffix}": write(checkpoint, label)}
+            _, write = _WRITERS[wanted]
+            files = {main_file(name, wanted): write(checkpoint, label)}
         for file, data in files.items():
             with replacing_file(out / file) as beside:
                 beside.write_bytes(data)
             written.append(out / file)
     return written
+
+
+def main_file(name: str, wanted: str) -> str:
+    """Return what the file is called that holds a policy called `name` in one of `FORMATS`."""
+    return "policy.c" if wanted == "c" else f"{name}{_WRITERS[wanted][0]}"
 
 
 def check_formats(formats: Iterable[str], dtype: str = "float32") -> None:

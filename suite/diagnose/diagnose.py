@@ -33,7 +33,7 @@ from suite.diagnose.fit.search import SearchResult, search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.confirmation import confirmed, control, without_names
 from suite.diagnose.verdict.diagnosis import Diagnosis
-from suite.diagnose.verdict.gap import measure, worse
+from suite.diagnose.verdict.gap import Gap, measure, worse
 from suite.diagnose.verdict.residual_structure import (
     ResidualStructure,
     disturbance_equations,
@@ -159,8 +159,15 @@ def _diagnose(
             found, after = without_names(model, found, limits), before
     found, after, without, gone = confirmed(model, found, held, (before, after), limits)
     warnings += [f"{label}: withdrawn, held-out flights are no better for it" for label in gone]
-    residual, turbulence = _left_over(model, found, seed, limits)
-    verdict, swing = verdict_on(found, residual, (before, after), rotor_input, limits), None
+
+    def leaves(
+        found: SearchResult, gaps: tuple[Gap, Gap]
+    ) -> tuple[ResidualStructure, Turbulence | None, Verdict]:
+        """Return the structure in what is left over, its wind, and the verdict on it."""
+        residual, turbulence = _left_over(model, found, seed, limits)
+        return residual, turbulence, verdict_on(found, residual, gaps, rotor_input, limits)
+
+    (residual, turbulence, verdict), swing = leaves(found, (before, after)), None
     if turbulence or verdict.where:
         swing = _swing(logs, vehicle, voltage, found, limits)
     if swing:
@@ -168,16 +175,14 @@ def _diagnose(
     if turbulence and found.named and not worse(after, before, limits=limits):
         # Wind that lasts from one stretch to the next looks like many a steady number.
         found, after = without_names(model, found, limits), before
-        residual, turbulence = _left_over(model, found, seed, limits)
-        verdict = verdict_on(found, residual, (before, after), rotor_input, limits)
+        residual, turbulence, verdict = leaves(found, (before, after))
     if turbulence:
         verdict = Verdict("named", share_left(before, after))
     if verdict.label == "unknown" and found.named:
         labels = ", ".join(candidate.label for candidate in found.candidates)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
         found, after = without_names(model, found, limits), before
-        residual, _ = _left_over(model, found, seed, limits)
-        bare = verdict_on(found, residual, (before, before), rotor_input, limits)
+        residual, _, bare = leaves(found, (before, after))
         verdict = Verdict("unknown", 1.0, bare.where or verdict.where)
         swing = _swing(logs, vehicle, voltage, found, limits) if swing else None
         if swing:

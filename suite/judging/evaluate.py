@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -25,7 +24,7 @@ from suite.judging.flying import (
 )
 from suite.judging.manner import Manner, manners
 from suite.judging.requests import Evaluation
-from tracks.common.files import to_json
+from tracks.common.files import digest_of
 from tracks.common.grid import rich_table
 from tracks.common.provenance import stamp
 from tracks.common.work import Workers
@@ -122,9 +121,7 @@ def file_digests(vehicle: Vehicle, tracks: Mapping[str, Track]) -> dict[str, str
 
     parts: dict[str, object] = {"vehicle": vehicle_table(vehicle)}
     parts |= {f"track {name}": track for name, track in tracks.items()}
-    return {
-        what: hashlib.sha256(to_json(part).encode()).hexdigest() for what, part in parts.items()
-    }
+    return {what: digest_of(part) for what, part in parts.items()}
 
 
 def _refuse_twice(called: list[str]) -> None:

@@ -9,14 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.choices import parse_levels, parse_tracks
 from suite.common.console import Console
+from suite.judging.content import policy_digest
 from suite.judging.evaluate import file_digests
-from suite.judging.flying import (
-    about_policy,
-    custom_tracks,
-    default_policy,
-    load_flier,
-    trial_list,
-)
+from suite.judging.flying import custom_tracks, default_policy, load_flier, trial_list
 from suite.judging.manner import manners
 from suite.judging.requests import Evaluation
 from tracks.input.ranges import check_ranges, shown
@@ -130,7 +125,7 @@ def fly_again(
     vehicle = load_vehicle(evaluation.vehicle)
     tracks = custom_tracks(parse_tracks(evaluation.track))
     if judged is not None:
-        digests = {"policy": about_policy(name, flier)["sha256"], **file_digests(vehicle, tracks)}
+        digests = {"policy": policy_digest(name), **file_digests(vehicle, tracks)}
         _refuse_changed({"policy": name, "vehicle": evaluation.vehicle}, digests, judged)
     flights: dict[TrialSpec, Flight] = {}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from suite.train.presets import (
     with_iterations,
     with_quadrotor,
 )
-from tracks.common.files import to_json
+from tracks.common.files import digest_of
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials, check_ranges
 
 RECORDED_FROM = 100_000
@@ -194,7 +193,7 @@ def resolve(
     if iterations is not None:
         training = with_iterations(training, iterations)
     simulated = load_vehicle(vehicle)
-    digests = {"vehicle": _digest(simulated)}
+    digests = {"vehicle": digest_of(simulated)}
     _check_changes(changes, policy, iterations)
     if not delta and world is None:
         raise ValueError("--no-delta: the loop is about the Delta Action Model; give --world, too")
@@ -216,7 +215,7 @@ def resolve(
                 "vehicle file with an effect more, such as examples/hidden.toml, or another "
                 "simulator, such as rotorpy"
             )
-        digests["world"] = _digest(true)
+        digests["world"] = digest_of(true)
     if policy is not None:
         given = load_policy_checkpoint(checkpoint_folder(policy))
         training = replace(at_rate(training, given.spec.rate_hz), spec=given.spec)
@@ -289,10 +288,6 @@ def parse_world(text: str, vehicle: str) -> tuple[str, str]:
         return OWN[0], text
     world_class(simulator)
     return simulator, flown or vehicle
-
-
-def _digest(value: object) -> str:
-    return hashlib.sha256(to_json(value).encode()).hexdigest()
 
 
 def _check_seeds(config: LoopConfig) -> None:

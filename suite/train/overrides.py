@@ -61,13 +61,18 @@ def _check_heard(config: object, path: str, change: str) -> None:
     """Refuse a setting that another one keeps from doing anything."""
     for name, need in NEEDS.items():
         part, _, field = need.partition(".")
-        if path == name or path.startswith(f"{name}."):
+        if _is_within(path, name):
             value = getattr(getattr(config, part, None), field, None)
             if value is not None and not value:
                 raise ValueError(
                     f"--set {change}: {path} does nothing where {need} is {value!r}; set that as "
                     "well, or leave this out"
                 )
+
+
+def _is_within(path: str, part: str) -> bool:
+    """Say whether a setting's path is that of `part`, or of something below it."""
+    return path == part or path.startswith(f"{part}.")
 
 
 def _check_read(config: object, keys: list[str], change: str) -> None:
@@ -94,7 +99,7 @@ def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = 
     for change in changes:
         path = change.partition("=")[0].strip()
         for mine, words in owned.items():
-            if path == mine or path.startswith(f"{mine}."):
+            if _is_within(path, mine):
                 raise ValueError(f"{option} {shown(change)}: this command sets {path}; {words}")
 
 

@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import errno
 import glob
+import hashlib
 import json
 import math
 import os
@@ -224,6 +225,11 @@ def to_json(value: Any, indent: int | None = None) -> str:
     become null, since JSON has neither.
     """
     return json.dumps(plain(value), indent=indent, allow_nan=False)
+
+
+def digest_of(value: Any) -> str:
+    """Return the SHA-256, 64 hex digits, of `value`, which JSON must be able to hold."""
+    return hashlib.sha256(to_json(value).encode()).hexdigest()
 
 
 def plain(value: Any) -> Any:

@@ -66,10 +66,7 @@ def thickness(triangles: np.ndarray) -> float:
     return float(np.ptp(corners @ axes, axis=0).min())
 
 
-def _check(path: Path, number: int, total: int, part: object) -> None:
-    import trimesh
-
-    assert isinstance(part, trimesh.Trimesh)
+def _check(path: Path, number: int, total: int, part: trimesh.Trimesh) -> None:
     where = f"{path}: part {number} of {total} ({len(part.faces)} triangles)"
     if not part.is_watertight:
         raise ValueError(

@@ -249,8 +249,8 @@ def half_widths95(
     known = float(student.ppf(0.975, noise_freedom or freedom))
     widths = np.sqrt(np.maximum(np.diag(inverse), 0.0)) * known
     widths = np.maximum(widths, by_draws(equations.gradient, freedom))
-    if flight is not None and len(np.unique(flight)) > 2:
-        numbers = np.unique(flight)
+    numbers = [] if flight is None else np.unique(flight)
+    if len(numbers) > 2:
         flights = np.array([equations.gradient[flight == one].sum(axis=0) for one in numbers])
         told = np.array([equations.hessian[flight == one].sum(axis=0) for one in numbers])
         widths = np.maximum(widths, by_draws(flights, len(flights) - 1))

@@ -186,9 +186,7 @@ def enter(vehicle: Vehicle, entries: Iterable[Number]) -> tuple[Vehicle, list[Nu
     for entry in entries:
         held = allowed(vehicle, entry)
         vehicle = put(vehicle, held)
-        gone = (
-            entry.key == DELAY and held.value == [0.0] and (entry.follows or entry.ci95 != [None])
-        )
+        gone = entry.key == DELAY and entry.is_entered and held.value == [0.0]
         if not gone:
             numbers.append(held)
         for k, span in enumerate(entry.ci95):
@@ -217,7 +215,7 @@ def allowed(vehicle: Vehicle, entry: Number) -> Number:
 
 def put(vehicle: Vehicle, entry: Number) -> Vehicle:
     """Return the vehicle with what was told of an `allowed` entry; the rest of it stays."""
-    if all(span is None for span in entry.ci95) and not entry.follows:
+    if not entry.is_entered:
         return vehicle
     changed = tuple(entry.value) if len(entry.value) > 1 else entry.value[0]
     table, _, key = entry.key.rpartition(".")

@@ -286,7 +286,7 @@ class _Start:
         kept: dict[str, Number] = {}
         for entry in entries:
             # What a later fit tells is told better: it sees the rotors themselves.
-            if entry.key not in kept or any(span is not None for span in entry.ci95):
+            if entry.key not in kept or entry.is_told:
                 kept[entry.key] = entry
         vehicle, numbers, notes = enter(self.start, kept.values())
         if "torque" in self.fitted and self.drive != "rates":

@@ -22,6 +22,16 @@ class Number(NamedTuple):
     follows: bool = False
     """Not told and in the file all the same: a sum was told, and this is what the rest leaves."""
 
+    @property
+    def is_told(self) -> bool:
+        """Whether flights tell any component."""
+        return any(span is not None for span in self.ci95)
+
+    @property
+    def is_entered(self) -> bool:
+        """Whether the file has it from these flights."""
+        return self.is_told or self.follows
+
 
 Derived = Callable[[Mapping[str, float]], np.ndarray]
 """Values of a file's entry from the fit's numbers."""
@@ -74,7 +84,7 @@ def as_json(numbers: Sequence[Number]) -> dict[str, Any]:
     """Return the told entries for JSON: a plain value where there is one component."""
     found = {}
     for entry in numbers:
-        if all(span is None for span in entry.ci95):
+        if not entry.is_told:
             continue
         one = len(entry.value) == 1
         spans = [None if span is None else list(span) for span in entry.ci95]

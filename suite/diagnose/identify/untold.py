@@ -44,7 +44,7 @@ def untold(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[
     names = dict.fromkeys(name for found in fitted.values() for name in found.untold)
     lines = [WHY[name] for name in names if name not in seen and name in WHY]
     late = [told(found)["late"] for found in fitted.values() if found.has("late")]
-    if late and entries[DELAY].ci95 == [None]:
+    if late and not entries[DELAY].is_told:
         rest = max(entries[DELAY].value[0], 0.0)
         lines.append(
             f"command_delay: only that it and the rotors' lag make {late[-1]:.3g} s together; of "

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from suite.common.provenance import machine, package_versions
-from tracks.common.files import to_json
+from tracks.common.files import digest_of
 from tracks.common.registry import added_entries
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -29,7 +29,7 @@ LOOP_ROOMS = (
 
 def digest(value: Any) -> str:
     """Return 16 hex digits that stand for `value`, which JSON must be able to hold."""
-    return hashlib.sha256(to_json(value).encode()).hexdigest()[:16]
+    return digest_of(value)[:16]
 
 
 @functools.cache

@@ -29,15 +29,19 @@ def export(
         ValueError: where the policy is not ours, a format or type is unknown, or another policy's
             export would be written over.
     """
-    from policies.formats.export import check_formats, export_policy, exported_checkpoint
+    from policies.formats.export import (
+        check_formats,
+        export_policy,
+        exported_checkpoint,
+        main_file,
+    )
     from policies.native import native_policy
 
     check_formats(formats, dtype)
     if "c" in formats:
         check_no_input(out / CARD, [shipped.locate(policy) / CARD], "--out")
     name, checkpoint = exported_checkpoint(policy)
-    files = {"torch": f"{name}.pt2", "onnx": f"{name}.onnx", "c": "policy.c"}
-    _claim(policy, out, [files[wanted] for wanted in formats], checkpoint.seed)
+    _claim(policy, out, [main_file(name, wanted) for wanted in formats], checkpoint.seed)
     observed = None
     if dtype == "int8":
         console.note("flying 10 random tracks to measure the activations")

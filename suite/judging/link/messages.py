@@ -147,22 +147,18 @@ class Wire:
 
     def speaks(self, datagram: bytes) -> bool:
         """Say whether a datagram is of whom this end listens to."""
-        parser = self._dialect.MAVLink(None)
-        parser.robust_parsing = True
+        messages, _ = self._parsed(datagram)
         return any(
             message.get_type() != "BAD_DATA" and message.get_srcSystem() == self._other
-            for message in parser.parse_buffer(datagram) or []
+            for message in messages
         )
 
     def decoded(self, datagrams: Iterable[bytes]) -> list[Message]:
         """Return what arrived, in order."""
         found: list[Message] = []
         for datagram in datagrams:
-            # A parser of its own for each: what is cut off must not swallow what comes next.
-            parser = self._dialect.MAVLink(None)
-            parser.robust_parsing = True
-            messages = parser.parse_buffer(datagram) or []
-            self.broken += parser.buf_len() > 0
+            messages, cut_off = self._parsed(datagram)
+            self.broken += cut_off
             for message in messages:
                 if message.get_type() == "BAD_DATA":
                     self.broken += 1
@@ -172,6 +168,13 @@ class Wire:
                     with np.errstate(invalid="ignore"):  # the watchdog finds infinities
                         found += self._ours(message)
         return found
+
+    def _parsed(self, datagram: bytes) -> tuple[list[Any], bool]:
+        """Return a datagram's messages, and whether its end is cut off."""
+        # A parser of its own for each: what is cut off must not swallow what comes next.
+        parser = self._dialect.MAVLink(None)
+        parser.robust_parsing = True
+        return parser.parse_buffer(datagram) or [], parser.buf_len() > 0
 
     def _ours(self, message: Any) -> list[Message]:
         kind = message.get_type()

@@ -124,8 +124,9 @@ def parted(
     Raises:
         ValueError: for a lone flight that is too short to part.
     """
-    if len(flights.names) > 1:
-        inside = [k for k in range(len(flights.names)) if k not in held]
+    count = len(flights.names)
+    if count > 1:
+        inside = [k for k in range(count) if k not in held]
         return (
             {name: [part[k] for k in inside] for name, part in flights.smoothed.items()},
             {name: [part[k] for k in held] for name, part in flights.smoothed.items()},
@@ -141,8 +142,9 @@ def parted(
         for part, chosen in ((first, early), (last, ~early)):
             some = smoothed(view, _only(rows, chosen), limits)
             if not len(some.form.middle_s):
-                name = "".join(flights.names)
-                raise ValueError(f"{name}: too short to hold a part of it out; fly longer")
+                raise ValueError(
+                    f"{flights.names[0]}: too short to hold a part of it out; fly longer"
+                )
             part[view.name] = [some._replace(credible=credible)]
     return first, last
 

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
+from eval.importers.rows import nearest
+
 
 class WeakForm(NamedTuple):
     """M bumps over the N rows of a flight."""
@@ -63,9 +65,8 @@ def weak_form(time_s: np.ndarray, good: np.ndarray, width_s: float, hole_s: floa
 
     share, weight = np.concatenate(shares), 0.5 * np.concatenate(spans)
     centres = np.array(kept)
-    after = np.clip(np.searchsorted(time_s, centres), 1, len(time_s) - 1)
-    nearest = after - (centres - time_s[after - 1] <= time_s[after] - centres)
-    return WeakForm(centres, nearest, matrix(-share, share), matrix(weight, weight))
+    middle_row = nearest(time_s, centres)
+    return WeakForm(centres, middle_row, matrix(-share, share), matrix(weight, weight))
 
 
 LEAST_ROWS = 4
