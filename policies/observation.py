@@ -29,6 +29,8 @@ class View(NamedTuple):
     """(..., 3) centre of the gate after it, or of the last gate where there is none [m]."""
     axis_w: Any
     """(..., 3) unit vector along which the next gate is flown through."""
+    second_axis_w: Any
+    """(..., 3) that of the gate of `second_w`."""
     depth_m: Any = None
     """(..., H, W) planar depth, clipped to the camera's range [m]; None without a camera."""
 
@@ -48,13 +50,14 @@ def view_of(
     pos_w: Array, rot_w: Array, vel_w: Array, gate: Gates, after: Gates, depth_m: Array | None
 ) -> View:
     """Return the view (N, ...) of drones that fly to `gate` and then `after`, one gate a row."""
-    axis_w = gate.rot_w[..., 0]
-    return View(pos_w, rot_w, vel_w, gate.center_w, after.center_w, axis_w, depth_m)
+    axes_w = gate.rot_w[..., 0], after.rot_w[..., 0]
+    return View(pos_w, rot_w, vel_w, gate.center_w, after.center_w, *axes_w, depth_m)
 
 
 EXTRA_VECTORS: dict[str, Callable[[View], Array]] = {
     "second_gate": lambda view: to_local(view.rot_w, view.second_w - view.pos_w),
     "gate_axis": lambda view: to_local(view.rot_w, view.axis_w),
+    "second_axis": lambda view: to_local(view.rot_w, view.second_axis_w),
 }
 """Key of a spec -> the three numbers, (..., 3) in body axes, that it adds to the state."""
 

@@ -1,7 +1,7 @@
 """What a policy expects of the world: its rate, its camera and how its inputs are scaled.
 
 The observation is the paper's (Su et al. 2026, Eq. 1), 12 numbers and a depth image, unless a
-policy asks for the gate after the next one, for the next gate's flight direction or for how fast it
+policy asks for the gate after the next one, for the flight direction of either or for how fast it
 is to fly as well.
 """
 
@@ -15,7 +15,7 @@ from tracks.input.ranges import Range, check_ranges
 
 STATE_SIZE = 12
 """Numbers in the paper's state: v_b (3), third row of R (3), gate in body axes (3), u (3)."""
-EXTRAS = {"second_gate": 3, "gate_axis": 3, "speed_input": 1}
+EXTRAS = {"second_gate": 3, "gate_axis": 3, "second_axis": 3, "speed_input": 1}
 """Key of a spec -> how many numbers it adds to the state, in this order."""
 ACTION_SIZE = 3
 """Numbers in an action: wanted net acceleration in current body axes [m/s^2]."""
@@ -58,6 +58,8 @@ class PolicySpec:
     """Whether the state goes on with the centre of the gate after the next one, in body axes."""
     gate_axis: bool = False
     """Whether the state goes on with the next gate's flight direction, in body axes."""
+    second_axis: bool = False
+    """Whether the state goes on with that of the gate after it, in body axes."""
     speed_input: bool = False
     """Whether the state ends with how fast to fly, from 0 (careful) to 1 (a race)."""
     speed: Annotated[float, Range(0.0, 1.0)] = 1.0

@@ -113,7 +113,7 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
     """Return the module of the command `name` and its configuration from `args`.
 
     Raises:
-        ValueError: for an option that is given twice.
+        ValueError: for an option that is given twice, and for a word that belongs to none.
         SystemExit: after --help (code 0), and for options that cannot be read (code 2).
     """
     import tyro
@@ -122,8 +122,30 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
     plain_flags = (tyro.conf.FlagCreatePairsOff,)
     options = command.config_type(args) if hasattr(command, "config_type") else command.Config
     _refuse_twice(args, options)
-    config = tyro.cli(options, prog=f"suite {name}", args=args, config=plain_flags)
+    config, left = tyro.cli(
+        options, prog=f"suite {name}", args=args, config=plain_flags, return_unknown_args=True
+    )
+    if left and not any(word.startswith("-") for word in left):
+        raise _left_over(name, args, left[0])
+    if left:
+        # Once more, and it ends by saying which options were meant.
+        tyro.cli(options, prog=f"suite {name}", args=args, config=plain_flags)
     return command, config
+
+
+def _left_over(name: str, args: Sequence[str], word: str) -> ValueError:
+    """Return the error for a word that belongs to no option, such as the second of two tracks."""
+    before = args[: args.index(word)]
+    last = max((i for i, arg in enumerate(before) if arg.startswith("--")), default=None)
+    hint = f"suite {name} --help says what it takes"
+    if last is None:
+        return ValueError(f"{word!r} belongs to no option; {hint}")
+    option, *values = before[last].split("=", 1) + list(before[last + 1 :])
+    joined = ",".join([*values, word])
+    return ValueError(
+        f"{word!r} after {option} is one word too many; an option that takes several values "
+        f"may want them joined, as in {option} {joined}; {hint}"
+    )
 
 
 def _refuse_twice(args: Sequence[str], options: Any) -> None:

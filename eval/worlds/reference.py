@@ -107,11 +107,12 @@ def fly_trial(
         # Ask the policy when it is its time.
         gate_w = gates.center_w[None, passed]
         if step == np.rint(decisions * (1 / (spec.rate_hz * dt))):
-            second_w = gates.center_w[None, min(passed + 1, count - 1)]
+            after = min(passed + 1, count - 1)
+            second_w = gates.center_w[None, after]
             depth = eye.image(model, data, pos_w, motion.rot_w[0])
-            axis_w = gates.rot_w[None, passed, :, 0]
+            axes_w = (gates.rot_w[None, index, :, 0] for index in (passed, after))
             seen = View(
-                motion.pos_w, motion.rot_w, motion.vel_w, gate_w, second_w, axis_w, depth[None]
+                motion.pos_w, motion.rot_w, motion.vel_w, gate_w, second_w, *axes_w, depth[None]
             )
             if sensors:
                 wanted = np.array([True])

@@ -8,7 +8,7 @@ from typing import Any
 from policies.block_policy import BLOCK
 from policies.errors import PolicyError
 from policies.formats.embedded_spec import KEY
-from policies.spec import PolicySpec
+from policies.spec import EXTRAS, PolicySpec
 
 INPUTS = ("state", "image", "hidden")
 """Names of a program's inputs, in order; a policy without memory leaves the last out."""
@@ -58,8 +58,8 @@ def check_inputs(
         if not free:
             raise PolicyError(
                 f"{where}: input {name!r} has shape {shapes[name]}, expected (batch, "
-                f"{', '.join(map(str, expected))}); the camera's size, second_gate, gate_axis "
-                f"and speed_input stand in {KEY}"
+                f"{', '.join(map(str, expected))}); the camera's size, {', '.join(EXTRAS)} "
+                f"stand in {KEY}"
             )
     return block, tuple(hidden)
 

@@ -94,8 +94,9 @@ def view_in(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
     """Return what drones in `state` that have passed `target` (B,) gates observe, but the image."""
     gates = worlds.scene.gates
     gate, target_w = target_gate(gates, target)
-    _, second_w = target_gate(gates, target, ahead=1)
-    return View(state.pos_w, state.rot_w, state.vel_w, target_w, second_w, gate.rot_w[:, :, 0])
+    after, second_w = target_gate(gates, target, ahead=1)
+    axes_w = gate.rot_w[:, :, 0], after.rot_w[:, :, 0]
+    return View(state.pos_w, state.rot_w, state.vel_w, target_w, second_w, *axes_w)
 
 
 def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:

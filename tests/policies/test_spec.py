@@ -12,5 +12,5 @@ BOTH = replace(SECOND, gate_axis=True)
 
 def test_the_paper_sees_one_gate_unless_asked():
     assert not PolicySpec().second_gate and PolicySpec().state_size == 12
-    assert not PolicySpec().gate_axis
+    assert not PolicySpec().gate_axis and not PolicySpec().second_axis
     assert SECOND.state_size == AXIS.state_size == 15 and BOTH.state_size == 18

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -117,6 +118,19 @@ def test_an_unknown_command_gets_the_nearest_and_code_2(capsys):
 def test_an_unknown_option_is_code_2(command, capsys):
     assert cli.main(["probe", "--sede", "3"]) == 2
     assert "--seed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("--track zigzag circular", r"'circular' after --track .* --track zigzag,circular;"),
+        ("--difficulty=0 3", r"'3' after --difficulty .* --difficulty 0,3;"),
+        ("runs/one", r"'runs/one' belongs to no option; suite eval --help"),
+    ],
+)
+def test_a_word_too_many_is_told_where_it_may_belong(capsys, line, words):
+    assert cli.main(["eval", *line.split()]) == 2
+    assert re.search(words, capsys.readouterr().err)
 
 
 def test_no_command_is_code_2_and_shows_the_commands(capsys):

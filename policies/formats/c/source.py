@@ -30,6 +30,7 @@ _OBSERVATION = (
 _EXTRA = {
     "second_gate": ("to the centre of the gate after the next (or the last), in body axes", "m"),
     "gate_axis": ("the next gate's flight direction, a unit vector in body axes", "1"),
+    "second_axis": ("that of the gate after it (or of the last)", "1"),
     "speed_input": ("how fast to fly, 0 (careful) to 1", "1"),
 }
 

@@ -289,11 +289,11 @@ def state_noise(config: FleetConfig, spec: PolicySpec) -> jax.Array:
     """Return the standard deviation (state_size,) of the noise on each number of the state.
 
     Velocity, up, gate and the last action, which is known; then the extras of `spec`: a second
-    gate, a gate's axis, and how fast to fly, which is known.
+    gate, both gates' axes, and how fast to fly, which is known.
     """
     vel, axis, gate = config.vel_noise, config.axis_noise, config.gate_noise_m
     triples = [vel, axis, gate, 0.0]
-    triples += [gate] * spec.second_gate + [axis] * spec.gate_axis
+    triples += [gate] * spec.second_gate + [axis] * (spec.gate_axis + spec.second_axis)
     known = [0.0] * (spec.state_size - 3 * len(triples))
     return jnp.concatenate([jnp.repeat(jnp.asarray(triples), 3), jnp.asarray(known)])
 

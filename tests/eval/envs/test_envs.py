@@ -17,6 +17,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.pilots import Pursuit
+from tracks.families import make_track
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of the renderers that dm_control looks for
@@ -143,9 +144,14 @@ def test_an_action_beyond_the_space_is_its_nearest_within():
 
 
 def test_the_second_gate_and_the_direction_are_shown_where_asked_for():
-    env = RaceEnv("zigzag", 0, 1, spec=PolicySpec(second_gate=True, gate_axis=True))
+    spec = PolicySpec(second_gate=True, gate_axis=True, second_axis=True)
+    env = RaceEnv("zigzag", 0, 1, spec=spec)
     seen, _ = env.reset(seed=0)
     state = seen["state"]
-    assert env.observation_space.contains(seen) and state.shape == (18,)
+    assert env.observation_space.contains(seen) and state.shape == (21,)
     assert np.linalg.norm(state[12:15] - state[6:9]) > 3.0
-    np.testing.assert_allclose(state[15:], [1, 0, 0], atol=0.3)  # at rest before the first gate
+    np.testing.assert_allclose(state[15:18], [1, 0, 0], atol=0.3)  # at rest before the first gate
+    track = make_track("zigzag", 0, 1)
+    assert state[18:] @ state[15:18] == pytest.approx(
+        track.scene.gates.rot_w[1, :, 0] @ track.scene.gates.rot_w[0, :, 0], abs=1e-6
+    )

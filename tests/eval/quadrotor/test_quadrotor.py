@@ -65,13 +65,13 @@ FUNCTIONS = {
     attractive_field: ("*batch 3, *batch 3", "*batch 3"),
     lambda pos_w, rot_w, vel_w, gate_w, second_w, axis_w, last_b: (
         observe(
-            PolicySpec(second_gate=True, gate_axis=True),
-            View(pos_w, rot_w, vel_w, gate_w, second_w, axis_w),
+            PolicySpec(second_gate=True, gate_axis=True, second_axis=True),
+            View(pos_w, rot_w, vel_w, gate_w, second_w, axis_w, axis_w),
             last_b,
         ).state
     ): (
         "*batch 3, *batch 3 3, *batch 3, *batch 3, *batch 3, *batch 3, *batch 3",
-        "*batch 18",
+        "*batch 21",
     ),
     lambda depth_m: encode_depth(DepthEncoding(), depth_m, 10.0): (
         "*batch height width",

@@ -19,6 +19,7 @@ from policies.spec import PolicySpec
 from tests.support.courses import straight
 from tests.support.pilots import Pursuit, Scripted, Steady
 from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tracks.families import make_track
 from tracks.geometry.camera import Camera
 
 VEHICLE = load_vehicle(Path(mujoco_world.__file__).parent.parent / "vehicles" / "reference.toml")
@@ -206,12 +207,28 @@ def test_the_second_gate_and_the_direction_are_those_of_a_line_of_gates(world):
     np.testing.assert_allclose(np.linalg.norm(axis, axis=-1), 1.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("more", [{"second_gate": True}, {"gate_axis": True}])
+@pytest.mark.parametrize(
+    "more", [{"second_gate": True}, {"gate_axis": True}, {"second_axis": True}]
+)
 def test_each_comes_alone_as_well(more):
     states = shown("reference", **more)
     assert states.shape[1] == 15
     length = np.linalg.norm(states[0, 12:])
     assert length == pytest.approx(DISTANCES[1] if "second_gate" in more else 1.0, abs=0.6)
+
+
+@pytest.mark.parametrize(
+    "world", ["mujoco", "reference", pytest.param("mjx", marks=pytest.mark.slow)]
+)
+def test_the_direction_of_the_gate_after_is_that_gates(world):
+    """Whatever the body's axes are, both directions make the same angle in them."""
+    camera = Camera(width=20, height=20)
+    policy = Witness(spec=PolicySpec(camera=camera, gate_axis=True, second_axis=True))
+    options = JudgeOptions(slots=1, rules=Rules(time_limit_s=0.1))
+    fly(policy, [TrialSpec("zigzag", 9, 1)], VEHICLE, world, options)
+    axis, after = make_track("zigzag", 9, 1).scene.gates.rot_w[:2, :, 0]
+    assert axis @ after < 0.95
+    assert policy.seen[0][12:15] @ policy.seen[0][15:] == pytest.approx(axis @ after, abs=1e-5)
 
 
 @pytest.mark.parametrize("world", ["mujoco", "reference"])

@@ -92,7 +92,7 @@ def test_exporting_again_replaces_the_file(tmp_path, checkpoint):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"second_gate": True}, {"second_gate": True, "gate_axis": True}, {"channels": (6, 64, 32)}],
+    [{"second_gate": True}, {"gate_axis": True, "second_axis": True}, {"channels": (6, 64, 32)}],
 )
 def test_policies_of_other_inputs_and_sizes_are_one_policy_as_well(tmp_path, changes):
     spec = replace(SPEC, **changes)

@@ -43,5 +43,7 @@ def test_what_is_no_observation_is_refused(shapes, said):
 def test_the_spec_sets_the_states_size():
     wider = PolicySpec(second_gate=True, gate_axis=True)
     assert check_inputs({"state": ("batch", 18), "image": IMAGE}, wider, "here") == (64, (0,))
-    with pytest.raises(PolicyError, match=r"expected \(batch, 18\); .* second_gate, gate_axis and"):
+    with pytest.raises(
+        PolicyError, match=r"expected \(batch, 18\); .* second_gate, gate_axis, second_axis, speed"
+    ):
         check_inputs({"state": STATE, "image": IMAGE}, wider, "here")

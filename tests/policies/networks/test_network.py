@@ -63,6 +63,8 @@ def test_one_action_for_all_is_learned_without_saturating_the_memory(seed):
         (SECOND, BOTH, slice(0, 15)),
         (AXIS, BOTH, np.r_[0:12, 15:18]),
         (AXIS, PACED, slice(0, 15)),
+        (AXIS, replace(PACED, second_axis=True), slice(0, 15)),
+        (PACED, replace(PACED, second_axis=True), np.r_[0:15, 18]),
         (PACED, replace(PACED, second_gate=True, speed=1.0), np.r_[0:12, 15:19]),
     ],
 )

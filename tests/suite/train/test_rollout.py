@@ -261,11 +261,12 @@ def test_the_step_before_is_progress_to_the_gate():
 
 
 def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
-    """The second gate's centre, the last one's where none comes after, and the next's direction."""
+    """The second gate's centre, the last one's where none comes after, and both directions."""
     seen = []
 
     def spy(spec, view, action_b, speed):
-        jax.debug.callback(lambda *shown: seen.append(shown), view.second_w, view.axis_w)
+        shown = view.second_w, view.axis_w, view.second_axis_w
+        jax.debug.callback(lambda *shown: seen.append(shown), *shown)
         return observe(spec, view, action_b, speed)
 
     monkeypatch.setattr(rollout, "observe", spy)
@@ -283,8 +284,8 @@ def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
     expected = [center[0, 1], center[1, 4], center[2, 7]]
     np.testing.assert_allclose(seen[0][0], expected, atol=1e-6)
     rot = worlds.scene.gates.rot_w
-    expected = [rot[0, 0, :, 0], rot[1, 3, :, 0], rot[2, 7, :, 0]]
-    np.testing.assert_allclose(seen[0][1], expected, atol=1e-6)
+    for found, numbers in zip(seen[0][1:], ([0, 3, 7], [1, 4, 7]), strict=True):
+        np.testing.assert_allclose(found, rot[range(3), numbers, :, 0], atol=1e-6)
 
 
 def test_a_state_on_its_way_at_the_start_is_that_of_the_start():

@@ -17,6 +17,7 @@ ODD = replace(
     hidden_size=50,
     channels=(6, 96, 32),
     gate_axis=True,
+    second_axis=True,
 )
 """Sizes that fill no block and no group of four pixels."""
 

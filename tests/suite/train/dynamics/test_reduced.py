@@ -214,9 +214,9 @@ def test_a_late_sensor_shows_where_the_body_was():
 
 def test_noise_has_a_size_for_every_number_of_the_state():
     config = FleetConfig(vel_noise=1.0, axis_noise=2.0, gate_noise_m=3.0)
-    spec = PolicySpec(second_gate=True, gate_axis=True)
+    spec = PolicySpec(second_gate=True, gate_axis=True, second_axis=True)
     found = reduced.state_noise(config, spec)
-    np.testing.assert_array_equal(found[::3], [1, 2, 3, 0, 3, 2])
+    np.testing.assert_array_equal(found[::3], [1, 2, 3, 0, 3, 2, 2])
     assert found.shape == (spec.state_size,)
 
 
