@@ -54,6 +54,12 @@ def _wrong(name: str, effect: Any) -> str | None:
         return "a memory with only one of `start` and `carry`; it needs both"
     if not effect.in_flight and any(callable(p.neutral) for p in effect.parameters):
         return "a fault of the log; its neutral values must be numbers"
+    fields, names = getattr(effect.values, "_fields", ()), tuple(p.name for p in effect.parameters)
+    if fields != names:
+        return (
+            f"its values ({effect.values.__name__}) have the fields {list(fields)} and its "
+            f"parameters the names {list(names)}; both must be the same, in the same order"
+        )
     return None
 
 

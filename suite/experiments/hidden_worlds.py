@@ -42,14 +42,14 @@ class Hidden(NamedTuple):
     """A world that hides something."""
 
     words: str
-    """What, for people."""
+    """What, for people; `{share}` is what the added mass is of the vehicle's [%]."""
     effects: Mapping[str, Mapping[str, Any]]
     """Parameters by effect, added to the vehicle that the simulation knows."""
 
 
 WORLDS: dict[str, Hidden] = {
     "heavy battery": Hidden(
-        "0.4 kg more, 53 % of the mass, and the centre of mass 8 mm further back",
+        "0.4 kg more, {share} % of the mass, and the centre of mass 8 mm further back",
         {"mass_offset": {"offset": 0.4}, "com_offset": {"offset": (-0.008, 0.0, 0.0)}},
     ),
     "moved centre of mass": Hidden(
@@ -148,7 +148,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
             jobs.append(Job(Asked(config, name, seed, simulated), folder, start))
     loop_of(jobs[0])
     came = all_done(run_one, jobs, place.workers, console, "loops in hidden worlds")
-    rows, words = pages.rows_of(came), {name: hidden.words for name, hidden in worlds.items()}
+    rows, words = pages.rows_of(came), {n: words_of(simulated, h) for n, h in worlds.items()}
     report = Report(
         title="Hidden worlds: what gives success back",
         lead=pages.lead(rows),
@@ -191,6 +191,12 @@ def world_of(simulated: Vehicle, hidden: Hidden) -> Vehicle:
     return with_effects(simulated, values)
 
 
+def words_of(simulated: Vehicle, hidden: Hidden) -> str:
+    """Return what is hidden there from who knows `simulated`, for people."""
+    more = hidden.effects.get("mass_offset", {}).get("offset", 0.0)
+    return hidden.words.format(share=f"{100 * more / simulated.mass:.0f}")
+
+
 def loop_of(job: Job) -> HiddenLoopConfig:
     """Return the loop of a job's `Asked`, having written its vehicles' files.
 
@@ -198,8 +204,14 @@ def loop_of(job: Job) -> HiddenLoopConfig:
         ValueError: for an option that cannot be used.
     """
     config, name, seed, simulated = job.task
-    path, vehicle = job.folder / "world.toml", config.vehicle
-    save_vehicle(world_of(simulated, WORLDS[name]), path, WORLDS[name].words)
+    path, vehicle, hidden = job.folder / "world.toml", config.vehicle, WORLDS[name]
+    try:
+        save_vehicle(world_of(simulated, hidden), path, words_of(simulated, hidden))
+    except ValueError as error:
+        raise ValueError(
+            f"hidden world {name!r} cannot be made of --vehicle {vehicle}: {error}; leave it "
+            "out by naming others with --only, or give another vehicle"
+        ) from error
     if vehicle not in shipped_vehicles():
         vehicle = str(job.folder / "vehicle.toml")
         save_vehicle(simulated, vehicle, "what the simulation knows")

@@ -28,8 +28,8 @@ MEANINGS = (
 )
 OF_EFFECTS = (
     "Each effect alone, added to the vehicle at the upper end of its usual size (`suite effects "
-    "NAME`); where the vehicle has more of it already, it keeps that. The autopilot and the policy "
-    "do not know."
+    "NAME`); where the vehicle has more of it already, it keeps that, and where its file may not "
+    "hold so much, it has the most that it may. The autopilot and the policy do not know."
 )
 OF_SWEEPS = (
     "The sensors' noise is in the policy's observation only; the autopilot below it sees "
@@ -85,7 +85,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
             f"{options.judged_seeds(config)}: {len(trials)} trials a condition, the same in all",
             "vehicle": config.vehicle,
         },
-        sections=[*_of_effects(effects), *_of_sweeps(grown, effects[0])],
+        sections=[*_of_effects(effects), *_of_sweeps(grown, effects[0], bool(alone))],
     )
     tested = [*effects, *(point for points in grown.values() for point in points)]
     return report, {"conditions": [disturbed.tested_numbers(entry, effects[0]) for entry in tested]}
@@ -109,7 +109,7 @@ def _of_effects(effects: Sequence[Tested]) -> list[Section]:
     return [Section("Every effect at its usual size", parts)]
 
 
-def _of_sweeps(grown: Grown, base: Tested) -> list[Section]:
+def _of_sweeps(grown: Grown, base: Tested, explained: bool) -> list[Section]:
     from suite.experiments.pages.charts import sweeps_chart
 
     if not grown:
@@ -119,7 +119,9 @@ def _of_sweeps(grown: Grown, base: Tested) -> list[Section]:
         "vehicle as it is."
     )
     grids = [condition_grid(points, base, (s.axis,), s.name) for s, points in grown.items()]
-    parts = [Picture(sweeps_chart(grown), caption), *grids, OF_SWEEPS]
+    # Said once a page, and above where there are effects.
+    words = [OF_SWEEPS] if explained else [MEANINGS, OF_SWEEPS]
+    parts = [Picture(sweeps_chart(grown), caption), *grids, *words]
     return [Section("Growing disturbances", parts)]
 
 

@@ -101,7 +101,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
             f"{100 * high:.1f}{spread}. The median is {found.median}."
         ),
         facts={
-            "recipe": "given policies" if config.policies else options.recipe_words(config),
+            "recipe": "given policies" if config.policies else _recipe(config),
             **{
                 name: f"SHA-256 {policy_digest(path)[:16]}, {_trained(locate(path))}"
                 for name, path in policies.items()
@@ -112,6 +112,12 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         sections=[Section("Success and speed by training seed", parts), every_cell(everything)],
     )
     return report, {"spread": found, "cells": everything}
+
+
+def _recipe(config: Config) -> str:
+    """Return what was trained, in words."""
+    steps = options.asked_recipe(config).optimizer.iterations
+    return f"{options.recipe_words(config)}, {steps} gradient steps"
 
 
 def _trained(policy: Path) -> str:

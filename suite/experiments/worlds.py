@@ -13,7 +13,7 @@ from eval.judging.statistics import paired_success, wilson
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import REFERENCE, differences, world_class
+from eval.worlds import REFERENCE, WORLDS, differences, world_class
 from eval.worlds.trial import TrialResult
 from policies import shipped
 from suite.common.console import Console
@@ -93,7 +93,11 @@ def columns(config: Config) -> list[Column]:
     for name in config.world or (ROUNDING, "rotorpy"):
         world = world_class(name)
         if name in (BASE, REFERENCE):
-            raise ValueError(f"--world {name}: flies as {BASE} does, with which others are paired")
+            others = ", ".join(known for known in WORLDS if known not in (BASE, REFERENCE))
+            raise ValueError(
+                f"--world {name}: flies as {BASE} does, with which others are paired; give one of "
+                + others
+            )
         if hasattr(world, "nearest"):
             label = f"{BASE}, the air of {name}"
             found.append(Column(label, BASE, world.nearest(vehicle), name))

@@ -3,10 +3,11 @@
     P = 0.032029 p e,  I += 0.244381 i e dt,  D = -0.000529 d d(rate)/dt,
     F = 0.00013754 f d(setpoint)/dt;  motor = throttle + sum / 1000
 
-Gyro, derivative and set point pass their first-order filters; the integral is relaxed by fast set
-points and near full motors, and limited; so is the sum. Where the motors' range is more than 1 it
-is scaled to 1, and the throttle is moved so that all fit (airmode). Left out: dynamic notches and
-RPM filters (which meet vibration that is not simulated), D max, anti gravity, thrust linearisation.
+where yaw's i counts 2.5 times, as in the firmware without `use_integrated_yaw`. Gyro, derivative
+and set point pass their first-order filters; the integral is relaxed by fast set points and near
+full motors, and limited; so is the sum. Where the motors' range is more than 1 it is scaled to 1,
+and the throttle is moved so that all fit (airmode). Left out: dynamic notches and RPM filters
+(which meet vibration that is not simulated), D max, anti gravity, thrust linearisation.
 Source: Betaflight's documentation and wiki (PID tuning guides of 4.2 to 4.5, CLI reference).
 """
 
@@ -26,6 +27,8 @@ GROUP = ""
 DEG = float(180.0 / np.pi)
 P_UNIT, I_UNIT, D_UNIT, F_UNIT = 0.032029, 0.244381, 0.000529, 0.00013754
 """What one unit of p, i, d and f is, in thousandths of a motor's range per deg/s and so on."""
+YAW_I = 2.5
+"""What the firmware multiplies yaw's i by."""
 SUM = 1000.0
 LIMITS = {
     "iterm_windup": (0.0, 100.0),
@@ -64,7 +67,7 @@ class Settings:
     """Third-order filter of the set point [Hz]."""
     iterm_limit: float = 400.0
     iterm_windup: float = 85.0
-    """Share of the motors' range above which the integral slows down [%]."""
+    """Share of the motors' range above which the integral slows down [%]; 100: it does not."""
     iterm_relax_cutoff: float = 15.0
     """[Hz]; 0: the integral is not relaxed."""
     pidsum_limit: float = 500.0
@@ -135,7 +138,7 @@ def gains(settings: Settings, layout: Layout) -> Gains:
     relaxes = 1.0 if s.iterm_relax_cutoff > 0.0 else 0.0
     return Gains(
         p=each("p", P_UNIT),
-        i=each("i", I_UNIT),
+        i=each("i", I_UNIT) * (1.0, 1.0, YAW_I),
         d=each("d", D_UNIT),
         f=each("f", F_UNIT),
         limit=np.array([s.pidsum_limit, s.pidsum_limit, s.pidsum_limit_yaw]),
@@ -184,7 +187,9 @@ def look(
 
     slow = pt1(pick(fresh, wanted, state.slow), wanted, gain.relax_hz, dt)
     relax = xp.maximum(1.0 - gain.relaxed * xp.abs(wanted - slow) / RELAXED, 0.0)
-    room = xp.clip((1.0 - state.span) / xp.maximum(1.0 - gain.windup, 1e-6), 0.0, 1.0)
+    slows = gain.windup < 1.0
+    room = (1.0 - state.span) / xp.where(slows, 1.0 - gain.windup, 1.0)
+    room = xp.where(slows, xp.clip(room, 0.0, 1.0), 1.0)
     added = state.integral + gain.i * relax * room[..., None] * error * dt
     integral = xp.clip(added, -gain.i_limit, gain.i_limit)
 

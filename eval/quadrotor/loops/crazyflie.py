@@ -3,7 +3,8 @@
     out = kp e + ki integral(e) + kd (-d rate/dt) + kff setpoint, within 16 bits
     motor = thrust -+ roll/2 -+ pitch/2 -+ yaw, all in 1/65535 of a motor's full command
 
-Where a motor would pass its full command all are lowered alike: attitude before thrust. Source:
+Where a motor would pass its full command all are lowered alike: attitude before thrust. Left out:
+that the firmware stops all motors and forgets its integrals at a thrust of exactly 0. Source:
 Bitcraze's documentation of the firmware ("Controllers", "PID tuning", parameter groups `pid_rate`),
 its values for the Crazyflie 2.x.
 """
@@ -45,7 +46,7 @@ class Settings:
     yaw_kd: float = 0.0
     yaw_kff: float = 0.0
     roll_ilimit: float = 33.3
-    """Largest integral of the error [deg]; a constant of the firmware."""
+    """Largest integral of the error [deg], 0: no limit; a constant of the firmware."""
     pitch_ilimit: float = 33.3
     yaw_ilimit: float = 166.7
     lpf_cutoff: float = 0.0
@@ -83,8 +84,10 @@ def gains(settings: Settings, layout: Layout) -> Gains:
     def each(key: str) -> np.ndarray:
         return np.array([getattr(settings, f"{axis}_{key}") for axis in ("roll", "pitch", "yaw")])
 
+    limit = each("ilimit")
     return Gains(
-        *(each(key) for key in ("kp", "ki", "kd", "kff", "ilimit")),
+        *(each(key) for key in ("kp", "ki", "kd", "kff")),
+        i_limit=np.where(limit > 0.0, limit, np.inf),
         cutoff_hz=np.asarray(settings.lpf_cutoff),
         layout=layout,
     )

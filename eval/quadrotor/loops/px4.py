@@ -3,11 +3,12 @@
     torque = K (P e + I-term - D accel) + FF setpoint
     I-term += I e (1 - (e / 400 deg/s)^2) dt, within MC_xR_INT_LIM, not further into saturation
 
-`accel` is the slope of the filtered gyro, filtered again; both are second-order low passes. A motor
-command is thrust plus 0.707 of roll and pitch plus yaw; what does not fit is taken off the thrust
-first, then off roll and pitch, then yaw is mixed with 15 % more room at the top and taken off where
-it does not fit, then thrust once more (airmode off). Source: PX4's user guide ("Multicopter PID
-Tuning Guide", "Control Allocation", the parameter reference MC_*, IMU_*, THR_MDL_FAC).
+`accel` is the slope of the gyro behind its second-order low pass, filtered to first order (as in
+PX4's source since 2021; its parameter reference says second). A motor command is thrust plus 0.707
+of roll and pitch plus yaw; what does not fit is taken off the thrust first, then off roll and
+pitch, then yaw is mixed with 15 % more room at the top and taken off where it does not fit, then
+thrust once more (airmode off). Source: PX4's user guide ("Multicopter PID Tuning Guide", "Control
+Allocation", the parameter reference MC_*, IMU_*, THR_MDL_FAC).
 """
 
 from __future__ import annotations
@@ -57,9 +58,9 @@ class Settings:
     MC_YAW_TQ_CUTOFF: float = 0.0
     """First-order filter of the yaw torque [Hz]; 0: off, as before v1.15."""
     IMU_GYRO_CUTOFF: float = 40.0
-    """[Hz]."""
+    """Second-order filter of the gyro [Hz]; 0: off."""
     IMU_DGYRO_CUTOFF: float = 30.0
-    """[Hz]."""
+    """First-order filter of the gyro's slope [Hz]; 0: off."""
     THR_MDL_FAC: float = 0.0
     """Relative thrust is FAC u^2 + (1 - FAC) u of the motor command u."""
 
@@ -78,6 +79,8 @@ class Gains(NamedTuple):
     slope_cutoff_hz: Array
     model: Array
     layout: Layout
+    unmixer: Array
+    """(3, 4) from the motors' relative thrusts to the torque that they give."""
 
 
 class State(NamedTuple):
@@ -91,8 +94,8 @@ class State(NamedTuple):
     """(..., 3) filtered rate of the last look [rad/s]."""
     gyro: Pair
     """(..., 3) of the gyro's filter."""
-    slope: Pair
-    """(..., 3) of the slope's filter."""
+    accel: Array
+    """(..., 3) filtered slope of that rate [rad/s^2]."""
     yaw: Array
     """(..., 1) filtered yaw torque."""
     lost: Array
@@ -116,14 +119,16 @@ def gains(settings: Settings, layout: Layout) -> Gains:
         slope_cutoff_hz=np.asarray(settings.IMU_DGYRO_CUTOFF),
         model=np.asarray(settings.THR_MDL_FAC),
         layout=layout,
+        # Of all four columns: on uneven arms thrust alone would else count as roll or pitch.
+        unmixer=np.linalg.inv(np.stack([np.ones(4), *columns(layout)], axis=-1))[1:],
     )
 
 
 def start(shape: tuple[int, ...], xp: Any) -> State:
     """Return the state before the first look of loops of this batch shape."""
     still = xp.zeros((*shape, 3))
-    pair = Pair(still, still)
-    return State(xp.zeros(shape), still, still, pair, pair, xp.zeros((*shape, 1)), still)
+    gyro = Pair(still, still)
+    return State(xp.zeros(shape), still, still, gyro, still, xp.zeros((*shape, 1)), still)
 
 
 def look(
@@ -141,7 +146,7 @@ def look(
     gyro = Pair(*(pick(state.started, a, b) for a, b in zip(rest, state.gyro, strict=True)))
     gyro, rate = butterworth(gyro, rate_b, gain.gyro_cutoff_hz, dt)
     before = pick(state.started, rate, state.rate)
-    slope, accel = butterworth(state.slope, (rate - before) / dt, gain.slope_cutoff_hz, dt)
+    accel = _alpha(state.accel, (rate - before) / dt, gain.slope_cutoff_hz, dt)
     error = rate_cmd_b - rate
     torque = gain.k * (gain.p * error - gain.d * accel) + state.integral + gain.f * rate_cmd_b
     torque = scale * torque
@@ -152,14 +157,15 @@ def look(
     added = state.integral + share * gain.k * gain.i * further * dt
     integral = xp.clip(added, -gain.i_limit, gain.i_limit)
     asked = torque[..., 2:]
-    yaw = pt1(pick(state.started, asked, state.yaw), asked, gain.yaw_cutoff_hz, dt)
+    yaw = _alpha(pick(state.started, asked, state.yaw), asked, gain.yaw_cutoff_hz, dt)
     torque = xp.concatenate([torque[..., :2], yaw], axis=-1)
     thrust = gain.model * throttle**2 + (1.0 - gain.model) * throttle
-    given = allocate(gain.layout, thrust, torque)
-    lost = torque - turned(gain.layout, given)
+    given = xp.clip(allocate(gain.layout, thrust, torque), 0.0, 1.0)
+    # Of what is left when clipped: with yaw's room the allocation may end below zero.
+    lost = torque - (given[..., None, :] * gain.unmixer).sum(axis=-1)
     lost = xp.where(xp.abs(lost) > SMALL, lost, 0.0)
-    state = State(xp.ones_like(state.started), integral, rate, gyro, slope, yaw, lost)
-    return state, signal(gain.model, xp.clip(given, 0.0, 1.0))
+    state = State(xp.ones_like(state.started), integral, rate, gyro, accel, yaw, lost)
+    return state, signal(gain.model, given)
 
 
 def columns(layout: Layout) -> tuple[Array, Array, Array]:
@@ -181,19 +187,18 @@ def allocate(layout: Layout, thrust: Array, torque: Array) -> Array:
     return _fit(motor, down, 1.0, only_more=True)
 
 
-def turned(layout: Layout, motor: Array) -> Array:
-    """Return the torque (..., 3) that relative motor thrusts (..., 4) give."""
-    xp = motor.__array_namespace__()
-    parts = [(motor * c).sum(axis=-1) / (c * c).sum() for c in columns(layout)]
-    return xp.stack(parts, axis=-1)
-
-
 def signal(model: Array, thrust: Array) -> Array:
     """Return the motor commands that give relative `thrust` (..., 4) from 0 to 1."""
     xp = thrust.__array_namespace__()
     linear = 1.0 - model
     root = xp.sqrt(xp.maximum(linear**2 + 4.0 * model * thrust, SMALL**2))
     return 2.0 * thrust / (linear + root)
+
+
+def _alpha(before: Array, value: Array, cutoff_hz: Array, dt: Array) -> Array:
+    """Return a first-order low pass, which from half the sampling rate on passes all, as PX4's."""
+    xp = value.__array_namespace__()
+    return pt1(before, value, xp.where(cutoff_hz * dt < 0.5, cutoff_hz, 0.0), dt)
 
 
 def _fit(motor: Array, along: Array, top: float, only_more: bool = False) -> Array:

@@ -98,7 +98,8 @@ def _cache() -> Path:
 
 def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
     policy_c, _, library_c = files
-    source = policy_c.resolve()
+    # Not resolved: where policy.c is a link, policy.h need not be beside what it points to.
+    source = policy_c.absolute()
     ends = [f"-I{source.parent}", str(source), str(library_c), "-o", str(out), "-lm"]
     message = ""
     for flags in ((*FLAGS, *HERE), FLAGS):

@@ -170,7 +170,8 @@ def _observation(spec: PolicySpec) -> str:
 def _string(text: str) -> str:
     """Return text as C string literals, one a line, joined by backslashes as a macro has them."""
     plain = text.encode("ascii", "backslashreplace").decode().replace("\\", "\\\\")
-    plain = plain.replace('"', '\\"')
+    # A ? as well: two of them and a third sign are one other sign in C99 (trigraphs).
+    plain = plain.replace('"', '\\"').replace("?", "\\?")
     pieces, piece = [], ""
     for word in plain.split(" "):
         if len(piece) + len(word) > 88:

@@ -37,7 +37,9 @@ class Place:
         """Trainings at once, in words."""
         if isinstance(self.workers, str):
             return "as many as the cluster has workers"
-        return f"{self.workers or 1}, each on its own share of the cores"
+        if self.workers in (None, 1):
+            return "1, on all cores"
+        return f"{self.workers}, each on its own share of the cores"
 
 
 def write_document(

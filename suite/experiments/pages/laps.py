@@ -103,8 +103,11 @@ def worst_tracks(
             ])  # fmt: skip
         if both and not parts:
             parts.append(_picture(name, best, flights[name], both[0].trial))
+    if not lines:
+        return ["There is no track that a plan and a policy both finish."]
     words = (
-        f"The {WORST} tracks a policy with the largest ratio, and the leg on which it turned most."
+        f"Of each policy the tracks with the largest ratio, {WORST} at most, and the leg on which "
+        "it turned most."
     )
     return [words, table(headers, lines), *parts]
 
@@ -147,6 +150,9 @@ def lead(found: Sequence[Plan], laps: Mapping[str, Sequence[Lap]]) -> str:
     for name, mine in laps.items():
         both = [lap for lap in mine if lap.ratio is not None]
         around = [lap for lap in both if goes_around(lap)]
+        if not both:
+            sentences.append(f"{name} finishes none of them, so that its laps have no ratio.")
+            continue
         text = (
             f"{name} takes {with_interval(_ratio(mine))} times as long (median over the "
             f"{len(both)} tracks that both finish, 95 % interval)"
@@ -155,9 +161,10 @@ def lead(found: Sequence[Plan], laps: Mapping[str, Sequence[Lap]]) -> str:
             others = [lap for lap in both if not goes_around(lap)]
             text += (
                 f"; in {len(around)} of them it goes around on the way to a gate, and takes "
-                f"{_median([lap.ratio for lap in around])} times as long, in the others "
-                f"{_median([lap.ratio for lap in others])}"
+                f"{_median([lap.ratio for lap in around])} times as long"
             )
+            if others:
+                text += f", in the others {_median([lap.ratio for lap in others])}"
         sentences.append(f"{text}.")
     sentences.append("A plan is an upper bound on the least lap, not a proof of it.")
     return " ".join(sentences)

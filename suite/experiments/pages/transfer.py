@@ -97,8 +97,8 @@ def source_words() -> str:
     each = "\n".join(f"- {source}: {words}." for source, words in SOURCES.items())
     return (
         f"Trials that the judge saw fail:\n\n{each}\n\nA near miss ends either way by a hair, so "
-        "single trials say less than the rates above: of those that the judge saw succeed, some "
-        "fail in the others."
+        "single trials say less than the rates above: those that the judge saw succeed may fail in "
+        "the others, too."
     )
 
 

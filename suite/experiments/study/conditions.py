@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS, constant_wind
-from eval.effects.interface import Effect, neutral
+from eval.effects.interface import Effect, at, neutral
 from eval.judging.sensors import SensorNoise
 from eval.vehicles.vehicle import Vehicle
 
 STATE_UNIT = SensorNoise(pos_m=0.03, vel=0.1, attitude_rad=math.radians(1.0))
 """What 1 means in the sweep of the state's estimate."""
+DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")
+"""Effects that grow in the sweep of drag, as many of them as the vehicle has."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +28,9 @@ class Condition:
     name: str
     """Of the effect or the sweep."""
     size: float
-    """How strong, in the sweep's or the effect's unit."""
+    """How strong it is asked to be, in the sweep's or the effect's unit."""
     words: str
-    """The size for people, with its unit."""
+    """How strong it is, for people, with its unit."""
     vehicle: Vehicle
     noise: SensorNoise = SensorNoise()
 
@@ -55,7 +57,8 @@ def log_faults() -> list[str]:
 def effect_conditions(vehicle: Vehicle) -> list[Condition]:
     """Return `vehicle` with each effect that touches a flight, at the upper end of its usual size.
 
-    Where the vehicle has more of an effect already, it keeps that.
+    Where the vehicle has more of an effect already, it keeps that; where it may not have so much,
+    as 27 g may not have 0.2 kg less, it has the most it may. What else it says of an effect stays.
     """
     found = []
     for effect in EFFECTS.values():
@@ -66,13 +69,14 @@ def effect_conditions(vehicle: Vehicle) -> list[Condition]:
 
 def _with(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     parameter = effect.parameters[0]
-    values = neutral(effect, vehicle)
+    values = _own(vehicle, effect.name)
     size = parameter.typical[1]
-    none = np.asarray(getattr(values, parameter.name), float)
+    none = np.asarray(getattr(neutral(effect, vehicle), parameter.name), float)
     none = np.zeros_like(none) if parameter.whole else none
     share = np.asarray(parameter.direction) if parameter.direction else np.ones(none.shape)
     changed = none + sign * size * share
-    own = np.asarray(getattr(_own(vehicle, effect.name), parameter.name), float)
+    changed = np.clip(changed, at(parameter.low, vehicle), at(parameter.high, vehicle))
+    own = np.asarray(getattr(values, parameter.name), float)
     changed = np.where(np.abs(own - none) > np.abs(changed - none), own, changed)
     value = tuple(changed.tolist()) if changed.ndim else float(changed)
     shown = "(" + ", ".join(f"{v:.3g}" for v in changed) + ")" if changed.ndim else f"{value:.3g}"
@@ -115,11 +119,33 @@ def _heavier(vehicle: Vehicle, percent: float) -> tuple[Vehicle, SensorNoise]:
 
 
 def _draggier(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorNoise]:
-    for name in ("linear_drag", "quadratic_drag"):
-        own = _own(vehicle, name)
-        more = tuple(factor * value for value in own.coefficient)
-        vehicle = with_effect(vehicle, name, own._replace(coefficient=more))
+    for name in _drags(vehicle):
+        own = vehicle.effects[name]
+        more = factor * np.asarray(own.coefficient, float)
+        value = tuple(more.tolist()) if more.ndim else float(more)
+        vehicle = with_effect(vehicle, name, own._replace(coefficient=value))
     return vehicle, SensorNoise()
+
+
+def _drags(vehicle: Vehicle) -> list[str]:
+    """Return the kinds of drag that `vehicle` has."""
+    return [
+        name
+        for name in DRAGS
+        if name in vehicle.effects and np.any(vehicle.effects[name].coefficient)
+    ]
+
+
+def _drag_sweep(vehicle: Vehicle) -> Sweep:
+    """Return the sweep of drag: the vehicle's own, or where it has none all of it new."""
+    if _drags(vehicle):
+        return Sweep("drag", "drag, times the vehicle's own", (1, 2, 4, 8, 16), _draggier)
+
+    def make(vehicle: Vehicle, coefficient: float) -> tuple[Vehicle, SensorNoise]:
+        values = EFFECTS["linear_drag"].values((coefficient,) * 3)
+        return with_effect(vehicle, "linear_drag", values), SensorNoise()
+
+    return Sweep("drag", "linear drag, each axis [1/s]", (0, 0.5, 1, 2, 4), make)
 
 
 def _windy(vehicle: Vehicle, speed: float) -> tuple[Vehicle, SensorNoise]:
@@ -161,7 +187,8 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
     wind = float(np.linalg.norm(_own(vehicle, "constant_wind").velocity))
 
     def more(first: float, *others: float) -> tuple[float, ...]:
-        return (first, *(size for size in others if size > first))
+        # A vehicle at the last of them or past it is disturbed as well.
+        return (first, *([size for size in others if size > first] or (1.5 * first, 2 * first)))
 
     return [
         Sweep("motor lag", "rotor time constant [ms]", more(lag, 50, 80, 120, 180),
@@ -169,7 +196,7 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
         Sweep("latency", "command delay [ms]", more(delay, 50, 80, 120, 180),
               _effect("command_delay", "delay", 1e-3)),
         Sweep("mass", "mass above nominal [%]", more(heavier, 10, 20, 40, 60), _heavier),
-        Sweep("drag", "drag, times the vehicle's own", (1, 2, 4, 8, 16), _draggier),
+        _drag_sweep(vehicle),
         Sweep("wind", "constant wind [m/s]", more(wind, 2, 4, 6, 8), _windy),
         Sweep("depth noise", "standard deviation of inverse depth [1/m]", (0, 0.01, 0.03, 0.1, 0.3),
               _sensing("inverse_depth")),

@@ -161,6 +161,12 @@ def test_an_effect_of_another_package_may_have_a_motion_of_its_own(monkeypatch, 
         plant_step(plant, state._replace(carried={}), motion, inputs, 0.0)
 
 
+@pytest.mark.parametrize("values", [NamedTuple("Other", [("shove", Any)]), tuple])
+def test_values_have_a_field_for_each_parameter(values):
+    with pytest.raises(ValueError, match=r"parameters the names \['push'\]; both must be the same"):
+        EFFECTS.register("flywheel", replace(WHEEL, values=values))
+
+
 def test_a_memory_needs_both_of_its_hooks():
     half = replace(WHEEL, carry=None)
     with pytest.raises(ValueError, match="only one of `start` and `carry`"):

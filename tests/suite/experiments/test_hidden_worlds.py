@@ -5,6 +5,7 @@ The loops themselves are stand-ins; tests/suite/loop has theirs.
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 
@@ -14,7 +15,7 @@ from policies import shipped
 from suite.common.errors import WorkFailed
 from suite.common.running.apart import Job
 from suite.experiments import hidden_worlds
-from suite.experiments.hidden_worlds import WORLDS, Asked, Config, loop_of, world_of
+from suite.experiments.hidden_worlds import WORLDS, Asked, Config, loop_of, words_of, world_of
 from suite.experiments.pages.hidden_worlds import ALL
 from suite.loop.config import loop_by_content
 from suite.loop.hidden_effect import CONTROL, NAMED, NOMINAL
@@ -89,6 +90,12 @@ def test_a_loop_needs_none_of_our_files_where_it_runs(tmp_path):
     assert here == there and set(here.digests) == {"policy", "vehicle", "world"}
 
 
+def test_the_added_mass_is_told_as_a_share_of_the_vehicles_own():
+    hidden, known = WORLDS["heavy battery"], load_vehicle("reference")
+    assert "0.4 kg more, 53 % of the mass" in words_of(known, hidden)
+    assert "0.4 kg more, 20 % of the mass" in words_of(replace(known, mass=2.0), hidden)
+
+
 def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeypatch):
     def broken(config, out, console):
         raise WorkFailed("the training diverged")
@@ -103,6 +110,7 @@ def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeyp
     [
         (["--only", "weak roter"], "Did you mean 'weak rotor'?"),
         (["--set", "seed=3"], "this command sets seed; give --training-seeds"),
+        (["--vehicle", "crazyflie21"], "hidden world 'heavy battery' cannot be made of --vehicle"),
         (["--trials", "1001"], "--trials is 1001, allowed is 1 to 1000"),
     ],
 )

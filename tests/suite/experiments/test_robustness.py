@@ -19,6 +19,7 @@ def test_robustness(sky, tmp_path, capfd):
     assert len(numbers["conditions"]) == 1 + 2 + 5 + 5
     assert text.count("| 0 % [0, 56] |") == 13
     assert "gyro_bias, accelerometer_bias and clock_offset are faults" in text
+    assert text.count("Change: against the same policy undisturbed") == 1
     assert (tmp_path / "docs" / "robustness-2.png").is_file()
 
 
@@ -30,6 +31,8 @@ def test_what_randomisation_buys_is_two_policies_side_by_side(sky, tmp_path):
     assert reproduce(tmp_path, "robustness", *args) == 0
     text, numbers = page(tmp_path, "robustness")
     assert "| other - racer |" in text and "| racer: success |" in text
+    # There is no table of effects above that says what the columns are.
+    assert text.count("Change: against the same policy undisturbed") == 1
     # The same network on the same trials under the same noise: no difference in any number.
     for condition in numbers["conditions"]:
         one, two = condition["policies"].values()

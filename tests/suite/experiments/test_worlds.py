@@ -47,7 +47,8 @@ def test_why_is_told_by_the_controls(rotorpy):
 
 def test_a_world_that_flies_as_mujoco_does_is_refused(sky, tmp_path, capsys):
     assert reproduce(tmp_path, "worlds", "--world", "reference") == 2
-    assert "--world reference: flies as mujoco does" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "--world reference: flies as mujoco does" in said and "give one of mjx, rotorpy" in said
     assert reproduce(tmp_path, "worlds", "--world", "rotorpi") == 2
     assert "Did you mean 'rotorpy'?" in capsys.readouterr().err
     assert reproduce(tmp_path, "worlds", "--world", "mjx", "--world", "mjx") == 2

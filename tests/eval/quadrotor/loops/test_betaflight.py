@@ -43,6 +43,12 @@ def test_two_looks_by_hand():
     np.testing.assert_allclose(motor, 0.25 + 0.945 * 0.014464461 * RIGHT_LEFT, atol=1e-7)
 
 
+def test_the_i_of_yaw_counts_two_and_a_half_times():
+    """0.244381 x 80 x 2.5 x 5.729578 x 0.002 of yaw, 0.244381 x 80 x 5.729578 x 0.002 of roll."""
+    state, _ = look(betaflight.start((), np), 0.5, [0.1, 0.0, 0.1], [0.0, 0.0, 0.0])
+    np.testing.assert_allclose(state.integral, [0.224032, 0.0, 0.560080], atol=1e-6)
+
+
 def test_d_falls_above_the_breakpoint():
     """At full throttle D has lost 65 %: -0.35 x 4.546420."""
     state, _ = look(betaflight.start((), np), 0.6, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
@@ -66,6 +72,9 @@ def test_the_integral_stops_near_full_motors_and_by_fast_set_points():
     full = state._replace(span=np.asarray(1.0))
     after, _ = look(full, 0.5, [0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
     np.testing.assert_allclose(after.integral, full.integral)
+    never = replace(UNFILTERED, iterm_windup=100.0)
+    after, _ = look(full, 0.5, [0.1, 0.0, 0.0], [0.0, 0.0, 0.0], never)
+    np.testing.assert_allclose(after.integral[0], 2 * 0.224032, atol=1e-6)
     relaxing = replace(UNFILTERED, iterm_relax_cutoff=15.0)
     jump, _ = look(state, 0.5, [3.0, 0.0, 0.0], [0.0, 0.0, 0.0], relaxing)
     np.testing.assert_allclose(jump.integral[0], state.integral[0])

@@ -39,6 +39,15 @@ def test_yaw_counts_whole_and_against_the_spin():
     np.testing.assert_allclose(motor, 0.5 + share * np.array([-1, 1, -1, 1]), atol=1e-7)
 
 
+def test_a_limit_of_0_is_none_as_in_the_firmware():
+    free = crazyflie.gains(crazyflie.Settings(roll_ilimit=0.0), GAINS.layout)
+    state = crazyflie.start((), np)._replace(integral=np.array([40.0, 0.0, 0.0]))
+    state, _ = crazyflie.look(
+        free, state, np.asarray(0.5), np.array([0.1, 0.0, 0.0]), np.zeros(3), 0.002, ONE
+    )
+    np.testing.assert_allclose(state.integral[0], 40.0 + 5.729578 * 0.002)
+
+
 def test_the_integral_is_limited_and_full_motors_lower_all():
     state = crazyflie.start((), np)._replace(integral=np.array([33.2999, 0.0, 0.0]))
     state, motor = look(state, 0.95, [1.0, 0.0, 0.0], [0.0, 0.0, 0.0])

@@ -56,6 +56,45 @@ def test_no_integral_into_saturation():
     np.testing.assert_allclose(after.integral, state.integral)
 
 
+def test_no_integral_into_what_the_clip_takes_from_yaw():
+    """Torque 0.54 at a thrust of 0.6: 1.14 and 0.06, lowered by 0.14 to 1 and -0.08, clipped to 0.
+
+    Of the 0.54 there are 0.5 left.
+    """
+    settings = replace(PLAIN, MC_YAWRATE_P=0.54)
+    state, motor = look(px4.start((), np), 0.6, [0.0, 0.0, 1.0], [0.0, 0.0, 0.0], settings)
+    np.testing.assert_allclose(motor, [0.0, 1.0, 0.0, 1.0], atol=1e-9)
+    np.testing.assert_allclose(state.lost, [0.0, 0.0, 0.04], atol=1e-9)
+    after, _ = look(state, 0.6, [0.0, 0.0, 1.0], [0.0, 0.0, 0.0], settings)
+    np.testing.assert_allclose(after.integral, state.integral)
+
+
+def test_thrust_is_no_torque_on_uneven_arms():
+    """Rear arms of half the length: what thrust alone gives is not taken for a lost torque."""
+    rotors = load_vehicle("crazyflie21").rotors
+    hubs = [(x if x > 0.0 else 0.5 * x, y, z) for x, y, z in rotors.position]
+    gains = px4.gains(PLAIN, layout_of(replace(rotors, position=tuple(hubs))))
+    asked = np.array([0.1, -0.1, 0.05])
+    state, motor = px4.look(
+        gains, px4.start((), np), np.asarray(0.5), asked, np.zeros(3), 0.002, np.ones(3)
+    )
+    assert 0.0 < motor.min() and motor.max() < 1.0
+    np.testing.assert_array_equal(state.lost, 0.0)
+
+
+def test_the_slope_of_the_gyro_is_filtered_to_first_order():
+    """At 30 Hz and 500 Hz k = 0.376991 / 1.376991 = 0.273779 of a slope of 5 rad/s^2."""
+    settings = replace(PLAIN, IMU_DGYRO_CUTOFF=30.0)
+    state, _ = look(px4.start((), np), 0.5, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], settings)
+    for k, left in ((1, 1.0 - 0.273779), (2, (1.0 - 0.273779) ** 2)):
+        state, _ = look(state, 0.5, [0.0, 0.0, 0.0], [0.01 * k, 0.0, 0.0], settings)
+        np.testing.assert_allclose(state.accel[0], 5.0 * (1.0 - left), rtol=1e-5)
+    # From half the sampling rate on it passes all.
+    settings = replace(PLAIN, IMU_DGYRO_CUTOFF=250.0)
+    state, _ = look(state, 0.5, [0.0, 0.0, 0.0], [0.01, 0.0, 0.0], settings)
+    np.testing.assert_allclose(state.accel[0], -5.0)
+
+
 def test_the_integrals_limit_is_one_of_torque():
     """As much with K = 2: 0.3 of roll, of which roll's 0.707 goes to a motor."""
     twice = replace(PLAIN, MC_ROLLRATE_K=2.0)

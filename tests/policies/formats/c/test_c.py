@@ -133,6 +133,27 @@ def test_what_cannot_be_compiled_is_said_in_plain_words(exports, tmp_path, monke
         load_c(exports["odd"].folder, trust=True)
 
 
+def test_a_folder_of_links_flies_with_its_own_header(exports, tmp_path):
+    """As caches keep files: by what they hold, in another folder and under other names."""
+    (tmp_path / "linked").mkdir()
+    for name in ("policy.c", "policy.h"):
+        kept = tmp_path / f"kept-{name[-1]}"
+        # Another text than other tests compile, so that no library of theirs is found.
+        kept.write_text((exports["odd"].folder / name).read_text() + "/* kept */\n")
+        (tmp_path / "linked" / name).symlink_to(kept)
+    assert load_c(tmp_path / "linked", trust=True).name == "odd.c"
+
+
+def test_a_name_with_signs_that_c_reads_otherwise_comes_back(exports, tmp_path):
+    """Of two ? and a third sign C99 makes another sign, a backslash even."""
+    name = r'run ??) "one" ??/ \ü'
+    project = c_project(exports["odd"].checkpoint, name)
+    for file, text in project.files.items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    assert checked(tmp_path).returncode == 0
+    assert load_c(tmp_path, trust=True).name == f"{name}.c"
+
+
 FOREIGN = """
 #include "policy.h"
 static int steps;

@@ -1,6 +1,6 @@
 """What the page on hidden worlds makes of loops: differences in pairs, laps, sentences."""
 
-from suite.experiments.pages.hidden_worlds import Came, lead, named_grid, rows_of
+from suite.experiments.pages.hidden_worlds import WORTH, Came, lead, named_grid, rows_of
 from suite.loop.hidden_effect import LABELS, NAMED
 from tests.support.loops import EFFECT, WON, four_trials
 
@@ -38,6 +38,9 @@ def test_the_lead_says_what_gained_and_where_nothing_is_named_only_what_was_lost
     said = lead(rows_of([came(seed, WON) for seed in range(3)]))
     assert "loops: 3. The diagnosis names something in 3 of 3. There 50 %" in said
     assert "The named effect gains in: a." in said and "loses" not in said
+    few = lead(rows_of([came(seed, WON) for seed in range(2)]))
+    assert "The named effect gains in: none." in few
+    assert "with less than 3 seeds nothing is called one" in WORTH
     worse = lead(rows_of([came(seed, {**WON, NAMED: 0}) for seed in range(3)]))
     assert "The named effect gains in: none; loses in: a." in worse
     silent = lead(rows_of([came(0, WON, named=False)]))

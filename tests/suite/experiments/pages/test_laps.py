@@ -57,3 +57,20 @@ def test_the_worst_track_comes_first_and_is_drawn():
     first = markdown(grid).splitlines()[2]
     assert "ellipse | 9 | 0 | 2.00 | 10.00 | 5.00" in first and "circles to gate 4" in first
     assert picture.png.startswith(b"\x89PNG") and "p (right)" in picture.caption
+
+
+def test_a_policy_that_finishes_nothing_has_no_ratio_and_no_list():
+    plans, best, _, _ = made()
+    lost = {trial: flown(9.0, success=False, trial=trial) for trial in TRIALS}
+    laps = {"p": [beside(best[trial], lost[trial]) for trial in TRIALS]}
+    text = lead(plans, laps)
+    assert "p finishes none of them" in text and "times as long" not in text
+    assert worst_tracks(best, {"p": lost}, laps) == [
+        "There is no track that a plan and a policy both finish."
+    ]
+
+
+def test_where_every_lap_goes_around_there_are_no_others():
+    plans, _, _, laps = made()
+    text = lead(plans[:1], {"p": laps[:1]})
+    assert "takes 5.00 times as long." in text and "others" not in text

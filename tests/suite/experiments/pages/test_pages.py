@@ -40,6 +40,15 @@ def test_a_page_has_its_facts_its_tables_and_numbered_figures(tmp_path):
     assert said["out"].endswith("name.md")
 
 
+def test_how_many_trainings_share_the_cores_is_told(tmp_path):
+    def told(workers):
+        return Place(tmp_path, tmp_path, workers).at_once
+
+    assert told(None) == told(1) == "1, on all cores"
+    assert told(2) == "2, each on its own share of the cores"
+    assert told("tcp://host:8786") == "as many as the cluster has workers"
+
+
 def test_differences_are_coloured_by_what_they_tell():
     assert points_cell(Interval(0.1, 0.02, 0.2)) == Cell("+10 [+2, +20]", "good")
     assert points_cell(Interval(-0.1, -0.2, -0.02)).tone == "bad"

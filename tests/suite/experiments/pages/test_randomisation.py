@@ -7,6 +7,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from suite.experiments.pages.randomisation import (
     ALL,
     FIXED,
+    MEANING,
     OWN,
     RANDOMISED,
     UNDISTURBED,
@@ -68,6 +69,10 @@ def test_a_seed_that_does_not_agree_is_no_gain():
     assert worth(under("wind", randomised=torn))[FIXED][ALL].gap.verdict == "unclear"
     agreed = torn | (np.arange(30) > 24)
     assert worth(under("wind", randomised=agreed))[FIXED][ALL].gap.verdict == "gain"
+    # Of two seeds nothing is called a gain, which a reader is told.
+    pair = worth_of(under("undisturbed"), [under("wind", randomised=agreed)], [15, 15])
+    assert pair[FIXED][ALL].gap.difference.low > 0 and pair[FIXED][ALL].gap.verdict == "unclear"
+    assert "with less than 3 seeds nothing is called one" in MEANING[1]
     worse = worth(under("wind", without_wind=HALF))
     assert "What costs under its own disturbance: wind -50 [" in lead(worse)
 

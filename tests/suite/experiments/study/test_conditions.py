@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS
+from eval.effects.interface import at
 from eval.judging.sensors import SensorNoise
-from eval.quadrotor.vehicle_file import load_vehicle
+from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 from suite.experiments.study.conditions import (
     effect_conditions,
     log_faults,
@@ -73,3 +74,38 @@ def test_sweeps_of_a_vehicle_with_effects_begin_at_those():
     assert named["wind"].sizes == (5.0, 6, 8)
     heavy = sweep_conditions(own, named["mass"])[1].vehicle
     assert heavy.effects["mass_offset"].offset == pytest.approx(0.3)
+    (slow,) = (s for s in sweeps(with_effects(VEHICLE, motor_lag=(0.2,))) if s.name == "motor lag")
+    assert slow.sizes == pytest.approx((200, 300, 400)), "past the last size it still grows"
+
+
+def test_what_a_vehicle_says_of_an_effect_besides_its_size_stays():
+    given = {"gusts": (3.0, 9.0), "slung_load": (0.05, 2.0), "ground_effect": (1.0, 0.09)}
+    own = with_effects(VEHICLE, **given)
+    flown = {c.name: c.vehicle.effects[c.name] for c in effect_conditions(own)}
+    assert flown["gusts"] == (3.0, 9.0)
+    assert flown["slung_load"] == (0.1, 2.0) and flown["ground_effect"] == (8.0, 0.09)
+
+
+@pytest.mark.parametrize("name", shipped_vehicles())
+def test_no_effect_is_beyond_what_a_vehicle_may_have(name):
+    """The usual sizes are those of 0.5 to 1 kg; 27 g less 0.2 kg would be no vehicle at all."""
+    vehicle = load_vehicle(name)
+    for condition in effect_conditions(vehicle):
+        parameter = EFFECTS[condition.name].parameters[0]
+        value = np.array(getattr(condition.vehicle.effects[condition.name], parameter.name))
+        assert (value >= at(parameter.low, vehicle)).all(), condition.words
+        assert (value <= at(parameter.high, vehicle)).all(), condition.words
+
+
+def test_all_drag_of_a_vehicle_grows_and_where_there_is_none_it_comes_anew():
+    rotors = with_effects(VEHICLE, linear_drag=((0.2, 0.2, 0.7),), rotor_drag=(1e-5,))
+    named = {sweep.name: sweep for sweep in sweeps(rotors)}
+    more, _ = named["drag"].make(rotors, 4)
+    assert more.effects["rotor_drag"].coefficient == pytest.approx(4e-5)
+    assert more.effects["linear_drag"].coefficient == pytest.approx((0.8, 0.8, 2.8))
+    assert "quadratic_drag" not in more.effects
+    bare = load_vehicle("crazyflie21")
+    (sweep,) = (sweep for sweep in sweeps(bare) if sweep.name == "drag")
+    drags = [c.vehicle.effects.get("linear_drag") for c in sweep_conditions(bare, sweep)]
+    assert drags == [None, *(((size,) * 3,) for size in (0.5, 1, 2, 4))]
+    assert sweep.axis == "linear drag, each axis [1/s]"
