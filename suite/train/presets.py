@@ -102,6 +102,12 @@ def swift_30() -> TrainConfig:
     )
 
 
+def swift_ahead() -> TrainConfig:
+    """Return how `swift-30` is trained on to `swift-ahead`: it sees how a second gate faces."""
+    base = swift_30()
+    return with_iterations(replace(base, spec=replace(base.spec, second_axis=True)), 1600)
+
+
 def paper() -> TrainConfig:
     """Return the weights of Su et al. 2026 and the simulator of Zhang et al. 2025 as printed.
 
@@ -278,13 +284,14 @@ PRESETS = {
     "swift-quad": swift_quad,
     "direct": direct,
     "swift-30": swift_30,
+    "swift-ahead": swift_ahead,
     "paper": paper,
     "small": small,
     "gpu": gpu,
 }
 """Name -> function that returns the configuration; the docstring is its description."""
 
-TRAIN_ON = ("swift-quad", "swift-30")
+TRAIN_ON = ("swift-quad", "swift-30", "swift-ahead")
 """Those that are made for a policy that flies already: their steps are small."""
 
 

@@ -65,6 +65,14 @@ def test_swift_30_decides_twice_as_often_on_rollouts_as_long():
     assert seconds[0] == seconds[1] and fast.loss.tilt > 0.0 == slow.loss.tilt
 
 
+def test_swift_ahead_sees_how_the_gate_after_faces_and_trains_as_swift_30():
+    before, ahead = preset("swift-30"), preset("swift-ahead")
+    check(ahead)
+    spec = replace(before.spec, second_axis=True)
+    optimizer = replace(before.optimizer, iterations=ahead.optimizer.iterations)
+    assert ahead == replace(before, spec=spec, optimizer=optimizer)
+
+
 def test_another_rate_keeps_rollouts_and_delays_in_seconds():
     slow = preset("swift-quad")
     fast = at_rate(slow, 30.0)
