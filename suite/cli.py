@@ -135,7 +135,10 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 
 def _left_over(name: str, args: Sequence[str], word: str) -> ValueError:
     """Return the error for a word that belongs to no option, such as the second of two tracks."""
-    before = args[: args.index(word)]
+    # The same word may stand behind an option that takes it.
+    places = [i for i, arg in enumerate(args) if arg == word]
+    free = (i for i in places if i == 0 or "=" in args[i - 1] or args[i - 1][:2] != "--")
+    before = args[: next(free, places[-1])]
     last = max((i for i, arg in enumerate(before) if arg.startswith("--")), default=None)
     hint = f"suite {name} --help says what it takes"
     if last is None:

@@ -125,6 +125,8 @@ def test_an_unknown_option_is_code_2(command, capsys):
     [
         ("--track zigzag circular", r"'circular' after --track .* --track zigzag,circular;"),
         ("--difficulty=0 3", r"'3' after --difficulty .* --difficulty 0,3;"),
+        ("--seed 3 --difficulty 0 3", r"'3' after --difficulty .* --difficulty 0,3;"),
+        ("--difficulty 0 3 --seed 3", r"'3' after --difficulty .* --difficulty 0,3;"),
         ("runs/one", r"'runs/one' belongs to no option; suite eval --help"),
     ],
 )
