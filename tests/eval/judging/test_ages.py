@@ -29,7 +29,7 @@ def seen_at(time_s, n=2):
     time_s = np.broadcast_to(np.asarray(time_s, float), (n,))
     at = np.repeat(time_s[:, None], 3, axis=1)
     image = np.repeat(at[:, :, None], 3, axis=2)
-    return View(at, np.zeros((n, 3, 3)), at, at, at, at, image)
+    return View(at, np.zeros((n, 3, 3)), at, at, at, at, at, image)
 
 
 def ages_seen(noise, trials, decisions):

@@ -28,7 +28,9 @@ def view(slots, depth=4.0):
     rot_w = Rotation.from_euler("xyz", [[0.3, -0.2, 1.0]] * slots).as_matrix()
     place = np.tile([1.0, 2.0, 3.0], (slots, 1))
     depth_m = np.full((slots, 12, 16), depth)
-    return View(place, rot_w, 2 * place, 3 * place, 5 * place, rot_w[:, :, 0], depth_m)
+    return View(
+        place, rot_w, 2 * place, 3 * place, 5 * place, rot_w[:, :, 0], rot_w[:, :, 1], depth_m
+    )
 
 
 def watched(noise, trials, times, gate=0, **more):
