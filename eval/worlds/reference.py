@@ -110,10 +110,11 @@ def fly_trial(
             after = min(passed + 1, count - 1)
             second_w = gates.center_w[None, after]
             depth = eye.image(model, data, pos_w, motion.rot_w[0])
-            axes_w = (gates.rot_w[None, index, :, 0] for index in (passed, after))
+            axis_w, second_axis_w = gates.rot_w[[passed], :, 0], gates.rot_w[[after], :, 0]
             seen = View(
-                motion.pos_w, motion.rot_w, motion.vel_w, gate_w, second_w, *axes_w, depth[None]
-            )
+                motion.pos_w, motion.rot_w, motion.vel_w,
+                gate_w, second_w, axis_w, second_axis_w, depth[None],
+            )  # fmt: skip
             if sensors:
                 wanted = np.array([True])
                 seen = sensors.see(sensors.misplace(seen, np.array([passed]), wanted), wanted)
