@@ -18,10 +18,11 @@ from eval.worlds import REFERENCE
 from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import layout_of, noise_of
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
-from policies.observation import View, observe
+from policies.observation import observe, view_of
 from policies.policy import Policy
 from tracks.geometry.crossing import crossing, is_near
 from tracks.geometry.rotation import to_world
+from tracks.geometry.scene import Gates
 from tracks.track import Track
 
 
@@ -107,14 +108,10 @@ def fly_trial(
         # Ask the policy when it is its time.
         gate_w = gates.center_w[None, passed]
         if step == np.rint(decisions * (1 / (spec.rate_hz * dt))):
-            after = min(passed + 1, count - 1)
-            second_w = gates.center_w[None, after]
             depth = eye.image(model, data, pos_w, motion.rot_w[0])
-            axis_w, second_axis_w = gates.rot_w[[passed], :, 0], gates.rot_w[[after], :, 0]
-            seen = View(
-                motion.pos_w, motion.rot_w, motion.vel_w,
-                gate_w, second_w, axis_w, second_axis_w, depth[None],
-            )  # fmt: skip
+            numbers = (passed, min(passed + 1, count - 1))
+            gate, after = (Gates(*(field[[number]] for field in gates)) for number in numbers)
+            seen = view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, after, depth[None])
             if sensors:
                 wanted = np.array([True])
                 seen = sensors.see(sensors.misplace(seen, np.array([passed]), wanted), wanted)

@@ -12,7 +12,7 @@ from eval.judging.tables import percent
 from eval.worlds.trial import TrialResult
 from suite.diagnose.report.parameters_json import components
 from suite.experiments.pages.tables import gap_cell, points_cell
-from suite.experiments.study.intervals import FEWEST_SEEDS, Gap, nested
+from suite.experiments.study.intervals import WHAT_COUNTS, Gap, nested
 from suite.loop.compare import BEFORE
 from suite.loop.hidden_effect import BOTH, CONTROL, DELTA, LABELS, NAMED, NOMINAL
 from suite.loop.work import named_effects
@@ -40,9 +40,8 @@ HOW = (
 WORTH = (
     "Differences in points over the same trials, with 95 % bootstrap intervals that draw training "
     "seeds anew and the trials of each; in brackets each training seed's own. Not corrected for "
-    "there being several. A gain or a loss is where the interval leaves zero out and every seed "
-    f"agrees; with less than {FEWEST_SEEDS} seeds nothing is called one. A loop whose diagnosis "
-    "names nothing has no fine-tuned policies, and counts in none."
+    f"there being several. {WHAT_COUNTS} A loop whose diagnosis names nothing has no fine-tuned "
+    "policies, and counts in none."
 )
 LAPS = (
     "Lap over that of the policy where nothing is hidden on the same trial, median over the "

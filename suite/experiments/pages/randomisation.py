@@ -10,7 +10,7 @@ import numpy as np
 from eval.judging.statistics import Interval, wilson
 from suite.experiments.pages.tables import gap_cell, points_cell
 from suite.experiments.study.disturbed import Grown, Tested
-from suite.experiments.study.intervals import FEWEST_SEEDS, Gap, nested
+from suite.experiments.study.intervals import WHAT_COUNTS, Gap, nested
 from tracks.common.grid import Cell, Grid, table
 
 FIXED, RANDOMISED, WITHOUT = "fixed", "randomised", "without "
@@ -36,9 +36,7 @@ MEANING = (
     "brackets each training seed's own. The last row is the recipe against one that varies "
     "nothing.",
     "Intervals: 95 %, bootstrap, drawing training seeds anew and the trials of each, a trial with "
-    "all its conditions; not corrected for there being several rows. A gain or a loss is where it "
-    f"leaves zero out and every seed agrees; with less than {FEWEST_SEEDS} seeds nothing is called "
-    "one.",
+    f"all its conditions; not corrected for there being several rows. {WHAT_COUNTS}",
 )
 BY_SEED = "Success undisturbed, under all disturbances [%]."
 CAPTION = "Success with 95 % Wilson intervals, of the recipe and where nothing is varied."

@@ -78,7 +78,7 @@ def _with(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     changed = np.clip(changed, at(parameter.low, vehicle), at(parameter.high, vehicle))
     own = np.asarray(getattr(values, parameter.name), float)
     changed = np.where(np.abs(own - none) > np.abs(changed - none), own, changed)
-    value = tuple(changed.tolist()) if changed.ndim else float(changed)
+    value = _plain(changed)
     shown = "(" + ", ".join(f"{v:.3g}" for v in changed) + ")" if changed.ndim else f"{value:.3g}"
     words = f"{parameter.name} {shown} {'' if parameter.unit == '1' else parameter.unit}".strip()
     changed_vehicle = with_effect(vehicle, effect.name, values._replace(**{parameter.name: value}))
@@ -88,6 +88,11 @@ def _with(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
 def with_effect(vehicle: Vehicle, name: str, values: Any) -> Vehicle:
     """Return `vehicle` with the effect `name` at `values` in place of its own."""
     return replace(vehicle, effects=MappingProxyType({**vehicle.effects, name: values}))
+
+
+def _plain(value: np.ndarray | np.floating) -> float | tuple[float, ...]:
+    """Return a number or an array (N,) as an effect's values hold it."""
+    return tuple(map(float, np.atleast_1d(value))) if value.ndim else float(value)
 
 
 def _own(vehicle: Vehicle, name: str) -> Any:
@@ -105,9 +110,11 @@ def sweep_conditions(vehicle: Vehicle, sweep: Sweep) -> list[Condition]:
     return [first, *rest]
 
 
-def _effect(name: str, field: str, scale: float) -> Callable[..., tuple[Vehicle, SensorNoise]]:
+def _effect(
+    name: str, field: str, scale: float | tuple[float, ...]
+) -> Callable[..., tuple[Vehicle, SensorNoise]]:
     def make(vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorNoise]:
-        values = EFFECTS[name].values(**{field: scale * size})
+        values = EFFECTS[name].values(**{field: _plain(np.asarray(scale) * size)})
         return with_effect(vehicle, name, values), SensorNoise()
 
     return make
@@ -121,9 +128,8 @@ def _heavier(vehicle: Vehicle, percent: float) -> tuple[Vehicle, SensorNoise]:
 def _draggier(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorNoise]:
     for name in _drags(vehicle):
         own = vehicle.effects[name]
-        more = factor * np.asarray(own.coefficient, float)
-        value = tuple(more.tolist()) if more.ndim else float(more)
-        vehicle = with_effect(vehicle, name, own._replace(coefficient=value))
+        more = _plain(factor * np.asarray(own.coefficient, float))
+        vehicle = with_effect(vehicle, name, own._replace(coefficient=more))
     return vehicle, SensorNoise()
 
 
@@ -140,18 +146,8 @@ def _drag_sweep(vehicle: Vehicle) -> Sweep:
     """Return the sweep of drag: the vehicle's own, or where it has none all of it new."""
     if _drags(vehicle):
         return Sweep("drag", "drag, times the vehicle's own", (1, 2, 4, 8, 16), _draggier)
-
-    def make(vehicle: Vehicle, coefficient: float) -> tuple[Vehicle, SensorNoise]:
-        values = EFFECTS["linear_drag"].values((coefficient,) * 3)
-        return with_effect(vehicle, "linear_drag", values), SensorNoise()
-
-    return Sweep("drag", "linear drag, each axis [1/s]", (0, 0.5, 1, 2, 4), make)
-
-
-def _windy(vehicle: Vehicle, speed: float) -> tuple[Vehicle, SensorNoise]:
-    wind = constant_wind.EFFECT
-    velocity = tuple(speed * share for share in wind.parameters[0].direction)
-    return with_effect(vehicle, wind.name, wind.values(velocity)), SensorNoise()
+    drag = _effect("linear_drag", "coefficient", (1.0, 1.0, 1.0))
+    return Sweep("drag", "linear drag, each axis [1/s]", (0, 0.5, 1, 2, 4), drag)
 
 
 def _sensing(field: str, scale: float = 1.0) -> Callable[..., tuple[Vehicle, SensorNoise]]:
@@ -197,7 +193,8 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
               _effect("command_delay", "delay", 1e-3)),
         Sweep("mass", "mass above nominal [%]", more(heavier, 10, 20, 40, 60), _heavier),
         _drag_sweep(vehicle),
-        Sweep("wind", "constant wind [m/s]", more(wind, 2, 4, 6, 8), _windy),
+        Sweep("wind", "constant wind [m/s]", more(wind, 2, 4, 6, 8),
+              _effect("constant_wind", "velocity", constant_wind.EFFECT.parameters[0].direction)),
         Sweep("depth noise", "standard deviation of inverse depth [1/m]", (0, 0.01, 0.03, 0.1, 0.3),
               _sensing("inverse_depth")),
         Sweep("gate-pose error", "standard deviation per axis [m]", (0, 0.05, 0.1, 0.2, 0.3),

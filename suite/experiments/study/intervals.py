@@ -17,6 +17,11 @@ DRAWS = 4000
 """Of the bootstrap."""
 FEWEST_SEEDS = 3
 """With less, nothing is called a gain or a loss."""
+WHAT_COUNTS = (
+    "A gain or a loss is where the interval leaves zero out and every seed agrees; with less than "
+    f"{FEWEST_SEEDS} seeds nothing is called one."
+)
+"""What `Gap.verdict` goes by, for the pages."""
 
 
 class Spread(NamedTuple):
