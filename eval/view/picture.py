@@ -250,7 +250,8 @@ def _title(track: Track) -> str:
 
 
 def _outcome(result: TrialResult, short: bool = False) -> str:
-    text = f"{result.ending} after {result.time_s:.2f} s, {result.gates_passed} gates passed"
+    gates = "1 gate" if result.gates_passed == 1 else f"{result.gates_passed} gates"
+    text = f"{result.ending} after {result.time_s:.2f} s, {gates} passed"
     if short:
         return text
     text += f", v_max {result.v_max:.1f} m/s, mean {result.v_mean:.1f} m/s"

@@ -35,6 +35,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for a name that is not in the table, or a policy where none is timed.
     """
     if not config.name:
+        if config.policy is not None:
+            raise ValueError(
+                f"--policy is {config.policy}, but no benchmark is named: suite bench policy takes "
+                "it"
+            )
         for name, summary in BENCHES.items():
             console.say(f"{name:<12} {summary}")
         return {"benches": BENCHES}

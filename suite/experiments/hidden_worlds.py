@@ -29,13 +29,15 @@ from suite.loop.run import run_loop
 from suite.loop.work import read_diagnosis
 from suite.train.overrides import check_owned
 from tracks.common.names import unknown_name
-from tracks.input.ranges import Iterations, Range, Seed, Trials
+from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials
 from tracks.input.reading import read_json
 
 ROOMS = (*LOOP_ROOMS, "suite/diagnose")
 """Code whose change makes every loop anew."""
 APART = 1000
 """The loops' seeds lie so far apart, so that no two of them judge the same trials."""
+TRAINING_SEED_MOST = 500
+"""Training seeds go up to this."""
 
 
 class Hidden(NamedTuple):
@@ -82,7 +84,7 @@ class Config:
     """A shipped policy's name or a checkpoint's folder; by default the shipped."""
     only: tuple[str, ...] = ()
     """Only these worlds, by name; by default all."""
-    training_seeds: tuple[Annotated[int, Range(0, 500)], ...] = (0, 1, 2)
+    training_seeds: tuple[Annotated[int, Range(0, TRAINING_SEED_MOST)], ...] = (0, 1, 2)
     """One loop each: flights, noise, fits and fine-tunings differ."""
     difficulty: str = "3,9"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
@@ -96,7 +98,7 @@ class Config:
     """Gradient steps of the fit of each Delta Action Model."""
     set: tuple[str, ...] = ()
     """Change settings of the fine-tuning by name."""
-    seed: Seed = 0
+    seed: Annotated[int, Range(0, SEED_MOST - APART * (TRAINING_SEED_MOST + 1))] = 0
     """Seed of the first judged trial of training seed 0; those of training seed K are 1,000 K
     above."""
     vehicle: str = "reference"

@@ -18,7 +18,7 @@ from suite.experiments.pages.document import Place
 from suite.experiments.pages.tables import points_cell
 from suite.experiments.schemes import PROJECTION, PROJECTION_DECAY
 from suite.experiments.study import judging, options, training
-from suite.experiments.study.intervals import Gap, crossed, spread
+from suite.experiments.study.intervals import WHAT_COUNTS, Gap, crossed, spread
 from suite.experiments.study.summary import Summary, summaries
 from suite.train.config import TrainConfig
 from suite.train.config import check as check_recipe
@@ -34,8 +34,8 @@ ROUND_CORNERS = 8
 MEANING = (
     "Success: over the trials of all training seeds, with the least and the most of a seed. "
     "Difference: to the recipe on the same trials and training seeds, in points, with a 95 % "
-    "bootstrap interval that draws training seeds and trials anew. A gain or a loss is where it "
-    "leaves zero out and every seed agrees. Seeds are few, and all rows are compared with the same "
+    "bootstrap interval that draws training seeds and trials anew. "
+    f"{WHAT_COUNTS} Seeds are few, and all rows are compared with the same "
     "trainings of the recipe: where a change does nothing, three seeds agree in sign one time in "
     "four, and of many rows one may stand out by chance.",
     "v_max: the median over trials of each one's largest speed before any contact. Training: the "

@@ -141,7 +141,7 @@ def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:
     ]
     for path in chosen:
         judging.name_of(path)
-    names = labels(config.policies, [Path(path).name for path in config.policies])
+    names = labels(config.policies, [Path(path).name for path in config.policies], "--policies")
     return dict(zip(names, chosen, strict=True))
 
 

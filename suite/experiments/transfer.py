@@ -55,6 +55,8 @@ NOMINAL = PointMassConfig(
 """A point mass without randomisation, much as `reference` flies; and the images of both."""
 DELAY_S = 1 / 30
 """Of the point mass's commands [s]."""
+AT_ONCE = 100
+"""Trials flown as one batch, at most: more would be no faster, and the memory grows with them."""
 MEANINGS = (
     f"{POINT}: the trainer's, with a lag of {NOMINAL.lag_mean:g} 1/s, drag of 0.3, 0.3 and 0.9 "
     f"1/s, commands {1000 * DELAY_S:.0f} ms late (at most two decisions), and nothing drawn. "
@@ -102,7 +104,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     rows: dict[str, list[Row]] = {}
     for name, policy in policies.items():
         won = {
-            kind: trainer_wins(policy, made(specs[name], vehicle), trials, config.trials, console)
+            kind: trainer_wins(policy, made(specs[name], vehicle), trials, console)
             for kind, made in TRAINERS.items()
         }
         columns = won[POINT], won[QUADROTOR], [result.success for result in judged[name]]
@@ -163,7 +165,6 @@ def trainer_wins(
     policy: str,
     recipe: TrainConfig,
     trials: Sequence[TrialSpec],
-    at_once: int,
     console: Console,
 ) -> list[bool]:
     """Return which trials a policy wins in the dynamics of `recipe`.
@@ -171,11 +172,11 @@ def trainer_wins(
     Args:
         policy: a shipped policy's name or a checkpoint's folder.
         recipe: its dynamics.
-        trials: on families' tracks; a multiple of `at_once`.
-        at_once: flown as one batch.
+        trials: on families' tracks.
         console: where progress goes.
     """
     limit = Rules().time_limit_s
+    at_once = min(len(trials), AT_ONCE)
     config = validation_worlds(recipe, at_once, 0, limit)
     params, fly = stored_params(shipped.locate(policy)), make_judged_flight(config)
     drawn = sample_worlds(config, 0)
@@ -183,8 +184,12 @@ def trainer_wins(
     flown = QUADROTOR if config.quadrotor is not None else POINT
     with console.progress(f"flying in the trainer's {flown}", len(trials)) as update:
         for first in range(0, len(trials), at_once):
-            worlds = judged_worlds(drawn, config.spec, trials[first : first + at_once])
-            won += np.asarray(fly(params, jax.tree.map(jnp.asarray, worlds))).tolist()
+            some = list(trials[first : first + at_once])
+            # The last batch is filled up, so that it is not compiled anew.
+            filled = some + some[-1:] * (at_once - len(some))
+            worlds = judged_worlds(drawn, config.spec, filled)
+            wins = np.asarray(fly(params, jax.tree.map(jnp.asarray, worlds))).tolist()
+            won += wins[: len(some)]
             update(len(won))
     return won
 

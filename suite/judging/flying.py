@@ -67,11 +67,15 @@ def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
     return folder
 
 
-def labels(policies: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return what tables call each policy: its name, or what was asked for where names clash."""
+def labels(policies: Sequence[str], names: Sequence[str], option: str = "--policy") -> list[str]:
+    """Return what tables call each policy: its name, or what was asked for where names clash.
+
+    Raises:
+        ValueError: where one is given twice; `option` is named.
+    """
     if len(set(policies)) < len(policies):
         twice = next(p for p in policies if list(policies).count(p) > 1)
-        raise ValueError(f"--policy {twice} is given twice; give each policy once")
+        raise ValueError(f"{option} {twice} is given twice; give each policy once")
     return [
         asked if list(names).count(name) > 1 else name
         for asked, name in zip(policies, names, strict=True)

@@ -273,6 +273,7 @@ HUGE = "9" * 400
         "loop --trials 1000000000000000000",
         f"loop --seed {HUGE}",
         "bench train --policy swift",
+        "bench --policy swift",
         "reproduce table2 --trials 0",
         "reproduce ideas --round-seconds nan",
         "reproduce schemes --workers 0",

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from eval.view import colours
+from eval.view import colours, picture
 from eval.view.picture import write_grid, write_picture
 from tests.support.flights import rollout, small_track
 from tests.support.pixels import opened, share
@@ -31,6 +31,13 @@ def test_a_name_with_dollar_signs_is_a_name(tmp_path):
     write_picture(tmp_path / "one.png", *odd)
     write_grid(tmp_path / "grid.png", [odd])
     assert opened(tmp_path / "one.png").size[0] > 600
+
+
+@pytest.mark.parametrize(("passed", "words"), [(0, "0 gates"), (1, "1 gate"), (2, "2 gates")])
+def test_one_gate_is_one_gate(passed, words):
+    _, _, result = rollout()
+    said = picture._outcome(result._replace(gates_passed=passed), short=True)
+    assert said.endswith(f", {words} passed")
 
 
 def test_a_grid_has_a_panel_a_trial(tmp_path):

@@ -112,6 +112,7 @@ def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeyp
         (["--set", "seed=3"], "this command sets seed; give --training-seeds"),
         (["--vehicle", "crazyflie21"], "hidden world 'heavy battery' cannot be made of --vehicle"),
         (["--trials", "1001"], "--trials is 1001, allowed is 1 to 1000"),
+        (["--seed", "4294967000"], "--seed is 4294967000, allowed is 0 to 4294466295"),
     ],
 )
 def test_what_cannot_be_used_is_code_2(args, words, loops, tmp_path, capsys):

@@ -84,14 +84,14 @@ def test_a_quadrotor_that_tips_over_has_failed(made, up, wins, monkeypatch):
 def test_the_page_says_where_failures_come_from(sky, monkeypatch, tmp_path):
     asked = []
 
-    def wins(policy, recipe, trials, at_once, console):
-        asked.append((policy, recipe.quadrotor is None, at_once))
+    def wins(policy, recipe, trials, console):
+        asked.append((policy, recipe.quadrotor is None, len(trials)))
         return [recipe.quadrotor is None and trial.track == "zigzag" for trial in trials]
 
     monkeypatch.setattr(transfer, "trainer_wins", wins)
     args = ["--policy", "racer", "--trials", "2", "--difficulty", "0"]
     assert reproduce(tmp_path, "transfer", *args) == 0
-    assert asked == [("racer", True, 2), ("racer", False, 2)]
+    assert asked == [("racer", True, 6), ("racer", False, 6)]
     text, numbers = page(tmp_path, "transfer")
     # Nothing passes eight gates within the second that trials last here.
     assert "before the judge, where 6 fail: 4 policy, 2 dynamics, 0 simulator." in text
@@ -117,11 +117,14 @@ def test_up_is_that_of_the_bodys_z_axis():
 
 
 def test_batches_are_flown_in_the_order_of_the_trials(monkeypatch):
-    """Whoever starts on the left has won, in the stand-in; parameters are the policy's own."""
+    """Whoever starts on the left has won, in the stand-in; parameters are the policy's own.
+
+    The last batch is short of trials.
+    """
     seen = []
 
     def made(config):
-        assert config.episode.steps == 20 * config.spec.rate_hz and config.episode.batch == 2
+        assert config.episode.steps == 20 * config.spec.rate_hz and config.episode.batch == 3
 
         def fly(params, worlds):
             seen.append(params)
@@ -130,8 +133,9 @@ def test_batches_are_flown_in_the_order_of_the_trials(monkeypatch):
         return fly
 
     monkeypatch.setattr(transfer, "make_judged_flight", made)
+    monkeypatch.setattr(transfer, "AT_ONCE", 3)
     trials = [TrialSpec(track, 5, seed) for track in ("zigzag", "circular") for seed in (3, 4)]
     recipe = transfer.point_recipe(load_policy_checkpoint(shipped.folder("racer")).spec, REFERENCE)
-    won = transfer.trainer_wins("racer", recipe, trials, 2, Console())
+    won = transfer.trainer_wins("racer", recipe, trials, Console())
     assert won == [make_track(*trial).start_pos_w[1] > 0 for trial in trials]
     assert len(seen) == 2 and set(seen[0]) == set(fresh_params())
