@@ -73,6 +73,16 @@ def test_swift_ahead_sees_how_the_gate_after_faces_and_trains_as_swift_30():
     assert ahead == replace(before, spec=spec, optimizer=optimizer)
 
 
+def test_swift_sure_has_a_nearer_sight_back_and_dearer_solids_than_swift_ahead():
+    before, sure = preset("swift-ahead"), preset("swift-sure")
+    check(sure)
+    assert sure.spec == before.spec and sure.quadrotor == before.quadrotor
+    assert sure.loss.gradient_decay > before.loss.gradient_decay
+    for weight in ("clearance", "collide"):
+        dearer = getattr(sure.loss, weight) / getattr(before.loss, weight)
+        assert dearer == pytest.approx(1.4)
+
+
 def test_another_rate_keeps_rollouts_and_delays_in_seconds():
     slow = preset("swift-quad")
     fast = at_rate(slow, 30.0)
