@@ -109,7 +109,7 @@ def swift_ahead() -> TrainConfig:
 
 
 def swift_sure() -> TrainConfig:
-    """Return how `swift-ahead` is trained on to `swift-sure`: surer, and faster.
+    """Return how `swift-ahead` is trained on to `swift-sure`: faster, and as sure.
 
     Gradients fade sooner: images carry none, so that one that lasts counts what the eye would have
     mended. Solids, which are felt from less far then, cost more by as much.
