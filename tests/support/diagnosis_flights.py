@@ -15,40 +15,38 @@ EVERY = 5
 """Physics steps a row."""
 
 
-def reference(rng, speed):
-    """A closed curve of three sines an axis: position, velocity, acceleration at a time."""
-    size = np.array([[3.0, 0.8, 0.3], [2.5, 0.8, 0.3], [0.5, 0.25, 0.1]])
+def curve(rng, speed):
+    """Return the rates [rad/s] and phases of a closed curve, three sines an axis, (3, 3) each."""
     rate = speed / 4.0 * np.array([[1.0, 1.9, 3.1], [0.8, 1.7, 2.9], [1.1, 2.0, 3.3]])
-    rate = rate * rng.uniform(0.85, 1.15, (3, 3))
-    phase = rng.uniform(0, 2 * np.pi, (3, 3))
-
-    def at(t):
-        angle = rate * t + phase
-        pos = (size * np.sin(angle)).sum(1) + [0, 0, 1.6]
-        vel = (size * rate * np.cos(angle)).sum(1)
-        return pos, vel, -(size * rate**2 * np.sin(angle)).sum(1)
-
-    return at
+    return rate * rng.uniform(0.85, 1.15, (3, 3)), rng.uniform(0, 2 * np.pi, (3, 3))
 
 
-def track(at, yaw, t, motion):
-    """A command that follows the curve: desired force, attitude error, body rates."""
-    pos, vel, acc = at(t)
+def on_curves(rate, phase, t):
+    """Return position, velocity, acceleration (..., 3) on the curves (..., 3, 3) at a time."""
+    size = np.array([[3.0, 0.8, 0.3], [2.5, 0.8, 0.3], [0.5, 0.25, 0.1]])
+    angle = rate * t + phase
+    pos = (size * np.sin(angle)).sum(-1) + [0, 0, 1.6]
+    vel = (size * rate * np.cos(angle)).sum(-1)
+    return pos, vel, -(size * rate**2 * np.sin(angle)).sum(-1)
+
+
+def track(point, yaw, motion):
+    """Commands that follow points of curves: desired force, attitude error, body rates."""
+    pos, vel, acc = point
     wanted = acc + 4.0 * (pos - motion.pos_w) + 3.0 * (vel - motion.vel_w) + [0, 0, 9.81]
-    wanted[2] = max(wanted[2], 3.0)
-    size = np.linalg.norm(wanted)
-    if size > 24.0:
-        wanted *= 24.0 / size
-    up = wanted / np.linalg.norm(wanted)
-    thrust = max(0.0, wanted @ motion.rot_w[:, 2])
-    nose = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    wanted[..., 2] = np.maximum(wanted[..., 2], 3.0)
+    size = np.linalg.norm(wanted, axis=-1, keepdims=True)
+    wanted *= np.minimum(1.0, 24.0 / size)
+    up = wanted / np.linalg.norm(wanted, axis=-1, keepdims=True)
+    thrust = np.maximum(0.0, (wanted * motion.rot_w[..., 2]).sum(-1))
+    nose = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1)
     left = np.cross(up, nose)
-    left /= np.linalg.norm(left)
-    rot = np.stack([np.cross(left, up), left, up], axis=1)
-    error = motion.rot_w.T @ rot
-    vee = 0.5 * np.array([error[2, 1] - error[1, 2], error[0, 2] - error[2, 0],
-                          error[1, 0] - error[0, 1]])  # fmt: skip
-    return Command(np.asarray(thrust), np.clip([8.0, 8.0, 4.0] * vee, -6, 6))
+    left /= np.linalg.norm(left, axis=-1, keepdims=True)
+    rot = np.stack([np.cross(left, up), left, up], axis=-1)
+    error = motion.rot_w.mT @ rot
+    vee = 0.5 * np.stack([error[..., 2, 1] - error[..., 1, 2], error[..., 0, 2] - error[..., 2, 0],
+                          error[..., 1, 0] - error[..., 0, 1]], axis=-1)  # fmt: skip
+    return Command(thrust, np.clip([8.0, 8.0, 4.0] * vee, -6, 6))
 
 
 def fly(vehicle, seed, *args, **options):
@@ -77,32 +75,28 @@ def fly_all(
     dt = 1.0 / vehicles[0].controller.frequency
     models = [compile_quadrotor(mujoco.MjSpec(), vehicle, dt) for vehicle in vehicles]
     datas = [mujoco.MjData(model) for model in models]
-    curves = [(reference(rng, speed), rng.uniform(-0.8, 0.8)) for rng in rngs]
+    drawn = [(*curve(rng, speed), rng.uniform(-0.8, 0.8)) for rng in rngs]
+    rate, phase, turning = map(np.array, zip(*drawn, strict=True))
     plant = make_plant(vehicles[0], dt, together([vehicle.effects for vehicle in vehicles]))
     draws = uses_noise(plant)
     gusts = np.array([rng.standard_normal(3) for rng in rngs]) if draws else None
     state = hover_state(plant, (len(seeds),), noise=gusts)
-    for data, (at, _) in zip(datas, curves, strict=True):
-        data.qpos[:3], data.qvel[:3] = at(0.0)[:2]
+    for data, *start in zip(datas, *on_curves(rate, phase, 0.0)[:2], strict=True):
+        data.qpos[:3], data.qvel[:3] = start
     rows, command = [], Command(np.zeros(len(seeds)), np.zeros((len(seeds), 3)))
     force, push = np.zeros((len(seeds), 3)), np.zeros((len(seeds), 3))
     for k in range(round(duration_s / dt) + 1):
         qpos, qvel = np.array([d.qpos for d in datas]), np.array([d.qvel for d in datas])
         motion = Motion(qpos[:, :3], quat_to_rot(qpos[:, 3:]), qvel[:, :3], qvel[:, 3:])
-        looked = extras or k % EVERY == 0
-        each = [Motion(*parts) for parts in zip(*motion, strict=True)] if looked else []
         if k % EVERY == 0:
-            yaws = headings or [rate * k * dt for _, rate in curves]
-            told = [
-                track(at, yaw, k * dt, one)
-                for (at, _), yaw, one in zip(curves, yaws, each, strict=True)
-            ]
-            command = Command(*map(np.array, zip(*told, strict=True)))
+            yaw = turning * k * dt if headings is None else np.asarray(headings)
+            command = track(on_curves(rate, phase, k * dt), yaw, motion)
             rows.append(np.column_stack([np.full(len(seeds), k * dt), qpos, qvel, command.thrust,
                                          command.rate_b, state.rotor_speed, force]))  # fmt: skip
         gusts = np.array([rng.standard_normal(3) for rng in rngs]) if draws else None
         state, wrench = plant_step(plant, state, motion, Inputs(command, noise=gusts), k * dt)
         if extras:
+            each = [Motion(*parts) for parts in zip(*motion, strict=True)]
             push = np.array([extra(one, k * dt) for extra, one in zip(extras, each, strict=True)])
         mass, rot = plant.constants.mass, motion.rot_w
         force = wrench.force_b / mass[..., None] + to_local(rot, push)

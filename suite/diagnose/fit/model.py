@@ -24,7 +24,7 @@ from suite.diagnose.fit.rollout import KNOTS, STATE, Flown, at_knots, difference
 BATCH = 12
 """Windows a call: one shape, compiled once."""
 DIRECTIONS = 8
-"""Slopes of the cheaper call, compiled once as well."""
+"""Slopes a call: a second, wider program takes longer to compile than it ever saves."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """XLA's options for the model: its newer code for loops is no faster, and compiles half as fast."""
 
@@ -128,21 +128,19 @@ class RolloutModel:
         `starts`.
         """
         everything = np.eye(self.size + self.free)
-        groups, width = [everything], len(everything)
-        if indices is not None:
-            groups, width = [], len(indices)
-            for first in range(0, max(width, 1), DIRECTIONS):
-                rows = np.zeros((DIRECTIONS, len(everything)))
-                part = everything[indices[first : first + DIRECTIONS]]
-                rows[: len(part)] = part
-                groups.append(rows)
+        asked = everything if indices is None else everything[indices]
+        groups = []
+        for first in range(0, max(len(asked), 1), DIRECTIONS):
+            part = asked[first : first + DIRECTIONS]
+            groups.append(np.pad(part, ((0, DIRECTIONS - len(part)), (0, 0))))
         values, slopes = [], []
         with jax.enable_x64(True):
             for x, w, count in batches(offset, windows):
                 answers = [self._linear(self.given, theta, x, w, group) for group in groups]
                 values.append(np.asarray(answers[0][0])[:count])
                 slopes.append(np.concatenate([np.asarray(a[1])[:count] for a in answers], axis=-1))
-        return Linearisation(-np.concatenate(values), np.concatenate(slopes)[..., :width], offset)
+        slope = np.concatenate(slopes)[..., : len(asked)]
+        return Linearisation(-np.concatenate(values), slope, offset)
 
 
 def batches(

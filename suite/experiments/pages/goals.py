@@ -84,7 +84,7 @@ def verdict(found: Sequence[Goal]) -> str:
     if slowest.v_max_miss:
         text += (
             f" v_max misses most on {slowest.track} at level {slowest.level}, "
-            f"by {slowest.v_max_miss:.1f} m/s."
+            f"by {slowest.v_max_miss:.2f} m/s."
         )
     return text.rstrip(";") + ("" if text.endswith(".") else ".")
 
@@ -105,7 +105,7 @@ def goal_grid(cells: Sequence[Tally]) -> Grid:
             _missed(100 * goal.floor_miss, "points"),
             f"{by_key[goal.track, goal.level].v_max.value:.2f}",
             f"{goal.v_max:.1f}",
-            _missed(goal.v_max_miss, "m/s"),
+            _missed(goal.v_max_miss, "m/s", digits=2),
         )
         for goal in goals(cells)
     ]
@@ -117,5 +117,5 @@ def goal_grid(cells: Sequence[Tally]) -> Grid:
     return table(headers, lines, note=note)
 
 
-def _missed(by: float, unit: str) -> str:
-    return f"{by:.1f} {unit}" if by else "met"
+def _missed(by: float, unit: str, digits: int = 1) -> str:
+    return f"{by:.{digits}f} {unit}" if by else "met"
