@@ -38,6 +38,7 @@ from suite.judging.flying import default_policy
 from suite.train.config import PointMassConfig, QuadrotorConfig, TrainConfig
 from suite.train.dynamics.interface import DynamicsState
 from suite.train.rollout import make_rollout
+from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import Worlds, sample_worlds
 from tracks.families import MAX_COUNTS, make_track
 from tracks.geometry.scene import stack
@@ -61,8 +62,9 @@ MEANINGS = (
     f"{POINT}: the trainer's, with a lag of {NOMINAL.lag_mean:g} 1/s, drag of 0.3, 0.3 and 0.9 "
     f"1/s, commands {1000 * DELAY_S:.0f} ms late (at most two decisions), and nothing drawn. "
     f"{QUADROTOR}: the trainer's, of the judged vehicle with its effects, in single precision and "
-    "fewer, longer steps. Both end a trial by the trainer's collisions and show the nearest solids "
-    "of each kind alone; the point mass is the same for every vehicle and cannot tip over, and the "
+    "fewer, longer steps. Both end a trial by the trainer's collisions, of a sphere of "
+    f"{BODY_RADIUS_M:g} m where the judge has the vehicle's box, and show the nearest solids of "
+    "each kind alone; the point mass is the same for every vehicle and cannot tip over, and the "
     "quadrotor is looked at for that where a decision ends, not in every step. "
     f"{JUDGE}: MuJoCo. Minus {JUDGE}: on the same trials, in points, with Newcombe's paired 95 % "
     "interval."

@@ -117,10 +117,7 @@ def test_a_policy_that_cannot_travel_is_refused_with_what_to_do():
 
 
 TRIALS = [
-    TrialSpec(track, level, seed)
-    for track in ("zigzag", "circular", "ellipse")
-    for level in (1, 6)
-    for seed in (0, 1)
+    TrialSpec(track, level, 0) for track in ("zigzag", "circular", "ellipse") for level in (1, 6)
 ]
 
 RULES = Rules(time_limit_s=2.0)
@@ -156,7 +153,7 @@ def test_repeats(expected):
 
 
 def test_order_and_subset(expected):
-    order = [TRIALS[i] for i in np.random.default_rng(1).permutation(len(TRIALS))][:7]
+    order = [TRIALS[i] for i in np.random.default_rng(1).permutation(len(TRIALS))][:4]
     same(order, results(order), expected)
 
 
@@ -176,7 +173,7 @@ def test_threads(expected):
 
 def test_processes(expected):
     policy = RandomNetwork  # made anew in each process
-    same(TRIALS[:6], results(TRIALS[:6], workers=2, policy=policy), expected)
+    same(TRIALS[:4], results(TRIALS[:4], workers=2, policy=policy), expected)
 
 
 def test_pursuit_by_a_scripted_policy_is_deterministic_too():
@@ -185,7 +182,7 @@ def test_pursuit_by_a_scripted_policy_is_deterministic_too():
 
 
 def test_reference_world_flies_the_same(expected):
-    trials = TRIALS[3::4]
+    trials = TRIALS[1::2]
     options = JudgeOptions(rules=RULES)
     found = fly(network(), trials, VEHICLE, "reference", options)
     assert [r._replace(world="mujoco") for r in found] == [expected[t] for t in trials]

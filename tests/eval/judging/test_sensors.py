@@ -18,7 +18,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from tests.support.pilots import RandomNetwork
 
 VEHICLE = load_vehicle("reference")
-RULES = Rules(time_limit_s=1.5)
+RULES = Rules(time_limit_s=1.0)
 NOISE = SensorNoise(inverse_depth=0.1, gate_m=0.2, pos_m=0.05, vel=0.2, attitude_rad=0.03)
 TRIALS = [TrialSpec(track, 4, seed) for track in ("zigzag", "ellipse") for seed in (0, 1, 2)]
 RANGE_M, RATE_HZ = 10.0, 20.0

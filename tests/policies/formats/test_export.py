@@ -92,7 +92,12 @@ def test_exporting_again_replaces_the_file(tmp_path, checkpoint):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"second_gate": True}, {"gate_axis": True, "second_axis": True}, {"channels": (6, 64, 32)}],
+    [
+        {"second_gate": True, "gate_axis": True, "second_axis": True, "channels": (6, 64, 32)},
+        pytest.param({"second_gate": True}, marks=pytest.mark.slow),
+        pytest.param({"gate_axis": True, "second_axis": True}, marks=pytest.mark.slow),
+        pytest.param({"channels": (6, 64, 32)}, marks=pytest.mark.slow),
+    ],
 )
 def test_policies_of_other_inputs_and_sizes_are_one_policy_as_well(tmp_path, changes):
     spec = replace(SPEC, **changes)

@@ -30,16 +30,21 @@ def run(seed, truth=LAGGED, conditions=CONDITIONS, extra=None):
     return flown, logs_of(flown, WAYS, truth, SENSORS["full"], conditions, rng)
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_one_does_not():
-    (_, first), (_, again), (_, other) = run(5), run(5), run(6)
+@pytest.fixture(scope="module")
+def fifth():
+    return run(5)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(fifth):
+    (_, first), (_, again), (_, other) = fifth, run(5), run(6)
     for one, two in zip(first, again, strict=True):
         for name in ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b", "thrust_cmd", "acc_b"):
             np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
     assert first[0].time_s[3] != other[0].time_s[3] and first[0].pos_w[3, 0] != other[0].pos_w[3, 0]
 
 
-def test_logs_are_as_long_as_their_trajectories_and_say_nothing():
-    flown, logs = run(5)
+def test_logs_are_as_long_as_their_trajectories_and_say_nothing(fifth):
+    flown, logs = fifth
     for log, way in zip(logs, WAYS, strict=True):
         assert abs(log.time_s[0]) <= 1e-4 and way.duration_s - 0.03 < log.time_s[-1]
         assert log.time_s[-1] < way.duration_s + 1e-4
@@ -68,8 +73,8 @@ def test_recordings_are_the_flight_on_an_even_grid():
         )
 
 
-def test_a_command_is_on_the_grid_from_its_first_moment_after_the_stamp():
-    flown, _ = run(5)
+def test_a_command_is_on_the_grid_from_its_first_moment_after_the_stamp(fifth):
+    flown, _ = fifth
     recording = recordings_of(flown, WAYS, 100.0)[0]
     stamps = flown.schedule.stamp_s[:-1, 0]
     changes = np.flatnonzero(np.diff(recording.command.thrust)) + 1
@@ -85,8 +90,8 @@ def test_a_flight_that_cannot_be_flown_fails_by_name():
         run(5, heavy)
 
 
-def test_physics_from_outside_acts_and_is_recorded():
-    plain, _ = run(5)
+def test_physics_from_outside_acts_and_is_recorded(fifth):
+    plain, _ = fifth
     flown, _ = run(5, extra=make_outside("tether", 0.1, 0.75))
     recording = recordings_of(flown, WAYS, 100.0)[0]
     pull_w = np.einsum("tij,tj->ti", recording.motion.rot_w, recording.extra.force_b)

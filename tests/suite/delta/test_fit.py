@@ -11,7 +11,7 @@ from suite.train.config import PointMassConfig
 from tests.support.point_mass_flights import fly
 
 PHYSICS = PointMassConfig(drag=(0.3, 0.3), drag_up=(0.3, 0.3), action_delay=(0.5, 0.5))
-CONFIG = FitConfig(horizon_s=0.6, iterations=240, batch=64, rate=1e-2)
+CONFIG = FitConfig(horizon_s=0.6, iterations=120, batch=32, rate=1e-2)
 
 
 def test_lag_drag_and_delay_of_a_point_mass_are_identified():

@@ -29,7 +29,7 @@ def drag():
     """Return the diagnosis of three flights with a drag that the vehicle file lacks."""
     given = with_lag(PLAIN, 0.03)
     truth = with_effects(given, linear_drag=((0.15, 0.15, 0.05),))
-    logs = fly_all([truth] * 3, range(3), duration_s=5.0, motors=True)
+    logs = fly_all([truth] * 3, range(3), duration_s=4.0, motors=True)
     return diagnose(logs, given, "commands")
 
 

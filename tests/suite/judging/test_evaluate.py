@@ -52,7 +52,7 @@ def _told(capsys):
 
 
 def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkeypatch, capfd):
-    args = ["--track", "circular,zigzag", "--trials", "2", "--policy", pilots["pursuit"]]
+    args = ["--track", "circular,zigzag", "--trials", "1", "--policy", pilots["pursuit"]]
     assert _eval(tmp_path / "whole", *args) == 0
     fly = eval.judging.judge.fly
     flown = []
@@ -70,7 +70,7 @@ def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkey
     assert _eval(tmp_path / "again", *args) == 130
     assert not (tmp_path / "again" / "trials.parquet").exists()
     assert _eval(tmp_path / "again", *args) == 0
-    assert len(flown) == len(set(flown)) == 4, "no trial is flown twice"
+    assert len(flown) == len(set(flown)) == 2, "no trial is flown twice"
     assert "1 trials were flown before" in capfd.readouterr().err
     whole, again = (read_trials(tmp_path / name / "trials.parquet") for name in ("whole", "again"))
     assert again == whole

@@ -1,6 +1,7 @@
 """The whole rollout: gradients, what is cut out of them, and how the field enters."""
 
 from dataclasses import replace
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -38,12 +39,22 @@ CONFIG = small_config(batch=3, steps=4)
 gradient_of = jax.jit(jax.grad(loss_of(CONFIG)))
 
 
+def noisy_config(finish):
+    return small_config(physics={"depth_noise": 0.02}, finish=finish)
+
+
+@cache
+def gradient_where(finish):
+    """Return the trainer's own method, compiled once for all tests."""
+    return jax.jit(make_gradient(noisy_config(finish)))
+
+
 @pytest.fixture(scope="module")
 def two_pass():
     """Return (config, worlds, params, gradient, loss, records) of the trainer's own method."""
-    config = small_config(physics={"depth_noise": 0.02})
+    config = noisy_config(False)
     worlds, params = boxes_worlds(config), fresh_params()
-    return config, worlds, params, *jax.jit(make_gradient(config))(params, worlds, KEY, None)
+    return config, worlds, params, *gradient_where(False)(params, worlds, KEY, None)
 
 
 def test_records_are_those_of_the_flight(two_pass):
@@ -143,7 +154,7 @@ def test_more_of_the_same_worlds_give_the_same_gradient(float64):
     assert largest_difference({k: again[k] for k in used}, {k: once[k] for k in used}) < 1e-9
 
 
-@pytest.mark.parametrize(("steps", "batch"), [(4, 2), (8, 6)])
+@pytest.mark.parametrize(("steps", "batch"), [pytest.param(4, 2, marks=pytest.mark.slow), (8, 6)])
 def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64, steps, batch):
     """A world that hangs still: every step pulls alike, so the mean is one step's pull."""
     still = {"drag": (0.0, 0.0), "drag_up": (0.0, 0.0), "wind_std": (0.0, 0.0, 0.0)}
@@ -224,9 +235,14 @@ STILL = {
 }
 
 
+@cache
+def rollout_of(config):
+    return jax.jit(make_rollout(config), static_argnums=4)
+
+
 def flown(config, worlds):
     embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
-    run = jax.jit(make_rollout(config), static_argnums=4)
+    run = rollout_of(config)
     return run(fresh_params(config.spec), embedding_shift, worlds, KEY, blind)[1]
 
 
@@ -247,14 +263,14 @@ def at_first_gate(config, ahead_m):
 @pytest.mark.parametrize(("pass_first", "progress"), [(True, -3.0), (False, 3.0)])
 def test_the_step_that_passes_a_gate_is_progress_to_the_next_where_asked(pass_first, progress):
     loss = {"progress": 1.0, "pass_first": pass_first}
-    config = small_config(1, 1, physics=STILL, loss=loss)
+    config = small_config(2, 1, physics=STILL, loss=loss)
     records = flown(config, at_first_gate(config, 0.02))
     assert bool(records.passed[0, 0])
     assert float(records.terms["progress"][0, 0]) == pytest.approx(progress, abs=0.2)
 
 
 def test_the_step_before_is_progress_to_the_gate():
-    config = small_config(1, 1, physics=STILL, loss={"progress": 1.0})
+    config = small_config(2, 1, physics=STILL, loss={"progress": 1.0})
     records = flown(config, at_first_gate(config, 1.0))
     assert not bool(records.passed[0, 0])
     assert float(records.terms["progress"][0, 0]) == pytest.approx(-3.0, abs=0.2)
@@ -319,7 +335,7 @@ def test_hovering_above_the_frame_there_is_progress_to_be_made_backwards():
 
 def test_beyond_the_last_gate_progress_goes_straight_on():
     loss = {"progress": 1.0, "approach_m": 1.5}
-    config = small_config(1, 1, physics=STILL, loss=loss)
+    config = small_config(2, 1, physics=STILL, loss=loss)
     worlds = at_first_gate(config, -3.0)
     first = worlds.scene.gates.center_w[:, 0]
     center = np.array(worlds.scene.gates.center_w)
@@ -328,18 +344,19 @@ def test_beyond_the_last_gate_progress_goes_straight_on():
     turn[:, -1] = turn[:, 0]
     gates = worlds.scene.gates._replace(center_w=center, rot_w=turn)
     worlds = worlds._replace(
-        scene=worlds.scene._replace(gates=gates), target=np.full(1, center.shape[1], np.int32)
+        scene=worlds.scene._replace(gates=gates), target=np.full(2, center.shape[1], np.int32)
     )
     term = flown(config, worlds).terms["progress"]
     assert float(term[0, 0]) == pytest.approx(-3.0, abs=0.2)
 
 
 def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
-    config = small_config(steps=4)
-    worlds, params = boxes_worlds(config), fresh_params()
-    run = jax.jit(make_gradient(config))
-    _, _, records = run(params, worlds._replace(stop=np.array([4, 2, 1, 4])), KEY, None)
-    assert np.array_equal(records.alive.T, [[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 0, 0], [1] * 4])
+    worlds, params = boxes_worlds(noisy_config(False)), fresh_params()
+    run = gradient_where(False)
+    _, _, records = run(params, worlds._replace(stop=np.array([6, 2, 1, 6])), KEY, None)
+    assert np.array_equal(
+        records.alive.T, [[1] * 6, [1, 1, 0, 0, 0, 0], [1, 0, 0, 0, 0, 0], [1] * 6]
+    )
     for term in records.terms.values():
         assert (np.asarray(term)[np.asarray(records.alive) == 0] == 0).all()
     remembered = worlds._replace(hidden=np.full_like(worlds.hidden, 0.5))
@@ -349,8 +366,7 @@ def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
 
 @pytest.mark.parametrize("finish", [False, True])
 def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the_finish(finish):
-    config = small_config(steps=4, finish=finish)
-    worlds = boxes_worlds(config)
+    worlds = boxes_worlds(noisy_config(finish))
     gates, last = worlds.scene.gates, worlds.scene.gates.center_w.shape[1] - 1
     ahead = gates.rot_w[:, last, :, 0]
     # 0.2 m before their last gates at 4 m/s, but for one that has the gate before them to pass.
@@ -360,7 +376,7 @@ def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the
         heading_w=ahead,
         target=np.array([last, last, last, last - 1]),
     )
-    records = jax.jit(make_gradient(config))(fresh_params(lively=0.0), worlds, KEY, None)[2]
+    records = gradient_where(finish)(fresh_params(lively=0.0), worlds, KEY, None)[2]
     passed = np.asarray(records.passed)
     assert (passed.sum(0) == [1, 1, 1, 0]).all()
     after = np.cumsum(passed, 0) - passed > 0

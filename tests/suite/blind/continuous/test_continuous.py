@@ -58,7 +58,7 @@ def test_a_finer_step_changes_a_flight_by_far_less_than_the_noise(lag):
         )
         return flown.state[flown.schedule.block[:-1]], flown.acc_b
 
-    (coarse, acc), (fine, fine_acc) = rows(1e-3), rows(2.5e-4)
+    (coarse, acc), (fine, fine_acc) = rows(1e-3), rows(5e-4)
     noise = SENSORS["full"]
     apart = np.abs(coarse - fine).max(axis=(0, 1))
     assert len(coarse) > 100

@@ -45,9 +45,10 @@ def test_the_simulated_log_has_it():
         ("scale", None): 1.04, ("late", None): 0.01,
     }.items():  # fmt: skip
         true[names.index(("imu_fault", parameter, component))] = value
+    fly_model = jax.jit(model.fly)
     with jax.enable_x64(True):
         off = [
-            np.asarray(model.fly(theta, true_starts(model, theta, windows), windows)[0])
+            np.asarray(fly_model(theta, true_starts(model, theta, windows), windows)[0])
             for theta in (start, true)
         ]
     for channel, share in {

@@ -1,5 +1,7 @@
 """The null of the search on sums whose truth is known: p-values are what they say."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.stats import kstest
@@ -43,6 +45,7 @@ def equations(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
     return NormalEquations(turned @ slope, cross, (noise**2).sum(axis=1), np.zeros(0))
 
 
+@cache
 def best_of(draws, **options):
     found = []
     for k in range(draws):
@@ -60,7 +63,7 @@ def test_p_values_of_noise_are_uniform_also_where_it_is_coloured(colour):
 
 
 def test_chance_is_the_gain_that_one_null_in_a_hundred_exceeds():
-    above = [found.gain > found.chance for found in best_of(DRAWS)]
+    above = [found.gain > found.chance for found in best_of(DRAWS, colour=0.0)]
     assert np.sum(above) < 8
 
 

@@ -24,6 +24,7 @@ from tests.support.training import (
 CONFIG = replace(
     small_config(loss={"value": 1.6}), critic=CriticConfig(horizon_s=0.5, trace=0.8, size=16)
 )
+gradient_of = jax.jit(make_gradient(CONFIG))
 FADE = np.exp(-1.0 / (0.5 * SPEC.rate_hz))
 
 
@@ -90,7 +91,7 @@ def judged():
 
 def test_the_gradient_with_a_critic_is_that_of_the_plain_loop_and_its_last_value(judged):
     worlds, params, judge = judged
-    gradient, loss, records = jax.jit(make_gradient(CONFIG))(params, worlds, KEY, None, judge)
+    gradient, loss, records = gradient_of(params, worlds, KEY, None, judge)
     still = jnp.zeros((CONFIG.episode.steps, 4, SPEC.hidden_size))
 
     def plain(params):
@@ -101,7 +102,7 @@ def test_the_gradient_with_a_critic_is_that_of_the_plain_loop_and_its_last_value
     expected_loss, expected = jax.jit(jax.value_and_grad(plain))(params)
     assert float(loss) == pytest.approx(float(expected_loss), rel=1e-5)
     assert largest_difference(gradient, expected) < 1e-3
-    without = jax.jit(make_gradient(CONFIG))(params, worlds, KEY, None)[0]
+    without = gradient_of(params, worlds, KEY, None)[0]
     assert largest_difference(without, expected) > 0.05
     total = sum(float(term.mean()) for term in records.terms.values())
     assert total == pytest.approx(float(loss), rel=1e-5)
@@ -113,7 +114,7 @@ def test_a_world_that_was_stopped_or_has_crashed_has_nothing_to_come(judged):
     pos_w = np.array(worlds.pos_w)
     pos_w[1] = worlds.scene.boxes.center_w[1, 0]
     worlds = worlds._replace(stop=np.array([6, 6, 2, 6]), pos_w=pos_w)
-    records = jax.jit(make_gradient(CONFIG))(params, worlds, KEY, None, judge)[2]
+    records = gradient_of(params, worlds, KEY, None, judge)[2]
     paid, way = np.asarray(records.terms["value"][0]), records.noted
     assert list(paid != 0) == [True, False, False, True]
     assert way.seen.shape == (7, 4, critic.FEATURES) and way.alive.shape == (7, 4)

@@ -122,7 +122,13 @@ def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(floa
         np.testing.assert_allclose(one, two, atol=2e-5)
 
 
-@pytest.mark.parametrize("vehicle", [REFERENCE, HIDDEN], ids=["reference", "hidden"])
+@pytest.mark.parametrize(
+    "vehicle",
+    [
+        pytest.param(REFERENCE, marks=pytest.mark.slow, id="reference"),
+        pytest.param(HIDDEN, id="hidden"),
+    ],
+)
 @pytest.mark.parametrize(
     ("rates", "steps", "off_m"),
     [((100.0, 250.0), (7, 2), 0.02), ((60.0, 120.0), (4, 2), 0.03)],
@@ -172,6 +178,7 @@ def test_no_vehicle_is_drawn_lighter_than_the_catalogue_knows():
     assert drawn.min() == pytest.approx(-0.5 * PLAIN.mass) and np.ptp(drawn) > PLAIN.mass
 
 
+@pytest.mark.slow
 def test_gradients_of_a_flight_are_those_of_finite_differences(float64, monkeypatch):
     """Through attitude loop, rate loop, mixer, rotors, delay and effects; heading held."""
     monkeypatch.setattr(quadrotor, "blend_heading", lambda heading_w, *_: heading_w)
@@ -225,7 +232,7 @@ def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatc
         steps=5,
         loss={"gradient_decay": 0.0, "field_gain": 0.0, "collide": 0.0, "barrier_slope": -4.0},
     )
-    config = replace(config, quadrotor=QuadrotorConfig(HIDDEN))
+    config = replace(config, quadrotor=QuadrotorConfig(HIDDEN, 100.0, 100.0))
     params, worlds = doubled(fresh_params()), doubled(boxes_worlds(config))
     worlds = worlds._replace(vel_w=4.0 * worlds.heading_w)
     delta = doubled(delta_network.init(jax.random.key(1)))
@@ -253,18 +260,17 @@ def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatc
 
 def test_gradients_of_the_motion_fade_as_those_of_the_point_mass(float64):
     config = QuadrotorConfig(PLAIN, **ALIKE)
-    still = jnp.zeros((1, 3))
+    still, key = jnp.zeros((1, 3)), jax.random.key(0)
     effects = doubled(quadrotor.draw_effects(config, 1, np.random.default_rng(0)))
     constants = QuadrotorParams(np.full(1, 0.05), effects)
 
     def end(pos_w, decay):
         start, step = quadrotor_dynamics(config, 0.05, decay)
         body = start(constants, pos_w, still, still + jnp.asarray([1.0, 0.0, 0.0]))
-        for _ in range(3):
-            body = step(body, constants, still, still + 5.0, jax.random.key(0))
-        return body.pos_w[0, 0]
+        one = lambda body, _: (step(body, constants, still, still + 5.0, key), None)  # noqa: E731
+        return jax.lax.scan(one, body, length=3)[0].pos_w[0, 0]
 
-    slope = jax.grad(end)(still, 0.916)[0, 0]
+    slope = jax.jit(jax.grad(end), static_argnums=1)(still, 0.916)[0, 0]
     assert float(slope) == pytest.approx(np.exp(-0.916 * 0.15), rel=1e-9)
 
 
@@ -327,21 +333,50 @@ def test_thrust_centre_of_mass_and_trim_vary_where_asked_and_move_no_other_draw(
     )
 
 
-@pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.in_flight])
-def test_every_effect_of_a_vehicle_file_flies_in_training(name):
+def fly_half_a_second(vehicle):
+    """Return where quadrotors of this file alone are, decision after decision."""
+    config = QuadrotorConfig(vehicle, **{**ALIKE, "drag_spread": 0.3})
+    return fly_trainer(config, lively_actions(7), 15.0)[0]
+
+
+@pytest.fixture(scope="module")
+def flown_plainly():
+    return fly_half_a_second(PLAIN)
+
+
+FLOWN_EVERY_TIME = (
+    "rotor_drag",
+    "constant_wind",
+    "gusts",
+    "ground_effect",
+    "command_delay",
+    "inertia_scale",
+    "frame_tilt",
+    "rotor_spin_up",
+    "slung_load",
+)
+"""One of each way in which an effect acts."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=() if n in FLOWN_EVERY_TIME else pytest.mark.slow)
+        for n, e in EFFECTS.items()
+        if e.in_flight
+    ],
+)
+def test_every_effect_of_a_vehicle_file_flies_in_training(name, flown_plainly):
     """A typical strength of it changes where the quadrotor is after half a second."""
     changed = {
         p.name: np.asarray(getattr(_neutral(name), p.name)) + p.typical[1]
         for p in EFFECTS[name].parameters
     }
     vehicle = replace(PLAIN, effects={name: EFFECTS[name].values(**changed)})
-    flown = [
-        fly_trainer(QuadrotorConfig(v, **{**ALIKE, "drag_spread": 0.3}), lively_actions(7), 15.0)
-        for v in (PLAIN, vehicle)
-    ]
-    assert np.isfinite(flown[1][0]).all()
+    flown = fly_half_a_second(vehicle)
+    assert np.isfinite(flown).all()
     if name != "ground_effect":  # too high above the ground
-        assert np.abs(flown[0][0] - flown[1][0]).max() > 1e-5
+        assert np.abs(flown_plainly - flown).max() > 1e-5
 
 
 def _neutral(name):
