@@ -24,7 +24,7 @@ from suite.diagnose.fit.rollout import KNOTS, STATE, Flown, at_knots, difference
 BATCH = 12
 """Windows a call: one shape, compiled once."""
 DIRECTIONS = 8
-"""Slopes a call: a second, wider program takes longer to compile than it ever saves."""
+"""Slopes a call: a wider program beside it pays from some 150 stretches on, for its compilation."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """XLA's options for the model: its newer code for loops is no faster, and compiles half as fast."""
 
