@@ -100,17 +100,17 @@ def fly_finely(
 ):  # fmt: skip
     """Return the log of a flight whose rate loop starts its period anew at every row."""
     rng = np.random.default_rng(seed)
-    truth, (rate, phase) = Truth(vehicle, lag_s, drag), curve(rng, speed)
+    truth, path = Truth(vehicle, lag_s, drag), curve(rng, speed)
     stamps = row_times(rng, rate_hz, duration_s, jitter)
     period = 1.0 / vehicle.controller.frequency
-    pos, vel, _ = on_curves(rate, phase, stamps[0])
+    pos, vel, _ = on_curves(*path, stamps[0])
     hover = truth.asked(np.array([9.81, 0, 0, 0]), np.zeros(3))
     state = SimpleNamespace(pos=pos, vel=vel, rot=np.eye(3), rate=np.zeros(3), speed=hover)
     given, asked, rows = [(-1.0, np.array([9.81, 0.0, 0.0, 0.0]))], hover, []
     for k, now in enumerate(stamps):
         acc = truth.force_b(state, state.speed) / truth.mass
         motion = SimpleNamespace(pos_w=state.pos, vel_w=state.vel, rot_w=state.rot)
-        order = track(on_curves(rate, phase, now), 0.4, motion)
+        order = track(on_curves(*path, now), 0.4, motion)
         command = np.array([float(order.thrust), *order.rate_b])
         rows.append((state.pos, state.rot, state.vel, state.rate, acc, command))
         given.append((now, command))

@@ -24,7 +24,8 @@ from suite.diagnose.fit.rollout import KNOTS, STATE, Flown, at_knots, difference
 BATCH = 12
 """Windows a call: one shape, compiled once."""
 DIRECTIONS = 8
-"""Slopes a call: a wider program beside it pays from some 150 stretches on, for its compilation."""
+"""Slopes a call, compiled once: a wider program beside it would take longer to compile than it
+saves in a diagnosis of fewer than some 150 stretches."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """XLA's options for the model: its newer code for loops is no faster, and compiles half as fast."""
 

@@ -1,9 +1,11 @@
 """The options of the train command become a run's settings."""
 
 import shutil
+from dataclasses import replace
 
 import pytest
 
+from eval.quadrotor.vehicle_file import load_vehicle
 from policies import shipped
 from suite import cli
 from suite.commands.train import Config, resolve
@@ -52,3 +54,24 @@ def test_the_policy_that_is_trained_on_is_not_written_over(tmp_path, monkeypatch
     own = shutil.copytree(shipped.folder("racer"), tmp_path / "policy")
     assert cli.main(["train", "--from", str(own), "--out", str(tmp_path)]) == 2
     assert "config.json is read, too, and would be written over" in capsys.readouterr().err
+
+
+def test_the_command_line_asks_for_model_and_vehicle_together():
+    reference = load_vehicle("reference")
+    config = resolve(Config(model="quad", vehicle="reference"))
+    assert config.quadrotor is not None and config.quadrotor.vehicle == reference
+    changed = resolve(Config(model="quad", vehicle="racer5", set=("quadrotor.physics_hz=500",)))
+    assert changed.quadrotor is not None and changed.quadrotor.physics_hz == 500.0
+    own = resolve(Config()).quadrotor
+    assert own is not None and own.vehicle != reference, "by default it has not seen the tables'"
+    assert resolve(Config(preset="racer")).quadrotor is None
+    with pytest.raises(ValueError, match="--model quad needs --vehicle.*reference"):
+        resolve(Config(model="quad"))
+    around = resolve(Config(vehicle="reference")).quadrotor
+    assert around == replace(own, vehicle=reference), "the recipe's own spreads"
+    with pytest.raises(ValueError, match="--vehicle is racer5.*point mass has none.*--model quad"):
+        resolve(Config(preset="swift", vehicle="racer5"))
+    with pytest.raises(ValueError, match="--vehicle is racer5.*fleet has none.*--model quad"):
+        resolve(Config(model="fleet", vehicle="racer5"))
+    with pytest.raises(ValueError, match="Did you mean 'racer5'"):
+        resolve(Config(model="quad", vehicle="racer6"))

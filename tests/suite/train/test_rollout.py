@@ -227,55 +227,6 @@ def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
     assert not np.any(total[1:, :2]) and np.all(total[1:, 2:] > 0)
 
 
-STILL = {
-    "drag": (0.0, 0.0),
-    "drag_up": (0.0, 0.0),
-    "wind_std": (0.0, 0.0, 0.0),
-    "action_delay": (0.0, 0.0),
-}
-
-
-@cache
-def rollout_of(config):
-    return jax.jit(make_rollout(config), static_argnums=4)
-
-
-def flown(config, worlds):
-    embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
-    run = rollout_of(config)
-    return run(fresh_params(config.spec), embedding_shift, worlds, KEY, blind)[1]
-
-
-def at_first_gate(config, ahead_m):
-    """Worlds that fly at 3 m/s along the first gate's axis, the next one 4 m behind it."""
-    worlds = boxes_worlds(config)
-    gates = worlds.scene.gates
-    forward = gates.rot_w[:, 0, :, 0]
-    center = np.array(gates.center_w)
-    center[:, 1] = center[:, 0] + 4 * forward
-    return worlds._replace(
-        scene=worlds.scene._replace(gates=gates._replace(center_w=center)),
-        pos_w=center[:, 0] - ahead_m * forward, vel_w=3 * forward,
-        target=np.zeros(len(center), np.int32),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(("pass_first", "progress"), [(True, -3.0), (False, 3.0)])
-def test_the_step_that_passes_a_gate_is_progress_to_the_next_where_asked(pass_first, progress):
-    loss = {"progress": 1.0, "pass_first": pass_first}
-    config = small_config(2, 1, physics=STILL, loss=loss)
-    records = flown(config, at_first_gate(config, 0.02))
-    assert bool(records.passed[0, 0])
-    assert float(records.terms["progress"][0, 0]) == pytest.approx(progress, abs=0.2)
-
-
-def test_the_step_before_is_progress_to_the_gate():
-    config = small_config(2, 1, physics=STILL, loss={"progress": 1.0})
-    records = flown(config, at_first_gate(config, 1.0))
-    assert not bool(records.passed[0, 0])
-    assert float(records.terms["progress"][0, 0]) == pytest.approx(-3.0, abs=0.2)
-
-
 def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
     """The second gate's centre, the last one's where none comes after, and both directions."""
     seen = []
@@ -318,36 +269,6 @@ def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
     far = np.linalg.norm(to_gate, axis=-1)
     np.testing.assert_allclose(np.linalg.norm(found[:, 0, 6:9], axis=-1), far, rtol=1e-5)
     np.testing.assert_array_equal(found[:, 0, -1], worlds.wanted)
-
-
-def test_hovering_above_the_frame_there_is_progress_to_be_made_backwards():
-    """1.2 m above the gate the way to its centre is down, through the bar; the goal lies before."""
-    terms = {}
-    for approach in (0.0, 1.5):
-        loss = {"progress": 1.0, "approach_m": approach}
-        config = small_config(2, 1, physics=STILL, loss=loss)
-        worlds = at_first_gate(config, 0.0)
-        turn = worlds.scene.gates.rot_w[:, 0]
-        worlds = worlds._replace(pos_w=worlds.pos_w + 1.2 * turn[:, :, 2], vel_w=-2 * turn[:, :, 0])
-        terms[approach] = np.asarray(flown(config, worlds).terms["progress"][0])
-    assert np.all(terms[0.0] > -0.3) and np.all(terms[1.5] < -0.8)
-
-
-def test_beyond_the_last_gate_progress_goes_straight_on():
-    loss = {"progress": 1.0, "approach_m": 1.5}
-    config = small_config(2, 1, physics=STILL, loss=loss)
-    worlds = at_first_gate(config, -3.0)
-    first = worlds.scene.gates.center_w[:, 0]
-    center = np.array(worlds.scene.gates.center_w)
-    center[:, -1] = first
-    turn = np.array(worlds.scene.gates.rot_w)
-    turn[:, -1] = turn[:, 0]
-    gates = worlds.scene.gates._replace(center_w=center, rot_w=turn)
-    worlds = worlds._replace(
-        scene=worlds.scene._replace(gates=gates), target=np.full(2, center.shape[1], np.int32)
-    )
-    term = flown(config, worlds).terms["progress"]
-    assert float(term[0, 0]) == pytest.approx(-3.0, abs=0.2)
 
 
 def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():

@@ -1,5 +1,8 @@
 """What a step is measured against: the gate to pass, the point to fly to, the nearest solid."""
 
+from functools import cache
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,8 +10,9 @@ import pytest
 from suite.train.config import LossConfig
 from suite.train.dynamics import point_mass
 from suite.train.losses import speed_to_goal
+from suite.train.rollout import make_rollout
 from suite.train.step import BEYOND_M, approach_shift, make_step, target_gate
-from tests.support.training import boxes_worlds, small_config
+from tests.support.training import KEY, SPEC, blind, boxes_worlds, fresh_params, small_config
 
 
 @pytest.mark.parametrize(
@@ -84,3 +88,82 @@ def test_a_step_through_a_gate_and_its_numbers(pass_first, speed):
     np.testing.assert_allclose(step.clearance, step.gap.min(-1) + config.safety_radius_m, atol=1e-6)
     beside = make_step(config, worlds, before, after, jnp.full(2, 8))
     assert not beside.passed.any()
+
+
+STILL = {
+    "drag": (0.0, 0.0),
+    "drag_up": (0.0, 0.0),
+    "wind_std": (0.0, 0.0, 0.0),
+    "action_delay": (0.0, 0.0),
+}
+
+
+@cache
+def rollout_of(config):
+    return jax.jit(make_rollout(config), static_argnums=4)
+
+
+def flown(config, worlds):
+    embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
+    run = rollout_of(config)
+    return run(fresh_params(config.spec), embedding_shift, worlds, KEY, blind)[1]
+
+
+def at_first_gate(config, ahead_m):
+    """Worlds that fly at 3 m/s along the first gate's axis, the next one 4 m behind it."""
+    worlds = boxes_worlds(config)
+    gates = worlds.scene.gates
+    forward = gates.rot_w[:, 0, :, 0]
+    center = np.array(gates.center_w)
+    center[:, 1] = center[:, 0] + 4 * forward
+    return worlds._replace(
+        scene=worlds.scene._replace(gates=gates._replace(center_w=center)),
+        pos_w=center[:, 0] - ahead_m * forward, vel_w=3 * forward,
+        target=np.zeros(len(center), np.int32),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("pass_first", "progress"), [(True, -3.0), (False, 3.0)])
+def test_the_step_that_passes_a_gate_is_progress_to_the_next_where_asked(pass_first, progress):
+    loss = {"progress": 1.0, "pass_first": pass_first}
+    config = small_config(2, 1, physics=STILL, loss=loss)
+    records = flown(config, at_first_gate(config, 0.02))
+    assert bool(records.passed[0, 0])
+    assert float(records.terms["progress"][0, 0]) == pytest.approx(progress, abs=0.2)
+
+
+def test_the_step_before_is_progress_to_the_gate():
+    config = small_config(2, 1, physics=STILL, loss={"progress": 1.0})
+    records = flown(config, at_first_gate(config, 1.0))
+    assert not bool(records.passed[0, 0])
+    assert float(records.terms["progress"][0, 0]) == pytest.approx(-3.0, abs=0.2)
+
+
+def test_hovering_above_the_frame_there_is_progress_to_be_made_backwards():
+    """1.2 m above the gate the way to its centre is down, through the bar; the goal lies before."""
+    terms = {}
+    for approach in (0.0, 1.5):
+        loss = {"progress": 1.0, "approach_m": approach}
+        config = small_config(2, 1, physics=STILL, loss=loss)
+        worlds = at_first_gate(config, 0.0)
+        turn = worlds.scene.gates.rot_w[:, 0]
+        worlds = worlds._replace(pos_w=worlds.pos_w + 1.2 * turn[:, :, 2], vel_w=-2 * turn[:, :, 0])
+        terms[approach] = np.asarray(flown(config, worlds).terms["progress"][0])
+    assert np.all(terms[0.0] > -0.3) and np.all(terms[1.5] < -0.8)
+
+
+def test_beyond_the_last_gate_progress_goes_straight_on():
+    loss = {"progress": 1.0, "approach_m": 1.5}
+    config = small_config(2, 1, physics=STILL, loss=loss)
+    worlds = at_first_gate(config, -3.0)
+    first = worlds.scene.gates.center_w[:, 0]
+    center = np.array(worlds.scene.gates.center_w)
+    center[:, -1] = first
+    turn = np.array(worlds.scene.gates.rot_w)
+    turn[:, -1] = turn[:, 0]
+    gates = worlds.scene.gates._replace(center_w=center, rot_w=turn)
+    worlds = worlds._replace(
+        scene=worlds.scene._replace(gates=gates), target=np.full(2, center.shape[1], np.int32)
+    )
+    term = flown(config, worlds).terms["progress"]
+    assert float(term[0, 0]) == pytest.approx(-3.0, abs=0.2)

@@ -87,16 +87,15 @@ def fleet(coverage):
     return coverage.flown(0, 1)
 
 
-@pytest.mark.parametrize(
-    "cases",
-    [
-        ("rotors", "rates", "pwm without attitude"),
-        pytest.param(("pwm", "torques", "pwm without rates"), marks=pytest.mark.slow),
-    ],
-)
-def test_drawn_numbers_come_back_within_their_intervals(coverage, fleet, cases):
+EVERY_TIME = ("rotors", "rates", "pwm without attitude")
+"""Cases of tools/coverage.py that are not left to the slow tests."""
+
+
+@pytest.mark.parametrize("often", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_drawn_numbers_come_back_within_their_intervals(coverage, fleet, often):
+    assert set(EVERY_TIME) < set(coverage.CASES)
     off = []
-    for case in cases:
+    for case in (case for case in coverage.CASES if (case in EVERY_TIME) == often):
         found = coverage.pulls(*fleet, case, np.random.default_rng(0))
         assert len(found) >= 3, case
         off += [pull for pull, _ in found.values()]

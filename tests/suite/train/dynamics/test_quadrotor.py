@@ -1,6 +1,6 @@
 """The trainer's quadrotor: parity with the judge, gradients, and what varies between worlds."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS
+from eval.effects.interface import neutral
 from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import Rules, TrialSpec
 from policies.networks import delta_network
-from suite.commands.train import Config, resolve
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
 from suite.train.dynamics.quadrotor import QuadrotorParams, quadrotor_dynamics, substeps
@@ -22,13 +22,7 @@ from suite.train.presets import preset, with_quadrotor
 from suite.train.rollout import make_rollout
 from suite.train.worlds import sample_worlds
 from tests.support.courses import straight
-from tests.support.training import (
-    SPEC,
-    boxes_worlds,
-    doubled,
-    fresh_params,
-    small_config,
-)
+from tests.support.training import SPEC, boxes_worlds, doubled, fresh_params, small_config
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tracks.geometry.camera import Camera
 
@@ -267,7 +261,10 @@ def test_gradients_of_the_motion_fade_as_those_of_the_point_mass(float64):
     def end(pos_w, decay):
         start, step = quadrotor_dynamics(config, 0.05, decay)
         body = start(constants, pos_w, still, still + jnp.asarray([1.0, 0.0, 0.0]))
-        one = lambda body, _: (step(body, constants, still, still + 5.0, key), None)  # noqa: E731
+
+        def one(body, _):
+            return step(body, constants, still, still + 5.0, key), None
+
         return jax.lax.scan(one, body, length=3)[0].pos_w[0, 0]
 
     slope = jax.jit(jax.grad(end), static_argnums=1)(still, 0.916)[0, 0]
@@ -352,10 +349,21 @@ FLOWN_EVERY_TIME = (
     "command_delay",
     "inertia_scale",
     "frame_tilt",
+    "battery_sag",
+    "weak_motor",
     "rotor_spin_up",
     "slung_load",
 )
-"""One of each way in which an effect acts."""
+"""One of each way in which an effect acts, and several that change the vehicle itself."""
+
+
+def test_one_of_each_way_in_which_effects_act_is_flown_every_time():
+    def acts(name):
+        hooks = (field.name for field in fields(EFFECTS[name]) if field.name != "values")
+        return frozenset(hook for hook in hooks if callable(getattr(EFFECTS[name], hook)))
+
+    in_flight = {acts(name) for name, effect in EFFECTS.items() if effect.in_flight}
+    assert {acts(name) for name in FLOWN_EVERY_TIME} == in_flight
 
 
 @pytest.mark.parametrize(
@@ -368,21 +376,15 @@ FLOWN_EVERY_TIME = (
 )
 def test_every_effect_of_a_vehicle_file_flies_in_training(name, flown_plainly):
     """A typical strength of it changes where the quadrotor is after half a second."""
+    still = neutral(EFFECTS[name], PLAIN)
     changed = {
-        p.name: np.asarray(getattr(_neutral(name), p.name)) + p.typical[1]
-        for p in EFFECTS[name].parameters
+        p.name: np.asarray(getattr(still, p.name)) + p.typical[1] for p in EFFECTS[name].parameters
     }
     vehicle = replace(PLAIN, effects={name: EFFECTS[name].values(**changed)})
     flown = fly_half_a_second(vehicle)
     assert np.isfinite(flown).all()
     if name != "ground_effect":  # too high above the ground
         assert np.abs(flown_plainly - flown).max() > 1e-5
-
-
-def _neutral(name):
-    from eval.effects.interface import neutral
-
-    return neutral(EFFECTS[name], PLAIN)
 
 
 @pytest.mark.slow
@@ -395,23 +397,3 @@ def test_the_trainers_own_method_takes_a_finite_gradient():
     assert np.isfinite(float(loss)) and records.image.shape == (6, 4, 20, 20)
     sizes = {name: float(np.abs(np.asarray(g)).max()) for name, g in gradient.items()}
     assert all(np.isfinite(size) for size in sizes.values()) and min(sizes.values()) > 1e-8, sizes
-
-
-def test_the_command_line_asks_for_model_and_vehicle_together(tmp_path):
-    config = resolve(Config(model="quad", vehicle="reference"))
-    assert config.quadrotor is not None and config.quadrotor.vehicle == REFERENCE
-    changed = resolve(Config(model="quad", vehicle="racer5", set=("quadrotor.physics_hz=500",)))
-    assert changed.quadrotor is not None and changed.quadrotor.physics_hz == 500.0
-    own = resolve(Config()).quadrotor
-    assert own is not None and own.vehicle != REFERENCE, "by default it has not seen the tables'"
-    assert resolve(Config(preset="racer")).quadrotor is None
-    with pytest.raises(ValueError, match="--model quad needs --vehicle.*reference"):
-        resolve(Config(model="quad"))
-    around = resolve(Config(vehicle="reference")).quadrotor
-    assert around == replace(own, vehicle=REFERENCE), "the recipe's own spreads"
-    with pytest.raises(ValueError, match="--vehicle is racer5.*point mass has none.*--model quad"):
-        resolve(Config(preset="swift", vehicle="racer5"))
-    with pytest.raises(ValueError, match="--vehicle is racer5.*fleet has none.*--model quad"):
-        resolve(Config(model="fleet", vehicle="racer5"))
-    with pytest.raises(ValueError, match="Did you mean 'racer5'"):
-        resolve(Config(model="quad", vehicle="racer6"))
