@@ -129,9 +129,6 @@ class LossConfig:
     """beta_1 of L_clearance [1]."""
     barrier_slope: Annotated[float, Range(-1e4, 0.0)] = -32.0
     """beta_2 of L_clearance [1/m]."""
-    barrier_power: Annotated[int, Range(1, 4)] = 1
-    """Power of L_clearance's softplus: with 1, the paper's, each centimetre nearer to a solid costs
-    as much as the one before; with 2 the near ones cost more and the far ones less."""
     safety_radius_m: Annotated[float, Range(0.0, 10.0)] = 0.2
     """r_q, the drone's radius with its margin [m]."""
     field_gain: Annotated[float, Range(0.0, 1e6)] = 10.0
@@ -192,10 +189,6 @@ class EpisodeConfig:
     start_speed: Annotated[float, Range(0.0, 100.0)] = 6.0
     """Largest speed towards the gate of a world that starts on the way; sideways some is added
     [m/s]."""
-    start_clear_s: Annotated[float, Range(0.0, 10.0)] = 0.0
-    """Worlds that start on the way towards a solid start slower than drawn, by as much as takes
-    them no nearer than 0.25 m to it in this time: what nothing can save teaches nothing; 0: as
-    drawn [s]."""
     missed_share: Share = 0.0
     """Share of the worlds that start on the way which start beside or above their gate's frame, as
     one does that has missed it."""

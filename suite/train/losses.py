@@ -29,8 +29,8 @@ Term = Callable[[LossConfig, Step], jax.Array]
 
 def clearance(config: LossConfig, step: Step) -> jax.Array:
     """Return L_clearance, the mean over the path [1]."""
-    depth = jax.nn.softplus(config.barrier_slope * step.gap)
-    return config.barrier_height * (depth**config.barrier_power).mean(-1)
+    barrier = config.barrier_height * jax.nn.softplus(config.barrier_slope * step.gap)
+    return barrier.mean(-1)
 
 
 def collide(_: LossConfig, step: Step) -> jax.Array:

@@ -119,21 +119,6 @@ def swift_sure() -> TrainConfig:
     return with_iterations(replace(base, loss=loss), 1000)
 
 
-def swift_clear() -> TrainConfig:
-    """Return how `swift-sure` is trained on to `swift-clear`: faster where it is as sure.
-
-    The price of what is near grows with the third power and not evenly, at 0.18 m as before: a
-    pass by a hair costs more, a pass at 0.25 m less. Starts from which nothing can be saved, which
-    two thirds of the training's collisions were, are slowed down.
-    """
-    base = swift_sure()
-    return replace(
-        base,
-        loss=replace(base.loss, barrier_power=3, barrier_height=0.134),
-        episode=replace(base.episode, start_clear_s=0.5),
-    )
-
-
 def paper() -> TrainConfig:
     """Return the weights of Su et al. 2026 and the simulator of Zhang et al. 2025 as printed.
 
@@ -312,14 +297,13 @@ PRESETS = {
     "swift-30": swift_30,
     "swift-ahead": swift_ahead,
     "swift-sure": swift_sure,
-    "swift-clear": swift_clear,
     "paper": paper,
     "small": small,
     "gpu": gpu,
 }
 """Name -> function that returns the configuration; the docstring is its description."""
 
-TRAIN_ON = ("swift-quad", "swift-30", "swift-ahead", "swift-sure", "swift-clear")
+TRAIN_ON = ("swift-quad", "swift-30", "swift-ahead", "swift-sure")
 """Those that are made for a policy that flies already: their steps are small."""
 
 

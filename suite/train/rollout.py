@@ -23,17 +23,12 @@ from suite.train.dynamics.interface import DynamicsState, make_dynamics
 from suite.train.step import make_step, target_gate
 from suite.train.worlds import Worlds
 from tracks.geometry.camera import pixel_rays_b
-from tracks.geometry.clearance import nearest_obstacle
 from tracks.geometry.depth import depth_image
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Counts
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
 """Solids of each kind that a training image shows, nearest first; the judge shows all."""
-START_CLEAR_M = 0.25
-"""Nearer to a solid than this a start's straight way on is not clear [m]."""
-CLEAR_POINTS = 10
-"""So many points of it are looked at."""
 
 
 class RolloutCarry(NamedTuple):
@@ -160,27 +155,13 @@ def choose(where: jax.Array, ones: Any, others: Any) -> Any:
     return jax.tree.map(pick, ones, others)
 
 
-def clear_share(worlds: Worlds, within_s: float) -> jax.Array:
-    """Return how much of the next `within_s` (B,) is clear, straight on at a start's velocity [1].
-
-    Clear is what lies `START_CLEAR_M` from all solids.
-    """
-    times = within_s * (jnp.arange(CLEAR_POINTS) + 1.0) / CLEAR_POINTS
-    path_w = worlds.pos_w[:, None] + times[:, None] * worlds.vel_w[:, None]
-    distance, _ = nearest_obstacle(worlds.scene, path_w)
-    return jnp.cumprod(distance > START_CLEAR_M, axis=-1).mean(-1)
-
-
 def make_start(config: TrainConfig) -> Callable[[Worlds], RolloutCarry]:
     """Return start(worlds) -> what worlds carry into a rollout's first step."""
     physics, width, dynamics = config.physics, config.spec.hidden_size, make_dynamics(config)
 
     def start(worlds: Worlds) -> RolloutCarry:
         batch = len(worlds.target)
-        vel_w = jnp.asarray(worlds.vel_w)
-        if config.episode.start_clear_s > 0.0:
-            vel_w = vel_w * clear_share(worlds, config.episode.start_clear_s)[:, None]
-        state = dynamics.start(worlds.constants, worlds.pos_w, vel_w, worlds.heading_w)
+        state = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
         fresh = RolloutCarry(
             state=state,
             target=jnp.asarray(worlds.target),

@@ -247,8 +247,7 @@ class Baseline:
         barrier = torch.nn.functional.softplus(config.barrier_slope * gap, threshold=1e3)
         closing = (-(away * body.vel_w.detach()[:, None]).sum(-1)).clamp(min=0)
         collide = closing * (1.0 - gap).clamp(min=0) ** 2
-        barrier = config.barrier_height * (barrier**config.barrier_power).mean(-1)
-        loss = config.clearance * barrier
+        loss = config.clearance * config.barrier_height * barrier.mean(-1)
         loss = loss + config.collide * collide.mean(-1)
 
         jerk = (body.acc_w - before.acc_w) / worlds.constants.time_step[:, None]

@@ -63,9 +63,7 @@ def make_reward(
     Args:
         config: beta_2, r_q and the points of a step's path are those of its `loss`.
     """
-    weights = replace(
-        config.loss, barrier_height=1.0, barrier_power=1, pass_first=True, approach_m=0.0
-    )
+    weights = replace(config.loss, barrier_height=1.0, pass_first=True, approach_m=0.0)
 
     def reward(
         worlds: Worlds, before: DynamicsState, after: DynamicsState, target: jax.Array

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from suite import cli
@@ -82,21 +81,6 @@ def test_swift_sure_has_a_nearer_sight_back_and_dearer_solids_than_swift_ahead()
     for weight in ("clearance", "collide"):
         dearer = getattr(sure.loss, weight) / getattr(before.loss, weight)
         assert dearer == pytest.approx(1.4)
-
-
-def test_swift_clear_prices_what_is_near_alone_and_its_starts_can_be_flown():
-    before, clear = preset("swift-sure"), preset("swift-clear")
-    check(clear)
-    assert clear.spec == before.spec and clear.episode.start_clear_s > 0
-    assert clear.loss.clearance == before.loss.clearance
-
-    def price(config, from_solid_m):
-        loss = config.loss
-        steep = loss.barrier_slope * (from_solid_m - loss.safety_radius_m)
-        return loss.barrier_height * np.log1p(np.exp(steep)) ** loss.barrier_power
-
-    dearer = [price(clear, at) / price(before, at) for at in (0.1, 0.18, 0.25)]
-    assert dearer[0] > 2.0 and dearer[1] == pytest.approx(1.0, abs=0.02) and dearer[2] < 0.3
 
 
 def test_another_rate_keeps_rollouts_and_delays_in_seconds():

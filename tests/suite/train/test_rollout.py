@@ -271,24 +271,6 @@ def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
     np.testing.assert_array_equal(found[:, 0, -1], worlds.wanted)
 
 
-def test_a_start_towards_a_solid_is_slower_by_what_of_its_way_is_not_clear():
-    """Walls 1.9 and 0.95 m ahead, the second a thin one: what lies behind it does not count."""
-    config = small_config(3, start_clear_s=0.5)
-    worlds = boxes_worlds(config)
-    boxes, ahead = worlds.scene.boxes, np.tile(np.float32([1, 0, 0]), (3, 1))
-    center, rot, half = (np.array(field) for field in boxes)
-    center[:, 0] = [(2.4, 0, 50), (1.0, 0, 50), (-9, 0, 50)]
-    rot[:, 0], half[:, 0] = np.eye(3), [(0.5, 2, 2), (0.05, 2, 2), (0.5, 2, 2)]
-    worlds = worlds._replace(
-        scene=worlds.scene._replace(boxes=type(boxes)(center, rot, half)),
-        pos_w=np.tile(np.float32([0, 0, 50]), (3, 1)), vel_w=5 * ahead, heading_w=ahead,
-    )  # fmt: skip
-    clear = rollout.make_start(config)(worlds).state.vel_w
-    np.testing.assert_allclose(clear, np.array([3.0, 1.0, 5.0])[:, None] * ahead, atol=1e-6)
-    drawn = rollout.make_start(small_config(3))(worlds).state.vel_w
-    np.testing.assert_allclose(drawn, 5 * ahead, atol=1e-6)
-
-
 def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
     worlds, params = boxes_worlds(noisy_config(False)), fresh_params()
     run = gradient_where(False)

@@ -108,8 +108,7 @@ def test_a_trainings_own_weights_change_nothing():
     own = LossConfig(
         clearance=1.0, collide=7.0, acceleration=1.0, jerk=1.0, progress=9.0, progress_norm=3.0,
         projection=2.0, approach_m=1.0, pass_first=True, barrier_height=5.0, field_gain=0.0,
-        crash_depth_m=1.0, speed_range=(0.1, 0.2), survival=3.0, tilt=2.0, barrier_power=2,
-        **shared,
+        crash_depth_m=1.0, speed_range=(0.1, 0.2), survival=3.0, tilt=2.0, **shared,
     )  # fmt: skip
     near = (-2.9, 0.9, 50)
     changed = replace(CONFIG, loss=own)
