@@ -9,7 +9,7 @@ from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Vehicle
 from tracks.formats.mujoco_scene import add_scene, solid_name
-from tracks.geometry.camera import Camera, pixel_rays_b
+from tracks.geometry.camera import Camera, cast_rays_b, nearest
 from tracks.geometry.scene import Counts
 from tracks.track import Track
 
@@ -39,7 +39,7 @@ class Eye:
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        self._rays_b = pixel_rays_b(camera)
+        self._rays_b = cast_rays_b(camera)
 
     def image(
         self, model: mujoco.MjModel, data: mujoco.MjData, pos_w: np.ndarray, rot_w: np.ndarray
@@ -69,8 +69,7 @@ class Eye:
             mujoco.mjMAXVAL,
         )
         depth = np.where(geom < 0, self.camera.range_m, depth)
-        depth = np.minimum(depth, self.camera.range_m)
-        return depth.reshape(self.camera.height, self.camera.width)
+        return nearest(self.camera, np.minimum(depth, self.camera.range_m))
 
 
 def motion_of(data: mujoco.MjData) -> Motion:

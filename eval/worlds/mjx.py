@@ -44,7 +44,7 @@ from eval.worlds.trial import (
 from policies.observation import View, view_of
 from tracks.common.tree_rows import select
 from tracks.formats.mujoco_scene import GROUND
-from tracks.geometry.camera import Camera, pixel_rays_b
+from tracks.geometry.camera import Camera, cast_rays_b, nearest
 from tracks.geometry.depth import depth_image
 from tracks.geometry.rotation import quat_to_rot, to_world
 from tracks.geometry.scene import Array, Scene, pad, stack
@@ -95,7 +95,7 @@ class MjxWorld:
         self._model = mjx.put_model(compile_quadrotor(free, vehicle, self.dt))
         self._half_size = np.asarray(vehicle.body.half_size)
         self._middle_b = -np.asarray(self._autopilot.plant.constants.com_offset_b)
-        self._rays_b = jnp.asarray(pixel_rays_b(camera), jnp.float32)
+        self._rays_b = jnp.asarray(cast_rays_b(camera), jnp.float32)
         self._most = 0
         self._has_noise = uses_noise(self._autopilot.plant)
         self._noise = [Gusts(IDLE)] * slots
@@ -213,9 +213,8 @@ class MjxWorld:
     def _look(self, state: Flying, course: Course, scene: Scene) -> View:
         pos_w, rot_w, vel_w, _ = _motion(state.qpos, state.qvel)
         depth = depth_image(scene, pos_w, rot_w, self._rays_b, self._camera.range_m)
-        depth = depth.reshape(self.slots, self._camera.height, self._camera.width)
         gate, after = (next_gate(course, state.progress.gates + ahead) for ahead in (0, 1))
-        return view_of(pos_w, rot_w, vel_w, gate, after, depth)
+        return view_of(pos_w, rot_w, vel_w, gate, after, nearest(self._camera, depth))
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
         """Fly each slot's action (N, 3) for its number of physics steps (N,)."""

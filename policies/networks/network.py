@@ -79,6 +79,8 @@ def fitted(params: Params, seen: PolicySpec, spec: PolicySpec) -> Params:
     """
     for entry in dataclasses.fields(spec):
         has, wanted = getattr(seen, entry.name), getattr(spec, entry.name)
+        if entry.name == "camera":
+            has = dataclasses.replace(has, rays=wanted.rays)
         if has != wanted and entry.name not in (*EXTRAS, "speed", "rate_hz"):
             raise ValueError(
                 f"the policy to start from has spec.{entry.name} {has}, and this run {wanted}; "

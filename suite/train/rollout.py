@@ -22,7 +22,7 @@ from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import DynamicsState, make_dynamics
 from suite.train.step import make_step, target_gate
 from suite.train.worlds import Worlds
-from tracks.geometry.camera import pixel_rays_b
+from tracks.geometry.camera import cast_rays_b, nearest
 from tracks.geometry.depth import depth_image
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Counts
@@ -111,7 +111,7 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
     The image has its noise, and carries no gradient to the state.
     """
     spec, physics, dynamics = config.spec, config.physics, make_dynamics(config)
-    rays = jnp.asarray(pixel_rays_b(spec.camera), jnp.float32)
+    rays = jnp.asarray(cast_rays_b(spec.camera), jnp.float32)
 
     def sight(
         worlds: Worlds,
@@ -128,13 +128,14 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
         pos_w, rot_w = jax.lax.stop_gradient((eye.pos_w, eye.rot_w))
         depth_m = depth_image(worlds.scene, pos_w, rot_w, wide, spec.camera.range_m, SEEN)
         sensed = dynamics.seen(state, worlds.constants, False)
-        view = view_in(worlds, sensed, target)._replace(depth_m=depth_m)
+        image_m = nearest(spec.camera, depth_m)
+        view = view_in(worlds, sensed, target)._replace(depth_m=image_m)
         seen = observe(spec, view, last_action_b, worlds.wanted)
         if dynamics.noise is not None:
             noise = jax.random.normal(jax.random.fold_in(key, 2), seen.state.shape)
             seen = seen._replace(state=seen.state + dynamics.noise * noise)
-        image = seen.image + physics.depth_noise * jax.random.normal(key, depth_m.shape)
-        return seen._replace(image=image.reshape(-1, spec.camera.height, spec.camera.width))
+        grain = physics.depth_noise * jax.random.normal(key, image_m.shape)
+        return seen._replace(image=seen.image + grain)
 
     return sight
 
