@@ -24,8 +24,8 @@ ACTION_SIZE = 3
 CHANNEL_BLOCK = 32
 """Channels come in such blocks from the second convolution on, as the C export lays weights out."""
 PIXELS_MOST = 640 * 480
-"""Pixels of an image: those of the usual depth cameras at full size. 64 trials' images of this size
-and what they are made with fit into 2 GB."""
+"""Rays of an image: the pixels of the usual depth cameras at full size. 64 trials' images of this
+size and what they are made with fit into 2 GB."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,12 @@ def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
     """
     check_ranges(spec, where)
     camera = spec.camera
-    if camera.width * camera.height > PIXELS_MOST:
+    across, down = camera.rays * camera.width, camera.rays * camera.height
+    if across * down > PIXELS_MOST:
+        times = f", times camera.rays {across} x {down}" if camera.rays > 1 else ""
         raise ValueError(
-            f"{where}camera.width x camera.height is {camera.width} x {camera.height}, allowed "
-            f"is up to {PIXELS_MOST} pixels, as many as 640 x 480"
+            f"{where}camera.width x camera.height is {camera.width} x {camera.height}{times}, "
+            f"allowed is up to {PIXELS_MOST} rays, as many as 640 x 480"
         )
     if spec.depth.near >= camera.range_m:
         raise ValueError(

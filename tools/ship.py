@@ -1,10 +1,11 @@
 """Make the training runs behind a policy and its judgement a shipped policy with its card.
 
-    python tools/ship.py RUN [RUN ...] --eval EVAL [--name racer] [--speed 0.8]
+    python tools/ship.py RUN [RUN ...] --eval EVAL [--name racer] [--speed 0.8] [--rays 2]
 
 Each RUN is a folder of `suite train` that started from the one before it; the last one's policy is
 shipped. EVAL is a folder of `suite eval`; without it the card has no table yet. A policy that takes
-how fast to fly as an input flies at --speed where nobody says otherwise.
+how fast to fly as an input flies at --speed where nobody says otherwise, and its camera casts
+--rays across and down a pixel.
 """
 
 from __future__ import annotations
@@ -86,14 +87,17 @@ def main() -> None:
     parser.add_argument("--eval", type=Path, help="folder of suite eval of the last run's policy")
     parser.add_argument("--name", default="racer", help="the shipped policy's name")
     parser.add_argument("--speed", type=float, help="spec.speed, in the place of the run's own")
+    parser.add_argument("--rays", type=int, help="spec.camera.rays, in the place of the run's own")
     options = parser.parse_args()
     with replacing_folder(SHELF / options.name) as beside:
         for file in (WEIGHTS, CONFIG):
             shutil.copy(options.runs[-1] / "policy" / file, beside / file)
+        config = json.loads((beside / CONFIG).read_text(encoding="utf-8"))
         if options.speed is not None:
-            config = json.loads((beside / CONFIG).read_text(encoding="utf-8"))
             config["spec"]["speed"] = options.speed
-            write_json(beside / CONFIG, config)
+        if options.rays is not None:
+            config["spec"]["camera"]["rays"] = options.rays
+        write_json(beside / CONFIG, config)
         (beside / "curve.png").write_bytes(training_chart({BEFORE: joined_curve(options.runs)}))
         text = card(options.name, options.runs, options.eval)
         (beside / "card.md").write_text(text, encoding="utf-8")

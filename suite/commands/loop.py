@@ -19,9 +19,9 @@ class Config:
     """
 
     preset: str | None = None
-    """The recipe: swift, direct, swift-quad, swift-30, swift-ahead or swift-sure (through
-    quadrotors), racer, small, gpu or paper. By default that of the policy to start from, or
-    swift."""
+    """The recipe: swift, direct, swift-quad, swift-30, swift-ahead, swift-sure or swift-keen
+    (through quadrotors), racer, small, gpu or paper. By default that of the policy to start from,
+    or swift."""
     policy: str | None = None
     """Start from this policy instead of training one: a shipped name or a checkpoint's folder."""
     track: str = "all"

@@ -25,8 +25,8 @@ class Config:
     preset: str = "direct"
     """The recipe: direct (through quadrotors from the first step), racer (through the point mass,
     with the paper's 12 numbers), swift (with 18), swift-quad (with --from swift), swift-30 (with
-    --from swift-quad), swift-ahead (with --from swift-30), swift-sure (with --from
-    swift-ahead), small, gpu or paper."""
+    --from swift-quad), swift-ahead (with --from swift-30), swift-sure or swift-keen (with
+    --from swift-ahead), small, gpu or paper."""
     model: Literal["point", "quad", "fleet"] | None = None
     """What flies in training: the point mass, the quadrotor of --vehicle with its effects, or
     quadrotors of a class, drawn anew for every world; the recipe's own if not given."""

@@ -139,7 +139,8 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
 def point_recipe(spec: PolicySpec, _: Vehicle) -> TrainConfig:
     """Return what flies as the point mass without randomisation."""
     delay = min(2.0, DELAY_S * spec.rate_hz)
-    return TrainConfig(spec=spec, physics=replace(NOMINAL, action_delay=(delay, delay)))
+    physics = replace(NOMINAL, action_delay=(delay, delay), rays=spec.camera.rays)
+    return TrainConfig(spec=spec, physics=physics)
 
 
 def quadrotor_recipe(spec: PolicySpec, vehicle: Vehicle) -> TrainConfig:
@@ -153,7 +154,8 @@ def quadrotor_recipe(spec: PolicySpec, vehicle: Vehicle) -> TrainConfig:
         gain_spread=0.0,
         wind_std=(0.0, 0.0, 0.0),
     )
-    return TrainConfig(spec=spec, physics=NOMINAL, quadrotor=exact)
+    physics = replace(NOMINAL, rays=spec.camera.rays)
+    return TrainConfig(spec=spec, physics=physics, quadrotor=exact)
 
 
 TRAINERS: Mapping[str, Callable[[PolicySpec, Vehicle], TrainConfig]] = {

@@ -44,6 +44,8 @@ class PointMassConfig:
     """Age of the image that the policy sees [policy periods]."""
     depth_noise: Annotated[float, Range(0.0, 10.0)] = 0.02
     """Standard deviation of the noise on the encoded inverse depth [1]."""
+    rays: Annotated[int, Range(1, 8)] = 1
+    """Rays across and down a pixel in training; in flight the camera casts its own."""
     fov_scale: Annotated[tuple[float, float], Range(0.1, 10.0, ordered=True)] = (0.95, 1.05)
     """Range by which the images' half widths, as tangents, are scaled: the field of view, drawn per
     iteration [1]."""

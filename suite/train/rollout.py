@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -111,7 +112,8 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
     The image has its noise, and carries no gradient to the state.
     """
     spec, physics, dynamics = config.spec, config.physics, make_dynamics(config)
-    rays = jnp.asarray(cast_rays_b(spec.camera), jnp.float32)
+    camera = replace(spec.camera, rays=physics.rays)
+    rays = jnp.asarray(cast_rays_b(camera), jnp.float32)
 
     def sight(
         worlds: Worlds,
@@ -126,9 +128,9 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
         wide = axis + (rays - axis) * worlds.fov_scale[0]
         eye = dynamics.seen(state, worlds.constants, True)
         pos_w, rot_w = jax.lax.stop_gradient((eye.pos_w, eye.rot_w))
-        depth_m = depth_image(worlds.scene, pos_w, rot_w, wide, spec.camera.range_m, SEEN)
+        depth_m = depth_image(worlds.scene, pos_w, rot_w, wide, camera.range_m, SEEN)
         sensed = dynamics.seen(state, worlds.constants, False)
-        image_m = nearest(spec.camera, depth_m)
+        image_m = nearest(camera, depth_m)
         view = view_in(worlds, sensed, target)._replace(depth_m=image_m)
         seen = observe(spec, view, last_action_b, worlds.wanted)
         if dynamics.noise is not None:

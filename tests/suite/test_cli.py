@@ -285,6 +285,8 @@ HUGE = "9" * 400
         "train --set spec.camera.width=0",
         "train --set spec.camera.width=33",
         "train --set spec.camera.width=1000 spec.camera.height=1000",
+        "train --set spec.camera.width=320 spec.camera.height=240 spec.camera.rays=3",
+        "train --set spec.camera.rays=0",
         "train --set spec.camera.range_m=0.2",
         "train --set spec.hidden_size=0",
         "train --set spec.hidden_size=10000000",

@@ -133,6 +133,7 @@ def _values(
         "PITCH": float_text(camera.pitch_deg),
         "FOV_H": float_text(camera.fov_deg[0]),
         "FOV_V": float_text(camera.fov_deg[1]),
+        "RAYS": camera.rays,
         "DEPTH_SCALE": float_text(depth.scale),
         "DEPTH_NEAR": float_text(depth.near),
         "DEPTH_FAR": float_text(camera.range_m),

@@ -1,5 +1,7 @@
 """What the worlds on the C engine share: the model of a trial, its rays, its contacts."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -55,6 +57,21 @@ def test_depth_is_planar_and_ends_at_the_range(wall):
     middle = image[image.shape[0] // 2 - 1, image.shape[1] // 2]
     assert middle == pytest.approx(2.95)
     assert image.max() == Camera().range_m
+
+
+@pytest.mark.parametrize(("rays", "seen"), [(1, False), (2, False), (4, True)])
+def test_a_plate_on_edge_between_two_rays_is_seen_by_finer_ones(rays, seen):
+    """It is 3 cm thick and 2 m away, where rays through pixels' centres are 10 cm apart."""
+    track = straight(wall_at=2.05)
+    boxes = track.scene.boxes
+    plate = boxes._replace(half_size=np.array([[0.05, 0.015, 1.0]]))
+    track = dataclasses.replace(track, scene=track.scene._replace(boxes=plate))
+    model = compile_model(track, VEHICLE, 0.002, layout_of([track]).solids)
+    data = mujoco.MjData(model)
+    mujoco.mj_step1(model, data)
+    eye = Eye(Camera(pitch_deg=0.0, rays=rays))
+    image = eye.image(model, data, track.start_pos_w, np.eye(3))
+    assert image.shape == (24, 32) and bool((abs(image - 2.0) < 1e-6).any()) == seen
 
 
 @pytest.mark.parametrize("away", [0.0, 5.0, 14.0, 15.0, 40.0, 1000.0])

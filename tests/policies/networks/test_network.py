@@ -118,11 +118,19 @@ def test_at_twice_the_rate_a_memory_lasts_as_long():
     np.testing.assert_allclose(twice, once, rtol=0.005)
 
 
+def test_more_rays_a_pixel_leave_the_weights_as_they_are():
+    params = network.init(jax.random.key(5), SMALL)
+    finer = replace(SMALL, camera=replace(SMALL.camera, rays=2))
+    for name, value in network.fitted(params, SMALL, finer).items():
+        np.testing.assert_array_equal(value, params[name])
+
+
 def test_a_policy_of_another_size_is_refused():
     params = network.init(jax.random.key(5), SMALL)
     other = {
         "hidden_size 64, and this run 32": {"hidden_size": 32},
         r"channels .*128\), and this run \(16": {"channels": (16, 32, 32)},
+        "camera .*width=36": {"camera": replace(SMALL.camera, width=36)},
     }
     for words, changed in other.items():
         with pytest.raises(ValueError, match=words):

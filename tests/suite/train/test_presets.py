@@ -83,6 +83,14 @@ def test_swift_sure_has_a_nearer_sight_back_and_dearer_solids_than_swift_ahead()
         assert dearer == pytest.approx(1.4)
 
 
+def test_swift_keen_trains_as_swift_sure_and_has_a_finer_eye_in_flight():
+    sure, keen = preset("swift-sure"), preset("swift-keen")
+    check(keen)
+    camera = replace(sure.spec.camera, rays=2)
+    assert keen == replace(sure, spec=replace(sure.spec, camera=camera))
+    assert keen.physics.rays == 1
+
+
 def test_another_rate_keeps_rollouts_and_delays_in_seconds():
     slow = preset("swift-quad")
     fast = at_rate(slow, 30.0)

@@ -13,7 +13,8 @@ $OBSERVATION
  *   high as POLICY_CAMERA_FOV_*_DEG says from edge to edge. A pixel is the planar depth d in metres
  *   (along the camera's axis, not along the ray), encoded as
  *       POLICY_DEPTH_SCALE / clip(d, POLICY_DEPTH_NEAR, POLICY_DEPTH_FAR) - POLICY_DEPTH_OFFSET
- *   where nothing is seen d counts as POLICY_DEPTH_FAR.
+ *   where nothing is seen d counts as POLICY_DEPTH_FAR; d is the nearest of POLICY_CAMERA_RAYS x
+ *   POLICY_CAMERA_RAYS rays through the pixel's parts.
  *
  *   action[POLICY_ACTION_SIZE]: the wanted net acceleration in current body axes [m/s^2], gravity
  *   already taken care of: zeros keep the velocity. Of it comes the wanted specific force
@@ -37,6 +38,7 @@ $OBSERVATION
 #define POLICY_CAMERA_PITCH_DEG $PITCH
 #define POLICY_CAMERA_FOV_H_DEG $FOV_H
 #define POLICY_CAMERA_FOV_V_DEG $FOV_V
+#define POLICY_CAMERA_RAYS $RAYS
 #define POLICY_DEPTH_SCALE $DEPTH_SCALE
 #define POLICY_DEPTH_NEAR $DEPTH_NEAR
 #define POLICY_DEPTH_FAR $DEPTH_FAR
