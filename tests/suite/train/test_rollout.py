@@ -68,6 +68,24 @@ def test_records_are_those_of_the_flight(two_pass):
     assert np.ptp(np.array(records.image)) > 1
 
 
+def test_a_pixel_is_the_nearest_of_the_trainings_own_rays():
+    config = small_config()
+    worlds = boxes_worlds(config)
+    start = rollout.make_start(config)(worlds)
+
+    def image(trained, flown=1, pixels=20):
+        camera = replace(SPEC.camera, width=pixels, height=pixels, rays=flown)
+        eye = replace(config, spec=replace(SPEC, camera=camera))
+        sight = rollout.make_sight(replace(eye, physics=replace(config.physics, rays=trained)))
+        return np.array(sight(worlds, start.state, start.target, start.action_b, KEY).image)
+
+    nearest = image(trained=1, pixels=40).reshape(4, 20, 2, 20, 2).max((2, 4))
+    np.testing.assert_allclose(image(trained=2), nearest, atol=1e-5)
+    plain = image(trained=1)
+    assert np.abs(plain - nearest).max() > 0.5
+    np.testing.assert_array_equal(image(trained=1, flown=2), plain)
+
+
 @pytest.fixture
 def float64():
     with jax.enable_x64(True):
