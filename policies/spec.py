@@ -23,7 +23,7 @@ ACTION_SIZE = 3
 
 CHANNEL_BLOCK = 32
 """Channels come in such blocks from the second convolution on, as the C export lays weights out."""
-PIXELS_MOST = 640 * 480
+RAYS_MOST = 640 * 480
 """Rays of an image: the pixels of the usual depth cameras at full size. 64 trials' images of this
 size and what they are made with fit into 2 GB."""
 
@@ -84,11 +84,11 @@ def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
     check_ranges(spec, where)
     camera = spec.camera
     across, down = camera.rays * camera.width, camera.rays * camera.height
-    if across * down > PIXELS_MOST:
+    if across * down > RAYS_MOST:
         times = f", times camera.rays {across} x {down}" if camera.rays > 1 else ""
         raise ValueError(
             f"{where}camera.width x camera.height is {camera.width} x {camera.height}{times}, "
-            f"allowed is up to {PIXELS_MOST} rays, as many as 640 x 480"
+            f"allowed is up to {RAYS_MOST} rays, as many as 640 x 480"
         )
     if spec.depth.near >= camera.range_m:
         raise ValueError(

@@ -122,8 +122,8 @@ def swift_sure() -> TrainConfig:
 def swift_keen() -> TrainConfig:
     """Return how `swift-keen` is made: as `swift-sure`, and flown with a finer eye.
 
-    Its pixels are the nearest of 2 x 2 rays in flight, and of one in training: no thin edge slips
-    through, and what is seen looks a little larger than it did while the policy learned.
+    Its pixels are the nearest of 2 x 2 rays in flight, and of one in training: fewer thin edges
+    slip through, and what is seen looks a little larger than it did while the policy learned.
     """
     base = swift_sure()
     camera = replace(base.spec.camera, rays=2)

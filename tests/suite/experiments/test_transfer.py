@@ -63,6 +63,12 @@ def test_commands_of_the_point_mass_are_as_late_at_any_rate():
     assert delays == pytest.approx(dict.fromkeys(delays, transfer.DELAY_S))
 
 
+@pytest.mark.parametrize("made", transfer.TRAINERS.values())
+def test_the_eye_is_as_fine_as_in_flight(made):
+    spec = replace(SPEC, camera=replace(SPEC.camera, rays=2))
+    assert made(spec, REFERENCE).physics.rays == 2
+
+
 @pytest.mark.parametrize(
     ("made", "up", "wins"),
     [
