@@ -20,7 +20,9 @@ VEHICLE = load_vehicle("reference")
 def wall():
     track = straight(wall_at=3.0)
     model = compile_model(track, VEHICLE, 0.002, layout_of([track]).solids)
-    return track, model, mujoco.MjData(model)
+    data = mujoco.MjData(model)
+    mujoco.mj_step1(model, data)
+    return track, model, data
 
 
 def test_the_quadrotor_is_the_first_body_and_starts_at_the_start(wall):
