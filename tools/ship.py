@@ -90,9 +90,9 @@ def main() -> None:
     parser.add_argument("--rays", type=int, help="spec.camera.rays, in the place of the run's own")
     options = parser.parse_args()
     with replacing_folder(SHELF / options.name) as beside:
-        for file in (WEIGHTS, CONFIG):
-            shutil.copy(options.runs[-1] / "policy" / file, beside / file)
-        config = json.loads((beside / CONFIG).read_text(encoding="utf-8"))
+        policy = options.runs[-1] / "policy"
+        shutil.copy(policy / WEIGHTS, beside / WEIGHTS)
+        config = json.loads((policy / CONFIG).read_text(encoding="utf-8"))
         if options.speed is not None:
             config["spec"]["speed"] = options.speed
         if options.rays is not None:

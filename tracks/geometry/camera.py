@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -26,7 +26,7 @@ class Camera:
     height: Annotated[int, Range(1, 1024)] = 24
     """Pixels down."""
     rays: Annotated[int, Range(1, 8)] = 1
-    """Rays across and down a pixel, which reads as the nearest: thin things do not slip through."""
+    """Rays across and down a pixel, which reads as the nearest: fewer thin things slip through."""
 
 
 def pixel_rays_b(camera: Camera) -> np.ndarray:
@@ -35,7 +35,15 @@ def pixel_rays_b(camera: Camera) -> np.ndarray:
     Row-major from the top left, as the image is stored. Each ray's component along the optical
     axis is 1, so the ray parameter at a hit is the planar depth itself.
     """
-    return _rays_b(camera, camera.height, camera.width).reshape(-1, 3)
+    half_u, half_v = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) / 2)
+    left = half_u * (1 - (2 * np.arange(camera.width) + 1) / camera.width)
+    up = half_v * (1 - (2 * np.arange(camera.height) + 1) / camera.height)
+    up, left = np.meshgrid(up, left, indexing="ij")
+    pitch = np.deg2rad(camera.pitch_deg)
+    rays = np.stack(
+        [np.cos(pitch) - up * np.sin(pitch), left, np.sin(pitch) + up * np.cos(pitch)], axis=-1
+    )
+    return rays.reshape(-1, 3)
 
 
 def cast_rays_b(camera: Camera) -> np.ndarray:
@@ -45,7 +53,8 @@ def cast_rays_b(camera: Camera) -> np.ndarray:
     All pixels' first parts come first, so that the nearest is taken over a leading axis.
     """
     n, height, width = camera.rays, camera.height, camera.width
-    rays = _rays_b(camera, n * height, n * width).reshape(height, n, width, n, 3)
+    finer = replace(camera, width=n * width, height=n * height)
+    rays = pixel_rays_b(finer).reshape(height, n, width, n, 3)
     return rays.transpose(1, 3, 0, 2, 4).reshape(-1, 3)
 
 
@@ -53,18 +62,6 @@ def nearest(camera: Camera, depth_m: Array) -> Array:
     """Return the image (..., height, width) from the depths (..., R) along `cast_rays_b` [m]."""
     parts = depth_m.reshape(*depth_m.shape[:-1], camera.rays**2, camera.height, camera.width)
     return parts.min(-3)
-
-
-def _rays_b(camera: Camera, rows: int, columns: int) -> np.ndarray:
-    """Return the rays through the centres of a grid over the image, (rows, columns, 3)."""
-    half_u, half_v = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) / 2)
-    left = half_u * (1 - (2 * np.arange(columns) + 1) / columns)
-    up = half_v * (1 - (2 * np.arange(rows) + 1) / rows)
-    up, left = np.meshgrid(up, left, indexing="ij")
-    pitch = np.deg2rad(camera.pitch_deg)
-    return np.stack(
-        [np.cos(pitch) - up * np.sin(pitch), left, np.sin(pitch) + up * np.cos(pitch)], axis=-1
-    )
 
 
 def optical_axis_b(camera: Camera) -> np.ndarray:
