@@ -7,8 +7,8 @@ Run it before and after a change, on one machine, and compare the two files:
     python tools/fingerprint.py --compare before.json after.json
 
 It goes through commands alone, so that it runs on any layout of the code: trials of the shipped
-policies (levels 0 and 9, 20 seeds, MuJoCo and MJX), 20 gradient steps in the point mass and in the
-quadrotor, a Delta Action Model in each, and the diagnosis of 20 blind cases.
+policies (levels 0 and 9), gradient steps of every recipe and of both dynamics, a Delta Action Model
+in each, `suite identify` on simulated flights, and the diagnosis of 20 blind cases.
 """
 
 from __future__ import annotations
@@ -25,7 +25,12 @@ from typing import Any
 
 import numpy as np
 
-POLICIES = ("racer", "swift", "swift-tuned")
+POLICIES = ("racer", "swift", "swift-quad", "swift-30", "swift-ahead", "swift-sure", "swift-keen",
+            "swift-small", "swift-tuned")  # fmt: skip
+RECIPES = ("racer", "swift", "swift-quad", "direct", "swift-30", "swift-ahead", "swift-sure",
+           "swift-keen", "paper")  # fmt: skip
+MJX_POLICIES = ("racer", "swift-keen")
+"""MJX takes longer: two of them show that its arithmetic stays."""
 STAMPS = ("version", "commit", "git_commit", "schema", "created", "seconds", "out")
 """Keys that may differ between two versions of the code that compute the same."""
 
@@ -81,20 +86,25 @@ def json_digest(path: Path) -> str:
 
 
 def trials(work: Path) -> dict[str, str]:
-    """Return digests of 120 trials a policy and world."""
+    """Return digests of 30 trials a policy and simulator."""
     digests = {}
-    for world in ("mujoco", "mjx"):
-        for policy in POLICIES:
+    for world, policies in (("mujoco", POLICIES), ("mjx", MJX_POLICIES)):
+        for policy in policies:
             out = work / f"eval-{world}-{policy}"
             suite("eval", "--policy", policy, "--world", world, "--difficulty", "0,9",
-                  "--trials", "20", "--workers", "1", "--out", out)  # fmt: skip
+                  "--trials", "5", "--workers", "1", "--out", out)  # fmt: skip
             digests[f"trials {world} {policy}"] = parquet_digest(out / "trials.parquet")
     return digests
 
 
 def training(work: Path) -> dict[str, str]:
-    """Return digests of 20 gradient steps: weights and curve."""
+    """Return digests of the weights after a few gradient steps."""
     digests = {}
+    for recipe in RECIPES:
+        out = work / f"train-{recipe}"
+        suite("train", "--preset", recipe, "--iterations", "3", "--out", out,
+              "--set", "episode.batch=4")  # fmt: skip
+        digests[f"training {recipe}"] = weights_digest(out / "policy")
     for model in ("point", "quad"):
         out = work / f"train-{model}"
         vehicle = ("--vehicle", "racer5") if model == "quad" else ()
@@ -133,10 +143,21 @@ def diagnosis(work: Path) -> dict[str, str]:
     return digests
 
 
+def identified(work: Path) -> dict[str, str]:
+    """Return digests of the vehicle that `suite identify` estimates from four flights."""
+    flights, out = work / "identify-flights", work / "identified.toml"
+    suite("collect", "--policy", "racer", "--trials", "4", "--vehicle", "reference",
+          "--out", flights)  # fmt: skip
+    suite("identify", *sorted(flights.glob("*.parquet")), "--vehicle", "racer5", "--out", out)
+    lines = [line for line in out.read_text().splitlines() if not line.startswith("#")]
+    return {"identify": hashlib.sha256("\n".join(lines).encode()).hexdigest()}
+
+
 PARTS: dict[str, Callable[[Path], dict[str, str]]] = {
     "trials": trials,
     "training": training,
     "delta": delta,
+    "identify": identified,
     "diagnosis": diagnosis,
 }
 
