@@ -14,9 +14,7 @@ EXPERIMENTS: dict[str, str] = {
     "ablation": "trainings with the vector field and without it, flown on unseen worlds",
     "schemes": "PPO, our method, and it without the field, measured as they learn",
     "ideas": "a recipe and variants of it with one change each, judged in pairs",
-    "laps": "laps of policies beside plans made with everything known and flown in MuJoCo",
     "hidden_worlds": "loops in worlds that hide an effect: what naming it and Delta Action gives",
-    "transfer": "judged trials in the trainer's dynamics, too: where failures come from",
     "worlds": "the shipped policies on the same trials in every world, side by side",
 }
 """Name -> one-line summary; NAME lives in suite/experiments/NAME.py."""

@@ -30,6 +30,7 @@ from tracks.common.provenance import stamp
 from tracks.common.work import Workers
 
 if TYPE_CHECKING:
+    from eval.judging.plans import OverPlan
     from eval.judging.results import Journal
     from eval.vehicles.vehicle import Vehicle
     from eval.worlds.trial import TrialResult
@@ -58,13 +59,14 @@ def evaluate(
     rest, by the same `workers` or others. The journals go when the tables are written.
 
     Returns:
-        The summary: `cells` and `paired` of `eval.judging.tables.summarise`, and what was judged.
+        The summary: `cells` and `paired` of `eval.judging.tables.summarise`, `over_plan` of
+        `eval.judging.plans.over_plan`, and what was judged.
 
     Raises:
         ValueError: for anything in `evaluation` that cannot be used, before the first flight.
     """
     from eval.judging.results import write_results
-    from eval.judging.tables import grids, markdown_table, summarise
+    from eval.judging.tables import grids, markdown_table, summarise, with_interval
 
     course, out = read_course(evaluation), Path(out)
     refuse_other_run(out, evaluation)
@@ -89,8 +91,10 @@ def evaluate(
     results: list[TrialResult] = []
     for flier, journal in zip(fliers, journals, strict=True):
         results += _fly_one(evaluation, course, flier, workers, journal, console)
+    over = _over_plan(results, course)
     summary = {
         **summarise(results),
+        "over_plan": over,
         "judged": evaluation,
         "policies": [about_policy(flier.source, flier.policy) for flier in fliers],
         "sha256": file_digests(course.vehicle, course.tracks),
@@ -108,8 +112,24 @@ def evaluate(
         journal.unlink()
     for grid in grids(summary):
         console.show(rich_table(grid))
+    for one in (one for one in over if one.finished):
+        whose = f"{one.policy}: " if len(over) > 1 else ""
+        console.say(
+            f"{whose}lap over plan: median {with_interval(one.ratio)} over {one.finished} planned "
+            "tracks"
+        )
     console.say(f"written: {out / 'trials.parquet'}, table.md, summary.json")
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
+
+
+def _over_plan(results: Sequence[TrialResult], course: Course) -> list[OverPlan]:
+    """Return laps over planned laps, where the vehicle is the one that the plans were flown on."""
+    from eval.judging.plans import VEHICLE, over_plan
+    from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table
+
+    if vehicle_table(course.vehicle) != vehicle_table(load_vehicle(VEHICLE)):
+        return []
+    return over_plan([row for row in results if row.track not in course.tracks])
 
 
 def file_digests(vehicle: Vehicle, tracks: Mapping[str, Track]) -> dict[str, str]:

@@ -37,6 +37,19 @@ def test_eval_writes_the_tables_and_says_them(pilots, tmp_path, capfd):
     assert set(header) >= {"schema", "suite_version", "git_commit", "seed"}
 
 
+def test_laps_are_compared_with_the_plans_of_their_tracks(pilots, tmp_path, capfd):
+    asked = ["--policy", pilots["pursuit"], "--track", "circular", "--trials", "2", "--seed", "1"]
+    assert _eval(tmp_path / "out", *asked) == 0
+    said = " ".join(capfd.readouterr().out.split())
+    (found,) = json.loads((tmp_path / "out" / "summary.json").read_text())["over_plan"]
+    ratio = found["ratio"]
+    assert found["planned"] == found["finished"] == 1 and 1.0 < ratio["value"] < 6.0
+    assert f"lap over plan: median {ratio['value']:.2f}" in said and "over 1 planned tracks" in said
+    assert _eval(tmp_path / "racer5", *asked, "--vehicle", "racer5") == 0
+    assert "lap over plan" not in capfd.readouterr().out
+    assert json.loads((tmp_path / "racer5" / "summary.json").read_text())["over_plan"] == []
+
+
 def test_what_a_folder_holds_is_not_written_over_without_a_word(pilots, tmp_path, capsys):
     asked = ["--track", "zigzag", "--policy", pilots["diver"]]
     assert _eval(tmp_path, *asked, "--trials", "1") == 0

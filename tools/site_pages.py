@@ -1,11 +1,13 @@
-"""What `make docs` does to a page's links that lead out of docs/: the site holds no such files.
+"""What `make docs` changes: links that lead out of docs/, and what the search finds.
 
-On a page read in the repository such a link opens a file; in the site its path stands there
-instead. A link to a file that does not exist ends the build.
+On a page read in the repository such a link opens a file. The site holds no such files, so their
+path within the repository stands there instead. A link to a file that does not exist ends the
+build. The search leaves out docs/archive, whose pages are of removed policies and experiments.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -29,3 +31,11 @@ def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
         return path if text.strip("`") in (target.name, path.strip("`")) else f"{text} ({path})"
 
     return OUTSIDE.sub(named, markdown)
+
+
+def on_post_build(config: Any, **_: Any) -> None:
+    """Take the pages of docs/archive out of the search."""
+    path = Path(config["site_dir"], "search", "search_index.json")
+    index = json.loads(path.read_text(encoding="utf-8"))
+    index["docs"] = [one for one in index["docs"] if not one["location"].startswith("archive/")]
+    path.write_text(json.dumps(index), encoding="utf-8")

@@ -1,1 +1,0 @@
-"""The fastest lap that is found with everything known: planned, and flown in MuJoCo."""
