@@ -7,7 +7,6 @@ from eval.judging.plans import over_plan, plans
 from eval.worlds.trial import TrialSpec, track_of
 from tests.support.judged_cells import result
 from tracks.geometry.crossing import crossing
-from tracks.geometry.gates import yaw_rotation
 
 
 def test_every_plan_passes_the_gates_of_its_track_in_order():
