@@ -15,8 +15,7 @@ from typing import final
 
 import numpy as np
 
-from policies.errors import NoAnswer, PolicyError
-from policies.spec import ACTION_SIZE, PolicySpec
+from policies.spec import ACTION_SIZE, NoAnswer, PolicyError, PolicySpec
 
 Model = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(state, image, hidden) to (action, hidden) for exactly one block of rows, float32 arrays."""

@@ -8,8 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from policies import shipped
-from policies.errors import PolicyError
-from policies.spec import PolicySpec
+from policies.spec import PolicyError, PolicySpec
 from tracks.common.names import closest, unknown_name
 
 Hidden = Any

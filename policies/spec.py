@@ -2,7 +2,7 @@
 
 The observation is the paper's (Su et al. 2026, Eq. 1), 12 numbers and a depth image, unless a
 policy asks for the gate after the next one, for the flight direction of either or for how fast it
-is to fly as well.
+is to fly as well. The errors of policies are here, too: a person's mistake, or a model's failure.
 """
 
 from __future__ import annotations
@@ -115,3 +115,15 @@ def check_network(spec: PolicySpec) -> None:
                 f"spec.camera.{side} is {pixels}, allowed for our network are multiples of 4 from "
                 "20 on"
             )
+
+
+class PolicyError(ValueError):
+    """A policy or checkpoint is refused; the message names it, the fault and what to do next."""
+
+
+class NeedsTrust(PolicyError):
+    """A file is refused since loading it can run its maker's code, and nobody said to trust it."""
+
+
+class NoAnswer(PolicyError):
+    """A policy that was loaded gave no answer: it failed, or did not come to an end in time."""

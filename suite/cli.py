@@ -95,7 +95,7 @@ def _dispatch(args: list[str]) -> int:
         print(overview(), file=sys.stdout if args else sys.stderr)
         return DONE if args else UNUSABLE
     if args[0] == "--version":
-        from tracks.common.version import VERSION
+        from tracks.common.provenance import VERSION
 
         print(f"suite {VERSION}")
         return DONE

@@ -39,7 +39,7 @@ from eval.effects import (
     weak_motor,
 )
 from eval.effects.interface import Effect, as_arrays, neutral
-from tracks.common.registry import Registry
+from tracks.common.names import Registry
 
 if TYPE_CHECKING:
     from eval.vehicles.vehicle import Vehicle

@@ -47,8 +47,7 @@ def import_log(
         ValueError: for an unknown format, or a mapping file that cannot be used.
     """
     from eval.importers.assemble import assemble
-    from eval.importers.detect import detect
-    from eval.importers.formats import FORMATS
+    from eval.importers.formats import FORMATS, detect
     from eval.importers.options import ImportOptions
 
     told = options or ImportOptions()

@@ -16,13 +16,10 @@ from eval.importers.checks.motion import (
 )
 from eval.importers.checks.units import check_units
 from eval.importers.checks.weight import check_weight
-from eval.importers.commands.motors import order_motors
-from eval.importers.commands.setpoint import rates_wanted
-from eval.importers.commands.thrust import thrust_command
-from eval.importers.findings import Finding, said
-from eval.importers.mapping.apply import KEPT
+from eval.importers.commands import order_motors, rates_wanted, thrust_command
+from eval.importers.findings import Finding, asked_of, said
+from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
-from eval.importers.partial import asked_of
 from eval.importers.rows import HOLE_S, HOLE_STEPS, NEEDED, own_rows, row_times, rows_at, slowest
 from eval.importers.signals import Recording, median_step
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError

@@ -17,7 +17,7 @@ from eval.judging.sensors import SensorNoise
 from eval.worlds.slots import IMAGE_AGES, LOSSES, STATE_AGES, generator_of
 from eval.worlds.trial import TrialSpec
 from policies.observation import View
-from tracks.common.tree_rows import select
+from tracks.common.masks import select
 
 
 class Due(NamedTuple):

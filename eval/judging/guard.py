@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from policies.errors import NoAnswer
 from policies.policy import Hidden, Policy
+from policies.spec import NoAnswer
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from eval.quadrotor.attitude import action_to_force, attitude_command, blend_hea
 from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant
 from eval.quadrotor.stepper import Inputs, PlantState, hover_state, plant_step
 from eval.vehicles.vehicle import Controller, Vehicle
-from tracks.common.masks import nowhere
-from tracks.common.tree_rows import packed, select
+from tracks.common.masks import nowhere, packed, select
 from tracks.geometry.scene import Array
 
 ATTITUDE_HZ = 100.0

@@ -14,8 +14,15 @@ from typing import Any, NamedTuple
 
 from eval.effects.interface import Array
 from eval.quadrotor import loops
-from eval.quadrotor.plant import Command, Motion, Plant, Wrench, uses_rotor_acc
-from eval.quadrotor.rigid_body import accelerations, euler_move
+from eval.quadrotor.plant import (
+    Command,
+    Motion,
+    Plant,
+    Wrench,
+    accelerations,
+    euler_move,
+    uses_rotor_acc,
+)
 from eval.quadrotor.rotors import RotorStep, acceleration, follow, steady
 from eval.quadrotor.stepper import (
     Feedback,

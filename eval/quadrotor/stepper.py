@@ -18,20 +18,20 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.effects.interface import GRAVITY, Array, Flow, Gust, Memory
 from eval.quadrotor import loops
-from eval.quadrotor.delay import delayed
 from eval.quadrotor.mixer import mix, rate_torque
 from eval.quadrotor.plant import (
     Command,
     Motion,
     Plant,
     Wrench,
+    accelerations,
+    euler_step,
     in_order,
     unpacked,
     uses_memory,
     uses_rotor_acc,
 )
-from eval.quadrotor.rigid_body import accelerations, euler_step
-from eval.quadrotor.rotors import RotorStep, follow, speed_command, steady
+from eval.quadrotor.rotors import RotorStep, delayed, follow, speed_command, steady
 from tracks.geometry.rotation import to_local
 
 

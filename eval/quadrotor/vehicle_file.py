@@ -21,7 +21,7 @@ from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Ve
 from eval.vehicles.vehicle_check import check_vehicle
 from tracks.common.files import write_text
 from tracks.common.names import LONGEST, closest, unknown_name
-from tracks.common.toml_text import to_toml
+from tracks.common.toml_table import to_toml
 from tracks.geometry.camera import Camera
 from tracks.input.ranges import is_number, shown
 from tracks.input.reading import InputError, read_toml, reason

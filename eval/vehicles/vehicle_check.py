@@ -8,8 +8,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.mixer import mixer_matrix
-from eval.vehicles.motors import motor_thrust
-from eval.vehicles.vehicle import MotorMap, Vehicle
+from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
 
 
 def check_vehicle(vehicle: Vehicle) -> None:

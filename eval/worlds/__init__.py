@@ -16,7 +16,7 @@ import numpy as np
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import Progress, TrialSpec
 from policies.observation import View
-from tracks.common.registry import Registry
+from tracks.common.names import Registry
 from tracks.track import Track
 
 REFERENCE = "reference"
@@ -28,7 +28,7 @@ WORLDS: Registry[Any] = Registry(
         "mujoco": "eval.worlds.mujoco:MujocoWorld",
         "mjx": "eval.worlds.mjx:MjxWorld",
         REFERENCE: "eval.worlds.reference:fly_trial",
-        "rotorpy": "eval.worlds.other.rotorpy:RotorpyWorld",
+        "rotorpy": "eval.worlds.rotorpy:RotorpyWorld",
     },
     lambda name, world: None if callable(world) else f"{world!r}; must be a class (`World`)",
 )

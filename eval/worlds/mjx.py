@@ -42,7 +42,7 @@ from eval.worlds.trial import (
     start_progress,
 )
 from policies.observation import View, view_of
-from tracks.common.tree_rows import select
+from tracks.common.masks import select
 from tracks.formats.mujoco_scene import GROUND
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
 from tracks.geometry.depth import depth_image

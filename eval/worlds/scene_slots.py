@@ -33,7 +33,7 @@ from eval.worlds.trial import (
     start_progress,
 )
 from policies.observation import View, view_of
-from tracks.common.tree_rows import packed, select
+from tracks.common.masks import packed, select
 from tracks.geometry.camera import Camera
 from tracks.track import Track
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from policies.errors import PolicyError
+from policies.spec import PolicyError
 from tracks.common.files import recover_folder, replacing_folder, to_json
 from tracks.common.provenance import stamp
 from tracks.input.ranges import shown

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from policies import shipped
-from policies.errors import PolicyError
-from policies.formats.embedded_spec import KEY, embed
 from policies.formats.policy_file import PolicyCheckpoint, load_policy_checkpoint
+from policies.formats.spec_json import KEY, embed
+from policies.spec import PolicyError
 from tracks.common.files import replacing_file
 from tracks.common.names import unknown_name
 

@@ -10,10 +10,10 @@ import numpy as np
 import onnx
 
 from policies.block_policy import BlockPolicy, proven
-from policies.errors import PolicyError
 from policies.formats.apart.process import Apart
-from policies.formats.embedded_spec import KEY, extract
 from policies.formats.program_inputs import INPUTS, check_inputs
+from policies.formats.spec_json import KEY, extract
+from policies.spec import PolicyError
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
 _STANDARD = ("", "ai.onnx")

@@ -14,8 +14,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from policies.networks.layouts import image_weight, kernel_oihw, rows_are_outputs
 from policies.networks.network import LEAK
+from policies.networks.tree_arrays import image_weight, kernel_oihw, rows_are_outputs
 from policies.spec import ACTION_SIZE, PolicySpec
 
 OPSET = 17

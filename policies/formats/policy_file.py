@@ -1,4 +1,4 @@
-"""Our policy as a checkpoint: the network's parameters with the `PolicySpec` they were made for."""
+"""Our networks as checkpoints: a policy with its `PolicySpec`, and a Delta Action Model."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from policies.errors import PolicyError
 from policies.formats.checkpoint import CONFIG, WEIGHTS, check_shapes, load_arrays, save_arrays
 from policies.formats.spec_json import spec_from_json, spec_to_json
-from policies.spec import PolicySpec, check_network
+from policies.spec import PolicyError, PolicySpec, check_network
 
-KIND = "policy"
+POLICY, DELTA = "policy", "delta"
+"""Kinds of checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def save_policy(
         OSError: where the disk refuses; what was there stays.
     """
     extra = {"spec": spec_to_json(spec), "training": dict(training or {})}
-    return save_arrays(folder, params, kind=KIND, seed=seed, extra=extra)
+    return save_arrays(folder, params, kind=POLICY, seed=seed, extra=extra)
 
 
 def load_policy_checkpoint(folder: Path) -> PolicyCheckpoint:
@@ -68,7 +68,7 @@ def load_policy_checkpoint(folder: Path) -> PolicyCheckpoint:
         PolicyError: where it is damaged, of another kind, not finite, or its arrays do not have
             the shapes that its spec asks for.
     """
-    stored = load_arrays(folder, kind=KIND)
+    stored = load_arrays(folder, kind=POLICY)
     if "spec" not in stored.config:
         raise PolicyError(f"{folder / CONFIG}: key 'spec' is missing; copy the whole folder again")
     spec = spec_from_json(stored.config["spec"], f"{folder / CONFIG}: spec")
@@ -92,3 +92,55 @@ def expected_shapes(spec: PolicySpec, where: str) -> dict[str, tuple[int, ...]]:
         raise PolicyError(f"{where}: {error}") from None
     shapes = jax.eval_shape(lambda key: network.init(key, spec), jax.random.key(0))
     return {name: tuple(value.shape) for name, value in shapes.items()}
+
+
+@dataclass(frozen=True)
+class DeltaCheckpoint:
+    """A Delta Action network as it was stored."""
+
+    params: dict[str, np.ndarray]
+    """The network's parameters, float32, as `delta_network.init` names and shapes them."""
+    config: dict[str, Any]
+    """The whole of config.json, "fit" among it."""
+
+
+def save_delta(
+    folder: Path,
+    params: Mapping[str, Any],
+    *,
+    seed: int | None,
+    fit: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write a Delta Action network; a kill at any moment leaves the old one or the new one.
+
+    Args:
+        folder: the checkpoint's folder.
+        params: the network's parameters.
+        seed: the fit's seed.
+        fit: the resolved configuration and results of the fit.
+
+    Returns:
+        `folder`.
+
+    Raises:
+        OSError: where the disk refuses; what was there stays.
+    """
+    return save_arrays(folder, params, kind=DELTA, seed=seed, extra={"fit": dict(fit or {})})
+
+
+def load_delta(folder: Path) -> DeltaCheckpoint:
+    """Read a Delta Action network.
+
+    Raises:
+        PolicyError: where the checkpoint is damaged, of another kind, not finite, or its arrays
+            are not the network's.
+    """
+    import jax
+
+    from policies.networks import delta_network
+
+    stored = load_arrays(folder, kind=DELTA)
+    shapes = jax.eval_shape(delta_network.init, jax.random.key(0))
+    expected = {name: tuple(value.shape) for name, value in shapes.items()}
+    check_shapes(folder / WEIGHTS, stored.arrays, expected)
+    return DeltaCheckpoint(stored.arrays, stored.config)

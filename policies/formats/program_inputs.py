@@ -6,9 +6,8 @@ import math
 from typing import Any
 
 from policies.block_policy import BLOCK
-from policies.errors import PolicyError
-from policies.formats.embedded_spec import KEY
-from policies.spec import EXTRAS, PolicySpec
+from policies.formats.spec_json import KEY
+from policies.spec import EXTRAS, PolicyError, PolicySpec
 
 INPUTS = ("state", "image", "hidden")
 """Names of a program's inputs, in order; a policy without memory leaves the last out."""

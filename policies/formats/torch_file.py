@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from policies.block_policy import BlockPolicy, Model, proven
-from policies.errors import NeedsTrust, PolicyError
 from policies.formats.apart.process import Apart
-from policies.formats.embedded_spec import KEY, extract
 from policies.formats.program_inputs import INPUTS, check_inputs, inputs_message
-from policies.spec import ACTION_SIZE
+from policies.formats.spec_json import KEY, extract
+from policies.spec import ACTION_SIZE, NeedsTrust, PolicyError
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from policies.networks.layouts import image_weight, kernel_oihw, rows_are_outputs
 from policies.networks.network import LEAK, flat_features
+from policies.networks.tree_arrays import image_weight, kernel_oihw, rows_are_outputs
 from policies.spec import ACTION_SIZE, PolicySpec
 
 CONVOLUTIONS = ("conv1", "conv2", "conv3")

@@ -9,8 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from policies.networks.draw import uniform
-from policies.networks.gru import gru_update
+from policies.networks.layers import gru_update, uniform
 from policies.networks.network import leaky_relu
 from policies.spec import ACTION_SIZE
 

@@ -13,9 +13,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from policies.networks.conv import conv_valid, patch_product
-from policies.networks.draw import uniform
-from policies.networks.gru import gru_update
+from policies.networks.layers import conv_valid, gru_update, patch_product, uniform
 from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
 
 Params = dict[str, jax.Array]

@@ -1,4 +1,7 @@
-"""A JAX pytree (parameters, optimizer state, step, random key) as arrays by name, and back."""
+"""A JAX pytree (parameters, optimizer state, step, random key) as arrays by name, and back.
+
+Of our network's parameters also the layouts of torch and ONNX: rows are outputs, channels first.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from policies.errors import PolicyError
+from policies.spec import PolicyError, PolicySpec
 
 
 def tree_to_arrays(tree: Any) -> dict[str, np.ndarray]:
@@ -58,3 +61,20 @@ def _is_key(leaf: Any) -> bool:
 
 def _data(leaf: Any) -> Any:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def rows_are_outputs(weight: np.ndarray) -> np.ndarray:
+    """Return a matrix (inputs, outputs) as (outputs, inputs), C-contiguous float32."""
+    return np.array(np.asarray(weight).T, np.float32, order="C")
+
+
+def kernel_oihw(kernel: np.ndarray) -> np.ndarray:
+    """Return a kernel (h, w, inputs, outputs) as (outputs, inputs, h, w), C-contiguous float32."""
+    return np.array(np.asarray(kernel).transpose(3, 2, 0, 1), np.float32, order="C")
+
+
+def image_weight(params: Mapping[str, np.ndarray], spec: PolicySpec) -> np.ndarray:
+    """Return the image's embedding (hidden, features) for features flattened channels first."""
+    rows, columns = spec.camera.height // 4 - 4, spec.camera.width // 4 - 4
+    weight = np.asarray(params["image.weight"]).reshape(rows, columns, spec.channels[2], -1)
+    return rows_are_outputs(weight.transpose(2, 0, 1, 3).reshape(-1, weight.shape[-1]))

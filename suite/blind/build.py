@@ -12,7 +12,6 @@ from eval.effects import EFFECTS, all_values
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.blind.cases import Case
-from suite.blind.hidden import changed_values, draw_change, true_parameters
 from suite.blind.oracle.information import (
     ALLOWED,
     REQUIRED,
@@ -36,7 +35,7 @@ from suite.blind.oracle.stretches import (
     whitened,
     without_start,
 )
-from suite.blind.outside import KINDS, make_outside
+from suite.blind.outside import KINDS, changed_values, draw_change, make_outside, true_parameters
 from suite.blind.simulators import Flights, Simulator, simulator_for
 from suite.common.errors import WorkFailed
 from suite.diagnose.plans.follow import FlightFailed, Recording

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eval.effects import EFFECTS, nameable_effects
-from eval.worlds.other.rotorpy_vehicle import ROTORPY_EFFECTS
+from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
 from suite.blind.oracle.strength import vehicle_names
 from suite.blind.outside import KINDS
 from suite.diagnose.plans.separating import SEPARATIONS

@@ -14,11 +14,10 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Command, Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery, rotation
-from suite.blind.continuous.conditions import Conditions
 from suite.blind.continuous.engine import Flown, Rows, fly
 from suite.blind.continuous.log import Noise, log_of_flight, state_at
 from suite.blind.continuous.quadrotor import quadrotor_of
-from suite.blind.continuous.timing import STEP_S, jittered_stamps, schedule
+from suite.blind.continuous.timing import STEP_S, Conditions, jittered_stamps, schedule
 from suite.diagnose.plans.follow import Recording, check_flights
 from suite.diagnose.plans.pilot import Gains, steer
 from suite.diagnose.plans.sensors import Sensors

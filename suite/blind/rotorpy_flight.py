@@ -2,11 +2,17 @@
 
 Pilot, rate loop and mixer are ours, since they are what the vehicle file describes; rotors, air
 and rigid body are RotorPy's, as the world `rotorpy` has them.
+
+RotorPy's rotor drag and inflow go by each hub's own airspeed `v + w x r`, those of our catalogue by
+the body's. At rotor speed `Omega` the difference is an angular damping: a drag `k Omega` in the
+rotor plane turns against `w_z` by `k Omega (x^2 + y^2)` a rotor, an inflow along body z against
+`w_x` by `k Omega y^2` and against `w_y` by `k Omega x^2`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +20,8 @@ from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.other.rotorpy import Multirotor, Push
-from eval.worlds.other.rotorpy_vehicle import ROTORPY_EFFECTS
+from eval.worlds.rotorpy import Multirotor, Push
+from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
 from suite.diagnose.plans.follow import Recording, Step, follow, wanted_of
 from suite.diagnose.plans.simulate import FULL_V
 from suite.diagnose.plans.trajectory import Reference, Trajectory
@@ -83,3 +89,34 @@ class _RotorpyBodies:
         acc_b = self._multirotor.specific_force_b(self._qpos, self._qvel, self._speed)
         voltage = np.full(len(speed), FULL_V)
         return Step(speed, voltage, command, Wrench(self._still, self._still), acc_b)
+
+
+NAME = "angular_damping"
+WITHIN = 1.5
+"""By this factor what is named may be off what hubs bring at hover: flights are no hover."""
+
+
+def damping_of_hubs(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.ndarray:
+    """Return the damping (3,) [1/s] that an answer's `effects` bring along at hover."""
+    place = np.asarray(vehicle.rotors.position)
+    inertia = np.asarray(vehicle.inertia)
+    thrust = vehicle.mass * GRAVITY / len(place)
+    speed = np.sqrt(thrust / vehicle.rotors.thrust_coefficient)
+    x_sum, y_sum = (place[:, :2] ** 2).sum(axis=0) * speed
+    found = np.zeros(3)
+    for effect in effects:
+        if effect["name"] == "rotor_drag":
+            found[2] += effect["parameters"]["coefficient"] * (x_sum + y_sum)
+        if effect["name"] == "inflow":
+            found[:2] += effect["parameters"]["coefficient"] * np.array([y_sum, x_sum])
+    return found / inertia
+
+
+def is_of_hubs(effect: Mapping[str, Any], damping: np.ndarray) -> bool:
+    """Return whether a diagnosis' `effect` is the damping (3,) that hubs bring."""
+    if effect["name"] != NAME or effect.get("alternatives") or not damping.any():
+        return False
+    value = np.asarray(effect["parameters"]["coefficient"]["value"], float)
+    most = int(damping.argmax())
+    ratio = value[most] / damping[most]
+    return bool(1.0 / WITHIN <= ratio <= WITHIN) and int(value.argmax()) in np.flatnonzero(damping)

@@ -15,8 +15,8 @@ from eval.effects import EFFECTS
 from eval.judging.statistics import wilson
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.blind.cases import MULTIPLES, ROTORPY
-from suite.blind.hubs import damping_of_hubs, is_of_hubs
 from suite.blind.make import load_manifest, open_answers, simulator_of
+from suite.blind.rotorpy_flight import damping_of_hubs, is_of_hubs
 from suite.blind.run import FAILED, TIMED
 from suite.diagnose.fit.parameters import effects_in
 from tracks.common.files import write_json, write_text

@@ -11,7 +11,7 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.cases import CONTINUOUS, ROTORPY, Case
-from suite.blind.continuous.conditions import draw_conditions
+from suite.blind.continuous.timing import draw_conditions
 from suite.blind.continuous_flight import (
     GRID_HZ,
     fly_continuous,

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from suite.common.console import Console, size
-from suite.common.estimate import available_memory_bytes
 from suite.common.provenance import machine, package_versions
-from tracks.common.provenance import git_commit
-from tracks.common.version import VERSION
+from suite.common.stages import available_memory_bytes
+from tracks.common.provenance import VERSION, git_commit
 
 
 @dataclass(frozen=True)

@@ -87,9 +87,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     import jax
 
     from policies.formats.checkpoint import CONFIG
-    from policies.formats.delta_file import load_delta
+    from policies.formats.policy_file import load_delta
     from policies.shipped import locate
-    from suite.delta.corrected import check_corrects
+    from suite.delta.replay import check_corrects
     from suite.train.run import started_from, train
 
     resolved = resolve(config)

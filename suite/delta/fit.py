@@ -20,9 +20,8 @@ import numpy as np
 import optax
 
 from policies.networks import delta_network
-from suite.delta.burn_in import forgotten
 from suite.delta.replay import PointMassModel, nominal_model, replay
-from suite.delta.windows import PointMassWindows
+from suite.delta.windows import PointMassWindows, forgotten
 from suite.train.config import PointMassConfig
 from tracks.input.ranges import Iterations, Range, Seed
 

@@ -17,8 +17,15 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.stepper import hover_state
 from policies.networks import delta_network
-from suite.delta.burn_in import BURN_IN_S, BurnIn, burn_in_before, state_after
-from suite.delta.windows import decision_period, refuse_none, stacked
+from suite.delta.windows import (
+    BURN_IN_S,
+    BurnIn,
+    burn_in_before,
+    decision_period,
+    refuse_none,
+    stacked,
+    state_after,
+)
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics.quadrotor import (
     QuadrotorState,

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from eval.logs.flight_log import FlightLog, read_flights
-from policies.formats.delta_file import save_delta
+from policies.formats.policy_file import save_delta
 from suite.common.console import Console
-from suite.common.estimate import Estimate, announce
 from suite.common.provenance import refuse_other_run, write_run_record
-from suite.delta.corrected import QUAD, corrected
+from suite.common.stages import Estimate, announce
 from suite.delta.fit import DeltaFit, FitConfig, PointMassFit, ReplayErrors, fit, fit_network
+from suite.delta.replay import QUAD, corrected
 from suite.delta.windows import cut_windows, decision_rate
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain, write_json, write_text

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from eval.logs.columns import DURATION_MIN
 from suite.common.console import Console
-from suite.common.estimate import announce
 from suite.common.provenance import refuse_other_run, write_run_record
+from suite.common.stages import announce
 from suite.judging.flying import (
     Course,
     about_policy,
@@ -23,8 +23,7 @@ from suite.judging.flying import (
     who_flies,
     workers_for,
 )
-from suite.judging.manner import Manner
-from suite.judging.requests import Collection
+from suite.judging.requests import Collection, Manner
 from tracks.common.files import write_json
 from tracks.common.provenance import git_commit, stamp
 from tracks.common.work import Workers

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.console import Console
-from suite.common.estimate import announce
 from suite.common.provenance import refuse_other_run, write_run_record
+from suite.common.stages import announce
 from suite.judging.flying import (
     Course,
     about_policy,
@@ -22,8 +22,7 @@ from suite.judging.flying import (
     who_flies,
     workers_for,
 )
-from suite.judging.manner import Manner, manners
-from suite.judging.requests import Evaluation
+from suite.judging.requests import Evaluation, Manner, manners
 from tracks.common.files import digest_of
 from tracks.common.grid import rich_table
 from tracks.common.provenance import stamp

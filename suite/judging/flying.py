@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.common.console import Console
-from suite.common.estimate import Estimate
+from suite.common.stages import Estimate
 from suite.judging.content import PolicyContent, policy_digest
-from suite.judging.manner import PLAIN, Manner
-from suite.judging.requests import Collection, Evaluation
+from suite.judging.requests import PLAIN, Collection, Evaluation, Manner
 from tracks.common.files import plain
 from tracks.common.work import Workers, crew, usable_cores
 from tracks.input.ranges import check_ranges

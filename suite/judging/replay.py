@@ -12,8 +12,7 @@ from suite.common.console import Console
 from suite.judging.content import policy_digest
 from suite.judging.evaluate import file_digests
 from suite.judging.flying import custom_tracks, default_policy, load_flier, trial_list
-from suite.judging.manner import manners
-from suite.judging.requests import Evaluation
+from suite.judging.requests import Evaluation, manners
 from tracks.input.ranges import check_ranges, shown
 from tracks.input.reading import read_json
 

@@ -11,8 +11,7 @@ from suite.loop.config import LoopConfig
 from suite.loop.variants import Findings, Loop
 from tracks.common.files import to_json
 from tracks.common.grid import Cell, Grid
-from tracks.common.provenance import git_commit
-from tracks.common.version import VERSION
+from tracks.common.provenance import VERSION, git_commit
 
 
 def write_loop_report(

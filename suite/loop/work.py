@@ -15,13 +15,12 @@ import numpy as np
 
 from eval.judging.results import read_trials
 from eval.quadrotor.vehicle_file import load_vehicle
-from policies.formats.delta_file import load_delta
+from policies.formats.policy_file import load_delta
 from suite.common.choices import parse_levels
 from suite.common.console import Console, Quiet
 from suite.common.errors import WorkFailed
-from suite.common.estimate import Estimate
 from suite.common.running.apart import Job
-from suite.common.stages import Stage, is_done
+from suite.common.stages import Estimate, Stage, is_done
 from suite.common.work import all_done
 from suite.delta.run import fit_delta, fitting_estimate
 from suite.judging.collect import collect

@@ -29,9 +29,9 @@ from policies.spec import PolicySpec
 from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.common.estimate import Estimate, announce
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.running import hosts
+from suite.common.stages import Estimate, announce
 from suite.train.worlds import Worlds
 from tracks.common.files import recover_folder
 from tracks.common.work.threads import threads

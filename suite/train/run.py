@@ -19,8 +19,8 @@ import numpy as np
 from policies.networks import delta_network, network
 from policies.spec import PolicySpec
 from suite.common.console import Console
-from suite.common.estimate import Estimate
 from suite.common.running import hosts
+from suite.common.stages import Estimate
 from suite.train.config import TrainConfig, check
 from suite.train.repeat import Method, Outcome, Run, Watch, flight_note, repeat
 from suite.train.update import (

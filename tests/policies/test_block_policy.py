@@ -8,9 +8,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from policies.block_policy import BlockPolicy, for_one_row, proven
-from policies.errors import NoAnswer, PolicyError
 from policies.policy import load_policy
-from policies.spec import PolicySpec
+from policies.spec import NoAnswer, PolicyError, PolicySpec
 
 
 @pytest.fixture(scope="module", params=["native", "torch", "onnx"])

@@ -2,8 +2,8 @@
 
 import pytest
 
-from policies.errors import PolicyError
 from policies.policy import load_policy
+from policies.spec import PolicyError
 
 
 def test_a_refusal_is_a_wrong_value_which_the_command_line_says_in_one_line():

@@ -27,7 +27,7 @@ def run(script, *arguments):
 def test_training_and_flying_our_policy_needs_jax_and_numpy_only(checkpoint, tmp_path):
     script = BLOCK + (
         "import pathlib, numpy as np\n"
-        "from policies.formats import delta_file, policy_file\n"
+        "from policies.formats import policy_file\n"
         "from policies.networks import delta_network, tree_arrays\n"
         "from policies.policy import load_policy\n"
         "stored = policy_file.load_policy_checkpoint(pathlib.Path(sys.argv[1]))\n"

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from policies import shipped
-from policies.errors import PolicyError
 from policies.policy import load_policy
+from policies.spec import PolicyError
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import pytest
 
 from suite import cli
-from tracks.common.version import VERSION
+from tracks.common.provenance import VERSION
 
 HEAVY = ("numpy", "jax", "mujoco", "torch", "tyro", "rich", "scipy", "pyarrow", "argparse")
 SLOW = ("jax", "mujoco", "torch", "dm_control", "trimesh", "matplotlib", "rerun", "scipy")

@@ -4,9 +4,9 @@ import importlib
 
 import numpy as np
 
-from policies.errors import NoAnswer, PolicyError
 from policies.formats.apart.process import REMEDIES, Port
 from policies.formats.apart.server import KINDS
+from policies.spec import NoAnswer, PolicyError
 
 
 class InProcess:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tracks.common.registry import Registry
+from tracks.common.names import Registry
 from tracks.families import circular, ellipse, random, zigzag
 from tracks.families.layout import GATE_COUNT, Layout
 from tracks.geometry.scene import Counts, counts

@@ -11,7 +11,9 @@ from typing import Any, Protocol
 
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
-from tracks.common.registry import Registry
+from eval.logs.columns import FlightLogError
+from eval.logs.files import read_head
+from tracks.common.names import Registry
 
 
 class Format(Protocol):
@@ -52,3 +54,24 @@ FORMATS: Registry[Format] = Registry(
     },
     _wrong,
 )
+
+
+def detect(path: Path, options: ImportOptions) -> str:
+    """Return the name of the format of the file at `path`.
+
+    Formats that take whatever has columns, such as tables, are asked after all others.
+
+    Raises:
+        FlightLogError: where the file cannot be read, or is of no known format.
+    """
+    head = read_head(path)
+    asked = sorted(FORMATS.items(), key=lambda item: getattr(item[1], "ASKED_LAST", False))
+    reason = "of no known format; name it with --format, and a table's columns with --map"
+    for name, format in asked:
+        try:
+            if format.detect(head, options):
+                return name
+        except ValueError as error:
+            reason = str(error)
+            break
+    raise FlightLogError(str(path), None, None, reason)

@@ -22,8 +22,7 @@ from eval.importers.formats.table import numbers
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
-from eval.logs.files import read_columns
-from eval.logs.head import first_line
+from eval.logs.files import first_line, read_columns
 
 SUMMARY = "CSV of blackbox_decode; needs --pose"
 TAKES_MAP = TAKES_SOURCE = False

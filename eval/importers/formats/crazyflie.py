@@ -8,7 +8,7 @@ the file; a Crazyflie that was switched off while logging leaves it out. Source:
 documentation of the deck and its log variables (Bitcraze).
 
 The firmware's world is z-up and its body forward-left-up. Which variable is what, in which unit
-and sign, is said by `eval/importers/mapping/shipped/crazyflie.toml`.
+and sign, is said by `eval/importers/mappings/crazyflie.toml`.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from zlib import crc32
 import numpy as np
 
 from eval.importers.findings import Finding
-from eval.importers.mapping.apply import recording_of
-from eval.importers.mapping.file import read_map
+from eval.importers.mapping import recording_of
+from eval.importers.mapping_file import read_map
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError
-from eval.logs.head import read_head
+from eval.logs.files import read_head
 from tracks.common.names import closest
 
 SUMMARY = "log of the Crazyflie's micro SD card deck"

@@ -30,7 +30,7 @@ from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, turn
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
-from eval.logs.head import read_head
+from eval.logs.files import read_head
 
 SUMMARY = "PX4 ULog (.ulg)"
 TAKES_MAP = TAKES_SOURCE = False

@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from eval.quadrotor.loops import betaflight, crazyflie, px4
-from eval.quadrotor.loops.layout import layout_of
-from eval.vehicles.motors import command_of_thrust
-from eval.vehicles.vehicle import MotorMap, Vehicle
+from eval.quadrotor.loops.filters import layout_of
+from eval.vehicles.vehicle import MotorMap, Vehicle, command_of_thrust
 from tracks.geometry.scene import Array
 
 NOMINAL = "p"

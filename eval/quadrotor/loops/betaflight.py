@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.quadrotor.loops.filters import PT3_SCALE, pick, pt1
-from eval.quadrotor.loops.layout import Layout
+from eval.quadrotor.loops.filters import PT3_SCALE, Layout, pick, pt1
 from eval.quadrotor.mixer import largest, least
 from tracks.geometry.scene import Array
 

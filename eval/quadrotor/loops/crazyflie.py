@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.quadrotor.loops.filters import Pair, butterworth, pick
-from eval.quadrotor.loops.layout import Layout
+from eval.quadrotor.loops.filters import Layout, Pair, butterworth, pick
 from eval.quadrotor.mixer import largest
 from tracks.geometry.scene import Array
 

@@ -1,9 +1,15 @@
-"""Discrete low-pass filters of flight controllers, for numpy and JAX; a cutoff of 0 passes all."""
+"""What firmwares' rate loops share: low-pass filters, and the signs of a mixer from the rotors.
+
+The filters are discrete, for numpy and JAX; a cutoff of 0 passes all.
+"""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from eval.vehicles.vehicle import Rotors
 from tracks.geometry.scene import Array
 
 PT3_SCALE = 1.961459177
@@ -62,3 +68,18 @@ def pick(fresh: Array, then: Any, otherwise: Any) -> Any:
     """Return `then` where `fresh` (...,) is 0, else `otherwise`, for arrays (..., 3)."""
     xp = fresh.__array_namespace__()
     return xp.where(fresh[..., None] == 0.0, then, otherwise)
+
+
+class Layout(NamedTuple):
+    """Shares (4,) of each motor, up to 1, in turning the body about its axes (FLU)."""
+
+    roll: Array
+    pitch: Array
+    yaw: Array
+
+
+def layout_of(rotors: Rotors) -> Layout:
+    """Return the layout of `rotors`: arms over the longest arm, and against the spin."""
+    x, y, _ = np.asarray(rotors.position, dtype=float).T
+    spin = np.asarray(rotors.spin, dtype=float)
+    return Layout(y / np.max(np.abs(y)), -x / np.max(np.abs(x)), -spin)

@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.quadrotor.loops.filters import Pair, butterworth, pick, pt1, settled
-from eval.quadrotor.loops.layout import Layout
+from eval.quadrotor.loops.filters import Layout, Pair, butterworth, pick, pt1, settled
 from eval.quadrotor.mixer import largest, least
 from tracks.geometry.scene import Array
 

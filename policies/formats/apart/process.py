@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from policies.errors import NoAnswer, PolicyError
 from policies.formats.apart.server import KINDS, data_bytes
+from policies.spec import NoAnswer, PolicyError
 
 LOAD_S = 60.0
 """To start, load the model and optimise it [s]."""

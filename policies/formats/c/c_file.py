@@ -9,11 +9,10 @@ from typing import final
 
 import numpy as np
 
-from policies.errors import NeedsTrust, PolicyError
 from policies.formats.apart.process import ANSWER_BYTES, Apart
 from policies.formats.c.compiler import compiled_library
-from policies.formats.embedded_spec import extract
-from policies.spec import ACTION_SIZE, PolicySpec
+from policies.formats.spec_json import extract
+from policies.spec import ACTION_SIZE, NeedsTrust, PolicyError, PolicySpec
 
 _STATE_MOST = 2**26
 """Bytes of one flight's `policy_state`."""

@@ -10,8 +10,8 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from policies.errors import PolicyError
 from policies.formats.c.source import TEMPLATES
+from policies.spec import PolicyError
 from tracks.common.files import replacing_file
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes
 

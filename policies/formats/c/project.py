@@ -8,16 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from policies.errors import PolicyError
 from policies.formats.c.arrays import float_text
 from policies.formats.c.forward import Observed
 from policies.formats.c.quantised import Quantised, answers, quantise
 from policies.formats.c.source import TEMPLATES, sources
-from policies.formats.embedded_spec import embed
 from policies.formats.policy_file import PolicyCheckpoint
+from policies.formats.spec_json import embed
 from policies.native import native_policy
 from policies.policy import Policy
-from policies.spec import PolicySpec
+from policies.spec import PolicyError, PolicySpec
 from tracks.common.names import unknown_name
 
 DTYPES = ("float32", "int8")

@@ -13,11 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from policies.errors import PolicyError
 from policies.formats.c import forward
 from policies.formats.c.arrays import LAYERS, matrices, small_arrays
 from policies.formats.c.forward import Observed
-from policies.spec import PolicySpec
+from policies.spec import PolicyError, PolicySpec
 
 SUM_MOST = 2**31 - 1
 """Of a layer's integer sums, which C adds up in 32 bits."""

@@ -16,7 +16,7 @@ from policies.formats.c.quantised import Quantised
 from policies.formats.policy_file import PolicyCheckpoint
 from policies.networks.network import LEAK, flat_features
 from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
-from tracks.common.version import VERSION
+from tracks.common.provenance import VERSION
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 TANH_TERMS = 12

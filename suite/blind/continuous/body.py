@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.blind.continuous.air import FORCES, THRUSTS, TORQUES, Moment
+from suite.blind.continuous.air import FORCES, THRUSTS, TORQUES, Moment, Wind
 from suite.blind.continuous.quadrotor import Quadrotor
-from suite.blind.continuous.wind import Wind
 
 POS, VEL, QUAT, RATE = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
 """Parts of a state (N, 13): position and velocity in the world, body to world, body rates."""

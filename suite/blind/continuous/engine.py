@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from suite.blind.continuous.air import Wind
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery, Body, rotation
-from suite.blind.continuous.controller import wanted_speeds
-from suite.blind.continuous.quadrotor import GRAVITY, Quadrotor
+from suite.blind.continuous.quadrotor import GRAVITY, Quadrotor, wanted_speeds
 from suite.blind.continuous.timing import Schedule
-from suite.blind.continuous.wind import Wind
 
 
 class Rows(NamedTuple):

@@ -9,8 +9,8 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL
-from suite.blind.continuous.conditions import Conditions
 from suite.blind.continuous.engine import Flown
+from suite.blind.continuous.timing import Conditions
 
 IN_A_ROW = 3
 """Rows without a pose follow each other in such stretches."""

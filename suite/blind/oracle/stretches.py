@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant
-from eval.quadrotor.rigid_body import euler_step
+from eval.quadrotor.plant import Command, Motion, Plant, Wrench, euler_step, make_plant
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.plans.follow import Recording

@@ -17,8 +17,7 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.vehicles.motors import command_of_thrust
-from eval.vehicles.vehicle import MotorMap, Vehicle
+from eval.vehicles.vehicle import MotorMap, Vehicle, command_of_thrust
 from suite.diagnose.identify.data.drive import torque_of
 from suite.diagnose.plans.follow import Recording
 from suite.diagnose.plans.sensors import Sensors, log_of

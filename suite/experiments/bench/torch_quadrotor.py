@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from eval.effects.interface import GRAVITY
-from eval.quadrotor.delay import delay_weight
 from eval.quadrotor.loops import NOMINAL
 from eval.quadrotor.mixer import mixer_matrix
+from eval.quadrotor.rotors import delay_weight
 from suite.experiments.bench.torch_fleet import asked, blend, exp_rot, faded
 from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import QuadrotorConfig

@@ -10,7 +10,7 @@ from typing import Any
 
 from suite.common.provenance import machine, package_versions
 from tracks.common.files import digest_of
-from tracks.common.registry import added_entries
+from tracks.common.names import added_entries
 
 ROOT = Path(__file__).resolve().parents[3]
 NO_RESULT = ("view", "importers", "envs")

@@ -21,11 +21,11 @@ from eval.judging.sensors import SensorNoise
 from eval.judging.tables import Tally, summarise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult, TrialSpec
-from policies.errors import NeedsTrust, PolicyError
 from policies.policy import Policy, load_policy
+from policies.spec import NeedsTrust, PolicyError
 from suite.common.choices import parse_levels
 from suite.common.console import Console
-from suite.common.estimate import announce
+from suite.common.stages import announce
 from suite.experiments.study.cache import code_digest, digest, engines
 from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.flying import TRIALS_A_PROCESS, cost_of, flying_needs, labels, trial_list

@@ -18,8 +18,8 @@ import numpy as np
 from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.common.estimate import Estimate, announce
 from suite.common.running.apart import Job
+from suite.common.stages import Estimate, announce
 from suite.common.work import all_done
 from suite.experiments.study.cache import digest
 from suite.train.config import TrainConfig

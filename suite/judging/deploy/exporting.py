@@ -1,19 +1,21 @@
-"""What `suite export` does: the files, and for C what they are worth on this machine."""
+"""What `suite export` does: the files, and for C a card of what they are worth on this machine."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from policies import shipped
+from policies.formats.c.arrays import multiply_adds
+from policies.formats.c.source import memory_bytes
+from policies.formats.policy_file import PolicyCheckpoint
 from suite.common.console import Console
 from suite.judging.content import policy_digest
-from suite.judging.deploy.card import CARD, card_text
-from suite.judging.deploy.observed import observed_flights
-from suite.judging.deploy.parity import parity
+from suite.judging.deploy.parity import Parity, observed_flights, parity
 from tracks.common.files import check_no_input, write_json, write_text
-from tracks.common.provenance import stamp
+from tracks.common.provenance import VERSION, stamp
 from tracks.input.reading import read_json
 
 NOTE = "exports.json"
@@ -84,3 +86,61 @@ def _noted(path: Path) -> dict[str, dict[str, str]]:
         return {file: dict(entry) for file, entry in read_json(path)["files"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: not a note of exports ({error}); move it away") from error
+
+
+CARD = "card.md"
+_LICENCE = (
+    "Apache-2.0, as diffracing-suite; the checkpoint's maker may say otherwise of the weights"
+)
+
+
+def card_text(
+    asked: str, name: str, checkpoint: PolicyCheckpoint, dtype: str, found: Parity
+) -> str:
+    """Return the card of an export as Markdown.
+
+    Args:
+        asked: the policy as it was asked for.
+        name: what it is called.
+        checkpoint: where it came from.
+        dtype: of the weights.
+        found: how near it is, and its time a step.
+    """
+    spec = checkpoint.spec
+    timing = "not measured"
+    if found.timing:
+        median, p99, most = (f"{1e6 * x:.0f}" for x in found.timing)
+        timing = f"median {median} us, 99th percentile {p99} us, longest {most} us (one thread)"
+    seed = "unknown" if checkpoint.seed is None else checkpoint.seed
+    rows = (
+        ("policy", name),
+        ("type", dtype),
+        ("checkpoint", f"weights.safetensors, SHA-256 `{checkpoint.config['weights']['sha256']}`"),
+        ("made by", f"diffracing-suite {VERSION}, training seed {seed}"),
+        ("rate", f"{spec.rate_hz:g} Hz"),
+        ("parity", found.sentence),
+        ("a step here", timing),
+        ("multiply-adds a step", str(multiply_adds(spec))),
+        ("memory of the caller", f"{memory_bytes(spec, dtype == 'int8')} bytes"),
+        ("licence", _LICENCE),
+    )
+    table = "\n".join(f"| {key} | {value} |" for key, value in rows)
+    return f"# {name}, {dtype}, in C\n\n| | |\n| --- | --- |\n{table}\n\n{_success(asked)}"
+
+
+def _success(asked: str) -> str:
+    """Return what the policy's own card says of its success, or that nothing is known."""
+    path = shipped.locate(asked) / "card.md"
+    text = Path(path).read_text(encoding="utf-8") if path.is_file() else ""
+    lines = [line for line in text.splitlines() if line.startswith("|") and "success" in line]
+    if not lines:
+        return "Success: not known; `suite eval --policy . --trust` flies it in the judge.\n"
+    whole = text.splitlines()
+    first = whole.index(lines[0])
+    last = next((k for k in range(first, len(whole)) if not whole[k].startswith("|")), len(whole))
+    table = "\n".join(whole[first:last])
+    spans = " with 95 % intervals" if re.search(r"\[\d", table) else ""
+    return (
+        f"Success of the policy that it came from, by its card{spans} "
+        f"(`suite eval --policy . --trust` flies the export):\n\n{table}\n"
+    )

@@ -28,8 +28,7 @@ from suite.judging.link.report import delays
 from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
-from suite.judging.manner import manners
-from suite.judging.requests import Evaluation
+from suite.judging.requests import Evaluation, manners
 from tracks.common.files import write_json
 from tracks.common.grid import rich_table, table
 from tracks.common.provenance import stamp

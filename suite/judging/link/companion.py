@@ -7,6 +7,8 @@ Time is handed in, so that a test can hold the clock.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from eval.judging.guard import ActionLimits, guard_action
@@ -21,7 +23,6 @@ from eval.vehicles.vehicle import Vehicle
 from policies.observation import observe, view_of
 from policies.policy import Policy
 from suite.judging.link.messages import Alive, Note, Packet, Picture, SetPoint, State, Wire
-from suite.judging.link.row import Row
 from suite.judging.link.watchdog import (
     Clock,
     ClockCheck,
@@ -263,3 +264,25 @@ class Companion:
 
 def _row(gates: Gates, number: int) -> Gates:
     return Gates(*(x[None, number] for x in gates))
+
+
+class Row(NamedTuple):
+    """What the companion knew and did at one state."""
+
+    state: State
+    thrust: float
+    """Wanted collective thrust per mass [m/s^2]."""
+    rate_b: np.ndarray
+    """(3,) wanted body rates [rad/s]."""
+    action_b: np.ndarray
+    """(3,) the policy's action in use [m/s^2]."""
+    decided: bool
+    """Whether the policy decided on this state."""
+    gate: int
+    """Number of the next gate."""
+    answered_s: float
+    """From the state's arrival to its set point [s]."""
+    state_age_s: float
+    """From the state's stamp to its set point, where both ends have one clock [s]."""
+    image_age_s: float
+    """From the image's arrival to the decision [s]."""

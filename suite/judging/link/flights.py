@@ -19,10 +19,9 @@ from policies.observation import Observation
 from policies.policy import Policy
 from suite.common.console import Console
 from suite.judging.flying import Course, log_name
-from suite.judging.link.companion import FINISHED, Companion
+from suite.judging.link.companion import FINISHED, Companion, Row
 from suite.judging.link.messages import Wire
 from suite.judging.link.report import delays, log_of
-from suite.judging.link.row import Row
 from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S, Request, VehicleProcess
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits

@@ -11,17 +11,20 @@
 MAVLink has no message for depth images (OBSTACLE_DISTANCE is 72 distances in a plane). Its image
 transmission is made for small pictures, and 24 x 32 pixels fit into seven packets; a packet that
 is lost loses its image and nothing else.
+
+MAVLink's world is NED and its body FRD, ours z up and FLU: north is our x, east minus our y, down
+minus our z, and forward, right and down likewise. Both changes are the same half turn about x.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN
 from suite.common.errors import WorkFailed
-from suite.judging.link.frames import turned, turned_quat
 from tracks.geometry.rotation import quat_to_rot, to_local, to_world
 
 PACKET = 253
@@ -281,3 +284,13 @@ class Picture:
         millimetres = np.frombuffer(data, ">u2", offset=len(self._head)).reshape(self._shape)
         metres = np.where(millimetres == 0, self._range_m, millimetres * 1e-3)
         return np.minimum(metres, self._range_m)
+
+
+def turned(vector: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return a vector (3,) of one world or body frame in the other convention."""
+    return np.asarray(vector, float) * HALF_TURN
+
+
+def turned_quat(quat_wxyz: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return an attitude (4,), body to world, wxyz, in the other convention."""
+    return np.asarray(quat_wxyz, float) * QUAT_HALF_TURN

@@ -8,8 +8,7 @@ import numpy as np
 
 from eval.logs.flight import Flight
 from eval.logs.flight_log import FlightLog, log_from_flight
-from suite.judging.link.companion import Companion
-from suite.judging.link.row import Row
+from suite.judging.link.companion import Companion, Row
 
 
 def delays(rows: list[Row], deadline_s: float) -> dict[str, Any]:

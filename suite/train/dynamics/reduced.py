@@ -24,8 +24,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading
-from eval.quadrotor.delay import delay_weight
-from eval.quadrotor.rotors import follow, speed_command
+from eval.quadrotor.rotors import delay_weight, follow, speed_command
 from policies.spec import PolicySpec
 from suite.train.dynamics.fleet import FleetConfig, Vehicles, draw_vehicles
 from suite.train.dynamics.point_mass import attitude, faded

@@ -9,7 +9,7 @@ import jax
 from jax.sharding import SingleDeviceSharding
 
 from suite.common.console import Console
-from suite.common.estimate import Estimate
+from suite.common.stages import Estimate
 from suite.train import run as trainer
 from suite.train.config import check
 from suite.train.ppo.config import PpoConfig

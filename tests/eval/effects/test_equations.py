@@ -9,8 +9,7 @@ import pytest
 
 from eval.effects import EFFECTS
 from eval.effects.log_faults import apply_log_faults
-from eval.quadrotor.plant import Command, Motion, make_plant, uses_noise
-from eval.quadrotor.rigid_body import accelerations
+from eval.quadrotor.plant import Command, Motion, accelerations, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from tests.support.flights import small_log
 from tests.support.vehicles import PLAIN, at_rest, with_effects

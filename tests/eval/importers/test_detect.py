@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
-from eval.importers.detect import detect
-from eval.importers.formats import FORMATS
+from eval.importers.formats import FORMATS, detect
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
 from tests.support import foreign_logs as made

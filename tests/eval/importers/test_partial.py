@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from eval.importers.partial import asked_of
+from eval.importers.findings import asked_of
 
 
 def test_motor_commands_and_positions_tell_weight_and_balance():

@@ -11,7 +11,7 @@ from eval.judging.guard import ActionLimits, guard_action
 from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
-from policies.errors import NoAnswer
+from policies.spec import NoAnswer
 from tests.support.courses import straight
 from tests.support.pilots import Pursuit
 

@@ -3,7 +3,7 @@
 import pytest
 
 from eval.logs.columns import FlightLogError
-from eval.logs.head import first_line, read_head
+from eval.logs.files import first_line, read_head
 
 
 def test_a_head_is_the_first_bytes_only(tmp_path):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.quadrotor.delay import delay_weight, delayed, whole_steps
+from eval.quadrotor.rotors import delay_weight, delayed, whole_steps
 
 DT = 0.002
 

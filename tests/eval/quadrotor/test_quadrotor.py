@@ -15,8 +15,7 @@ from jaxtyping import Float, Shaped, jaxtyped
 
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
 from eval.quadrotor.mixer import mix, rate_torque
-from eval.quadrotor.plant import Motion, Wrench, make_plant
-from eval.quadrotor.rigid_body import accelerations, euler_step
+from eval.quadrotor.plant import Motion, Wrench, accelerations, euler_step, make_plant
 from eval.quadrotor.rotors import follow, speed_command
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from eval.quadrotor.vehicle_file import load_vehicle

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from eval.quadrotor.plant import Wrench, make_plant
-from eval.quadrotor.rigid_body import euler_step
+from eval.quadrotor.plant import Wrench, euler_step, make_plant
 from tests.support.vehicles import PLAIN, at_rest
 
 

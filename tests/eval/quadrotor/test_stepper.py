@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from eval.effects import EFFECTS, all_values
 from eval.quadrotor.model import compile_quadrotor
-from eval.quadrotor.plant import Command, Motion, fit_plant, make_plant
-from eval.quadrotor.rigid_body import accelerations
+from eval.quadrotor.plant import Command, Motion, accelerations, fit_plant, make_plant
 from eval.quadrotor.stepper import Feedback, Inputs, hover_state, plant_step, rollout, step
 from eval.quadrotor.vehicle_file import load_vehicle
 from tests.support.vehicles import PLAIN, at_rest, drawn_effects, with_effects, with_lag

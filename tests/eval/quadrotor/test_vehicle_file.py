@@ -19,7 +19,7 @@ from eval.quadrotor.vehicle_file import (
     vehicle_table,
 )
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects
-from tracks.common.toml_text import to_toml
+from tracks.common.toml_table import to_toml
 
 TABLE = tomllib.loads((SHIPPED / "racer5.toml").read_text())
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle, parse_vehicle, vehicle_table
-from eval.vehicles.motors import command_of_thrust, motor_speed, motor_thrust
-from eval.vehicles.vehicle import MotorMap
+from eval.vehicles.vehicle import MotorMap, command_of_thrust, motor_speed, motor_thrust
 from tests.support.vehicles import PLAIN
 
 MAP = MotorMap(thrust=(0.2, 0.6), voltage=4.0)

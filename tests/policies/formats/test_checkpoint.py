@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from policies.errors import PolicyError
 from policies.formats.checkpoint import CONFIG, WEIGHTS, load_arrays, save_arrays
+from policies.spec import PolicyError
 
 ARRAYS = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "step": np.int64(7)}
 

@@ -4,9 +4,8 @@ import json
 
 import pytest
 
-from policies.errors import PolicyError
-from policies.formats.embedded_spec import KEY, SCHEMA, embed, extract
-from policies.spec import PolicySpec
+from policies.formats.spec_json import KEY, SCHEMA, embed, extract
+from policies.spec import PolicyError, PolicySpec
 from tests.policies.conftest import SPEC
 
 

@@ -10,11 +10,11 @@ import onnx
 import pytest
 import torch
 
-from policies.errors import PolicyError
-from policies.formats.embedded_spec import KEY
 from policies.formats.export import export_policy
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
+from policies.formats.spec_json import KEY
 from policies.policy import load_policy
+from policies.spec import PolicyError
 from tests.policies.conftest import SPEC, lively
 
 

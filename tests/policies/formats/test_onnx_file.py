@@ -5,10 +5,10 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from policies.errors import PolicyError
 from policies.formats import onnx_file
 from policies.formats.onnx_file import files_of
 from policies.policy import load_policy
+from policies.spec import PolicyError
 
 FLOAT = TensorProto.FLOAT
 

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from policies.errors import PolicyError
 from policies.formats.checkpoint import CONFIG
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.networks import network
-from policies.spec import PolicySpec
+from policies.spec import PolicyError, PolicySpec
 from tracks.geometry.camera import Camera
 
 SPEC = PolicySpec(rate_hz=33.0, camera=Camera(pitch_deg=20.0), hidden_size=16)

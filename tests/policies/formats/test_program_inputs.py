@@ -2,9 +2,8 @@
 
 import pytest
 
-from policies.errors import PolicyError
 from policies.formats.program_inputs import check_inputs
-from policies.spec import PolicySpec
+from policies.spec import PolicyError, PolicySpec
 
 STATE, IMAGE = ("batch", 12), ("batch", 24, 32)
 

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policies.errors import PolicyError
 from policies.formats.spec_json import spec_from_json, spec_to_json
-from policies.spec import DepthEncoding, PolicySpec
+from policies.spec import DepthEncoding, PolicyError, PolicySpec
 from tests.policies.conftest import SPEC
 from tracks.geometry.camera import Camera
 

@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from policies.block_policy import BlockPolicy
-from policies.errors import NoAnswer, PolicyError
 from policies.formats import torch_file
 from policies.formats.apart import process
-from policies.formats.embedded_spec import KEY
+from policies.formats.spec_json import KEY
 from policies.policy import load_policy
+from policies.spec import NoAnswer, PolicyError
 from tests.support.in_process import InProcess
 
 PROGRAM = "models/model.json"

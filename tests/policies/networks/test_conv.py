@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from policies.networks.conv import conv_valid, patch_product
+from policies.networks.layers import conv_valid, patch_product
 
 
 def jax_own(x, kernel):

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from policies.networks.draw import uniform
+from policies.networks.layers import uniform
 
 
 def test_every_array_is_what_its_own_key_gives():

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from policies.networks.gru import gru_update
+from policies.networks.layers import gru_update
 
 
 def test_it_is_torchs_cell():

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from policies.networks.layouts import image_weight, kernel_oihw, rows_are_outputs
+from policies.networks.tree_arrays import image_weight, kernel_oihw, rows_are_outputs
 from policies.spec import PolicySpec
 from tracks.geometry.camera import Camera
 

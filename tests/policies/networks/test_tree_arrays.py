@@ -6,11 +6,10 @@ import numpy as np
 import optax
 import pytest
 
-from policies.errors import PolicyError
 from policies.formats.checkpoint import load_arrays, save_arrays
 from policies.networks import network
 from policies.networks.tree_arrays import tree_from_arrays, tree_to_arrays
-from policies.spec import PolicySpec
+from policies.spec import PolicyError, PolicySpec
 from tracks.geometry.camera import Camera
 
 SPEC = PolicySpec(rate_hz=33.0, camera=Camera(pitch_deg=20.0), hidden_size=16)

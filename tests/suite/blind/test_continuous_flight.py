@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.blind.continuous.conditions import Conditions
+from suite.blind.continuous.timing import Conditions
 from suite.blind.continuous_flight import (
     fly_continuous,
     logs_of,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS, nameable_effects
-from suite.blind.hidden import changed_values, draw_change
 from suite.blind.oracle.strength import columns_in_table, detectable_along, given_vehicle
+from suite.blind.outside import changed_values, draw_change
 
 
 def test_a_strength_is_the_multiple_of_the_table_or_cut_at_a_bound():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.blind.hubs import damping_of_hubs
+from suite.blind.rotorpy_flight import damping_of_hubs
 from tests.support.vehicles import PLAIN
 
 K = 2e-6

@@ -10,7 +10,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from suite.blind import make as make_module
 from suite.blind.build import build
 from suite.blind.cases import Case
-from suite.blind.continuous.conditions import draw_conditions
+from suite.blind.continuous.timing import draw_conditions
 from suite.blind.make import make_set, open_answers
 from suite.blind.simulators import simulator_for
 from suite.common.console import Console

@@ -1,7 +1,7 @@
 """What is said before long work."""
 
 from suite.common.console import Console
-from suite.common.estimate import Estimate, announce
+from suite.common.stages import Estimate, announce
 
 
 def test_an_estimate_is_said_and_missing_memory_is_warned_of(capsys):

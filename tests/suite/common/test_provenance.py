@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from suite.common.estimate import Estimate
 from suite.common.provenance import refuse_other_run, run_record, write_run_record
+from suite.common.stages import Estimate
 from suite.judging.requests import Collection, Evaluation
 
 
@@ -16,7 +16,7 @@ def test_a_run_record_holds_what_is_needed_to_repeat_it(tmp_path):
     assert record["config"] == {"seconds": 1.0, "memory_bytes": 2.0}
     assert record["seed"] == 3 and record["schema"] == 1
     assert set(record) >= {"suite_version", "git_commit", "python", "packages", "machine"}
-    assert run_record(config, None)["config_type"] == "suite.common.estimate.Estimate"
+    assert run_record(config, None)["config_type"] == "suite.common.stages.Estimate"
 
 
 def test_a_folder_of_another_kind_of_run_is_refused(tmp_path):

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import pytest
 
 from suite.common.console import Console
-from suite.common.estimate import Estimate
-from suite.common.stages import MARK, Stage, claim, do_stages
+from suite.common.stages import MARK, Estimate, Stage, claim, do_stages
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from policies.networks import delta_network
-from suite.delta.burn_in import BurnIn, burn_in_before, forgotten, state_after
+from suite.delta.windows import BurnIn, burn_in_before, forgotten, state_after
 
 STILL = np.tile(np.eye(3), (5, 1, 1))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
-from suite.delta.corrected import check_corrects, corrected
+from suite.delta.replay import check_corrects, corrected
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from suite.train.presets import racer, swift
 from tests.support.vehicles import with_lag

@@ -12,14 +12,14 @@ from eval.judging.judge import JudgeOptions, Record, fly
 from eval.logs.flight_log import log_from_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
-from policies.formats.delta_file import load_delta
+from policies.formats.policy_file import load_delta
 from policies.networks import delta_network
 from policies.spec import PolicySpec
 from suite.common.console import Console
-from suite.delta.burn_in import state_after
 from suite.delta.fit import FitConfig, window_errors
 from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor, row_period
 from suite.delta.run import fit_delta
+from suite.delta.windows import state_after
 from suite.train.config import QuadrotorConfig
 from tests.support.courses import straight
 from tests.support.pilots import Pursuit

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.logs.flight_log import write_flight
-from policies.formats.delta_file import load_delta
+from policies.formats.policy_file import load_delta
 from suite.common.console import Console
 from suite.delta.fit import FitConfig
 from suite.delta.replay import nominal_model

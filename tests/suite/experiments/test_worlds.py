@@ -2,7 +2,7 @@
 
 import pytest
 
-from eval.worlds.other import rotorpy as rotorpy_world
+from eval.worlds import rotorpy as rotorpy_world
 from suite.experiments.worlds import OTHERWISE, Column, Config, changes, columns
 from tests.support.documents import page, reproduce
 from tests.support.engines import STAND_IN

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from policies import shipped
-from policies.errors import PolicyError
 from policies.policy import load_policy
+from policies.spec import PolicyError
 from suite.judging.content import PolicyContent, policy_digest
 from tracks.common.work.travel import pack, unpack
 

@@ -10,7 +10,7 @@ import eval.logs.flight_log
 from eval.judging.results import read_trials
 from suite import cli
 from suite.judging.flying import load_flier, who_flies
-from suite.judging.manner import Manner
+from suite.judging.requests import Manner
 
 
 def _eval(out, *args):

@@ -85,7 +85,7 @@ def test_export_refuses_what_is_not_ours(tmp_path, capsys):
 def test_what_a_world_flies_otherwise_is_said_once_and_written(
     pilots, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr("eval.worlds.other.rotorpy.rotorpy", lambda: STAND_IN)
+    monkeypatch.setattr("eval.worlds.rotorpy.rotorpy", lambda: STAND_IN)
     args = ["--world", "rotorpy", "--track", "zigzag", "--trials", "2", "--policy", pilots["diver"]]
     assert _eval(tmp_path / "out", *args) == 0
     said = capsys.readouterr().err

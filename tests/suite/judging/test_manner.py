@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from policies.errors import PolicyError
 from policies.policy import load_policy
+from policies.spec import PolicyError
 from suite import cli
-from suite.judging.manner import Manner, manners
+from suite.judging.requests import Manner, manners
 
 
 @pytest.fixture(scope="module")

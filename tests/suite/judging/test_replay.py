@@ -12,9 +12,8 @@ from suite import cli
 from suite.commands import view
 from suite.common.console import Quiet
 from suite.judging.evaluate import evaluate
-from suite.judging.manner import Manner, manners
 from suite.judging.replay import read_evaluation
-from suite.judging.requests import Evaluation
+from suite.judging.requests import Evaluation, Manner, manners
 from tests.support.recordings import columns
 
 

@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
-from eval.worlds.other import rotorpy as rotorpy_world
+from eval.worlds import rotorpy as rotorpy_world
 from policies import shipped
 from suite import cli
 from suite.loop.config import (

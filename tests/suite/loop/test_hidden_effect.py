@@ -18,8 +18,7 @@ from eval.judging.results import read_trials
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import with_effects
-from policies.formats.delta_file import save_delta
-from policies.formats.policy_file import load_policy_checkpoint
+from policies.formats.policy_file import load_policy_checkpoint, save_delta
 from policies.networks import delta_network
 from suite import cli
 from suite.common.console import Quiet
@@ -226,7 +225,7 @@ def test_the_example_hides_one_effect(root):
 
 def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root, tmp_path):
     monkeypatch.chdir(root)
-    monkeypatch.setattr("eval.worlds.other.rotorpy.rotorpy", lambda: STAND_IN)
+    monkeypatch.setattr("eval.worlds.rotorpy.rotorpy", lambda: STAND_IN)
     config = resolve(recipe="small", world="rotorpy:examples/rotorpy.toml")
     assert isinstance(config, HiddenLoopConfig)
     run = work.LoopRun(LOOP, config, tmp_path, Quiet())

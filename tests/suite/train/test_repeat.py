@@ -12,7 +12,7 @@ import pytest
 from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.common.estimate import Estimate
+from suite.common.stages import Estimate
 from suite.train import repeat as module
 from suite.train.repeat import Method, Run, Watch, repeat
 from tests.support.training import SPEC, fresh_params, small_config

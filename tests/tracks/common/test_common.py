@@ -7,10 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tracks.common.names import closest, unknown_name
-from tracks.common.provenance import git_commit, stamp
-from tracks.common.toml_table import read_toml
-from tracks.common.toml_text import to_toml
-from tracks.common.version import VERSION
+from tracks.common.provenance import VERSION, git_commit, stamp
+from tracks.common.toml_table import read_toml, to_toml
 
 KEYS = st.text("abcdefgh_", min_size=1, max_size=6)
 ENTRIES = st.one_of(

@@ -5,8 +5,8 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from tracks.common import registry
-from tracks.common.registry import Registry
+from tracks.common import names as registry
+from tracks.common.names import Registry
 
 
 class Package:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tracks.common.tree_rows import packed, select
+from tracks.common.masks import packed, select
 
 NEW = ({"a": np.arange(3.0)}, np.ones((3, 2)))
 OLD = ({"a": -np.arange(3.0)}, np.zeros((3, 2)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TypeVar
 
-from tracks.common.work.cores import core_shares, usable_cores
+from tracks.common.work.threads import core_shares, usable_cores
 from tracks.common.work.travel import WorkerDied
 
 __all__ = [

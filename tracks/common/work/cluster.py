@@ -20,9 +20,17 @@ from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
-from tracks.common.work.software import differences, software
 from tracks.common.work.threads import set_threads
-from tracks.common.work.travel import Failure, WorkerDied, failure, pack, raised, unpack
+from tracks.common.work.travel import (
+    Failure,
+    WorkerDied,
+    differences,
+    failure,
+    pack,
+    raised,
+    software,
+    unpack,
+)
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")

@@ -17,7 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from tracks.common.work.cores import core_shares, usable_cores
+from tracks.common.work.threads import core_shares, usable_cores
 from tracks.common.work.travel import Failure, WorkerDied, failure, pack, raised, unpack
 
 Piece = TypeVar("Piece")

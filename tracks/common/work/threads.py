@@ -1,18 +1,18 @@
-"""How many threads XLA's CPU and numpy's products of matrices work with.
+"""How many cores there are, and how many threads XLA's CPU and numpy's products take.
 
 XLA's are as many as cores, and at least two. Its matrix products (Eigen's) are cut into other
 blocks where there is one thread than where there are several, and so add up in another order. With
 two threads on a single core too, a training comes to the same bits on any number of cores; there it
 costs about a tenth of the speed. Products that several threads would cut along their sums are cut
-by us (`policies/networks/conv.py`).
+by us (`policies/networks/layers.py`).
+
+The cores that this process may run on are counted here, too, and shared out among processes.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import MutableMapping
-
-from tracks.common.work.cores import usable_cores
 
 VARIABLE = "NPROC"
 """Of the environment; XLA reads it when JAX first looks for devices."""
@@ -67,3 +67,19 @@ def one_thread_a_product(environment: MutableMapping[str, str] | None = None) ->
 
 def _wanted() -> int:
     return max(LEAST, usable_cores())
+
+
+def usable_cores() -> int:
+    """Return how many processor cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def core_shares(workers: int) -> list[list[int]]:
+    """Return the cores of each of `workers` processes; empty lists where a system cannot pin."""
+    if not hasattr(os, "sched_getaffinity"):
+        return [[] for _ in range(workers)]
+    cores = sorted(os.sched_getaffinity(0))
+    each = len(cores) // workers
+    return [cores[k * each : (k + 1) * each] for k in range(workers)]

@@ -9,7 +9,7 @@ import lzma
 from importlib.resources import files
 
 MAPPING = "nanobench.toml"
-"""Of `eval/importers/mapping/shipped`; it goes with the logs."""
+"""Of `eval/importers/mappings`; it goes with the logs."""
 KEPT = (".csv.xz", ".yaml", ".md", "LICENSE")
 
 
@@ -21,5 +21,5 @@ def real_files() -> dict[str, bytes]:
             packed = source.name.endswith(".xz")
             whole = lzma.decompress(source.read_bytes()) if packed else source.read_bytes()
             found[source.name.removesuffix(".xz")] = whole
-    shipped = files("eval.importers.mapping.shipped")
+    shipped = files("eval.importers.mappings")
     return found | {MAPPING: shipped.joinpath(MAPPING).read_bytes()}

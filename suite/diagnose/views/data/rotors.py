@@ -9,8 +9,7 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mix
 from eval.quadrotor.plant import make_plant, nominal_quadrotor
-from eval.vehicles.motors import motor_speed
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle, motor_speed
 from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.resample import interpolate
 from suite.diagnose.data.steps import LONGEST_S

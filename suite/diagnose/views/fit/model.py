@@ -13,8 +13,7 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.effects.interface import Sample
 from eval.effects.log_faults import restored
-from eval.quadrotor.plant import Motion, assemble, nominal_quadrotor
-from eval.quadrotor.rigid_body import accelerations
+from eval.quadrotor.plant import Motion, accelerations, assemble, nominal_quadrotor
 from eval.quadrotor.rotors import steady
 from eval.quadrotor.stepper import Inputs, wind_and_flow, wrench_on
 from eval.vehicles.vehicle import Vehicle

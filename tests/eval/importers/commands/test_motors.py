@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from eval.importers.commands.motors import SHIPPED_ORDER, order_motors
+from eval.importers.commands import SHIPPED_ORDER, order_motors
 from tests.support.vehicles import PLAIN
 
 

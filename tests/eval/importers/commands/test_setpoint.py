@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from eval.importers.commands.setpoint import rates_wanted
+from eval.importers.commands import rates_wanted
 from tests.support.vehicles import PLAIN
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eval.importers.commands.thrust import thrust_command
+from eval.importers.commands import thrust_command
 from eval.importers.options import ImportOptions
 from eval.vehicles.vehicle import MotorMap
 from tests.support.vehicles import PLAIN

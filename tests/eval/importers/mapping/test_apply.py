@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
-from eval.importers.mapping.file import MIXERS
+from eval.importers.mapping_file import MIXERS
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
 from tests.support import known_flight

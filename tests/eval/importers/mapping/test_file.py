@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from eval.importers.mapping.file import UNITS, WIDTHS, read_map, shipped_maps
+from eval.importers.mapping_file import UNITS, WIDTHS, read_map, shipped_maps
 
 
 def test_every_shipped_mapping_is_read_by_its_name():

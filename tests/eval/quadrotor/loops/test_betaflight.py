@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from eval.quadrotor.loops import betaflight
-from eval.quadrotor.loops.layout import layout_of
+from eval.quadrotor.loops.filters import layout_of
 from eval.quadrotor.vehicle_file import load_vehicle
 
 LAYOUT = layout_of(load_vehicle("crazyflie21").rotors)

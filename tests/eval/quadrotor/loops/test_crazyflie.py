@@ -3,7 +3,7 @@
 import numpy as np
 
 from eval.quadrotor.loops import crazyflie
-from eval.quadrotor.loops.layout import layout_of
+from eval.quadrotor.loops.filters import layout_of
 from eval.quadrotor.vehicle_file import load_vehicle
 
 GAINS = crazyflie.gains(crazyflie.Settings(), layout_of(load_vehicle("crazyflie21").rotors))

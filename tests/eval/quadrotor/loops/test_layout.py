@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from eval.quadrotor.loops.layout import layout_of
+from eval.quadrotor.loops.filters import layout_of
 from eval.quadrotor.vehicle_file import load_vehicle
 
 

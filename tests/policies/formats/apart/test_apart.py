@@ -12,10 +12,10 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from policies.errors import NoAnswer, PolicyError
 from policies.formats.apart import process, server
 from policies.formats.apart.process import Apart
 from policies.policy import load_policy
+from policies.spec import NoAnswer, PolicyError
 
 FLOAT = TensorProto.FLOAT
 

@@ -6,7 +6,6 @@ import subprocess
 import numpy as np
 import pytest
 
-from policies.errors import NoAnswer, PolicyError
 from policies.formats.apart import process
 from policies.formats.c import arrays, quantised, source
 from policies.formats.c.c_file import load_c
@@ -14,6 +13,7 @@ from policies.formats.c.compiler import STRICT, compiled_library, find_compiler
 from policies.formats.c.forward import Observed
 from policies.formats.c.project import c_project, drawn, native_answers
 from policies.policy import load_policy
+from policies.spec import NoAnswer, PolicyError
 
 
 def answers(policy, observed):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from suite.blind.continuous.air import Wind
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery, Body, rotation
 from suite.blind.continuous.quadrotor import quadrotor_of
-from suite.blind.continuous.wind import Wind
 from tests.support.vehicles import PLAIN, with_effects
 
 SPEED = np.array([[1000.0, 500.0, 1500.0, 1000.0]])

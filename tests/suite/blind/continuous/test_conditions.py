@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from suite.blind.continuous.conditions import CLOCK_S, COLOUR_S, DROPPED, JITTER, draw_conditions
+from suite.blind.continuous.timing import CLOCK_S, COLOUR_S, DROPPED, JITTER, draw_conditions
 
 
 def test_conditions_are_within_bounds_and_of_every_kind():

@@ -8,7 +8,7 @@ import pytest
 
 import suite.blind.continuous
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL
-from suite.blind.continuous.conditions import Conditions
+from suite.blind.continuous.timing import Conditions
 from suite.blind.continuous_flight import fly_continuous, with_loop
 from suite.diagnose.plans.sensors import SENSORS
 from suite.diagnose.plans.trajectory import Trajectory

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.blind.continuous.controller import allotted, wanted_speeds
-from suite.blind.continuous.quadrotor import quadrotor_of
+from suite.blind.continuous.quadrotor import allotted, quadrotor_of, wanted_speeds
 from tests.support.vehicles import PLAIN
 
 BELIEVED = quadrotor_of(PLAIN).believed

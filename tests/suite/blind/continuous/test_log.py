@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery
-from suite.blind.continuous.conditions import Conditions
 from suite.blind.continuous.engine import fly
 from suite.blind.continuous.log import Noise, gauss_markov, log_of_flight, state_at, turned
 from suite.blind.continuous.quadrotor import quadrotor_of
-from suite.blind.continuous.timing import jittered_stamps, schedule
+from suite.blind.continuous.timing import Conditions, jittered_stamps, schedule
 from tests.support.vehicles import PLAIN, with_effects
 
 NOISE = Noise(100.0, 0.002, 0.003, 0.02, 0.03, 0.3, 5.0, 0.02, 0.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.blind.continuous.wind import Wind
+from suite.blind.continuous.air import Wind
 from tests.support.vehicles import with_effects
 
 

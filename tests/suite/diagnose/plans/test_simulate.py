@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from eval.quadrotor.plant import Wrench, make_plant
-from eval.quadrotor.rigid_body import accelerations
+from eval.quadrotor.plant import Wrench, accelerations, make_plant
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from suite.diagnose.plans.follow import FlightFailed
 from suite.diagnose.plans.simulate import FULL_V, fly

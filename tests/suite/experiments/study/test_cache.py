@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint, EntryPoints
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.experiments.study import cache
 from suite.experiments.study.cache import added_digest, code_digest, digest
-from tracks.common import registry
+from tracks.common import names as registry
 
 
 def test_the_cache_is_named_by_all_code_that_flies(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.policy import load_policy
 from policies.spec import PolicySpec
 from suite import cli
-from suite.judging.deploy import card, exporting, latency, observed, parity
+from suite.judging.deploy import exporting, latency, parity
 from tests.policies.conftest import SPEC, lively
 from tests.support.pilots import Steady
 from tests.support.small_policy import small_checkpoint
@@ -38,9 +38,9 @@ def test_the_command_writes_c_and_a_card_that_says_how_near_it_is(folder, tmp_pa
     assert cli.main(asked) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["parity"]["steps"] == 1000 and answer["parity"]["worst"] <= 1e-4
-    names = {"policy.h", "policy.c", "vectors.h", "main.c", "CMakeLists.txt", card.CARD}
+    names = {"policy.h", "policy.c", "vectors.h", "main.c", "CMakeLists.txt", exporting.CARD}
     assert {path.name for path in tmp_path.iterdir()} == {*names, exporting.NOTE}
-    text = (tmp_path / card.CARD).read_text()
+    text = (tmp_path / exporting.CARD).read_text()
     digest = json.loads((folder / "config.json").read_text())["weights"]["sha256"]
     for said in ("| policy | tiny |", digest, "| licence | Apache-2.0", "Success: not known"):
         assert said in text
@@ -103,8 +103,10 @@ def test_an_export_of_another_policy_is_not_written_over(
 
 def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
     found = parity.Parity(0, "", np.nan, np.nan, None)
-    text = card.card_text("racer", "racer", load_policy_checkpoint(folder), "float32", found)
-    asked = card.card_text("swift-30", "swift-30", load_policy_checkpoint(folder), "float32", found)
+    text = exporting.card_text("racer", "racer", load_policy_checkpoint(folder), "float32", found)
+    asked = exporting.card_text(
+        "swift-30", "swift-30", load_policy_checkpoint(folder), "float32", found
+    )
     assert "95 % intervals" in text and "95 % intervals" not in asked
     assert "| racer | zigzag | 0 | 100 | 98 % [93, 99]" in text
     assert "no C compiler" in text and "not measured" in text
@@ -114,16 +116,19 @@ def test_a_card_of_a_checkpoint_without_a_seed_says_so(folder):
     found = parity.Parity(0, "", np.nan, np.nan, None)
     stored = load_policy_checkpoint(folder)
     config = {key: value for key, value in stored.config.items() if key != "seed"}
-    text = card.card_text("tiny", "tiny", replace(stored, config=config), "float32", found)
+    text = exporting.card_text("tiny", "tiny", replace(stored, config=config), "float32", found)
     assert "training seed unknown" in text
 
 
 def test_the_card_of_a_policy_is_not_written_over(tmp_path, folder, capsys):
     own = shutil.copytree(folder, tmp_path / "own")
-    (own / card.CARD).write_text("mine")
+    (own / exporting.CARD).write_text("mine")
     assert cli.main(["export", str(own), "--format", "c", "--out", str(own)]) == 2
     assert "card.md is read, too, and would be written over" in capsys.readouterr().err
-    assert {path.name for path in own.iterdir()} == {*(p.name for p in folder.iterdir()), card.CARD}
+    assert {path.name for path in own.iterdir()} == {
+        *(p.name for p in folder.iterdir()),
+        exporting.CARD,
+    }
 
 
 def test_without_a_compiler_nothing_is_measured_and_it_is_said(folder, tmp_path, monkeypatch):
@@ -133,9 +138,9 @@ def test_without_a_compiler_nothing_is_measured_and_it_is_said(folder, tmp_path,
 
 
 def test_what_a_policy_is_given_on_flights_is_kept(monkeypatch):
-    monkeypatch.setattr(observed, "TRACK", "zigzag")
+    monkeypatch.setattr(parity, "TRACK", "zigzag")
     pilot = Steady((0.0, 0.0, -8.0), spec=PolicySpec(rate_hz=10.0))
-    heard = observed.observed_flights(pilot, levels=(0, 1))
+    heard = parity.observed_flights(pilot, levels=(0, 1))
     assert heard.fresh.sum() == 2 and heard.fresh[0]
     assert heard.state.shape[1:] == (12,) and heard.image.shape[1:] == (24, 32)
     assert len(heard.state) == len(heard.image) == len(heard.fresh)
@@ -144,7 +149,7 @@ def test_what_a_policy_is_given_on_flights_is_kept(monkeypatch):
 
 
 def test_rows_in_which_nothing_flies_are_no_observations():
-    listener = observed.Listener(Steady())
+    listener = parity.Listener(Steady())
     hidden = listener.start(2)
     for k, flying in enumerate(((1, 1), (1, 0), (1, 0))):
         state = np.full((2, 12), float(k + 1)) * np.array(flying)[:, None]

@@ -5,8 +5,7 @@ import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
-from policies.errors import NoAnswer
-from policies.spec import PolicySpec
+from policies.spec import NoAnswer, PolicySpec
 from suite.judging.link.flights import write_log
 from suite.judging.link.messages import Note, SetPoint, State, Wire, dialect
 from suite.judging.link.watchdog import Limits

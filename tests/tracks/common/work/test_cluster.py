@@ -12,7 +12,7 @@ import pytest
 from tests.support.cluster import cluster
 from tracks.common.work import WorkerDied, crew, work_off
 from tracks.common.work.cluster import UnusableCluster
-from tracks.common.work.software import software
+from tracks.common.work.travel import software
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,8 @@ import pytest
 
 from suite.common.errors import explain
 from tracks.common.work import MOST, core_shares, crew, read_workers
-from tracks.common.work.cores import usable_cores
-from tracks.common.work.software import PACKAGES, differences, software
-from tracks.common.work.travel import failure, pack, raised, unpack
+from tracks.common.work.threads import usable_cores
+from tracks.common.work.travel import PACKAGES, differences, failure, pack, raised, software, unpack
 
 
 @pytest.mark.parametrize(

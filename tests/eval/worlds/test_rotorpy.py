@@ -11,8 +11,8 @@ import torch
 from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds import differences, world_class
-from eval.worlds.other import rotorpy as rotorpy_world
-from eval.worlds.other.rotorpy import Multirotor, Push
+from eval.worlds import rotorpy as rotorpy_world
+from eval.worlds.rotorpy import Multirotor, Push
 from eval.worlds.trial import Rules, TrialSpec
 from suite.cli import main
 from tests.support.courses import straight

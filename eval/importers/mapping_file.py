@@ -21,7 +21,7 @@ from eval.logs.files import METADATA
 from tracks.common.names import unknown_name
 from tracks.common.toml_table import Table, read_toml
 
-SHIPPED = Path(__file__).resolve().parent / "shipped"
+SHIPPED = Path(__file__).resolve().parent / "mappings"
 DEG = float(np.pi / 180.0)
 RPM = float(2.0 * np.pi / 60.0)
 _LENGTH = {"m": 1.0, "cm": 0.01, "mm": 1e-3}

@@ -17,8 +17,7 @@ import numpy as np
 from eval.effects import EFFECTS, all_values
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import make_plant
-from eval.vehicles.motors import motor_speed
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle, motor_speed
 
 AIR: Mapping[str, Callable[[Any, float], Mapping[str, float]]] = {
     "quadratic_drag": lambda values, mass: dict(

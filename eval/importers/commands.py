@@ -1,18 +1,58 @@
-"""Normalised thrust (0 to 1) as thrust per mass.
+"""A log's commands as the flight log has them.
 
-What full throttle gives is told by the user, or follows from the vehicle file (by its `[motors]`
-with the battery's voltage, where it has them), or is fitted to the accelerometer. The last takes
-what a diagnosis would look for in the thrust's scale into the command, and says so.
+Motors are put in the vehicle file's order by where they are. Attitude set points become rates by
+the vehicle file's attitude loop. Normalised thrust (0 to 1) becomes thrust per mass: what full
+throttle gives is told by the user, or follows from the vehicle file (by its `[motors]` with the
+battery's voltage, where it has them), or is fitted to the accelerometer. The last takes what a
+diagnosis would look for in the thrust's scale into the command, and says so.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import permutations
+
 import numpy as np
 
 from eval.importers.findings import Finding
+from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.options import ImportOptions
-from eval.vehicles.motors import motor_thrust
-from eval.vehicles.vehicle import MotorMap, Vehicle
+from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
+
+SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
+"""Front right, rear right, rear left, front left: the order of the vehicles that are shipped."""
+SIDES = ("front right", "rear right", "rear left", "front left")
+
+
+def order_motors(
+    rows: dict[str, np.ndarray],
+    motor_side: Sequence[tuple[float, float]] | None,
+    vehicle: Vehicle | None,
+) -> list[Finding]:
+    """Put `motor`, `motor_cmd` and `pwm` of `rows` in the vehicle's order, in place.
+
+    Args:
+        rows: see `eval.importers.rows`.
+        motor_side: (x forward, y left) of the file's motors 1 to 4; None: the order is the
+            vehicle's already.
+        vehicle: whose order is wanted; None: that of the shipped vehicles.
+    """
+    if motor_side is None or not ({"motor", "motor_cmd", "pwm"} & rows.keys()):
+        return []
+    hubs = SHIPPED_ORDER if vehicle is None else [hub[:2] for hub in vehicle.rotors.position]
+    have, wanted = _directions(motor_side), _directions(hubs)
+    order = max(permutations(range(4)), key=lambda p: float(np.sum(have[list(p)] * wanted)))
+    for name in ("motor", "motor_cmd", "pwm"):
+        if name in rows:
+            rows[name] = rows[name][:, list(order)]
+    numbers = ", ".join(str(k + 1) for k in order)
+    whose = "the shipped vehicles" if vehicle is None else f"vehicle {vehicle.name!r}"
+    return [Finding("note", "motors", f"put in the order of {whose}: the file's {numbers}")]
+
+
+def _directions(hubs: Sequence[Sequence[float]]) -> np.ndarray:
+    array = np.asarray(hubs, dtype=np.float64)
+    return array / np.linalg.norm(array, axis=1, keepdims=True)
 
 
 def thrust_command(rows: dict[str, np.ndarray], options: ImportOptions) -> list[Finding]:
@@ -84,3 +124,26 @@ def _hover(rows: dict[str, np.ndarray], thrust: np.ndarray) -> list[Finding]:
         "thrust coefficient or speed_max, or a curved throttle"
     )
     return [Finding("doubt", "thrust", text)]
+
+
+def rates_wanted(rows: dict[str, np.ndarray], vehicle: Vehicle | None) -> list[Finding]:
+    """Replace `cmd_quat` of `rows` by `cmd_rate`, in place, where nothing commanded rates.
+
+    The rate is the attitude gain times the rotation vector from the attitude to the set point,
+    within the vehicle's `rate_max`.
+    """
+    if "cmd_quat" not in rows:
+        return []
+    wanted = rows.pop("cmd_quat")
+    if "cmd_rate" in rows or "quat" not in rows:
+        return []
+    if vehicle is None:
+        text = "are attitudes, and nothing says the attitude loop's gains: left out; give --vehicle"
+        return [Finding("doubt", "set points", text)]
+    norm = np.linalg.norm(wanted, axis=1, keepdims=True)
+    error = rotation_vector(multiply(conjugate(rows["quat"]), wanted / norm))
+    limit = np.asarray(vehicle.controller.rate_max)
+    gain = np.asarray(vehicle.controller.attitude_gain)
+    rows["cmd_rate"] = np.clip(gain * error, -limit, limit)
+    text = f"are attitudes; rates by the attitude gains of {vehicle.name!r}, {gain.tolist()} 1/s"
+    return [Finding("note", "set points", text)]

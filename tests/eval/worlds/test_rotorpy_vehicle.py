@@ -10,7 +10,7 @@ from eval.quadrotor.plant import Motion, make_plant
 from eval.quadrotor.rotors import steady
 from eval.quadrotor.stepper import Inputs, wind_and_flow, wrench_on
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds.other.rotorpy_vehicle import AIR, differences, rotorpy_parameters
+from eval.worlds.rotorpy_vehicle import AIR, differences, rotorpy_parameters
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects, with_lag
 
 

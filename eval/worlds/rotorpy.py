@@ -20,7 +20,7 @@ from eval.quadrotor.autopilot import AutopilotState, attitude_step
 from eval.quadrotor.plant import Motion
 from eval.quadrotor.stepper import rotor_command, winds_on
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.other import rotorpy_vehicle
+from eval.worlds import rotorpy_vehicle
 from eval.worlds.scene_slots import TO_CONTACTS, SceneSlots
 from eval.worlds.slots import Layout
 from eval.worlds.trial import Rules

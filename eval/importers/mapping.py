@@ -18,7 +18,7 @@ from eval.importers.frames import (
     turn,
     world_vector,
 )
-from eval.importers.mapping.file import MIXERS, Column, LogMap
+from eval.importers.mapping_file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
 from eval.importers.rows import measured
 from eval.importers.signals import Recording, Signal, collect

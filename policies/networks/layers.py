@@ -1,5 +1,6 @@
-"""Convolutions whose gradients are matrix products that XLA's CPU runs fast, and alike.
+"""The layers of our networks: convolutions, the gated recurrent unit, and fresh weights.
 
+The gradients of these convolutions are matrix products that XLA's CPU runs fast, and alike.
 XLA's CPU gradients of small convolutions run at a tenth of the machine's matrix-product rate or
 less. Here a row of pixels, all its channels side by side, is one vector: a kernel row maps it to an
 output row by a banded matrix, so both gradients are products of matrices some hundreds wide. Two
@@ -12,6 +13,8 @@ so its last bits would depend on the machine's cores. `patch_product` cuts it it
 from __future__ import annotations
 
 import functools
+import math
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -98,3 +101,36 @@ def _backward(saved: tuple[jax.Array, jax.Array], grad: jax.Array) -> tuple[jax.
 
 
 conv_valid.defvjp(_forward, _backward)
+
+
+def gru_update(from_input: jax.Array, from_hidden: jax.Array, hidden: jax.Array) -> jax.Array:
+    """Return the next hidden state (..., H).
+
+    Args:
+        from_input: (..., 3 H) the input's part of the gates reset, update and new.
+        from_hidden: (..., 3 H) the hidden state's part of the same.
+        hidden: (..., H).
+    """
+    reset_x, update_x, new_x = jnp.split(from_input, 3, axis=-1)
+    reset_h, update_h, new_h = jnp.split(from_hidden, 3, axis=-1)
+    reset = jax.nn.sigmoid(reset_x + reset_h)
+    update = jax.nn.sigmoid(update_x + update_h)
+    new = jnp.tanh(new_x + reset * new_h)
+    return new + update * (hidden - new)
+
+
+def uniform(key: jax.Array, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, jax.Array]:
+    """Return numbers in [0, 1) by name, float32, each array from a key of its own.
+
+    They are those of `jax.random.uniform(key, shape)`: JAX makes a number from its place alone, so
+    a short array is the beginning of a long one. A program for each shape takes ten times as long
+    to compile as one row of the longest does.
+    """
+    longest = max(math.prod(shape) for shape in shapes.values())
+    rows = jax.vmap(lambda one: jax.random.uniform(one, (longest,), jnp.float32))(
+        jax.random.split(key, len(shapes))
+    )
+    return {
+        name: row[: math.prod(shape)].reshape(shape)
+        for row, (name, shape) in zip(rows, shapes.items(), strict=True)
+    }

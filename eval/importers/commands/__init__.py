@@ -1,1 +1,0 @@
-"""Commands as the flight log has them: motors in order, throttle and set points made rates."""

@@ -1,1 +1,0 @@
-"""Mapping files: which columns of a file are which signal, and how they become ours."""

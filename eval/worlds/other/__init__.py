@@ -1,1 +1,0 @@
-"""Worlds whose vehicle is flown by a simulator that nobody here wrote."""
