@@ -1,7 +1,7 @@
 """What people and other programs hand over that cannot be used: exit 2, one line, nothing left.
 
 Every case is a whole command line in this process. Options and settings out of range are in
-tests/suite/test_cli.py; models that hang or abort, in tests/policies/formats/apart.
+tests/suite/test_cli.py; models that hang or abort, in tests/policies/formats/test_apart.py.
 """
 
 import errno

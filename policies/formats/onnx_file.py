@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 
 from policies.block_policy import BlockPolicy, proven
-from policies.formats.apart.process import Apart
+from policies.formats.apart_process import Apart
 from policies.formats.program_inputs import INPUTS, check_inputs
 from policies.formats.spec_json import KEY, extract
 from policies.spec import PolicyError

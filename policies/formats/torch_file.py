@@ -3,7 +3,7 @@
 Neither is loaded without trust: `torch.jit.load` runs what a file says by design, and
 `torch.export.load` unpickles sample inputs and some weights, resolves operators by dotted paths and
 evaluates expressions, all from the file; torch has no safe mode for it. The process of their own
-(`apart/`) keeps a module that hangs or aborts from taking the suite with it, and nothing more.
+(`apart_process.py`) keeps a module that hangs or aborts from taking the suite along, no more.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from policies.block_policy import BlockPolicy, Model, proven
-from policies.formats.apart.process import Apart
+from policies.formats.apart_process import Apart
 from policies.formats.program_inputs import INPUTS, check_inputs, inputs_message
 from policies.formats.spec_json import KEY, extract
 from policies.spec import ACTION_SIZE, NeedsTrust, PolicyError

@@ -4,8 +4,8 @@ import importlib
 
 import numpy as np
 
-from policies.formats.apart.process import REMEDIES, Port
-from policies.formats.apart.server import KINDS
+from policies.formats.apart_process import REMEDIES, Port
+from policies.formats.apart_server import KINDS
 from policies.spec import NoAnswer, PolicyError
 
 

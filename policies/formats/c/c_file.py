@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from policies.formats.apart.process import ANSWER_BYTES, Apart
+from policies.formats.apart_process import ANSWER_BYTES, Apart
 from policies.formats.c.compiler import compiled_library
 from policies.formats.spec_json import extract
 from policies.spec import ACTION_SIZE, NeedsTrust, PolicyError, PolicySpec

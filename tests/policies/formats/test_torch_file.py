@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from policies.block_policy import BlockPolicy
+from policies.formats import apart_process as process
 from policies.formats import torch_file
-from policies.formats.apart import process
 from policies.formats.spec_json import KEY
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError

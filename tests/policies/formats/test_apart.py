@@ -12,8 +12,9 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from policies.formats.apart import process, server
-from policies.formats.apart.process import Apart
+from policies.formats import apart_process as process
+from policies.formats import apart_server as server
+from policies.formats.apart_process import Apart
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
 
@@ -117,7 +118,7 @@ def test_a_limit_that_this_process_is_under_stays_the_models(tmp_path):
     onnx.save(PLAIN, path)
     # Below what the engine has already and may have besides.
     script = (
-        "import resource, sys; from policies.formats.apart.process import Apart, MEMORY_BYTES\n"
+        "import resource, sys; from policies.formats.apart_process import Apart, MEMORY_BYTES\n"
         "resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))\n"
         "print(Apart(open(sys.argv[1], 'rb').read(), 'here', 'onnx').inputs[0].name)"
     )

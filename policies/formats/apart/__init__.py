@@ -1,1 +1,0 @@
-"""Models from elsewhere in a process of their own, which can be killed."""
