@@ -2,7 +2,7 @@
 
 A model from elsewhere is a program: a `Loop` of 2^62 rounds is one node of ONNX, also one that is
 worked out while the file is loaded; TorchScript has `while`, and C anything. So onnxruntime, torch
-and a compiled policy.c have a process with limits of time and memory (`apart_server.py`), and whoever
+and a compiled policy.c have a process with limits of time and memory (`apart_server.py`), and who
 does not answer in time is killed. That is for what goes wrong: torch files and C are code and may
 do more.
 """
