@@ -2,7 +2,7 @@
 
     python tools/coverage.py COUNT [SEED] [CASES] [OUT.json]
 
-Identifies COUNT simulated fleets of drawn numbers (`suite/diagnose/plans/fleets.py`) by each of
+Identifies COUNT simulated fleets of drawn numbers (`tests/support/fleets.py`) by each of
 CASES (with commas between; else all). Prints, for every number of a vehicle file, how many fleets
 told it, in how many of these the 95 % interval holds the truth (with Wilson's interval), its
 half-width over the truth (the median), and the pulls (errors in half-widths): mean and root mean
@@ -23,7 +23,10 @@ import numpy as np
 
 from eval.judging.statistics import wilson
 from suite.diagnose.identify.identify import identify
-from suite.diagnose.plans.fleets import (
+from suite.diagnose.plans.follow import FlightFailed, Recording
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests/support
+from tests.support.fleets import (
     Fleet,
     Slow,
     drawn,
@@ -32,7 +35,6 @@ from suite.diagnose.plans.fleets import (
     start,
     truths,
 )
-from suite.diagnose.plans.follow import FlightFailed, Recording
 
 CASES = {
     "rotors": ("rotors", ()),

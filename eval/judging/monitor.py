@@ -4,7 +4,7 @@ It sees what the policy sees and shares nothing with it. Limits on tilt and spee
 the way out replaces it, and only where it must: paths of the next moments are laid through the
 points of the depth image, one for each way out (stop, climb, to either side, back and up), begun
 now and begun one decision later. While a way out is still clear one decision later, the policy has
-its will.
+its will. The judge and real-time flights (`suite fly`) fly with the same one.
 """
 
 from __future__ import annotations

@@ -36,6 +36,8 @@ class Config:
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """How fast a policy that takes it as an input is asked to fly, 0 (careful) to 1 (a race);
     without it as its card says."""
+    monitor: bool = False
+    """Fly with the safety monitor of `suite eval --monitor` around the policy."""
     link: str = ""
     """udpin:HOST:PORT or udpout:HOST:PORT of a vehicle that speaks MAVLink; one flight. Without it
     the vehicle is simulated in real time, on this machine's loopback."""
@@ -74,6 +76,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         time_limit_s=config.time_limit_s,
         trust=config.trust,
         speed=() if config.speed is None else (config.speed,),
+        monitor=config.monitor,
     )
     if config.link and not config.confirm:
         raise ValueError(

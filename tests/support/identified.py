@@ -9,9 +9,9 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap
-from suite.diagnose.plans.fleets import Fleet, logs_of, recordings_of
 from suite.diagnose.plans.sensors import Sensors
 from suite.diagnose.plans.trajectory import Trajectory
+from tests.support.fleets import Fleet, logs_of, recordings_of
 
 DRAG, DELAY = (0.3, 0.4, 0.2), 0.012
 MOTORS = MotorMap(thrust=(1.1, 4.4), voltage=16.0, voltage_exponent=1.2)

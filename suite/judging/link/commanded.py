@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from eval.judging.monitor import Monitored
 from eval.worlds.trial import Rules
 from policies.block_policy import BlockPolicy, for_one_row
 from policies.policy import Policy
@@ -63,9 +64,12 @@ def fly_commanded(
     course = read_course(asked, real_time=True)
     refuse_one_name({trial.track for trial in course.trials})
     name = policy or default_policy()
-    loaded = load_flier(name, asked.trust, manners(asked.speed, monitor=False)[0])
-    flown = LinkFlights(asked, about_policy(name, loaded), limits, link or "simulated")
+    (plain,) = manners(asked.speed, monitor=False)
+    loaded = load_flier(name, asked.trust, plain)
     flier = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
+    if asked.monitor:
+        loaded, flier = Monitored(loaded), Monitored(flier)
+    flown = LinkFlights(asked, about_policy(name, loaded), limits, link or "simulated")
     refuse_other_run(out, flown)
     rules = Rules(time_limit_s=asked.time_limit_s)
     # Before the flights: what the judge refuses is not flown.
@@ -85,6 +89,8 @@ def fly_commanded(
         found["flights"] = [flight.row for flight in flights]
         _show(found, flights, console)
     about = {"policy": flown.policy, "limits": limits, "link": flown.link}
+    if isinstance(flier, Monitored):
+        found["interventions"] = flier.interventions
     answer = {**stamp(1, asked.seed), **about, **found}
     write_json(out / FLY, answer)
     write_run_record(out, flown, asked.seed)

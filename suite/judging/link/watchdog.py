@@ -1,4 +1,8 @@
-"""When a policy must hand over: limits, and the reasons in words."""
+"""When a policy must hand over: limits of the vehicle's states and of the link, and the reasons.
+
+It looks at what arrives. What a policy answers is held to its limits by the judge's own guard and,
+where asked for, by the safety monitor (`eval/judging/monitor.py`).
+"""
 
 from __future__ import annotations
 

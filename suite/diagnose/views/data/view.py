@@ -38,8 +38,6 @@ FORCE = View(
 TORQUE = View(
     "torque", "rotation under the measured rotor speeds", "rad/s^2", slice(3, 6), 0.1, False
 )
-VIEWS = (FORCE, TORQUE)
-"""In the order in which they are looked at."""
 
 
 class SmoothedFlight(NamedTuple):

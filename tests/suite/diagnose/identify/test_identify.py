@@ -10,8 +10,8 @@ from eval.judging.statistics import wilson
 from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.identify.identify import identify
 from suite.diagnose.identify.numbers import as_json
-from suite.diagnose.plans.fleets import Fleet, logs_of
 from tests.support import identified as known
+from tests.support.fleets import Fleet, logs_of
 from tests.support.vehicles import with_effects
 
 TRUE = {

@@ -7,7 +7,8 @@ import pytest
 
 from suite.diagnose.identify.data.drive import MotorGuess, motor_thrusts, torque_of
 from suite.diagnose.identify.data.grid import grid_of
-from suite.diagnose.plans.fleets import (
+from suite.diagnose.plans.trajectory import Trajectory
+from tests.support.fleets import (
     DELAY,
     SENSORS,
     Fleet,
@@ -18,7 +19,6 @@ from suite.diagnose.plans.fleets import (
     start,
     truths,
 )
-from suite.diagnose.plans.trajectory import Trajectory
 
 QUIET = replace(SENSORS, pos=0.0, attitude=0.0, gyro=0.0, vel=1e-9, rotor=1e-6, voltage=1e-9)
 

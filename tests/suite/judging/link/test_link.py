@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from eval.judging.monitor import Monitored
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec, track_of
@@ -358,3 +359,14 @@ def test_a_speed_is_asked_of_policies_that_take_one(capsys, tmp_path, monkeypatc
     assert cli.main([*asked, "swift-30", "--speed", "0.3", *link]) == 0
     assert cli.main([*asked, "swift-30", *link]) == 0
     assert [policy.spec.speed for policy in flown] == [0.3, load_policy("swift-30").spec.speed]
+
+
+def test_the_judges_monitor_flies_in_real_time_too(capsys, tmp_path, monkeypatch):
+    flown = []
+    monkeypatch.setattr(commanded, "_real", lambda policy, *_: flown.append(policy) or {})
+    link = ["--link", "udpin:127.0.0.1:0", "--confirm", "--monitor", "--json"]
+    assert cli.main(["fly", "--out", str(tmp_path), "--policy", "swift", *link]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    (policy,) = flown
+    assert isinstance(policy, Monitored) and policy.policy.block == 1
+    assert (answer["policy"]["name"], answer["interventions"]) == ("swift+monitor", 0)
