@@ -26,7 +26,8 @@ class Unread:
 class Config(Generic[Experiment]):
     """Make one of the documents of docs/results; the same command again goes on where it stopped.
 
-    NAME.md, its figures and NAME.json with the numbers go to --out.
+    NAME.json with the numbers, charts and NAME.md with the tables go to --out. Of a NAME.md that is
+    there, what stands between its two comments is replaced.
     """
 
     experiment: Experiment
@@ -75,12 +76,13 @@ def run(config: Config[Any], console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
     """
-    from suite.experiments.pages.document import Place, write_document
+    from suite.experiments.pages.document import Place, check_page, write_document
     from suite.experiments.study.options import check
 
     workers = asked_workers(config.workers, whole_cores=True)
     check(config.experiment)
     place, module = Place(config.out, config.cache, workers), type(config.experiment).__module__
     name, document = module.rpartition(".")[2], importlib.import_module(module).document
-    report, numbers = document(config.experiment, place, console)
-    return write_document(place, name, config.experiment, report, numbers, console)
+    check_page(place.out, name)
+    made = document(config.experiment, place, console)
+    return write_document(place, name, config.experiment, made, console)

@@ -1,4 +1,4 @@
-"""Loops in worlds that hide an effect: what the diagnosis and Delta Action Models give back."""
+"""Loops on vehicles that hide an effect: what diagnosis and Delta Action Models regain."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from eval.vehicles.vehicle import Vehicle, with_effects
 from policies import shipped
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.common.report import Report, Section
 from suite.common.running.apart import Job
 from suite.common.work import all_done
 from suite.experiments.pages import hidden_worlds as pages
-from suite.experiments.pages.document import Place
+from suite.experiments.pages.document import Made, Place
 from suite.experiments.pages.hidden_worlds import Came
 from suite.experiments.study import judging, options
 from suite.experiments.study.cache import LOOP_ROOMS, code_digest, digest, engines
@@ -74,7 +73,7 @@ WORLDS: dict[str, Hidden] = {
 
 @dataclass(frozen=True)
 class Config:
-    """Run `suite loop --world` in worlds that hide an effect, and tell what gives success back.
+    """Run `suite loop --world` in worlds that hide an effect, and report what regains success.
 
     From every seed the same policy is fine-tuned anew in every world: as a control, with a Delta
     Action Model, with the effect that the diagnosis names, and with both.
@@ -115,8 +114,8 @@ class Asked(NamedTuple):
     """What the simulation knows, by content: the loop may run where there are none of our files."""
 
 
-def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
-    """Return the page and its numbers; loops that are missing are run first."""
+def document(config: Config, place: Place, console: Console) -> Made:
+    """Return tables and numbers; loops that are missing are run first."""
     simulated = load_vehicle(config.vehicle)
     policy = config.policy or default_policy()
     config = replace(config, policy=policy)
@@ -151,31 +150,27 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     loop_of(jobs[0])
     came = all_done(run_one, jobs, place.workers, console, "loops in hidden worlds")
     rows, words = pages.rows_of(came), {n: words_of(simulated, h) for n, h in worlds.items()}
-    report = Report(
-        title="Hidden worlds: what gives success back",
-        lead=pages.lead(rows),
-        facts={
-            **judging.policy_facts({"policy": policy}),
-            "simulation's vehicle": config.vehicle,
-            "training seeds": " ".join(map(str, config.training_seeds)),
-            "trials": f"three tracks, levels {config.difficulty}: "
-            f"{len(judging.trials_of(config))} of each policy for each training seed, seeds "
-            + ", ".join(
-                options.judged_seeds(replace(config, seed=config.seed + APART * seed))
-                for seed in config.training_seeds
-            ),
-            "recorded": f"{config.flights} flights on every track and level, at other seeds",
-            "fine-tuning": f"{config.iterations} gradient steps each",
-        },
-        sections=[
-            Section("Success", [pages.success_grid(rows), *pages.HOW]),
-            Section("What it is worth", [pages.worth_grid(rows), pages.WORTH]),
-            Section("Laps", [pages.lap_grid(rows), pages.LAPS]),
-            Section("What is hidden, and what is named", [pages.named_grid(came, words)]),
-            Section("Delta Action Models", [pages.errors_grid(came), pages.ERRORS]),
-        ],
-    )
-    return report, {
+    facts = {
+        **judging.policy_facts({"policy": policy}),
+        "simulation's vehicle": config.vehicle,
+        "training seeds": " ".join(map(str, config.training_seeds)),
+        "trials": f"three tracks, levels {config.difficulty}: "
+        f"{len(judging.trials_of(config))} of each policy for each training seed, seeds "
+        + ", ".join(
+            options.judged_seeds(replace(config, seed=config.seed + APART * seed))
+            for seed in config.training_seeds
+        ),
+        "recorded": f"{config.flights} flights on every track and level, at other seeds",
+        "fine-tuning": f"{config.iterations} gradient steps each",
+    }
+    parts = {
+        "Success": [pages.success_grid(rows)],
+        "Differences in success": [pages.worth_grid(rows)],
+        "Laps": [pages.lap_grid(rows)],
+        "What is hidden, and what is named": [pages.named_grid(came, words)],
+        "Errors of the Delta Action Models": [pages.errors_grid(came)],
+    }
+    numbers = {
         "worlds": [row._asdict() for row in rows],
         "diagnoses": [
             {"world": one.world, "training_seed": one.training_seed, **one.diagnosis}
@@ -185,6 +180,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
             {"world": one.world, "training_seed": one.training_seed, **one.errors} for one in came
         ],
     }
+    return Made(facts, parts, numbers)
 
 
 def world_of(simulated: Vehicle, hidden: Hidden) -> Vehicle:

@@ -1,24 +1,46 @@
-"""What randomised dynamics in training buy, spread by spread: disturbed with each and without."""
+"""What randomised dynamics in training gain: every spread left out in turn, under disturbances."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, NamedTuple
 
+import numpy as np
 import tyro
 
+from eval.judging.statistics import Interval, wilson
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.common.console import Console
-from suite.common.report import Picture, Report, Section
-from suite.experiments.pages import randomisation as pages
-from suite.experiments.pages.document import Place
-from suite.experiments.pages.randomisation import FIXED, RANDOMISED, UNDISTURBED, WITHOUT
+from suite.common.report import Picture
+from suite.experiments.pages.document import Made, Place
+from suite.experiments.pages.tables import gap_cell
 from suite.experiments.study import disturbed, judging, options, training
 from suite.experiments.study.conditions import Condition
+from suite.experiments.study.disturbed import Grown, Tested
+from suite.experiments.study.intervals import Gap, nested
 from suite.train.dynamics import spreads
+from tracks.common.grid import Cell, Grid, table
 from tracks.common.names import unknown_name
 from tracks.input.ranges import Iterations, Seed, Trials
+
+FIXED, RANDOMISED, WITHOUT = "fixed", "randomised", "without "
+"""Settings; the last is followed by a spread's name."""
+UNDISTURBED, ALL, OWN = "undisturbed", "all disturbances", "its own"
+"""What settings are compared under."""
+AGAINST = {
+    "mass": "mass",
+    "thrust": "thrust_scale",
+    "rotor lag": "motor lag",
+    "drag": "drag",
+    "delay": "latency",
+    "rate gain": "rate_gain",
+    "centre of mass": "com_offset",
+    "torque trim": "torque_trim",
+    "wind": "wind",
+    "image": "depth noise",
+}
+"""The disturbance that each spread is there for."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +70,12 @@ class Config:
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """What is disturbed: a shipped vehicle's name or a vehicle file (.toml)."""
-    only: tuple[str, ...] = tuple(pages.AGAINST.values())
+    only: tuple[str, ...] = tuple(AGAINST.values())
     """Only these effects, at their usual size, and sweeps, by name."""
 
 
-def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
-    """Return the page and its numbers; what is missing is trained and flown first."""
+def document(config: Config, place: Place, console: Console) -> Made:
+    """Return tables and numbers; what is missing is trained and flown first."""
     from suite.experiments.pages.charts import sweeps_chart
 
     seeds, recipe = config.training_seeds, options.asked_recipe(config)
@@ -79,37 +101,33 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         [base, *alone], sweeps, fliers, place.cache, console, place.workers
     )
     tested = [*effects, *(point for points in grown.values() for point in points[1:])]
-    worth = pages.worth_of(still, tested, [len(share) for share in shares.values()])
-    sections = [Section("Spread by spread", [pages.worth_grid(worth), *pages.MEANING])]
-    pictured = [Picture(sweeps_chart(pages.two_of(grown)), pages.CAPTION)] if grown else []
-    sections += [
-        Section("By disturbance", [pages.success_grid([still, *tested]), *pictured]),
-        Section("Every training", [pages.seeds_grid(shares, still, tested), pages.BY_SEED]),
-    ]
-    report = Report(
-        title="What randomised dynamics in training buy",
-        lead=pages.lead(worth),
-        facts={
-            "recipe": f"{options.recipe_words(config)}, {recipe.optimizer.iterations} gradient "
-            "steps",
-            RANDOMISED: spreads.words(recipe),
-            FIXED: "none of that",
-            "training seeds": " ".join(map(str, seeds)),
-            "trained at commit": training.commits(runs),
-            "trials": f"three tracks, level {config.difficulty}, seeds "
-            f"{options.judged_seeds(config)}: {len(trials)} trials a condition, shared out to the "
-            "training seeds",
-            "vehicle": config.vehicle,
-        },
-        sections=sections,
-    )
-    return report, {
+    worth = worth_of(still, tested, [len(share) for share in shares.values()])
+    facts = {
+        "recipe": f"{options.recipe_words(config)}, {recipe.optimizer.iterations} gradient steps",
+        RANDOMISED: spreads.words(recipe),
+        FIXED: "none of that",
+        "training seeds": " ".join(map(str, seeds)),
+        "trained at commit": training.commits(runs),
+        "trials": f"three tracks, level {config.difficulty}, seeds "
+        f"{options.judged_seeds(config)}: {len(trials)} trials a condition, shared out to the "
+        "training seeds",
+        "vehicle": config.vehicle,
+    }
+    caption = "Success with every spread and with none against the size of each disturbance"
+    pictured = [Picture(sweeps_chart(two_of(grown)), caption)] if grown else []
+    parts = {
+        "Spread by spread": [worth_grid(worth)],
+        "By disturbance": [success_grid([still, *tested]), *pictured],
+        "Every training": [seeds_grid(shares, still, tested)],
+    }
+    numbers = {
         "worth": {
             name: {what: {"rates": w.rates, **w.gap._asdict()} for what, w in mine.items()}
             for name, mine in worth.items()
         },
         "conditions": [disturbed.tested_numbers(entry, still) for entry in [still, *tested]],
     }
+    return Made(facts, parts, numbers)
 
 
 def settings(config: Config) -> Sequence[training.Row]:
@@ -133,3 +151,106 @@ def settings(config: Config) -> Sequence[training.Row]:
         ),
         training.Row(RANDOMISED, "the recipe", recipe),
     ]
+
+
+class Worth(NamedTuple):
+    """The recipe against another setting under some conditions, all of them together."""
+
+    rates: tuple[Interval, Interval]
+    """Success of the other and of the recipe, with Wilson intervals."""
+    gap: Gap
+    """In success, the recipe - the other."""
+
+
+def worth_of(
+    still: Tested, tested: Sequence[Tested], sizes: Sequence[int]
+) -> dict[str, dict[str, Worth]]:
+    """Return what each setting but the recipe lacks, by its name and by what it is disturbed by.
+
+    Args:
+        still: undisturbed, with every setting's trials, one training seed's after the other.
+        tested: disturbed.
+        sizes: trials of each training seed, in their order.
+    """
+    found = {}
+    for name in still.results:
+        if name == RANDOMISED:
+            continue
+        own = AGAINST.get(name.removeprefix(WITHOUT))
+        under = {
+            UNDISTURBED: [still],
+            OWN: [entry for entry in tested if entry.condition.name == own],
+            ALL: list(tested),
+        }
+        found[name] = {
+            what: compare(name, entries, sizes) for what, entries in under.items() if entries
+        }
+    return found
+
+
+def compare(name: str, entries: Sequence[Tested], sizes: Sequence[int]) -> Worth:
+    """Return the recipe against the setting `name` over all of `entries` together."""
+    other, recipe = (np.array([e.won(each) for e in entries]) for each in (name, RANDOMISED))
+    # A trial counts once, with its mean over conditions, under which all fly the same trials.
+    other, recipe = other.mean(axis=0), recipe.mean(axis=0)
+    first, second = (wilson(float(won.sum()), won.size) for won in (other, recipe))
+    apart = recipe - other
+    return Worth((first, second), nested(np.split(apart, np.cumsum(sizes)[:-1])))
+
+
+def worth_grid(worth: Mapping[str, Mapping[str, Worth]]) -> Grid:
+    """Return what each spread is worth, and last all of them."""
+    lines = []
+    for name in sorted(worth, key=lambda setting: setting == FIXED):
+        mine, spread = worth[name], name.removeprefix(WITHOUT)
+        line: list[str | Cell] = ["all of them" if name == FIXED else spread]
+        line.append(AGAINST.get(spread, "-"))
+        for what in (UNDISTURBED, OWN, ALL):
+            line.append(gap_cell(mine[what].gap) if what in mine else "-")
+        verdicts = [mine[what].gap.verdict if what in mine else "unclear" for what in (OWN, ALL)]
+        line += ["" if verdict == "unclear" else verdict for verdict in verdicts]
+        lines.append(line)
+    headers = ["spread", "its own disturbance", UNDISTURBED, OWN, ALL, f"{OWN}?", "all?"]
+    return table(headers, lines)
+
+
+def success_grid(tested: Sequence[Tested]) -> Grid:
+    """Return the success of every setting under every condition."""
+    names = list(tested[0].results)
+    lines = [
+        [
+            f"{entry.condition.name} {entry.condition.words}".strip(),
+            *(f"{100 * entry.success(name).value:.0f}" for name in names),
+        ]
+        for entry in tested
+    ]
+    return table(["success [%]", *names], lines)
+
+
+def seeds_grid(
+    shares: Mapping[int, Sequence[object]], still: Tested, tested: Sequence[Tested]
+) -> Grid:
+    """Return every training's success, undisturbed and disturbed."""
+    cuts = np.cumsum([len(share) for share in shares.values()])[:-1]
+
+    def by_seed(entries: Sequence[Tested], name: str) -> list[float]:
+        won = np.mean([entry.won(name) for entry in entries], axis=0)
+        return [100 * float(part.mean()) for part in np.split(won, cuts)]
+
+    lines = []
+    for name in still.results:
+        pairs = zip(by_seed([still], name), by_seed(tested, name), strict=True)
+        lines.append([name, *(f"{calm:.0f}, {worse:.0f}" for calm, worse in pairs)])
+    headers = [f"training seed {seed}, {len(share)} trials" for seed, share in shares.items()]
+    return table(["setting", *headers], lines)
+
+
+def two_of(grown: Grown) -> Grown:
+    """Return sweeps with the recipe and the one that varies nothing alone."""
+    return {
+        sweep: [
+            point._replace(results={name: point.results[name] for name in (FIXED, RANDOMISED)})
+            for point in points
+        ]
+        for sweep, points in grown.items()
+    }

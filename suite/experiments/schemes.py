@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
 from suite.common.console import Console, duration
-from suite.common.report import Picture, Report, Section
-from suite.experiments.pages.document import Place
+from suite.common.report import Picture
+from suite.experiments.pages.document import Made, Place
 from suite.experiments.pages.tables import every_training
 from suite.experiments.study import options, training
-from suite.experiments.study.intervals import Spread
 from suite.experiments.study.summary import METRICS, Summary, summaries
 from suite.train.overrides import check_owned
 from suite.train.ppo.config import ppo_like
@@ -28,27 +27,6 @@ FIGURE = ("reward", "v_max", "success_rate", "gates")
 """What the paper's figure shows."""
 WANTED = (1, 2, 3)
 """Mean gates a trial, of four, whose first time the table gives."""
-CAPTION = (
-    "Over environment steps (above) and over seconds of training (below): mean over training "
-    "seeds, with a band from the least to the most."
-)
-MEANING = (
-    "Reward: the paper's, summed over a trial until its end. Success rate: no collision, whatever "
-    "gates were passed. Success cross: all gates passed without a collision before. v_max: the "
-    "median over trials of each one's largest speed. Trials end at a collision, at the last gate "
-    "or at their time, and fly the training's dynamics on worlds that no training has seen, the "
-    "same for all; a collision is what the trainer takes for one, by its own code.",
-    "Policy, dynamics, worlds and environment steps of an iteration are the same for all schemes. "
-    "PPO learns from the reward that is measured; the other two from their losses, with the "
-    "recipe's weights but for lambda_p. Without the field, L_proj stands in with the paper's "
-    "lambda_proj and beta_3.",
-    "Seconds are those of iterations alone: measurements are left out, and iterations that compile "
-    "count as long as the median of the others; what they took longer stands in the table. Each "
-    "training is held to its share of the cores, the same for all; what else the machine did "
-    "meanwhile is in the seconds.",
-    "A time of reaching so many gates is that of the first measurement which has them: the median "
-    "over the seeds that do, and of how many.",
-)
 
 
 @dataclass(frozen=True)
@@ -71,8 +49,8 @@ class Config(options.FourGates):
     """Schemes: ppo, ours, projection; all if none is named."""
 
 
-def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
-    """Return the page and its numbers; train what is missing."""
+def document(config: Config, place: Place, console: Console) -> Made:
+    """Return tables and numbers; train what is missing."""
     chosen = schemes(config)
     looks = training.Looks(config.measurements, config.trials, config.seed, config.seconds)
     study = training.Study(chosen, config.training_seeds, looks, by_seed=True)
@@ -82,51 +60,50 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         row.key: float(np.mean([run.compile_s for run in runs if run.row == row.key]))
         for row in rows
     }
-    report = Report(
-        title="Training schemes compared: PPO, ours, ours without the field",
-        lead=verdict(rows),
-        facts={
-            "recipe": f"{options.recipe_words(config)} episode.gates={episode.gates} "
-            f"lambda_p={config.progress:g}",
-            "an iteration": f"{episode.batch} worlds x {episode.steps} steps",
-            "training seeds": " ".join(map(str, config.training_seeds)),
-            "trained at commit": training.commits(runs),
-            "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
-            "trainings at once": place.at_once,
-        },
-        sections=[
-            Section("Learning curves", _curves([row for row in rows if row.at], compiling)),
-            every_training("scheme", runs, DIGITS, _trained_for),
-            Section("What was measured", MEANING),
-        ],
-    )
-    return report, {
-        "rows": [
-            {
-                "scheme": row.key,
-                "words": row.words,
-                "seeds": row.seeds,
-                "diverged": row.diverged,
-                "steps": [int(point["steps"].mean) for point in row.at],
-                "time": [point["time"].mean for point in row.at],
-                "curves": {n: [point[n] for point in row.at] for n in METRICS if row.at},
-                "reached": {gates: first_times(row, gates) for gates in WANTED},
-                "compile_s": compiling[row.key],
-            }
-            for row in rows
-        ],
-        "runs": [
-            {
-                "scheme": run.row,
-                "seed": run.seed,
-                "points": run.points,
-                "compile_s": run.compile_s,
-                "commit": run.commit,
-                "diverged": run.diverged,
-            }
-            for run in runs
-        ],
+    facts = {
+        "recipe": f"{options.recipe_words(config)} episode.gates={episode.gates} "
+        f"lambda_p={config.progress:g}",
+        "an iteration": f"{episode.batch} worlds x {episode.steps} steps",
+        "training seeds": " ".join(map(str, config.training_seeds)),
+        "trained at commit": training.commits(runs),
+        "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
+        "trainings at once": place.at_once,
     }
+    parts = {
+        "Learning curves": _curves([row for row in rows if row.at], compiling),
+        "Every training": [every_training("scheme", runs, DIGITS, _trained_for)],
+    }
+    return Made(
+        facts,
+        parts,
+        {
+            "rows": [
+                {
+                    "scheme": row.key,
+                    "words": row.words,
+                    "seeds": row.seeds,
+                    "diverged": row.diverged,
+                    "steps": [int(point["steps"].mean) for point in row.at],
+                    "time": [point["time"].mean for point in row.at],
+                    "curves": {n: [point[n] for point in row.at] for n in METRICS if row.at},
+                    "reached": {gates: first_times(row, gates) for gates in WANTED},
+                    "compile_s": compiling[row.key],
+                }
+                for row in rows
+            ],
+            "runs": [
+                {
+                    "scheme": run.row,
+                    "seed": run.seed,
+                    "points": run.points,
+                    "compile_s": run.compile_s,
+                    "commit": run.commit,
+                    "diverged": run.diverged,
+                }
+                for run in runs
+            ],
+        },
+    )
 
 
 def _trained_for(run: training.Trained) -> str:
@@ -174,48 +151,6 @@ def number_at(row: Summary, time: float) -> int:
     return max(k for k, point in enumerate(row.at) if point["time"].mean <= time + 1e-9)
 
 
-def verdict(rows: Sequence[Summary]) -> str:
-    """Return what came out in sentences, and whether it is what the paper says."""
-    measured = {row.key: row for row in rows if row.at}
-    said = [f"Every training of {row.words} diverged." for row in rows if not row.at]
-    for row in measured.values():
-        end = row.at[-1]
-        said.append(
-            f"{row.words[0].upper()}{row.words[1:]}: {end['gates'].mean:.2f} gates, "
-            f"success cross {100 * end['success_cross'].mean:.0f} %, success rate "
-            f"{100 * end['success_rate'].mean:.0f} % after {end['steps'].mean:,.0f} environment "
-            f"steps ({duration(end['time'].mean)} of training)."
-        )
-    if {"ours", "ppo"} <= set(measured):
-        ours, ppo = measured["ours"], measured["ppo"]
-        limit = min(row.at[-1]["time"].mean for row in (ours, ppo))
-        clock = _ahead(*(row.at[number_at(row, limit)] for row in (ours, ppo)))
-        said.append(
-            f"The paper has ours ahead of PPO in {_listed(FIGURE)}; here it is ahead at the end "
-            f"in {_ahead(ours.at[-1], ppo.at[-1])}, and after {duration(limit)} of training each "
-            f"in {clock}."
-        )
-    if {"ours", "projection"} <= set(measured):
-        ours, bare = (measured[name].at[-1]["gates"] for name in ("ours", "projection"))
-        said.append(
-            "The paper's scheme without the field fails to learn to cross gates; here it passes "
-            f"{bare.mean:.2f} ({bare.least:.2f} to {bare.most:.2f} over seeds), with the field "
-            f"{ours.mean:.2f} ({ours.least:.2f} to {ours.most:.2f})."
-        )
-    return " ".join(said)
-
-
-def _ahead(ours: Mapping[str, Spread], other: Mapping[str, Spread]) -> str:
-    """Return in which of the figure's numbers ours has more, and where seeds part."""
-    ahead = [name for name in FIGURE if ours[name].mean > other[name].mean]
-    apart = [name for name in FIGURE if ours[name].least > other[name].most]
-    return f"{_listed(ahead)} (with every seed above every one of PPO's: {_listed(apart)})"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(METRICS[name].title.split(" [")[0] for name in names) or "none of them"
-
-
 def _curves(rows: Sequence[Summary], compiling: Mapping[str, float]) -> list[Picture | Grid]:
     from suite.experiments.pages.charts import curves_chart
 
@@ -224,7 +159,7 @@ def _curves(rows: Sequence[Summary], compiling: Mapping[str, float]) -> list[Pic
     limit = min(row.at[-1]["time"].mean for row in rows)
     same = f"After {duration(limit)} of training, the shortest of the budgets"
     return [
-        Picture(curves_chart(rows, FIGURE), CAPTION),
+        Picture(curves_chart(rows, FIGURE), "Learning curves over steps and over time"),
         _numbers("At the end of each budget", rows, lambda row: -1),
         _numbers(same, rows, lambda row: number_at(row, limit)),
         _reached(rows, compiling),

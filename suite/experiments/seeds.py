@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import tyro
@@ -14,8 +14,8 @@ from eval.judging.tables import Tally
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.shipped import locate
 from suite.common.console import Console, duration
-from suite.common.report import Picture, Report, Section
-from suite.experiments.pages.document import Place
+from suite.common.report import Picture
+from suite.experiments.pages.document import Made, Place
 from suite.experiments.pages.tables import every_cell
 from suite.experiments.study import judging, options, training
 from suite.judging.content import policy_digest
@@ -25,15 +25,11 @@ from tracks.input.ranges import Iterations, Seed, Trials
 
 LEVELS = (0, 3, 6, 9)
 """The levels of the paper's table."""
-MEANING = (
-    "Every policy flew the same trials. The standard deviation is over training seeds (n - 1); "
-    "each cell's own sampling error is part of it, as the intervals further down show."
-)
 
 
 @dataclass(frozen=True)
 class Config:
-    """Judge the policies of several training seeds on the same trials, and say which is the median.
+    """Judge the policies of several training seeds on the same trials, and name the median.
 
     Without --policies they are trained, and found again by the hash of their configuration.
     """
@@ -72,8 +68,8 @@ class Repeats(NamedTuple):
     """Over policies; NaN of one."""
 
 
-def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
-    """Return the page and its numbers; what is missing is trained and flown first."""
+def document(config: Config, place: Place, console: Console) -> Made:
+    """Return tables and numbers; what is missing is trained and flown first."""
     from suite.experiments.pages.charts import cells_chart
 
     vehicle, policies = load_vehicle(config.vehicle), _policies(config, place, console)
@@ -83,35 +79,25 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     _, cells = judging.judged_cells(orders, place.cache, console, what, place.workers)
     found = repeats(cells)
     everything = [cell for some in cells.values() for cell in some]
-    low, high = min(found.mean_success.values()), max(found.mean_success.values())
-    parts = [
-        _grid("Success [%]", cells, lambda c: c.success.value, 100, 0),
-        _grid("v_max, median over trials [m/s]", cells, lambda c: c.v_max.value, 1, 2),
-        MEANING,
-        Picture(cells_chart(cells), "Success of each training seed, cell by cell."),
-    ]
-    spread = ""
-    if len(cells) > 1:
-        spread = f" (standard deviation {100 * found.standard_deviation:.1f} points)"
-    report = Report(
-        title="The same recipe from several training seeds",
-        lead=(
-            f"Mean success over the {len(everything) // len(cells)} cells: "
-            f"{100 * found.mean:.1f} % over {len(cells)} training seeds, from {100 * low:.1f} to "
-            f"{100 * high:.1f}{spread}. The median is {found.median}."
-        ),
-        facts={
-            "recipe": "given policies" if config.policies else _recipe(config),
-            **{
-                name: f"SHA-256 {policy_digest(path)[:16]}, {_trained(locate(path))}"
-                for name, path in policies.items()
-            },
-            "vehicle": config.vehicle,
-            "judged seeds": f"{options.judged_seeds(config)}, the same for all",
+    facts = {
+        "recipe": "given policies" if config.policies else _recipe(config),
+        **{
+            name: f"SHA-256 {policy_digest(path)[:16]}, {_trained(locate(path))}"
+            for name, path in policies.items()
         },
-        sections=[Section("Success and speed by training seed", parts), every_cell(everything)],
-    )
-    return report, {"spread": found, "cells": everything}
+        "vehicle": config.vehicle,
+        "judged seeds": f"{options.judged_seeds(config)}, the same for all",
+    }
+    title = f"Success [%]; the median is {found.median}"
+    parts = {
+        "Success and speed by training seed": [
+            _grid(title, cells, lambda c: c.success.value, 100, 0),
+            _grid("v_max, median over trials [m/s]", cells, lambda c: c.v_max.value, 1, 2),
+            Picture(cells_chart(cells), "Success of each training seed by cell"),
+        ],
+        "Every cell with its intervals": every_cell(everything),
+    }
+    return Made(facts, parts, {"spread": found, "cells": everything})
 
 
 def _recipe(config: Config) -> str:

@@ -1,21 +1,20 @@
-"""The paper's table of judged policies, ours beside the printed rows; then all ten levels."""
+"""The paper's table of judged policies, ours next to the printed rows; then all ten levels."""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from eval.judging.tables import Tally, percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialResult
 from suite.common.choices import LEVELS
 from suite.common.console import Console
-from suite.common.report import Picture, Report, Section
-from suite.experiments.pages.document import Place
-from suite.experiments.pages.goals import goal_grid, goals, verdict
+from suite.common.report import Picture
+from suite.experiments.pages.document import Made, Place
+from suite.experiments.pages.goals import goal_grid, goals, met_grid
 from suite.experiments.pages.paper import sim_to_sim
 from suite.experiments.pages.tables import every_cell
 from suite.experiments.study import judging, options
@@ -40,28 +39,11 @@ COLUMNS = [
     for header in (f"{track} SR", "v_max [m/s]", "of ten [m/s]", "v_mean [m/s]", "lap [s]")
 ]
 """Of every track."""
-MEANINGS = (
-    "Success (SR): all 8 gates in order, no contact, within 20 s; ours with its 95 % Wilson "
-    "interval, the others as printed, out of 10 trials. v_max: ours is the median over a cell's "
-    "trials of each trial's largest speed before any contact; of ten: the mean, over picks of ten "
-    "trials, of the largest among them. The paper and the baseline flew ten trials a cell and do "
-    "not say whether theirs is a median, a mean or the largest. Simulator, vehicle and tracks are "
-    "ours: the tracks follow the baseline's rules, the numbers of the others were measured in "
-    "theirs."
-)
-NO_DELTA = (
-    "There is no row of ours with the Delta Action Model: neither --delta-policy nor "
-    "--delta-iterations was given."
-)
-CHART = (
-    "Success with 95 % Wilson intervals and median v_max at every level; hollow: printed by the "
-    "paper (with Delta Action Model)."
-)
 
 
 @dataclass(frozen=True)
 class Config:
-    """Judge a policy on three tracks at all ten levels, beside the paper's and the baseline's rows.
+    """Judge a policy on three tracks at all ten levels, next to the paper's and baseline's rows.
 
     The rows with the Delta Action Model, at the paper's four levels, are there where --delta-policy
     or --delta-iterations is.
@@ -96,8 +78,10 @@ class TablePolicy(NamedTuple):
     """Where it comes from."""
 
 
-def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
-    """Return the page and its numbers; what is missing is flown first."""
+def document(config: Config, place: Place, console: Console) -> Made:
+    """Return tables and numbers; what is missing is flown first."""
+    from suite.experiments.pages.charts import level_chart
+
     vehicle, printed = load_vehicle(config.vehicle), sim_to_sim()
     variants = variants_of(config, place, console)
     orders = {
@@ -112,25 +96,31 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     )
     lines = _merit(results)
     everything = [cell for some in cells.values() for cell in some]
-    report = Report(
-        title="Sim-to-sim: the paper's table and all ten levels",
-        lead=" ".join(
-            f"{name}: {verdict(goals(cells[name]))}" for name in cells if name != CONTROL
-        ),
-        facts={
-            **{variant.name: variant.about for variant in variants},
-            "vehicle": config.vehicle,
-            "seeds": f"{options.judged_seeds(config)}, {config.trials} trials a cell, the same "
-            "for all",
-        },
-        sections=list(_sections(cells, lines)),
-    )
-    return report, {
+    facts = {
+        **{variant.name: variant.about for variant in variants},
+        "vehicle": config.vehicle,
+        "seeds": f"{options.judged_seeds(config)}, {config.trials} trials a cell, the same for all",
+    }
+    levels = [(str(level), *_ours(cells[OURS], level)) for level in LEVELS]
+    delta = {"With the Delta Action Model": compare.grids(lines)[:1]} if lines else {}
+    parts = {
+        "Compared with the paper": [against_the_paper(cells)],
+        **delta,
+        "Cells that meet the goals": [met_grid(cells)],
+        **{f"Goals by cell: {name}": [goal_grid(some)] for name, some in cells.items()},
+        "All ten levels": [
+            Picture(level_chart(everything), "Success and v_max at every level"),
+            table(["level", *COLUMNS], levels, OURS),
+        ],
+        "Every cell with its intervals": every_cell(everything),
+    }
+    numbers = {
         "cells": everything,
         "goals": {name: goals(some) for name, some in cells.items()},
         "with_against_without": lines,
         "policies": variants,
     }
+    return Made(facts, parts, numbers)
 
 
 def variants_of(config: Config, place: Place, console: Console) -> list[TablePolicy]:
@@ -202,27 +192,7 @@ def _merit(results: Mapping[str, Sequence[TrialResult]]) -> list[compare.Line]:
     )
 
 
-def _sections(
-    cells: Mapping[str, Sequence[Tally]], lines: Sequence[compare.Line]
-) -> Iterator[Section]:
-    from suite.experiments.pages.charts import level_chart
-
-    everything = [cell for some in cells.values() for cell in some]
-    asides = [] if WITH in cells else [NO_DELTA]
-    yield Section("Beside the paper", [*asides, beside_the_paper(cells), MEANINGS])
-    if lines:
-        parts = [compare.verdict(lines[-1]), *compare.grids(lines)[:1], compare.CAVEAT]
-        yield Section("What the Delta Action Model changes", parts)
-    for name, some in cells.items():
-        yield Section(f"The goal, cell by cell: {name}", [goal_grid(some)])
-    picture = Picture(level_chart(everything), CHART)
-    levels = [(str(level), *_ours(cells[OURS], level)) for level in LEVELS]
-    whole = table(["level", *COLUMNS], levels, OURS)
-    yield Section("All ten levels", [where_it_breaks(OURS, cells[OURS]), picture, whole])
-    yield every_cell(everything)
-
-
-def beside_the_paper(cells: Mapping[str, Sequence[Tally]]) -> Grid:
+def against_the_paper(cells: Mapping[str, Sequence[Tally]]) -> Grid:
     """Return our rows and the printed ones, a method and level each, tracks as columns."""
     printed = sim_to_sim()
     lines = [
@@ -249,17 +219,3 @@ def _ours(cells: Sequence[Tally], level: int) -> list[str]:
         texts += [percent(cell.success), *("-" if v is None else f"{v:.1f}" for v in speeds)]
         texts.append(lap)
     return texts
-
-
-def where_it_breaks(policy: str, cells: Sequence[Tally]) -> str:
-    """Return up to which level a policy flies each track well, and by half."""
-    parts = []
-    for track in JUDGED:
-        rates = {c.difficulty: c.success.value for c in cells if c.track == track}
-        parts.append(f"{track} {_up_to(rates, 0.9)} (half: {_up_to(rates, 0.5)})")
-    return f"Levels up to which at least 90 % of trials succeed, {policy}: {', '.join(parts)}."
-
-
-def _up_to(rates: dict[int, float], least: float) -> str:
-    good = [str(level) for level in itertools.takewhile(lambda k: rates[k] >= least, sorted(rates))]
-    return good[-1] if good else "none"

@@ -1,4 +1,4 @@
-"""The shipped policies in every world, on the same trials: where worlds differ, and why."""
+"""The shipped policies in every world on the same trials: where worlds differ, and why."""
 
 from __future__ import annotations
 
@@ -17,43 +17,32 @@ from eval.worlds import REFERENCE, WORLDS, differences, world_class
 from eval.worlds.trial import TrialResult
 from policies import shipped
 from suite.common.console import Console
-from suite.common.report import Report, Section
-from suite.experiments.pages.document import Place
+from suite.experiments.pages.document import Made, Place
 from suite.experiments.pages.tables import points_cell
 from suite.experiments.study import judging, options
-from tracks.common.grid import Cell, Grid, table
+from tracks.common.grid import Grid, table
 from tracks.families import JUDGED
 from tracks.input.ranges import Seed, Trials
 
 BASE = "mujoco"
-"""The world that the others are held against."""
+"""The world that the others are compared with."""
 ROUNDING = "mjx"
 """The world that flies as the first does but for rounding to single precision, contacts by distance
 and images by analytic rays."""
-OTHERWISE = {
-    "rounding": "it changes in mjx, too: single precision, contacts by distance or images by "
-    "analytic rays are enough",
-    "air": "mujoco ends as the world does once its vehicle has that world's air",
-    "rest": "neither: what the world has and no vehicle file of ours says, its steps among it",
-}
-"""What may decide a flight that ends otherwise, in words."""
-MEANINGS = (
-    "Success: rate over all cells, 95 % Wilson interval. Minus mujoco: in points on the same "
-    "trials, with Newcombe's paired 95 % interval; p: McNemar's exact test. Ends alike: trials "
-    "that end in the same way (`ended_by`). Lap and mean speed: the median over the trials that "
-    "are finished in both worlds of how far the two are apart."
-)
+WHY = ("rounding", "air", "rest")
+"""Why a trial changes: `rounding`, it does in mjx too; `air`, it does in mujoco with that world's air;
+`rest`, neither."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Fly the shipped policies on the same trials in every world, side by side."""
+    """Fly the shipped policies on the same trials in every world."""
 
     policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
     Without it all shipped policies fly."""
     world: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A world beside mujoco; may be given several times. Without it mjx and rotorpy."""
+    """A world besides mujoco; may be given several times. Without it mjx and rotorpy."""
     difficulty: str = "0,9"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials = 20
@@ -105,8 +94,8 @@ def columns(config: Config) -> list[Column]:
     return found
 
 
-def document(config: Config, place: Place, console: Console) -> tuple[Report, dict[str, Any]]:
-    """Return the page and its numbers; what is missing is flown first."""
+def document(config: Config, place: Place, console: Console) -> Made:
+    """Return tables and numbers; what is missing is flown first."""
     flown_in = columns(config)
     policies = judging.named_policies(config.policy or tuple(shipped.names()))
     names = list(policies)
@@ -121,23 +110,19 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
     what = "flying in every world"
     results = judging.flown(orders, place.cache, console, what, place.workers)
     changed = changes(names, flown_in, results)
-    report = Report(
-        title="Worlds: the same trials in other simulators",
-        lead=_lead(names, flown_in, results, changed),
-        facts={
-            **judging.policy_facts(policies),
-            "trials": f"three tracks, levels {config.difficulty}, seeds "
-            f"{options.judged_seeds(config)}: {len(trials)} of each policy in each world",
-            "vehicle": config.vehicle,
-        },
-        sections=[
-            Section("Side by side", [_overall(names, flown_in, results), MEANINGS]),
-            Section("Every cell", [_cells(names, flown_in, results)]),
-            Section("Which flights, and why", _why(changed, flown_in)),
-            Section("What the worlds fly otherwise", [_otherwise(flown_in)]),
-        ],
-    )
-    return report, {
+    facts = {
+        **judging.policy_facts(policies),
+        "trials": f"three tracks, levels {config.difficulty}, seeds "
+        f"{options.judged_seeds(config)}: {len(trials)} of each policy in each world",
+        "vehicle": config.vehicle,
+    }
+    parts = {
+        "Success by world": [_overall(names, flown_in, results)],
+        "Every cell": [_cells(names, flown_in, results)],
+        "Trials that change their success": [_counts(changed, flown_in), _each(changed, flown_in)],
+        "What the worlds fly otherwise": [_otherwise(flown_in)],
+    }
+    numbers = {
         "success": [
             {"policy": name, "column": column.label, **_numbers(results, name, column.label)}
             for name in names
@@ -145,6 +130,7 @@ def document(config: Config, place: Place, console: Console) -> tuple[Report, di
         ],
         "changed": changed,
     }
+    return Made(facts, parts, numbers)
 
 
 def _won(rows: Sequence[TrialResult]) -> np.ndarray:
@@ -184,8 +170,8 @@ def _overall(names: Sequence[str], flown_in: Sequence[Column], results: Flown) -
             less = found["minus_mujoco"]
             gaps = (found["lap_apart_s"], found["v_mean_apart"])
             alike = f"{found['ends_alike']} of {found['trials']}"
-            told = ["-" if gap is None else f"{gap:.3f}" for gap in gaps]
-            lines.append([*line, points_cell(less), f"{less.p_value:.2g}", alike, *told])
+            shown = ["-" if gap is None else f"{gap:.3f}" for gap in gaps]
+            lines.append([*line, points_cell(less), f"{less.p_value:.2g}", alike, *shown])
     return table(headers, lines)
 
 
@@ -208,21 +194,21 @@ def changes(
 ) -> list[dict[str, Any]]:
     """Return the trials whose success in a world is not that in mujoco.
 
-    Each has the endings by column, and `why`: a key of `OTHERWISE`, told by the controls that were
-    flown; in `ROUNDING` itself and in controls it is None.
+    Each has the endings by column, and `why`: one of `WHY`, by the controls that were flown; in
+    `ROUNDING` itself and in controls it is None.
     """
     has_rounding = any(column.world == ROUNDING for column in flown_in)
     found = []
     for name in names:
         for column in flown_in[1:]:
             own = [c.label for c in flown_in if c.control_of == column.world]
-            told = column.world not in (BASE, ROUNDING)
+            explained = column.world not in (BASE, ROUNDING)
             for number, base in enumerate(results[name, BASE]):
                 row = results[name, column.label][number]
                 if row.success == base.success:
                     continue
                 why = None
-                if told:
+                if explained:
                     aired = any(results[name, c][number].success == row.success for c in own)
                     why = "air" if aired else "rest"
                     if has_rounding and results[name, ROUNDING][number].success != base.success:
@@ -235,57 +221,33 @@ def changes(
     return found
 
 
-def _why(changed: Sequence[Mapping[str, Any]], flown_in: Sequence[Column]) -> list[str | Grid]:
-    parts: list[str | Grid] = []
-    counts = []
+def _counts(changed: Sequence[Mapping[str, Any]], flown_in: Sequence[Column]) -> Grid:
+    """Return how many trials change in each world, and why."""
+    lines = []
     for column in flown_in[1:]:
-        mine = [change for change in changed if change["column"] == column.label]
-        counts.append(f"{column.label}: {len(mine)}")
-        reasons = [change["why"] for change in mine if change["why"]]
-        if reasons:
-            each = (f"{reasons.count(why)} {why} ({OTHERWISE[why]})" for why in OTHERWISE)
-            parts.append(f"Of those in {column.label}: " + "; ".join(each) + ".")
-    parts.insert(0, f"Trials whose success is not that in mujoco, by world: {', '.join(counts)}.")
-    told = [change for change in changed if change["why"]]
-    if told:
-        headers = ["policy", "track", "level", "seed", *(c.label for c in flown_in), "why"]
-        lines: list[list[str | Cell]] = [
-            [c["policy"], c["trial"].track, str(c["trial"].difficulty), str(c["trial"].seed)]
-            + [c["endings"][column.label] for column in flown_in]
-            + [c["why"]]
-            for c in told
-        ]
-        parts.append(table(headers, lines))
-    return parts
+        why = [change["why"] for change in changed if change["column"] == column.label]
+        reasons = (str(why.count(one)) if any(why) else "-" for one in WHY)
+        lines.append([column.label, str(len(why)), *reasons])
+    return table(["world", "changed", *WHY], lines)
 
 
-def _otherwise(flown_in: Sequence[Column]) -> str:
+def _each(changed: Sequence[Mapping[str, Any]], flown_in: Sequence[Column]) -> Grid:
+    """Return the trials that change for a reason of `WHY`, one by one."""
     lines = [
-        f"- {column.label}: {sentence}"
+        [c["policy"], c["trial"].track, str(c["trial"].difficulty), str(c["trial"].seed)]
+        + [c["endings"][column.label] for column in flown_in]
+        + [c["why"]]
+        for c in changed
+        if c["why"]
+    ]
+    headers = ["policy", "track", "level", "seed", *(c.label for c in flown_in), "why"]
+    return table(headers, lines)
+
+
+def _otherwise(flown_in: Sequence[Column]) -> Grid:
+    lines = [
+        [column.label, sentence]
         for column in flown_in
         for sentence in differences(column.world, column.vehicle)
     ]
-    return "\n".join(lines) or "Every world flies the vehicle as its file says."
-
-
-def _lead(
-    names: Sequence[str],
-    flown_in: Sequence[Column],
-    results: Flown,
-    changed: Sequence[Mapping[str, Any]],
-) -> str:
-    sentences = []
-    for column in flown_in[1:]:
-        if column.control_of:
-            continue
-        each = []
-        for name in names:
-            found = _numbers(results, name, column.label)
-            points = points_cell(found["minus_mujoco"]).text
-            each.append(f"{name} {percent(found['success'])}, {points} points against mujoco")
-        count = sum(change["column"] == column.label for change in changed)
-        total = sum(len(results[name, column.label]) for name in names)
-        sentences.append(
-            f"In {column.label}: {'; '.join(each)}; {count} of {total} trials change their success."
-        )
-    return " ".join(sentences)
+    return table(["world", "difference to the vehicle's file"], lines)

@@ -13,7 +13,7 @@ from suite.common.charts import LINES, png, titled
 from suite.experiments.pages.paper import Ablated, sim_to_sim
 from suite.experiments.study.conditions import Sweep
 from suite.experiments.study.disturbed import Tested
-from suite.experiments.study.intervals import Gap, Spread
+from suite.experiments.study.intervals import Spread
 from suite.experiments.study.summary import METRICS, Summary
 from tracks.families import JUDGED
 
@@ -120,22 +120,6 @@ def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
         axes.set_ylim(-3, 103)
     if len(names) > 1:
         _legend(figure, panels[0])
-    return png(figure)
-
-
-def gaps_chart(gaps: Mapping[str, Gap]) -> bytes:
-    """Return differences in success to the recipe with their intervals, training seeds as dots."""
-    figure = Figure(figsize=(7.4, 1.2 + 0.32 * len(gaps)), layout="constrained")
-    axes = figure.subplots()
-    axes.axvline(0, color="black", lw=0.8)
-    for at, gap in enumerate(gaps.values()):
-        value, low, high = 100 * np.array(gap.difference)
-        axes.plot([low, high], [at, at], "-", lw=4, color=LINES[0], alpha=0.35)
-        axes.plot(value, at, "|", ms=12, mew=2, color=LINES[0])
-        axes.plot(100 * np.array(gap.of_seeds), [at] * len(gap.of_seeds), "o", ms=4, color=LINES[0])
-    titled(axes, "Success, points more than the recipe (bar: 95 % interval)")
-    axes.set_yticks(range(len(gaps)), list(gaps))
-    axes.invert_yaxis()
     return png(figure)
 
 

@@ -1,17 +1,22 @@
-"""A result as a Markdown page with its figures beside it and its numbers as JSON."""
+"""A result page: what an experiment made stands between two comments, the text around it in docs.
+
+`suite reproduce` replaces what stands between the comments and nothing else, so that a page can be
+made again without losing its text.
+"""
 
 from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from suite.common.console import Console
 from suite.common.provenance import machine, package_versions
-from suite.common.report import Details, Links, Part, Picture, Report
+from suite.common.report import Picture
+from suite.experiments import EXPERIMENTS
 from tracks.common.files import plain, replacing_file, write_json, write_text
 from tracks.common.grid import Grid, markdown
 from tracks.common.provenance import stamp
@@ -19,6 +24,8 @@ from tracks.common.work import Workers
 
 SCHEMA = 1
 """Version of NAME.json."""
+BEGIN, END = "<!-- made by suite reproduce -->", "<!-- end of what suite reproduce made -->"
+"""The lines between which a page is made anew."""
 
 
 @dataclass(frozen=True)
@@ -42,62 +49,88 @@ class Place:
         return f"{self.workers}, each on its own share of the cores"
 
 
+class Made(NamedTuple):
+    """What an experiment came to."""
+
+    facts: Mapping[str, str]
+    """Name and value of what was done: policies, recipe, trials, seeds."""
+    parts: Mapping[str, Sequence[Grid | Picture]]
+    """Tables and charts, by heading."""
+    numbers: Mapping[str, Any]
+    """What NAME.json holds besides what was asked and how it was made."""
+
+
+def check_page(out: Path, name: str) -> None:
+    """Refuse a page that cannot be made again without losing text.
+
+    Raises:
+        ValueError: where `out` has a NAME.md without the two comments.
+    """
+    path = out / f"{name}.md"
+    if path.is_file():
+        _around(path.read_text(encoding="utf-8"), path)
+
+
 def write_document(
-    place: Place,
-    name: str,
-    config: Any,
-    report: Report,
-    numbers: Mapping[str, Any],
-    console: Console,
+    place: Place, name: str, config: Any, made: Made, console: Console
 ) -> dict[str, Any]:
-    """Write `name`.md, its figures `name`.png, `name`-2.png, ... and `name`.json to `place.out`.
+    """Write the charts `name`.png, `name`-2.png, ..., `name`.json and `name`.md to `place.out`.
 
     The page is written last: where it stands, all that it shows does.
 
     Args:
         place: where.
-        name: of the page.
+        name: of the experiment.
         config: what was asked; its `seed` is what every seed was made from, or the first one.
-        report: what the page says; its facts come first, then command, commit and machine.
-        numbers: what `name`.json holds besides the stamp and `config`.
+        made: what came out.
         console: told what was written.
 
     Returns:
         What `name`.json holds, and `out`, the page's path.
 
     Raises:
+        ValueError: where a page is there that lacks the two comments.
         OSError: where a file cannot be written.
     """
-    header = stamp(SCHEMA, config.seed)
-    facts = {**report.facts, **_provenance(header)}
+    header, page = stamp(SCHEMA, config.seed), place.out / f"{name}.md"
+    facts = {**made.facts, **_provenance(header)}
+    old = page.read_text(encoding="utf-8") if page.is_file() else _new_page(name)
+    before, after = _around(old, page)
+    answer = {**header, "made_by": facts, "config": config, **made.numbers}
     figures: list[str] = []
-
-    def part(content: Part) -> str:
-        if isinstance(content, Picture):
+    blocks = ["\n".join(f"- {key}: {value}" for key, value in facts.items())]
+    for title, parts in made.parts.items():
+        blocks.append(f"## {title}")
+        for part in parts:
+            if isinstance(part, Grid):
+                blocks.append(markdown(part).strip("\n"))
+                continue
             file = f"{name}.png" if not figures else f"{name}-{len(figures) + 1}.png"
             figures.append(file)
             with replacing_file(place.out / file) as beside:
-                beside.write_bytes(content.png)
-            return f"![{content.caption}]({file})\n\n*{content.caption}*"
-        if isinstance(content, Grid):
-            return markdown(content).strip("\n")
-        if isinstance(content, Links):
-            return "\n".join(f"- [{path}]({path}): {words}" for path, words in content.entries)
-        if isinstance(content, Details):
-            return f"{content.summary}\n\n```\n{content.text}\n```"
-        return content
-
-    blocks = [f"# {report.title}", report.lead]
-    blocks.append("\n".join(f"- {key}: {value}" for key, value in facts.items()))
-    for section in report.sections:
-        blocks += [f"## {section.title}", *map(part, section.parts)]
-    blocks.append("<!-- " + "; ".join(f"{key}: {value}" for key, value in header.items()) + " -->")
-    answer = {**header, "made_by": facts, "config": config, **numbers}
+                beside.write_bytes(part.png)
+            blocks.append(f"![{part.caption}]({file})")
     write_json(place.out / f"{name}.json", answer)
-    page = place.out / f"{name}.md"
-    write_text(page, "\n\n".join(blocks) + "\n")
+    write_text(page, "\n\n".join([before + BEGIN, *blocks, END]) + after)
     console.say(f"written: {page}, {name}.json" + "".join(f", {file}" for file in figures))
     return {**plain(answer), "out": str(page)}
+
+
+def _new_page(name: str) -> str:
+    summary = EXPERIMENTS.get(name, name)
+    return f"# {name}\n\n{summary[0].upper()}{summary[1:]}.\n\n{BEGIN}\n{END}\n"
+
+
+def _around(text: str, path: Path) -> tuple[str, str]:
+    """Return what stands before and after the part of a page that is made."""
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(
+            f"{path}: has no {END if begin else BEGIN}, so its text would be lost; move it away, "
+            f"or add the lines {BEGIN} and {END} around what is to be replaced"
+        )
+    return before, after
 
 
 def _provenance(header: Mapping[str, Any]) -> dict[str, str]:
@@ -105,6 +138,6 @@ def _provenance(header: Mapping[str, Any]) -> dict[str, str]:
     engines = (f"{key} {versions[key]}" for key in ("mujoco", "jax", "numpy"))
     return {
         "command": f"`{shlex.join(['suite', *sys.argv[1:]])}`",
-        "commit": str(header["git_commit"]),
+        "commit": f"{header['git_commit']}, version {header['suite_version']}",
         "machine": f"{where['processor']}, {where['cores']} cores; {', '.join(engines)}",
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from eval.judging.tables import Tally, percent
@@ -60,33 +60,22 @@ def goals(cells: Sequence[Tally]) -> list[Goal]:
     return found
 
 
-def verdict(found: Sequence[Goal]) -> str:
-    """Return in two sentences how many cells meet the goal, and where the most is missing."""
-    met = sum(goal.met for goal in found)
-    won = sum(goal.success_miss == 0 for goal in found)
-    fast = sum(goal.v_max_miss == 0 for goal in found)
-    text = (
-        f"{met} of {len(found)} cells meet the whole goal: {won} in success against the better of "
-        f"paper and baseline, {fast} in v_max against both."
-    )
-    reached = sum(goal.floor_miss == 0 for goal in found)
-    text += f" The success that a shipped policy is to reach is reached in {reached}."
-    largest = sum(goal.of_ten_miss == 0 for goal in found)
-    if not any(goal.of_ten_miss is None for goal in found):
-        text += f" If the printed v_max is the largest of ten trials, it is reached in {largest}."
-    worst = max(found, key=lambda goal: goal.success_miss)
-    slowest = max(found, key=lambda goal: goal.v_max_miss)
-    if worst.success_miss:
-        text += (
-            f" Success misses most on {worst.track} at level {worst.level}, "
-            f"by {100 * worst.success_miss:.0f} points;"
-        )
-    if slowest.v_max_miss:
-        text += (
-            f" v_max misses most on {slowest.track} at level {slowest.level}, "
-            f"by {slowest.v_max_miss:.2f} m/s."
-        )
-    return text.rstrip(";") + ("" if text.endswith(".") else ".")
+def met_grid(cells: Mapping[str, Sequence[Tally]]) -> Grid:
+    """Return how many cells of each policy meet what is asked of them."""
+    headers = ["policy", "cells", "all that is asked", "success", "floor", "v_max",
+               "v_max, largest of ten"]  # fmt: skip
+    lines = []
+    for name, some in cells.items():
+        found = goals(some)
+        ten = [goal.of_ten_miss for goal in found]
+        met = (
+            sum(goal.met for goal in found),
+            *(sum(not getattr(goal, f"{what}_miss") for goal in found)
+              for what in ("success", "floor", "v_max")),
+            "-" if None in ten else sum(not miss for miss in ten),
+        )  # fmt: skip
+        lines.append([name, str(len(found)), *map(str, met)])
+    return table(headers, lines)
 
 
 def goal_grid(cells: Sequence[Tally]) -> Grid:
@@ -109,12 +98,7 @@ def goal_grid(cells: Sequence[Tally]) -> Grid:
         )
         for goal in goals(cells)
     ]
-    note = (
-        "Asked of success: the better of the paper's and the baseline's rate; where that is 10 of "
-        f"10, a Wilson interval from {100 * SURE:.0f} % up. The floor is what the shipped policy "
-        "is to reach. Asked of v_max: the largest of the printed ones."
-    )
-    return table(headers, lines, note=note)
+    return table(headers, lines)
 
 
 def _missed(by: float, unit: str, digits: int = 1) -> str:

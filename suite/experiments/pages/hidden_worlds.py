@@ -1,4 +1,4 @@
-"""What the page on hidden worlds shows: success, what it is worth, laps, names and errors."""
+"""Tables of loops on hidden vehicles: success, differences, laps, named effects and errors."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from eval.judging.statistics import Interval, wilson
 from eval.judging.tables import percent
 from eval.worlds.trial import TrialResult
 from suite.diagnose.report.parameters_json import components
-from suite.experiments.pages.tables import gap_cell, points_cell
-from suite.experiments.study.intervals import WHAT_COUNTS, Gap, nested
+from suite.experiments.pages.tables import gap_cell
+from suite.experiments.study.intervals import Gap, nested
 from suite.loop.compare import BEFORE
 from suite.loop.hidden_effect import BOTH, CONTROL, DELTA, LABELS, NAMED, NOMINAL
 from suite.loop.work import named_effects
@@ -26,32 +26,7 @@ PAIRS = {
     "control - before": (CONTROL, BEFORE),
     "named - nothing hidden": (NAMED, NOMINAL),
 }
-"""What is held against what."""
-HOW = (
-    "Every policy is fine-tuned from the same one, for as many gradient steps on the same tracks. "
-    "Control: through the simulation's quadrotor as it is; with delta: through it with a Delta "
-    "Action Model of the flights; with the named effect: through the quadrotor that the diagnosis "
-    "corrected from the same flights; with both: through that with a Delta Action Model of what it "
-    "still lacks. All randomise their quadrotor as the recipe does. The first column flies the "
-    "simulation's vehicle, all others the hidden world.",
-    "Success over the training seeds from which something was named, [95 % Wilson intervals]; over "
-    "all worlds each trial counts once, with its mean, as all worlds fly the same.",
-)
-WORTH = (
-    "Differences in points over the same trials, with 95 % bootstrap intervals that draw training "
-    "seeds anew and the trials of each; in brackets each training seed's own. Not corrected for "
-    f"there being several. {WHAT_COUNTS} A loop whose diagnosis names nothing has no fine-tuned "
-    "policies, and counts in none."
-)
-LAPS = (
-    "Lap over that of the policy where nothing is hidden on the same trial, median over the "
-    "trials that both finish; how many these are."
-)
-ERRORS = (
-    "Held-out flights as measured, flown again for 1 s: error in position [m], mean over the "
-    "training seeds. The noise of the start is in every number. The diagnosis, which corrected the "
-    "quadrotor, has seen some of these flights; no Delta Action Model has."
-)
+"""Which pairs are compared."""
 
 
 class Came(NamedTuple):
@@ -142,46 +117,6 @@ def _lap_ratio(
     return (float(np.median(ratios)) if ratios else float("nan")), len(ratios)
 
 
-def lead(rows: Sequence[Row]) -> str:
-    """Return in sentences what was lost and what gives it back."""
-    *worlds, over = rows
-
-    def rate(policy: str) -> str:
-        found = over.success.get(policy)
-        return "-" if found is None else f"{100 * found.value:.0f} %"
-
-    told = "There" if over.named in (0, over.loops) else "In those"
-    text = (
-        f"Hidden worlds: {len(worlds)}, loops: {over.loops}. The diagnosis names something in "
-        f"{over.named} of {over.loops}. {told} {rate(BEFORE)} succeed, of {rate(NOMINAL)} where "
-        "nothing is hidden."
-    )
-    if NAMED not in over.success:
-        return text
-
-    def apart(pair: str) -> str:
-        return f"{points_cell(over.gaps[pair].difference).text} points"
-
-    text += (
-        f" Fine-tuned with what it names {rate(NAMED)} succeed, with a Delta Action Model "
-        f"{rate(DELTA)}, with both {rate(BOTH)}, and as the control {rate(CONTROL)}: the named "
-        f"effect is worth {apart('named - control')}, the Delta Action Model "
-        f"{apart('delta - control')}, and on top of the named effect {apart('both - named')}."
-    )
-    for pair, words in (
-        ("named - control", "The named effect gains"),
-        ("delta - control", "The Delta Action Model gains"),
-    ):
-        told = {
-            verdict: [row.world for row in worlds
-                      if pair in row.gaps and row.gaps[pair].verdict == verdict]
-            for verdict in ("gain", "loss")
-        }  # fmt: skip
-        text += f" {words} in: {', '.join(told['gain']) or 'none'}"
-        text += f"; loses in: {', '.join(told['loss'])}." if told["loss"] else "."
-    return text
-
-
 def success_grid(rows: Sequence[Row]) -> Grid:
     """Return success by world and policy."""
     lines = [
@@ -216,7 +151,7 @@ def lap_grid(rows: Sequence[Row]) -> Grid:
 
 
 def named_grid(came: Sequence[Came], words: Mapping[str, str]) -> Grid:
-    """Return what every diagnosis said, beside what is true."""
+    """Return what every diagnosis named, next to what is true."""
     lines = []
     for one in came:
         values = [

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from eval.judging.statistics import Interval, PairedDifference, paired_success
-from eval.judging.tables import Tally, markdown_table, percent
-from suite.common.report import Section
+from eval.judging.tables import Tally, grids, percent
 from suite.experiments.study.disturbed import Tested
 from suite.experiments.study.intervals import Gap
 from suite.experiments.study.summary import METRICS
@@ -58,15 +57,14 @@ def condition_grid(
     return table(headers, lines, title)
 
 
-def every_cell(cells: Sequence[Tally]) -> Section:
-    """Return all numbers of judged cells, at a page's end."""
-    text = markdown_table({"cells": cells, "paired": []}).strip("\n")
-    return Section("Every cell with its intervals", [text])
+def every_cell(cells: Sequence[Tally]) -> list[Grid]:
+    """Return all numbers of judged cells."""
+    return grids({"cells": cells, "paired": []})
 
 
 def every_training(
     what: str, runs: Sequence[Trained], digits: Mapping[str, int], time: Callable[[Trained], str]
-) -> Section:
+) -> Grid:
     """Return what each training came to at its end: numbers with their `digits`, and its time."""
     headers = [what, "training seed", *(METRICS[name].title for name in digits), "trained for"]
     lines = []
@@ -76,4 +74,4 @@ def every_training(
             last = run.points[-1]
             line = [f"{METRICS[name].scale * last[name]:.{d}f}" for name, d in digits.items()]
         lines.append([run.row, str(run.seed), *line, time(run)])
-    return Section("Every training", [table(headers, lines)])
+    return table(headers, lines)

@@ -49,11 +49,6 @@ class Sweep:
     """Returns what flies at one size."""
 
 
-def log_faults() -> list[str]:
-    """Return the effects that are faults of a log and touch no flight."""
-    return [name for name, effect in EFFECTS.items() if not effect.in_flight]
-
-
 def effect_conditions(vehicle: Vehicle) -> list[Condition]:
     """Return `vehicle` with each effect that touches a flight, at the upper end of its usual size.
 

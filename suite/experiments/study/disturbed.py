@@ -45,18 +45,18 @@ Grown = dict[Sweep, list[Tested]]
 
 
 def asked_conditions(
-    vehicle: Vehicle, only: Sequence[str], effects: bool = True
+    vehicle: Vehicle, only: Sequence[str]
 ) -> tuple[list[Condition], dict[Sweep, list[Condition]]]:
     """Return the effects and the sweeps of `vehicle` whose names are in `only`, all if it is empty.
 
     Raises:
-        ValueError: for a name that there is not; `effects` False leaves those of effects out.
+        ValueError: for a name that does not exist.
     """
-    grown, alone = sweeps(vehicle), effect_conditions(vehicle) if effects else []
+    grown, alone = sweeps(vehicle), effect_conditions(vehicle)
     known = dict.fromkeys(entry.name for entry in (*grown, *alone))
     for name in only:
         if name not in known:
-            raise unknown_name("effect or sweep" if effects else "sweep", name, known)
+            raise unknown_name("effect or sweep", name, known)
     chosen = only or tuple(known)
     return (
         [condition for condition in alone if condition.name in chosen],

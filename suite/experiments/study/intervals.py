@@ -17,11 +17,6 @@ DRAWS = 4000
 """Of the bootstrap."""
 FEWEST_SEEDS = 3
 """With less, nothing is called a gain or a loss."""
-WHAT_COUNTS = (
-    "A gain or a loss is where the interval leaves zero out and every seed agrees; with less than "
-    f"{FEWEST_SEEDS} seeds nothing is called one."
-)
-"""What `Gap.verdict` goes by, for the pages."""
 
 
 class Spread(NamedTuple):
@@ -56,20 +51,6 @@ class Gap(NamedTuple):
 def spread(values: Sequence[float]) -> Spread:
     """Return the mean of values with the least and the most of them."""
     return Spread(float(np.mean(values)), min(values), max(values))
-
-
-def crossed(gap: np.ndarray) -> Gap:
-    """Return the mean of `gap` (seeds, trials), all seeds having flown the same trials.
-
-    Both are drawn anew, the same trials for every seed of a draw.
-    """
-    rng = np.random.default_rng(0)
-    seeds, trials = gap.shape
-    drawn = [
-        gap[rng.integers(0, seeds, seeds)][:, rng.integers(0, trials, trials)].mean()
-        for _ in range(DRAWS)
-    ]
-    return Gap(_interval(float(gap.mean()), drawn), gap.mean(axis=1).tolist())
 
 
 def nested(gaps: Sequence[np.ndarray]) -> Gap:

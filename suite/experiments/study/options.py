@@ -52,8 +52,6 @@ def check(config: Any) -> None:
         raise ValueError(f"--training-seeds is {said}; give each once")
     if isinstance(config, FourGates):
         _check_unseen("--seed", config.seed, seeds)
-    if "round_seed" in given:
-        _check_unseen("--round-seed", given["round_seed"], seeds)
     if "difficulty" in given:
         parse_levels(given["difficulty"])
 

@@ -40,8 +40,6 @@ class Row(NamedTuple):
     """What tables call it."""
     recipe: Any
     """A `TrainConfig` or a `PpoConfig`, with the seed left as it is."""
-    changes: tuple[str, ...] = ()
-    """Of the study's recipe, as --set takes them, where that says it all."""
 
 
 class Looks(NamedTuple):

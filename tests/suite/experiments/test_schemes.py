@@ -4,7 +4,7 @@ import pytest
 
 from suite.experiments.ablation import Config as AblationConfig
 from suite.experiments.ablation import settings
-from suite.experiments.schemes import Config, first_times, number_at, schemes, verdict
+from suite.experiments.schemes import Config, first_times, number_at, schemes
 from suite.experiments.study.intervals import Spread
 from suite.experiments.study.summary import summaries
 from suite.experiments.study.training import Trained
@@ -46,7 +46,7 @@ def test_the_comparison_from_one_command_and_again(tmp_path, monkeypatch):
     # Before the first step both are the same network in the same worlds.
     one, two = (row["curves"]["reward"][0] for row in numbers["rows"])
     assert one["mean"] == pytest.approx(two["mean"]) and one["mean"] != 0
-    assert "not reached" in text and "The paper has ours ahead of PPO" in text
+    assert "not reached" in text
     for module in ("suite.train.run", "suite.train.ppo.run"):
         monkeypatch.setattr(f"{module}.make_update", None)
     assert reproduce(tmp_path, "schemes", *args) == 0, "nothing is trained again"
@@ -63,7 +63,7 @@ def learnt(scheme, seed, pace, gates, diverged=""):
     return Trained(scheme, seed, "", 60.0, 5.0, "c", diverged, points)
 
 
-def test_curves_first_times_and_sentences_by_hand():
+def test_curves_and_first_times_by_hand():
     chosen = schemes(Config(only=("ours", "ppo")))
     runs = [
         learnt("ppo", 0, 4.0, [0.0, 0.5, 1.5]),
@@ -80,14 +80,6 @@ def test_curves_first_times_and_sentences_by_hand():
     assert first_times(ours, 3) == [(200, 2), (200, 6)]
     assert first_times(ppo, 1) == [(200, 8.0)] and first_times(ppo, 2) == []
     assert number_at(ppo, 4.0) == 1 and number_at(ppo, 3.9) == 0
-    said = verdict([ppo, ours])
-    assert "ours: 3.50 gates" in said.lower() and "(8.0 s of training)" in said
-    assert "ahead at the end in reward, gates (with every seed above every one of PPO's" in said
-    assert "after 4.0 s of training each in reward, gates" in said
-    swapped = verdict([ppo._replace(at=ours.at), ours._replace(at=ppo.at)])
-    assert "ahead at the end in none of them" in swapped
-    gone = summaries(chosen[:1], [learnt("ppo", 0, 4.0, [0.0], "it diverged")])
-    assert verdict(gone) == "Every training of PPO diverged."
 
 
 @pytest.mark.parametrize(

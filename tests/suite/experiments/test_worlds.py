@@ -1,9 +1,9 @@
-"""Policies in several worlds at a small size, and what is said of flights that end otherwise."""
+"""Policies in several worlds at a small size, and why trials change."""
 
 import pytest
 
 from eval.worlds import rotorpy as rotorpy_world
-from suite.experiments.worlds import OTHERWISE, Column, Config, changes, columns
+from suite.experiments.worlds import WHY, Column, Config, _counts, changes, columns
 from tests.support.documents import page, reproduce
 from tests.support.engines import STAND_IN
 from tests.support.loops import trial_result
@@ -25,7 +25,7 @@ def test_a_policy_in_two_worlds_and_a_control(sky, rotorpy, tmp_path):
     text, numbers = page(tmp_path, "worlds")
     labels = [entry["column"] for entry in numbers["success"]]
     assert labels == ["mujoco", "mujoco, the air of rotorpy", "rotorpy"]
-    assert "- rotorpy: linear_drag: RotorPy's drag goes with the rotors' speed" in text
+    assert "| rotorpy | linear_drag: RotorPy's drag goes with the rotors' speed" in text
     assert "ends alike" in text and numbers["changed"] == []
 
 
@@ -39,8 +39,11 @@ def test_why_is_told_by_the_controls(rotorpy):
         for label, digits in won.items()
     }
     found = changes(["p"], flown_in, results)
+    counts = [[cell.text for cell in row] for row in _counts(found, flown_in).rows]
+    assert counts == [[single, "1", "-", "-", "-"], [aired, "1", "-", "-", "-"],
+                      [other, "3", "1", "1", "1"]]  # fmt: skip
     mine = {change["trial"].seed: change["why"] for change in found if change["column"] == other}
-    assert mine == {0: "rounding", 1: "air", 2: "rest"} and set(mine.values()) == set(OTHERWISE)
+    assert mine == {0: "rounding", 1: "air", 2: "rest"} and set(mine.values()) == set(WHY)
     assert [change["why"] for change in found if change["column"] in (single, aired)] == [None] * 2
     assert found[0]["endings"][base] == results["p", base][0].ending
 

@@ -1,6 +1,6 @@
-"""What the page on hidden worlds makes of loops: differences in pairs, laps, sentences."""
+"""What the page on hidden worlds makes of loops: differences in pairs, laps, names."""
 
-from suite.experiments.pages.hidden_worlds import WORTH, Came, lead, named_grid, rows_of
+from suite.experiments.pages.hidden_worlds import Came, named_grid, rows_of
 from suite.loop.hidden_effect import LABELS, NAMED
 from tests.support.loops import EFFECT, WON, four_trials
 
@@ -34,19 +34,15 @@ def test_worlds_of_one_training_seed_add_no_trials():
     assert many.laps["nominal"] == (1.0, 24)
 
 
-def test_the_lead_says_what_gained_and_where_nothing_is_named_only_what_was_lost():
-    said = lead(rows_of([came(seed, WON) for seed in range(3)]))
-    assert "loops: 3. The diagnosis names something in 3 of 3. There 50 %" in said
-    assert "The named effect gains in: a." in said and "loses" not in said
-    few = lead(rows_of([came(seed, WON) for seed in range(2)]))
-    assert "The named effect gains in: none." in few
-    assert "with less than 3 seeds nothing is called one" in WORTH
-    worse = lead(rows_of([came(seed, {**WON, NAMED: 0}) for seed in range(3)]))
-    assert "The named effect gains in: none; loses in: a." in worse
-    silent = lead(rows_of([came(0, WON, named=False)]))
-    assert "in 0 of 1. There 50 %" in silent and silent.endswith("where nothing is hidden.")
-    lost = came(1, {**WON, "before": 0}, named=False)
-    assert "in 1 of 2. In those 50 %" in lead(rows_of([came(0, WON), lost]))
+def test_a_gain_needs_three_seeds_that_agree_and_a_loop_with_names():
+    def verdict(*loops):
+        return {pair: gap.verdict for pair, gap in rows_of(loops)[0].gaps.items()}
+
+    assert verdict(*(came(seed, WON) for seed in range(3)))["named - control"] == "gain"
+    assert verdict(*(came(seed, WON) for seed in range(2)))["named - control"] == "unclear"
+    worse = verdict(*(came(seed, {**WON, NAMED: 0}) for seed in range(3)))
+    assert worse["named - control"] == "loss"
+    assert verdict(came(0, WON, named=False)) == {}
 
 
 def test_what_is_named_is_told_in_as_many_digits_as_mean_something():

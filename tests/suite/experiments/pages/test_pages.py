@@ -1,18 +1,27 @@
 """A page's text, its tables and its charts, from numbers made by hand."""
 
 import json
+import re
 from dataclasses import dataclass
+
+import pytest
 
 from eval.judging.statistics import Interval
 from suite.common.console import Console
-from suite.common.report import Picture, Report, Section
+from suite.common.report import Picture
 from suite.experiments.pages import charts
-from suite.experiments.pages.document import Place, write_document
+from suite.experiments.pages.document import (
+    BEGIN,
+    END,
+    Made,
+    Place,
+    check_page,
+    write_document,
+)
 from suite.experiments.pages.tables import every_training, points_cell
-from suite.experiments.study.intervals import Gap
 from suite.experiments.study.training import Trained
 from tests.support.judged_cells import cell
-from tracks.common.grid import Cell, Grid, table
+from tracks.common.grid import Cell, table
 from tracks.families import JUDGED
 
 PNG = b"\x89PNG"
@@ -25,19 +34,46 @@ class Config:
     seed: int
 
 
-def test_a_page_has_its_facts_its_tables_and_numbered_figures(tmp_path):
+def made(number="1"):
     picture = Picture(PNG, "A figure.")
-    parts = [table(["a", "b"], [["1", Cell("2", "good")]], note="Below."), picture, picture]
-    report = Report("Title", "What came out.", {"recipe": "small"}, [Section("Part", parts)])
+    grid = table(["a", "b"], [[number, Cell("2", "good")]], note="Below.")
+    return Made({"recipe": "small"}, {"Part": [grid, picture, picture]}, {"x": 1})
+
+
+def test_a_page_has_its_facts_its_tables_and_numbered_figures(tmp_path):
     place = Place(tmp_path / "docs", tmp_path)
-    said = write_document(place, "name", Config(7), report, {"x": 1}, Console())
-    text = (tmp_path / "docs" / "name.md").read_text()
-    assert text.startswith("# Title\n\nWhat came out.\n\n- recipe: small\n- command: `")
-    assert "| a | b |\n| --- | --- |\n| 1 | 2 |\n\nBelow." in text
-    assert "![A figure.](name.png)" in text and "![A figure.](name-2.png)" in text
-    numbers = json.loads((tmp_path / "docs" / "name.json").read_text())
+    said = write_document(place, "seeds", Config(7), made(), Console())
+    text = (tmp_path / "docs" / "seeds.md").read_text()
+    assert text.startswith("# seeds\n\nThe policies of several training seeds")
+    assert f"\n\n{BEGIN}\n\n- recipe: small\n- command: `" in text and text.endswith(f"{END}\n")
+    assert "## Part\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n\nBelow." in text
+    assert "![A figure.](seeds.png)" in text and "![A figure.](seeds-2.png)" in text
+    numbers = json.loads((tmp_path / "docs" / "seeds.json").read_text())
     assert numbers["seed"] == numbers["config"]["seed"] == 7 and numbers["x"] == 1
-    assert said["out"].endswith("name.md")
+    assert said["out"].endswith("seeds.md")
+
+
+def test_a_page_made_again_keeps_the_text_around_what_is_made(tmp_path):
+    place, page = Place(tmp_path, tmp_path), tmp_path / "seeds.md"
+    write_document(place, "seeds", Config(7), made(), Console())
+    page.write_text(page.read_text().replace("# seeds", "# My own title") + "\nWhat it means.\n")
+    write_document(place, "seeds", Config(7), made("3"), Console())
+    text = page.read_text()
+    assert text.startswith("# My own title\n\nThe policies of")
+    assert text.endswith(f"{END}\n\nWhat it means.\n")
+    assert "| 3 | 2 |" in text and "| 1 | 2 |" not in text
+    again = page.read_text()
+    write_document(place, "seeds", Config(7), made("3"), Console())
+    assert page.read_text() == again
+
+
+@pytest.mark.parametrize(("lost", "words"), [(BEGIN, f"has no {BEGIN}"), (END, f"has no {END}")])
+def test_a_page_whose_text_would_be_lost_is_refused(lost, words, tmp_path):
+    page = tmp_path / "seeds.md"
+    page.write_text(f"# Mine\n\n{BEGIN}\n{END}\n".replace(lost, ""))
+    with pytest.raises(ValueError, match=re.escape(words)):
+        check_page(tmp_path, "seeds")
+    check_page(tmp_path, "table2")
 
 
 def test_how_many_trainings_share_the_cores_is_told(tmp_path):
@@ -60,19 +96,16 @@ def test_every_training_has_a_line_and_one_that_diverged_no_numbers():
         Trained("a", 0, "", 1.0, 0.0, "c", "", [{"gates": 0.0}, {"gates": 1.234}]),
         Trained("a", 1, "", 1.0, 0.0, "c", "it diverged", []),
     ]
-    (grid,) = every_training("row", runs, {"gates": 2}, lambda run: f"{run.seconds:g} s").parts
-    assert isinstance(grid, Grid)
+    grid = every_training("row", runs, {"gates": 2}, lambda run: f"{run.seconds:g} s")
     lines = [[entry.text for entry in row] for row in grid.rows]
     assert lines == [["a", "0", "1.23", "1 s"], ["a", "1", "diverged", "1 s"]]
 
 
 def test_charts_are_pictures():
     cells = [cell(track, level, 0.5) for track in JUDGED for level in (0, 3)]
-    gap = Gap(Interval(0.1, 0.0, 0.2), [0.1, 0.2])
     for made in (
         charts.level_chart(cells),
         charts.cells_chart({"p": cells}),
         charts.cells_chart({"p$x^{$": cells}),
-        charts.gaps_chart({"a": gap}),
     ):
         assert made.startswith(PNG)

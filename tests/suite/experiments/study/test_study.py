@@ -8,17 +8,19 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
 from suite.common.console import Console
 from suite.experiments.ablation import Config as AblationConfig
-from suite.experiments.ideas import Config as IdeasConfig
+from suite.experiments.schemes import Config as SchemesConfig
 from suite.experiments.study import disturbed
 from suite.experiments.study.conditions import Condition
 from suite.experiments.study.intervals import Spread
 from suite.experiments.study.judging import Flier, Order, flown, trials_of
-from suite.experiments.study.options import asked_recipe, check, judged_seeds
+from suite.experiments.study.options import check, judged_seeds
 from suite.experiments.study.summary import summaries
 from suite.experiments.study.training import Row, Study, Trained
+from suite.experiments.worlds import Config as WorldsConfig
+from suite.train.presets import preset
 
 VEHICLE = load_vehicle("reference")
-RECIPE = asked_recipe(IdeasConfig())
+RECIPE = preset("racer")
 
 
 def test_rows_take_turns_where_they_are_to_meet_the_same_load():
@@ -47,8 +49,8 @@ def test_a_summary_leaves_out_what_diverged():
         (AblationConfig(worlds=0), "--worlds is 0"),
         (AblationConfig(seed=2), "--seed 2 is one of --training-seeds"),
         (AblationConfig(training_seeds=()), "--training-seeds is empty"),
-        (IdeasConfig(round_seconds=0.1), r"--round-seconds is 0\.1"),
-        (IdeasConfig(difficulty="10"), "level 10 is not 0 to 9"),
+        (SchemesConfig(seconds=0.1), r"--seconds is 0\.1"),
+        (WorldsConfig(difficulty="10"), "level 10 is not 0 to 9"),
     ],
 )
 def test_options_are_checked_by_their_fields_names(config, words):
@@ -66,7 +68,7 @@ def test_the_same_flier_in_two_orders_flies_a_trial_once(sky, tmp_path):
 
 
 def test_trials_and_their_seeds():
-    config = IdeasConfig(trials=2, seed=7, difficulty="0,3")
+    config = WorldsConfig(trials=2, seed=7, difficulty="0,3")
     assert len(trials_of(config)) == 3 * 2 * 2 and judged_seeds(config) == "7 to 8"
     assert {trial.seed for trial in trials_of(config, (9,))} == {7, 8}
 
@@ -85,5 +87,3 @@ def test_several_policies_under_one_name_fly_one_after_the_other(sky, tmp_path):
     assert len(points[wind]) == 2 and len(sky.flown) == 2 * 3, "the undisturbed once for both"
     numbers = disturbed.tested_numbers(points[wind][1], tested)["policies"]["both"]
     assert numbers["success"].value == 0 and math.isclose(numbers["change"].value, 0)
-    with pytest.raises(ValueError, match="sweep"):
-        disturbed.asked_conditions(VEHICLE, ("mass_offset",), effects=False)
