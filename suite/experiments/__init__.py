@@ -13,7 +13,7 @@ EXPERIMENTS: dict[str, str] = {
     "seeds": "the policies of several training seeds on the same trials, and their median",
     "ablation": "trainings with the vector field and without it, flown on unseen worlds",
     "schemes": "PPO, our method, and it without the field, measured as they learn",
-    "hidden_worlds": "loops in worlds that hide an effect: with its name, with a Delta Action Model",
+    "hidden_worlds": "loops that regain a hidden effect by its name and by a Delta Action Model",
     "worlds": "the shipped policies on the same trials in every world",
 }
 """Name -> one-line summary; NAME lives in suite/experiments/NAME.py."""

@@ -30,7 +30,7 @@ ROUNDING = "mjx"
 """The world that flies as the first does but for rounding to single precision, contacts by distance
 and images by analytic rays."""
 WHY = ("rounding", "air", "rest")
-"""Why a trial changes: `rounding`, it does in mjx too; `air`, it does in mujoco with that world's air;
+"""Why a trial changes: `rounding`, it does in mjx too; `air`, in mujoco with that world's air too;
 `rest`, neither."""
 
 
