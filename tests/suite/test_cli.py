@@ -275,7 +275,7 @@ HUGE = "9" * 400
         "bench train --policy swift",
         "bench --policy swift",
         "reproduce table2 --trials 0",
-        "reproduce ideas --round-seconds nan",
+        "reproduce schemes --seconds nan",
         "reproduce schemes --workers 0",
         f"train --iterations {HUGE}",
         f"train --seed {HUGE}",
