@@ -1,0 +1,270 @@
+"""Plant faults in the code one at a time, and count how many of them the tests catch.
+
+    python tools/plant_faults.py [--tree DIR] [--out FILE.json] [--only NUMBER ...] [--list]
+
+A fault is a text of the code, found exactly once below its folder, and what stands there instead:
+a sign, an axis, a row, a term, a unit or a threshold that is wrong. The tests named with it run
+first without any fault, then with each in turn, in a copy of the files that git tracks in DIR. A
+fault is caught where a test fails. The same command goes on where it was stopped. Exit 1: some
+survived.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent
+LONGEST_S = 900.0
+"""A fault that makes the tests run for longer than this is caught: they hang."""
+FAILED = 1
+"""Exit code of pytest."""
+
+
+class Fault(NamedTuple):
+    """One fault."""
+
+    folder: str
+    """Below which the text is found exactly once."""
+    old: str
+    new: str
+    tests: str
+    """Ends of the names of the test files that should catch it; any that are there count."""
+
+
+FAULTS = (
+    # tracks: field, gates, cameras, solids
+    Fault("tracks", "return ((1 - aligned) / xp.max", "return ((1 + aligned) / xp.max",
+          "test_field"),
+    Fault("tracks", "share = -before[..., 0] /", "share = before[..., 0] /", "test_crossing"),
+    Fault(
+        "tracks", "2 * (x * y - w * z), 2 * (x * z + w * y)",
+        "2 * (x * y + w * z), 2 * (x * z + w * y)", "test_rotation",
+    ),
+    Fault(
+        "tracks", "half_u * (1 - (2 * np.arange(camera.width) + 1) /",
+        "half_u * (1 - (2 * np.arange(camera.width)) /", "test_depth",
+    ),
+    Fault(
+        "tracks", "along = jnp.clip((away * rods.axis_w).sum(-1), -rods",
+        "along = jnp.clip((away * rods.axis_w).sum(-1), 0.0 * rods",
+        "test_obstacles test_clearance",
+    ),
+    Fault("tracks", "center_w, angle + turn * np.pi / 2", "center_w, angle + np.pi / 2",
+          "test_circular test_families"),
+    # policies: networks, observation, C
+    Fault("policies", "new + update * (hidden - new)", "hidden + update * (new - hidden)",
+          "test_gru"),
+    Fault("policies", "numbers = [vel_b, rot_w[..., 2, :]", "numbers = [vel_b, rot_w[..., :, 2]",
+          "test_observation"),
+    Fault("policies", "x < -8.0f ? -8.0f : x > 8.0f ? 8.0f : x", "x", "test_c"),
+    Fault("policies", "math.log(spec.rate_hz / seen.rate_hz)",
+          "math.log(seen.rate_hz / spec.rate_hz)", "test_network"),
+    Fault("policies", "range_m) - encoding.offset", "range_m) + encoding.offset",
+          "test_observation"),
+    Fault("policies", "-zero * whole.sum(0", "zero * whole.sum(0", "test_c"),
+    # eval: effects, quadrotor
+    Fault("eval/effects", "-per_axis(flow.constants.mass) * values.coefficient * flow.air_vel_b",
+          "-values.coefficient * flow.air_vel_b", "test_equations"),
+    Fault("eval/effects", "/ (4.0 * height)) ** 2", "/ (2.0 * height)) ** 2", "test_equations"),
+    Fault("eval/effects", "constants.rotor_position_b - values.offset[",
+          "constants.rotor_position_b + values.offset[", "test_equations test_effects"),
+    Fault("eval/quadrotor", "(rate_cmd_b - rate_b) + cross(", "(rate_cmd_b - rate_b) - cross(",
+          "test_mixer test_stepper test_quadrotor"),
+    Fault("eval/quadrotor", "steps * (1.0 - left**2)", "steps * (1.0 - left)", "test_rotors"),
+    Fault("eval/quadrotor", "xp.where(age == whole + 1.0, part",
+          "xp.where(age == whole - 1.0, part",
+          "quadrotor/test_delay"),
+    Fault("eval/quadrotor", "xp.where(known, hx * gy - hy * gx, 0.0)",
+          "xp.where(known, hy * gx - hx * gy, 0.0)", "test_attitude"),
+    # eval: units of importers
+    Fault("eval/importers/formats", '"V": 1.0, "mV": 1e-3}', '"V": 1.0, "mV": 1e-2}',
+          "formats/test_betaflight test_units"),
+    Fault("eval/importers/mapping", '"Hz": float(2.0 * np.pi)', '"Hz": float(np.pi)',
+          "mapping/test_apply mapping/test_file test_units"),
+    Fault("eval/importers/mapping", '"mrad/s": 1e-3', '"mrad/s": 1e-2',
+          "mapping/test_apply mapping/test_file test_units"),
+    # eval: judging, statistics
+    Fault("eval/worlds", "xp.where(free & (rot_w[:, 2, 2] < 0), TIPPED",
+          "xp.where(free & (rot_w[:, 2, 2] < 0.05), TIPPED", "test_trial"),
+    Fault("eval/worlds", "progress.step <= short_step, gates", "progress.step < short_step, gates",
+          "test_trial"),
+    Fault("eval/judging", "np.rint((place + 1) * self._period - ages)",
+          "np.floor((place + 1) * self._period - ages)", "test_ages"),
+    Fault("eval/judging", "+ (z / (2 * trials)) ** 2)", "+ (z / trials) ** 2)", "test_statistics"),
+    # suite: losses, gradient, point mass
+    Fault("suite/train", "jnp.maximum(1.0 - step.gap, 0.0) ** 2",
+          "jnp.maximum(1.0 + step.gap, 0.0) ** 2", "test_losses"),
+    Fault("suite/train", "-(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos))",
+          "(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos))", "test_losses"),
+    Fault("suite/train", "return x * factor + jax.lax.stop_gradient(x * (1 - factor))",
+          "return x * (1 - factor) + jax.lax.stop_gradient(x * factor)", "test_point_mass"),
+    Fault("suite/train", "(images, stride * cotangents)", "(images, cotangents)", "test_gradient"),
+    Fault("suite/train", "error = reward + discount * going * value[1:] - value[:-1]",
+          "error = reward + discount * value[1:] - value[:-1]", "test_objective test_ppo"),
+    # suite: Delta Action Model
+    Fault("suite/delta", "mean_norm(pos - windows.pos_w[:, 1:])",
+          "mean_norm(pos - windows.pos_w[:, :-1])", "delta/test_fit"),
+    Fault("suite/delta", "optax.adam(optax.cosine_decay_schedule(config.rate, iterations))",
+          "optax.adam(config.rate)", "delta/test_fit"),
+    Fault("suite/delta", "ahead * np.where(up[..., 2:] < 0, -1.0, 1.0)", "ahead * 1.0",
+          "delta/test_windows"),
+    # suite: diagnosis
+    Fault("suite/diagnose", "(slow**2).sum(axis=(2, 3)) - (taken**2).sum(axis=(2, 3))",
+          "(slow**2).sum(axis=(2, 3))", "test_normal_equations test_whitening test_verdict"),
+    Fault("suite/diagnose", "float((1 + (null >= fall).sum()) / (1 + draws))",
+          "float((null >= fall).sum() / (1 + draws))", "test_permutation"),
+    # suite: blind cases, link
+    Fault("suite/blind", "return vector[:, [1, 0, 2]] * [1.0, -1.0, 0.0]",
+          "return vector[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]", "test_air"),
+    Fault("suite/blind", "yield bool(span[0] <= one <= span[1])", "yield bool(one <= span[1])",
+          "test_score"),
+    Fault("suite/judging/link", "np.asarray(quat_wxyz, float) * QUAT_HALF_TURN",
+          "np.asarray(quat_wxyz, float) * [1.0, -1.0, 1.0, -1.0]", "test_link"),
+    Fault("suite/judging/link", "since_s + limits.jump_m", "since_s + 2.0 * limits.jump_m",
+          "test_companion test_link test_watchdog"),
+)  # fmt: skip
+"""Forty: 6 of tracks, 6 of policies, 14 of eval, 14 of suite."""
+
+
+def copied(tree: Path, place: Path) -> list[str]:
+    """Copy the files that git tracks in `tree` to `place`, and return their names."""
+    listed = subprocess.run(
+        ["git", "-C", str(tree), "ls-files", "-z"], check=True, capture_output=True, text=True
+    )
+    names = [name for name in listed.stdout.split("\0") if (tree / name).is_file()]
+    for name in names:
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(tree / name, place / name)
+    return names
+
+
+def place_of(fault: Fault, names: list[str], copy: Path) -> Path:
+    """Return the file that holds the fault's text.
+
+    Raises:
+        SystemExit: where it is not found exactly once.
+    """
+    inside = [copy / name for name in names if name.startswith(f"{fault.folder}/")]
+    inside = [path for path in inside if path.suffix in (".py", ".c")]
+    holds = [path for path in inside for _ in range(path.read_text("utf-8").count(fault.old))]
+    if len(holds) != 1:
+        found = ", ".join(str(path.relative_to(copy)) for path in holds) or "nowhere"
+        raise SystemExit(
+            f"{fault.old!r}: found {len(holds)} times below {fault.folder} ({found}), allowed is "
+            "once; make the fault's text in tools/plant_faults.py that of the code"
+        )
+    return holds[0]
+
+
+def tests_of(fault: Fault, names: list[str]) -> list[str]:
+    """Return the test files of a fault that there are.
+
+    Raises:
+        SystemExit: where there is none.
+    """
+    ends = tuple(f"/{name}.py" for name in fault.tests.split())
+    found = [n for n in names if n.startswith(f"tests/{fault.folder.split('/')[0]}/")]
+    found = [n for n in found if n.endswith(ends)]
+    if not found:
+        raise SystemExit(f"{fault.old!r}: no test file is called {fault.tests}; name those that do")
+    return found
+
+
+def run_tests(copy: Path, tests: list[str]) -> tuple[int, str]:
+    """Return pytest's exit code on `tests` in `copy`, and what failed or its last line."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider"]
+    env = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run([*command, *tests], cwd=copy, env=env, capture_output=True,
+                              text=True, timeout=LONGEST_S)  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return FAILED, f"not done after {LONGEST_S:g} s"
+    lines = (done.stdout + done.stderr).splitlines() or ["said nothing"]
+    failed = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
+    return done.returncode, (failed or lines)[-1][:160]
+
+
+class Work:
+    """A copy of a tree, and what came of faults in it."""
+
+    def __init__(self, tree: Path, copy: Path, out: Path) -> None:
+        """Copy `tree` to `copy`; results are kept in `out`."""
+        self.names, self.copy, self._out = copied(tree, copy), copy, out
+        self._done = json.loads(out.read_text("utf-8")) if out.is_file() else {}
+
+    def result(self, number: int) -> dict[str, Any]:
+        """Return what the tests make of a fault: caught, and what they said.
+
+        Raises:
+            SystemExit: where they fail without it.
+        """
+        fault = FAULTS[number - 1]
+        place, tests = place_of(fault, self.names, self.copy), tests_of(fault, self.names)
+        right = place.read_text("utf-8")
+        code, said = self._run(tests, place)
+        if code:
+            raise SystemExit(f"{' '.join(tests)}: fail without any fault ({said}); repair them")
+        place.write_text(right.replace(fault.old, fault.new), "utf-8")
+        try:
+            code, said = self._run(tests, place)
+        finally:
+            place.write_text(right, "utf-8")
+        file = str(place.relative_to(self.copy))
+        return {"number": number, "file": file, "caught": code != 0, "said": said}
+
+    def _run(self, tests: list[str], place: Path) -> tuple[int, str]:
+        """Run tests, unless that was done with the same bits of them and of `place`."""
+        sums = hashlib.sha256()
+        for path in (place, *(self.copy / test for test in tests)):
+            sums.update(path.read_bytes())
+        key = f"{' '.join(tests)} {place.relative_to(self.copy)} {sums.hexdigest()[:16]}"
+        if key not in self._done:
+            self._done[key] = run_tests(self.copy, tests)
+            self._out.parent.mkdir(parents=True, exist_ok=True)
+            beside = self._out.with_suffix(".new")
+            beside.write_text(json.dumps(self._done, indent=1), "utf-8")
+            beside.replace(self._out)
+        return self._done[key]
+
+
+def main() -> int:
+    """Plant the faults."""
+    parser = argparse.ArgumentParser(description="plant faults, and count those that tests catch")
+    parser.add_argument("--tree", type=Path, default=ROOT, help="checkout whose code is changed")
+    parser.add_argument("--out", type=Path, default=Path("runs/faults.json"), help="results, JSON")
+    parser.add_argument("--only", type=int, nargs="+", help="numbers of the faults, from 1")
+    parser.add_argument("--list", action="store_true", help="print the faults and their tests")
+    args = parser.parse_args()
+    numbers = args.only or list(range(1, len(FAULTS) + 1))
+    with tempfile.TemporaryDirectory() as folder:
+        work = Work(args.tree, Path(folder) / "tree", args.out)
+        for number in numbers:
+            fault = FAULTS[number - 1]
+            place = place_of(fault, work.names, work.copy).relative_to(work.copy)
+            tests = tests_of(fault, work.names)
+            if args.list:
+                print(f"{number} {place}: {fault.old!r} -> {fault.new!r}; {' '.join(tests)}")
+        if args.list:
+            return 0
+        results = []
+        for number in numbers:
+            row = work.result(number)
+            results.append(row)
+            verdict = "caught" if row["caught"] else "SURVIVED"
+            print(f"{number} {row['file']}: {verdict} ({row['said']})", flush=True)
+    caught = sum(row["caught"] for row in results)
+    print(f"{caught} of {len(results)} caught")
+    return 0 if caught == len(results) else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
