@@ -46,7 +46,7 @@ types: $(STAMP)
 	$(PY) -m pyright --pythonpath $(PY) --warnings
 
 tests: $(STAMP)
-	$(PY) -m pytest -n $(JOBS) --dist worksteal
+	$(PY) -m pytest -n $(JOBS) --dist loadgroup --no-loadscope-reorder
 
 # The types are checked on one core, beside the tests.
 test: style

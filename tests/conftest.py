@@ -7,6 +7,19 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).resolve().parent.parent
+TOGETHER = (
+    "suite/diagnose",
+    "suite/train",
+    "suite/diagnose/identify",
+    "examples",
+    "eval/worlds",
+    "suite/judging",
+    "policies",
+    "suite/delta",
+    "suite/loop",
+    "suite/experiments",
+)
+"""Folders whose tests share fixtures and compiled code, those that take longest first."""
 
 # Before jax is imported anywhere. Compiled code in .cache/jax makes a second run much faster.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -15,6 +28,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 # Tests compile much and run little: code that is made in a fifth of the time, and is slower.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "agg")
 
@@ -32,3 +46,19 @@ settings.load_profile("suite")
 def root() -> Path:
     """Return the checkout's root folder."""
     return ROOT
+
+
+def folder_of(path: Path) -> str:
+    """Return the folder that a test is run with: one of `TOGETHER`, or the one it is in."""
+    folder = path.relative_to(ROOT / "tests").parent.as_posix()
+    inside = [one for one in TOGETHER if folder == one or folder.startswith(f"{one}/")]
+    return max(inside, key=len, default=folder)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run a folder's tests in one process (`--dist loadgroup`), the longest folders first."""
+    order = {name: number for number, name in enumerate(TOGETHER)}
+    items.sort(key=lambda item: order.get(folder_of(item.path), len(order)))
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group(folder_of(item.path)))

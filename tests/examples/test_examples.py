@@ -3,13 +3,16 @@
 Eight programs are shown in docs/start.md; a file that is not in the table here fails.
 """
 
-import os
 import re
-import subprocess
+import runpy
 import sys
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
+import jax
 import pytest
+
+from eval.effects import EFFECTS
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = {
@@ -27,8 +30,6 @@ EXAMPLES = {
     "quadrotor_gradient": (["3"], r"0\.06000 kg; the truth is 0\.06 kg", []),
 }
 """Name: arguments, what it must say (an expression), files that it must write."""
-# A diagnosis runs for longer than it compiles.
-OPTIMISED = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
 
 
 def source(name):
@@ -43,14 +44,33 @@ def test_every_example_is_run_here_and_shown_to_newcomers():
         assert 25 <= len(source(name).splitlines()) <= 80
 
 
+@pytest.fixture(autouse=True)
+def as_a_program(tmp_path, monkeypatch):
+    """Run in an empty folder; what a program adds to the tables of effects goes again."""
+    monkeypatch.chdir(tmp_path)
+    for table in ("_entries", "_values"):
+        monkeypatch.setattr(EFFECTS, table, dict(getattr(EFFECTS, table)))
+
+
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_example_runs(name, tmp_path):
+def test_the_example_runs(name, tmp_path, monkeypatch, capsys):
+    """In this process, where jax and what is compiled are there already; warnings are errors."""
     args, said, written = EXAMPLES[name]
-    command = [sys.executable, "-W", "error", str(ROOT / "examples" / f"{name}.py"), *args]
-    env = OPTIMISED if name == "diagnose_a_log" else None
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=env)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert re.search(said, done.stdout), done.stdout
-    assert "arning" not in done.stderr, done.stderr
+    program = str(ROOT / "examples" / f"{name}.py")
+    monkeypatch.setattr(sys, "argv", [program, *args])
+    # A diagnosis runs for longer than it compiles.
+    with optimised() if name == "diagnose_a_log" else nullcontext():
+        runpy.run_path(program, run_name="__main__")
+    out, err = capsys.readouterr()
+    assert re.search(said, out), out
+    assert "arning" not in err, err
     for file in written:
         assert (tmp_path / file).stat().st_size > 0
+
+
+@contextmanager
+def optimised():
+    plainly = jax.config.jax_disable_most_optimizations
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", plainly)

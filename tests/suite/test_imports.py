@@ -1,6 +1,7 @@
 """Imports go one way, rooms open empty, and the trainer needs jax, numpy and pure Python only."""
 
 import ast
+import json
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -8,10 +9,23 @@ from pathlib import Path
 
 import pytest
 
+from suite.cli import COMMANDS
+from suite.experiments import EXPERIMENTS
+from tests.support.small_policy import small_checkpoint
+
 ROOMS = ("tracks", "policies", "eval", "suite")
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
-TRAINER_HAS_NOT = ("mujoco", "torch", "dm_control", "gymnasium", "trimesh", "onnx", "rerun")
+HEAVY = ("numpy", "jax", "mujoco", "torch", "tyro", "rich", "scipy", "pyarrow", "argparse")
+SLOW = ("jax", "mujoco", "torch", "dm_control", "trimesh", "matplotlib", "rerun", "scipy")
+BARE_HAS_NOT = (
+    "torch", "onnx", "onnxruntime", "mujoco", "dm_control", "gymnasium", "trimesh", "rerun",
+    "pyarrow", "matplotlib", "rich", "tyro", "pandas",
+)  # fmt: skip
+DOORS = (
+    "policies.policy", "policies.formats.checkpoint", "policies.formats.export",
+    "eval.quadrotor.stepper",
+)  # fmt: skip
 
 
 def _imported(path, top_level_only=False):
@@ -90,20 +104,91 @@ def test_every_package_is_typed_and_has_an_init():
     assert not missing
 
 
-def test_the_trainer_runs_on_a_bare_gpu_machine():
-    modules = [
-        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+BLOCKER = """
+import json, sys
+blocked = set()
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in blocked:
+            raise ImportError(f"{name} is blocked")
+sys.meta_path.insert(0, Blocker())
+"""
+LIGHT = (
+    BLOCKER
+    + """
+import contextlib, io
+from suite import cli
+said = {}
+for line, heavy in json.loads(sys.argv[1]):
+    blocked.update(heavy)
+    blocked.intersection_update(heavy)
+    with contextlib.redirect_stdout(io.StringIO()) as text:
+        assert cli.main(line.split()) == 0, line
+    said[line] = text.getvalue()
+    if line.startswith("reproduce"):
+        assert not any(name.startswith("suite.experiments.") for name in sys.modules)
+blocked.update(json.loads(sys.argv[2]))
+for name in json.loads(sys.argv[3]):
+    __import__(name)
+print(json.dumps(said))
+"""
+)
+BARE = (
+    BLOCKER
+    + """
+import pathlib
+blocked.update(json.loads(sys.argv[1]))
+for name in json.loads(sys.argv[2]):
+    __import__(name)
+import numpy as np
+from policies.formats import delta_file, policy_file
+from policies.networks import delta_network, tree_arrays
+from policies.policy import load_policy
+stored = policy_file.load_policy_checkpoint(pathlib.Path(sys.argv[3]))
+arrays = tree_arrays.tree_to_arrays(stored.params)
+tree_arrays.tree_from_arrays(stored.params, arrays, "here")
+folder = pathlib.Path(sys.argv[4]) / "again"
+policy_file.save_policy(folder, stored.params, stored.spec, seed=1)
+policy = load_policy(folder)
+state, image = np.zeros((2, 12)), np.zeros((2, 24, 32))
+action, _ = policy.act(policy.start(2), state, image, np.ones(2, bool))
+assert np.isfinite(action).all()
+try:
+    import policies.formats.torch_twin
+except ImportError as error:
+    print(error)
+"""
+)
+
+
+def _said(code, *arguments):
+    """Return what a program says whose imports fail where they are blocked."""
+    texts = [a if isinstance(a, str) else json.dumps(a) for a in arguments]
+    command = [sys.executable, "-W", "error", "-c", code, *texts]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_help_and_the_doors_of_the_rooms_import_nothing_slow():
+    """Each line is run where importing what is named with it fails."""
+    lines = [("--help", HEAVY), ("reproduce --help", SLOW)]
+    lines += [(f"{name} --help", SLOW) for name in COMMANDS if name != "reproduce"]
+    light = ("jax", "safetensors", *BARE_HAS_NOT)
+    light = [name for name in light if name not in ("rich", "tyro", "pandas")]
+    said = json.loads(_said(LIGHT, lines, light, DOORS))
+    assert all(f"  {name} " in said["--help"] for name in COMMANDS)
+    assert all(name in said["reproduce --help"] for name in EXPERIMENTS)
+    assert all(f"suite {name}" in said[f"{name} --help"] for name in COMMANDS)
+
+
+def test_a_bare_machine_trains_and_flies_our_policies(tmp_path):
+    """It has jax, numpy and pure Python; the last import is one that has to fail there."""
+    trainer = sorted(
+        _module(path)
         for path in FILES
         if path.relative_to(ROOT).parts[:2] == ("suite", "train") and path.name != "__init__.py"
-    ]
-    code = (
-        "import importlib, sys\n"
-        "class Blocker:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        f"        if name.split('.')[0] in {TRAINER_HAS_NOT!r}:\n"
-        "            raise ImportError('blocked: ' + name)\n"
-        "sys.meta_path.insert(0, Blocker())\n"
-        f"for name in {modules!r}: importlib.import_module(name)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    policy = small_checkpoint(tmp_path)
+    said = _said(BARE, BARE_HAS_NOT, trainer, str(policy), str(tmp_path))
+    assert "torch is blocked" in said

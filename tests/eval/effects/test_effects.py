@@ -1,7 +1,5 @@
 """What all effects have in common: neutral values, numpy and JAX alike, a vehicle a row."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -110,14 +108,6 @@ def test_parameters_with_a_batch_axis_are_one_vehicle_each():
 def test_unknown_effect_names_the_nearest():
     with pytest.raises(ValueError, match="'linear_drg'.*'linear_drag'"):
         find_effect("linear_drg")
-
-
-def test_effects_import_neither_mujoco_nor_jax():
-    code = "import sys, eval.quadrotor.stepper; print(sorted({'mujoco', 'jax'} & set(sys.modules)))"
-    output = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert output.stdout.strip() == "[]"
 
 
 class Flywheel(NamedTuple):
