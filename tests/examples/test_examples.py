@@ -3,6 +3,7 @@
 Eight programs are shown in docs/start.md; a file that is not in the table here fails.
 """
 
+import os
 import re
 import runpy
 import sys
@@ -13,7 +14,10 @@ import jax
 import pytest
 
 from eval.effects import EFFECTS
+from suite.train import presets
+from suite.train.overrides import override
 
+PRESET = presets.preset
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = {
     "fly_and_plot": (["."], "8 gates, finished", ["trial.png", "trial.gif", "trial.rrd"]),
@@ -46,7 +50,9 @@ def test_every_example_is_run_here_and_shown_to_newcomers():
 
 @pytest.fixture(autouse=True)
 def as_a_program(tmp_path, monkeypatch):
-    """Run in an empty folder; what a program adds to the tables of effects goes again."""
+    """Run in an empty folder, train in few worlds; effects that a program adds go again."""
+    few = ("episode.batch=4", "episode.steps=8")
+    monkeypatch.setattr(presets, "preset", lambda name: override(PRESET(name), few))
     monkeypatch.chdir(tmp_path)
     for table in ("_entries", "_values"):
         monkeypatch.setattr(EFFECTS, table, dict(getattr(EFFECTS, table)))
@@ -70,7 +76,7 @@ def test_the_example_runs(name, tmp_path, monkeypatch, capsys):
 
 @contextmanager
 def optimised():
-    plainly = jax.config.jax_disable_most_optimizations
     jax.config.update("jax_disable_most_optimizations", False)
     yield
+    plainly = os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] != "0"
     jax.config.update("jax_disable_most_optimizations", plainly)

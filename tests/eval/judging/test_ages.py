@@ -69,6 +69,12 @@ def test_what_is_seen_has_the_age_that_is_asked_for(age_s):
         assert not found[:, others].any()
 
 
+@pytest.mark.parametrize(("age_s", "steps"), [(0.0506, 25), (0.0514, 26), (0.0006, 0)])
+def test_an_age_between_two_physics_steps_is_that_of_the_nearer_one(age_s, steps):
+    found = ages_seen(SensorNoise(state_age_s=age_s), TRIALS, 12)[6:, 0]
+    assert found == pytest.approx(steps * DT, abs=1e-9)
+
+
 def test_a_fresh_trial_sees_its_own_start_while_the_others_go_on():
     aged, none = Aged(0.1, 0.5, 2, STEPS, DT), np.zeros(2, bool)
     for k in range(4):

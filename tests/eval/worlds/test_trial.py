@@ -59,6 +59,23 @@ def test_upside_down_late_and_lost():
     assert lost.ended[0] == DIVERGED and np.isfinite(lost.pos_w).all()
 
 
+def leaning(angle_deg):
+    """Return the attitude (1, 3, 3) of a body that is rolled by an angle."""
+    cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return np.array([[[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]]])
+
+
+def test_a_trial_ends_as_tipped_from_90_degrees_on_and_not_before():
+    assert judged((0, 0, 1), rot_w=leaning(89.9)).ended[0] == FLYING
+    assert judged((0, 0, 1), rot_w=leaning(90.1)).ended[0] == TIPPED
+
+
+def test_gates_of_the_first_8_s_count_up_to_that_very_step():
+    """8 s are 4,000 steps of 2 ms."""
+    assert judged((1.1, 0, 1.5), (0.9, 0, 1.5), step=4000).gates_8s[0] == 1
+    assert judged((1.1, 0, 1.5), (0.9, 0, 1.5), step=4001).gates_8s[0] == 0
+
+
 def test_what_is_no_state_and_no_wrench():
     fine = np.zeros((3, 3))
     vel_w = np.array([[0.0, 0.0, 0.0], [1001.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])

@@ -1,10 +1,14 @@
 """Lag, drag and delay found again, and a residual learned, on flights whose truth is known."""
 
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
-from suite.delta.fit import FitConfig, fit, identify
-from suite.delta.replay import PointMassModel, nominal_model
+from suite.delta.fit import FitConfig, _descend, _loss, fit, fit_network, identify
+from suite.delta.replay import PointMassModel, nominal_model, replay
 from suite.delta.run import table
 from suite.delta.windows import cut_windows
 from suite.train.config import PointMassConfig
@@ -47,3 +51,35 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(logs):
     assert held_out[-1] == pytest.approx(result.with_delta.position_m, rel=1e-5)
     assert held_out[-1] < 0.5 * held_out[0] and len(shown) == len(held_out)
     assert "| point mass with Delta Action Model |" in table(result, 0.6)
+
+
+def test_the_correction_that_is_found_is_the_known_one_to_two_per_cent():
+    """The vehicle is pushed by what the log does not know, however it flies."""
+    known_b = np.array([0.6, 0.8, -0.5], np.float32)
+    # Without a delay: what was pushed before a window begins is in no log.
+    model = nominal_model(replace(PHYSICS, action_delay=(0.0, 0.0)))
+    windows = cut_windows(fly(model, 4, extra_b=lambda *_: known_b), 0.6, 0.3)
+    nominal = partial(replay, model)
+    config = FitConfig(horizon_s=0.6, iterations=150, batch=16, rate=2e-2, size_weight=0.0)
+    found = fit_network(config, nominal, windows, windows)
+    correction_b = np.asarray(nominal(windows, found.params)[2]).mean((0, 1))
+    assert np.linalg.norm(correction_b - known_b) < 0.02 * np.linalg.norm(known_b)
+
+
+def test_a_replay_that_is_the_record_costs_nothing(logs):
+    windows = cut_windows(logs[:1], 0.6, 0.15)
+    same = lambda w, _: (w.pos_w[:, 1:], w.vel_w[:, 1:], 0 * w.action_b)  # noqa: E731
+    assert float(_loss(CONFIG, same, windows, None)) < 1e-3
+
+
+def test_the_steps_of_a_descent_become_small():
+    class Windows(NamedTuple):
+        pos_w: np.ndarray
+
+    seen = []
+    windows = Windows(np.random.default_rng(0).normal(size=(64, 1)))
+    loss = lambda x, batch: ((x - batch.pos_w) ** 2).mean()  # noqa: E731
+    config = FitConfig(batch=4, rate=0.1)
+    _descend(config, loss, np.float32(0.5), windows, 60, lambda _, x: seen.append(float(x)))
+    steps = np.abs(np.diff(seen))
+    assert steps[-3:].max() < 0.02 * steps[:3].max()

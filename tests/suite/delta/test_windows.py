@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from suite.delta.replay import PointMassModel, nominal_model
-from suite.delta.windows import cut_windows, decision_period, decision_rate
+from suite.delta.windows import _heading, cut_windows, decision_period, decision_rate
 from suite.train.config import PointMassConfig
+from suite.train.dynamics import point_mass
 from tests.support.point_mass_flights import fly
 
 
@@ -22,6 +24,17 @@ def test_the_nose_of_a_rolled_and_pitched_flight_is_recovered():
     np.testing.assert_allclose(np.linalg.norm(heading, axis=-1), 1, atol=1e-6)
     np.testing.assert_allclose((heading * rot[:, :, 1]).sum(-1), 0, atol=1e-6)
     assert np.all((heading * rot[:, :, 0]).sum(-1) > 0)
+
+
+def test_the_nose_of_a_body_that_is_upside_down_is_recovered():
+    """Thrusts point up, aside and down; the point mass makes the same attitude again."""
+    rng = np.random.default_rng(1)
+    thrust, angle = rng.normal(0, 15, (50, 3)), rng.uniform(0, 6.3, 50)
+    level = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+    rot = np.array(point_mass.attitude(*map(jnp.asarray, (thrust, level))))
+    assert 10 < (rot[:, 2, 2] < 0).sum() < 40
+    again = point_mass.attitude(jnp.asarray(thrust), jnp.asarray(_heading(rot)))
+    np.testing.assert_allclose(again, rot, atol=1e-4)
 
 
 def test_windows_leave_out_what_is_missing():

@@ -43,6 +43,24 @@ def test_it_compiles_strictly_and_runs_under_the_sanitizers(exports, name):
     assert "12 steps, 0 numbers wrong" in done.stdout
 
 
+def test_its_tanh_is_tanh_however_large_its_argument(exports, tmp_path):
+    folder, program = exports["odd"].folder, tmp_path / "tanh"
+    code = """
+    #include <stdio.h>
+    #include "policy.c"
+    int main(void) {
+        for (int k = -400; k <= 400; k++) { printf("%.9g\\n", (double)tanh_of(0.1f * (float)k)); }
+        return 0;
+    }
+    """
+    (tmp_path / "tanh.c").write_text(code)
+    command = [*(find_compiler() or ()), f"-I{folder}", str(tmp_path / "tanh.c")]
+    subprocess.run([*command, "-o", str(program), "-lm"], check=True, capture_output=True)
+    said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
+    wanted = np.tanh(0.1 * np.arange(-400, 401))
+    np.testing.assert_allclose(np.array(said.split(), float), wanted, atol=1e-6)
+
+
 def test_the_vectors_find_one_wrong_weight(exports, tmp_path):
     folder = shutil.copytree(exports["odd"].folder, tmp_path / "wrong")
     text = (folder / "policy.c").read_text()
