@@ -86,11 +86,11 @@ FAULTS = (
     Fault("eval/quadrotor", "xp.where(known, hx * gy - hy * gx, 0.0)",
           "xp.where(known, hy * gx - hx * gy, 0.0)", "test_attitude"),
     # eval: units of importers
-    Fault("eval/importers/formats", '"V": 1.0, "mV": 1e-3}', '"V": 1.0, "mV": 1e-2}',
+    Fault("eval/importers", '0.01, "V": 1.0, "mV": 1e-3}', '0.01, "V": 1.0, "mV": 1e-2}',
           "formats/test_betaflight test_units"),
-    Fault("eval/importers/mapping", '"Hz": float(2.0 * np.pi)', '"Hz": float(np.pi)',
+    Fault("eval/importers", '"Hz": float(2.0 * np.pi)', '"Hz": float(np.pi)',
           "mapping/test_apply mapping/test_file test_units"),
-    Fault("eval/importers/mapping", '"mrad/s": 1e-3', '"mrad/s": 1e-2',
+    Fault("eval/importers", '"mrad/s": 1e-3', '"mrad/s": 1e-2',
           "mapping/test_apply mapping/test_file test_units"),
     # eval: judging, statistics
     Fault("eval/worlds", "xp.where(free & (rot_w[:, 2, 2] < 0), TIPPED",

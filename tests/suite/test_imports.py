@@ -141,7 +141,7 @@ blocked.update(json.loads(sys.argv[1]))
 for name in json.loads(sys.argv[2]):
     __import__(name)
 import numpy as np
-from policies.formats import delta_file, policy_file
+from policies.formats import policy_file
 from policies.networks import delta_network, tree_arrays
 from policies.policy import load_policy
 stored = policy_file.load_policy_checkpoint(pathlib.Path(sys.argv[3]))

@@ -5,7 +5,7 @@ import pytest
 
 from eval.importers.checks.units import ANGLES, TIMES
 from eval.importers.formats import betaflight
-from eval.importers.mapping.file import UNITS
+from eval.importers.mapping_file import UNITS
 
 TURN, G = 6.283185307179586, 9.81
 ONE = {
