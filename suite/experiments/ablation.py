@@ -12,7 +12,6 @@ from suite.common.console import Console, duration
 from suite.common.report import Picture
 from suite.experiments.pages import paper
 from suite.experiments.pages.document import Made, Place
-from suite.experiments.pages.tables import every_training
 from suite.experiments.study import options, training
 from suite.experiments.study.summary import Summary, summaries
 from suite.train.overrides import check_owned
@@ -27,8 +26,6 @@ KINDS = ("field", "progress", "normalised")
 """First words of rows' keys."""
 RATES = ("success_cross", "success_rate")
 SPREADS = ("success_cross", "success_rate", "v_max", "v_max_most", "gates")
-DIGITS = {"success_cross": 1, "success_rate": 1, "v_max": 2, "gates": 2}
-"""Of every training's numbers."""
 
 
 @dataclass(frozen=True)
@@ -60,48 +57,38 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "a training": f"{config.iterations} gradient steps of {recipe.episode.batch} worlds x "
         f"{recipe.episode.steps} steps, {steps:,} in all; {each} (median), at once "
         f"{place.at_once}",
-        "training seeds": " ".join(map(str, config.training_seeds)),
-        "trained at commit": training.commits(runs),
-        "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
+        **training.facts(config, runs),
     }
     parts = {
         "The paper's table, and ours": [
             _main(rows, config.trials),
             Picture(chart, "Success cross, success rate and v_max by setting"),
         ],
-        "Every training": [
-            every_training("setting", runs, DIGITS, lambda run: duration(run.seconds))
-        ],
     }
-    return Made(
-        facts,
-        parts,
+    numbers = [
         {
-            "rows": [
-                {
-                    "setting": row.key,
-                    "words": row.words,
-                    "weight": weight(row),
-                    "seeds": row.seeds,
-                    "diverged": row.diverged,
-                    "over": {name: row.at[-1][name] for name in SPREADS if row.at},
-                    "pooled": {name: pooled(row, name, config.trials) for name in RATES if row.at},
-                }
-                for row in rows
-            ],
-            "runs": [
-                {
-                    "setting": run.row,
-                    "seed": run.seed,
-                    "seconds": run.seconds,
-                    "commit": run.commit,
-                    "measured": run.points[-1] if run.points else None,
-                    "diverged": run.diverged,
-                }
-                for run in runs
-            ],
-        },
-    )
+            "setting": row.key,
+            "words": row.words,
+            "weight": weight(row),
+            "seeds": row.seeds,
+            "diverged": row.diverged,
+            "over": {name: row.at[-1][name] for name in SPREADS if row.at},
+            "pooled": {name: pooled(row, name, config.trials) for name in RATES if row.at},
+        }
+        for row in rows
+    ]
+    each = [
+        {
+            "setting": run.row,
+            "seed": run.seed,
+            "seconds": run.seconds,
+            "commit": run.commit,
+            "measured": run.points[-1] if run.points else None,
+            "diverged": run.diverged,
+        }
+        for run in runs
+    ]
+    return Made(facts, parts, {"rows": numbers, "runs": each})
 
 
 def settings(config: Config) -> list[training.Row]:

@@ -43,14 +43,14 @@ class Hidden(NamedTuple):
     """A world that hides something."""
 
     words: str
-    """What, for people; `{share}` is what the added mass is of the vehicle's [%]."""
+    """What, for people."""
     effects: Mapping[str, Mapping[str, Any]]
     """Parameters by effect, added to the vehicle that the simulation knows."""
 
 
 WORLDS: dict[str, Hidden] = {
     "heavy battery": Hidden(
-        "0.4 kg more, {share} % of the mass, and the centre of mass 8 mm further back",
+        "0.4 kg more, and the centre of mass 8 mm further back",
         {"mass_offset": {"offset": 0.4}, "com_offset": {"offset": (-0.008, 0.0, 0.0)}},
     ),
     "moved centre of mass": Hidden(
@@ -131,25 +131,15 @@ def document(config: Config, place: Place, console: Console) -> Made:
         for name, hidden in worlds.items():
             true = world_of(simulated, hidden)
             # Where files lie makes no other loop; a shipped policy's name is its recipe.
-            asked = replace(
-                config,
-                policy=policy if start is None else "",
-                vehicle="",
-                only=(),
-                training_seeds=(seed,),
-            )
-            about = {
-                "loop": asked,
-                "policy": policy_digest(policy),
-                "vehicles": [simulated, true],
-                "code": code_digest(*ROOMS),
-                "engines": engines(),
-            }
+            shown = policy if start is None else ""
+            asked = replace(config, policy=shown, vehicle="", only=(), training_seeds=(seed,))
+            made_of = [asked, policy_digest(policy), simulated, true]
+            about = [*made_of, code_digest(*ROOMS), engines()]
             folder = place.cache / "loops" / f"{name.replace(' ', '-')}-{seed}-{digest(about)}"
             jobs.append(Job(Asked(config, name, seed, simulated), folder, start))
     loop_of(jobs[0])
     came = all_done(run_one, jobs, place.workers, console, "loops in hidden worlds")
-    rows, words = pages.rows_of(came), {n: words_of(simulated, h) for n, h in worlds.items()}
+    rows, words = pages.rows_of(came), {name: hidden.words for name, hidden in worlds.items()}
     facts = {
         **judging.policy_facts({"policy": policy}),
         "simulation's vehicle": config.vehicle,
@@ -164,35 +154,26 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "fine-tuning": f"{config.iterations} gradient steps each",
     }
     parts = {
-        "Success": [pages.success_grid(rows)],
-        "Differences in success": [pages.worth_grid(rows)],
-        "Laps": [pages.lap_grid(rows)],
+        **pages.by_world(rows),
         "What is hidden, and what is named": [pages.named_grid(came, words)],
         "Errors of the Delta Action Models": [pages.errors_grid(came)],
     }
     numbers = {
         "worlds": [row._asdict() for row in rows],
-        "diagnoses": [
-            {"world": one.world, "training_seed": one.training_seed, **one.diagnosis}
-            for one in came
-        ],
-        "errors": [
-            {"world": one.world, "training_seed": one.training_seed, **one.errors} for one in came
-        ],
+        "diagnoses": [{**_whose(one), **one.diagnosis} for one in came],
+        "errors": [{**_whose(one), **one.errors} for one in came],
     }
     return Made(facts, parts, numbers)
+
+
+def _whose(one: Came) -> dict[str, Any]:
+    return {"world": one.world, "training_seed": one.training_seed}
 
 
 def world_of(simulated: Vehicle, hidden: Hidden) -> Vehicle:
     """Return what flies there."""
     values = {name: EFFECTS[name].values(**given) for name, given in hidden.effects.items()}
     return with_effects(simulated, values)
-
-
-def words_of(simulated: Vehicle, hidden: Hidden) -> str:
-    """Return what is hidden there from who knows `simulated`, for people."""
-    more = hidden.effects.get("mass_offset", {}).get("offset", 0.0)
-    return hidden.words.format(share=f"{100 * more / simulated.mass:.0f}")
 
 
 def loop_of(job: Job) -> HiddenLoopConfig:
@@ -204,7 +185,7 @@ def loop_of(job: Job) -> HiddenLoopConfig:
     config, name, seed, simulated = job.task
     path, vehicle, hidden = job.folder / "world.toml", config.vehicle, WORLDS[name]
     try:
-        save_vehicle(world_of(simulated, hidden), path, words_of(simulated, hidden))
+        save_vehicle(world_of(simulated, hidden), path, hidden.words)
     except ValueError as error:
         raise ValueError(
             f"hidden world {name!r} cannot be made of --vehicle {vehicle}: {error}; leave it "

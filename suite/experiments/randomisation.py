@@ -17,7 +17,7 @@ from suite.experiments.pages.document import Made, Place
 from suite.experiments.pages.tables import gap_cell
 from suite.experiments.study import disturbed, judging, options, training
 from suite.experiments.study.conditions import Condition
-from suite.experiments.study.disturbed import Grown, Tested
+from suite.experiments.study.disturbed import Tested
 from suite.experiments.study.intervals import Gap, nested
 from suite.train.dynamics import spreads
 from tracks.common.grid import Cell, Grid, table
@@ -114,11 +114,10 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "vehicle": config.vehicle,
     }
     caption = "Success with every spread and with none against the size of each disturbance"
-    pictured = [Picture(sweeps_chart(two_of(grown)), caption)] if grown else []
+    pictured = [Picture(sweeps_chart(grown, (FIXED, RANDOMISED)), caption)] if grown else []
     parts = {
         "Spread by spread": [worth_grid(worth)],
         "By disturbance": [success_grid([still, *tested]), *pictured],
-        "Every training": [seeds_grid(shares, still, tested)],
     }
     numbers = {
         "worth": {
@@ -225,32 +224,3 @@ def success_grid(tested: Sequence[Tested]) -> Grid:
         for entry in tested
     ]
     return table(["success [%]", *names], lines)
-
-
-def seeds_grid(
-    shares: Mapping[int, Sequence[object]], still: Tested, tested: Sequence[Tested]
-) -> Grid:
-    """Return every training's success, undisturbed and disturbed."""
-    cuts = np.cumsum([len(share) for share in shares.values()])[:-1]
-
-    def by_seed(entries: Sequence[Tested], name: str) -> list[float]:
-        won = np.mean([entry.won(name) for entry in entries], axis=0)
-        return [100 * float(part.mean()) for part in np.split(won, cuts)]
-
-    lines = []
-    for name in still.results:
-        pairs = zip(by_seed([still], name), by_seed(tested, name), strict=True)
-        lines.append([name, *(f"{calm:.0f}, {worse:.0f}" for calm, worse in pairs)])
-    headers = [f"training seed {seed}, {len(share)} trials" for seed, share in shares.items()]
-    return table(["setting", *headers], lines)
-
-
-def two_of(grown: Grown) -> Grown:
-    """Return sweeps with the recipe and the one that varies nothing alone."""
-    return {
-        sweep: [
-            point._replace(results={name: point.results[name] for name in (FIXED, RANDOMISED)})
-            for point in points
-        ]
-        for sweep, points in grown.items()
-    }

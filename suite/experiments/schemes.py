@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -11,7 +11,6 @@ import numpy as np
 from suite.common.console import Console, duration
 from suite.common.report import Picture
 from suite.experiments.pages.document import Made, Place
-from suite.experiments.pages.tables import every_training
 from suite.experiments.study import options, training
 from suite.experiments.study.summary import METRICS, Summary, summaries
 from suite.train.overrides import check_owned
@@ -21,8 +20,6 @@ from tracks.input.ranges import Iterations, Range, Trials
 
 PROJECTION, PROJECTION_DECAY = 3.0, 0.5
 """lambda_proj and beta_3 of the paper's scheme without the field."""
-DIGITS = {name: metric.digits + 1 for name, metric in METRICS.items()}
-"""Of every training's numbers."""
 FIGURE = ("reward", "v_max", "success_rate", "gates")
 """What the paper's figure shows."""
 WANTED = (1, 2, 3)
@@ -51,6 +48,8 @@ class Config(options.FourGates):
 
 def document(config: Config, place: Place, console: Console) -> Made:
     """Return tables and numbers; train what is missing."""
+    from suite.experiments.pages.charts import curves_chart
+
     chosen = schemes(config)
     looks = training.Looks(config.measurements, config.trials, config.seed, config.seconds)
     study = training.Study(chosen, config.training_seeds, looks, by_seed=True)
@@ -64,50 +63,31 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "recipe": f"{options.recipe_words(config)} episode.gates={episode.gates} "
         f"lambda_p={config.progress:g}",
         "an iteration": f"{episode.batch} worlds x {episode.steps} steps",
-        "training seeds": " ".join(map(str, config.training_seeds)),
-        "trained at commit": training.commits(runs),
-        "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
+        **training.facts(config, runs),
         "trainings at once": place.at_once,
     }
+    whole = [row for row in rows if row.at]
+    chart = [Picture(curves_chart(whole, FIGURE), "Learning curves over steps and over time")]
     parts = {
-        "Learning curves": _curves([row for row in rows if row.at], compiling),
-        "Every training": [every_training("scheme", runs, DIGITS, _trained_for)],
+        "Learning curves": [*chart[: len(whole)], _end(whole), _reached(whole, compiling)],
     }
-    return Made(
-        facts,
-        parts,
+    numbers = [
         {
-            "rows": [
-                {
-                    "scheme": row.key,
-                    "words": row.words,
-                    "seeds": row.seeds,
-                    "diverged": row.diverged,
-                    "steps": [int(point["steps"].mean) for point in row.at],
-                    "time": [point["time"].mean for point in row.at],
-                    "curves": {n: [point[n] for point in row.at] for n in METRICS if row.at},
-                    "reached": {gates: first_times(row, gates) for gates in WANTED},
-                    "compile_s": compiling[row.key],
-                }
-                for row in rows
-            ],
-            "runs": [
-                {
-                    "scheme": run.row,
-                    "seed": run.seed,
-                    "points": run.points,
-                    "compile_s": run.compile_s,
-                    "commit": run.commit,
-                    "diverged": run.diverged,
-                }
-                for run in runs
-            ],
-        },
-    )
-
-
-def _trained_for(run: training.Trained) -> str:
-    return "-" if run.diverged else duration(run.points[-1]["time"])
+            "scheme": row.key,
+            "words": row.words,
+            "seeds": row.seeds,
+            "diverged": row.diverged,
+            "steps": [int(point["steps"].mean) for point in row.at],
+            "time": [point["time"].mean for point in row.at],
+            "curves": {n: [point[n] for point in row.at] for n in METRICS if row.at},
+            "reached": {gates: first_times(row, gates) for gates in WANTED},
+            "compile_s": compiling[row.key],
+        }
+        for row in rows
+    ]
+    fields = ("seed", "points", "compile_s", "commit", "diverged")
+    each = [{"scheme": run.row, **{f: getattr(run, f) for f in fields}} for run in runs]
+    return Made(facts, parts, {"rows": numbers, "runs": each})
 
 
 def schemes(config: Config) -> list[training.Row]:
@@ -146,37 +126,13 @@ def first_times(row: Summary, gates: float) -> list[tuple[float, float]]:
     return [(point["steps"], point["time"]) for point in firsts if point is not None]
 
 
-def number_at(row: Summary, time: float) -> int:
-    """Return which measurement was the last within `time` seconds of training."""
-    return max(k for k, point in enumerate(row.at) if point["time"].mean <= time + 1e-9)
-
-
-def _curves(rows: Sequence[Summary], compiling: Mapping[str, float]) -> list[Picture | Grid]:
-    from suite.experiments.pages.charts import curves_chart
-
-    if not rows:
-        return []
-    limit = min(row.at[-1]["time"].mean for row in rows)
-    same = f"After {duration(limit)} of training, the shortest of the budgets"
-    return [
-        Picture(curves_chart(rows, FIGURE), "Learning curves over steps and over time"),
-        _numbers("At the end of each budget", rows, lambda row: -1),
-        _numbers(same, rows, lambda row: number_at(row, limit)),
-        _reached(rows, compiling),
-    ]
-
-
-def _numbers(title: str, rows: Sequence[Summary], at: Callable[[Summary], int]) -> Grid:
+def _end(rows: Sequence[Summary]) -> Grid:
     headers = ["scheme", *(metric.title for metric in METRICS.values()), "diverged"]
     lines = [
-        [
-            row.words,
-            *(row.text(name, at(row)) for name in METRICS),
-            f"{row.diverged} of {row.seeds}",
-        ]
+        [row.words, *(row.text(name) for name in METRICS), f"{row.diverged} of {row.seeds}"]
         for row in rows
     ]
-    return table(headers, lines, f"{title}: mean over seeds [least, most]")
+    return table(headers, lines, "At the end of each budget: mean over seeds [least, most]")
 
 
 def _reached(rows: Sequence[Summary], compiling: Mapping[str, float]) -> Grid:

@@ -80,7 +80,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     found = repeats(cells)
     everything = [cell for some in cells.values() for cell in some]
     facts = {
-        "recipe": "given policies" if config.policies else _recipe(config),
+        "recipe": "given policies" if config.policies else options.recipe_words(config),
         **{
             name: f"SHA-256 {policy_digest(path)[:16]}, {_trained(locate(path))}"
             for name, path in policies.items()
@@ -98,12 +98,6 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "Every cell with its intervals": every_cell(everything),
     }
     return Made(facts, parts, {"spread": found, "cells": everything})
-
-
-def _recipe(config: Config) -> str:
-    """Return what was trained, in words."""
-    steps = options.asked_recipe(config).optimizer.iterations
-    return f"{options.recipe_words(config)}, {steps} gradient steps"
 
 
 def _trained(policy: Path) -> str:

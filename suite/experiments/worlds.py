@@ -21,7 +21,6 @@ from suite.experiments.pages.document import Made, Place
 from suite.experiments.pages.tables import points_cell
 from suite.experiments.study import judging, options
 from tracks.common.grid import Grid, table
-from tracks.families import JUDGED
 from tracks.input.ranges import Seed, Trials
 
 BASE = "mujoco"
@@ -118,8 +117,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     }
     parts = {
         "Success by world": [_overall(names, flown_in, results)],
-        "Every cell": [_cells(names, flown_in, results)],
-        "Trials that change their success": [_counts(changed, flown_in), _each(changed, flown_in)],
+        "Trials that change their success": [_each(changed, flown_in)],
         "What the worlds fly otherwise": [_otherwise(flown_in)],
     }
     numbers = {
@@ -175,20 +173,6 @@ def _overall(names: Sequence[str], flown_in: Sequence[Column], results: Flown) -
     return table(headers, lines)
 
 
-def _cells(names: Sequence[str], flown_in: Sequence[Column], results: Flown) -> Grid:
-    headers = ["policy", "track", "level", *(column.label for column in flown_in)]
-    lines = []
-    for name in names:
-        cells = dict.fromkeys(row.trial[:2] for row in results[name, BASE])
-        for track, level in sorted(cells, key=lambda cell: (JUDGED.index(cell[0]), cell[1])):
-            line = [name, track, str(level)]
-            for column in flown_in:
-                rows = [r for r in results[name, column.label] if r.trial[:2] == (track, level)]
-                line.append(percent(wilson(sum(row.success for row in rows), len(rows))))
-            lines.append(line)
-    return table(headers, lines)
-
-
 def changes(
     names: Sequence[str], flown_in: Sequence[Column], results: Flown
 ) -> list[dict[str, Any]]:
@@ -219,16 +203,6 @@ def changes(
                      "endings": ends}
                 )  # fmt: skip
     return found
-
-
-def _counts(changed: Sequence[Mapping[str, Any]], flown_in: Sequence[Column]) -> Grid:
-    """Return how many trials change in each world, and why."""
-    lines = []
-    for column in flown_in[1:]:
-        why = [change["why"] for change in changed if change["column"] == column.label]
-        reasons = (str(why.count(one)) if any(why) else "-" for one in WHY)
-        lines.append([column.label, str(len(why)), *reasons])
-    return table(["world", "changed", *WHY], lines)
 
 
 def _each(changed: Sequence[Mapping[str, Any]], flown_in: Sequence[Column]) -> Grid:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from eval.quadrotor.model import BODY, add_quadrotor, rotor_name
 from eval.quadrotor.plant import make_plant
@@ -182,17 +183,12 @@ def _measured(task: Task, w: int) -> Any:
 
 def _difference(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Return simulated - measured (N, 12), the attitude as a small rotation in body axes."""
-    w, x, y, z = np.moveaxis(measured[:, 3:7] * [1, -1, -1, -1], -1, 0)
-    a, b, c, d = np.moveaxis(simulated[:, 3:7], -1, 0)
-    turn = np.stack(
-        [
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ],
-        axis=-1,
+    turn = np.full((len(measured), 3), np.nan)
+    seen = np.isfinite(measured[:, 3:7]).all(axis=1)
+    was, now = (
+        Rotation.from_quat(rows[seen, 3:7], scalar_first=True) for rows in (measured, simulated)
     )
-    turn *= 2.0 * np.sign(w * a - x * b - y * c - z * d)[:, None]
+    turn[seen] = 2.0 * (was.inv() * now).as_quat(canonical=True)[:, :3]
     apart = np.zeros((len(measured), 12))
     apart[:, SLICES["position"]] = simulated[:, :3] - measured[:, :3]
     apart[:, SLICES["attitude"]] = turn

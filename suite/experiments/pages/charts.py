@@ -100,9 +100,10 @@ def effects_chart(entries: Sequence[Tested]) -> bytes:
     return png(figure)
 
 
-def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
-    """Return success against the size of each disturbance, a panel each."""
-    names, rows = list(next(iter(grown.values()))[0].results), -(-len(grown) // 4)
+def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]], names: Sequence[str] = ()) -> bytes:
+    """Return success against the size of each disturbance, a panel each; of `names` or of all."""
+    names = names or list(next(iter(grown.values()))[0].results)
+    rows = -(-len(grown) // 4)
     columns = -(-len(grown) // rows)
     figure = Figure(figsize=(10.4, 0.5 + 2.5 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()

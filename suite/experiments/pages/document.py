@@ -41,12 +41,8 @@ class Place:
 
     @property
     def at_once(self) -> str:
-        """Trainings at once, in words."""
-        if isinstance(self.workers, str):
-            return "as many as the cluster has workers"
-        if self.workers in (None, 1):
-            return "1, on all cores"
-        return f"{self.workers}, each on its own share of the cores"
+        """Trainings at once: their number, or the address of the cluster."""
+        return str(self.workers or 1)
 
 
 class Made(NamedTuple):

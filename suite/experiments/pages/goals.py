@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from eval.judging.tables import Tally, percent
@@ -58,24 +58,6 @@ def goals(cells: Sequence[Tally]) -> list[Goal]:
         speed = v_max, max(0.0, of_speed), ten_miss
         found.append(Goal(cell.track, cell.difficulty, *rates, *speed))
     return found
-
-
-def met_grid(cells: Mapping[str, Sequence[Tally]]) -> Grid:
-    """Return how many cells of each policy meet what is asked of them."""
-    headers = ["policy", "cells", "all that is asked", "success", "floor", "v_max",
-               "v_max, largest of ten"]  # fmt: skip
-    lines = []
-    for name, some in cells.items():
-        found = goals(some)
-        ten = [goal.of_ten_miss for goal in found]
-        met = (
-            sum(goal.met for goal in found),
-            *(sum(not getattr(goal, f"{what}_miss") for goal in found)
-              for what in ("success", "floor", "v_max")),
-            "-" if None in ten else sum(not miss for miss in ten),
-        )  # fmt: skip
-        lines.append([name, str(len(found)), *map(str, met)])
-    return table(headers, lines)
 
 
 def goal_grid(cells: Sequence[Tally]) -> Grid:

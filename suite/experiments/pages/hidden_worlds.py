@@ -117,37 +117,27 @@ def _lap_ratio(
     return (float(np.median(ratios)) if ratios else float("nan")), len(ratios)
 
 
-def success_grid(rows: Sequence[Row]) -> Grid:
-    """Return success by world and policy."""
-    lines = [
+def by_world(rows: Sequence[Row]) -> dict[str, list[Grid]]:
+    """Return success, its differences and laps by world, with their headings."""
+    later = [policy for policy in LABELS if policy != NOMINAL]
+    success = [
         [row.world, *(percent(row.success[p]) if p in row.success else "-" for p in LABELS)]
         for row in rows
     ]
-    return table(["hidden", *LABELS.values()], lines)
-
-
-def worth_grid(rows: Sequence[Row]) -> Grid:
-    """Return differences by world."""
-    lines: list[list[str | Cell]] = []
-    for row in rows:
-        line: list[str | Cell] = [row.world]
-        line += [gap_cell(row.gaps[pair]) if pair in row.gaps else "-" for pair in PAIRS]
-        lines.append(line)
-    return table(["hidden", *PAIRS], lines)
-
-
-def lap_grid(rows: Sequence[Row]) -> Grid:
-    """Return laps by world and policy."""
-    later = [policy for policy in LABELS if policy != NOMINAL]
-    lines = [
-        [
-            row.world,
-            *("{:.3f} ({})".format(*row.laps[p]) if p in row.laps and row.laps[p][1] else "-"
-              for p in later),
-        ]
+    worth: list[list[str | Cell]] = [
+        [row.world, *(gap_cell(row.gaps[p]) if p in row.gaps else "-" for p in PAIRS)]
+        for row in rows
+    ]
+    laps = [
+        [row.world, *("{:.3f} ({})".format(*row.laps[p]) if p in row.laps and row.laps[p][1]
+                      else "-" for p in later)]
         for row in rows
     ]  # fmt: skip
-    return table(["hidden", *(LABELS[policy] for policy in later)], lines)
+    return {
+        "Success": [table(["hidden", *LABELS.values()], success)],
+        "Differences in success": [table(["hidden", *PAIRS], worth)],
+        "Laps": [table(["hidden", *(LABELS[policy] for policy in later)], laps)],
+    }
 
 
 def named_grid(came: Sequence[Came], words: Mapping[str, str]) -> Grid:
@@ -160,18 +150,12 @@ def named_grid(came: Sequence[Came], words: Mapping[str, str]) -> Grid:
             for label, value, _ in components(effect["parameters"])
             if value is not None
         ]
-        gap = one.diagnosis["gap"]
-        lines.append(
-            [
-                one.world,
-                words[one.world],
-                str(one.training_seed),
-                one.diagnosis["verdict"],
-                named_effects(one.diagnosis) or "nothing",
-                "; ".join(values),
-                f"{gap['before']:.2f}, {gap['after']:.2f}, {gap['noise_floor']:.2f}",
-            ]
+        gap = ", ".join(
+            f"{one.diagnosis['gap'][name]:.2f}" for name in ("before", "after", "noise_floor")
         )
+        named = named_effects(one.diagnosis) or "nothing"
+        line = [one.world, words[one.world], str(one.training_seed), one.diagnosis["verdict"]]
+        lines.append([*line, named, "; ".join(values), gap])
     headers = ["hidden", "what", "training seed", "verdict", "named", "values"]
     return table([*headers, "held-out gap before, after, noise floor"], lines)
 

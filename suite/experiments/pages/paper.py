@@ -13,8 +13,6 @@ class Printed(NamedTuple):
 
     method: str
     """Its key in paper.toml."""
-    name: str
-    """What tables call it."""
     track: str
     level: int
     won: int
@@ -66,7 +64,7 @@ def sim_to_sim() -> SimToSim:
     table = _table("sim_to_sim")
     names = {key: method["name"] for key, method in table["methods"].items()}
     cells = [
-        Printed(key, names[key], track, level, won, table["trials"], v_max)
+        Printed(key, track, level, won, table["trials"], v_max)
         for key, method in table["methods"].items()
         for track, rows in method.items()
         if track != "name"

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 from eval.judging.statistics import Interval, PairedDifference, paired_success
 from eval.judging.tables import Tally, grids, percent
 from suite.experiments.study.disturbed import Tested
 from suite.experiments.study.intervals import Gap
-from suite.experiments.study.summary import METRICS
-from suite.experiments.study.training import Trained
 from tracks.common.grid import Cell, Grid, table
 
 
@@ -60,18 +58,3 @@ def condition_grid(
 def every_cell(cells: Sequence[Tally]) -> list[Grid]:
     """Return all numbers of judged cells."""
     return grids({"cells": cells, "paired": []})
-
-
-def every_training(
-    what: str, runs: Sequence[Trained], digits: Mapping[str, int], time: Callable[[Trained], str]
-) -> Grid:
-    """Return what each training came to at its end: numbers with their `digits`, and its time."""
-    headers = [what, "training seed", *(METRICS[name].title for name in digits), "trained for"]
-    lines = []
-    for run in runs:
-        line = ["diverged"] + ["-"] * (len(digits) - 1)
-        if not run.diverged:
-            last = run.points[-1]
-            line = [f"{METRICS[name].scale * last[name]:.{d}f}" for name, d in digits.items()]
-        lines.append([run.row, str(run.seed), *line, time(run)])
-    return table(headers, lines)

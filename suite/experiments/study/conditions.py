@@ -145,29 +145,18 @@ def _drag_sweep(vehicle: Vehicle) -> Sweep:
     return Sweep("drag", "linear drag, each axis [1/s]", (0, 0.5, 1, 2, 4), drag)
 
 
-def _sensing(field: str, scale: float = 1.0) -> Callable[..., tuple[Vehicle, SensorNoise]]:
+def _sensing(
+    scale: float, *fields: str, jitter: float = 0.0
+) -> Callable[..., tuple[Vehicle, SensorNoise]]:
     def make(vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorNoise]:
-        return vehicle, replace(SensorNoise(), **{field: scale * size})
+        return vehicle, SensorNoise(age_jitter=jitter, **dict.fromkeys(fields, scale * size))
 
     return make
 
 
 def _estimating(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorNoise]:
-    unit = STATE_UNIT
-    return vehicle, replace(
-        unit,
-        pos_m=factor * unit.pos_m,
-        vel=factor * unit.vel,
-        attitude_rad=factor * unit.attitude_rad,
-    )
-
-
-def _late(jitter: float) -> Callable[..., tuple[Vehicle, SensorNoise]]:
-    def make(vehicle: Vehicle, age_ms: float) -> tuple[Vehicle, SensorNoise]:
-        age_s = 1e-3 * age_ms
-        return vehicle, SensorNoise(state_age_s=age_s, image_age_s=age_s, age_jitter=jitter)
-
-    return make
+    grown = {name: factor * getattr(STATE_UNIT, name) for name in ("pos_m", "vel", "attitude_rad")}
+    return vehicle, replace(STATE_UNIT, **grown)
 
 
 def sweeps(vehicle: Vehicle) -> list[Sweep]:
@@ -191,17 +180,18 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
         Sweep("wind", "constant wind [m/s]", more(wind, 2, 4, 6, 8),
               _effect("constant_wind", "velocity", constant_wind.EFFECT.parameters[0].direction)),
         Sweep("depth noise", "standard deviation of inverse depth [1/m]", (0, 0.01, 0.03, 0.1, 0.3),
-              _sensing("inverse_depth")),
+              _sensing(1, "inverse_depth")),
         Sweep("gate-pose error", "standard deviation per axis [m]", (0, 0.05, 0.1, 0.2, 0.3),
-              _sensing("gate_m")),
+              _sensing(1, "gate_m")),
         Sweep("age of the state", "age at the decision [ms]", (0, 20, 40, 60, 80, 100),
-              _sensing("state_age_s", 1e-3)),
+              _sensing(1e-3, "state_age_s")),
         Sweep("age of the image", "age at the decision [ms]", (0, 20, 40, 60, 80, 100),
-              _sensing("image_age_s", 1e-3)),
-        Sweep("age of both", "age at the decision [ms]", (0, 20, 40, 60, 80, 100), _late(0.0)),
+              _sensing(1e-3, "image_age_s")),
+        Sweep("age of both", "age at the decision [ms]", (0, 20, 40, 60, 80, 100),
+              _sensing(1e-3, "state_age_s", "image_age_s")),
         Sweep("jittering age of both", "mean age at the decision [ms]", (0, 20, 40, 60, 80, 100),
-              _late(1.0)),
+              _sensing(1e-3, "state_age_s", "image_age_s", jitter=1.0)),
         Sweep("lost images", "share of the images [%]", (0, 10, 30, 50, 80),
-              _sensing("image_loss", 1e-2)),
+              _sensing(1e-2, "image_loss")),
         Sweep("state-estimation noise", "times 3 cm, 0.1 m/s, 1 deg", (0, 1, 2, 4, 8), _estimating),
     ]  # fmt: skip

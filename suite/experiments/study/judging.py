@@ -33,8 +33,6 @@ from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import JUDGED
 
 Key = TypeVar("Key", bound=Hashable)
-OPEN_FILES = 256
-"""Journals that are open at once."""
 
 
 @dataclass(frozen=True)
@@ -104,19 +102,13 @@ def flown(
             cost = sum(c * len(trials) for c, trials in zip(costs, missing, strict=True))
             announce(console, f"{what}: {left} trials", flying_needs(cost, workers))
             numbers, all_journals = count(total - left + 1), list(journals.values())
-            lately: dict[int, None] = {}
             with console.progress(what, total) as update:
 
                 def keep(piece: int, ended: tuple[int, TrialResult]) -> None:
                     number, result = ended
                     all_journals[number].append(result)
                     # A sweep has more journals than a process may have files open.
-                    lately.pop(number, None)
-                    lately[number] = None
-                    if len(lately) > OPEN_FILES:
-                        oldest = next(iter(lately))
-                        all_journals[oldest].close()
-                        del lately[oldest]
+                    all_journals[number].close()
                     update(next(numbers))
 
                 loaders = _loaders(fliers.values(), workers)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -50,18 +49,13 @@ def check(config: Any) -> None:
     if len(set(seeds)) < len(seeds) or not seeds:
         said = " ".join(map(str, seeds)) or "empty"
         raise ValueError(f"--training-seeds is {said}; give each once")
-    if isinstance(config, FourGates):
-        _check_unseen("--seed", config.seed, seeds)
-    if "difficulty" in given:
-        parse_levels(given["difficulty"])
-
-
-def _check_unseen(option: str, seed: int, training_seeds: Sequence[int]) -> None:
-    if seed in training_seeds:
+    if isinstance(config, FourGates) and config.seed in seeds:
         raise ValueError(
-            f"{option} {seed} is one of --training-seeds, whose policies would have seen the "
+            f"--seed {config.seed} is one of --training-seeds, whose policies would have seen the "
             "worlds they are measured on; give another"
         )
+    if "difficulty" in given:
+        parse_levels(given["difficulty"])
 
 
 def asked_recipe(config: Any) -> TrainConfig:

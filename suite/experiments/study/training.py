@@ -178,7 +178,7 @@ def train_one(
     Raises:
         WorkFailed: where it diverges and may not.
     """
-    from suite.experiments.study.validation import make_validation, stored_params
+    from suite.experiments.study.validation import make_validation
     from suite.train.ppo.run import train_ppo
     from suite.train.repeat import Watch
     from suite.train.run import started_from, train
@@ -203,7 +203,8 @@ def train_one(
         console.note(f"{key}, seed {config.seed}: {diverged}")
     points = []
     if looks and not (watch or diverged):
-        found = make_validation(config, *looks[1:])(stored_params(folder / "policy"))
+        params = started_from(str(folder / "policy"), config.spec)
+        found = make_validation(config, *looks[1:])(params)
         points = [found]
         console.note(
             f"{key}, seed {config.seed}: success cross {found['success_cross']:.0%}, "
@@ -266,6 +267,15 @@ def commit_of(policy: Path) -> str:
         return ", ".join([*record.get("earlier_commits", []), record["git_commit"] or "unknown"])
     except (OSError, ValueError, KeyError):
         return "unknown"
+
+
+def facts(config: Any, runs: Sequence[Trained]) -> dict[str, str]:
+    """Return what a page says of trainings that flew unseen worlds: seeds, commits, worlds."""
+    return {
+        "training seeds": " ".join(map(str, config.training_seeds)),
+        "trained at commit": commits(runs),
+        "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
+    }
 
 
 def commits(runs: Sequence[Trained]) -> str:

@@ -8,22 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import network
 from suite.train.config import TrainConfig
 from suite.train.rollout import Note, make_rollout
 from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import Worlds, sample_worlds
-
-SECONDS = 10.0
-"""Of a trial: the horizon of the paper's rollouts, 150 steps at 15 Hz [s]."""
 
 Measure = Callable[[network.Params], dict[str, float]]
 """Of a policy's parameters; fits `suite.train.repeat.Watch`."""
@@ -136,18 +131,8 @@ def measured(scores: Scores) -> dict[str, float]:
     return {name: float(value) for name, value in numbers.items()}
 
 
-def stored_params(policy: Path | str) -> network.Params:
-    """Return the parameters of the checkpoint in the folder `policy`, ready for the device."""
-    stored = load_policy_checkpoint(Path(policy)).params
-    return {name: jnp.asarray(array) for name, array in stored.items()}
-
-
 def make_validation(
-    config: TrainConfig,
-    trials: int,
-    seed: int,
-    seconds: float = SECONDS,
-    reward: Note | None = None,
+    config: TrainConfig, trials: int, seed: int, seconds: float, reward: Note | None = None
 ) -> Measure:
     """Return measure(params) -> numbers of `measured`, on the same worlds at every call.
 
@@ -157,15 +142,7 @@ def make_validation(
         seed: of the worlds; not one that is trained on.
         seconds: of a trial, from standing start [s].
         reward: (worlds, before, body, target) -> (B,), of a step.
-
-    Raises:
-        ValueError: where the seed is the training's own.
     """
-    if seed == config.seed:
-        raise ValueError(
-            f"--seed {seed} is a training's seed, so that its policy has seen these worlds; give "
-            "one that is not among --training-seeds"
-        )
     config = validation_worlds(config, trials, seed, seconds)
     fly, worlds = make_flight(config, reward), sample_worlds(config, 0)
     placed: Worlds = jax.tree.map(jnp.asarray, worlds)

@@ -5,7 +5,6 @@ The loops themselves are stand-ins; tests/suite/loop has theirs.
 
 import json
 import shutil
-from dataclasses import replace
 
 import pytest
 
@@ -15,7 +14,7 @@ from policies import shipped
 from suite.common.errors import WorkFailed
 from suite.common.running.apart import Job
 from suite.experiments import hidden_worlds
-from suite.experiments.hidden_worlds import WORLDS, Asked, Config, loop_of, words_of, world_of
+from suite.experiments.hidden_worlds import WORLDS, Asked, Config, loop_of, world_of
 from suite.experiments.pages.hidden_worlds import ALL
 from suite.loop.config import loop_by_content
 from suite.loop.hidden_effect import CONTROL, NAMED, NOMINAL
@@ -87,12 +86,6 @@ def test_a_loop_needs_none_of_our_files_where_it_runs(tmp_path):
     vehicle.unlink()
     there = loop_by_content(loop_of(Job(asked, tmp_path / "there", tmp_path / "reads")))
     assert here == there and set(here.digests) == {"policy", "vehicle", "world"}
-
-
-def test_the_added_mass_is_told_as_a_share_of_the_vehicles_own():
-    hidden, known = WORLDS["heavy battery"], load_vehicle("reference")
-    assert "0.4 kg more, 53 % of the mass" in words_of(known, hidden)
-    assert "0.4 kg more, 20 % of the mass" in words_of(replace(known, mass=2.0), hidden)
 
 
 def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeypatch):

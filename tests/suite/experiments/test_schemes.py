@@ -4,7 +4,7 @@ import pytest
 
 from suite.experiments.ablation import Config as AblationConfig
 from suite.experiments.ablation import settings
-from suite.experiments.schemes import Config, first_times, number_at, schemes
+from suite.experiments.schemes import Config, first_times, schemes
 from suite.experiments.study.intervals import Spread
 from suite.experiments.study.summary import summaries
 from suite.experiments.study.training import Trained
@@ -79,7 +79,6 @@ def test_curves_and_first_times_by_hand():
     assert first_times(ours, 2) == [(200, 2.0), (100, 3.0)]
     assert first_times(ours, 3) == [(200, 2), (200, 6)]
     assert first_times(ppo, 1) == [(200, 8.0)] and first_times(ppo, 2) == []
-    assert number_at(ppo, 4.0) == 1 and number_at(ppo, 3.9) == 0
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import json
 
 from policies import shipped
-from suite.experiments.table2 import Config, loop_config
 from tests.support.documents import another_racer, page, reproduce
 
 
@@ -19,7 +18,6 @@ def test_table2_and_all_levels(sky, tmp_path, capfd):
         (track, level) for track in ("zigzag", "circular", "ellipse") for level in range(10)
     }
     # In a second nobody finishes: every cell misses what is asked of it, and says by how much.
-    assert "| ours | 12 | 0 | 0 | 0 | 0 | - |" in text
     assert all(goal["success_miss"] > 0 for goal in numbers["goals"]["ours"])
     assert "| 90.0 points | 97 % | 97.0 points |" in text
     assert "| paper, with Delta Action Model | 9 | 7/10 | 6.1 |" in text
@@ -58,9 +56,3 @@ def test_table2_with_policies_tuned_under_the_delta_model(sky, tmp_path):
     overall = numbers["with_against_without"][-1]
     assert overall["track"] == "all" and overall["trials"] == 12
     assert "With the Delta Action Model" in text and "with - without" in text
-
-
-def test_a_shipped_policy_is_fine_tuned_by_its_own_recipe():
-    config = Config(delta_iterations=3)
-    assert loop_config(config, "swift-quad").tuning.quadrotor is not None
-    assert loop_config(config, "swift").tuning.quadrotor is None

@@ -3,7 +3,7 @@
 import pytest
 
 from eval.worlds import rotorpy as rotorpy_world
-from suite.experiments.worlds import WHY, Column, Config, _counts, changes, columns
+from suite.experiments.worlds import WHY, Column, Config, changes, columns
 from tests.support.documents import page, reproduce
 from tests.support.engines import STAND_IN
 from tests.support.loops import trial_result
@@ -39,9 +39,6 @@ def test_why_is_told_by_the_controls(rotorpy):
         for label, digits in won.items()
     }
     found = changes(["p"], flown_in, results)
-    counts = [[cell.text for cell in row] for row in _counts(found, flown_in).rows]
-    assert counts == [[single, "1", "-", "-", "-"], [aired, "1", "-", "-", "-"],
-                      [other, "3", "1", "1", "1"]]  # fmt: skip
     mine = {change["trial"].seed: change["why"] for change in found if change["column"] == other}
     assert mine == {0: "rounding", 1: "air", 2: "rest"} and set(mine.values()) == set(WHY)
     assert [change["why"] for change in found if change["column"] in (single, aired)] == [None] * 2

@@ -18,8 +18,7 @@ from suite.experiments.pages.document import (
     check_page,
     write_document,
 )
-from suite.experiments.pages.tables import every_training, points_cell
-from suite.experiments.study.training import Trained
+from suite.experiments.pages.tables import points_cell
 from tests.support.judged_cells import cell
 from tracks.common.grid import Cell, table
 from tracks.families import JUDGED
@@ -76,29 +75,10 @@ def test_a_page_whose_text_would_be_lost_is_refused(lost, words, tmp_path):
     check_page(tmp_path, "table2")
 
 
-def test_how_many_trainings_share_the_cores_is_told(tmp_path):
-    def told(workers):
-        return Place(tmp_path, tmp_path, workers).at_once
-
-    assert told(None) == told(1) == "1, on all cores"
-    assert told(2) == "2, each on its own share of the cores"
-    assert told("tcp://host:8786") == "as many as the cluster has workers"
-
-
 def test_differences_are_coloured_by_what_they_tell():
     assert points_cell(Interval(0.1, 0.02, 0.2)) == Cell("+10 [+2, +20]", "good")
     assert points_cell(Interval(-0.1, -0.2, -0.02)).tone == "bad"
     assert points_cell(Interval(-0.001, -0.1, 0.1)) == Cell("+0 [-10, +10]", "")
-
-
-def test_every_training_has_a_line_and_one_that_diverged_no_numbers():
-    runs = [
-        Trained("a", 0, "", 1.0, 0.0, "c", "", [{"gates": 0.0}, {"gates": 1.234}]),
-        Trained("a", 1, "", 1.0, 0.0, "c", "it diverged", []),
-    ]
-    grid = every_training("row", runs, {"gates": 2}, lambda run: f"{run.seconds:g} s")
-    lines = [[entry.text for entry in row] for row in grid.rows]
-    assert lines == [["a", "0", "1.23", "1 s"], ["a", "1", "diverged", "1 s"]]
 
 
 def test_charts_are_pictures():

@@ -9,7 +9,6 @@ import pytest
 
 from suite.experiments.study.validation import (
     make_flight,
-    make_validation,
     measured,
     scored,
     validation_worlds,
@@ -107,8 +106,3 @@ def test_a_policy_that_takes_a_speed_is_asked_for_its_own():
     asked = replace(CONFIG, spec=spec, episode=replace(CONFIG.episode, race_share=0.5))
     worlds = sample_worlds(validation_worlds(asked, 40, 9, 2.0), 0)
     assert np.all(np.asarray(worlds.wanted) == spec.speed)
-
-
-def test_a_trainings_own_seed_is_refused():
-    with pytest.raises(ValueError, match="--seed 0 is a training's seed"):
-        make_validation(CONFIG, 2, CONFIG.seed)
