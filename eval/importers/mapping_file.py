@@ -150,8 +150,8 @@ def read_map(path: Path) -> LogMap:
     world, body, side = "z-up", "flu", None
     if top.has("frames"):
         frames = top.table("frames")
-        world = _choice(frames, "world", WORLDS)
-        body = _choice(frames, "body", BODIES)
+        world = frames.choice("world", WORLDS)
+        body = frames.choice("body", BODIES)
         side = motor_side_of(frames)
         frames.close()
     columns = {}
@@ -165,7 +165,7 @@ def read_map(path: Path) -> LogMap:
         _check_placeholders(about, beside)
         mass_key = about.text("mass") if about.has("mass") else ""
         about.close()
-    optional = top.has("optional") and _choice(top, "optional", ("no", "yes")) == "yes"
+    optional = top.has("optional") and top.choice("optional", ("no", "yes")) == "yes"
     keep = tuple(top.texts("keep")) if top.has("keep") else ()
     ours = [name for name in keep if name in KNOWN or name in ("throttle", METADATA)]
     if ours:
@@ -224,7 +224,7 @@ def _column(signal: str, table: Table) -> Column:
     width = WIDTHS[signal]
     in_cells = width == 1 or table.has("column")
     names = [table.text("column")] if in_cells else _strings(table, width)
-    unit = _choice(table, "unit", tuple(UNITS[signal]))
+    unit = table.choice("unit", tuple(UNITS[signal]))
     sign = table.vector("sign", width, [1.0] * width)
     if not np.all(np.abs(sign) == 1.0):
         raise table.error("sign", sign.tolist(), "1 or -1 for each column")
@@ -232,30 +232,23 @@ def _column(signal: str, table: Table) -> Column:
     inverse = other = False
     gravity, mixer, source = True, "", ""
     if signal in ("quat", "cmd_quat"):
-        if _choice(table, "order", ("wxyz", "xyzw")) == "xyzw":
+        if table.choice("order", ("wxyz", "xyzw")) == "xyzw":
             order = [3, 0, 1, 2]
             names = names if in_cells else [names[k] for k in order]
             if in_cells:
                 names = [f"{names[0]}[{k}]" for k in order]
             sign = sign[order]
-        inverse = _choice(table, "maps", ("body to world", "world to body")) == "world to body"
+        inverse = table.choice("maps", ("body to world", "world to body")) == "world to body"
     if signal in AXES:
-        other = _choice(table, "axes", AXES[signal]) != AXES[signal][0]
+        other = table.choice("axes", AXES[signal]) != AXES[signal][0]
     if signal == "acc" and other:
-        gravity = _choice(table, "gravity", ("specific force", "removed")) == "specific force"
+        gravity = table.choice("gravity", ("specific force", "removed")) == "specific force"
     if signal == "pwm" and table.has("mixer"):
-        mixer = _choice(table, "mixer", tuple(MIXERS))
+        mixer = table.choice("mixer", tuple(MIXERS))
     if signal in ("pos", "quat", "euler", "vel") and table.has("source"):
-        source = _choice(table, "source", SOURCES)
+        source = table.choice("source", SOURCES)
     factor = tuple(float(s) * scale * UNITS[signal][unit] for s in sign)
     return Column(tuple(names), factor, other, gravity, inverse, unit != PER_MASS, mixer, source)
-
-
-def _choice(table: Table, key: str, allowed: tuple[str, ...]) -> str:
-    value = table.text(key, allowed[0])
-    if value not in allowed:
-        raise table.error(key, value, " or ".join(repr(choice) for choice in allowed))
-    return value
 
 
 def _strings(table: Table, width: int) -> list[str]:

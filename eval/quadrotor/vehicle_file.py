@@ -17,13 +17,12 @@ from typing import Any
 from eval.effects import EFFECTS, find_effect
 from eval.effects.interface import Effect, at
 from eval.quadrotor.loops import KINDS, NOMINAL
-from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Vehicle
+from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Vector, Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
 from tracks.common.files import write_text
-from tracks.common.names import LONGEST, closest, unknown_name
-from tracks.common.toml_table import to_toml
+from tracks.common.names import unknown_name
+from tracks.common.toml_table import REQUIRED, Table, to_toml
 from tracks.geometry.camera import Camera
-from tracks.input.ranges import is_number, shown
 from tracks.input.reading import InputError, read_toml, reason
 
 SCHEMA = 1
@@ -80,26 +79,26 @@ def parse_vehicle(table: Mapping[str, Any]) -> Vehicle:
     Raises:
         ValueError: with the key, the value and what is allowed.
     """
-    _known_keys("", table, KEYS)
-    schema = table.get("schema", SCHEMA)
-    if schema is True or schema != SCHEMA:
-        raise ValueError(f"schema = {shown(schema)}: this version of the suite reads {SCHEMA}")
-    name = _required("", table, "name")
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"name = {shown(name)}: must be a text that is not empty")
+    top = Table("", "", table)
+    top.expect(KEYS)
+    if top.whole("schema", SCHEMA) != SCHEMA:
+        raise top.error("schema", table["schema"], f"{SCHEMA}: this version of the suite reads it")
     vehicle = Vehicle(
-        name=name,
-        mass=_number("mass", _required("", table, "mass")),
-        inertia=_numbers("inertia", _required("", table, "inertia"), 3),
-        rotors=_rotors(_section(table, "rotors")),
-        controller=_controller(_section(table, "controller")),
-        body=_body(_section(table, "body", needed=False)),
-        camera=_camera(_section(table, "camera", needed=False)),
-        motors=_motors(_section(table, "motors")) if "motors" in table else None,
+        name=top.text("name"),
+        mass=top.value("mass", float),
+        inertia=top.value("inertia", Vector),
+        rotors=top.table("rotors").read(Rotors),
+        controller=_controller(top.table("controller")),
+        body=top.table("body", {}).read(CollisionBox),
+        camera=_camera(top.table("camera", {})),
+        motors=top.table("motors").read(MotorMap) if top.has("motors") else None,
     )
+    if any(direction not in (1, -1) for direction in vehicle.rotors.spin):
+        allowed = "1 (counter-clockwise from above) or -1 each"
+        raise top.error("rotors.spin", list(vehicle.rotors.spin), allowed)
     check_vehicle(vehicle)
-    effects = _section(table, "effects", needed=False)
-    return replace(vehicle, effects=MappingProxyType(_effects(effects, vehicle)))
+    effects = _effects(top.table("effects", {}), vehicle)
+    return replace(vehicle, effects=MappingProxyType(effects))
 
 
 def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = "") -> None:
@@ -145,15 +144,13 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
     }
 
 
-def _effects(tables: Mapping[str, Any], vehicle: Vehicle) -> dict[str, Any]:
+def _effects(tables: Table, vehicle: Vehicle) -> dict[str, Any]:
     values = {}
-    for name, table in tables.items():
-        effect = find_effect(name)
-        if not isinstance(table, Mapping):
-            raise ValueError(f"effects.{name} = {shown(table)}: must be a table [effects.{name}]")
+    for name in tables.values:
+        effect, table = find_effect(name), tables.table(name)
         if effect.read:
             try:
-                values[name] = effect.read(table)
+                values[name] = effect.read(table.values)
             except ValueError as error:
                 raise ValueError(f"effects.{name}: {error}") from error
         else:
@@ -162,23 +159,19 @@ def _effects(tables: Mapping[str, Any], vehicle: Vehicle) -> dict[str, Any]:
     return values
 
 
-def _effect_values(effect: Effect, table: Mapping[str, Any], vehicle: Vehicle) -> Any:
-    where = f"effects.{effect.name}."
-    _known_keys(where, table, [parameter.name for parameter in effect.parameters])
-    if not table:
+def _effect_values(effect: Effect, table: Table, vehicle: Vehicle) -> Any:
+    table.expect(parameter.name for parameter in effect.parameters)
+    if not table.values:
         names = " or ".join(parameter.name for parameter in effect.parameters)
         raise ValueError(f"effects.{effect.name}: empty; give {names}")
     values = []
     for parameter in effect.parameters:
-        key = where + parameter.name
-        if parameter.name not in table and not parameter.required:
+        default = REQUIRED
+        if not parameter.required:
             number = at(parameter.neutral, vehicle)
-            values.append((number,) * parameter.size if parameter.size else number)
-        elif parameter.size:
-            entry = _required(where, table, parameter.name)
-            values.append(_numbers(key, entry, parameter.size))
-        else:
-            values.append(_number(key, _required(where, table, parameter.name)))
+            default = (number,) * parameter.size if parameter.size else number
+        kind = tuple[(float,) * parameter.size] if parameter.size else float
+        values.append(table.value(parameter.name, kind, default))
     return effect.values(*values)
 
 
@@ -198,73 +191,25 @@ def check_bounds(effect: Effect, values: Any, vehicle: Vehicle) -> None:
                 )
 
 
-def _rotors(table: Mapping[str, Any]) -> Rotors:
-    where = "rotors."
-    names = list(Rotors.__dataclass_fields__)
-    _known_keys(where, table, names)
-    hubs = _required(where, table, "position")
-    if not isinstance(hubs, list) or len(hubs) != 4:
-        raise ValueError(
-            f"rotors.position = {shown(hubs)}: must be a list of 4 lists of 3 numbers [m]"
-        )
-    spin = _numbers("rotors.spin", _required(where, table, "spin"), 4)
-    if any(direction not in (1, -1) for direction in spin):
-        raise ValueError(
-            f"rotors.spin = {_plain(spin)}: must be 1 (counter-clockwise from above) or -1 each"
-        )
-    first, second, third, fourth = (
-        _numbers(f"rotors.position[{i}]", hub, 3) for i, hub in enumerate(hubs)
-    )
-    a, b, c, d = (int(direction) for direction in spin)
-    scalars = {key: _number(where + key, _required(where, table, key)) for key in names[2:]}
-    return Rotors((first, second, third, fourth), (a, b, c, d), **scalars)
-
-
-def _controller(table: Mapping[str, Any]) -> Controller:
-    where = "controller."
-    kind = table.get("kind", NOMINAL)
-    if not isinstance(kind, str) or kind not in (NOMINAL, *KINDS):
-        allowed = ", ".join((NOMINAL, *KINDS))
-        raise ValueError(f"controller.kind = {shown(kind)}: allowed: {allowed}")
-    settings, own = None, set()
-    if kind != NOMINAL:
-        settings, own = _settings(kind, table)
-    known = [key for key in Controller.__dataclass_fields__ if key != "settings"]
-    _known_keys(where, {k: v for k, v in table.items() if k not in own}, [*known, *sorted(own)])
-    given = {
-        key: _numbers(where + key, table[key], 3)
-        for key in ("attitude_gain", "rate_max")
-        if key in table
-    }
-    gain = (1.0, 1.0, 1.0)
-    if kind == NOMINAL or "rate_gain" in table:
-        gain = _numbers(where + "rate_gain", _required(where, table, "rate_gain"), 3)
-    return Controller(
-        rate_gain=gain,
-        frequency=_number(where + "frequency", _required(where, table, "frequency")),
-        kind=kind,
-        settings=settings,
-        **given,
-    )
-
-
-def _settings(kind: str, table: Mapping[str, Any]) -> tuple[Any, set[str]]:
-    """Return a firmware's settings, and the keys of [controller] that are theirs."""
-    module, where, given = KINDS[kind], "controller.", table
+def _controller(table: Table) -> Controller:
+    kind = table.choice("kind", (NOMINAL, *KINDS))
+    if kind == NOMINAL:
+        return table.read(Controller, ["kind"], kind=kind, settings=None)
+    module = KINDS[kind]
     keys = list(module.Settings.__dataclass_fields__)
-    own = set(keys)
+    inside, own = table, keys
     if module.GROUP:
-        where, own = f"controller.{module.GROUP}.", {module.GROUP}
-        given = table.get(module.GROUP, {})
-        if not isinstance(given, Mapping):
-            raise ValueError(f"{where[:-1]} = {shown(given)}: must be a table [{where[:-1]}]")
-        _known_keys(where, given, keys)
-    values = {key: _number(where + key, given[key]) for key in keys if key in given}
-    for key, value in values.items():
+        inside, own = table.table(module.GROUP, {}), [module.GROUP]
+        inside.expect(keys)
+    # Its settings are in place of the nominal loop's gain.
+    held = {} if table.has("rate_gain") else {"rate_gain": (1.0, 1.0, 1.0)}
+    controller = table.read(Controller, ["kind", *own], kind=kind, settings=None, **held)
+    given = {key: inside.value(key, float) for key in keys if inside.has(key)}
+    for key, value in given.items():
         low, high = module.LIMITS.get(key, (0.0, 1e6))
         if not low <= value <= high:
-            raise ValueError(f"{where}{key} = {value:g}: must be from {low:g} to {high:g}")
-    return module.Settings(**values), own
+            raise inside.error(key, value, f"from {low:g} to {high:g}")
+    return replace(controller, settings=module.Settings(**given))
 
 
 def _controller_table(controller: Controller) -> dict[str, Any]:
@@ -275,69 +220,15 @@ def _controller_table(controller: Controller) -> dict[str, Any]:
     return {"kind": controller.kind, **table, **({group: settings} if group else settings)}
 
 
-def _motors(table: Mapping[str, Any]) -> MotorMap:
-    where = "motors."
-    _known_keys(where, table, list(MotorMap.__dataclass_fields__))
-    thrust = _numbers(where + "thrust", _required(where, table, "thrust"), 2)
-    scalars = {
-        key: _number(where + key, table[key])
-        for key in ("voltage", "voltage_exponent")
-        if key in table
-    }
-    _required(where, table, "voltage")
-    return MotorMap(thrust, **scalars)
-
-
-def _body(table: Mapping[str, Any]) -> CollisionBox:
-    _known_keys("body.", table, ["half_size"])
-    return CollisionBox(**{key: _numbers(f"body.{key}", table[key], 3) for key in table})
-
-
-def _camera(table: Mapping[str, Any]) -> Camera:
-    _known_keys("camera.", table, ["pitch_deg", "fov_deg", "range"])
+def _camera(table: Table) -> Camera:
+    table.expect(["pitch_deg", "fov_deg", "range"])
     camera = Camera()
-    if "pitch_deg" in table:
-        camera = replace(camera, pitch_deg=_number("camera.pitch_deg", table["pitch_deg"]))
-    if "fov_deg" in table:
-        camera = replace(camera, fov_deg=_numbers("camera.fov_deg", table["fov_deg"], 2))
-    if "range" in table:
-        camera = replace(camera, range_m=_number("camera.range", table["range"]))
-    return camera
-
-
-def _section(table: Mapping[str, Any], key: str, needed: bool = True) -> Mapping[str, Any]:
-    section = _required("", table, key) if needed else table.get(key, {})
-    if not isinstance(section, Mapping):
-        raise ValueError(f"{key} = {shown(section)}: must be a table [{key}]")
-    return section
-
-
-def _required(where: str, table: Mapping[str, Any], key: str) -> Any:
-    if key not in table:
-        raise ValueError(f"{where}{key}: missing; it must be given")
-    return table[key]
-
-
-def _known_keys(where: str, table: Mapping[str, Any], allowed: Any) -> None:
-    for key in table:
-        if key not in allowed:
-            guess = closest(key, allowed)
-            meant = f" did you mean {guess!r}?" if guess else ""
-            raise ValueError(
-                f"{where}{key[:LONGEST]}: unknown key;{meant} allowed: {', '.join(allowed)}"
-            )
-
-
-def _number(key: str, value: Any) -> float:
-    if not is_number(value):
-        raise ValueError(f"{key} = {shown(value)}: must be a finite number")
-    return float(value)
-
-
-def _numbers(key: str, value: Any, size: int) -> Any:
-    if not isinstance(value, list) or len(value) != size:
-        raise ValueError(f"{key} = {shown(value)}: must be a list of {size} numbers")
-    return tuple(_number(key, entry) for entry in value)
+    return replace(
+        camera,
+        pitch_deg=table.value("pitch_deg", float, camera.pitch_deg),
+        fov_deg=table.value("fov_deg", tuple[float, float], camera.fov_deg),
+        range_m=table.value("range", float, camera.range_m),
+    )
 
 
 def _plain(value: Any) -> Any:

@@ -103,37 +103,49 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
         _by_voltage(nominal, changes, effects)
     truth = with_effects(simulator.given, effects)
     flown = simulator.fly(truth, ways, rng)
-    flights = flown.recordings
-    answer: dict[str, Any] = {"kind": case.kind, "verdict": "no_gap", "effects": []}
     named = {name: change for name, change in changes.items() if not EFFECTS[name].random}
-    info = long = None
-    if named:
-        info = _information(nominal, flights, sensors, ways, EVERY_S)
-        length = min(LONG_S, 0.5 * max(way.duration_s for way in ways))
-        long = _information(nominal, flights, sensors, ways, length)
-        if case.kind == "pair":
-            _check_pair(info, named, nominal)
-    for name in case.hidden:
-        entry: dict[str, Any] = {
-            "name": name,
-            "parameters": true_parameters(name, effects[name], has_voltage),
-            "multiple": multiples[name],
-            "sigma": None,
-            "required": [],
-            "allowed": [],
-        }
-        if info is not None and long is not None and name in named:
-            entry["sigma"] = float(np.sqrt(2.0 * log_ratio(info.block(name), named[name])))
-            rests = alternatives(info, named, nominal, bool(sensors.acc))[name]
-            hidden = alternatives(long, named, nominal, bool(sensors.acc))[name]
-            entry["required"] = [o for o in rests if hidden.get(o, np.inf) < REQUIRED]
-            entry["allowed"] = [other for other, rest in rests.items() if rest < ALLOWED]
-            entry["left_over"] = rests
-            entry["left_over_of_long_stretches"] = hidden
-        answer["effects"].append(entry)
-    if case.hidden:
-        answer["verdict"] = "named"
+    judged = _judged(case, nominal, flown.recordings, sensors, ways, named) if named else {}
+    answer = {
+        "kind": case.kind,
+        "verdict": "named" if case.hidden else "no_gap",
+        "effects": [
+            {
+                "name": name,
+                "parameters": true_parameters(name, effects[name], has_voltage),
+                "multiple": multiples[name],
+                **judged.get(name, {"sigma": None, "required": [], "allowed": []}),
+            }
+            for name in case.hidden
+        ],
+    }
     return _built(case, simulator, truth, ways, flown, answer, rng)
+
+
+def _judged(
+    case: Case,
+    nominal: Vehicle,
+    flights: Sequence[Recording],
+    sensors: Sensors,
+    ways: Sequence[Trajectory],
+    named: dict[str, np.ndarray],
+) -> dict[str, dict[str, Any]]:
+    """Return for each effect in `named` how strong it is and which names may stand for it."""
+    info = _information(nominal, flights, sensors, ways, EVERY_S)
+    if case.kind == "pair":
+        _check_pair(info, named, nominal)
+    length = min(LONG_S, 0.5 * max(way.duration_s for way in ways))
+    long = _information(nominal, flights, sensors, ways, length)
+    rests, hidden = (alternatives(i, named, nominal, bool(sensors.acc)) for i in (info, long))
+    return {
+        name: {
+            "sigma": float(np.sqrt(2.0 * log_ratio(info.block(name), change))),
+            "required": [o for o in rests[name] if hidden[name].get(o, np.inf) < REQUIRED],
+            "allowed": [other for other, rest in rests[name].items() if rest < ALLOWED],
+            "left_over": rests[name],
+            "left_over_of_long_stretches": hidden[name],
+        }
+        for name, change in named.items()
+    }
 
 
 def _by_voltage(nominal: Vehicle, changes: dict[str, np.ndarray], effects: dict[str, Any]) -> None:
@@ -252,10 +264,9 @@ def _built(
     rng: np.random.Generator,
 ) -> Built:
     logs = flown.logs(rng)
-    if simulator.conditions:
-        answer = {**answer, "conditions": simulator.conditions}
     answer = {
         **answer,
+        **({"conditions": simulator.conditions} if simulator.conditions else {}),
         "case": asdict(case),
         "trajectories": [asdict(way) for way in ways],
         # Without it the hash of a short answer could be guessed.

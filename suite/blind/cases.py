@@ -83,12 +83,7 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     """Return the set that RotorPy flies: its effects at both multiples, pairs of them, and nulls.
 
-    Args:
-        seed: of the set.
-        count: about how many; every kind keeps its share, and at least one. All if not given.
-
-    Raises:
-        ValueError: for a count below 1.
+    Arguments and errors are those of `draw_cases`.
     """
     rng = np.random.default_rng([seed, 1])
     drawn: list[tuple[str, tuple[str, ...], float]] = [
@@ -115,16 +110,9 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 
 
 def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case]:
-    """Return the set that is flown in continuous time.
+    """Return the set that is flown in continuous time, with single effects that all differ.
 
-    Every single effect is another one, half of them at each multiple.
-
-    Args:
-        seed: of the set.
-        count: about how many; every kind keeps its share, and at least one. All if not given.
-
-    Raises:
-        ValueError: for a count below 1.
+    Half of them are at each multiple. Arguments and errors are those of `draw_cases`.
     """
     share = _share_of(count, sum(CONTINUOUS_FULL.values()))
     rng = np.random.default_rng([seed, 2])
@@ -160,42 +148,35 @@ def _share_of(count: int | None, full: int) -> float:
 
 
 def _singles(rng: np.random.Generator, seed: int, share: float) -> list[Case]:
-    wanted = [(name, multiple) for multiple in MULTIPLES for name in nameable_effects()]
+    wanted = [((name,), multiple) for multiple in MULTIPLES for name in nameable_effects()]
     keep = max(round(share * len(wanted)), 1)
-    chosen = sorted(rng.permutation(len(wanted))[:keep])
-    found = []
-    for index in chosen:
-        name, multiple = wanted[index]
-        vehicle, sensors = _equipment(rng, (name,))
-        found.append(Case("single", (name,), multiple, vehicle, sensors, (seed, 10_000 + index)))
-    return found
+    return [
+        Case("single", *wanted[index], *_equipment(rng, wanted[index][0]), (seed, 10_000 + index))
+        for index in sorted(rng.permutation(len(wanted))[:keep])
+    ]
 
 
 def _drawn(rng: np.random.Generator, kind: str, index: int, number: tuple[int, int]) -> Case:
     seed = number[0]
     if kind == "outside":
-        name = list(KINDS)[index % len(KINDS)]
-        vehicle, sensors = _equipment(rng, ())
-        return Case(kind, (name,), float(rng.choice([3.0, 6.0])), vehicle, sensors, number)
+        name, equipment = list(KINDS)[index % len(KINDS)], _equipment(rng, ())
+        return Case(kind, (name,), float(rng.choice([3.0, 6.0])), *equipment, number)
     if kind == "pair":
         names = nameable_effects()
         pool = [name for name in names if not (EFFECTS[name].random or EFFECTS[name].slow)]
-        first, second = (pool[i] for i in rng.choice(len(pool), 2, replace=False))
-        vehicle, sensors = _equipment(rng, (first, second))
-        return Case(kind, (first, second), MULTIPLES[1], vehicle, sensors, number)
+        pair = tuple(pool[i] for i in rng.choice(len(pool), 2, replace=False))
+        return Case(kind, pair, MULTIPLES[1], *_equipment(rng, pair), number)
     if kind in ("blurred", "separated"):
         # The same pairs with the same truth in both kinds: a stream of their own by index.
         own = np.random.default_rng([seed, 3, index])
         entry = index % len(SEPARATIONS)
         pair = SEPARATIONS[entry].pair
         name = pair[int(own.integers(2))]
-        vehicle, _ = _equipment(own, pair)
         measured = {"motor", "voltage"} & set(SEPARATIONS[entry].measure)
         sensors = "full" if kind == "separated" and measured else "capture"
-        number = (seed, 30_000 + index)
-        return Case(kind, (name,), MULTIPLES[0], vehicle, sensors, number, entry)
-    vehicle, sensors = _equipment(rng, ())
-    return Case(kind, (), 0.0, vehicle, sensors, number)
+        at = _equipment(own, pair)[0], sensors, (seed, 30_000 + index)
+        return Case(kind, (name,), MULTIPLES[0], *at, entry)
+    return Case(kind, (), 0.0, *_equipment(rng, ()), number)
 
 
 def _equipment(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[str, str]:

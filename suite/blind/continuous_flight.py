@@ -6,12 +6,12 @@ The pilot is the one of the other simulators, for it only gives commands.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from eval.quadrotor.plant import Command, Motion, Wrench
+from eval.quadrotor.plant import Motion, Wrench, unpacked
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery, rotation
 from suite.blind.continuous.engine import Flown, Rows, fly
@@ -123,14 +123,12 @@ def recordings_of(
 
     A command is there from the first moment of the grid at or after its own.
     """
+    return [_recording(flown, index, way, rate_hz) for index, way in enumerate(trajectories)]
+
+
+def _recording(flown: Flown, index: int, way: Trajectory, rate_hz: float) -> Recording:
     dt, period = 1.0 / GRID_HZ, round(GRID_HZ / rate_hz)
-    return [
-        _recording(flown, index, np.arange(round(way.duration_s * GRID_HZ)) * dt, dt, period)
-        for index, way in enumerate(trajectories)
-    ]
-
-
-def _recording(flown: Flown, index: int, time_s: np.ndarray, dt: float, period: int) -> Recording:
+    time_s = np.arange(round(way.duration_s * GRID_HZ)) * dt
     state = state_at(flown, index, time_s)
     stamps = flown.schedule.stamp_s[:-1, index]
     ends = flown.time_s[:, index]
@@ -140,7 +138,6 @@ def _recording(flown: Flown, index: int, time_s: np.ndarray, dt: float, period: 
     def between(ends: np.ndarray, series: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(time_s, ends, column) for column in series.T], axis=1)
 
-    command, acting = flown.command[row, index], flown.acting[row, index]
     push_b = flown.push_b[step, index]
     return Recording(
         dt=dt,
@@ -149,10 +146,10 @@ def _recording(flown: Flown, index: int, time_s: np.ndarray, dt: float, period: 
         motion=Motion(state[:, POS], rotation(state[:, QUAT]), state[:, VEL], state[:, RATE]),
         quat_wxyz=state[:, QUAT],
         rotor_speed=between(ends, flown.speed[:, index]),
-        command=Command(command[:, 0], command[:, 1:]),
+        command=unpacked(flown.command[row, index]),
         acc_b=between(stamps, flown.acc_b[:, index]),
         voltage=np.interp(time_s, stamps, flown.voltage[:, index]),
-        acting=Command(acting[:, 0], acting[:, 1:]),
+        acting=unpacked(flown.acting[row, index]),
         extra=Wrench(push_b, np.zeros_like(push_b)),
     )
 
@@ -166,18 +163,7 @@ def logs_of(
     rng: np.random.Generator | None,
 ) -> tuple[FlightLog, ...]:
     """Return the flights' logs with noise as `sensors` has it a second; `rng` None logs without."""
-    noise = Noise(
-        sensors.rate_hz,
-        sensors.pos,
-        sensors.attitude,
-        sensors.gyro,
-        sensors.vel,
-        sensors.acc,
-        sensors.rotor,
-        sensors.voltage,
-        sensors.lost,
-    )
-    about = {"source": "suite blind", "vehicle": truth.name}
+    noise, about = Noise(*astuple(sensors)[1:]), {"source": "suite blind", "vehicle": truth.name}
     return tuple(
         log_of_flight(
             flown, index, way.duration_s, truth.effects, noise, conditions, rng,

@@ -20,6 +20,7 @@ from suite.blind.rotorpy_flight import damping_of_hubs, is_of_hubs
 from suite.blind.run import FAILED, TIMED
 from suite.diagnose.fit.parameters import effects_in
 from tracks.common.files import write_json, write_text
+from tracks.common.grid import markdown, table
 from tracks.common.provenance import stamp
 
 SCHEMA = 1
@@ -83,35 +84,34 @@ def score_case(
     that has it.
     """
     truths: Sequence[Mapping[str, Any]] = answer["effects"]
-    hidden = tuple(truth["name"] for truth in truths)
-    outside = answer.get("outside")
-    multiple = max((truth["multiple"] for truth in truths), default=0.0)
-    if outside:
-        hidden, multiple = (outside["name"],), outside["multiple"]
+    hidden = [answer["outside"]] if answer.get("outside") else truths
     effects = [] if diagnosis is None else diagnosis.get("effects", [])
     sets = tuple((e["name"], *e.get("alternatives", [])) for e in effects)
     brought = [hubs is not None and is_of_hubs(e, hubs) for e in effects]
     pairs = _matched(truths, sets)
     right = [_is_right(truths[t], sets[e]) for t, e in pairs.items()]
-    names = {truth["name"] for truth in truths}
-    covered: list[bool] = []
-    for t, e in pairs.items():
-        if sets[e][0] == truths[t]["name"]:
-            covered += _covered(truths[t]["parameters"], effects[e].get("parameters", {}))
+    names, used = {truth["name"] for truth in truths}, set(pairs.values())
+    # What is not there, and what is true but another set stands for already.
+    extra = [
+        e not in used if names & set(group) else not brought[e] for e, group in enumerate(sets)
+    ]
+    covered = [
+        inside
+        for t, e in pairs.items()
+        if sets[e][0] == truths[t]["name"]
+        for inside in _covered(truths[t]["parameters"], effects[e].get("parameters", {}))
+    ]
     gap = (diagnosis or {}).get("gap") or {}
     floor, after = gap.get("noise_floor"), gap.get("after")
     return Verdict(
         name,
         answer["kind"],
-        hidden,
-        float(multiple),
+        tuple(each["name"] for each in hidden),
+        float(max((each["multiple"] for each in hidden), default=0.0)),
         "failed" if diagnosis is None else str(diagnosis["verdict"]),
         sets,
         bool(truths) and len(right) == len(truths) and all(right),
-        sum(
-            not names & set(group) and not there for group, there in zip(sets, brought, strict=True)
-        )
-        + _doubles(sets, pairs, names),
+        sum(extra),
         tuple(covered),
         after / floor if floor and after is not None and sets else None,
         seconds,
@@ -153,91 +153,87 @@ def not_run(out: Path, verdicts: Sequence[Verdict]) -> list[str]:
 
 def shares(verdicts: Sequence[Verdict]) -> list[Share]:
     """Return the lines of the table that are shares, empty ones left out."""
-    by = {kind: [v for v in verdicts if v.kind == kind] for kind in {v.kind for v in verdicts}}
-    single, null = by.get("single", []), by.get("null", [])
-    told = ("unknown", "partly")
+
+    def of(kind: str) -> list[Verdict]:
+        return [v for v in verdicts if v.kind == kind]
+
+    single, null, pair = of("single"), of("null"), of("pair")
     # A failed one names nothing, which is no merit.
     ended = [v for v in verdicts if v.verdict != "failed"]
     by_chance = {name for name, effect in EFFECTS.items() if effect.random}
-    gaps = [v for v in verdicts
-            if v.found and not by_chance & set(v.hidden) and v.gap_ratio is not None]  # fmt: skip
-    intervals = [inside for v in verdicts for inside in v.covered]
+    ratios = [v.gap_ratio for v in verdicts if v.found and not by_chance & set(v.hidden)]
     lines = [
-        ("single effects: named, nothing else", [v.exact for v in single], "95 %"),
+        ("single effects: named, nothing else", "95 %", [v.exact for v in single]),
         *(
             (
-                f"  of these at {m:g} times detectable",
-                [v.exact for v in single if _near(v.multiple, MULTIPLES) == m],
+                f"  of these at {times:g} times detectable",
                 "",
+                [v.exact for v in single if _near(v.multiple, MULTIPLES) == times],
             )
-            for m in MULTIPLES
+            for times in MULTIPLES
         ),
-        *_beside_hubs("single", single),
-        ("single effects: named, others perhaps too", [v.found for v in single], ""),
-        ("single effects: verdict `named`", [v.verdict == "named" for v in single], ""),
-        (
-            "nulls: something named",
-            [bool(v.named) for v in ended if v.kind == "null"],
-            "at most 2 of 100",
-        ),
-        ("nulls: verdict `no_gap`", [v.verdict == "no_gap" for v in null], ""),
-        (
-            "outside the catalogue: `unknown` or `partly`",
-            [v.verdict in told for v in by.get("outside", [])],
-            "85 %",
-        ),
-        ("pairs: both named", [v.found for v in by.get("pair", [])], "80 %"),
-        ("pairs: both named, nothing else", [v.exact for v in by.get("pair", [])], ""),
-        *_beside_hubs("pair", by.get("pair", [])),
-        ("inseparable: the right set", [v.exact for v in by.get("blurred", [])], "95 %"),
-        ("the same with separating flights", [v.exact for v in by.get("separated", [])], "95 %"),
-        ("cases with a spurious extra name", [v.extra > 0 for v in ended if v.hidden], ""),
-        ("95 % intervals that hold the truth", intervals, "90-98 %"),
-        (
-            f"gap after within {GAP_LIMIT} of the noise floor, where named",
-            [v.gap_ratio <= GAP_LIMIT for v in gaps if v.gap_ratio is not None],
-            "all",
-        ),
-        ("diagnosis failed", [v.verdict == "failed" for v in verdicts], "none"),
-    ]
-    return [_share(what, flags, wanted) for what, flags, wanted in lines if flags]
+        _beside_hubs(single),
+        ("single effects: named, others perhaps too", "", [v.found for v in single]),
+        ("single effects: verdict `named`", "", [v.verdict == "named" for v in single]),
+        ("nulls: something named", "at most 2 of 100",
+         [bool(v.named) for v in ended if v.kind == "null"]),
+        ("nulls: verdict `no_gap`", "", [v.verdict == "no_gap" for v in null]),
+        ("outside the catalogue: `unknown` or `partly`", "85 %", [*map(_as_hoped, of("outside"))]),
+        ("pairs: both named", "80 %", [v.found for v in pair]),
+        ("pairs: both named, nothing else", "", [v.exact for v in pair]),
+        _beside_hubs(pair),
+        ("inseparable: the right set", "95 %", [v.exact for v in of("blurred")]),
+        ("the same with separating flights", "95 %", [v.exact for v in of("separated")]),
+        ("cases with a spurious extra name", "", [v.extra > 0 for v in ended if v.hidden]),
+        ("95 % intervals that hold the truth", "90-98 %", [x for v in verdicts for x in v.covered]),
+        (f"gap after within {GAP_LIMIT} of the noise floor, where named", "all",
+         [ratio <= GAP_LIMIT for ratio in ratios if ratio is not None]),
+        ("diagnosis failed", "none", [v.verdict == "failed" for v in verdicts]),
+    ]  # fmt: skip
+    found = []
+    for what, wanted, flags in lines:
+        if flags:
+            share = wilson(sum(flags), len(flags))
+            found.append(Share(what, sum(flags), len(flags), share.low, share.high, wanted))
+    return found
 
 
 def report(out: Path, verdicts: Sequence[Verdict]) -> str:
     """Write `table.md` and `table.json` into `out` and return the table (Markdown)."""
-    lines = ["| | | 95 % interval | wanted |", "|---|---|---|---|"]
     counted = shares(verdicts)
-    for s in counted:
-        rate = f"{s.count} of {s.of} ({100 * s.count / s.of:.0f} %)"
-        lines.append(f"| {s.what} | {rate} | {100 * s.low:.0f}-{100 * s.high:.0f} % | {s.wanted} |")
+    lines = [
+        [s.what, f"{s.count} of {s.of} ({100 * s.count / s.of:.0f} %)",
+         f"{100 * s.low:.0f}-{100 * s.high:.0f} %", s.wanted]
+        for s in counted
+    ]  # fmt: skip
     times = [v.seconds for v in verdicts if v.seconds is not None]
     ratios = [v.gap_ratio for v in verdicts if v.found and v.gap_ratio is not None]
-    for what, values, unit in (
-        ("seconds a case, median", times, "s"),
-        ("gap after over noise floor where named, median", ratios, ""),
-    ):
-        if values:
-            lines.append(f"| {what} | {median(values):.3g} {unit} | | |")
-    wrong = [v for v in verdicts if not _as_hoped(v)]
-    lines += ["", f"{len(wrong)} of {len(verdicts)} cases are not as hoped:", ""]
-    lines += [
-        "| case | kind | hidden | x detectable | verdict | named |",
-        "|---|---|---|---|---|---|",
+    if times:
+        lines.append(["seconds a case, median", f"{median(times):.3g} s", "", ""])
+    if ratios:
+        what = "gap after over noise floor where named, median"
+        lines.append([what, f"{median(ratios):.3g}", "", ""])
+    wrong = [
+        [v.case, v.kind, ", ".join(v.hidden) or "–", f"{v.multiple:.1f}", v.verdict,
+         "; ".join(" or ".join(group) for group in v.named) or "–"]
+        for v in verdicts
+        if not _as_hoped(v)
+    ]  # fmt: skip
+    heads = ["case", "kind", "hidden", "x detectable", "verdict", "named"]
+    title = f"{len(wrong)} of {len(verdicts)} cases are not as hoped:"
+    waiting, failed = not_run(out, verdicts), load_manifest(out).failed
+    count = len(waiting) + len(verdicts)
+    notes = [
+        waiting and f"Not run yet, so in none of these numbers: {len(waiting)} of {count} cases.",
+        failed and f"Not made: {', '.join(failed)}.",
     ]
-    for v in wrong:
-        named = "; ".join(" or ".join(group) for group in v.named) or "–"
-        lines.append(
-            f"| {v.case} | {v.kind} | {', '.join(v.hidden) or '–'} | {v.multiple:.1f} "
-            f"| {v.verdict} | {named} |"
-        )
-    waiting = not_run(out, verdicts)
-    if waiting:
-        count = len(waiting) + len(verdicts)
-        lines += ["", f"Not run yet, so in none of these numbers: {len(waiting)} of {count} cases."]
-    failed = load_manifest(out).failed
-    if failed:
-        lines += ["", f"Not made: {', '.join(failed)}."]
-    text = "\n".join(lines) + "\n"
+    text = "\n".join(
+        [
+            markdown(table(["", "", "95 % interval", "wanted"], lines)),
+            markdown(table(heads, wrong, title)),
+            *(f"{note}\n" for note in notes if note),
+        ]
+    )
     write_text(out / "table.md", text)
     summary = {
         **stamp(SCHEMA, None),
@@ -250,12 +246,12 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
     return text
 
 
-def _beside_hubs(kind: str, verdicts: Sequence[Verdict]) -> list[tuple[str, list[bool], str]]:
+def _beside_hubs(verdicts: Sequence[Verdict]) -> tuple[str, str, list[bool]]:
     """Return the line on what is right where hubs' damping counts as not there, if it was named."""
-    if not any(v.brought for v in verdicts):
-        return []
-    flags = [v.exact and not v.brought for v in verdicts]
-    return [(f"  {kind}: with no damping by moving hubs beside them", flags, "")]
+    brought = any(v.brought for v in verdicts)
+    flags = [v.exact and not v.brought for v in verdicts if brought]
+    kind = verdicts[0].kind if verdicts else ""
+    return f"  {kind}: with no damping by moving hubs beside them", "", flags
 
 
 def _matched(
@@ -279,12 +275,6 @@ def _is_right(truth: Mapping[str, Any], group: tuple[str, ...]) -> bool:
     # Several effects that are one hypothesis are not judged: the oracle weighs single ones.
     others = {name for name in group if len(effects_in(name)) == 1} - {truth["name"]}
     return set(truth["required"]) <= others <= set(truth["allowed"]) | set(truth["required"])
-
-
-def _doubles(sets: Sequence[tuple[str, ...]], pairs: dict[int, int], names: set[str]) -> int:
-    """Return how many sets name something true that another set stands for already."""
-    used = set(pairs.values())
-    return sum(e not in used and bool(names & set(group)) for e, group in enumerate(sets))
 
 
 def _covered(truth: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[bool]:
@@ -316,11 +306,6 @@ def _as_hoped(v: Verdict) -> bool:
 
 def _near(value: float, steps: Sequence[float]) -> float:
     return min(steps, key=lambda step: abs(step - value))
-
-
-def _share(what: str, flags: Sequence[bool], wanted: str) -> Share:
-    interval = wilson(sum(flags), len(flags))
-    return Share(what, sum(flags), len(flags), interval.low, interval.high, wanted)
 
 
 def _read(path: Path) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,20 +36,6 @@ class Flights(NamedTuple):
     """What is logged of them, with noise."""
 
 
-class Fly(Protocol):
-    """Flies trajectories side by side with a vehicle and what is true besides."""
-
-    def __call__(
-        self,
-        truth: Vehicle,
-        ways: Sequence[Trajectory],
-        rng: np.random.Generator,
-        extra: Extra | None = None,
-    ) -> Flights:
-        """Return the flights of `truth`; `rng` is for what happens by chance in flight."""
-        ...
-
-
 @dataclass(frozen=True)
 class Simulator:
     """A simulator, set up for one case."""
@@ -58,7 +44,9 @@ class Simulator:
     """Given to the diagnosis."""
     judged: Vehicle
     """The same at the rate of the recordings' grid, for what works on that."""
-    fly: Fly
+    fly: Callable[..., Flights]
+    """Flies (truth, ways, rng, extra) side by side: a vehicle on N trajectories, with what happens
+    by chance in flight, and physics besides, if any."""
     conditions: dict[str, Any] = field(default_factory=dict)
     """Under which it is flown and logged, for the answer."""
 
@@ -105,6 +93,5 @@ def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
             lambda rng: logs_of(flown, ways, truth, sensors, conditions, rng),
         )
 
-    return Simulator(
-        looped, with_loop(given, GRID_HZ), in_continuous_time, conditions=asdict(conditions)
-    )
+    judged = with_loop(given, GRID_HZ)
+    return Simulator(looped, judged, in_continuous_time, asdict(conditions))

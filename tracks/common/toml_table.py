@@ -1,18 +1,24 @@
-"""Tables of a person's TOML file, read key by key and refused by file and key; and TOML as text."""
+"""Tables of a person's file, read key by key or as a typed dataclass; and TOML as text.
+
+What is wrong is refused by file and key, with the value, what is allowed and the nearest name.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from tracks.common.names import closest
 from tracks.input import reading
 from tracks.input.ranges import is_number, shown
+
+T = TypeVar("T")
 
 REQUIRED: Any = object()
 """In place of a default: the key must be there."""
@@ -25,7 +31,7 @@ def read_toml(path: Path) -> Table:
         ValueError: where there is no such file or it is no TOML, naming the file.
     """
     try:
-        return Table(path, "", reading.read_toml(path))
+        return Table(str(path), "", reading.read_toml(path))
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({reading.reason(error)})") from None
 
@@ -33,22 +39,71 @@ def read_toml(path: Path) -> Table:
 class Table:
     """One table of a file; every key that is asked for counts as known."""
 
-    def __init__(self, path: Path, place: str, values: dict[str, Any]) -> None:
-        self.path = path
-        self._place = place
-        self._values = values
+    def __init__(self, source: str, place: str, values: Mapping[str, Any]) -> None:
+        """Prepare to read `values`; messages begin with `source`, unless it is empty."""
+        self._source, self._place, self.values = source, place, values
         self._known: list[str] = []
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return Path(self._source)
 
     def error(self, key: str, value: object, allowed: str) -> ValueError:
         """Return (not raise) the error for a value that is not allowed under `key`."""
-        where = f"{self._place}.{key}" if self._place else key
-        return ValueError(f"{self.path}: {where} is {shown(value)}, allowed is {allowed}")
+        return self._refused(f"{self._at(key)} is {shown(value)}, allowed is {allowed}")
+
+    def read(self, cls: type[T], also: Iterable[str] = (), **held: Any) -> T:
+        """Return a dataclass from this table's keys; fields that are left out take their defaults.
+
+        Args:
+            cls: its fields are numbers, texts, truth values, tuples of these, or dataclasses.
+            also: further keys that the table may have.
+            held: fields that the table does not say.
+        """
+        named = {field.name: field for field in dataclasses.fields(cls) if field.name not in held}  # pyright: ignore[reportArgumentType]
+        self.expect([*named, *also])
+        hints = get_type_hints(cls)
+        for name, field in named.items():
+            needed = field.default is field.default_factory is dataclasses.MISSING
+            if needed or self.has(name):
+                held[name] = self.value(name, hints[name])
+        return cls(**held)
+
+    def value(self, key: str, kind: Any, default: Any = REQUIRED) -> Any:
+        """Return what stands under `key` as `kind`, a type that a field of `read` may have."""
+        found = self._get(key, default, _words(kind))
+        return found if key not in self.values else self._typed(key, found, kind)
+
+    def choice(self, key: str, allowed: Iterable[str]) -> str:
+        """Return one of the texts `allowed`; the first where the key is not there."""
+        allowed = list(allowed)
+        value = self._get(key, allowed[0], "a text")
+        if not isinstance(value, str) or value not in allowed:
+            raise self.error(key, value, " or ".join(map(repr, allowed)))
+        return value
+
+    def _typed(self, key: str, value: Any, kind: Any) -> Any:
+        parts = get_args(kind)
+        if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+            return self.table(key).read(kind)
+        if get_origin(kind) is tuple:
+            if not isinstance(value, list | tuple) or len(value) != len(parts):
+                raise self.error(key, value, _words(kind))
+            both = enumerate(zip(value, parts, strict=True))
+            # A list in a list has a place of its own in the message.
+            inner = get_origin(parts[0]) is tuple
+            return tuple(self._typed(f"{key}[{i}]" if inner else key, v, k) for i, (v, k) in both)
+        good = isinstance(value, kind) if kind in (bool, str) else is_number(value)
+        if not good or value == "" or (kind is int and value != int(value)):
+            raise self.error(key, value, _words(kind))
+        return kind(value)
 
     def has(self, key: str) -> bool:
         """Return whether the key is there; asking makes it known."""
         if key not in self._known:
             self._known.append(key)
-        return key in self._values
+        return key in self.values
 
     def number(
         self,
@@ -120,39 +175,59 @@ class Table:
             )
         return np.array(value, float)
 
-    def table(self, key: str) -> Table:
+    def table(self, key: str, default: Mapping[str, Any] = REQUIRED) -> Table:
         """Return a table below this one."""
-        value = self._get(key, REQUIRED, "a table")
-        if not isinstance(value, dict):
-            raise self.error(key, value, f"a table [{key}]")
-        return Table(self.path, f"{self._place}.{key}" if self._place else key, value)
+        value = self._get(key, default, f"a table [{self._at(key)}]")
+        if not isinstance(value, Mapping):
+            raise self.error(key, value, f"a table [{self._at(key)}]")
+        return Table(self._source, self._at(key), value)
 
     def tables(self, key: str) -> list[Table]:
         """Return the tables of an array [[key]], none where it is absent."""
         value = self._get(key, [], f"tables [[{key}]]")
         if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
             raise self.error(key, value, f"tables [[{key}]]")
-        return [Table(self.path, f"{key}[{i}]", entry) for i, entry in enumerate(value)]
+        return [Table(self._source, f"{key}[{i}]", entry) for i, entry in enumerate(value)]
 
     def close(self) -> None:
         """Refuse every key that nothing asked for."""
-        for key in self._values:
-            if key not in self._known:
-                near = closest(key, self._known)
+        self.expect(self._known)
+
+    def expect(self, allowed: Iterable[str]) -> None:
+        """Refuse every key that is not `allowed`."""
+        allowed = list(allowed)
+        for key in self.values:
+            if key not in allowed:
+                near = closest(key, allowed)
                 hint = f" Did you mean {near!r}?" if near else ""
                 where = f"in [{self._place}]" if self._place else "at the top"
-                raise ValueError(
-                    f"{self.path}: key {shown(key)} {where} is unknown.{hint} "
-                    f"Allowed: {', '.join(self._known)}."
+                raise self._refused(
+                    f"key {shown(key)} {where} is unknown.{hint} Allowed: {', '.join(allowed)}."
                 )
 
     def _get(self, key: str, default: Any, kind: str) -> Any:
         if self.has(key):
-            return self._values[key]
+            return self.values[key]
         if default is REQUIRED:
             where = f"[{self._place}]" if self._place else "the file"
-            raise ValueError(f"{self.path}: {where} has no {key!r}; add it ({kind})")
+            raise self._refused(f"{where} has no {key!r}; add it ({kind})")
         return default
+
+    def _at(self, key: str) -> str:
+        return f"{self._place}.{key}" if self._place else key
+
+    def _refused(self, text: str) -> ValueError:
+        return ValueError(f"{self._source}: {text}" if self._source else text)
+
+
+def _words(kind: Any) -> str:
+    """Return what values of `kind` are called."""
+    if get_origin(kind) is not tuple:
+        names = {bool: "true or false", int: "a whole number", float: "a finite number"}
+        return names.get(kind, "a text that is not empty" if kind is str else "a table")
+    parts, inner = get_args(kind), get_args(get_args(kind)[0])
+    each = f"lists of {len(inner)} numbers" if inner else "numbers"
+    return f"a list of {len(parts)} {each}"
 
 
 def _limits(above: float, least: float, most: float) -> str:

@@ -215,7 +215,7 @@ def _start(top: Table, gates: Gates) -> tuple[np.ndarray, float]:
     ahead = gates.rot_w[0, :, 0] * [1.0, 1.0, 0.0]
     level = np.linalg.norm(ahead)
     pos_w = gates.center_w[0] - _START_BEHIND_M * ahead / max(level, 1e-9)
-    table = top.table("start") if top.has("start") else Table(top.path, "start", {})
+    table = top.table("start", {})
     if level < 1e-6 and not table.has("position"):
         raise table.error("position", None, "a position: gate 0 is flown straight up or down")
     pos_w = _place(table, "position", pos_w.tolist())

@@ -134,25 +134,19 @@ def rotation(quat_wxyz: np.ndarray) -> np.ndarray:
     return (pairs @ _ROTATION).reshape(-1, 3, 3)
 
 
-def _quadratic(*terms: tuple[float, str]) -> np.ndarray:
-    """Return (16,) what to make of the products of a quaternion's parts, such as (2, "xy")."""
+def _quadratic(terms: str) -> np.ndarray:
+    """Return (16,) what to make of the products of a quaternion's parts, such as "+2xy -2wz"."""
     made = np.zeros((4, 4))
-    for factor, (first, second) in terms:
-        made["wxyz".index(first), "wxyz".index(second)] += factor
+    for sign, factor, first, second in terms.split():
+        made["wxyz".index(first), "wxyz".index(second)] += float(sign + factor)
     return made.ravel()
 
 
 _ROTATION = np.stack(
     [
-        _quadratic((1, "ww"), (1, "xx"), (-1, "yy"), (-1, "zz")),
-        _quadratic((2, "xy"), (-2, "wz")),
-        _quadratic((2, "xz"), (2, "wy")),
-        _quadratic((2, "xy"), (2, "wz")),
-        _quadratic((1, "ww"), (-1, "xx"), (1, "yy"), (-1, "zz")),
-        _quadratic((2, "yz"), (-2, "wx")),
-        _quadratic((2, "xz"), (-2, "wy")),
-        _quadratic((2, "yz"), (2, "wx")),
-        _quadratic((1, "ww"), (-1, "xx"), (-1, "yy"), (1, "zz")),
+        *map(_quadratic, ("+1ww +1xx -1yy -1zz", "+2xy -2wz", "+2xz +2wy")),
+        *map(_quadratic, ("+2xy +2wz", "+1ww -1xx +1yy -1zz", "+2yz -2wx")),
+        *map(_quadratic, ("+2xz -2wy", "+2yz +2wx", "+1ww -1xx -1yy +1zz")),
     ],
     axis=1,
 )

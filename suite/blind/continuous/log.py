@@ -71,46 +71,36 @@ def log_of_flight(
     late = float(faults["clock_offset"].offset) if "clock_offset" in faults else 0.0
     state = flown.state[step, index]
     posed = state if late == 0.0 else state_at(flown, index, time_s - late)
+    pos_w, vel_w, quat = posed[:, POS], posed[:, VEL], posed[:, QUAT]
     rate_b = state[:, RATE] + _bias(faults, "gyro_bias")
     acc_b = flown.acc_b[rows, index] + _bias(faults, "accelerometer_bias")
-    values = {
-        "pos_w": posed[:, POS],
-        "vel_w": posed[:, VEL],
-        "rate_b": rate_b,
-        "acc_b": acc_b,
-        "rotor_speed": flown.speed[step, index],
-        "voltage": flown.voltage[rows, index],
-    }
-    quat = posed[:, QUAT]
+    speed, voltage = flown.speed[step, index], flown.voltage[rows, index]
     kept = np.ones(len(rows), bool)
     if rng is not None:
         drawn = _Draws(rng, time_s, noise, conditions)
-        values = {
-            "pos_w": values["pos_w"] + drawn.estimated(noise.pos),
-            "vel_w": values["vel_w"] + drawn.estimated(noise.vel),
-            "rate_b": values["rate_b"] + drawn.white(noise.gyro, 3),
-            "acc_b": values["acc_b"] + drawn.white(noise.acc, 3),
-            "rotor_speed": values["rotor_speed"] + drawn.white(noise.rotor, 4),
-            "voltage": values["voltage"] + drawn.white(noise.voltage, 1)[:, 0],
-        }
+        pos_w = pos_w + drawn.estimated(noise.pos)
+        vel_w = vel_w + drawn.estimated(noise.vel)
+        rate_b += drawn.white(noise.gyro, 3)
+        acc_b += drawn.white(noise.acc, 3)
+        speed = speed + drawn.white(noise.rotor, 4)
+        voltage = voltage + drawn.white(noise.voltage, 1)[:, 0]
         quat = turned(quat, drawn.estimated(noise.attitude))
         for row in np.flatnonzero(drawn.chosen(noise.lost / IN_A_ROW)):
-            values["pos_w"][row : row + IN_A_ROW] = np.nan
-            quat[row : row + IN_A_ROW] = np.nan
+            pos_w[row : row + IN_A_ROW] = quat[row : row + IN_A_ROW] = np.nan
         kept = ~drawn.chosen(conditions.dropped)
         time_s = time_s + conditions.clock_s * rng.uniform(-1.0, 1.0, len(time_s))
     return FlightLog(
         name=name,
         time_s=time_s[kept],
-        pos_w=values["pos_w"][kept],
+        pos_w=pos_w[kept],
         quat_wxyz=quat[kept],
-        vel_w=values["vel_w"][kept],
-        rate_b=values["rate_b"][kept],
+        vel_w=vel_w[kept],
+        rate_b=rate_b[kept],
         thrust_cmd=flown.command[rows, index, 0][kept],
         rate_cmd_b=flown.command[rows, index, 1:][kept],
-        rotor_speed=values["rotor_speed"][kept] if noise.rotor else None,
-        acc_b=values["acc_b"][kept] if noise.acc else None,
-        voltage=values["voltage"][kept] if noise.voltage else None,
+        rotor_speed=speed[kept] if noise.rotor else None,
+        acc_b=acc_b[kept] if noise.acc else None,
+        voltage=voltage[kept] if noise.voltage else None,
         about=dict(about),
         # Not written to a file, as if it had not been measured.
         velocity_derived=not noise.vel,

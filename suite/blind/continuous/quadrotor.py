@@ -94,20 +94,13 @@ def quadrotor_of(vehicle: Vehicle) -> Quadrotor:
     rotors, controller = vehicle.rotors, vehicle.controller
     hubs, spin = np.array(rotors.position, dtype=float), np.array(rotors.spin, dtype=float)
     weak = value("weak_motor", "scale", np.ones(4))
+    twist = -spin * rotors.torque_coefficient / rotors.thrust_coefficient
+    lift = rotors.thrust_coefficient * float(value("thrust_scale", "scale", 1.0))
     believed = Believed(
         mass=vehicle.mass,
         inertia=np.array(vehicle.inertia),
         rate_gain=np.array(controller.rate_gain) * value("rate_gain", "scale", np.ones(3)),
-        shares=np.linalg.inv(
-            np.array(
-                [
-                    np.ones(4),
-                    hubs[:, 1],
-                    -hubs[:, 0],
-                    -spin * rotors.torque_coefficient / rotors.thrust_coefficient,
-                ]
-            )
-        ),
+        shares=np.linalg.inv(np.array([np.ones(4), hubs[:, 1], -hubs[:, 0], twist])),
         thrust_max=rotors.thrust_coefficient * rotors.speed_max**2,
         thrust_coefficient=rotors.thrust_coefficient,
         period_s=1.0 / controller.frequency,
@@ -119,9 +112,7 @@ def quadrotor_of(vehicle: Vehicle) -> Quadrotor:
         gravity_w=-GRAVITY * leaning_z(value("frame_tilt", "angle", np.zeros(2))),
         arm=hubs - value("com_offset", "offset", np.zeros(3)),
         spin=spin,
-        thrust_coefficient=rotors.thrust_coefficient
-        * float(value("thrust_scale", "scale", 1.0))
-        * weak,
+        thrust_coefficient=lift * weak,
         torque_coefficient=rotors.torque_coefficient * weak,
         thrust_axis=leaning_z(value("thrust_tilt", "angle", np.zeros(2))),
         time_constant=float(value("motor_lag", "time_constant", rotors.time_constant)),

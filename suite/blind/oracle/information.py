@@ -17,7 +17,6 @@ import numpy as np
 from eval.effects import EFFECTS, all_values, nameable_effects
 from eval.effects.interface import GRAVITY, Parameter, Sample, Values, as_arrays, at, neutral
 from eval.effects.log_faults import lateness, measured
-from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.oracle.stretches import (
     DELAY_STEP_S,
@@ -43,6 +42,8 @@ MOSTLY = 0.25
 """A name may stand for another only where it leaves less than this share of what that explains."""
 GUST_DRAWS = 24
 """Simulated draws of random wind."""
+FAULT_STEP = 1e-4
+"""By which a fault of the log is changed, in its own unit."""
 
 
 class Column(NamedTuple):
@@ -113,20 +114,20 @@ def signatures(
     has_voltage = bool(sensors.voltage)
     columns = columns_of(has_voltage, names)
     basis, base = start_of(nominal, stretches, sensors)
-    moved = {}
     flown = [c for c in columns if EFFECTS[c.effect].in_flight]
+    moved = {
+        column: whitened(sensors, _faulty(column, base, nominal), base) / FAULT_STEP
+        for column in columns
+        if column not in flown
+    }
     if flown:
         # Times act by whole physics steps.
         steps = np.array(
             [DELAY_STEP_S if c.spec.unit == "s" else 0.1 * c.spec.typical[0] for c in flown]
         )
         plant = stretch_plant(nominal, _changed(nominal, flown, steps))
-        motion = Motion(*(np.broadcast_to(f, (len(flown), *f.shape)) for f in stretches.motion))
-        apart = whitened(sensors, replay(stretches, plant, motion, has_voltage=has_voltage), base)
-        moved = dict(zip(flown, apart / steps[:, None, None], strict=True))
-    for column in columns:
-        if column not in moved:
-            moved[column] = whitened(sensors, _faulty(column, base, nominal), base) / FAULT_STEP
+        apart = whitened(sensors, replay(stretches, plant, has_voltage=has_voltage), base)
+        moved |= dict(zip(flown, apart / steps[:, None, None], strict=True))
     return columns, without_start(basis, np.stack([moved[column] for column in columns]))
 
 
@@ -167,12 +168,10 @@ def gust_strength(
         return float(0.5 * (raised - np.log1p(raised)).sum())
 
     low, high = 1e-4, 100.0
-    if ratio(high) < THRESHOLD:
-        return float("inf")
     for _ in range(60):
         middle = np.sqrt(low * high)
         low, high = (middle, high) if ratio(middle) < THRESHOLD else (low, middle)
-    return float(high)
+    return float(high) if ratio(high) >= THRESHOLD else float("inf")
 
 
 def log_ratio(matrix: np.ndarray, change: np.ndarray) -> float:
@@ -200,73 +199,58 @@ def left_over(
         info: of the case's flights.
         truth: change of each true effect's columns from the given vehicle, by name.
         instead_of: the true effect that is left out; the other true ones are fitted too.
-        other: the effect that takes its place, within its physical bounds.
+        other: takes its place, within its physical bounds; only its column `one` if that is given.
         nominal: the given vehicle.
-        one: use only this one of the columns of `other`.
+        one: number of a column.
     """
     from scipy.optimize import lsq_linear
 
     kept = [row for name in truth if name != instead_of for row in info.rows_of(name)]
     mine, theirs = info.rows_of(instead_of), info.rows_of(other)
-    if one is not None:
-        theirs = theirs[one : one + 1]
-    used = [*mine, *theirs, *kept]
+    theirs = theirs if one is None else [theirs[one]]
+    used, count = [*mine, *theirs, *kept], len(mine)
     matrix = info.matrix[np.ix_(used, used)]
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    matrix = matrix / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(matrix)
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    target = root[:, : len(mine)] @ (truth[instead_of] * scale[: len(mine)])
-    bounds = [info.columns[row].room(nominal) for row in theirs]
+    target = root[:, :count] @ (truth[instead_of] * scale[:count])
     free = [(-np.inf, np.inf)] * len(kept)
-    low, high = np.array([*bounds, *free]).T
-    rest = scale[len(mine) :]
-    fitted = lsq_linear(root[:, len(mine) :], target, (low * rest - 1e-12, high * rest + 1e-12))
-    return float(fitted.cost)
+    room = np.array([*(info.columns[row].room(nominal) for row in theirs), *free]).T
+    low, high = room * scale[count:] + np.array([[-1e-12], [1e-12]])
+    return float(lsq_linear(root[:, count:], target, (low, high)).cost)
 
 
 def alternatives(
     info: Information, truth: Mapping[str, np.ndarray], nominal: Vehicle, has_acc: bool
 ) -> dict[str, dict[str, float]]:
     """Return for each true effect the names that may stand for it, with what they leave over."""
-    found: dict[str, dict[str, float]] = {}
-    for name in truth:
-        whole = log_ratio(info.block(name), truth[name])
-        found[name] = {}
-        for other in nameable_effects():
-            effect = EFFECTS[other]
-            silent = "acc_b" in effect.needs and not has_acc
-            if other in truth or effect.random or silent:
-                continue
-            # All four rotors together imitate a thrust scale; a weak motor is one of them.
-            rows = info.rows_of(other)
-            alone = any(info.columns[row].spec.one_at_a_time for row in rows)
-            single = range(len(rows)) if alone else (None,)
+    found: dict[str, dict[str, float]] = {name: {} for name in truth}
+    for other in nameable_effects():
+        effect = EFFECTS[other]
+        if other in truth or effect.random or ("acc_b" in effect.needs and not has_acc):
+            continue
+        # All four rotors together imitate a thrust scale; a weak motor is one of them.
+        rows = info.rows_of(other)
+        alone = any(info.columns[row].spec.one_at_a_time for row in rows)
+        single = range(len(rows)) if alone else (None,)
+        for name in truth:
+            whole = log_ratio(info.block(name), truth[name])
             rest = min(left_over(info, truth, name, other, nominal, one) for one in single)
             if rest < min(ALLOWED, MOSTLY * whole):
                 found[name][other] = rest
     return found
 
 
-FAULT_STEP = 1e-4
-"""By which a fault of the log is changed, in its own unit."""
-
-
 def _changed(nominal: Vehicle, columns: Sequence[Column], steps: np.ndarray) -> dict[str, Any]:
     """Return every effect's values with leading axes (P, 1), each changed in its own columns."""
-    changed = {}
-    for name, values in all_values(nominal).items():
-        if not EFFECTS[name].by_state:
-            continue
-        fields = {}
-        for key, value in values._asdict().items():
-            batch = np.tile(value, (len(columns), 1, *(1,) * value.ndim))
-            for row, column in enumerate(columns):
-                if (column.effect, column.parameter) == (name, key):
-                    index = (row, 0, column.component) if value.ndim else (row, 0)
-                    batch[index] += steps[row]
-            fields[key] = batch
-        changed[name] = type(values)(**fields)
+    changed = {
+        name: type(values)(*(np.tile(v, (len(columns), 1, *(1,) * v.ndim)) for v in values))
+        for name, values in all_values(nominal).items()
+        if EFFECTS[name].by_state
+    }
+    for row, column in enumerate(columns):
+        field = getattr(changed[column.effect], column.parameter)
+        field.reshape(len(columns), -1)[row, column.component] += steps[row]
     return changed
 
 
@@ -278,8 +262,7 @@ def _faulty(column: Column, base: Channels, nominal: Vehicle) -> Channels:
     fault = {column.effect: none._replace(**{column.parameter: field + step})}
     sample = Sample(*base[: len(Sample._fields)])
     if EFFECTS[column.effect].late:
-        # Along the true motion: poses of a moment earlier.
-        late = lateness(fault)
+        late = lateness(fault)  # along the true motion: poses of a moment earlier
         acc_w = to_world(base.rot_w, base.acc_b) - np.array([0.0, 0.0, GRAVITY])
         acc_w[0] = acc_w[1]
         sample = sample._replace(

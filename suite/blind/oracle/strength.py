@@ -32,6 +32,7 @@ from suite.diagnose.plans.sensors import SENSORS
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import long_flights, ordinary_flights
 from tracks.common.files import write_json
+from tracks.common.grid import markdown, table
 from tracks.common.provenance import stamp
 
 SCHEMA = 1
@@ -59,15 +60,17 @@ def make_table(progress: Callable[[float, str], None] | None = None) -> dict[str
     Args:
         progress: called with how many of `table_size()` parts are done and a note.
     """
-    entries: dict[str, Any] = {}
-    for name in vehicle_names():
-        entries[name] = {}
-        for sensors in SENSORS:
-            entries[name][sensors] = strengths(name, sensors, nameable_effects())
-            if progress is not None:
-                done = len(entries[name]) + (len(entries) - 1) * len(SENSORS)
-                progress(done, f"{name}, {sensors}")
+    entries: dict[str, Any] = {name: {} for name in vehicle_names()}
+    for done, (name, sensors) in enumerate(_places(), 1):
+        entries[name][sensors] = strengths(name, sensors, nameable_effects())
+        if progress is not None:
+            progress(done, f"{name}, {sensors}")
     return {**stamp(SCHEMA, FLIGHTS_SEED), "threshold": THRESHOLD, "vehicles": entries}
+
+
+def _places() -> list[tuple[str, str]]:
+    """Return the vehicles and sensors of the table."""
+    return [(name, sensors) for name in vehicle_names() for sensors in SENSORS]
 
 
 def strengths(vehicle: str, sensors: str, names: Sequence[str]) -> dict[str, Any]:
@@ -102,7 +105,7 @@ def _flown(vehicle: str, sensors: str, slow: bool) -> tuple[Stretches, np.random
 
 def table_size() -> int:
     """Return the number of parts of the table."""
-    return len(vehicle_names()) * len(SENSORS)
+    return len(_places())
 
 
 def save_table(table: dict[str, Any], path: Path = TABLE) -> Path:
@@ -136,27 +139,20 @@ def detectable_along(vehicle: str, sensors: str, effect: str, direction: np.ndar
 
 def table_text() -> str:
     """Return the table (Markdown): each component alone, just detectable, in its unit."""
-    vehicles = [(v, s) for v in vehicle_names() for s in SENSORS]
-    lines = [
-        "| effect | component | unit | " + " | ".join(f"{v}, {s}" for v, s in vehicles) + " |",
-        "|---|---|---|" + "---|" * len(vehicles),
-    ]
+    found: dict[Column, dict[tuple[str, str], str]] = {}
     for name in nameable_effects():
-        found: dict[Column, dict[tuple[str, str], float]] = {}
-        for where in vehicles:
+        for where in _places():
             columns = columns_in_table(*where, name)
-            for index, column in enumerate(columns):
-                alone = np.eye(len(columns))[index]
-                found.setdefault(column, {})[where] = detectable_along(*where, name, alone)
-        for column, values in found.items():
-            cells = [name, f"{column.parameter} {column.component + 1}", column.spec.unit]
-            cells += [_cell(values.get(where)) for where in vehicles]
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def _cell(value: float | None) -> str:
-    return "–" if value is None or not np.isfinite(value) else f"{value:.2g}"
+            for column, alone in zip(columns, np.eye(len(columns)), strict=True):
+                value = detectable_along(*where, name, alone)
+                found.setdefault(column, {})[where] = f"{value:.2g}" if np.isfinite(value) else "–"
+    lines = [
+        [c.effect, f"{c.parameter} {c.component + 1}", c.spec.unit]
+        + [values.get(where, "–") for where in _places()]
+        for c, values in found.items()
+    ]
+    heads = ["effect", "component", "unit", *(", ".join(where) for where in _places())]
+    return markdown(table(heads, lines))
 
 
 @cache

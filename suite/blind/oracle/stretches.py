@@ -2,18 +2,20 @@
 
 What a log can say about a parameter is how far the parameter moves the logged channels over
 stretches of half a second with the same commands, after the unknown state at the start of each
-stretch has been fitted away. Everything here is numpy and free of noise.
+stretch has been fitted away. Everything here is numpy and free of noise. The stretches are flown
+by the plant's own step (`eval/quadrotor/stepper.py`), one batch for all parameters: the oracle is
+independent of the diagnosis and its rollouts, not of the catalogue's equations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.quadrotor.plant import Command, Motion, Plant, Wrench, euler_step, make_plant
+from eval.quadrotor.plant import Motion, Plant, Wrench, euler_step, make_plant, unpacked
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.plans.follow import Recording
@@ -49,10 +51,10 @@ class Stretches(NamedTuple):
     """(W, 4) at the start [rad/s]."""
     history: np.ndarray
     """(W, 4, L) commands of the steps before, newest first."""
-    command: Command
-    """(S, W, ...)."""
-    acting: Command
-    """(S, W, ...) with what physics outside the catalogue made of it."""
+    command: np.ndarray
+    """(S, W, 4) thrust [m/s^2] and body rates [rad/s]."""
+    acting: np.ndarray
+    """(S, W, 4) with what physics outside the catalogue made of it."""
     extra: Wrench
     """(S, W, 3) of physics outside the catalogue."""
     voltage_drop: np.ndarray
@@ -84,40 +86,29 @@ def cut(
     steps = round(horizon_s / dt / period) * period
     room = round(ROOM_S / dt)
     stride = max(round(every_s / dt / period), 1) * period
-    parts: list[list[Any]] = []
-    for flight in recordings:
-        first = -(-room // period) * period
-        for start in range(first, len(flight.time_s) - steps, stride):
-            span, past = slice(start, start + steps), slice(start - room, start)
-            packed = np.concatenate([flight.acting.thrust[:, None], flight.acting.rate_b], axis=1)
-            parts.append(
-                [
-                    flight.time_s[start],
-                    *(field[start] for field in flight.motion),
-                    flight.rotor_speed[start],
-                    packed[past][::-1].T,
-                    flight.command.thrust[span],
-                    flight.command.rate_b[span],
-                    flight.acting.thrust[span],
-                    flight.acting.rate_b[span],
-                    flight.extra.force_b[span],
-                    flight.extra.torque_b[span],
-                    FULL_V - flight.voltage[span],
-                ]
-            )
-    heads = [np.stack([part[i] for part in parts]) for i in range(7)]
-    rows = [np.stack([part[i] for part in parts], axis=1) for i in range(7, 14)]
+    begins = [
+        (flight, start)
+        for flight in recordings
+        for start in range(-(-room // period) * period, len(flight.time_s) - steps, stride)
+    ]
+
+    def first(read: Callable[[Recording], np.ndarray]) -> np.ndarray:
+        return np.stack([read(flight)[start] for flight, start in begins])
+
+    def during(read: Callable[[Recording], np.ndarray]) -> np.ndarray:
+        return np.stack([read(flight)[start : start + steps] for flight, start in begins], axis=1)
+
     return Stretches(
         dt,
         period,
-        heads[0],
-        Motion(*heads[1:5]),
-        heads[5],
-        heads[6],
-        Command(rows[0], rows[1]),
-        Command(rows[2], rows[3]),
-        Wrench(rows[4], rows[5]),
-        rows[6],
+        first(lambda flight: flight.time_s),
+        Motion(*(first(lambda flight, k=k: flight.motion[k]) for k in range(4))),
+        first(lambda flight: flight.rotor_speed),
+        np.stack([f.acting.packed[start - room : start][::-1].T for f, start in begins]),
+        during(lambda flight: flight.command.packed),
+        during(lambda flight: flight.acting.packed),
+        Wrench(*(during(lambda flight, k=k: flight.extra[k]) for k in range(2))),
+        during(lambda flight: FULL_V - flight.voltage),
     )
 
 
@@ -140,52 +131,42 @@ def replay(
         draws: (S + 1, P, W, 3) normal draws for random wind.
     """
     start = stretches.motion if motion is None else motion
-    lead = np.broadcast_shapes(start.pos_w.shape[:-1], plant.constants.mass.shape)
-    if draws is not None:
-        lead = np.broadcast_shapes(lead, draws.shape[1:-1])
-    motion = Motion(*(np.broadcast_to(f, (*lead, *f.shape[_axes(i) :])) for i, f in _ends(start)))
+    shapes = [start.pos_w.shape[:-1], plant.constants.mass.shape]
+    lead = np.broadcast_shapes(*shapes, () if draws is None else draws.shape[1:-1])
+    motion = Motion(
+        *(np.broadcast_to(part, (*lead, *own)) for part, own in zip(start, _SHAPES, strict=True))
+    )
     room = plant.delay_weight.shape[-1]
-    wind = {}
-    if draws is not None:
-        for name, value in plant.effects.items():
-            gust = EFFECTS[name].gust
-            if gust is not None:
-                wind[name] = gust(value, draws[0])
+    gusts = {name: gust for name in plant.effects if (gust := EFFECTS[name].gust) is not None}
+    wind = {} if draws is None else {n: g(plant.effects[n], draws[0]) for n, g in gusts.items()}
     state = PlantState(
         np.broadcast_to(stretches.rotor_speed, (*lead, 4)),
         np.broadcast_to(stretches.history[..., :room], (*lead, 4, room)),
         wind,
     )
     acc_b = np.zeros((*lead, 3))
-    kept = []
-    given = stretches.acting if outside else stretches.command
-    steps = len(given.thrust)
-    for step in range(steps + 1):
-        if step % stretches.period == 0:
-            # The first row has no step before it: its accelerometer says nothing.
-            kept.append((*motion, acc_b, state.rotor_speed))
-        if step == steps:
-            break
-        command = Command(
-            np.broadcast_to(given.thrust[step], lead),
-            np.broadcast_to(given.rate_b[step], (*lead, 3)),
-        )
+    # The first row has no step before it: its accelerometer says nothing.
+    kept = [(*motion, acc_b, state.rotor_speed)]
+    for step, given in enumerate(stretches.acting if outside else stretches.command):
         inputs = Inputs(
-            command,
+            unpacked(np.broadcast_to(given, (*lead, 4))),
             noise=None if draws is None else draws[step + 1],
             voltage_drop=stretches.voltage_drop[step] if has_voltage else None,
         )
         time_s = stretches.start_s + step * stretches.dt
         state, wrench = plant_step(plant, state, motion, inputs, time_s)
         if outside:
-            wrench = Wrench(
-                wrench.force_b + stretches.extra.force_b[step],
-                wrench.torque_b + stretches.extra.torque_b[step],
-            )
+            added = (part[step] for part in stretches.extra)
+            wrench = Wrench(*(one + two for one, two in zip(wrench, added, strict=True)))
         acc_b = wrench.force_b / plant.constants.mass[..., None]
         motion = euler_step(plant, motion, wrench)
-    pos_w, rot_w, vel_w, rate_b, acc_b, speed = (np.stack(part) for part in zip(*kept, strict=True))
-    return Channels(pos_w, rot_w, vel_w, rate_b, acc_b, speed)
+        if (step + 1) % stretches.period == 0:
+            kept.append((*motion, acc_b, state.rotor_speed))
+    return Channels(*(np.stack(part) for part in zip(*kept, strict=True)))
+
+
+_SHAPES = ((3,), (3, 3), (3,), (3,))
+"""Of a body's motion: position, body to world, velocity, body rates."""
 
 
 def whitened(sensors: Sensors, channels: Channels, base: Channels) -> np.ndarray:
@@ -193,29 +174,19 @@ def whitened(sensors: Sensors, channels: Channels, base: Channels) -> np.ndarray
 
     `base` may lack leading axes that `channels` has.
     """
-
-    def apart(new: np.ndarray, old: np.ndarray) -> np.ndarray:
-        return new - old.reshape(len(old), *(1,) * (new.ndim - old.ndim), *old.shape[1:])
-
-    old_rot = base.rot_w.reshape(
-        len(base.rot_w), *(1,) * (channels.rot_w.ndim - base.rot_w.ndim), *base.rot_w.shape[1:]
-    )
-    turn = np.matmul(np.swapaxes(old_rot, -1, -2), channels.rot_w)
+    more = (1,) * (channels.pos_w.ndim - base.pos_w.ndim)
+    old = Channels(*(part.reshape(len(part), *more, *part.shape[1:]) for part in base))
+    turn = np.matmul(np.swapaxes(old.rot_w, -1, -2), channels.rot_w)
     angle = 0.5 * np.stack(
-        [
-            turn[..., 2, 1] - turn[..., 1, 2],
-            turn[..., 0, 2] - turn[..., 2, 0],
-            turn[..., 1, 0] - turn[..., 0, 1],
-        ],
-        axis=-1,
+        [turn[..., k, j] - turn[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=-1
     )
     parts = [
-        (apart(channels.pos_w, base.pos_w), sensors.pos),
+        (channels.pos_w - old.pos_w, sensors.pos),
         (angle, sensors.attitude),
-        (apart(channels.rate_b, base.rate_b), sensors.gyro),
-        (apart(channels.vel_w, base.vel_w), sensors.vel),
-        (apart(channels.acc_b, base.acc_b), sensors.acc),
-        (apart(channels.rotor_speed, base.rotor_speed), sensors.rotor),
+        (channels.rate_b - old.rate_b, sensors.gyro),
+        (channels.vel_w - old.vel_w, sensors.vel),
+        (channels.acc_b - old.acc_b, sensors.acc),
+        (channels.rotor_speed - old.rotor_speed, sensors.rotor),
     ]
     both = np.concatenate([part / sigma for part, sigma in parts if sigma], axis=-1)
     both = np.moveaxis(both, 0, -2)
@@ -227,17 +198,13 @@ def state_columns(
 ) -> np.ndarray:
     """Return (W, D, 12): an orthonormal basis of what an unknown start can explain."""
     motion = stretches.motion
-    step = STATE_STEP * np.eye(3)[:, None, :]
-    still = np.zeros((3, 1, 3))
-
-    def stacked(part: int) -> np.ndarray:
-        return np.concatenate([step if i == part else still for i in range(4)])
-
+    # One row of 12 for each axis of position, attitude, velocity and body rates.
+    moves = STATE_STEP * np.eye(12).reshape(12, 4, 1, 3)
     moved = Motion(
-        motion.pos_w + stacked(0),
-        np.matmul(motion.rot_w, exp_rot(stacked(1) + 0.0 * motion.pos_w)),
-        motion.vel_w + stacked(2),
-        motion.rate_b + stacked(3),
+        motion.pos_w + moves[:, 0],
+        np.matmul(motion.rot_w, exp_rot(moves[:, 1] + 0.0 * motion.pos_w)),
+        motion.vel_w + moves[:, 2],
+        motion.rate_b + moves[:, 3],
     )
     columns = whitened(sensors, replay(stretches, plant, moved), base) / STATE_STEP
     return np.linalg.qr(np.moveaxis(columns, 0, -1))[0]
@@ -257,11 +224,3 @@ def stretch_plant(vehicle: Vehicle, effects: Mapping[str, Any] | None = None) ->
     dt = 1.0 / vehicle.controller.frequency
     room = float(make_plant(vehicle, dt).constants.delay) + DELAY_STEP_S
     return make_plant(vehicle, dt, effects, min(room, ROOM_S - 2.0 * dt))
-
-
-def _ends(motion: Motion) -> list[tuple[int, np.ndarray]]:
-    return list(enumerate(motion))
-
-
-def _axes(index: int) -> int:
-    return -2 if index == 1 else -1

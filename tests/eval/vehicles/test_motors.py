@@ -42,9 +42,12 @@ def test_motors_come_back_from_a_file_and_wrong_ones_are_refused():
     table = vehicle_table(crazyflie)
     assert parse_vehicle(table) == crazyflie
     for motors, reason in (
-        ({"thrust": [0.1, 0.1]}, "motors.voltage: missing"),
+        ({"thrust": [0.1, 0.1]}, r"\[motors\] has no 'voltage'"),
         ({"thrust": [0.1, -0.1], "voltage": 4.0}, "must grow"),
-        ({"thrust": [0.1, 0.1], "voltage": 4.0, "volts": 1.0}, "motors.volts: unknown key"),
+        (
+            {"thrust": [0.1, 0.1], "voltage": 4.0, "volts": 1.0},
+            "Did you mean 'voltage'",
+        ),
     ):
         with pytest.raises(ValueError, match=reason):
             parse_vehicle({**table, "motors": motors})

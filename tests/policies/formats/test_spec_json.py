@@ -42,5 +42,5 @@ def test_a_checkpoint_without_the_keys_sees_one_gate_with_the_usual_channels():
 @pytest.mark.parametrize("value", [1, "yes", None])
 def test_the_key_is_true_or_false(value):
     stored = json.loads(json.dumps({**spec_to_json(SPEC), "second_gate": value}))
-    with pytest.raises(PolicyError, match=r"second_gate is .*expected true or false"):
+    with pytest.raises(PolicyError, match=r"second_gate is .*allowed is true or false"):
         spec_from_json(stored, "here")
