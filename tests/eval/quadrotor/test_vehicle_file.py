@@ -177,7 +177,7 @@ def test_unreadable_files_are_refused(tmp_path):
     with pytest.raises(VehicleFileError, match="is not TOML"):
         load_vehicle(path)
     path.write_text("mass = " + "9" * 400)
-    with pytest.raises(VehicleFileError, match="mass|missing"):
+    with pytest.raises(VehicleFileError, match="mass|has no 'name'"):
         load_vehicle(path)
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(VehicleFileError, match="is not TOML"):
