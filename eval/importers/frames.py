@@ -3,6 +3,9 @@
 A north-east-down world becomes north-west-up, and a forward-right-down body forward-left-up, by
 half a turn about x: y and z change their sign. Motion capture with y up (OptiTrack's default)
 becomes z up by a quarter turn about x: z_up = y, y_left = -z.
+
+Logs have rows without an attitude, NaN or all zero, which scipy's `Rotation` refuses as quaternions;
+so products and rotation vectors are written out here.
 """
 
 from __future__ import annotations
@@ -66,13 +69,9 @@ def attitude(quat_wxyz: np.ndarray, world: str, body: str) -> np.ndarray:
 
 def from_euler(roll_pitch_yaw: np.ndarray) -> np.ndarray:
     """Return quaternions wxyz (..., 4) of roll, pitch, yaw (..., 3) [rad]: about z, y', x''."""
-    half = 0.5 * roll_pitch_yaw
-    cos, sin = np.cos(half), np.sin(half)
-    zero = np.zeros_like(half[..., 0])
-    x = np.stack([cos[..., 0], sin[..., 0], zero, zero], axis=-1)
-    y = np.stack([cos[..., 1], zero, sin[..., 1], zero], axis=-1)
-    z = np.stack([cos[..., 2], zero, zero, sin[..., 2]], axis=-1)
-    return multiply(multiply(z, y), x)
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler("ZYX", roll_pitch_yaw[..., ::-1]).as_quat(scalar_first=True)
 
 
 def rotation_vector(quat_wxyz: np.ndarray) -> np.ndarray:
