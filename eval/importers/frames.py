@@ -4,8 +4,8 @@ A north-east-down world becomes north-west-up, and a forward-right-down body for
 half a turn about x: y and z change their sign. Motion capture with y up (OptiTrack's default)
 becomes z up by a quarter turn about x: z_up = y, y_left = -z.
 
-Logs have rows without an attitude, NaN or all zero, which scipy's `Rotation` refuses as quaternions;
-so products and rotation vectors are written out here.
+Logs have rows without an attitude, NaN or all zero, which scipy's `Rotation` refuses; so products
+of quaternions and rotation vectors are written out here.
 """
 
 from __future__ import annotations

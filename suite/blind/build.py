@@ -198,12 +198,16 @@ def _outside(
     """
     name, nominal = case.hidden[0], simulator.judged
     kind = KINDS[name]
-    trial = simulator.fly(simulator.given, ways, rng, make_outside(name, kind.usual, nominal.mass))
-    rest = unnameable(nominal, trial.recordings, sensors)
+
+    def flown_at(strength: float) -> tuple[Flights, float]:
+        extra = make_outside(name, strength, nominal.mass)
+        flown = simulator.fly(simulator.given, ways, rng, extra)
+        return flown, unnameable(nominal, flown.recordings, sensors)
+
+    _, rest = flown_at(kind.usual)
     wanted = case.multiple * kind.usual * np.sqrt(THRESHOLD / max(rest, 1e-9))
     strength = float(np.clip(wanted, 0.2 * kind.usual, kind.most))
-    flown = simulator.fly(simulator.given, ways, rng, make_outside(name, strength, nominal.mass))
-    rest = unnameable(nominal, flown.recordings, sensors)
+    flown, rest = flown_at(strength)
     pushed = np.concatenate([flight.extra.force_b for flight in flown.recordings]) / nominal.mass
     answer = {
         "kind": case.kind,

@@ -68,12 +68,12 @@ def make_set(
     cases = DRAWERS[simulator](seed, count)
     about = {"seed": seed, "count": count, "simulator": simulator, "strengths": _hash(TABLE)}
     _same_set(out, about)
-    missing = {
-        name: case
-        for name, case in cases.items()
+    names = [
+        name
+        for name in cases
         if not ((out / "cases" / name).is_dir() and (out / "answers" / f"{name}.json").is_file())
-    }
-    names, failed = list(missing), dict[str, str]()
+    ]
+    failed: dict[str, str] = {}
     with console.progress("cases", len(cases)) as update:
 
         def keep(number: int, built: Built | str) -> None:
@@ -89,7 +89,7 @@ def make_set(
                     write_flight(beside / f"{log.name}.parquet", log)
             update(len(cases) - len(names) + number + 1, name)
 
-        work_off(_build, missing.values(), workers or 1, keep)
+        work_off(_build, [cases[name] for name in names], workers or 1, keep)
     made = [name for name in cases if name not in failed]
     manifest = Manifest(
         {
@@ -141,33 +141,30 @@ def open_answers(out: Path) -> dict[str, dict[str, Any]]:
     manifest = load_manifest(out)
     answers = {}
     for name, files in manifest.cases.items():
-        for file, digest in files.items():
-            _check(out / "cases" / name / file, digest)
-        path = out / "answers" / f"{name}.json"
-        _check(path, manifest.answers[name])
-        answers[name] = read_json(path)
+        answer = out / "answers" / f"{name}.json"
+        made = {out / "cases" / name / file: digest for file, digest in files.items()}
+        for path, digest in {**made, answer: manifest.answers[name]}.items():
+            if not path.is_file() or _hash(path) != digest:
+                raise ValueError(
+                    f"{path}: not the file that the manifest was made with; make the set again "
+                    "elsewhere"
+                )
+        answers[name] = read_json(answer)
     return answers
-
-
-def _check(path: Path, digest: str) -> None:
-    if not path.is_file() or _hash(path) != digest:
-        raise ValueError(
-            f"{path}: not the file that the manifest was made with; make the set again elsewhere"
-        )
 
 
 def _same_set(out: Path, wanted: dict[str, Any]) -> None:
     path = out / "set.json"
-    if path.is_file():
-        there = read_json(path)
-        for key, value in wanted.items():
-            if there.get(key) != value:
-                raise ValueError(
-                    f"{path}: {key} is {there.get(key)!r} there, {value!r} here; "
-                    "give another --out, or the same options to go on"
-                )
+    there = read_json(path) if path.is_file() else None
+    if there is None:
+        write_json(path, {**stamp(SCHEMA, wanted["seed"]), **wanted})
         return
-    write_json(path, {**stamp(SCHEMA, wanted["seed"]), **wanted})
+    for key, value in wanted.items():
+        if there.get(key) != value:
+            raise ValueError(
+                f"{path}: {key} is {there.get(key)!r} there, {value!r} here; "
+                "give another --out, or the same options to go on"
+            )
 
 
 def _hash(path: Path) -> str:

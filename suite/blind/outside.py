@@ -50,13 +50,10 @@ class SlungLoad(Outside):
 
     LENGTH_M, STIFFNESS, DAMPING = 0.4, 60.0, 0.3
 
-    def __init__(self, strength: float, mass: float) -> None:
-        """Prepare; the load hangs at rest when the flight starts."""
-        super().__init__(strength, mass)
-        self._pos_w = self._vel_w = np.zeros(0)
+    _pos_w = _vel_w = np.zeros(0)
 
     def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return the line's pull, and move the load."""
+        """Return the line's pull, and move the load, which hangs at rest at the start."""
         if not self._pos_w.size:
             stretch = self.strength * GRAVITY / self.STIFFNESS
             self._pos_w = motion.pos_w - np.array([0.0, 0.0, self.LENGTH_M + stretch])
@@ -73,12 +70,9 @@ class SlungLoad(Outside):
 
 
 class Hysteresis(Outside):
-    """Backlash of `strength` m/s^2 in the collective thrust."""
+    """Backlash of `strength` m/s^2 in the collective thrust; the play starts in its middle."""
 
-    def __init__(self, strength: float, mass: float) -> None:
-        """Prepare; the play starts in its middle."""
-        super().__init__(strength, mass)
-        self._acting = np.zeros(0)
+    _acting = np.zeros(0)
 
     def command(self, command: Command, time_s: float) -> Command:
         """Return the thrust that follows only when it is pushed by the play's edges."""
