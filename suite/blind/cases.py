@@ -150,10 +150,12 @@ def _share_of(count: int | None, full: int) -> float:
 def _singles(rng: np.random.Generator, seed: int, share: float) -> list[Case]:
     wanted = [((name,), multiple) for multiple in MULTIPLES for name in nameable_effects()]
     keep = max(round(share * len(wanted)), 1)
-    return [
-        Case("single", *wanted[index], *_equipment(rng, wanted[index][0]), (seed, 10_000 + index))
-        for index in sorted(rng.permutation(len(wanted))[:keep])
-    ]
+    found = []
+    for index in sorted(rng.permutation(len(wanted))[:keep]):
+        names, multiple = wanted[index]
+        own = (seed, 10_000 + index)
+        found.append(Case("single", names, multiple, *_equipment(rng, names), own))
+    return found
 
 
 def _drawn(rng: np.random.Generator, kind: str, index: int, number: tuple[int, int]) -> Case:

@@ -94,10 +94,11 @@ class Table:
             # A list in a list has a place of its own in the message.
             inner = get_origin(parts[0]) is tuple
             return tuple(self._typed(f"{key}[{i}]" if inner else key, v, k) for i, (v, k) in both)
-        good = isinstance(value, kind) if kind in (bool, str) else is_number(value)
-        if not good or value == "" or (kind is int and value != int(value)):
+        plain: Any = kind
+        good = isinstance(value, plain) if plain in (bool, str) else is_number(value)
+        if not good or value == "" or (plain is int and value != int(value)):
             raise self.error(key, value, _words(kind))
-        return kind(value)
+        return plain(value)
 
     def has(self, key: str) -> bool:
         """Return whether the key is there; asking makes it known."""

@@ -157,7 +157,7 @@ def gust_strength(
     wind = EFFECTS[name].values(1.0, *neutral(EFFECTS[name], nominal)[1:])
     plant = stretch_plant(nominal, {**nominal.effects, name: wind})
     count = len(stretches.start_s)
-    draws = rng.standard_normal((len(stretches.command.thrust) + 1, GUST_DRAWS, count, 3))
+    draws = rng.standard_normal((len(stretches.command) + 1, GUST_DRAWS, count, 3))
     channels = replay(stretches, plant, has_voltage=bool(sensors.voltage), draws=draws)
     moved = without_start(basis, whitened(sensors, channels, base))
     gram = np.einsum("kwd,lwd->wkl", moved, moved) / GUST_DRAWS

@@ -28,7 +28,7 @@ def test_stretches_start_after_the_commands_that_a_delay_may_need(flight):
     stretches = cut([flight])
     # 1000 steps of 2 ms, 25 of room, then every 250 while 250 are left.
     np.testing.assert_allclose(stretches.start_s, 0.002 * np.array([25, 275, 525]))
-    assert stretches.command.thrust.shape == (250, 3) and stretches.history.shape == (3, 4, 25)
+    assert stretches.command.shape == (250, 3, 4) and stretches.history.shape == (3, 4, 25)
     np.testing.assert_array_equal(stretches.history[1, 0, :2], flight.acting.thrust[[274, 273]])
 
 
