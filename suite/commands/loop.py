@@ -77,7 +77,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """
     from suite.loop.config import resolve
     from suite.loop.run import run_loop
-    from suite.train.presets import doubt_of
+    from suite.train.presets import fresh_start_note
 
     workers = asked_workers(config.workers, whole_cores=True)
     resolved = resolve(
@@ -96,6 +96,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         delta=config.delta,
         changes=config.set,
     )
-    if resolved.policy is None and config.preset and (doubt := doubt_of(config.preset, "--policy")):
-        console.note(doubt)
+    if resolved.policy is None and config.preset:
+        warning = fresh_start_note(config.preset, "--policy")
+        if warning:
+            console.note(warning)
     return run_loop(resolved, config.out, console, workers)

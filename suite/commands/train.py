@@ -13,7 +13,7 @@ from suite.common.running.hosts import Joined, join, member
 from suite.common.work import Silent
 from suite.train.config import TrainConfig, check
 from suite.train.overrides import override
-from suite.train.presets import chosen_model, doubt_of, preset, with_iterations
+from suite.train.presets import chosen_model, fresh_start_note, preset, with_iterations
 from tracks.common.files import check_no_input, plain
 from tracks.input.ranges import Iterations, Seed
 
@@ -27,9 +27,9 @@ class Config:
     with the paper's 12 numbers), swift (with 18), swift-quad (with --from swift), swift-30 (with
     --from swift-quad), swift-ahead (with --from swift-30), swift-sure or swift-keen (with
     --from swift-ahead), small, gpu or paper."""
-    model: Literal["point", "quad", "fleet"] | None = None
-    """What flies in training: the point mass, the quadrotor of --vehicle with its effects, or
-    quadrotors of a class, drawn anew for every world; the recipe's own if not given."""
+    model: Literal["point", "quad"] | None = None
+    """What flies in training: the point mass, or the quadrotor of --vehicle with its effects; the
+    recipe's own if not given."""
     vehicle: str | None = None
     """What the training's quadrotors are drawn around: a shipped vehicle's name or a vehicle file
     (.toml); with --model quad, or with a preset that trains through quadrotors."""
@@ -93,8 +93,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.train.run import started_from, train
 
     resolved = resolve(config)
-    if config.from_ is None and (doubt := doubt_of(config.preset, "--from")):
-        console.note(doubt)
+    if config.from_ is None and (warning := fresh_start_note(config.preset, "--from")):
+        console.note(warning)
     params, delta = None, None
     if config.from_ is not None:
         # What is trained is written to out/policy, which nothing there may yet say is another run.
@@ -103,10 +103,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         params = started_from(config.from_, resolved.spec)
     if config.delta is not None:
         stored = load_delta(config.delta)
-        if resolved.fleet is not None:
-            raise ValueError(
-                "--delta corrects one vehicle's dynamics, and a fleet is many: add --model point"
-            )
         dynamics = resolved.quadrotor or resolved.physics
         fit = stored.config.get("fit", {})
         check_corrects(fit, dynamics, resolved.spec.rate_hz, config.delta)

@@ -85,7 +85,7 @@ def replay(
             time_step=time_step,
             delay=jnp.broadcast_to(model.delay, count),
         )
-        body = point_mass.step(body, constants, action + correction, body.pos_w, 0.0, 0.0)
+        body = point_mass.step(body, constants, action + correction, body.pos_w, 0.0)
         body = body._replace(
             heading_w=heading,
             rot_w=point_mass.attitude(jax.lax.stop_gradient(body.thrust_w), heading),

@@ -104,7 +104,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     worth = worth_of(still, tested, [len(share) for share in shares.values()])
     facts = {
         "recipe": f"{options.recipe_words(config)}, {recipe.optimizer.iterations} gradient steps",
-        RANDOMISED: spreads.words(recipe),
+        RANDOMISED: ", ".join(spreads.spreads(recipe)),
         FIXED: "none of that",
         "training seeds": " ".join(map(str, seeds)),
         "trained at commit": training.commits(runs),

@@ -220,8 +220,7 @@ def resolve(
         given = load_policy_checkpoint(checkpoint_folder(policy))
         training = replace(at_rate(training, given.spec.rate_hz), spec=given.spec)
         digests["policy"] = policy_digest(policy)
-    # A Delta Action Model corrects one vehicle's dynamics, and a fleet is many.
-    tuning = replace(finetune(training), fleet=None)
+    tuning = finetune(training)
     longer = size.finetune_iterations if finetune_iterations is None else finetune_iterations
     if longer is not None:
         tuning = with_iterations(tuning, longer)

@@ -8,7 +8,6 @@ from typing import Annotated
 
 from eval.vehicles.vehicle import Vehicle
 from policies.spec import PolicySpec, check_network, check_spec
-from suite.train.dynamics.fleet import FleetConfig
 from tracks.input.ranges import Iterations, Range, Seed, Share, check_ranges
 
 COM_STD_MOST, TRIM_STD_MOST = 0.02, 0.2
@@ -44,13 +43,9 @@ class PointMassConfig:
     """Age of the image that the policy sees [policy periods]."""
     depth_noise: Annotated[float, Range(0.0, 10.0)] = 0.02
     """Standard deviation of the noise on the encoded inverse depth [1]."""
-    rays: Annotated[int, Range(1, 8)] = 1
-    """Rays across and down a pixel in training; in flight the camera casts its own."""
     fov_scale: Annotated[tuple[float, float], Range(0.1, 10.0, ordered=True)] = (0.95, 1.05)
     """Range by which the images' half widths, as tangents, are scaled: the field of view, drawn per
     iteration [1]."""
-    heading_rate: Annotated[float, Range(0.0, 1000.0)] = 6.0
-    """Rate at which the heading follows the direction to the gate [1/s]."""
 
 
 @dataclass(frozen=True)
@@ -111,9 +106,9 @@ class LossConfig:
     progress: Annotated[float, Range(0.0, 1e6)] = 1.2
     """lambda_p of L_p [s/m]."""
     speed_range: Annotated[tuple[float, float], Range(0.1, 100.0, ordered=True)] = (1.5, 7.0)
-    """Speeds that a policy with `spec.speed_input` is asked for by 0 and by 1, and evenly between:
-    progress counts up to it, and what is faster costs as much as progress is worth; at 1 nothing
-    does [m/s]."""
+    """Speeds that the input of a policy with `spec.speed_input` means from 0 up to 1, linearly:
+    progress counts up to it, and what is faster costs as much as progress is worth; at 1 there is
+    no limit [m/s]."""
     progress_norm: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Weight of L_p^norm, the ablation's direction-only progress [1]."""
     projection: Annotated[float, Range(0.0, 1e6)] = 0.0
@@ -127,42 +122,20 @@ class LossConfig:
     backwards to the one that was passed: faster, and less careful at these weights."""
     projection_decay: Annotated[float, Range(0.0, 1000.0)] = 0.5
     """beta_3 of L_proj [1/m]."""
-    barrier_height: Annotated[float, Range(0.0, 1e6)] = 2.0
-    """beta_1 of L_clearance [1]."""
-    barrier_slope: Annotated[float, Range(-1e4, 0.0)] = -32.0
-    """beta_2 of L_clearance [1/m]."""
     safety_radius_m: Annotated[float, Range(0.0, 10.0)] = 0.2
     """r_q, the drone's radius with its margin [m]."""
     field_gain: Annotated[float, Range(0.0, 1e6)] = 10.0
     """Gradient per step, of the loss before averaging over time and batch, that u_A adds at the
     centre of a 1 m gate to a velocity across it [1/m]; 0 turns the field off."""
-    field_square: bool = False
-    """Whether every gate pulls as the square around its opening would, whatever its shape."""
-    field_decay: Annotated[float, Range(0.0, 1000.0, above=True)] = 0.3
-    """lambda_A, how slowly u_A falls with distance [1]."""
     gradient_decay: Annotated[float, Range(0.0, 1000.0)] = 0.916
     """alpha, the rate at which gradients of position and velocity fade back in time [1/s]."""
     crash_depth_m: Annotated[float, Range(0.0, math.inf)] = 0.0
     """A world that gets deeper than this into a solid leaves the loss for the rest of the rollout:
     from there on its gradients say nothing about flying [m]."""
-    survival: Annotated[float, Range(0.0, 1e6)] = 0.0
-    """Price of a crash, as a weight of the progress that it costs later [s/m]; 0: none. At the
-    weight of `progress` a crash costs what the way lost is worth."""
-    value: Annotated[float, Range(0.0, 1e6)] = 0.0
-    """Weight of the progress that a critic expects after the rollout [s/m]; 0: none, and no critic
-    learns. At the weight of `progress` a way is worth the same after the rollout's end as before;
-    a world that will crash there has little to come, and one that `episode.stop_from` stops on the
-    way has nothing."""
-    survival_width_m: Annotated[float, Range(1e-3, 10.0)] = 0.04
-    """How far from contact with the body the probability to fly on begins to fall [m]."""
     tilt: Annotated[float, Range(0.0, 1e6)] = 0.0
-    """Weight of L_tilt, which grows from 0 at `tilt_from_deg` to 1 where body z is level: the judge
-    ends a trial beyond, and above 0 such a world leaves the loss. It has a gradient through
+    """Weight of L_tilt, which grows from 0 at a tilt of 65 degrees to 1 where body z is level: the
+    judge ends a trial beyond, and above 0 such a world leaves the loss. It has a gradient through
     quadrotors only; a point mass has no attitude to learn [1]."""
-    tilt_from_deg: Annotated[float, Range(0.0, 90.0, below=True)] = 65.0
-    """Tilt from which on L_tilt counts [deg]."""
-    path_samples: Annotated[int, Range(1, 1000)] = 4
-    """Points of every step's path at which the nearest obstacle is looked up."""
 
 
 @dataclass(frozen=True)
@@ -180,8 +153,6 @@ class EpisodeConfig:
     """Gates of a track, the first so many of those that it is made with, at most 8."""
     difficulty: Annotated[tuple[float, float], Range(0.0, 1.0, ordered=True)] = (0.0, 1.0)
     """Range of the tracks' difficulty."""
-    easy_until: Share = 0.0
-    """Share of training during which the range of difficulty grows from its lower end."""
     rest_share: Share = 0.3
     """Share of worlds that start at rest at the track's start; the others start on the way, with a
     recurrent state from a random step of the last rollout."""
@@ -200,53 +171,18 @@ class EpisodeConfig:
     """Range of the obstacles' density as a share of the judged families'."""
     bare_share: Share = 0.2
     """Share of tracks without obstacles."""
-    beside_m: Annotated[tuple[float, float], Range(0.1, 100.0, ordered=True)] = (2.0, 4.0)
-    """How far beside the straight lines between gates obstacles stand at most, drawn for every
-    track: the nearer, the more of them stand in the way [m]."""
     finish: bool = False
     """Whether a world leaves the loss as it passes its last gate. If not, it is to fly on to a
     point 10 m beyond, so that speed is worth more at the last gate than at the others."""
     height_spread: Annotated[float, Range(0.0, 100.0)] = 1.0
     """How far gates' heights lie apart before they are held to 0.8 to 2.2 m, as a share of what is
     usual for a difficulty: with 2 they lie about as far apart as those of circles and ellipses."""
-    live_on: Share = 0.0
-    """Share of the worlds still flying at the end of a rollout that the next rollout goes on with,
-    in the place of fresh ones."""
-    again: Share = 0.0
-    """Share of the worlds that crash which the next rollout goes on with from before the crash: the
-    tracks, vehicles and places where the policy fails."""
-    again_before_s: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (1.0, 2.0)
-    """How long before the crash that is, drawn for every world [s]."""
-    gate_corners: Annotated[int, Range(3, 12)] = 4
-    """Corners of the gates' openings: 4 for squares, more for rounder gates of the same width. Each
-    is a bar, and an image shows the nearest 24 bars and plates: two gates of 12 corners."""
     race_share: Share = 0.5
-    """Share of worlds in which a policy with `spec.speed_input` is asked for 1; in the others it is
-    asked for anything from 0 to 1."""
+    """Share of worlds in which the input of a policy with `spec.speed_input` is 1; in the others it
+    is drawn from 0 to 1."""
     hairpin_share: Share = 0.0
     """Share of tracks with one or two gates that are met nearly from the side and left backwards,
     as at the apexes of the hardest ellipses."""
-
-    @property
-    def carries(self) -> bool:
-        """Whether worlds outlive a rollout."""
-        return self.live_on > 0.0 or self.again > 0.0
-
-
-@dataclass(frozen=True)
-class CriticConfig:
-    """The critic of `loss.value`: what it learns is the mean progress to come, in m/s."""
-
-    horizon_s: Annotated[float, Range(0.0, 1e4, above=True)] = 2.0
-    """Progress later than about this counts little: its weight falls by e in this time [s]."""
-    trace: Share = 0.95
-    """lambda of the returns that it learns (Sutton and Barto 2018, Sec. 12.1) [1]."""
-    size: Annotated[int, Range(1, 8192)] = 128
-    """Width of its two hidden layers."""
-    rate: Annotated[float, Range(0.0, 10.0)] = 1e-3
-    """Adam's learning rate."""
-    passes: Annotated[int, Range(1, 10_000)] = 16
-    """Steps of Adam after each rollout, over all of it; it sees no images, so they cost little."""
 
 
 @dataclass(frozen=True)
@@ -257,12 +193,8 @@ class OptimizerConfig:
     """Gradient steps."""
     rate: Annotated[float, Range(0.0, 10.0)] = 2e-3
     """Peak learning rate."""
-    rate_end: Annotated[float, Range(0.0, 10.0)] = 1e-5
-    """Learning rate at the end."""
     warmup: Annotated[int, Range(0, 10**9)] = 20
     """Iterations of linear warm-up; the first of them changes nothing."""
-    weight_decay: Annotated[float, Range(0.0, 10.0)] = 1e-2
-    """AdamW's decoupled weight decay."""
     memory: Annotated[float, Range(0.0, 1.0, below=True)] = 0.99
     """Adam's beta_2: short, because the first crashes' gradients are ten times all later ones."""
     clip: Annotated[float, Range(0.0, 1e12)] = 1.0
@@ -279,16 +211,12 @@ class TrainConfig:
     """Dynamics and their randomisation."""
     quadrotor: QuadrotorConfig | None = None
     """Train through this quadrotor; None: through the point mass of `physics`."""
-    fleet: FleetConfig | None = None
-    """Train through quadrotors drawn from this distribution, in the place of either."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Weights of the loss and of the field."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
     """Worlds and horizon."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Optimiser and its schedule."""
-    critic: CriticConfig = field(default_factory=CriticConfig)
-    """Of `loss.value`, where that is not 0."""
     seed: Seed = 0
     """Seed of the parameters, the tracks and the randomisation."""
     devices: Annotated[int, Range(1, 4096)] | None = None
@@ -323,28 +251,8 @@ def check(config: TrainConfig) -> None:
 
         check_vehicle(config.quadrotor.vehicle)
         check_decides_in_time(config.spec, config.quadrotor.vehicle)
-    if config.fleet is not None and config.quadrotor is not None:
-        raise ValueError("a run has a fleet or one vehicle's quadrotor, and this one has both")
-    _check_beyond(config)
     stride, steps = config.episode.image_stride, config.episode.steps
     if steps % stride:
         raise ValueError(
             f"episode.image_stride is {stride}, allowed are divisors of episode.steps ({steps})"
-        )
-
-
-def _check_beyond(config: TrainConfig) -> None:
-    """Refuse what comes after a rollout where nothing crashes or no rollout is long enough."""
-    loss, episode = config.loss, config.episode
-    for name, value in (("loss.value", loss.value), ("episode.again", episode.again)):
-        if value > 0.0 and math.isinf(loss.crash_depth_m):
-            raise ValueError(
-                f"{name} is {value:g} and loss.crash_depth_m is inf, by which no world crashes "
-                "into anything; allowed is a finite one, such as 0"
-            )
-    least, length = episode.again_before_s[0], episode.steps / config.spec.rate_hz
-    if episode.again > 0.0 and least >= length:
-        raise ValueError(
-            f"episode.again_before_s begins at {least:g} s, allowed is less than the {length:g} s "
-            "of a rollout"
         )

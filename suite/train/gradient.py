@@ -10,10 +10,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from policies.networks import delta_network, network
-from suite.train.beyond import critic
-from suite.train.beyond.value import Way, to_come
 from suite.train.config import TrainConfig
-from suite.train.dynamics.interface import DynamicsState
 from suite.train.rollout import StepRecord, make_rollout
 from suite.train.worlds import Worlds
 
@@ -24,12 +21,6 @@ CHUNK = 320
 def _chunk(count: int) -> int:
     """Return the largest divisor of count that is at most CHUNK."""
     return max(size for size in range(1, min(count, CHUNK) + 1) if count % size == 0)
-
-
-def every(stride: int, first: jax.Array, array: jax.Array) -> jax.Array:
-    """Return one in `stride` of the rows of an array (T, ...), from row `first` on."""
-    split = array.reshape(-1, stride, *array.shape[1:])
-    return jax.lax.dynamic_index_in_dim(split, first, axis=1, keepdims=False)
 
 
 def encoder_gradient(
@@ -76,65 +67,32 @@ def sampled_encoder_gradient(
         key: picks the first step.
     """
     first = jax.random.randint(key, (), 0, stride)
-    images, cotangents = (
-        every(stride, first, array).reshape(-1, *array.shape[2:])
-        for array in (images, stride * cotangents)
-    )
-    return encoder_gradient(params, images, cotangents)
 
+    def taken(array: jax.Array) -> jax.Array:
+        split = array.reshape(-1, stride, *array.shape[1:])
+        chosen = jax.lax.dynamic_index_in_dim(split, first, axis=1, keepdims=False)
+        return chosen.reshape(-1, *array.shape[2:])
 
-def seen_by_critic(
-    worlds: Worlds, before: DynamicsState, _: DynamicsState, target: jax.Array
-) -> jax.Array:
-    """Return what the critic sees at a step's beginning, (B, F)."""
-    return critic.features(worlds, before, target)
+    return encoder_gradient(params, taken(images), taken(stride * cotangents))
 
 
 def make_gradient(
     config: TrainConfig,
 ) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
-    """Return gradient(params, worlds, key, delta, critic_params) -> (gradient, loss, records).
-
-    It is that of one device. `critic_params` are there where `loss.value` asks for them; the
-    records then note the `Way` that it learns from.
-    """
+    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) of one device."""
     stride, steps = config.episode.image_stride, config.episode.steps
-    rollout = make_rollout(config, seen_by_critic if config.loss.value > 0.0 else None)
-    width = config.spec.hidden_size
+    rollout, width = make_rollout(config), config.spec.hidden_size
 
     def frozen_encode(params: network.Params, image: jax.Array) -> jax.Array:
         return jax.lax.stop_gradient(network.encode(params, image))
 
     def gradient(
-        params: network.Params,
-        worlds: Worlds,
-        key: jax.Array,
-        delta: delta_network.Params | None,
-        critic_params: critic.Params | None = None,
+        params: network.Params, worlds: Worlds, key: jax.Array, delta: delta_network.Params | None
     ) -> tuple[network.Params, jax.Array, StepRecord]:
         def flown(
             params: network.Params, embedding_shift: jax.Array
         ) -> tuple[jax.Array, StepRecord]:
-            loss, records, last = rollout(
-                params, embedding_shift, worlds, key, frozen_encode, delta
-            )
-            if critic_params is None:
-                return loss, records
-            seen = critic.features(worlds, last.state, last.target)
-            rest = last.alive * to_come(config, critic.value(critic_params, seen))
-            held = jax.lax.stop_gradient((seen, last.alive, rest))
-            # A world that leaves in the last step passed its last gate, and was not stopped.
-            number = jnp.arange(steps)[:, None]
-            stops = (number + 1 >= worlds.stop) & (number + 1 < steps)
-            way = Way(
-                seen=jnp.concatenate([records.noted, held[0][None]]),
-                worth=records.worth,
-                alive=jnp.concatenate([records.alive, held[1][None]]),
-                hit=records.hit,
-                stopped=(records.alive > 0) & stops,
-            )
-            terms = {**records.terms, "value": jnp.broadcast_to(held[2], records.alive.shape)}
-            return loss + rest.mean(), records._replace(terms=terms, noted=way)
+            return rollout(params, embedding_shift, worlds, key, frozen_encode, delta)
 
         embedding_shift = jnp.zeros((steps, worlds.pos_w.shape[0], width))
         (loss, records), (direct, cotangents) = jax.value_and_grad(
@@ -154,21 +112,17 @@ def shard_gradient(
     """Return the gradient shared by the devices of `mesh`, each with its part of the worlds.
 
     Returns:
-        gradient(params, worlds, key, delta, critic_params) -> (gradient, loss, records without
+        gradient(params, worlds, key, delta) -> (gradient, loss, records without
         images); gradient and loss are means over all worlds, the records are gathered.
     """
     local = make_gradient(config)
     axis = mesh.axis_names[0]
 
     def part(
-        params: network.Params,
-        worlds: Worlds,
-        key: jax.Array,
-        delta: delta_network.Params | None,
-        critic_params: critic.Params | None,
+        params: network.Params, worlds: Worlds, key: jax.Array, delta: delta_network.Params | None
     ) -> tuple[network.Params, jax.Array, StepRecord]:
         key = jax.random.fold_in(key, jax.lax.axis_index(axis))
-        gradient, loss, records = local(params, worlds, key, delta, critic_params)
+        gradient, loss, records = local(params, worlds, key, delta)
         records = records._replace(image=jnp.zeros((config.episode.steps, 1)))
         return jax.lax.pmean(gradient, axis), jax.lax.pmean(loss, axis), records
 
@@ -177,7 +131,7 @@ def shard_gradient(
     return jax.shard_map(
         part,
         mesh=mesh,
-        in_specs=(P(), worlds_spec, P(), P(), P()),
+        in_specs=(P(), worlds_spec, P(), P()),
         out_specs=(P(), P(), records_spec),
         check_vma=False,
     )

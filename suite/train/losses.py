@@ -15,8 +15,13 @@ import jax.numpy as jnp
 from suite.train.config import LossConfig
 from suite.train.step import Step, norm
 from tracks.geometry.field import CURRENT, attractive_field, magnetic_field
-from tracks.geometry.gates import rectangle
 
+BARRIER_HEIGHT, BARRIER_SLOPE = 2.0, -32.0
+"""beta_1 [1] and beta_2 [1/m] of L_clearance, as the paper prints them."""
+FIELD_DECAY = 0.3
+"""lambda_A, how slowly u_A falls with distance, as the paper prints it [1]."""
+TILT_FREE_DEG = 65.0
+"""Tilt up to which L_tilt is 0: fast turns need about this much [deg]."""
 UNIT_FIELD = 11.313708498984761
 """|B| / C_I at the centre of a square gate of 1 m: 8 sqrt(2) [1/m]."""
 MAX_PULL = 5.0
@@ -27,10 +32,14 @@ Term = Callable[[LossConfig, Step], jax.Array]
 """(shape of the term, step) -> the loss (B,), not weighted."""
 
 
-def clearance(config: LossConfig, step: Step) -> jax.Array:
+def barrier(step: Step) -> jax.Array:
+    """Return ln(1 + e^{beta_2 gap}) at the points of the path, (B, S) [1]."""
+    return jax.nn.softplus(BARRIER_SLOPE * step.gap)
+
+
+def clearance(_: LossConfig, step: Step) -> jax.Array:
     """Return L_clearance, the mean over the path [1]."""
-    barrier = config.barrier_height * jax.nn.softplus(config.barrier_slope * step.gap)
-    return barrier.mean(-1)
+    return (BARRIER_HEIGHT * barrier(step)).mean(-1)
 
 
 def collide(_: LossConfig, step: Step) -> jax.Array:
@@ -50,9 +59,9 @@ def jerk(_: LossConfig, step: Step) -> jax.Array:
     return (step.jerk_w * step.jerk_w).sum(-1)
 
 
-def tilt(config: LossConfig, step: Step) -> jax.Array:
-    """Return L_tilt, the square of how far body z is down from `tilt_from_deg` to level [1]."""
-    least = math.cos(math.radians(config.tilt_from_deg))
+def tilt(_: LossConfig, step: Step) -> jax.Array:
+    """Return L_tilt, the square of how far body z is down from `TILT_FREE_DEG` to level [1]."""
+    least = math.cos(math.radians(TILT_FREE_DEG))
     return (jnp.maximum(least - step.up, 0.0) / least) ** 2
 
 
@@ -63,10 +72,9 @@ def speed_to_goal(step: Step) -> jax.Array:
 
 
 def progress(config: LossConfig, step: Step) -> jax.Array:
-    """Return L_p, minus the speed towards the goal as far as it is asked for [m/s].
+    """Return L_p, minus the speed towards the goal, up to the commanded speed [m/s].
 
-    Beyond the speed that a world is asked for, more progress counts nothing and speed, whichever
-    way, costs.
+    Beyond the commanded speed more progress counts nothing, and speed in any direction costs.
     """
     if step.wanted is None:
         return -speed_to_goal(step)
@@ -86,29 +94,18 @@ def projection(config: LossConfig, step: Step) -> jax.Array:
     return (step.place_g[:, 1:] ** 2).sum(-1) * near
 
 
-def guidance(config: LossConfig, step: Step) -> jax.Array:
+def guidance(_: LossConfig, step: Step) -> jax.Array:
     """Return the term whose position gradient is -u_A / u_A(centre of a 1 m gate); 0 in value.
 
     At the wires the field has no bound, so its pull is held to MAX_PULL.
     """
     held_pos, held_vel = jax.lax.stop_gradient(step.pos_w), jax.lax.stop_gradient(step.vel_w)
     gate = step.gate
-    wires_g = _square_around(gate.opening_g) if config.field_square else gate.opening_g
-    field = magnetic_field(gate.center_w, gate.rot_w, wires_g, held_pos)
-    pull = attractive_field(field, held_vel, config.field_decay)
-    pull = pull / (CURRENT * UNIT_FIELD) ** (1 - config.field_decay)
+    field = magnetic_field(gate.center_w, gate.rot_w, gate.opening_g, held_pos)
+    pull = attractive_field(field, held_vel, FIELD_DECAY)
+    pull = pull / (CURRENT * UNIT_FIELD) ** (1 - FIELD_DECAY)
     pull = pull * jnp.minimum(1.0, MAX_PULL / norm(pull))[:, None]
     return -(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos)).sum(-1)
-
-
-def survival(_: LossConfig, step: Step) -> jax.Array:
-    """Return minus the progress that is still flown for [m/s]: speed times probability to be there.
-
-    Its gradient is that of the probability alone, so that a crash costs all the progress after it,
-    and since no progress counts as less than none, to crash never pays.
-    """
-    worth = jax.lax.stop_gradient(jnp.maximum(speed_to_goal(step), 0.0))
-    return -worth * step.survival
 
 
 LOSSES: dict[str, tuple[tuple[Term, str], ...]] = {
@@ -123,13 +120,8 @@ LOSSES: dict[str, tuple[tuple[Term, str], ...]] = {
         (projection, "projection"),
     ),
     "guidance": ((guidance, "field_gain"),),
-    "survival": ((survival, "survival"),),
 }
 """Name in the curve -> its terms, each with the field of `LossConfig` that is its weight."""
-
-
-AFTER_CRASH = ("survival",)
-"""Names whose terms go on where a world has crashed: what would have been flown is the price."""
 
 
 def weighted(config: LossConfig, step: Step) -> dict[str, jax.Array]:
@@ -140,9 +132,3 @@ def weighted(config: LossConfig, step: Step) -> dict[str, jax.Array]:
         return functools.reduce(jnp.add, parts)
 
     return {name: total(terms) for name, terms in LOSSES.items()}
-
-
-def _square_around(opening_g: jax.Array) -> jax.Array:
-    """Return the square (B, 4, 2) around a regular opening (B, V, 2) whose first side is level."""
-    side = -2.0 * opening_g[..., :1, 1:]
-    return side * rectangle(1.0, 1.0)

@@ -13,28 +13,15 @@ from tracks.input.ranges import check_ranges, is_finite, shown
 
 T = TypeVar("T")
 
-ABSENT = {
-    "quadrotor": "take a preset that trains through quadrotors (suite train: or add --model quad "
-    "and --vehicle)",
-    "fleet": "suite train has one with --model fleet",
-}
-"""Parts that not every run has -> how a run gets one."""
-
-
-UNREAD = ("lag_mean", "lag_std", "drag", "drag_up", "wind_std", "time_step_std", "action_delay",
-          "heading_rate")  # fmt: skip
+UNREAD = ("lag_mean", "lag_std", "drag", "drag_up", "wind_std", "time_step_std", "action_delay")
 """Settings of `physics` that the point mass alone reads."""
 NEEDS = {
-    "critic": "loss.value",
     "loss.projection_decay": "loss.projection",
     "loss.speed_range": "spec.speed_input",
-    "loss.survival_width_m": "loss.survival",
-    "loss.tilt_from_deg": "loss.tilt",
-    "episode.again_before_s": "episode.again",
     "episode.race_share": "spec.speed_input",
     "episode.stop_from": "episode.rest_share",
 }
-"""Settings, or parts, that do nothing where another is 0 or False."""
+"""Settings that do nothing where another is 0 or False."""
 
 
 def override(config: T, changes: Iterable[str]) -> T:
@@ -77,11 +64,11 @@ def _is_within(path: str, part: str) -> bool:
 
 def _check_read(config: object, keys: list[str], change: str) -> None:
     """Refuse a setting of the point mass where quadrotors fly, which have their own."""
-    flown = [part for part in ABSENT if getattr(config, part, None) is not None]
-    if flown and keys[0] == "physics" and set(keys) & set(UNREAD):
+    quadrotor = getattr(config, "quadrotor", None)
+    if quadrotor is not None and keys[0] == "physics" and set(keys) & set(UNREAD):
         raise ValueError(
             f"--set {change}: {'.'.join(keys)} is of the point mass, and this run goes through "
-            f"quadrotors; set one of {flown[0]}.* (suite train: or add --model point)"
+            "quadrotors; set one of quadrotor.* (suite train: or add --model point)"
         )
 
 
@@ -111,8 +98,11 @@ def _changed(config: T, path: list[str], text: str, change: str) -> T:
     if name not in names:
         raise unknown_name(f"--set {change}: setting", name, names)
     old = getattr(config, name)
-    if rest and old is None and name in ABSENT:
-        raise ValueError(f"--set {change}: this run has no {name}; {ABSENT[name]}")
+    if rest and old is None and name == "quadrotor":
+        raise ValueError(
+            f"--set {change}: this run has no quadrotor; take a preset that trains through "
+            "quadrotors (suite train: or add --model quad and --vehicle)"
+        )
     if rest:
         return dataclasses.replace(config, **{name: _changed(old, rest, text, change)})
     if dataclasses.is_dataclass(old):

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +22,7 @@ from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import DynamicsState, make_dynamics
 from suite.train.step import make_step, target_gate
 from suite.train.worlds import Worlds
-from tracks.geometry.camera import cast_rays_b, nearest
+from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.depth import depth_image
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Counts
@@ -51,10 +50,6 @@ class RolloutCarry(NamedTuple):
     """(B, 32) of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 while the world counts in the loss: until it crashes, stops or finishes, then 0."""
-    going: jax.Array
-    """(B,) the same but for crashes."""
-    survival: jax.Array
-    """(B,) smooth probability to have flown until now."""
 
 
 class StepRecord(NamedTuple):
@@ -76,14 +71,8 @@ class StepRecord(NamedTuple):
     """(B, hidden) recurrent state after the step."""
     alive: jax.Array
     """1 where the step counted in the loss, else 0."""
-    hit: jax.Array
-    """Bool: the world counted until this step, and crashed in it."""
-    worth: jax.Array
-    """Progress as far as it was asked for, never less than none [m/s]."""
     noted: Any = None
     """What `note` returned, where there was one."""
-    after: RolloutCarry | None = None
-    """What the world carries on, where another rollout may begin with it."""
 
 
 Note = Callable[[Worlds, DynamicsState, DynamicsState, jax.Array], Any]
@@ -111,9 +100,9 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
 
     The image has its noise, and carries no gradient to the state.
     """
-    spec, physics, dynamics = config.spec, config.physics, make_dynamics(config)
-    camera = replace(spec.camera, rays=physics.rays)
-    rays = jnp.asarray(cast_rays_b(camera), jnp.float32)
+    spec, camera, noise = config.spec, config.spec.camera, config.physics.depth_noise
+    # One ray a pixel, whatever the camera casts in flight: more cost time and gained nothing.
+    rays = jnp.asarray(pixel_rays_b(camera), jnp.float32)
 
     def sight(
         worlds: Worlds,
@@ -126,18 +115,12 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
         # iteration shares it, so that the rays stay one array.
         axis = rays.mean(0)
         wide = axis + (rays - axis) * worlds.fov_scale[0]
-        eye = dynamics.seen(state, worlds.constants, True)
-        pos_w, rot_w = jax.lax.stop_gradient((eye.pos_w, eye.rot_w))
+        pos_w, rot_w = jax.lax.stop_gradient((state.pos_w, state.rot_w))
         depth_m = depth_image(worlds.scene, pos_w, rot_w, wide, camera.range_m, SEEN)
-        sensed = dynamics.seen(state, worlds.constants, False)
-        image_m = nearest(camera, depth_m)
-        view = view_in(worlds, sensed, target)._replace(depth_m=image_m)
+        image_m = depth_m.reshape(-1, camera.height, camera.width)
+        view = view_in(worlds, state, target)._replace(depth_m=image_m)
         seen = observe(spec, view, last_action_b, worlds.wanted)
-        if dynamics.noise is not None:
-            noise = jax.random.normal(jax.random.fold_in(key, 2), seen.state.shape)
-            seen = seen._replace(state=seen.state + dynamics.noise * noise)
-        grain = physics.depth_noise * jax.random.normal(key, image_m.shape)
-        return seen._replace(image=seen.image + grain)
+        return seen._replace(image=seen.image + noise * jax.random.normal(key, image_m.shape))
 
     return sight
 
@@ -149,23 +132,22 @@ def observed_at_start(worlds: Worlds, state: DynamicsState, config: TrainConfig)
     return jnp.repeat(seen[:, None], config.physics.state_delay, axis=1)
 
 
-def choose(where: jax.Array, ones: Any, others: Any) -> Any:
-    """Return the leaves (B, ...) of `ones` for worlds `where` (B,) is true, else of `others`."""
+def make_rollout(
+    config: TrainConfig, note: Note | None = None
+) -> Callable[..., tuple[jax.Array, StepRecord]]:
+    """Return rollout(params, embedding_shift, worlds, key, encode, delta) -> (loss, records).
 
-    def pick(one: jax.Array, other: jax.Array) -> jax.Array:
-        return jnp.where(where.reshape(-1, *(1,) * (one.ndim - 1)), one, other)
-
-    return jax.tree.map(pick, ones, others)
-
-
-def make_start(config: TrainConfig) -> Callable[[Worlds], RolloutCarry]:
-    """Return start(worlds) -> what worlds carry into a rollout's first step."""
-    physics, width, dynamics = config.physics, config.spec.hidden_size, make_dynamics(config)
+    `encode(params, image)` gives the embeddings; `embedding_shift` is (T, B, hidden); `delta` is
+    the frozen Delta Action network's parameters or None. The loss is the mean over steps and
+    worlds; records are (T, B, ...), without gradient.
+    """
+    weights, physics, width = config.loss, config.physics, config.spec.hidden_size
+    sight, dynamics = make_sight(config), make_dynamics(config)
 
     def start(worlds: Worlds) -> RolloutCarry:
         batch = len(worlds.target)
         state = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
-        fresh = RolloutCarry(
+        return RolloutCarry(
             state=state,
             target=jnp.asarray(worlds.target),
             hidden=jnp.asarray(worlds.hidden),
@@ -174,28 +156,7 @@ def make_start(config: TrainConfig) -> Callable[[Worlds], RolloutCarry]:
             observed=observed_at_start(worlds, state, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
-            going=jnp.ones(batch),
-            survival=jnp.ones(batch),
         )
-        if worlds.begun is None:
-            return fresh
-        return choose(jnp.asarray(worlds.begun), worlds.flown, fresh)
-
-    return start
-
-
-def make_rollout(
-    config: TrainConfig, note: Note | None = None
-) -> Callable[..., tuple[jax.Array, StepRecord, RolloutCarry]]:
-    """Return rollout(params, embedding_shift, worlds, key, encode, delta) -> (loss, records, last).
-
-    `encode(params, image)` gives the embeddings; `embedding_shift` is (T, B, hidden); `delta` is
-    the frozen Delta Action network's parameters or None. The loss is the mean over steps and
-    worlds; records are (T, B, ...), without gradient; `last` (B, ...), what worlds carry after the
-    last step, has one.
-    """
-    weights = config.loss
-    start, sight, dynamics = make_start(config), make_sight(config), make_dynamics(config)
 
     def rollout(
         params: network.Params,
@@ -204,7 +165,7 @@ def make_rollout(
         key: jax.Array,
         encode: Callable[[network.Params, jax.Array], jax.Array],
         delta: delta_network.Params | None = None,
-    ) -> tuple[jax.Array, StepRecord, RolloutCarry]:
+    ) -> tuple[jax.Array, StepRecord]:
         steps = len(embedding_shift)
 
         def step(
@@ -226,51 +187,42 @@ def make_rollout(
                 flown = action + correction
             _, target_w = target_gate(worlds.scene.gates, target)
             after = dynamics.step(before, worlds.constants, flown, target_w, key_now)
-            crashed = carry.going > carry.alive
-            made = make_step(weights, worlds, before, after, target, carry.survival, crashed)
+            made = make_step(weights, worlds, before, after, target)
             terms = losses.weighted(weights, made)
-            passed_after = target + made.passed
-            # To reach the rollout's end is not to stop: what comes after it may be worth something.
-            goes_on = (number + 1 < worlds.stop) | (number + 1 == steps)
+            target_after = target + made.passed
+            goes_on = number + 1 < worlds.stop
             if config.episode.finish:
-                goes_on = goes_on & (passed_after < worlds.scene.gates.center_w.shape[1])
+                goes_on = goes_on & (target_after < worlds.scene.gates.center_w.shape[1])
             unhurt = made.clearance > -weights.crash_depth_m
             if weights.tilt > 0.0:
                 unhurt = unhurt & (made.up > 0.0)
             record = StepRecord(
                 image=seen.image,
-                terms={
-                    name: term * (carry.going if name in losses.AFTER_CRASH else carry.alive)
-                    for name, term in terms.items()
-                },
+                terms={name: term * carry.alive for name, term in terms.items()},
                 speed=jnp.linalg.norm(after.vel_w, axis=-1),
                 clearance=made.clearance,
                 passed=made.passed,
                 pos_w=after.pos_w,
                 hidden=hidden,
                 alive=carry.alive,
-                hit=(carry.alive > 0) & ~unhurt,
-                worth=jnp.maximum(-losses.progress(weights, made), 0.0),
                 noted=None if note is None else note(worlds, before, after, target),
             )
             carry = RolloutCarry(
                 state=after,
-                target=passed_after,
+                target=target_after,
                 hidden=hidden,
                 action_b=action,
                 embeddings=embeddings,
                 observed=observed,
                 delta_hidden=delta_hidden,
                 alive=carry.alive * unhurt * goes_on,
-                going=carry.going * goes_on,
-                survival=made.survival,
             )
-            return carry, record._replace(after=carry) if config.episode.carries else record
+            return carry, record
 
         keys = jax.random.split(key, steps)
         inputs = embedding_shift, keys, jnp.arange(steps)
-        last, records = jax.lax.scan(step, start(worlds), inputs)
+        _, records = jax.lax.scan(step, start(worlds), inputs)
         loss = functools.reduce(jnp.add, (records.terms[name].mean() for name in losses.LOSSES))
-        return loss, jax.lax.stop_gradient(records), last
+        return loss, jax.lax.stop_gradient(records)
 
     return rollout

@@ -1,7 +1,7 @@
 """A training run in a folder, by backpropagation through its dynamics.
 
-Fresh worlds and noise depend on the seed and the iteration alone; `repeat.py` says what the folder
-holds.
+Fresh worlds and noise depend on the seed and the iteration alone; `training_loop.py` says what the
+folder holds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from suite.common.console import Console
 from suite.common.running import hosts
 from suite.common.stages import Estimate
 from suite.train.config import TrainConfig, check
-from suite.train.repeat import Method, Outcome, Run, Watch, flight_note, repeat
+from suite.train.training_loop import Method, Outcome, Run, Watch, flight_note, train_in_folder
 from suite.train.update import (
     device_mesh,
     make_update,
@@ -119,11 +119,11 @@ def train(
         note=functools.partial(flight_note, "loss"),
     )
     run = Run(config, config.spec, config.seed, origin, folder, state_place(mesh))
-    return repeat(method, run, start_state(config, params), console, watch)
+    return train_in_folder(method, run, start_state(config, params), console, watch)
 
 
 def _digest(params: Mapping[str, Any] | None) -> str | None:
-    """Return what tells one network's parameters from another's; None for none."""
+    """Return the SHA-256 of a network's parameters; None for none."""
     if params is None:
         return None
     digest = hashlib.sha256()

@@ -14,13 +14,14 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from policies.networks import delta_network, network
 from suite.common.running import hosts
-from suite.train.beyond.carried import carried_over, nothing_carried, taken_over
-from suite.train.beyond.value import Critic, make_teach, start_critic
 from suite.train.config import OptimizerConfig, TrainConfig
 from suite.train.gradient import shard_gradient
 from suite.train.rollout import StepRecord
 from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import Worlds
+
+RATE_END, WEIGHT_DECAY = 1e-5, 1e-2
+"""Learning rate at the end of every run, and AdamW's decoupled weight decay."""
 
 
 class TrainState(NamedTuple):
@@ -34,18 +35,14 @@ class TrainState(NamedTuple):
     """Gradient steps done, a scalar."""
     hidden: jax.Array
     """(B, hidden) recurrent states from random steps of the last rollout."""
-    critic: Critic | None = None
-    """Of what comes after a rollout, where `loss.value` asks for one."""
-    carried: Worlds | None = None
-    """Worlds that the next rollout goes on with, where the episodes' settings ask for such."""
 
 
 def make_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
     """Return AdamW with warm-up, cosine decay and optional clipping by global norm."""
     rate = optax.warmup_cosine_decay_schedule(
-        0.0, config.rate, config.warmup, max(config.iterations, config.warmup + 1), config.rate_end
+        0.0, config.rate, config.warmup, max(config.iterations, config.warmup + 1), RATE_END
     )
-    adamw = optax.adamw(rate, b2=config.memory, weight_decay=config.weight_decay)
+    adamw = optax.adamw(rate, b2=config.memory, weight_decay=WEIGHT_DECAY)
     if config.clip <= 0:
         return adamw
     return optax.chain(optax.clip_by_global_norm(config.clip), adamw)
@@ -61,8 +58,6 @@ def start_state(config: TrainConfig, params: network.Params | None = None) -> Tr
         optimizer=make_optimizer(config.optimizer).init(params),
         iteration=jnp.zeros((), int),
         hidden=hidden,
-        critic=start_critic(config) if config.loss.value > 0.0 else None,
-        carried=nothing_carried(config) if config.episode.carries else None,
     )
 
 
@@ -152,36 +147,22 @@ def make_update(
     """
     optimizer = make_optimizer(config.optimizer)
     gradient_of = shard_gradient(config, mesh)
-    seed, teach = jax.random.key(np.uint32(config.seed)), make_teach(config)
+    seed, batch = jax.random.key(np.uint32(config.seed)), config.episode.batch
 
     # Every device holds the whole state, and the first process saves it.
     @functools.partial(jax.jit, out_shardings=state_place(mesh))
     def update(state: TrainState, worlds: Worlds) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(seed, state.iteration)
         worlds = worlds._replace(hidden=state.hidden * worlds.remembers[:, None])
-        carried, critic = state.carried, state.critic
-        if carried is not None:
-            worlds = taken_over(config, worlds, carried)
-        gradient, loss, records = gradient_of(
-            state.params, worlds, key, delta, None if critic is None else critic.params
-        )
+        gradient, loss, records = gradient_of(state.params, worlds, key, delta)
         change, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
         numbers = curve_numbers(loss, gradient, records)
-        batch = config.episode.batch
-        if records.after is not None:
-            last = jax.random.fold_in(key, batch + 1)
-            carried = carried_over(config, last, worlds, records.after, records.hit)
-        if critic is not None:
-            critic, learnt = teach(critic, records.noted)
-            numbers |= learnt
         state = TrainState(
             # optax types any tree of parameters; it gives back the one it was given.
             params=cast(network.Params, optax.apply_updates(state.params, change)),
             optimizer=optimizer_state,
             iteration=state.iteration + 1,
             hidden=sample_hidden(jax.random.fold_in(key, batch), records, state.hidden),
-            critic=critic,
-            carried=carried,
         )
         return state, numbers
 

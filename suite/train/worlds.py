@@ -6,14 +6,14 @@ A pure function of (config, iteration), so a resumed run sees the worlds that it
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from suite.train.config import TrainConfig
 from suite.train.dynamics import interface as dynamics
 from suite.train.dynamics import point_mass
-from tracks.families import max_counts, random_track
+from tracks.families import MAX_COUNTS, random_track
 from tracks.families.random import Mix
 from tracks.geometry.cull import Bounds, bounds
 from tracks.geometry.scene import Array, Scene, stack
@@ -43,19 +43,7 @@ class Worlds(NamedTuple):
     fov_scale: Array
     """(B,) this iteration's scale of the rays across the optical axis."""
     wanted: Array | None = None
-    """(B,) how fast the policy is asked to fly, 0 to 1, where it has that input [1]."""
-    flown: Any = None
-    """A `RolloutCarry` with which worlds begin that were flown before; None: none was."""
-    begun: Array | None = None
-    """(B,) bool: where `flown` is what a world begins with, in the place of its start."""
-
-
-def difficulty_range(config: TrainConfig, iteration: int) -> tuple[float, float]:
-    """Return the range of difficulty at an iteration: it grows over `easy_until` of the run."""
-    low, high = config.episode.difficulty
-    whole = config.episode.easy_until * config.optimizer.iterations
-    share = 1.0 if whole <= 0 else min(1.0, iteration / whole)
-    return low, low + share * (high - low)
+    """(B,) the commanded speed, 0 to 1, where the policy has that input [1]."""
 
 
 def _clearance(track: Track, point_w: np.ndarray) -> float:
@@ -122,23 +110,33 @@ def _beside_a_gate(
     return point, speed_limit * onward, target
 
 
-def _quadrotor_constants(config: TrainConfig, iteration: int) -> dynamics.WorldParams:
-    """Return the quadrotors of an iteration, from draws of their own: the tracks stay the same."""
+def _constants(
+    config: TrainConfig, iteration: int, rng: np.random.Generator
+) -> dynamics.WorldParams:
+    """Return what flies in an iteration; quadrotors have draws of their own: the rest is the same.
+
+    The point masses are drawn in any case, so that what `rng` gives afterwards does not depend on
+    the model.
+    """
+    physics, batch, period = config.physics, config.episode.batch, 1.0 / config.spec.rate_hz
+    stretch = np.clip(1 + physics.time_step_std * rng.standard_normal(batch), 0.5, 1.5)
+    low_drag, high_drag = np.transpose([physics.drag, physics.drag, physics.drag_up])
+    lag = physics.lag_mean + physics.lag_std * rng.standard_normal(batch)
+    point = point_mass.PointMassParams(
+        lag=np.clip(lag, 0.2 * physics.lag_mean, None),
+        drag=rng.uniform(low_drag, high_drag, (batch, 3)),
+        wind_w=rng.standard_normal((batch, 3)) * np.asarray(physics.wind_std),
+        time_step=period * stretch,
+        delay=rng.uniform(*physics.action_delay, batch),
+    )
+    if config.quadrotor is None:
+        return point_mass.PointMassParams(*(np.asarray(x, np.float32) for x in point))
+    # The trainer of the point mass stays clear of the judge's physics.
     from suite.train.dynamics.quadrotor import QuadrotorParams, draw_effects
 
-    assert config.quadrotor is not None
-    batch, rng = config.episode.batch, np.random.default_rng([config.seed, iteration, 1])
-    period = np.full(batch, 1.0 / config.spec.rate_hz, np.float32)
-    return QuadrotorParams(period, draw_effects(config.quadrotor, batch, rng))
-
-
-def _fleet_constants(config: TrainConfig, iteration: int) -> dynamics.WorldParams:
-    """Return the fleet of an iteration, from draws of their own: the tracks stay the same."""
-    from suite.train.dynamics.reduced import draw_fleet
-
-    assert config.fleet is not None
-    rng = np.random.default_rng([config.seed, iteration, 2])
-    return draw_fleet(config.fleet, 1.0 / config.spec.rate_hz, config.episode.batch, rng)
+    own = np.random.default_rng([config.seed, iteration, 1])
+    effects = draw_effects(config.quadrotor, batch, own)
+    return QuadrotorParams(np.full(batch, period, np.float32), effects)
 
 
 def _wanted(config: TrainConfig, iteration: int) -> Array | None:
@@ -154,9 +152,7 @@ def _wanted(config: TrainConfig, iteration: int) -> Array | None:
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     """Return the worlds of an iteration."""
     rng = np.random.default_rng([config.seed, iteration])
-    episode, physics = config.episode, config.physics
-    batch = episode.batch
-    low, high = difficulty_range(config, iteration)
+    episode, batch = config.episode, config.episode.batch
     tracks, starts = [], []
     rests = rng.uniform(size=batch) < episode.rest_share
     mix = Mix(
@@ -164,12 +160,11 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         density=episode.density,
         bare_share=episode.bare_share,
         hairpin_share=episode.hairpin_share,
-        gate_corners=episode.gate_corners,
         height_spread=episode.height_spread,
-        beside_m=episode.beside_m,
     )
     for rest in rests:
-        track = first_gates(random_track(rng.uniform(low, high), rng, mix), episode.gates)
+        drawn = random_track(rng.uniform(*episode.difficulty), rng, mix)
+        track = first_gates(drawn, episode.gates)
         tracks.append(track)
         if rest:
             starts.append((track.start_pos_w, np.zeros(3), 0))
@@ -180,25 +175,10 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     pos, vel, target = (np.stack(column) for column in zip(*starts, strict=True))
     gate = np.stack([t.scene.gates.center_w[i] for t, i in zip(tracks, target, strict=True)])
     yaw = np.arctan2(gate[:, 1] - pos[:, 1], gate[:, 0] - pos[:, 0]) + rng.normal(0, 0.2, batch)
-    period = 1.0 / config.spec.rate_hz
+    constants = _constants(config, iteration, rng)
     earliest = max(1, round(episode.stop_from * episode.steps))
-    stretch = np.clip(1 + physics.time_step_std * rng.standard_normal(batch), 0.5, 1.5)
-    low_drag, high_drag = np.transpose([physics.drag, physics.drag, physics.drag_up])
-    lag = physics.lag_mean + physics.lag_std * rng.standard_normal(batch)
-    point = point_mass.PointMassParams(
-        lag=np.clip(lag, 0.2 * physics.lag_mean, None),
-        drag=rng.uniform(low_drag, high_drag, (batch, 3)),
-        wind_w=rng.standard_normal((batch, 3)) * np.asarray(physics.wind_std),
-        time_step=period * stretch,
-        delay=rng.uniform(*physics.action_delay, batch),
-    )
-    constants = point_mass.PointMassParams(*(np.asarray(x, np.float32) for x in point))
-    if config.quadrotor is not None:
-        constants = _quadrotor_constants(config, iteration)
-    elif config.fleet is not None:
-        constants = _fleet_constants(config, iteration)
     return Worlds(
-        scene=stack([track.scene for track in tracks], max_counts(episode.gate_corners)),
+        scene=stack([track.scene for track in tracks], MAX_COUNTS),
         pos_w=pos.astype(np.float32),
         vel_w=vel.astype(np.float32),
         heading_w=np.stack([np.cos(yaw), np.sin(yaw), np.zeros(batch)], -1).astype(np.float32),
@@ -207,6 +187,6 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         hidden=np.zeros((batch, config.spec.hidden_size), np.float32),
         remembers=np.where(rests, 0.0, 1.0).astype(np.float32),
         stop=np.where(rests, rng.integers(earliest, episode.steps + 1, batch), episode.steps),
-        fov_scale=np.full(batch, rng.uniform(*physics.fov_scale), np.float32),
+        fov_scale=np.full(batch, rng.uniform(*config.physics.fov_scale), np.float32),
         wanted=_wanted(config, iteration),
     )

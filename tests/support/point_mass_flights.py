@@ -42,7 +42,7 @@ def fly(plant, count=4, seconds=3.0, seed=0, extra_b=None):
         flown = action
         if extra_b is not None:
             flown = action + extra_b((body.rot_w * body.vel_w[..., :, None]).sum(-2), action)
-        return point_mass.step(body, constants, flown, target, 6.0, 0.0), body
+        return point_mass.step(body, constants, flown, target, 0.0), body
 
     target = np.stack([np.cos(0.8 * time), np.sin(0.8 * time), 0 * time], -1) * 100
     inputs = (jnp.asarray(action.swapaxes(0, 1)), jnp.asarray(target[:, None], jnp.float32))

@@ -41,12 +41,6 @@ MAX_COUNTS = Counts(boxes=70, cylinders=15, capsules=12, spheres=12)
 most 3 plates, 3 small solids, 1 pillar and 4 ground objects, whose kinds are dealt out evenly."""
 
 
-def max_counts(gate_corners: int) -> Counts:
-    """Return `MAX_COUNTS` where every gate has so many corners, and so many bars."""
-    bars = GATE_COUNT * (gate_corners - 4)
-    return MAX_COUNTS._replace(boxes=MAX_COUNTS.boxes + bars)
-
-
 def make_track(family: str, level: int, seed: int) -> Track:
     """Return the track that (family, level, seed) alone determine.
 

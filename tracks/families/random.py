@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tracks.families.layout import GATE_COUNT, MAX_YAW_NOISE, Layout, furnish, ramp
-from tracks.geometry.gates import round_gates, square_gates
+from tracks.geometry.gates import square_gates
 from tracks.geometry.obstacles import PerStretch, segment_distance, straight_sites
 from tracks.geometry.scene import Gates
 
@@ -27,6 +27,10 @@ MAX_TOTALS = PerStretch(*(np.array(n) for n in (23, 23, 10, 14)))
 """Most plates, small solids, pillars and ground objects of a track."""
 _WALKS = 8
 _DRAWS = 12
+
+BESIDE_M = (2.0, 4.0)
+"""Range of how far beside the straight lines between gates a track's obstacles stand at most; near
+lines more of them stand in the way [m]."""
 
 
 class Walks(NamedTuple):
@@ -51,13 +55,8 @@ class Mix(NamedTuple):
     """Probability that a track has no obstacles."""
     hairpin_share: float = 0.0
     """Probability that a track is drawn with one or two hairpins; the crowded ones are redrawn."""
-    gate_corners: int = 4
-    """Corners of the gates' openings: squares, or regular polygons around the same circle."""
     height_spread: float = 1.0
     """How far the gates' heights lie apart, as a share of what is usual."""
-    beside_m: tuple[float, float] = (2.0, 4.0)
-    """How far beside the straight lines between gates a track's obstacles stand at most, from and
-    to; near lines more of them stand in the way [m]."""
 
 
 MIX = Mix()
@@ -74,15 +73,12 @@ def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:
     height = middle + reach * rng.uniform(-1, 1, shape)
     height = np.clip(height, np.maximum(0.8, side / 2 + width), 2.2)
     center_w = np.column_stack([xy, height])
-    if mix.gate_corners == 4:
-        gates = square_gates(center_w, yaw, side, width, depth)
-    else:
-        gates = round_gates(center_w, yaw, side, width, depth, mix.gate_corners)
+    gates = square_gates(center_w, yaw, side, width, depth)
     start_height = max(0.5, height[0] + rng.uniform(-0.3, 0.3))
     start_pos_w = np.array([*start, start_height])
 
     stretches = np.arange(GATE_COUNT - 1)
-    site = straight_sites(gates, stretches, rng.uniform(*mix.beside_m))
+    site = straight_sites(gates, stretches, rng.uniform(*BESIDE_M))
     return furnish(rng, gates, start_pos_w, _density(d, rng, len(stretches), mix), site)
 
 

@@ -55,33 +55,6 @@ def square_gates(
     return Gates(center_w, yaw_rotation(yaw), rectangle(side, side), frame_width, frame_depth)
 
 
-def round_gates(
-    center_w: np.ndarray,
-    yaw: np.ndarray,
-    diameter: np.ndarray,
-    frame_width: np.ndarray,
-    frame_depth: np.ndarray,
-    corners: int,
-) -> Gates:
-    """Return upright gates whose openings are regular polygons.
-
-    Args:
-        center_w: (G, 3) opening centres [m].
-        yaw: (G,) flight directions about world z [rad].
-        diameter: (G,) of the openings' inscribed circles [m].
-        frame_width: (G,) widths of the bars around the openings [m].
-        frame_depth: (G,) extents of the frames along the flight direction [m].
-        corners: of every opening; the more, the rounder.
-
-    Raises:
-        ValueError: for fewer than three corners.
-    """
-    if corners < 3:
-        raise ValueError(f"gates with {corners} corners cannot be made, allowed are 3 and more")
-    opening = np.asarray(diameter, float)[:, None, None] * regular_polygon(corners, 0.5)
-    return Gates(center_w, yaw_rotation(yaw), opening, frame_width, frame_depth)
-
-
 def frame_boxes(gates: Gates) -> Boxes:
     """Return the frames' bars, one box a side of the opening, gate by gate, (G * V) boxes.
 

@@ -1,7 +1,7 @@
 """The trainer's method as a plain torch-eager loop: the baseline of `suite bench train`.
 
-Same network, dynamics (point mass, fleet or quadrotors), losses, field, delays and noise as
-`suite.train` with the preset `paper`, one step after another with the encoder inside the loop, and
+Same network, point mass, losses, field, delays and noise as `suite.train` with the preset `paper`,
+one step after another with the encoder inside the loop, and
 backward through it. What the preset does not use is not here, so that a yardstick stays what it is
 while the trainer grows.
 """
@@ -12,20 +12,18 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 
 from eval.effects.interface import GRAVITY
 from policies.formats.torch_twin import torch_twin
-from suite.experiments.bench import torch_fleet, torch_quadrotor, torch_scene
+from suite.experiments.bench import torch_scene
 from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
-from suite.train.dynamics.point_mass import PointMassParams
-from suite.train.dynamics.quadrotor import QuadrotorParams, substeps
-from suite.train.dynamics.reduced import ReducedParams, state_noise, steps_of
-from suite.train.losses import MAX_PULL, UNIT_FIELD
+from suite.train.dynamics.point_mass import HEADING_RATE, PointMassParams
+from suite.train.losses import BARRIER_HEIGHT, BARRIER_SLOPE, FIELD_DECAY, MAX_PULL, UNIT_FIELD
 from suite.train.presets import paper
-from suite.train.step import BEYOND_M
+from suite.train.step import BEYOND_M, PATH_SAMPLES
+from suite.train.update import WEIGHT_DECAY
 from suite.train.worlds import Worlds
 from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.scene import Gates
@@ -46,14 +44,8 @@ class TorchState(NamedTuple):
     commands_w: Tensor
 
 
-Body = TorchState | torch_fleet.TorchReduced | torch_quadrotor.TorchQuadrotor
-"""What flies."""
-
-
 def to_torch(tree: Any) -> Any:
     """Return a tree of named tuples with its arrays as tensors, and None where there is none."""
-    if isinstance(tree, dict):
-        return {name: to_torch(part) for name, part in tree.items()}
     if isinstance(tree, tuple):
         return type(tree)(*(to_torch(part) for part in tree))
     return None if tree is None else torch.as_tensor(tree)
@@ -61,6 +53,11 @@ def to_torch(tree: Any) -> Any:
 
 def _norm(vector: Tensor) -> Tensor:
     return ((vector * vector).sum(-1) + 1e-12).sqrt()
+
+
+def faded(x: Tensor, factor: Tensor) -> Tensor:
+    """Return x, with its gradient multiplied by factor."""
+    return x * factor + (x * (1 - factor)).detach()
 
 
 def attitude(thrust_w: Tensor, heading_w: Tensor) -> Tensor:
@@ -89,13 +86,13 @@ def step(
     air_b = to_local(body.rot_w, body.vel_w - constants.wind_w)
     acc = thrust - to_world(body.rot_w, constants.drag * air_b)
     fade = (-config.loss.gradient_decay * dt).exp()
-    pos, vel = torch_fleet.faded(body.pos_w, fade), torch_fleet.faded(body.vel_w, fade)
+    pos, vel = faded(body.pos_w, fade), faded(body.vel_w, fade)
     pos = pos + vel * dt + 0.5 * body.acc_w * dt * dt
     vel = vel + 0.5 * (body.acc_w + acc) * dt
     with torch.no_grad():
         towards = (target_w - pos) * torch.tensor([1.0, 1.0, 0.0])
         towards = towards / towards.norm(dim=-1, keepdim=True).clamp(min=1e-3)
-        blend = (-config.physics.heading_rate * dt).exp()
+        blend = (-HEADING_RATE * dt).exp()
         heading = body.heading_w * blend + towards * (1 - blend)
         size = heading.norm(dim=-1, keepdim=True)
         heading = torch.where(size > 1e-3, heading / size.clamp(min=1e-3), body.heading_w)
@@ -110,8 +107,11 @@ class Baseline:
         """Take over the parameters of `policies.networks.network`.
 
         Raises:
-            ValueError: for a setting of the loss or the observation that is not the preset's.
+            ValueError: for a setting of the loss or the observation that is not the preset's, and
+                for quadrotors.
         """
+        if config.quadrotor is not None:
+            raise ValueError("the torch baseline flies the point mass alone; leave quadrotor out")
         for part in ("loss", "spec"):
             mine, fixed = getattr(config, part), getattr(paper(), part)
             for field in fields(fixed):
@@ -123,13 +123,9 @@ class Baseline:
                     )
         self.config = config
         self.network = torch_twin(params, config.spec).requires_grad_(True)
-        rate, decay = config.optimizer.rate, config.optimizer.weight_decay
-        self.optimizer = torch.optim.AdamW(self.network.parameters(), rate, weight_decay=decay)
-        self.cut = None
-        if config.quadrotor is not None:
-            self.cut = substeps(config.quadrotor, 1.0 / config.spec.rate_hz)
-        if config.fleet is not None:
-            self.noise = torch.from_numpy(np.array(state_noise(config.fleet, config.spec)))
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), config.optimizer.rate, weight_decay=WEIGHT_DECAY
+        )
         self.rays = torch.as_tensor(pixel_rays_b(config.spec.camera), dtype=torch.float32)
 
     def update(self, worlds: Worlds) -> float:
@@ -143,9 +139,9 @@ class Baseline:
     def loss(self, worlds: Worlds) -> Tensor:
         """Return the mean loss over steps and worlds of a rollout."""
         config, physics = self.config, self.config.physics
-        worlds = self.prepared(worlds)
         count = worlds.pos_w.shape[0]
-        zero = torch.zeros(count, 3)
+        zero, constants = torch.zeros(count, 3), worlds.constants
+        assert isinstance(constants, PointMassParams)
         body = self.start(worlds)
         camera = config.spec.camera
         images = [torch.zeros(count, camera.height, camera.width)] * physics.image_delay
@@ -156,64 +152,23 @@ class Baseline:
         for _ in range(config.episode.steps):
             gate, target_w = self.target_gate(worlds.scene.gates, target)
             images.append(self.look(worlds, body))
-            now = self.seen(worlds, body)
-            seen = [to_local(now.rot_w, v) for v in (now.vel_w, target_w - now.pos_w)]
-            state = torch.cat([seen[0], now.rot_w[:, 2], seen[1], action], -1)
-            if config.fleet is not None:
-                state = state + self.noise * torch.randn_like(state)
+            seen = [to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w)]
+            state = torch.cat([seen[0], body.rot_w[:, 2], seen[1], action], -1)
             states = [*(states or [state] * physics.state_delay), state]
             action, hidden = self.network(states.pop(0), images.pop(0), hidden)
-            before, body = body, self.fly(worlds, body, action, target_w)
+            before, body = body, step(body, constants, action, target_w, config)
             passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
             total = total + self.judge(worlds, before, body, gate, target_w).mean()
             target = target + (passed & (target < worlds.scene.gates.center_w.shape[1]))
         return total / config.episode.steps
 
-    def prepared(self, worlds: Worlds) -> Worlds:
-        """Return the worlds with their quadrotors ready to be stepped, if that is what flies."""
-        if self.cut is None:
-            return worlds
-        assert self.config.quadrotor is not None
-        given = worlds.constants
-        assert isinstance(given, QuadrotorParams)
-        plants = torch_quadrotor.prepare(self.config.quadrotor, given, self.cut.dt)
-        return worlds._replace(constants=plants)
-
-    def start(self, worlds: Worlds) -> Body:
+    def start(self, worlds: Worlds) -> TorchState:
         """Return the bodies at the start of a rollout."""
         zero = torch.zeros_like(worlds.pos_w)
-        rot_w = attitude(zero, worlds.heading_w)
-        if isinstance(worlds.constants, ReducedParams):
-            return torch_fleet.start(worlds.constants, worlds.pos_w, worlds.vel_w, rot_w)
-        if isinstance(worlds.constants, torch_quadrotor.Plants):
-            return torch_quadrotor.start(worlds.constants, worlds.pos_w, worlds.vel_w, rot_w)
         return TorchState(
-            worlds.pos_w, worlds.vel_w, zero, zero, rot_w,
+            worlds.pos_w, worlds.vel_w, zero, zero, attitude(zero, worlds.heading_w),
             worlds.heading_w, torch.zeros(len(zero), 2, 3),
         )  # fmt: skip
-
-    def seen(self, worlds: Worlds, body: Body, image: bool = False) -> Body:
-        """Return the bodies as sensors, or the camera, show them: a fleet's are late."""
-        if not isinstance(worlds.constants, ReducedParams):
-            return body
-        assert isinstance(body, torch_fleet.TorchReduced)
-        vehicle = worlds.constants.vehicle
-        age = vehicle.image_latency if image else vehicle.state_latency
-        return torch_fleet.as_seen(body, age)
-
-    def fly(self, worlds: Worlds, body: Body, action: Tensor, target_w: Tensor) -> Body:
-        """Return the bodies one policy period later."""
-        constants, config = worlds.constants, self.config
-        if isinstance(body, TorchState):
-            assert isinstance(constants, PointMassParams)
-            return step(body, constants, action, target_w, config)
-        decay = config.loss.gradient_decay
-        if isinstance(body, torch_quadrotor.TorchQuadrotor):
-            assert isinstance(constants, torch_quadrotor.Plants) and self.cut is not None
-            return torch_quadrotor.step(body, constants, action, target_w, self.cut, decay)
-        assert isinstance(constants, ReducedParams) and config.fleet is not None
-        steps = steps_of(config.fleet, 1.0 / config.spec.rate_hz)
-        return torch_fleet.step(body, constants, action, target_w, steps, decay)
 
     def target_gate(self, gates: Gates, target: Tensor) -> tuple[Gates, Tensor]:
         """Return each world's current gate and the point to fly to (B, 3)."""
@@ -224,9 +179,8 @@ class Baseline:
         return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
 
     @torch.no_grad()
-    def look(self, worlds: Worlds, body: Body) -> Tensor:
+    def look(self, worlds: Worlds, body: TorchState) -> Tensor:
         """Return the encoded images (B, height, width) with their noise."""
-        body = self.seen(worlds, body, image=True)
         camera, encoding = self.config.spec.camera, self.config.spec.depth
         axis = self.rays.mean(0)
         rays = axis + (self.rays - axis) * worlds.fov_scale[0]
@@ -236,18 +190,23 @@ class Baseline:
         return image.reshape(-1, camera.height, camera.width)
 
     def judge(
-        self, worlds: Worlds, before: Body, body: Body, gate: Gates, target_w: Tensor
+        self,
+        worlds: Worlds,
+        before: TorchState,
+        body: TorchState,
+        gate: Gates,
+        target_w: Tensor,
     ) -> Tensor:
         """Return the loss of a step (B,)."""
         config = self.config.loss
-        share = (torch.arange(config.path_samples) + 1.0) / config.path_samples
+        share = (torch.arange(PATH_SAMPLES) + 1.0) / PATH_SAMPLES
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
         distance, away = torch_scene.nearest_obstacle(worlds.scene, path.detach())
         gap = distance + ((path - path.detach()) * away).sum(-1) - config.safety_radius_m
-        barrier = torch.nn.functional.softplus(config.barrier_slope * gap, threshold=1e3)
+        barrier = torch.nn.functional.softplus(BARRIER_SLOPE * gap, threshold=1e3)
         closing = (-(away * body.vel_w.detach()[:, None]).sum(-1)).clamp(min=0)
         collide = closing * (1.0 - gap).clamp(min=0) ** 2
-        loss = config.clearance * config.barrier_height * barrier.mean(-1)
+        loss = config.clearance * BARRIER_HEIGHT * barrier.mean(-1)
         loss = loss + config.collide * collide.mean(-1)
 
         jerk = (body.acc_w - before.acc_w) / worlds.constants.time_step[:, None]
@@ -263,10 +222,9 @@ class Baseline:
 
     def pull(self, gate: Gates, pos_w: Tensor, vel_w: Tensor) -> Tensor:
         """Return u_A (B, 3), 1 across the centre of a gate of 1 m."""
-        decay = self.config.loss.field_decay
         field = torch_scene.magnetic_field(gate, pos_w)
         size = field.norm(dim=-1)
         aligned = (vel_w * field).sum(-1) / (vel_w.norm(dim=-1) * size + 1e-5)
-        pull = ((1 - aligned) / size.clamp(min=1e-9) ** decay)[:, None] * field
-        pull = pull / (2e-5 * UNIT_FIELD) ** (1 - decay)
+        pull = ((1 - aligned) / size.clamp(min=1e-9) ** FIELD_DECAY)[:, None] * field
+        pull = pull / (2e-5 * UNIT_FIELD) ** (1 - FIELD_DECAY)
         return pull * (MAX_PULL / _norm(pull)).clamp(max=1.0)[:, None]

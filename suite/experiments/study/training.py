@@ -180,8 +180,8 @@ def train_one(
     """
     from suite.experiments.study.validation import make_validation
     from suite.train.ppo.run import train_ppo
-    from suite.train.repeat import Watch
     from suite.train.run import started_from, train
+    from suite.train.training_loop import Watch
 
     (key, config), folder, watch = job.task, job.folder, None
     is_ppo, diverged = isinstance(config, PpoConfig), ""

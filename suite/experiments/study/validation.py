@@ -1,7 +1,7 @@
 """Success in the trainer's own dynamics: a policy on fixed worlds that no training has seen.
 
 Flight, collision and passing are the trainer's code (`suite/train/rollout.py`): the nearest of the
-`NEAR` solids at `path_samples` points of a step's path, closer than `BODY_RADIUS_M`.
+`NEAR` solids at `PATH_SAMPLES` points of a step's path, closer than `BODY_RADIUS_M`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import Worlds, sample_worlds
 
 Measure = Callable[[network.Params], dict[str, float]]
-"""Of a policy's parameters; fits `suite.train.repeat.Watch`."""
+"""Of a policy's parameters; fits `suite.train.training_loop.Watch`."""
 
 
 class Scores(NamedTuple):
@@ -81,7 +81,6 @@ def validation_worlds(config: TrainConfig, trials: int, seed: int, seconds: floa
         config.episode,
         batch=trials,
         steps=round(seconds * config.spec.rate_hz),
-        easy_until=0.0,
         rest_share=1.0,
         stop_from=1.0,
         race_share=1.0,
@@ -105,7 +104,7 @@ def make_flight(
     def fly(params: network.Params, worlds: Worlds) -> Scores:
         embedding_shift = jnp.zeros((episode.steps, episode.batch, config.spec.hidden_size))
         key = jax.random.key(np.uint32(config.seed))
-        _, records, _ = rollout(params, embedding_shift, worlds, key, network.encode)
+        _, records = rollout(params, embedding_shift, worlds, key, network.encode)
         noted = 0.0 if reward is None else records.noted
         gates = worlds.scene.gates.center_w.shape[1]
         return scored(records.passed, records.clearance, records.speed, gates, noted)

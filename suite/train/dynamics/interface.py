@@ -1,4 +1,4 @@
-"""What flies in a rollout: the point mass, the quadrotor around a vehicle file, or a fleet."""
+"""What flies in a rollout: the point mass, or the quadrotor around a vehicle file."""
 
 from __future__ import annotations
 
@@ -45,10 +45,6 @@ class WorldParams(Protocol):
         ...
 
 
-def _as_it_is(body: Any, _: Any, __: bool) -> Any:
-    return body
-
-
 class Dynamics(NamedTuple):
     """Pure functions over B worlds; state and parameters are pytrees of arrays (B, ...)."""
 
@@ -56,10 +52,6 @@ class Dynamics(NamedTuple):
     """(constants, pos_w (B, 3), vel_w (B, 3), heading_w (B, 3)) -> body, upright."""
     step: Callable[[Any, Any, jax.Array, jax.Array, jax.Array], Any]
     """(body, constants, action_b (B, 3), target_w (B, 3), key) -> body one policy period later."""
-    seen: Callable[[Any, Any, bool], Any] = _as_it_is
-    """(body, constants, whether by the camera) -> the body as late sensors show it."""
-    noise: Array | None = None
-    """(state_size,) standard deviation of what is added to the state that the policy sees."""
 
 
 def make_dynamics(config: TrainConfig) -> Dynamics:
@@ -69,14 +61,7 @@ def make_dynamics(config: TrainConfig) -> Dynamics:
         from suite.train.dynamics.quadrotor import quadrotor_dynamics
 
         period = 1.0 / config.spec.rate_hz
-        start, step = quadrotor_dynamics(config.quadrotor, period, config.loss.gradient_decay)
-        return Dynamics(start, step)
-    if config.fleet is not None:
-        from suite.train.dynamics.reduced import as_sensed, fleet_dynamics, state_noise
-
-        period = 1.0 / config.spec.rate_hz
-        start, step = fleet_dynamics(config.fleet, period, config.loss.gradient_decay)
-        return Dynamics(start, step, as_sensed, state_noise(config.fleet, config.spec))
+        return Dynamics(*quadrotor_dynamics(config.quadrotor, period, config.loss.gradient_decay))
 
     def start_point(
         _: point_mass.PointMassParams, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
@@ -90,7 +75,7 @@ def make_dynamics(config: TrainConfig) -> Dynamics:
         target_w: jax.Array,
         _: jax.Array,
     ) -> point_mass.PointMassState:
-        rate, decay = config.physics.heading_rate, config.loss.gradient_decay
-        return point_mass.step(body, constants, action_b, target_w, rate, decay)
+        decay = config.loss.gradient_decay
+        return point_mass.step(body, constants, action_b, target_w, decay)
 
     return Dynamics(start_point, step_point)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from eval.effects.interface import GRAVITY
+from eval.quadrotor.attitude import HEADING_RATE
 from tracks.geometry.rotation import to_local, to_world
 from tracks.geometry.scene import Array
 
@@ -83,7 +84,6 @@ def step(
     constants: PointMassParams,
     action_b: jax.Array,
     target_w: jax.Array,
-    heading_rate: float,
     gradient_decay: float,
 ) -> PointMassState:
     """Return the body one policy period later.
@@ -95,7 +95,6 @@ def step(
         constants: of each world.
         action_b: (B, 3) wanted net acceleration in the body axes of now [m/s^2].
         target_w: (B, 3) the gate that the nose turns to [m].
-        heading_rate: of the first-order turn of the nose [1/s].
         gradient_decay: rate at which gradients of position and velocity fade back in time [1/s].
     """
     dt = constants.time_step[:, None]
@@ -118,7 +117,7 @@ def step(
     flat = jnp.asarray([1.0, 1.0, 0.0])
     towards = jax.lax.stop_gradient(target_w - pos) * flat
     towards = towards / jnp.maximum(jnp.linalg.norm(towards, axis=-1, keepdims=True), 1e-3)
-    blend = jnp.exp(-heading_rate * dt)
+    blend = jnp.exp(-HEADING_RATE * dt)
     heading = body.heading_w * blend + towards * (1 - blend)
     size = jnp.linalg.norm(heading, axis=-1, keepdims=True)
     heading = jnp.where(size > 1e-3, heading / jnp.maximum(size, 1e-3), body.heading_w)

@@ -23,9 +23,11 @@ from eval.quadrotor.plant import Command, Motion, Plant, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, PlantState, hover_state, step
 from eval.vehicles.vehicle import Vehicle
 from suite.train.config import QuadrotorConfig
-from suite.train.dynamics.fleet import TRIM_AXES, cut_normal
 from suite.train.dynamics.point_mass import attitude, faded
 from tracks.geometry.scene import Array
+
+TRIM_AXES = (1.0, 1.0, 0.2)
+"""A constant torque about x, y and z as shares of that about x."""
 
 
 class QuadrotorParams(NamedTuple):
@@ -81,6 +83,11 @@ def substeps(config: QuadrotorConfig, period_s: float) -> Substeps:
     return Substeps(attitude_steps, physics, period_s / (attitude_steps * physics))
 
 
+def cut_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Return normal draws that are cut off at twice their deviation of 1."""
+    return np.clip(rng.standard_normal(shape), -2.0, 2.0)
+
+
 def draw_effects(
     config: QuadrotorConfig, batch: int, rng: np.random.Generator
 ) -> dict[str, Values]:
@@ -114,7 +121,7 @@ def draw_effects(
         ),
         "rate_gain": (own("rate_gain").scale * (1 + config.gain_spread * either_way(3)),),
     }
-    # Only where they are asked for: a plant is the dearer the more of its effects vary.
+    # Only where they vary: each effect that varies makes the plant's step slower.
     if config.thrust_spread:
         scale = 1 + config.thrust_spread * either_way()
         fields["thrust_scale"] = (own("thrust_scale").scale * scale,)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from suite.train.config import PointMassConfig, QuadrotorConfig, TrainConfig
+from suite.train.config import PointMassConfig, TrainConfig
 
 STILL = (0.0, 0.0, 0.0)
 """No wind."""
@@ -30,62 +30,22 @@ def spreads(config: TrainConfig) -> dict[str, TrainConfig]:
 
     What is drawn from a range has the range's middle instead; what is drawn around the vehicle's
     own has that.
-
-    Raises:
-        ValueError: for a fleet, whose distribution is not made of such spreads.
     """
-    if config.fleet is not None:
-        raise ValueError(
-            "a fleet is drawn as a whole, nothing of it can be left out; give a recipe through "
-            "one vehicle's quadrotors or through the point mass"
-        )
-    quadrotor, physics = config.quadrotor, config.physics
-    found: dict[str, TrainConfig]
-    if quadrotor is not None:
-        found = {
-            name: replace(config, quadrotor=replace(quadrotor, **changes))
-            for name, changes in QUADROTOR.items()
-        }
-    else:
-        found = {
-            name: replace(config, physics=replace(physics, **changes))
-            for name, changes in _of_point_mass(physics).items()
-        }
-    found["image"] = replace(config, physics=replace(physics, **IMAGE))
+    part = "physics" if config.quadrotor is None else "quadrotor"
+    settings = _of_point_mass(config.physics) if config.quadrotor is None else QUADROTOR
+    named = [(name, part, changes) for name, changes in settings.items()]
+    found = {
+        name: replace(config, **{part: replace(getattr(config, part), **changes)})
+        for name, part, changes in [*named, ("image", "physics", IMAGE)]
+    }
     return {name: without for name, without in found.items() if without != config}
 
 
 def fixed(config: TrainConfig) -> TrainConfig:
-    """Return `config` without any of its spreads; raises as `spreads` does."""
+    """Return `config` without any of its spreads."""
     for name in spreads(config):
         config = spreads(config)[name]
     return config
-
-
-def words(config: TrainConfig) -> str:
-    """Return in words between what the dynamics of `config` vary."""
-    physics, quadrotor = config.physics, config.quadrotor
-    both = "field of view, noise of the image"
-    if quadrotor is None:
-        low, high = physics.drag
-        least, most = physics.drag_up
-        first, last = physics.action_delay
-        return (
-            f"lag {physics.lag_mean:g} +- {physics.lag_std:g} 1/s, drag {low:g} to {high:g} 1/s "
-            f"({least:g} to {most:g} along z), delay {first:g} to {last:g} decisions, "
-            f"wind {physics.wind_std[0]:g} m/s, time step {100 * physics.time_step_std:g} %, {both}"
-        )
-    return f"around {quadrotor.vehicle.name}: {_of_quadrotor(quadrotor)}, {both}"
-
-
-def _of_quadrotor(config: QuadrotorConfig) -> str:
-    return (
-        f"mass {100 * config.mass_std:g} %, thrust {100 * config.thrust_spread:g} %, rotor lag "
-        f"{100 * config.lag_spread:g} % and {1e3 * config.lag_spread_s:g} ms, drag "
-        f"{config.drag_spread:g} 1/s, delay {1e3 * config.delay_spread_s:g} ms, rate gain "
-        f"{100 * config.gain_spread:g} %, centre of mass {1e3 * config.com_std_m:g} mm, torque "
-        f"trim {config.trim_std:g} N m, wind {config.wind_std[0]:g} m/s"
-    )
 
 
 def _of_point_mass(physics: PointMassConfig) -> dict[str, dict[str, Any]]:

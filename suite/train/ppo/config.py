@@ -14,10 +14,9 @@ from suite.train.config import (
     QuadrotorConfig,
     TrainConfig,
 )
-from suite.train.dynamics.fleet import FleetConfig
 from tracks.input.ranges import Iterations, Range, Seed, Share
 
-SHARED = ("spec", "physics", "quadrotor", "fleet", "loss", "episode", "seed")
+SHARED = ("spec", "physics", "quadrotor", "loss", "episode", "seed")
 """Settings that both trainings have."""
 
 
@@ -31,13 +30,11 @@ class PpoConfig:
     """Dynamics and their randomisation."""
     quadrotor: QuadrotorConfig | None = None
     """Train through this quadrotor; None: through the point mass of `physics`."""
-    fleet: FleetConfig | None = None
-    """Train through quadrotors drawn from this distribution, in the place of either."""
     loss: LossConfig = field(default_factory=LossConfig)
-    """beta_2, r_q and the points of a step's path, for the reward; nothing else of it is read."""
+    """r_q, for the reward; nothing else of it is read."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
-    """Worlds and horizon; `stop_from`, `finish`, `live_on` and `again` are not read, since the
-    value of what follows is learned and a world is flown anew where it ends."""
+    """Worlds and horizon; `stop_from` and `finish` are not read, since the value of what follows is
+    learned and a world is flown anew where it ends."""
     seed: Seed = 0
     """Seed of the parameters, the tracks, the randomisation and the exploration."""
     iterations: Iterations = 200

@@ -1,9 +1,8 @@
 """The reward of one step, for any policy's rollout (Su et al. 2026, Table "Reward Function").
 
 It is the yardstick of the comparison of training schemes, so its weights are constants: no
-training's own weights change it. What the table leaves open is taken from `LossConfig`, as the
-differentiable trainer has it: beta_2 is `barrier_slope`, r_q is `safety_radius_m`, and the nearest
-obstacle is looked up at `path_samples` points of the step.
+training's own weights change it. What the table leaves open is as the differentiable trainer has
+it: beta_2, the points of a step's path and, of `LossConfig`, r_q (`safety_radius_m`).
 """
 
 from __future__ import annotations
@@ -61,15 +60,15 @@ def make_reward(
     r_th of its centre; such a step's progress is towards the next gate.
 
     Args:
-        config: beta_2, r_q and the points of a step's path are those of its `loss`.
+        config: r_q is that of its `loss`.
     """
-    weights = replace(config.loss, barrier_height=1.0, pass_first=True, approach_m=0.0)
+    weights = replace(config.loss, pass_first=True, approach_m=0.0)
 
     def reward(
         worlds: Worlds, before: DynamicsState, after: DynamicsState, target: jax.Array
     ) -> tuple[RewardTerms, jax.Array, jax.Array]:
         step = make_step(weights, worlds, before, after, target)
-        avoid = BARRIER * losses.clearance(weights, step)
+        avoid = BARRIER * losses.barrier(step).mean(-1)
         smooth = ACCELERATION * losses.acceleration(weights, step)
         terms = RewardTerms(
             collision=COLLISION * (step.clearance < weights.safety_radius_m),

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from policies.networks import network
-from suite.train.beyond import critic
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import make_dynamics
+from suite.train.ppo import critic
 from suite.train.ppo.reward import RewardTerms, make_reward
-from suite.train.rollout import choose, make_sight, observed_at_start, queue
+from suite.train.rollout import make_sight, observed_at_start, queue
 from suite.train.step import BODY_RADIUS_M, target_gate
 from suite.train.worlds import Worlds
 
@@ -70,6 +70,11 @@ def log_probability(mean: jax.Array, log_deviation: jax.Array, action: jax.Array
     """
     away = (action - mean) * jnp.exp(-log_deviation)
     return -(0.5 * away * away + log_deviation + 0.5 * jnp.log(2 * jnp.pi)).sum(-1)
+
+
+def choose(where: jax.Array, ones: Any, others: Any) -> Any:
+    """Return the leaves (B, ...) of `ones` for worlds `where` (B,) is true, else of `others`."""
+    return jax.tree.map(lambda one, other: jax.vmap(jnp.where)(where, one, other), ones, others)
 
 
 def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]:

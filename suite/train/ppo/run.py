@@ -1,4 +1,4 @@
-"""A PPO run in a folder; `suite/train/repeat.py` says what the folder holds."""
+"""A PPO run in a folder; `suite/train/training_loop.py` says what the folder holds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from suite.train import run as trainer
 from suite.train.config import check
 from suite.train.ppo.config import PpoConfig
 from suite.train.ppo.update import make_update, start_state
-from suite.train.repeat import Method, Outcome, Run, Watch, flight_note, repeat
+from suite.train.training_loop import Method, Outcome, Run, Watch, flight_note, train_in_folder
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
 
@@ -59,4 +59,4 @@ def train_ppo(
     place = SingleDeviceSharding(jax.devices()[0])
     origin = {"config": plain(config), "from": None, "delta": None, "method": "ppo"}
     run = Run(config, config.spec, config.seed, origin, folder, place)
-    return repeat(method, run, start_state(config), console, watch)
+    return train_in_folder(method, run, start_state(config), console, watch)

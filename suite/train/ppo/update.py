@@ -16,8 +16,8 @@ import numpy as np
 import optax
 
 from policies.networks import network
-from suite.train.beyond import critic
 from suite.train.gradient import sampled_encoder_gradient
+from suite.train.ppo import critic
 from suite.train.ppo.config import PpoConfig
 from suite.train.ppo.objective import Actor, Sequences, advantages, clipped_loss
 from suite.train.ppo.rollout import Record, make_rollout

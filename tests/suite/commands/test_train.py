@@ -71,7 +71,5 @@ def test_the_command_line_asks_for_model_and_vehicle_together():
     assert around == replace(own, vehicle=reference), "the recipe's own spreads"
     with pytest.raises(ValueError, match="--vehicle is racer5.*point mass has none.*--model quad"):
         resolve(Config(preset="swift", vehicle="racer5"))
-    with pytest.raises(ValueError, match="--vehicle is racer5.*fleet has none.*--model quad"):
-        resolve(Config(model="fleet", vehicle="racer5"))
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
         resolve(Config(model="quad", vehicle="racer6"))

@@ -6,7 +6,7 @@ import pytest
 
 from eval.worlds.trial import Rules
 from suite.experiments.study import judging
-from suite.train.repeat import Outcome
+from suite.train.training_loop import Outcome
 from tests.support.documents import another_racer
 
 

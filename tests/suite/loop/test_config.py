@@ -138,11 +138,11 @@ def test_a_policy_is_fine_tuned_by_its_own_recipe(policy, recipe, root, monkeypa
 
 def test_settings_are_of_the_fine_tuning_where_a_policy_is_given():
     """Else of the recipe, which the fine-tuning follows at its share of the rate."""
-    changes = ("optimizer.rate=1e-4", "episode.easy_until=0.2")
+    changes = ("optimizer.rate=1e-4", "episode.rest_share=0.2")
     given = resolve(policy="racer", changes=changes).tuning
-    assert (given.optimizer.rate, given.episode.easy_until) == (1e-4, 0.2)
+    assert (given.optimizer.rate, given.episode.rest_share) == (1e-4, 0.2)
     trained = resolve(recipe="small", changes=changes).tuning
-    assert (trained.optimizer.rate, trained.episode.easy_until) == (pytest.approx(3e-5), 0.0)
+    assert (trained.optimizer.rate, trained.episode.rest_share) == (pytest.approx(3e-5), 0.2)
 
 
 def test_settings_are_checked_at_the_rate_that_is_fine_tuned():

@@ -75,25 +75,17 @@ import jax
 jax.config.update("jax_num_cpu_devices", 2)
 import numpy as np
 from jax.sharding import Mesh
-from suite.train.beyond.carried import taken_over
-from suite.train.beyond.value import start_critic
 from suite.train.gradient import shard_gradient
-from suite.train.rollout import make_start
 from suite.train.update import device_mesh
 from tests.support.training import boxes_worlds, fresh_params, largest_difference, small_config
-config = small_config(loss={"value": 1.2}, live_on=0.5)
+config = small_config()
 assert device_mesh(config).size == 2
-judge = start_critic(config).params
-old, fresh = (jax.tree.map(np.asarray, boxes_worlds(config, i)) for i in (0, 1))
-left = old._replace(flown=make_start(config)(old), begun=np.array([True, False, False, True]))
-worlds = taken_over(config, fresh, left)
-args = (fresh_params(), worlds, jax.random.key(0), None, judge)
+args = (fresh_params(), boxes_worlds(config), jax.random.key(0), None)
 results = []
 for count in (1, 2):
     mesh = Mesh(np.array(jax.devices()[:count]), ("worlds",))
     gradient, loss, records = jax.jit(shard_gradient(config, mesh))(*args)
-    noted = records.noted.seen, records.noted.worth, records.after.state.pos_w
-    results.append((gradient, loss, records.pos_w, records.terms, *noted))
+    results.append((gradient, loss, records.pos_w, records.terms))
 print(largest_difference(results[1], results[0]))
 """
 

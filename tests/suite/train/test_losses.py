@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from suite.train import losses
 from suite.train.config import LossConfig
 from suite.train.losses import MAX_PULL, weighted
-from suite.train.step import Step, flown_on, gap_beyond
+from suite.train.step import Step, gap_beyond
 from tracks.geometry.clearance import nearest_obstacle
 from tracks.geometry.field import attractive_field, magnetic_field
-from tracks.geometry.gates import round_gates, square_gates
+from tracks.geometry.gates import square_gates
 from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
 
 
@@ -24,6 +24,12 @@ from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
 def _float64():
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture(autouse=True)
+def _gentle_barrier(monkeypatch):
+    """Let the barrier reach as far as the points that are drawn: the paper's ends after 0.1 m."""
+    monkeypatch.setattr(losses, "BARRIER_SLOPE", -8.0)
 
 
 def one_of_each() -> Scene:
@@ -47,7 +53,7 @@ def a_step(batch, **known):
     zero = jnp.zeros((batch, 3))
     rest = {name: zero for name in ("pos_w", "vel_w", "acc_w", "jerk_w", "goal_w", "place_g")}
     path = {"gap": jnp.ones((batch, 1)), "away_w": zero[:, None], "clearance": jnp.ones(batch)}
-    path |= {"survival": jnp.ones(batch), "up": jnp.ones(batch)}
+    path |= {"up": jnp.ones(batch)}
     gate = {"gate": unit_gate(batch), "passed": jnp.zeros(batch, bool)}
     return Step(**{**rest, **path, **gate, **known})
 
@@ -88,14 +94,14 @@ def test_every_weight_of_the_table_scales_its_term_alone():
 
 
 def test_tilt_costs_from_an_angle_on_and_one_where_the_body_lies_level():
-    angle = np.radians([0.0, 59.0, 75.0, 90.0, 120.0])
-    config = LossConfig(tilt_from_deg=60.0)
+    angle = np.radians([0.0, 64.0, 75.0, 90.0, 120.0])
+    least = np.cos(np.radians(65.0))
 
     def cost(up):
-        return losses.tilt(config, a_step(5, up=up))
+        return losses.tilt(LossConfig(), a_step(5, up=up))
 
     up = jnp.asarray(np.cos(angle))
-    wanted = [0.0, 0.0, (1 - np.cos(angle[2]) / 0.5) ** 2, 1.0, 4.0]
+    wanted = [0.0, 0.0, (1 - np.cos(angle[2]) / least) ** 2, 1.0, (1 + 0.5 / least) ** 2]
     np.testing.assert_allclose(cost(up), wanted, atol=1e-6)
     slope = jax.grad(lambda up: cost(up).sum())(up)
     assert np.all(slope[:2] == 0) and np.all(np.diff(slope[1:]) < 0), "the further, the dearer"
@@ -122,7 +128,7 @@ def terms_at(path_w, vel_w, config):
 
 
 def test_obstacle_terms_are_the_papers():
-    config = LossConfig(barrier_height=2.0, barrier_slope=-8.0, safety_radius_m=0.15)
+    config = LossConfig(safety_radius_m=0.15)
     vel, path = np.array([1.0, 2.0, -1.0]), around()
     distance, away = (np.array(x[0]) for x in nearest(one_of_each(), path))
     gap, closing = distance - 0.15, np.maximum(0.0, -(away @ vel))
@@ -132,7 +138,7 @@ def test_obstacle_terms_are_the_papers():
 
 
 def test_the_terms_of_a_step_are_means_over_its_path():
-    config, path = LossConfig(barrier_slope=-8.0), around(4, seed=2)
+    config, path = LossConfig(), around(4, seed=2)
     vel = jnp.asarray([[1.0, 2.0, -1.0]])
     distance, away = nearest(one_of_each(), path)
     whole = obstacle_terms(config, distance, away, path, vel)
@@ -145,7 +151,7 @@ def test_obstacle_terms_push_away_from_every_kind_of_solid_outside_and_inside():
     distance, away = (np.array(x[0]) for x in nearest(one_of_each(), path))
     near = distance < 1.0
     assert (distance < 0).sum() > 20 and near.sum() > 200
-    config = LossConfig(barrier_slope=-8.0)
+    config = LossConfig()
     for index in (0, 1):
         # Closing in at 2 m/s on whatever is nearest, point by point.
         push = -jax.grad(lambda p, i=index: terms_at(p, -2.0 * away, config)[i].sum())(path)
@@ -158,7 +164,7 @@ def test_obstacle_terms_push_away_from_every_kind_of_solid_outside_and_inside():
 @pytest.mark.parametrize("index", [0, 1])
 def test_obstacle_gradients_are_those_of_the_true_distance(index):
     """Central differences look the nearest obstacle up again at each moved point."""
-    config = LossConfig(barrier_slope=-8.0)
+    config = LossConfig()
     path, vel = around(40, seed=5), np.array([1.0, -1.5, 0.7])
     gradient = jax.grad(lambda p: terms_at(p, jnp.asarray(vel), config)[index].sum())(path)
     # The closing speed has no gradient on purpose, so the differences hold it as well.
@@ -278,9 +284,9 @@ def test_the_field_enters_as_minus_its_vector_with_the_strength_it_says():
     centers, rot, opening = (np.array(x) for x in (gates.center_w, gates.rot_w, gates.opening_g))
     center, sideways = centers[:1], rot[:1, :, 1]
     unit_field = magnetic_field(center, rot[:1], opening[:1], center)
-    at_center = attractive_field(unit_field, sideways, config.field_decay)
+    at_center = attractive_field(unit_field, sideways, 0.3)
     field = magnetic_field(centers, rot, opening, np.array(pos))
-    u_a = attractive_field(field, np.array(vel), config.field_decay)
+    u_a = attractive_field(field, np.array(vel), 0.3)
     expected = 0.42 * u_a / np.linalg.norm(at_center)
     far = np.linalg.norm(expected, axis=-1) < 0.42 * MAX_PULL
     assert far.sum() > 15
@@ -288,20 +294,6 @@ def test_the_field_enters_as_minus_its_vector_with_the_strength_it_says():
     middle = jnp.tile(jnp.asarray(center), (20, 1))
     at = pull_at(config, gates, middle, jnp.tile(jnp.asarray(sideways), (20, 1)))
     np.testing.assert_allclose(at[0], 0.42 * rot[0, :, 0], atol=1e-6)
-
-
-def test_a_round_gate_pulls_as_itself_or_as_the_square_around_it():
-    ones, rng = np.ones(20), np.random.default_rng(8)
-    octagon = round_gates(np.zeros((20, 3)), 0.4 * ones, ones, 0.2 * ones, 0.1 * ones, 8)
-    square = square_gates(np.zeros((20, 3)), 0.4 * ones, ones, 0.2 * ones, 0.1 * ones)
-    octagon, square = (Gates(*(jnp.asarray(x) for x in g)) for g in (octagon, square))
-    pos, vel = (jnp.asarray(rng.normal(0, size, (20, 3))) for size in (1.0, 3.0))
-    own = pull_at(LossConfig(), octagon, pos, vel)
-    borrowed = pull_at(LossConfig(field_square=True), octagon, pos, vel)
-    np.testing.assert_allclose(borrowed, pull_at(LossConfig(), square, pos, vel), rtol=1e-5)
-    assert np.abs(own - borrowed).max() > 0.1
-    unchanged = pull_at(LossConfig(field_square=True), square, pos, vel)
-    np.testing.assert_allclose(unchanged, borrowed, rtol=1e-5)
 
 
 def test_the_field_is_held_near_the_wires_and_carries_no_gradient_itself():
@@ -321,24 +313,3 @@ def test_the_field_is_held_near_the_wires_and_carries_no_gradient_itself():
     assert not np.any(jax.grad(of_velocity)(vel))
     bend = jax.jacrev(jax.grad(lambda p: guidance_term(config, gates, p, vel).sum()))(wire - 0.3)
     assert not np.any(bend)
-
-
-def test_a_crash_costs_the_progress_that_comes_after_it():
-    """Three steps at 2, 3 and -1 m/s, the chance of the first one on: 2 q + 3 q + 0 q."""
-    config = LossConfig(survival=0.5, safety_radius_m=0.3, survival_width_m=0.05)
-    ahead, still = jnp.asarray([[9.0, 0.0, 0.0]]), jnp.zeros((1, 3))
-
-    def loss(gap):
-        chance = flown_on(config, jnp.full((1, 2), gap))
-        speeds = (jnp.asarray([[x, 0.0, 0.0]]) for x in (2.0, 3.0, -1.0))
-        known = {"pos_w": still, "goal_w": ahead, "survival": chance}
-        steps = (a_step(1, vel_w=vel_w, **known) for vel_w in speeds)
-        return sum(weighted(config, step)["survival"][0] for step in steps)
-
-    # The body touches at a gap of 0.08 - 0.3 m: even odds.
-    assert float(loss(-0.22)) == pytest.approx(-0.5 * 5.0 * 0.5, rel=1e-4)
-    slope = jax.grad(loss)(-0.22)
-    assert float(slope) == pytest.approx(-0.5 * 5.0 * 0.5 * 0.5 / 0.05, rel=1e-4)
-    assert float(jax.grad(loss)(0.1)) > -0.1, "far away there is nothing to gain"
-    at_speed = jax.grad(lambda v: weighted(config, a_step(1, vel_w=v, goal_w=ahead))["survival"][0])
-    np.testing.assert_array_equal(at_speed(2.0 + still), 0.0, "speed is paid by `progress`")

@@ -6,7 +6,7 @@ import pytest
 
 from suite.train.config import TrainConfig
 from suite.train.overrides import check_owned, override
-from suite.train.presets import preset, with_fleet
+from suite.train.presets import preset
 
 
 def test_settings_are_changed_by_name():
@@ -32,17 +32,14 @@ def test_what_only_the_point_mass_reads_is_refused_through_quadrotors():
         with pytest.raises(ValueError, match=r"is of the point mass.*set one of quadrotor\."):
             override(run, [change])
     assert override(run, ["physics.image_delay=2"]).physics.image_delay == 2
-    with pytest.raises(ValueError, match=r"set one of fleet\."):
-        override(with_fleet(run), ["physics.drag=(0,1)"])
 
 
 @pytest.mark.parametrize(
     ("change", "need", "given"),
     [
-        ("critic.size=64", "loss.value", "1.2"),
-        ("loss.tilt_from_deg=30", "loss.tilt", "40"),
+        ("loss.projection_decay=1", "loss.projection", "3"),
         ("loss.speed_range=(3, 9)", "spec.speed_input", "True"),
-        ("episode.again_before_s=(0.5, 1)", "episode.again", "0.5"),
+        ("episode.race_share=0.9", "spec.speed_input", "True"),
     ],
 )
 def test_what_would_do_nothing_is_refused(change, need, given):
@@ -67,7 +64,6 @@ def test_what_a_command_sets_itself_is_refused_with_what_to_do_instead():
         ("loss=1", "has parts, set one of clearance"),
         ("loss.progress.more=1", "'more' is below a setting that has no parts"),
         ("quadrotor.mass_std=0.1", "this run has no quadrotor; take a preset"),
-        ("fleet.mass=1", "this run has no fleet; suite train has one"),
         ("loss.progress", "write FIELD=VALUE"),
         ("loss.progress=fast", "'fast' does not fit, the setting is like"),
         ("episode.batch=3.5", "(int)"),

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from policies.networks import delta_network, network
 from policies.observation import observe
-from suite.train import rollout
+from suite.train import losses, rollout
 from suite.train.config import PointMassConfig
 from suite.train.dynamics import point_mass
+from suite.train.dynamics.interface import make_dynamics
 from suite.train.gradient import make_gradient
 from suite.train.losses import UNIT_FIELD
 from suite.train.rollout import make_rollout, view_in
@@ -68,22 +69,17 @@ def test_records_are_those_of_the_flight(two_pass):
     assert np.ptp(np.array(records.image)) > 1
 
 
-def test_a_pixel_is_the_nearest_of_the_trainings_own_rays():
+def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight():
     config = small_config()
     worlds = boxes_worlds(config)
-    start = rollout.make_start(config)(worlds)
+    state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
 
-    def image(trained, flown=1, pixels=20):
-        camera = replace(SPEC.camera, width=pixels, height=pixels, rays=flown)
-        eye = replace(config, spec=replace(SPEC, camera=camera))
-        sight = rollout.make_sight(replace(eye, physics=replace(config.physics, rays=trained)))
-        return np.array(sight(worlds, start.state, start.target, start.action_b, KEY).image)
+    def image(rays):
+        camera = replace(SPEC.camera, rays=rays)
+        sight = rollout.make_sight(replace(config, spec=replace(SPEC, camera=camera)))
+        return np.array(sight(worlds, state, jnp.asarray(worlds.target), state.pos_w, KEY).image)
 
-    nearest = image(trained=1, pixels=40).reshape(4, 20, 2, 20, 2).max((2, 4))
-    np.testing.assert_allclose(image(trained=2), nearest, atol=1e-5)
-    plain = image(trained=1)
-    assert np.abs(plain - nearest).max() > 0.5
-    np.testing.assert_array_equal(image(trained=1, flown=2), plain)
+    np.testing.assert_array_equal(image(2), image(1))
 
 
 @pytest.fixture
@@ -101,13 +97,14 @@ def held_attitude(float64, monkeypatch):
     )
 
 
-def test_the_rollouts_gradient_is_that_of_finite_differences(held_attitude):
+def test_the_rollouts_gradient_is_that_of_finite_differences(held_attitude, monkeypatch):
     """Where nothing is cut: no decay, no field, no closing speed, attitude held."""
     config = small_config(
         steps=8,
         physics={"state_delay": 1, "image_delay": 1},
-        loss={"gradient_decay": 0.0, "field_gain": 0.0, "collide": 0.0, "barrier_slope": -4.0},
+        loss={"gradient_decay": 0.0, "field_gain": 0.0, "collide": 0.0},
     )
+    monkeypatch.setattr(losses, "BARRIER_SLOPE", -4.0)  # smooth enough for differences
     both = jax.jit(jax.value_and_grad(loss_of(config)))
     params, worlds = doubled(fresh_params()), doubled(boxes_worlds(config))
     gradient = both(params, worlds)[1]
@@ -132,7 +129,7 @@ def fly(params, worlds):
     for _ in range(CONFIG.episode.steps):
         state = observe(CONFIG.spec, view_in(worlds, body, worlds.target), action).state
         action, hidden = network.recur(params, hidden, blind(params, state), state)
-        body = point_mass.step(body, worlds.constants, action, target_w, 6.0, 0.916)
+        body = point_mass.step(body, worlds.constants, action, target_w, 0.916)
         positions.append(body.pos_w)
         velocities.append(body.vel_w)
     return jnp.stack(positions), jnp.stack(velocities)
@@ -142,8 +139,7 @@ def pull_at(worlds, pos_w, vel_w):
     """Return u_A of every world's first gate, 1 across the centre of a gate of 1 m."""
     gate, _ = target_gate(worlds.scene.gates, worlds.target)
     field = magnetic_field(gate.center_w, gate.rot_w, gate.opening_g, pos_w)
-    decay = CONFIG.loss.field_decay
-    return attractive_field(field, vel_w, decay) / (2e-5 * UNIT_FIELD) ** (1 - decay)
+    return attractive_field(field, vel_w, 0.3) / (2e-5 * UNIT_FIELD) ** 0.7
 
 
 def test_the_field_enters_as_the_paper_says(float64):
@@ -237,7 +233,7 @@ def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
         scene=worlds.scene._replace(boxes=boxes._replace(center_w=center, half_size=wall)),
     )  # fmt: skip
     embedding_shift = jnp.zeros((6, 4, SPEC.hidden_size))
-    _, records, _ = jax.jit(make_rollout(config), static_argnums=4)(
+    _, records = jax.jit(make_rollout(config), static_argnums=4)(
         params, embedding_shift, moved, KEY, blind
     )
     total = np.abs(sum(np.array(term) for term in records.terms.values()))
@@ -279,7 +275,8 @@ def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
     config = replace(config, spec=replace(config.spec, speed_input=True))
     worlds = sample_worlds(config, 0)
     worlds = worlds._replace(vel_w=3.0 * worlds.heading_w)
-    found = rollout.make_start(config)(worlds).observed
+    state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
+    found = rollout.observed_at_start(worlds, state, config)
     assert found.shape == (2, 2, config.spec.state_size)
     np.testing.assert_array_equal(found[:, 0], found[:, 1])
     np.testing.assert_allclose(np.linalg.norm(found[:, 0, :3], axis=-1), 3.0, rtol=1e-6)
@@ -321,23 +318,3 @@ def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the
     after = np.cumsum(passed, 0) - passed > 0
     assert after.any()
     assert np.array_equal(np.asarray(records.alive) == 0, after & finish)
-
-
-def test_a_crashed_world_keeps_the_price_of_its_crash_and_nothing_else():
-    config = small_config(batch=2, steps=4, loss={"survival": 1.0})
-    worlds = boxes_worlds(config)
-    center_w = np.array(worlds.scene.boxes.center_w)
-    center_w[0, 0] = worlds.pos_w[0]  # the first world starts inside a solid
-    boxes = worlds.scene.boxes._replace(center_w=center_w)
-    worlds = worlds._replace(
-        scene=worlds.scene._replace(boxes=boxes), vel_w=worlds.heading_w * np.float32(2.0)
-    )
-    shift = jnp.zeros((4, 2, SPEC.hidden_size))
-    _, records, _ = jax.jit(lambda p: make_rollout(config)(p, shift, worlds, KEY, blind))(
-        fresh_params()
-    )
-    np.testing.assert_array_equal(records.alive[:, 0], [1, 0, 0, 0])
-    assert np.all(np.asarray(records.terms["progress"])[1:, 0] == 0)
-    price = -np.asarray(records.terms["survival"])
-    assert np.all(price[1:, 0] > 0), "what would have been flown"
-    assert np.all(price[:, 0] < 0.5 * price[:, 1]), "its chance is gone"

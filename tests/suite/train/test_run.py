@@ -6,7 +6,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import jax
 import numpy as np
@@ -18,8 +17,7 @@ from policies.networks import delta_network
 from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.train import repeat, run
-from suite.train.beyond import carried
+from suite.train import run, training_loop
 from suite.train.dynamics import point_mass
 from tests.support.training import boxes_worlds, fresh_params, small_config
 
@@ -107,25 +105,6 @@ def test_a_stopped_run_resumes_exactly(whole, tmp_path, monkeypatch):
     assert_same_run(tmp_path, whole)
 
 
-def test_a_run_with_a_critic_and_worlds_that_live_on_resumes_exactly(tmp_path, monkeypatch):
-    monkeypatch.setattr(carried, "sample_worlds", boxes_worlds)
-    config = small_config(loss={"value": 1.2}, live_on=0.7, again=0.5, again_before_s=(0.0, 0.1))
-    folders = tmp_path / "whole", tmp_path / "stopped"
-    run.train(config, folders[0], Console())
-    go_on = stop_at(monkeypatch, 4)
-    with pytest.raises(KeyboardInterrupt):
-        run.train(config, folders[1], Console())
-    go_on()
-    run.train(config, folders[1], Console())
-    assert_same_run(*folders[::-1])
-    state = load_arrays(folders[0] / "state", kind="training").arrays
-    begun = next(value for name, value in state.items() if name.endswith("carried.begun"))
-    assert np.any(begun), "worlds go on, so that a state without them would not do"
-    update: Any = compiled_update(config, run.device_mesh(config))
-    assert update._cache_size() == 1
-    assert all("value_explained" in row for row in rows(folders[0]))
-
-
 class Killed(BaseException):
     """Stands for a kill: nothing after it is written."""
 
@@ -134,8 +113,8 @@ class Killed(BaseException):
 def test_a_kill_in_the_middle_of_saving_leaves_a_run_that_resumes(
     dies_in, whole, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(repeat, "SAVE_PERIOD_S", 0.0)
-    owner = curve if dies_in == "append" else repeat
+    monkeypatch.setattr(training_loop, "SAVE_PERIOD_S", 0.0)
+    owner = curve if dies_in == "append" else training_loop
     real, calls = getattr(owner, dies_in), []
 
     def dying(*args, **kwargs):
@@ -186,9 +165,9 @@ sys.meta_path.insert(0, Blocker())
 from pathlib import Path
 import tracks.common.files
 from suite.common.console import Console
-from suite.train import repeat, run
+from suite.train import run, training_loop
 from tests.support.training import boxes_worlds, small_config
-run.sample_worlds, repeat.SAVE_PERIOD_S = boxes_worlds, 0.0
+run.sample_worlds, training_loop.SAVE_PERIOD_S = boxes_worlds, 0.0
 real, renamed = os.replace, []
 def replace(source, target):
     if Path(target).name == "state":

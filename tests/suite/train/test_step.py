@@ -11,7 +11,7 @@ from suite.train.config import LossConfig
 from suite.train.dynamics import point_mass
 from suite.train.losses import speed_to_goal
 from suite.train.rollout import make_rollout
-from suite.train.step import BEYOND_M, approach_shift, make_step, target_gate
+from suite.train.step import BEYOND_M, PATH_SAMPLES, approach_shift, make_step, target_gate
 from tests.support.training import KEY, SPEC, blind, boxes_worlds, fresh_params, small_config
 
 
@@ -30,24 +30,6 @@ def test_the_point_before_the_gate_that_progress_is_measured_to(place_g, shift):
     found = approach_shift(config, jnp.array([place_g]))
     np.testing.assert_allclose(found, [shift], atol=1e-6)
     assert approach_shift(LossConfig(), jnp.array([place_g])) == 0.0
-
-
-def test_tipping_over_lowers_the_odds_to_fly_on_where_it_ends_a_world():
-    worlds = boxes_worlds(small_config(3))
-    body = point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w)
-    lean = jnp.asarray([0.0, 0.5 * np.pi, np.pi])
-    zero, one = jnp.zeros(3), jnp.ones(3)
-    rows = [[jnp.cos(lean), zero, jnp.sin(lean)], [zero, one, zero],
-            [-jnp.sin(lean), zero, jnp.cos(lean)]]  # fmt: skip
-    leaning = body._replace(rot_w=jnp.stack([jnp.stack(row, -1) for row in rows], -2))
-
-    def odds(**weights):
-        config = LossConfig(survival=1.0, **weights)
-        return np.asarray(make_step(config, worlds, body, leaning, jnp.zeros(3, int)).survival)
-
-    upright, level, over = odds(tilt=40.0) / odds()
-    assert upright == pytest.approx(1.0, abs=1e-6) and level == pytest.approx(0.5, abs=1e-4)
-    assert over < 1e-6
 
 
 def test_past_the_last_gate_the_point_to_fly_to_lies_behind_it():
@@ -84,7 +66,7 @@ def test_a_step_through_a_gate_and_its_numbers(pass_first, speed):
     place = np.einsum("bij,bi->bj", turn, np.array(after.pos_w) - aim)
     np.testing.assert_allclose(step.place_g, place, atol=1e-4)
     np.testing.assert_allclose(step.jerk_w, after.acc_w / worlds.constants.time_step[:, None])
-    assert step.gap.shape == (2, config.path_samples)
+    assert step.gap.shape == (2, PATH_SAMPLES)
     np.testing.assert_allclose(step.clearance, step.gap.min(-1) + config.safety_radius_m, atol=1e-6)
     beside = make_step(config, worlds, before, after, jnp.full(2, 8))
     assert not beside.passed.any()

@@ -8,16 +8,8 @@ import pytest
 
 from suite.delta.replay import nominal_model
 from suite.train.dynamics.point_mass import PointMassParams
-from suite.train.worlds import difficulty_range, sample_worlds
+from suite.train.worlds import sample_worlds
 from tests.support.training import small_config
-
-
-def test_difficulty_grows_from_its_lower_end():
-    config = small_config(difficulty=(0.2, 0.8), easy_until=0.5)
-    assert difficulty_range(config, 0) == (0.2, 0.2)
-    assert difficulty_range(config, 3) == (0.2, 0.8) == difficulty_range(config, 5)
-    at_once = replace(config, episode=replace(config.episode, easy_until=0.0))
-    assert difficulty_range(at_once, 0) == (0.2, 0.8)
 
 
 def test_gates_heights_follow_the_setting():

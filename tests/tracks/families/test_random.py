@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tracks.families import make_track, random_track
+from tracks.families import make_track, random, random_track
 from tracks.families.random import Mix, is_free
 from tracks.geometry.obstacles import segment_distance
 
@@ -98,11 +98,12 @@ def test_dense_tracks_are_as_dense_at_the_end_as_at_the_start():
     assert by_stretch[-2:].mean() > 0.85 * by_stretch[:2].mean()
 
 
-def test_obstacles_stand_in_the_way_where_they_are_to_be_near():
+def test_obstacles_stand_in_the_way_where_they_are_to_be_near(monkeypatch):
     def share_in_line(beside_m):
+        monkeypatch.setattr(random, "BESIDE_M", beside_m)
         rng, inside, total = np.random.default_rng(5), 0, 0
         for _ in range(40):
-            track = random_track(0.5, rng, Mix(bare_share=0.0, beside_m=beside_m))
+            track = random_track(0.5, rng, Mix(bare_share=0.0))
             centers = np.concatenate([solids.center_w for solids in track.scene[1:5]])[32:, :2]
             gates = track.scene.gates.center_w[:, :2]
             away = segment_distance(centers[:, None], gates[:-1], gates[1:]).min(axis=1)
@@ -137,19 +138,6 @@ def test_heights_lie_further_apart_where_they_are_to():
     free = (usual[:, 2] > 0.9) & (wide[:, 2] > 0.9) & (wide[:, 2] < 2.2)
     assert free.sum() > 3
     np.testing.assert_allclose(np.diff(wide[free, 2]), 2 * np.diff(usual[free, 2]))
-
-
-def test_round_gates_are_as_wide_as_the_squares_in_their_place():
-    square, octagon = (
-        random_track(0.6, np.random.default_rng(3), Mix(gate_corners=n)).scene for n in (4, 8)
-    )
-    np.testing.assert_array_equal(square.gates.center_w, octagon.gates.center_w)
-    assert octagon.gates.opening_g.shape == (8, 8, 2)
-    np.testing.assert_allclose(octagon.gates.opening_g.max(1), square.gates.opening_g.max(1))
-    # Bars first; what stands about is the same.
-    np.testing.assert_array_equal(octagon.boxes.center_w[64:], square.boxes.center_w[32:])
-    with pytest.raises(ValueError, match="gates with 2 corners cannot be made, allowed are 3"):
-        random_track(0.6, np.random.default_rng(3), Mix(gate_corners=2))
 
 
 def test_without_hairpins_a_seed_keeps_its_tracks():

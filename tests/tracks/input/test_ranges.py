@@ -12,7 +12,6 @@ from suite.cli import COMMANDS
 from suite.delta.fit import FitConfig
 from suite.experiments import EXPERIMENTS
 from suite.train.config import QuadrotorConfig, TrainConfig
-from suite.train.dynamics.fleet import FleetConfig
 from suite.train.ppo.config import PpoConfig
 from tracks.input.ranges import Range, check_ranges, is_finite, ranged, shown
 
@@ -73,7 +72,7 @@ def _configs() -> list[Any]:
     modules = [f"suite.commands.{name}" for name in COMMANDS]
     modules += [f"suite.experiments.{name}" for name in EXPERIMENTS]
     found = [importlib.import_module(name).Config for name in modules]
-    return [*found, TrainConfig, QuadrotorConfig, FleetConfig, PpoConfig, FitConfig]
+    return [*found, TrainConfig, QuadrotorConfig, PpoConfig, FitConfig]
 
 
 def _dataclasses(cls: type) -> list[type]:

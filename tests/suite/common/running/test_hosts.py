@@ -108,9 +108,9 @@ class Trainings:
 
     def start(self, out, *options, seed=0, devices=1):
         code = (
-            "import sys, suite.train.repeat as repeat\n"
+            "import sys, suite.train.training_loop as training_loop\n"
             "from suite.cli import entry\n"
-            "repeat.SAVE_PERIOD_S = 0.2\n"
+            "training_loop.SAVE_PERIOD_S = 0.2\n"
             "entry()\n"
         )
         args = ["train", "--preset", "small", "--iterations", "120", "--seed", str(seed)]

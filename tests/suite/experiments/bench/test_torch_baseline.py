@@ -9,31 +9,14 @@ import pytest
 from policies.formats.torch_twin import torch_twin
 from suite.experiments.bench import train
 from suite.experiments.bench.torch_baseline import Baseline, to_torch
-from suite.train.dynamics.fleet import FleetConfig
 from suite.train.gradient import make_gradient
-from suite.train.presets import preset
 from tests.support.training import fresh_params
 
-MODELS = {
-    "point": {},
-    "fleet": {"fleet": FleetConfig(vel_noise=0.0, axis_noise=0.0, gate_noise_m=0.0)},
-    "quadrotor": {"quadrotor": preset("swift-quad").quadrotor},
-}
 
-
-@pytest.fixture(
-    scope="module",
-    params=[
-        "point",
-        pytest.param("fleet", marks=pytest.mark.slow),
-        pytest.param("quadrotor", marks=pytest.mark.slow),
-    ],
-)
-def pair(request):
+@pytest.fixture(scope="module")
+def pair():
     """Return (our gradient, our loss, the baseline after backward, its loss, config)."""
-    # What images differ by adds up fastest through the quadrotors' many steps.
-    steps = 6 if request.param == "quadrotor" else 12
-    base = replace(train.bench_config(6, steps), **MODELS[request.param])
+    base = train.bench_config(6, 12)
     config = replace(base, physics=replace(base.physics, depth_noise=0.0))
     worlds, params = train.bench_worlds(config), fresh_params(config.spec)
     gradient, loss, _ = jax.jit(make_gradient(config))(params, worlds, jax.random.key(0), None)

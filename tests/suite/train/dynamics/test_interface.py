@@ -13,7 +13,7 @@ from suite.train.worlds import sample_worlds
 from tests.support.training import small_config
 from tests.support.vehicles import PLAIN
 
-CONFIG = small_config(batch=2, physics={"heading_rate": 3.0}, loss={"gradient_decay": 0.4})
+CONFIG = small_config(batch=2, loss={"gradient_decay": 0.4})
 ACTION, TARGET = jnp.asarray([[1.0, 0.5, 2.0]] * 2), jnp.asarray([[9.0, 1.0, 2.0]] * 2)
 
 
@@ -27,7 +27,7 @@ def test_the_point_mass_is_stepped_with_the_runs_settings():
     worlds, dynamics, body = started(CONFIG)
     assert isinstance(worlds.constants, point_mass.PointMassParams)
     found = dynamics.step(body, worlds.constants, ACTION, TARGET, jax.random.key(0))
-    expected = point_mass.step(body, worlds.constants, ACTION, TARGET, 3.0, 0.4)
+    expected = point_mass.step(body, worlds.constants, ACTION, TARGET, 0.4)
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(ours, theirs)
 

@@ -49,7 +49,7 @@ def held_step(decay, rot_w=ROLL, drag=(0.3, 0.4, 0.45), delay=0.4):
 
     def f(pos, vel, thrust, acc, commands, action):
         body = base._replace(pos_w=pos, vel_w=vel, thrust_w=thrust, acc_w=acc, commands_w=commands)
-        after = point_mass.step(body, fixed, action, TARGET, 6.0, decay)
+        after = point_mass.step(body, fixed, action, TARGET, decay)
         return after.pos_w, after.vel_w, after.thrust_w, after.acc_w, after.commands_w
 
     start = (base.pos_w, base.vel_w, base.thrust_w, base.acc_w, base.commands_w)
@@ -91,14 +91,12 @@ def test_attitude_carries_no_gradient():
     fixed, body = constants(2), some_body(2)
 
     def of_rotation(rot_w):
-        after = point_mass.step(
-            body._replace(rot_w=rot_w), fixed, jnp.asarray(ACTION), TARGET, 6.0, 0.0
-        )
+        after = point_mass.step(body._replace(rot_w=rot_w), fixed, jnp.asarray(ACTION), TARGET, 0.0)
         return sum(x.sum() for x in (after.pos_w, after.vel_w, after.thrust_w, after.acc_w))
 
     def to_attitude(action, pos, thrust):
         moved = body._replace(pos_w=pos, thrust_w=thrust)
-        after = point_mass.step(moved, fixed, action, TARGET, 6.0, 0.0)
+        after = point_mass.step(moved, fixed, action, TARGET, 0.0)
         return (after.rot_w * jnp.arange(9.0).reshape(3, 3)).sum() + after.heading_w[:, 1].sum()
 
     assert not np.any(jax.grad(of_rotation)(body.rot_w))
@@ -154,7 +152,7 @@ def test_a_fine_rollout_is_the_solution_of_its_differential_equation(monkeypatch
         first = -ROLL @ (drag * (ROLL.T @ (vel - wind)))
         body = body._replace(acc_w=jnp.array([first]))
         for _ in range(steps):
-            body = point_mass.step(body, fixed, jnp.array([action]), TARGET[:1], 6.0, 0.0)
+            body = point_mass.step(body, fixed, jnp.array([action]), TARGET[:1], 0.0)
         found = [np.array(x[0]) for x in (body.pos_w, body.vel_w, body.thrust_w)]
         np.testing.assert_allclose(found[2], expected[2], atol=1e-9)
         errors.append(max(np.abs(found[i] - expected[i]).max() for i in (0, 1)))
@@ -173,14 +171,12 @@ def test_a_delayed_command_is_the_one_of_steps_before():
     action, keep = jnp.ones((1, 3)) @ jnp.asarray(ROLL), np.exp(-12.0 * 0.033)
     for delay, command in commands.items():
         now = point_mass.step(
-            body, fixed._replace(delay=jnp.array([delay])), action, TARGET[:1], 6.0, 0.0
+            body, fixed._replace(delay=jnp.array([delay])), action, TARGET[:1], 0.0
         )
         np.testing.assert_allclose(
             now.thrust_w, command * (1 - keep) + body.thrust_w * keep, atol=1e-9
         )
-    half = point_mass.step(
-        body, fixed._replace(delay=jnp.array([1.5])), action, TARGET[:1], 6.0, 0.0
-    )
+    half = point_mass.step(body, fixed._replace(delay=jnp.array([1.5])), action, TARGET[:1], 0.0)
     between = body.commands_w.mean(1) * (1 - keep) + body.thrust_w * keep
     np.testing.assert_allclose(half.thrust_w, between, atol=1e-9)
 
@@ -189,7 +185,7 @@ def test_a_steady_acceleration_is_followed_exactly():
     fixed = constants(1, drag=(0.0, 0.0, 0.0), delay=0.0)
     body, held = some_body(1), jnp.array(ACTION[:1] @ ROLL.T)
     body = body._replace(thrust_w=held, acc_w=held)
-    after = point_mass.step(body, fixed, jnp.array(ACTION[:1]), TARGET[:1], 6.0, 0.0)
+    after = point_mass.step(body, fixed, jnp.array(ACTION[:1]), TARGET[:1], 0.0)
     dt = 0.033
     expected = body.pos_w + body.vel_w * dt + 0.5 * held * dt**2
     np.testing.assert_allclose(after.pos_w, expected, atol=1e-12)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from suite.train.dynamics.quadrotor import draw_effects
-from suite.train.dynamics.spreads import fixed, spreads, words
-from suite.train.presets import preset, with_fleet
+from suite.train.dynamics.spreads import fixed, spreads
+from suite.train.presets import preset
 
 
 def test_each_spread_of_a_quadrotor_is_left_out_alone():
@@ -45,14 +45,3 @@ def test_point_masses_without_spreads_have_the_middle_of_their_ranges():
     assert physics.action_delay == (0.75, 0.75) and physics.lag_mean == recipe.physics.lag_mean
     assert not (physics.lag_std or any(physics.wind_std) or physics.time_step_std)
     assert physics.depth_noise == 0 and physics.fov_scale == (1, 1)
-
-
-def test_what_varies_is_said_in_words():
-    assert "delay 70 ms" in words(preset("swift-quad"))
-    assert words(preset("swift-quad")).startswith("around racer5: mass 8 %")
-    assert "delay 0 to 1.5 decisions" in words(preset("swift"))
-
-
-def test_of_a_fleet_nothing_can_be_left_out():
-    with pytest.raises(ValueError, match="a fleet is drawn as a whole"):
-        spreads(with_fleet(preset("swift")))

@@ -2,15 +2,14 @@
 
 from dataclasses import replace
 
-from suite.train.dynamics.fleet import FleetConfig
 from suite.train.ppo.config import PpoConfig, ppo_like
 from suite.train.presets import preset
 
 
 def test_ppo_like_a_training_has_its_worlds_and_ppos_own_settings():
-    config = replace(preset("swift"), fleet=FleetConfig(), seed=4)
+    config = replace(preset("swift-quad"), seed=4)
     found = ppo_like(config, iterations=7)
-    for part in ("spec", "physics", "quadrotor", "fleet", "loss", "episode", "seed"):
+    for part in ("spec", "physics", "quadrotor", "loss", "episode", "seed"):
         assert getattr(found, part) == getattr(config, part), part
     own = PpoConfig()
     assert found.iterations == 7 and found.rate == own.rate and found.clip == own.clip

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from policies.spec import PolicySpec
-from suite.train.beyond import critic
 from suite.train.dynamics import point_mass
+from suite.train.ppo import critic
 from tests.support.training import boxes_worlds, small_config
 from tracks.geometry.gates import square_gates
 from tracks.geometry.scene import Gates, Spheres

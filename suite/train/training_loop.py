@@ -1,4 +1,4 @@
-"""A method repeated in a folder: checkpoints that survive a kill, exact resumption, its curves.
+"""A training in a folder: iterations, checkpoints that survive a kill, exact resumption, curves.
 
 The folder holds run.json (what was run), metrics.jsonl (the curve), validation.jsonl (what was
 measured on the way), policy/ (what flies) and state/ (what resumes). An iteration depends on the
@@ -62,7 +62,7 @@ class Watch(NamedTuple):
 
 
 class Method(NamedTuple):
-    """What a run repeats. A state has the policy's `params` and the `iteration` to do next."""
+    """What is iterated. A state has the policy's `params` and the `iteration` to do next."""
 
     iterations: int
     """How often."""
@@ -103,10 +103,10 @@ class Run(NamedTuple):
     """Where the update leaves its state."""
 
 
-def repeat(
+def train_in_folder(
     method: Method, run: Run, fresh: Any, console: Console, watch: Watch | None = None
 ) -> Outcome:
-    """Repeat a method's update from the folder's state, or the `fresh` one, to its end.
+    """Iterate a method's update from the folder's state, or the `fresh` one, to its end.
 
     Of several processes the first reads and writes the folder, and hands the others its state.
 
@@ -156,7 +156,7 @@ def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watc
         watched.clear()
         _save(run, state)
 
-    def look() -> None:
+    def measure_if_due() -> None:
         done = int(state.iteration)
         if watch and _is_due(watch, done, total):
             watched.append({"iteration": done, **watch.measure(state.params)})
@@ -164,7 +164,7 @@ def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watc
     try:
         with console.progress("training", total, begun=first) as show:
             if _is_missing(watch, run.folder, first, total):
-                look()
+                measure_if_due()
             for iteration in range(first, total):
                 started = time.monotonic()
                 with _others_there(iteration, run.folder):
@@ -180,7 +180,7 @@ def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watc
                 clock = {"seconds": round(seconds, 4), "cold": iteration == first}
                 rows.append({"iteration": iteration, **row, "steps_per_s": round(speed), **clock})
                 state = after
-                look()
+                measure_if_due()
                 show(iteration + 1, f"{method.note(row)}, {speed:.0f} steps/s")
                 if time.monotonic() - saved_at > SAVE_PERIOD_S:
                     save()
@@ -246,6 +246,20 @@ def _save(run: Run, state: Any) -> None:
     )
 
 
+def _differences(theirs: Mapping[str, Any], mine: Mapping[str, Any], part: str = "") -> list[str]:
+    """Return the settings in which a stored configuration differs, those of other versions too."""
+    found: list[str] = []
+    for key in sorted({*theirs, *mine}):
+        one, other = theirs.get(key), mine.get(key)
+        if isinstance(one, Mapping) and isinstance(other, Mapping):
+            found += _differences(one, other, f"{part}{key}.")
+        elif key not in mine:
+            found.append(f"{part}{key}, which this version does not have")
+        elif key not in theirs or one != other:
+            found.append(f"{part}{key}")
+    return found
+
+
 def _resume(run: Run, fresh: Any) -> Any:
     origin, folder, devices = run.origin, run.folder, run.place.num_devices
     place = folder / "state"
@@ -257,7 +271,7 @@ def _resume(run: Run, fresh: Any) -> Any:
         return fresh
     theirs = read_config(place)["training"]
     options = [f"--{key}" for key in ("from", "delta") if theirs.get(key) != origin[key]]
-    settings = [k for k, v in origin["config"].items() if theirs["config"].get(k) != v]
+    settings = _differences(theirs["config"], origin["config"])
     if options or settings:
         raise ValueError(
             f"{folder} holds another run (it differs in {', '.join(options + settings)}); "

@@ -1,5 +1,6 @@
-"""A method that only counts, repeated in a folder: what is measured, resumed and refused."""
+"""A method that only counts, iterated in a folder: what is measured, resumed and refused."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple, cast
@@ -13,8 +14,8 @@ from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.stages import Estimate
-from suite.train import repeat as module
-from suite.train.repeat import Method, Run, Watch, repeat
+from suite.train import training_loop as module
+from suite.train.training_loop import Method, Run, Watch, train_in_folder
 from tests.support.training import SPEC, fresh_params, small_config
 from tracks.common.files import plain
 
@@ -62,29 +63,30 @@ def measured(folder):
 
 def test_the_outcome_is_of_the_last_tenth_and_the_policy_is_measured_on_the_way(tmp_path):
     seen = []
-    outcome = repeat(counting(20), run_in(tmp_path), FRESH, Console(), watch_of(seen))
+    outcome = train_in_folder(counting(20), run_in(tmp_path), FRESH, Console(), watch_of(seen))
     assert outcome.iterations == 20 and outcome.policy == tmp_path / "policy"
     assert outcome.last["loss"] == (100.0 - 18 + 100.0 - 19) / 2
     assert measured(tmp_path) == [0, 4, 8, 12, 16, 20] and len(seen) == 6
     rows = curve.read(tmp_path)
     assert [row["loss"] for row in rows] == [100.0 - i for i in range(20)]
     assert [row["cold"] for row in rows] == [True] + [False] * 19
-    repeat(counting(20), run_in(tmp_path), FRESH, Console(), watch_of(seen))
-    assert len(seen) == 6, "a finished run is neither repeated nor measured again"
+    train_in_folder(counting(20), run_in(tmp_path), FRESH, Console(), watch_of(seen))
+    assert len(seen) == 6, "a finished run is neither trained nor measured again"
 
 
 def test_a_finished_run_without_its_curve_says_so(tmp_path):
-    repeat(counting(), run_in(tmp_path), FRESH, Console(), watch_of([]))
+    train_in_folder(counting(), run_in(tmp_path), FRESH, Console(), watch_of([]))
     (tmp_path / "metrics.jsonl").unlink()
     with pytest.raises(ValueError, match=r"without its curve, metrics\.jsonl: put that back, use"):
-        repeat(counting(), run_in(tmp_path), FRESH, Console(), watch_of([]))
+        train_in_folder(counting(), run_in(tmp_path), FRESH, Console(), watch_of([]))
 
 
 def test_a_stopped_run_goes_on_with_its_curve_and_its_measurements(tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        repeat(counting(stop=6), run_in(tmp_path), FRESH, Console(), watch_of([]))
+        train_in_folder(counting(stop=6), run_in(tmp_path), FRESH, Console(), watch_of([]))
     assert len(curve.read(tmp_path)) == 6 and measured(tmp_path) == [0, 4]
-    assert repeat(counting(), run_in(tmp_path), FRESH, Console(), watch_of([])).iterations == 10
+    whole = train_in_folder(counting(), run_in(tmp_path), FRESH, Console(), watch_of([]))
+    assert whole.iterations == 10
     assert [row["iteration"] for row in curve.read(tmp_path)] == list(range(10))
     assert measured(tmp_path) == [0, 4, 8, 10]
 
@@ -96,17 +98,17 @@ def test_rows_of_a_save_that_was_cut_off_are_computed_again(tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(module, "save_arrays", full)
         with pytest.raises(OSError, match="No space"):
-            repeat(counting(3), run_in(tmp_path), FRESH, Console())
+            train_in_folder(counting(3), run_in(tmp_path), FRESH, Console())
     assert len(curve.read(tmp_path)) == 3 and not (tmp_path / "state").exists()
-    repeat(counting(3), run_in(tmp_path), FRESH, Console())
+    train_in_folder(counting(3), run_in(tmp_path), FRESH, Console())
     assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1, 2]
 
 
 def test_a_number_that_is_not_finite_ends_the_run_with_the_last_good_state(tmp_path):
     with pytest.raises(WorkFailed, match="diverged at iteration 3: loss not finite.*clip"):
-        repeat(counting(bad=3), run_in(tmp_path), FRESH, Console())
+        train_in_folder(counting(bad=3), run_in(tmp_path), FRESH, Console())
     assert len(curve.read(tmp_path)) == 3
-    outcome = repeat(counting(), run_in(tmp_path), FRESH, Console())
+    outcome = train_in_folder(counting(), run_in(tmp_path), FRESH, Console())
     assert outcome.iterations == 10 and np.isfinite(outcome.last["loss"])
 
 
@@ -114,24 +116,38 @@ def test_a_run_on_several_threads_does_not_go_on_with_one_and_goes_on_with_more(
     tmp_path, monkeypatch
 ):
     monkeypatch.setenv("NPROC", "2")
-    repeat(counting(2), run_in(tmp_path), FRESH, Console())
+    train_in_folder(counting(2), run_in(tmp_path), FRESH, Console())
     monkeypatch.setenv("NPROC", "1")
     with pytest.raises(ValueError, match=r"with 2 threads .* here are 1.* Set NPROC=2 in the env"):
-        repeat(counting(4), run_in(tmp_path), FRESH, Console())
+        train_in_folder(counting(4), run_in(tmp_path), FRESH, Console())
     monkeypatch.setenv("NPROC", "16")
-    assert repeat(counting(4), run_in(tmp_path), FRESH, Console()).iterations == 4
+    assert train_in_folder(counting(4), run_in(tmp_path), FRESH, Console()).iterations == 4
 
 
 def test_a_run_on_some_devices_does_not_go_on_on_more(tmp_path):
     run, two = run_in(tmp_path), SimpleNamespace(num_devices=2)
-    repeat(counting(2), run, FRESH, Console())
+    train_in_folder(counting(2), run, FRESH, Console())
     with pytest.raises(ValueError, match=r"on 1 JAX devices, and here are 2: each .*as many again"):
-        repeat(counting(4), run._replace(place=cast(Any, two)), FRESH, Console())
+        train_in_folder(counting(4), run._replace(place=cast(Any, two)), FRESH, Console())
 
 
 def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
-    repeat(counting(2), run_in(tmp_path), FRESH, Console())
+    train_in_folder(counting(2), run_in(tmp_path), FRESH, Console())
     with pytest.raises(ValueError, match=r"holds another run \(it differs in seed\); give another"):
-        repeat(counting(2), run_in(tmp_path, replace(CONFIG, seed=9)), FRESH, Console())
+        train_in_folder(counting(2), run_in(tmp_path, replace(CONFIG, seed=9)), FRESH, Console())
+    changed = replace(CONFIG, loss=replace(CONFIG.loss, progress=9.0))
+    with pytest.raises(ValueError, match=r"it differs in loss\.progress\)"):
+        train_in_folder(counting(2), run_in(tmp_path, changed), FRESH, Console())
     with pytest.raises(ValueError, match="differs in --from"):
-        repeat(counting(2), run_in(tmp_path, start="a digest"), FRESH, Console())
+        train_in_folder(counting(2), run_in(tmp_path, start="a digest"), FRESH, Console())
+
+
+def test_a_run_of_a_version_with_more_settings_is_refused_by_their_names(tmp_path):
+    train_in_folder(counting(2), run_in(tmp_path), FRESH, Console())
+    path = tmp_path / "state" / "config.json"
+    record = json.loads(path.read_text())
+    record["training"]["config"]["loss"]["survival"] = 0.0
+    path.write_text(json.dumps(record))
+    words = r"differs in loss\.survival, which this version does not have\); give another --out"
+    with pytest.raises(ValueError, match=words):
+        train_in_folder(counting(4), run_in(tmp_path), FRESH, Console())

@@ -1,1 +1,0 @@
-"""What comes after a rollout: its value, and worlds that the next rollout goes on with."""
