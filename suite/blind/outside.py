@@ -184,11 +184,7 @@ INSIDE = 0.98
 
 
 def draw_change(
-    rng: np.random.Generator,
-    nominal: Vehicle,
-    sensors: str,
-    effect: str,
-    multiple: float,
+    rng: np.random.Generator, nominal: Vehicle, sensors: str, effect: str, multiple: float
 ) -> tuple[np.ndarray, float]:
     """Return the change of each of the effect's columns, and the multiple that came of it.
 

@@ -26,6 +26,9 @@ from suite.diagnose.plans.sensors import SENSORS, log_of
 from suite.diagnose.plans.simulate import Extra, fly
 from suite.diagnose.plans.trajectory import Trajectory
 
+Ways = Sequence[Trajectory]
+Random = np.random.Generator
+
 
 class Flights(NamedTuple):
     """A case's flights."""
@@ -55,12 +58,7 @@ def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
     """Return who flies `case`; `rng` is for the conditions, where a simulator draws any."""
     given, sensors = given_vehicle(case.vehicle), SENSORS[case.sensors]
 
-    def on_grid(
-        truth: Vehicle,
-        ways: Sequence[Trajectory],
-        rng: np.random.Generator,
-        extra: Extra | None = None,
-    ) -> Flights:
+    def on_grid(truth: Vehicle, ways: Ways, rng: Random, extra: Extra | None = None) -> Flights:
         if case.simulator == ROTORPY:
             flown = fly_rotorpy(given, truth, ways, sensors.rate_hz)
         else:
@@ -81,12 +79,7 @@ def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
     conditions = draw_conditions(rng)
     looped = with_loop(given, conditions.loop_hz)
 
-    def in_continuous_time(
-        truth: Vehicle,
-        ways: Sequence[Trajectory],
-        rng: np.random.Generator,
-        extra: Extra | None = None,
-    ) -> Flights:
+    def between(truth: Vehicle, ways: Ways, rng: Random, extra: Extra | None = None) -> Flights:
         flown = fly_continuous(looped, truth, ways, conditions, rng, extra)
         return Flights(
             recordings_of(flown, ways, sensors.rate_hz),
@@ -94,4 +87,4 @@ def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
         )
 
     judged = with_loop(given, GRID_HZ)
-    return Simulator(looped, judged, in_continuous_time, asdict(conditions))
+    return Simulator(looped, judged, between, asdict(conditions))

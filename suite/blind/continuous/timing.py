@@ -36,13 +36,9 @@ class Schedule(NamedTuple):
 
 
 def jittered_stamps(
-    rng: np.random.Generator,
-    count: int,
-    start_s: float,
-    end_s: float,
-    rate_hz: float,
+    rng: np.random.Generator, count: int, start_s: float, end_s: float, rate_hz: float,
     jitter: float,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return the stamps (R + 1, N) of rows from `start_s` past `end_s` [s].
 
     Rows are nominally 1 / rate apart, with one at 0, which does not jitter; the others do by up to
@@ -166,15 +162,9 @@ def draw_conditions(rng: np.random.Generator) -> Conditions:
     keep = rng.random(3) < (0.8, 0.8, 0.6)
     is_coloured = rng.random() < 0.5
     coloured, colour_s = rng.uniform(0.5, 0.9), np.exp(rng.uniform(*np.log(COLOUR_S)))
-    return Conditions(
-        loop_hz=loop_hz,
-        row_hz=row_hz,
-        jitter=float(jitter * keep[0]),
-        clock_s=float(clock_s * keep[1]),
-        dropped=float(dropped * keep[2]),
-        coloured=float(coloured) if is_coloured else 0.0,
-        colour_s=float(colour_s),
-    )
+    kept = (float(value) for value in (jitter, clock_s, dropped) * keep)
+    share = float(coloured) if is_coloured else 0.0
+    return Conditions(loop_hz, row_hz, *kept, share, float(colour_s))
 
 
 def _rate(rng: np.random.Generator, usual: tuple[float, ...], span: tuple[float, float]) -> float:
