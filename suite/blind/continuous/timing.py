@@ -162,9 +162,9 @@ def draw_conditions(rng: np.random.Generator) -> Conditions:
     keep = rng.random(3) < (0.8, 0.8, 0.6)
     is_coloured = rng.random() < 0.5
     coloured, colour_s = rng.uniform(0.5, 0.9), np.exp(rng.uniform(*np.log(COLOUR_S)))
-    kept = (float(value) for value in (jitter, clock_s, dropped) * keep)
+    jitter, clock_s, dropped = (float(value) for value in (jitter, clock_s, dropped) * keep)
     share = float(coloured) if is_coloured else 0.0
-    return Conditions(loop_hz, row_hz, *kept, share, float(colour_s))
+    return Conditions(loop_hz, row_hz, jitter, clock_s, dropped, share, float(colour_s))
 
 
 def _rate(rng: np.random.Generator, usual: tuple[float, ...], span: tuple[float, float]) -> float:

@@ -368,5 +368,6 @@ def test_the_judges_monitor_flies_in_real_time_too(capsys, tmp_path, monkeypatch
     assert cli.main(["fly", "--out", str(tmp_path), "--policy", "swift", *link]) == 0
     answer = json.loads(capsys.readouterr().out)
     (policy,) = flown
-    assert isinstance(policy, Monitored) and policy.policy.block == 1
+    assert isinstance(policy, Monitored) and isinstance(policy.policy, BlockPolicy)
+    assert policy.policy.block == 1
     assert (answer["policy"]["name"], answer["interventions"]) == ("swift+monitor", 0)
