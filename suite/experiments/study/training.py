@@ -111,15 +111,6 @@ def asked_rows(rows: Sequence[Row], only: Sequence[str], what: str) -> list[Row]
     return [row for row in rows if not only or row.key in only]
 
 
-class Ended(NamedTuple):
-    """How a training ended; all else stands in its folder."""
-
-    diverged: str
-    """As `Trained` has it."""
-    points: list[dict[str, float]]
-    """What was measured of the finished policy alone."""
-
-
 def trained(
     study: Study, cache: Path, console: Console, workers: Workers | None = None
 ) -> list[Trained]:
@@ -150,7 +141,7 @@ def trained(
     start = None if study.start is None else checkpoint_folder(study.start, "--from")
     jobs = [Job(piece, cache / _place_of(piece, study), start) for piece in pieces]
     ended = all_done(do, jobs, workers, console, "training")
-    return [_read(job, end) for job, end in zip(jobs, ended, strict=True)]
+    return [_read(job, *end) for job, end in zip(jobs, ended, strict=True)]
 
 
 def _place_of(piece: tuple[str, Any], study: Study) -> Path:
@@ -166,14 +157,14 @@ def _place_of(piece: tuple[str, Any], study: Study) -> Path:
 
 
 def train_one(
-    job: Job,
-    console: Console,
-    looks: Looks | None = None,
-    may_diverge: bool = False,
-) -> Ended:
-    """Train one of `Study.pieces` in the job's folder, or find it, and look at it as `looks` says.
+    job: Job, console: Console, looks: Looks | None = None, may_diverge: bool = False
+) -> tuple[str, list[dict[str, float]]]:
+    """Train one of `Study.pieces` in the job's folder, or find it, and measure it as `looks` says.
 
     It starts from the checkpoint that the job reads, if it reads one.
+
+    Returns:
+        `Trained.diverged`, and what was measured of the finished policy alone.
 
     Raises:
         WorkFailed: where it diverges and may not.
@@ -210,15 +201,15 @@ def train_one(
             f"{key}, seed {config.seed}: success cross {found['success_cross']:.0%}, "
             f"success rate {found['success_rate']:.0%}, v_max {found['v_max']:.1f} m/s"
         )
-    return Ended(diverged, points)
+    return diverged, points
 
 
-def _read(job: Job, ended: Ended) -> Trained:
+def _read(job: Job, diverged: str, found: list[dict[str, float]]) -> Trained:
     """Return a training from its folder."""
     (key, config), policy = job.task, job.folder / "policy"
     points, compile_s = curve_of(job.folder, config.episode.batch * config.episode.steps)
     about = (str(policy), seconds_of(policy), compile_s, commit_of(policy))
-    return Trained(key, config.seed, *about, ended.diverged, ended.points or points)
+    return Trained(key, config.seed, *about, diverged, found or points)
 
 
 def rewarded(config: TrainConfig) -> Note:
