@@ -20,10 +20,6 @@ from suite.diagnose.fit.parameters import ParameterSpace, make_space
 
 REFITTED = ("mass_offset", "com_offset", "inertia_scale")
 """Effects whose numbers are fitted; between them six that a flight can tell."""
-GIVEN = "bare"
-"""The vehicle that both believe in."""
-SENSORS = "full"
-"""What is logged."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +57,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
     """
     from suite.blind.oracle.strength import given_vehicle
     from suite.diagnose.plans.follow import FlightFailed
-    from suite.diagnose.plans.sensors import SENSORS as ALL
-    from suite.diagnose.plans.sensors import log_of
+    from suite.diagnose.plans.sensors import SENSORS, log_of
     from suite.diagnose.plans.simulate import fly
     from suite.diagnose.plans.trajectory import ordinary_flights
 
@@ -79,7 +74,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
             nominal, space, indices, make_space(truth).array("start")[list(indices)], windows
         )
 
-    nominal, sensors = given_vehicle(GIVEN), ALL[SENSORS]
+    nominal, sensors = given_vehicle("bare"), SENSORS["full"]
     space = make_space(nominal)
     indices = tuple(i for i, entry in enumerate(space.entries) if entry.effect in REFITTED)
     number = 0

@@ -135,11 +135,9 @@ def bars_chart(
         kinds: all first words of keys, in the colours' order.
     """
     figure = Figure(figsize=(10.4, 5.2), layout="constrained")
-    titles = {"success_cross": "Success cross [%]", "success_rate": "Success rate [%]",
-              "v_max": "v_max, median [m/s]"}  # fmt: skip
-    every = figure.subplots(1, len(titles), sharey=True)
-    for axes, (name, title) in zip(every, titles.items(), strict=True):
-        scale = METRICS[name].scale
+    every = figure.subplots(1, 3, sharey=True)
+    for axes, name in zip(every, ("success_cross", "success_rate", "v_max"), strict=True):
+        title, scale, _ = METRICS[name]
         for at, (key, numbers) in enumerate(rows.items()):
             colour = LINES[kinds.index(key.split()[0])]
             mean, least, most = (scale * value for value in numbers[name])
