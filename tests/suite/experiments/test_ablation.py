@@ -59,7 +59,7 @@ def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, capfd):
     # In half a second nobody passes four gates; who has not moved far hits nothing.
     assert field["over"]["success_cross"]["most"] == field["pooled"]["success_cross"]["low"] == 0
     assert field["over"]["success_rate"]["least"] == 1 and field["over"]["v_max"]["mean"] > 0
-    assert "| normalised 6.4 | 4 | diverged | - |" in text and "| 1 of 1 |" in text
+    assert "| without, L_p^norm | 6.4 | diverged | - |" in text and "| 1 of 1 |" in text
     assert "| 95 |" in text
     capfd.readouterr()
     monkeypatch.setattr("suite.train.run.make_update", None)
