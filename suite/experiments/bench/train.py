@@ -75,42 +75,6 @@ def _beside(gates: Gates, missing: np.ndarray, rng: np.random.Generator) -> np.n
     return center + shift.T
 
 
-def work_per_step(config: TrainConfig) -> float:
-    """Return the floating-point operations of the network for one gradient step of one world.
-
-    Counted from its sizes, two for each product and sum: the encoder runs forward twice (once for
-    the rollout, once to be differentiated) and backward once at twice the cost; the recurrent part
-    forward once and backward once. Rays, distances and dynamics are not counted, so the share of
-    the machine's rate is a lower bound.
-    """
-    from policies.networks.network import flat_features
-    from policies.spec import ACTION_SIZE
-
-    spec = config.spec
-    rows, columns, hidden = spec.camera.height // 4, spec.camera.width // 4, spec.hidden_size
-    first, second, third = spec.channels
-    encoder = rows * columns * 4 * first
-    encoder += (rows - 2) * (columns - 2) * 9 * first * second
-    encoder += (rows - 4) * (columns - 4) * 9 * second * third
-    encoder += flat_features(spec) * hidden
-    recurrent = spec.state_size * hidden + 6 * hidden * hidden + hidden * ACTION_SIZE
-    return 2.0 * (4 * encoder + 3 * recurrent)
-
-
-def matrix_rate(seconds: float = 1.0) -> float:
-    """Return the machine's float32 matrix-product rate [FLOP/s], the best of some seconds."""
-    import torch
-
-    size = 1536
-    a, b = torch.randn(size, size), torch.randn(size, size)
-    best, until = np.inf, time.perf_counter() + seconds
-    while time.perf_counter() < until:
-        started = time.perf_counter()
-        torch.mm(a, b)
-        best = min(best, time.perf_counter() - started)
-    return 2.0 * size**3 / best
-
-
 def _ours(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
     import jax
 
@@ -181,7 +145,6 @@ def _compare(batch: int, steps: int, rounds: int) -> Comparison:
     taken: dict[str, list[float]] = {key: [] for key in sides}
     for side in sides.values():
         side()
-    machine = matrix_rate()
     until = time.perf_counter() + ENOUGH_S
     for done in range(rounds):
         if done and time.perf_counter() > until:
@@ -198,12 +161,8 @@ def _compare(batch: int, steps: int, rounds: int) -> Comparison:
             f"the baseline makes {baseline:.0f} steps/s; on a free machine of two cores it makes "
             f"{UNTRUSTED_BELOW:.0f} or more: it is not to be trusted, run again on a free machine",
         )
-    work = work_per_step(point)
     unit = "gradient steps/s"
     details = {
-        "share_of_matrix_rate": round(ours * work / machine, 4),
-        "matrix_rate_gflop_s": round(machine / 1e9, 1),
-        "network_mflop_a_step": round(work / 1e6, 2),
         "solids": sum(SOLIDS),
         "batch": batch,
         "steps": steps,
