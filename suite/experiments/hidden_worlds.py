@@ -228,10 +228,6 @@ def run_one(job: Job, console: Console) -> Came:
             fitted = read_json(path)
             errors[f"{whose} quadrotor"] = fitted["without"]["position_m"]
             errors[f"{whose} quadrotor with delta"] = fitted["delta_action"]["position_m"]
-    return Came(
-        job.task.world,
-        job.task.training_seed,
-        {name: read_trials(path) for name, path in paths.items() if path.is_file()},
-        {key: found[key] for key in ("verdict", "effects", "gap")},
-        errors,
-    )
+    judged = {name: read_trials(path) for name, path in paths.items() if path.is_file()}
+    named = {key: found[key] for key in ("verdict", "effects", "gap")}
+    return Came(job.task.world, job.task.training_seed, judged, named, errors)

@@ -51,7 +51,9 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
     model = RolloutModel(
         task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
     )
-    problem = sysid_baseline.prepare(task, _noise(model, task))
+    begin = start_estimate(model, task.windows)
+    residual = model.residual(begin.theta, begin.offset, task.windows)
+    problem = sysid_baseline.prepare(task, noise_of(residual, task.windows))
     answers: dict[str, tuple[np.ndarray, NormalEquations]] = {}
 
     def ours() -> None:
@@ -88,12 +90,6 @@ def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]
         if view.seen.sum() <= seen:
             return state.theta[indices], equations
         seen = view.seen.sum()
-
-
-def _noise(model: RolloutModel, task: Task) -> np.ndarray:
-    begin = start_estimate(model, task.windows)
-    residual = model.residual(begin.theta, begin.offset, task.windows)
-    return noise_of(residual, task.windows)
 
 
 def _agreement(

@@ -1,9 +1,8 @@
 """The trainer's method as a plain torch-eager loop: the baseline of `suite bench train`.
 
 Same network, point mass, losses, field, delays and noise as `suite.train` with the preset `paper`,
-one step after another with the encoder inside the loop, and
-backward through it. What the preset does not use is not here, so that a yardstick stays what it is
-while the trainer grows.
+one step after another with the encoder inside the loop, and backward through it. What the preset
+does not use is not here.
 """
 
 from __future__ import annotations

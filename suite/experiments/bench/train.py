@@ -81,10 +81,8 @@ def _ours(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
     from suite.train.update import device_mesh, make_update, start_state, state_place
 
     mesh = device_mesh(config)
-    update, state = (
-        make_update(config, mesh),
-        jax.device_put(start_state(config), state_place(mesh)),
-    )
+    update = make_update(config, mesh)
+    state = jax.device_put(start_state(config), state_place(mesh))
 
     def call() -> Any:
         nonlocal state

@@ -130,8 +130,8 @@ def _around(text: str, path: Path) -> tuple[str, str]:
 
 
 def _provenance(header: Mapping[str, Any]) -> dict[str, str]:
-    where, versions = machine(), package_versions()
-    engines = (f"{key} {versions[key]}" for key in ("mujoco", "jax", "numpy"))
+    where = machine()
+    engines = (f"{key} {package_versions()[key]}" for key in ("mujoco", "jax", "numpy"))
     return {
         "command": f"`{shlex.join(['suite', *sys.argv[1:]])}`",
         "commit": f"{header['git_commit']}, version {header['suite_version']}",

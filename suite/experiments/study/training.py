@@ -177,9 +177,8 @@ def train_one(
     (key, config), folder, watch = job.task, job.folder, None
     is_ppo, diverged = isinstance(config, PpoConfig), ""
     if looks and looks.measurements:
-        shared, iterations = (
-            (config.shared, config.iterations) if is_ppo else (config, config.optimizer.iterations)
-        )
+        shared = config.shared if is_ppo else config
+        iterations = config.iterations if is_ppo else config.optimizer.iterations
         measure = make_validation(shared, *looks[1:], rewarded(shared))
         watch = Watch(max(1, iterations // looks.measurements), measure)
     begin = {}
