@@ -1,12 +1,16 @@
 """One diagnosis of a hidden drag, for the tests of what is said of it; code here is optimised."""
 
+import contextlib
+import io
 import os
 
 import jax
 import pytest
 
-from suite.diagnose.diagnose import diagnose
-from suite.diagnose.verdict.checks import run_checks
+from eval.logs.flight_log import write_flight
+from eval.quadrotor.vehicle_file import save_vehicle
+from suite.cli import main
+from suite.diagnose import run
 from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -24,16 +28,50 @@ def pytest_runtest_teardown():
     jax.config.update("jax_disable_most_optimizations", UNOPTIMISED)
 
 
-@pytest.fixture(scope="session")
-def drag():
-    """Return the diagnosis of three flights with a drag that the vehicle file lacks."""
-    given = with_lag(PLAIN, 0.03)
-    truth = with_effects(given, linear_drag=((0.15, 0.15, 0.05),))
-    logs = fly_all([truth] * 3, range(3), duration_s=4.0, motors=True)
-    return diagnose(logs, given, "commands")
+LAGGED = with_lag(PLAIN, 0.03)
 
 
 @pytest.fixture(scope="session")
-def drag_checks(drag):
+def diagnosed(tmp_path_factory):
+    """Diagnose by the command line three flights with a drag that the vehicle file lacks.
+
+    Return its folder with the files that it wrote, the diagnosis itself and its checks.
+    """
+    folder = tmp_path_factory.mktemp("diagnosis")
+    truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
+    logs = fly_all([truth] * 3, range(3), duration_s=6.0, motors=True)
+    paths = [str(write_flight(folder / f"{k}.parquet", log)) for k, log in enumerate(logs)]
+    bad = folder / "bad.csv"
+    bad.write_text("time,pos_x\n0,1\n", encoding="utf-8")
+    save_vehicle(LAGGED, folder / "v.toml")
+    out = folder / "out"
+    line = [*paths, str(bad), "--vehicle", str(folder / "v.toml"), "--out", str(out), "--plan"]
+    said, made = io.StringIO(), {}
+    with contextlib.redirect_stdout(said), pytest.MonkeyPatch.context() as patch:
+        for name in ("diagnose", "run_checks"):
+            patch.setattr(run, name, kept(name, getattr(run, name), made))
+        assert main(["diagnose", *line, "--drive", "commands", "--seed", "3", "--json"]) == 0
+    (folder / "said.json").write_text(said.getvalue(), encoding="utf-8")
+    return out, made["diagnose"], made["run_checks"]
+
+
+def kept(name, function, made):
+    """Return `function`, whose result is kept in `made` as well."""
+
+    def call(*args, **options):
+        made[name] = function(*args, **options)
+        return made[name]
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def drag(diagnosed):
+    """Return the diagnosis."""
+    return diagnosed[1]
+
+
+@pytest.fixture(scope="session")
+def drag_checks(diagnosed):
     """Return what stands beside its names."""
-    return run_checks(drag)
+    return diagnosed[2]

@@ -52,7 +52,7 @@ def within(entry, truth):
 
 
 def test_flights_of_the_vehicle_itself_have_no_gap():
-    found = diagnosis_json(diagnose(flights(LAGGED), LAGGED))
+    found = diagnosis_json(diagnose(flights(LAGGED, duration_s=5.0), LAGGED))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
     assert 0.8 < found["gap"]["before"] < 1.2
 
@@ -60,6 +60,7 @@ def test_flights_of_the_vehicle_itself_have_no_gap():
 REMEMBERED = with_lag(REMEMBERING, 0.03)
 
 
+@pytest.mark.slow
 def test_behind_a_loop_that_remembers_measured_rotors_drive():
     """What its integrators hold where a stretch begins is in no log."""
     truth = (0.2, 0.2, 0.1)
@@ -127,6 +128,7 @@ def named_with_value(found, name, parameter, truth):
         assert found["control"]["after"] > found["gap"]["after"]
 
 
+@pytest.mark.slow
 def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
     def swing(motion, t):
         return np.array([0.8 * np.sin(2 * np.pi * 1.3 * t), 0.8 * np.cos(2 * np.pi * 1.1 * t), 0.0])

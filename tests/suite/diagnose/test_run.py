@@ -1,7 +1,5 @@
 """What a diagnosis writes: every step in the report, a recording that loads, a plan."""
 
-import contextlib
-import io
 import json
 import re
 import subprocess
@@ -11,14 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval.logs.flight_log import read_flight, write_flight
+from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
-from tests.support.diagnosis_flights import fly_all
 from tests.support.recordings import columns
-from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tests.support.vehicles import PLAIN, with_effects
 
-LAGGED = with_lag(PLAIN, 0.03)
 STEPS = (
     "1. The logs and their faults",
     "2. The measurement noise",
@@ -31,46 +27,33 @@ STEPS = (
 )
 
 
-@pytest.fixture(scope="module")
-def diagnosed(tmp_path_factory):
-    """A diagnosis of a drag with rotor speeds in the logs, by the command line."""
-    folder = tmp_path_factory.mktemp("diagnosis")
-    truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
-    logs = fly_all([truth] * 3, range(3), duration_s=6.0, motors=True)
-    paths = [str(write_flight(folder / f"{k}.parquet", log)) for k, log in enumerate(logs)]
-    bad = folder / "bad.csv"
-    bad.write_text("time,pos_x\n0,1\n", encoding="utf-8")
-    save_vehicle(LAGGED, folder / "v.toml")
-    out = folder / "out"
-    line = [*paths, str(bad), "--vehicle", str(folder / "v.toml"), "--out", str(out), "--plan"]
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
-        assert main(["diagnose", *line, "--drive", "commands", "--seed", "3", "--json"]) == 0
-    (folder / "said.json").write_text(said.getvalue(), encoding="utf-8")
-    return out
+@pytest.fixture
+def written(diagnosed):
+    """Return the folder of what was written."""
+    return diagnosed[0]
 
 
-def test_files_come_out_whole_and_bad_flights_are_named(diagnosed):
-    found = json.loads((diagnosed / "diagnosis.json").read_text(encoding="utf-8"))
-    assert json.loads((diagnosed.parent / "said.json").read_text(encoding="utf-8")) == found
+def test_files_come_out_whole_and_bad_flights_are_named(written):
+    found = json.loads((written / "diagnosis.json").read_text(encoding="utf-8"))
+    assert json.loads((written.parent / "said.json").read_text(encoding="utf-8")) == found
     assert any("bad.csv" in warning for warning in found["warnings"])
     names = {effect["name"] for effect in found["effects"]}
-    assert names and set(load_vehicle(diagnosed / "vehicle.toml").effects) == names
+    assert names and set(load_vehicle(written / "vehicle.toml").effects) == names
 
 
-def test_every_step_is_in_the_report(diagnosed):
-    text = (diagnosed / "report.html").read_text(encoding="utf-8")
+def test_every_step_is_in_the_report(written):
+    text = (written / "report.html").read_text(encoding="utf-8")
     heads = re.findall(r"<h2>(.*?)</h2>", text)
     assert [head for head in heads if head[0].isdigit()] == list(STEPS)
     assert "Actuators, apart from the air" in heads
     assert text.count("data:image/png;base64,") >= 4
     assert "<script" not in text and not re.search(r'(src|href)="https?:', text)
     for link in re.findall(r'href="([^"]+)"', text):
-        assert (diagnosed / link).is_file()
+        assert (written / link).is_file()
 
 
-def test_the_numbers_beside_the_names_are_in_the_json(diagnosed):
-    found = json.loads((diagnosed / "diagnosis.json").read_text(encoding="utf-8"))
+def test_the_numbers_beside_the_names_are_in_the_json(written):
+    found = json.loads((written / "diagnosis.json").read_text(encoding="utf-8"))
     assert found["seed"] == 3 and found["black_box"] is None
     assert "velocity" in found["disagreement"]["before"]
     by_speed = found["disagreement"]["by"]["speed"]
@@ -85,8 +68,8 @@ def test_the_numbers_beside_the_names_are_in_the_json(diagnosed):
     assert found["plan"]["flights"] == [] or effect["alternatives"]
 
 
-def test_the_recording_holds_what_was_measured_and_simulated(diagnosed):
-    found = columns(diagnosed / "recording.rrd")
+def test_the_recording_holds_what_was_measured_and_simulated(written):
+    found = columns(written / "recording.rrd")
     entities = {entity for entity, _ in found}
     simulated = ["simulated\\ as\\ given", "simulated\\ with\\ what\\ was\\ named"]
     for who in ("measured", *simulated):
@@ -98,15 +81,15 @@ def test_the_recording_holds_what_was_measured_and_simulated(diagnosed):
         errors.append(float(np.sqrt(np.nanmean(np.array(values, dtype=float) ** 2))))
     assert errors[1] < 0.5 * errors[0]
     times, poses = found["/flight_0/world/measured/drone", "Transform3D:translation"]
-    (held_out,) = json.loads((diagnosed / "diagnosis.json").read_text())["gap"]["held_out"]
-    log = read_flight(diagnosed.parent / Path(held_out).name)
+    (held_out,) = json.loads((written / "diagnosis.json").read_text())["gap"]["held_out"]
+    log = read_flight(written.parent / Path(held_out).name)
     assert len(poses) == len(log.time_s)
     np.testing.assert_allclose(np.array(poses)[:, 0], log.pos_w, atol=1e-5)
     assert times is not None and (np.diff(times) > 0).all()
 
 
-def test_the_recording_opens_with_the_command_that_people_have(diagnosed):
-    line = [sys.executable, "-m", "rerun", "rrd", "verify", str(diagnosed / "recording.rrd")]
+def test_the_recording_opens_with_the_command_that_people_have(written):
+    line = [sys.executable, "-m", "rerun", "rrd", "verify", str(written / "recording.rrd")]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

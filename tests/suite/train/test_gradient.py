@@ -11,6 +11,7 @@ import pytest
 
 from policies.networks import network
 from suite.train.gradient import encoder_gradient, make_gradient
+from tests.support.canonical import NOISY, gradient_of
 from tests.support.training import (
     KEY,
     boxes_worlds,
@@ -24,9 +25,8 @@ from tests.support.training import (
 @pytest.fixture(scope="module")
 def two_pass():
     """Return (config, worlds, params, gradient, loss, records) of the trainer's own method."""
-    config = small_config(physics={"depth_noise": 0.02})
-    worlds, params = boxes_worlds(config), fresh_params()
-    return config, worlds, params, *jax.jit(make_gradient(config))(params, worlds, KEY, None)
+    worlds, params = boxes_worlds(NOISY), fresh_params()
+    return NOISY, worlds, params, *gradient_of(NOISY)(params, worlds, KEY, None)
 
 
 def test_images_outside_the_loop_give_the_gradient_of_the_plain_loop(two_pass):

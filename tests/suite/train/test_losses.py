@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from suite.train import losses
 from suite.train.config import LossConfig
-from suite.train.losses import MAX_PULL, weighted
+from suite.train.losses import MAX_PULL
 from suite.train.step import Step, gap_beyond
 from tracks.geometry.clearance import nearest_obstacle
 from tracks.geometry.field import attractive_field, magnetic_field
@@ -50,25 +50,33 @@ def one_of_each() -> Scene:
 
 def a_step(batch, **known):
     """Return a step of `batch` worlds at rest before a gate, but for what is `known`."""
-    zero = jnp.zeros((batch, 3))
+    zero = np.zeros((batch, 3))
     rest = {name: zero for name in ("pos_w", "vel_w", "acc_w", "jerk_w", "goal_w", "place_g")}
-    path = {"gap": jnp.ones((batch, 1)), "away_w": zero[:, None], "clearance": jnp.ones(batch)}
-    path |= {"up": jnp.ones(batch)}
-    gate = {"gate": unit_gate(batch), "passed": jnp.zeros(batch, bool)}
+    path = {"gap": np.ones((batch, 1)), "away_w": zero[:, None], "clearance": np.ones(batch)}
+    path |= {"up": np.ones(batch)}
+    gate = {"gate": unit_gate(batch), "passed": np.zeros(batch, bool)}
     return Step(**{**rest, **path, **gate, **known})
 
 
+# As one program each: op by op there is more to compile than to test.
+by_config = partial(jax.jit, static_argnums=0)
+weighted = by_config(losses.weighted)
+
+
+@by_config
 def obstacle_terms(config, distance, away_w, path_w, vel_w):
     gap = gap_beyond(config, distance, away_w, path_w)
-    step = a_step(len(vel_w), gap=gap, away_w=away_w, vel_w=jnp.asarray(vel_w))
+    step = a_step(len(vel_w), gap=gap, away_w=away_w, vel_w=vel_w)
     return losses.clearance(config, step), losses.collide(config, step)
 
 
+@by_config
 def progress_term(config, pos_w, vel_w, goal_w, place_g):
     step = a_step(len(pos_w), pos_w=pos_w, vel_w=vel_w, goal_w=goal_w, place_g=place_g)
     return weighted(config, step)["progress"]
 
 
+@by_config
 def smoothness_terms(config, acc_w, acc_before_w, time_step):
     jerk_w = (acc_w - acc_before_w) / time_step[:, None]
     step = a_step(len(acc_w), acc_w=acc_w, jerk_w=jerk_w)
@@ -76,6 +84,7 @@ def smoothness_terms(config, acc_w, acc_before_w, time_step):
     return terms["acceleration"], terms["jerk"]
 
 
+@by_config
 def guidance_term(config, gates, pos_w, vel_w):
     return weighted(config, a_step(len(pos_w), gate=gates, pos_w=pos_w, vel_w=vel_w))["guidance"]
 
@@ -88,7 +97,8 @@ def test_every_weight_of_the_table_scales_its_term_alone():
     nothing = {weight: 0.0 for terms in losses.LOSSES.values() for _, weight in terms}
     for name, terms in losses.LOSSES.items():
         for term, weight in terms:
-            found = weighted(replace(LossConfig(), **{**nothing, weight: 3.0}), step)
+            config = replace(LossConfig(), **{**nothing, weight: 3.0})
+            found = losses.weighted(config, step)
             np.testing.assert_allclose(found[name], 3.0 * term(LossConfig(), step), rtol=1e-6)
             assert not any(np.any(value) for key, value in found.items() if key != name)
 
@@ -97,6 +107,7 @@ def test_tilt_costs_from_an_angle_on_and_one_where_the_body_lies_level():
     angle = np.radians([0.0, 64.0, 75.0, 90.0, 120.0])
     least = np.cos(np.radians(65.0))
 
+    @jax.jit
     def cost(up):
         return losses.tilt(LossConfig(), a_step(5, up=up))
 
@@ -119,6 +130,7 @@ def around(count=30, seed=0):
     return jnp.asarray(point)[None]
 
 
+@partial(jax.jit, static_argnums=2)
 def terms_at(path_w, vel_w, config):
     """Return both terms (S,), every point being the path of a world of its own."""
     distance, away = nearest(one_of_each(), jax.lax.stop_gradient(path_w))

@@ -1,7 +1,6 @@
 """The whole rollout: gradients, what is cut out of them, and how the field enters."""
 
 from dataclasses import replace
-from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +14,11 @@ from suite.train import losses, rollout
 from suite.train.config import PointMassConfig
 from suite.train.dynamics import point_mass
 from suite.train.dynamics.interface import make_dynamics
-from suite.train.gradient import make_gradient
 from suite.train.losses import UNIT_FIELD
 from suite.train.rollout import make_rollout, view_in
 from suite.train.step import target_gate
 from suite.train.worlds import sample_worlds
+from tests.support.canonical import NOISY, gradient_of
 from tests.support.training import (
     KEY,
     SPEC,
@@ -37,25 +36,18 @@ TILTED = Rotation.from_euler("ZYX", [0.7, -0.3, 0.2]).as_matrix()
 
 
 CONFIG = small_config(batch=3, steps=4)
-gradient_of = jax.jit(jax.grad(loss_of(CONFIG)))
+plain_gradient = jax.jit(jax.grad(loss_of(CONFIG)))
 
 
 def noisy_config(finish):
-    return small_config(physics={"depth_noise": 0.02}, finish=finish)
-
-
-@cache
-def gradient_where(finish):
-    """Return the trainer's own method, compiled once for all tests."""
-    return jax.jit(make_gradient(noisy_config(finish)))
+    return replace(NOISY, episode=replace(NOISY.episode, finish=finish))
 
 
 @pytest.fixture(scope="module")
 def two_pass():
     """Return (config, worlds, params, gradient, loss, records) of the trainer's own method."""
-    config = noisy_config(False)
-    worlds, params = boxes_worlds(config), fresh_params()
-    return config, worlds, params, *gradient_where(False)(params, worlds, KEY, None)
+    worlds, params = boxes_worlds(NOISY), fresh_params()
+    return NOISY, worlds, params, *gradient_of(NOISY)(params, worlds, KEY, None)
 
 
 def test_records_are_those_of_the_flight(two_pass):
@@ -145,7 +137,7 @@ def pull_at(worlds, pos_w, vel_w):
 def test_the_field_enters_as_the_paper_says(float64):
     """Eq. final_optimization: the gradient changes by -u_A pulled back through the positions."""
     worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
-    with_field, without = (gradient_of(params, worlds, None, gain) for gain in (0.42, 0.0))
+    with_field, without = (plain_gradient(params, worlds, None, gain) for gain in (0.42, 0.0))
     change = jax.tree.map(jnp.subtract, with_field, without)
 
     @jax.jit
@@ -163,7 +155,7 @@ def test_the_field_enters_as_the_paper_says(float64):
 def test_more_of_the_same_worlds_give_the_same_gradient(float64):
     worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
     many = jax.tree.map(lambda x: jnp.concatenate([jnp.asarray(x)] * 3), worlds)
-    once, again = (gradient_of(params, w, None, 5.0) for w in (worlds, many))
+    once, again = (plain_gradient(params, w, None, 5.0) for w in (worlds, many))
     used = [name for name in once if np.abs(np.array(once[name])).max() > 0]
     assert largest_difference({k: again[k] for k in used}, {k: once[k] for k in used}) < 1e-9
 
@@ -209,7 +201,7 @@ def test_images_carry_no_gradient_to_the_state(float64):
 def test_a_delta_action_is_frozen_and_changes_the_gradient(float64):
     worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
     delta = doubled(delta_network.init(jax.random.key(1)))
-    base, unmoved = (gradient_of(params, worlds, d, 0.0) for d in (None, delta))
+    base, unmoved = (plain_gradient(params, worlds, d, 0.0) for d in (None, delta))
     used = [name for name in base if np.abs(np.array(base[name])).max() > 0]
 
     def apart(gradient):
@@ -217,7 +209,7 @@ def test_a_delta_action_is_frozen_and_changes_the_gradient(float64):
 
     assert unmoved.keys() == params.keys() and apart(unmoved) < 1e-9
     delta["output.weight"] += 0.5
-    assert apart(gradient_of(params, worlds, delta, 0.0)) > 1e-2
+    assert apart(plain_gradient(params, worlds, delta, 0.0)) > 1e-2
 
 
 def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
@@ -287,8 +279,8 @@ def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
 
 
 def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
-    worlds, params = boxes_worlds(noisy_config(False)), fresh_params()
-    run = gradient_where(False)
+    worlds, params = boxes_worlds(NOISY), fresh_params()
+    run = gradient_of(NOISY)
     _, _, records = run(params, worlds._replace(stop=np.array([6, 2, 1, 6])), KEY, None)
     assert np.array_equal(
         records.alive.T, [[1] * 6, [1, 1, 0, 0, 0, 0], [1, 0, 0, 0, 0, 0], [1] * 6]
@@ -302,7 +294,8 @@ def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
 
 @pytest.mark.parametrize("finish", [False, True])
 def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the_finish(finish):
-    worlds = boxes_worlds(noisy_config(finish))
+    config = noisy_config(finish)
+    worlds = boxes_worlds(config)
     gates, last = worlds.scene.gates, worlds.scene.gates.center_w.shape[1] - 1
     ahead = gates.rot_w[:, last, :, 0]
     # 0.2 m before their last gates at 4 m/s, but for one that has the gate before them to pass.
@@ -312,7 +305,7 @@ def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the
         heading_w=ahead,
         target=np.array([last, last, last, last - 1]),
     )
-    records = gradient_where(finish)(fresh_params(lively=0.0), worlds, KEY, None)[2]
+    records = gradient_of(config)(fresh_params(lively=0.0), worlds, KEY, None)[2]
     passed = np.asarray(records.passed)
     assert (passed.sum(0) == [1, 1, 1, 0]).all()
     after = np.cumsum(passed, 0) - passed > 0

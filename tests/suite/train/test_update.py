@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.train.gradient import make_gradient
 from suite.train.update import curve_numbers, device_mesh, sample_hidden
+from tests.support.canonical import NOISY, gradient_of
 from tests.support.training import boxes_worlds, fresh_params, small_config
 
 KEY = jax.random.key(3)
@@ -24,11 +24,10 @@ def test_devices_that_are_not_there_or_do_not_divide_the_batch():
 
 
 def test_the_curve_is_of_steps_that_count():
-    config = small_config(steps=4)
-    worlds, params = boxes_worlds(config), fresh_params()
+    worlds, params = boxes_worlds(NOISY), fresh_params()
     worlds = worlds._replace(stop=np.array([1, 1, 1, 1]))
-    gradient, loss, records = jax.jit(make_gradient(config))(params, worlds, KEY, None)
-    after = np.arange(4)[:, None] > 0
+    gradient, loss, records = gradient_of(NOISY)(params, worlds, KEY, None)
+    after = np.arange(6)[:, None] > 0
     # What comes later would be a gate and a collision at 100 m/s.
     records = records._replace(
         passed=after & np.ones_like(records.passed),
@@ -44,17 +43,17 @@ def test_the_curve_is_of_steps_that_count():
 
 
 def test_remembered_states_are_of_steps_that_counted():
-    config = small_config(steps=4)
-    worlds, params = boxes_worlds(config), fresh_params()
-    worlds = worlds._replace(stop=np.array([4, 4, 4, 1]))
-    records = jax.jit(make_gradient(config))(params, worlds, KEY, None)[2]
-    before = jnp.full((4, config.spec.hidden_size), 9.0)
-    seen = np.stack([sample_hidden(jax.random.key(i), records, before) for i in range(40)])
+    worlds, params = boxes_worlds(NOISY), fresh_params()
+    worlds = worlds._replace(stop=np.array([6, 6, 6, 1]))
+    records = gradient_of(NOISY)(params, worlds, KEY, None)[2]
+    before = jnp.full((4, NOISY.spec.hidden_size), 9.0)
+    drawn = jax.jit(jax.vmap(lambda key: sample_hidden(key, records, before)))
+    seen = np.asarray(drawn(jax.random.split(KEY, 80)))
     for world in range(3):
         known = np.asarray(records.hidden[:, world])
         assert all(any(np.array_equal(row, k) for k in known) for row in seen[:, world])
-        assert len(np.unique(seen[:, world, 0])) == 4
+        assert len(np.unique(seen[:, world, 0])) == 6
     last = seen[:, 3]
     kept = (last == 9.0).all(-1)
-    assert 0 < kept.sum() < 40
+    assert 0 < kept.sum() < 80
     assert np.array_equal(last[~kept], np.tile(records.hidden[0, 3], ((~kept).sum(), 1)))

@@ -54,21 +54,15 @@ def test_what_flights_tell_is_near_the_truth(drive, least):
     assert np.max(np.abs(list(off.values()))) < 2.5
 
 
-@pytest.mark.parametrize("noise", [2.0, 4.0])
+@pytest.mark.parametrize("noise", [pytest.param(2.0, marks=pytest.mark.slow), 4.0])
 def test_noise_of_the_rotor_speeds_makes_no_body_heavier_to_turn(noise):
     """Without a chirp they say little of the inertia: less than its own noise, and then nothing."""
     fleet = Fleet(known.truth(), known.WAYS[:3])
-    for seed in range(2):
-        logs = logs_of(
-            fleet,
-            known.recordings(known.WAYS[:3]),
-            "rotors",
-            np.random.default_rng(seed),
-            sensors=replace(known.SENSORS, rotor=noise),
-        )
-        (entry,) = [n for n in identify(logs, known.start()).numbers if n.key == "inertia"]
-        for value, true, span in zip(entry.value, TRUE["inertia"], entry.ci95, strict=True):
-            assert span is None or abs(np.log(value / true)) < 0.2
+    sensors, rng = replace(known.SENSORS, rotor=noise), np.random.default_rng(0)
+    logs = logs_of(fleet, known.recordings(known.WAYS[:3]), "rotors", rng, sensors=sensors)
+    (entry,) = [n for n in identify(logs, known.start()).numbers if n.key == "inertia"]
+    for value, true, span in zip(entry.value, TRUE["inertia"], entry.ci95, strict=True):
+        assert span is None or abs(np.log(value / true)) < 0.2
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +81,7 @@ def fleet(coverage):
     return coverage.flown(0, 1)
 
 
-EVERY_TIME = ("rotors", "rates", "pwm without attitude")
+EVERY_TIME = ("rotors",)
 """Cases of tools/coverage.py that are not left to the slow tests."""
 
 
@@ -188,7 +182,7 @@ def without_voltage(logs):
     return [replace(log, voltage=None) for log in logs]
 
 
-@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("first", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_file_from_flights_with_or_without_a_voltage_starts_flights_with_or_without(first):
     with_it = known.logs("pwm", 0)
     bare = replace(known.start(), motors=None)
@@ -269,7 +263,9 @@ def test_rotors_that_are_logged_in_turn_tell_all_but_their_lag():
     assert sum("no row has all columns of rotor_speed" in note for note in found.notes) == 4
 
 
-@pytest.mark.parametrize("drive", ["rates", "thrust", "torques"])
+@pytest.mark.parametrize(
+    "drive", [*(pytest.param(d, marks=pytest.mark.slow) for d in ("rates", "torques")), "thrust"]
+)
 def test_a_scale_of_the_thrust_that_is_left_alone_counts(drive):
     fleet = Fleet(known.truth(), known.WAYS, scale=0.8)
     rng = np.random.default_rng(0)

@@ -47,7 +47,7 @@ def test_a_scale_with_which_it_could_not_hover_is_refused_before_the_work():
     assert with_own_numbers(slow, False) == slow
 
 
-@pytest.mark.parametrize("drive", ["rates", "pwm"])
+@pytest.mark.parametrize("drive", [pytest.param("rates", marks=pytest.mark.slow), "pwm"])
 def test_it_makes_no_difference_how_the_start_says_a_number(drive):
     plain = known.start()
     said = with_effects(plain, rate_gain=((1.5, 0.8, 1.2),), inertia_scale=((0.9, 1.1, 1.0),))
