@@ -84,6 +84,7 @@ def small_boxes(track, count):
     return replace(track, scene=track.scene._replace(boxes=boxes), names=names)
 
 
+@pytest.mark.slow
 def test_who_decides_rarely_meets_what_was_not_near_when_it_decided():
     track = small_boxes(straight((20.0, 30.0), wall_at=6.0), 2 * NEAR.boxes)
     pilot = Steady((4.0, 0.0, 1.6), PolicySpec(rate_hz=1.0))

@@ -113,7 +113,7 @@ def installed():
 
 
 def test_a_trial_is_finished(installed):
-    result, flight = one(Pursuit(3.0), record=Record(depth=True))
+    result, flight = one(Pursuit(3.0), straight((1.0, 2.0)), record=Record(depth=True))
     assert (result.ended_by, result.gates_passed, result.gates_035) == ("finished", 2, 2)
     assert 1.0 < result.v_mean < result.v_max < 3.5
     assert flight.depth_m.shape[1:] == (24, 32)
@@ -121,7 +121,7 @@ def test_a_trial_is_finished(installed):
 
 
 def test_a_wall_is_hit(installed):
-    result, _ = one(Pursuit(3.0), straight(wall_at=3.0))
+    result, _ = one(Pursuit(3.0), straight((4.0, 5.0), wall_at=1.2))
     assert (result.ended_by, result.collided_with) == ("collision", "the wall")
 
 

@@ -25,7 +25,7 @@ height = 1.0
 def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkeypatch, capfd):
     out = tmp_path / "flights"
     args = ["collect", "--policy", pilots["pursuit"], "--track", "zigzag", "--difficulty", "0"]
-    args += ["--trials", "2", "--seed", "7", "--out", str(out)]
+    args += ["--trials", "2", "--seed", "7", "--time-limit-s", "1.5", "--out", str(out)]
     assert cli.main(args) == 0
     logs = sorted(out.glob("*.parquet"))
     assert [log.name for log in logs] == ["zigzag-0-7.parquet", "zigzag-0-8.parquet"]
@@ -116,7 +116,8 @@ def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
     monkeypatch.setattr(eval.logs.flight_log, "log_from_flight", broken)
     out = tmp_path / "flights"
     args = ["collect", "--policy", pilots["pursuit"], "--track", "zigzag", "--difficulty", "0"]
-    assert cli.main([*args, "--trials", "2", "--seed", "7", "--out", str(out)]) == 0
+    args += ["--trials", "2", "--seed", "7", "--time-limit-s", "1.5", "--out", str(out)]
+    assert cli.main(args) == 0
     flights = json.loads((out / "flights.json").read_text())["flights"]
     assert [row["file"] for row in flights] == [None, "zigzag-0-8.parquet"]
     said = capfd.readouterr()

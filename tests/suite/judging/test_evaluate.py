@@ -19,7 +19,7 @@ def _eval(out, *args):
 
 def test_eval_writes_the_tables_and_says_them(pilots, tmp_path, capfd):
     out = tmp_path / "out"
-    args = ["--track", "zigzag", "--trials", "2", "--seed", "5", "--json"]
+    args = ["--track", "zigzag", "--trials", "2", "--seed", "5", "--time-limit-s", "3", "--json"]
     code = _eval(out, *args, "--policy", pilots["pursuit"], "--policy", pilots["diver"])
     said = json.loads(capfd.readouterr().out)
     assert code == 0
@@ -45,7 +45,7 @@ def test_laps_are_compared_with_the_plans_of_their_tracks(pilots, tmp_path, capf
     ratio = found["ratio"]
     assert found["planned"] == found["finished"] == 1 and 1.0 < ratio["value"] < 6.0
     assert f"lap over plan: median {ratio['value']:.2f}" in said and "over 1 planned tracks" in said
-    assert _eval(tmp_path / "racer5", *asked, "--vehicle", "racer5") == 0
+    assert _eval(tmp_path / "racer5", *asked, "--vehicle", "racer5", "--time-limit-s", "1") == 0
     assert "lap over plan" not in capfd.readouterr().out
     assert json.loads((tmp_path / "racer5" / "summary.json").read_text())["over_plan"] == []
 
@@ -66,6 +66,7 @@ def _told(capsys):
 
 def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkeypatch, capfd):
     args = ["--track", "circular,zigzag", "--trials", "1", "--policy", pilots["pursuit"]]
+    args += ["--time-limit-s", "1"]
     assert _eval(tmp_path / "whole", *args) == 0
     fly = eval.judging.judge.fly
     flown = []
