@@ -340,7 +340,7 @@ def flown_plainly():
     return fly_half_a_second(PLAIN)
 
 
-FLOWN_EVERY_TIME = (
+FLOWN_TOGETHER = (
     "rotor_drag",
     "constant_wind",
     "gusts",
@@ -356,31 +356,34 @@ FLOWN_EVERY_TIME = (
 """One of each way in which an effect acts, and several that change the vehicle itself."""
 
 
-def test_one_of_each_way_in_which_effects_act_is_flown_every_time():
+def test_one_of_each_way_in_which_effects_act_is_flown_together():
     def acts(name):
         hooks = (field.name for field in fields(EFFECTS[name]) if field.name != "values")
         return frozenset(hook for hook in hooks if callable(getattr(EFFECTS[name], hook)))
 
     in_flight = {acts(name) for name, effect in EFFECTS.items() if effect.in_flight}
-    assert {acts(name) for name in FLOWN_EVERY_TIME} == in_flight
+    assert {acts(name) for name in FLOWN_TOGETHER} == in_flight
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(n, marks=() if n in FLOWN_EVERY_TIME else pytest.mark.slow)
-        for n, e in EFFECTS.items()
-        if e.in_flight
-    ],
-)
+def typical(name):
+    """Return the effect `name` at a typical strength."""
+    still = neutral(EFFECTS[name], PLAIN)
+    parameters = EFFECTS[name].parameters
+    return EFFECTS[name].values(
+        **{p.name: np.asarray(getattr(still, p.name)) + p.typical[1] for p in parameters}
+    )
+
+
+def test_effects_of_every_kind_fly_in_training_together():
+    vehicle = replace(PLAIN, effects={name: typical(name) for name in FLOWN_TOGETHER})
+    assert np.isfinite(fly_half_a_second(vehicle)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, effect in EFFECTS.items() if effect.in_flight])
 def test_every_effect_of_a_vehicle_file_flies_in_training(name, flown_plainly):
     """A typical strength of it changes where the quadrotor is after half a second."""
-    still = neutral(EFFECTS[name], PLAIN)
-    changed = {
-        p.name: np.asarray(getattr(still, p.name)) + p.typical[1] for p in EFFECTS[name].parameters
-    }
-    vehicle = replace(PLAIN, effects={name: EFFECTS[name].values(**changed)})
-    flown = fly_half_a_second(vehicle)
+    flown = fly_half_a_second(replace(PLAIN, effects={name: typical(name)}))
     assert np.isfinite(flown).all()
     if name != "ground_effect":  # too high above the ground
         assert np.abs(flown_plainly - flown).max() > 1e-5

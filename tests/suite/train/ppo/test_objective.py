@@ -69,6 +69,11 @@ def rollout_of(actor, seed=1, done=False):
     return embeddings, sequences._replace(action_b=action, log_prob=log_prob)
 
 
+loss_and_slope = jax.jit(
+    jax.value_and_grad(clipped_loss, argnums=1, has_aux=True), static_argnums=0
+)
+
+
 def actor_of(seed=0):
     return doubled(Actor(fresh_params(seed=seed), jnp.log(jnp.asarray([0.5, 1.0, 2.0]))))
 
@@ -78,14 +83,13 @@ def test_where_nothing_has_changed_its_gradient_is_the_policy_gradient():
     actor = actor_of()
     embeddings, sequences = rollout_of(actor, done=True)
 
+    @jax.jit
     def surrogate(actor):
         mean = action_means(actor.params, embeddings, sequences)
         logs = log_probability(mean, actor.log_deviation, sequences.action_b)
         return -(logs * sequences.advantage).mean()
 
-    (_, numbers), gradient = jax.value_and_grad(clipped_loss, argnums=1, has_aux=True)(
-        CONFIG, actor, embeddings, sequences
-    )
+    (_, numbers), gradient = loss_and_slope(CONFIG, actor, embeddings, sequences)
     assert float(numbers["clipped"]) == 0 and float(numbers["divergence"]) == pytest.approx(0)
     rng = np.random.default_rng(3)
     way = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), actor)
@@ -107,7 +111,7 @@ def test_a_change_beyond_the_clip_is_not_rewarded(ratio, advantage, gain, learns
         log_prob=sequences.log_prob - np.log(ratio),
         advantage=jnp.full((STEPS, BATCH), advantage),
     )
-    (loss, numbers), gradient = jax.value_and_grad(clipped_loss, argnums=1, has_aux=True)(
+    (loss, numbers), gradient = loss_and_slope(
         replace(CONFIG, clip=0.2), actor, embeddings, sequences
     )
     assert float(loss) == pytest.approx(-gain) and float(numbers["clipped"]) == 1
@@ -134,7 +138,5 @@ def test_entropy_widens_the_exploration():
     embeddings, sequences = rollout_of(actor)
     sequences = sequences._replace(advantage=jnp.zeros((STEPS, BATCH)))
     config = replace(CONFIG, entropy=0.3)
-    gradient, _ = jax.grad(clipped_loss, argnums=1, has_aux=True)(
-        config, actor, embeddings, sequences
-    )
+    _, gradient = loss_and_slope(config, actor, embeddings, sequences)
     np.testing.assert_allclose(gradient.log_deviation, -0.3 * np.ones(3), rtol=1e-12)
