@@ -43,7 +43,7 @@ style: $(STAMP)
 	$(PY) -m ruff format --check .
 
 types: $(STAMP)
-	$(PY) -m pyright --pythonpath $(PY) --warnings
+	$(PY) -m pyright --pythonpath $(PY) --warnings --level warning
 
 tests: $(STAMP)
 	$(PY) -m pytest -n $(JOBS) --dist loadgroup --no-loadscope-reorder

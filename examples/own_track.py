@@ -10,6 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import trimesh
 
 from eval.judging.judge import JudgeOptions, fly
@@ -48,7 +49,7 @@ def main(folder: Path) -> None:
     """Write course.toml, roof.stl and course.png to `folder`, and fly the course once."""
     folder.mkdir(parents=True, exist_ok=True)
     corners = [(x, y, 0.0) for x in (-1, 1) for y in (-0.5, 0.5)] + [(-1, 0, 1.2), (1, 0, 1.2)]
-    trimesh.PointCloud(corners).convex_hull.export(folder / "roof.stl")
+    trimesh.convex.convex_hull(np.array(corners)).export(folder / "roof.stl")
     path = folder / "course.toml"
     path.write_text(COURSE, encoding="utf-8")
 

@@ -3,21 +3,23 @@
 Eight programs are shown in docs/start.md; a file that is not in the table here fails.
 """
 
-import os
+import inspect
 import re
 import runpy
 import sys
-from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
-import jax
 import pytest
 
 from eval.effects import EFFECTS
+from eval.logs.flight_log import read_flights
+from eval.quadrotor.vehicle_file import load_vehicle
+from suite.delta.run import flight_files
+from suite.diagnose import run as diagnose_run
 from suite.train import presets
 from suite.train.overrides import override
 
-PRESET = presets.preset
+PRESET, DIAGNOSE = presets.preset, diagnose_run.diagnose_files
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = {
     "fly_and_plot": (["."], "8 gates, finished", ["trial.png", "trial.gif", "trial.rrd"]),
@@ -64,9 +66,9 @@ def test_the_example_runs(name, tmp_path, monkeypatch, capsys):
     args, said, written = EXAMPLES[name]
     program = str(ROOT / "examples" / f"{name}.py")
     monkeypatch.setattr(sys, "argv", [program, *args])
-    # A diagnosis runs for longer than it compiles.
-    with optimised() if name == "diagnose_a_log" else nullcontext():
-        runpy.run_path(program, run_name="__main__")
+    if name == "diagnose_a_log":
+        monkeypatch.setattr(diagnose_run, "diagnose_files", diagnosed)
+    runpy.run_path(program, run_name="__main__")
     out, err = capsys.readouterr()
     assert re.search(said, out), out
     assert "arning" not in err, err
@@ -74,9 +76,13 @@ def test_the_example_runs(name, tmp_path, monkeypatch, capsys):
         assert (tmp_path / file).stat().st_size > 0
 
 
-@contextmanager
-def optimised():
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
-    plainly = os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] != "0"
-    jax.config.update("jax_disable_most_optimizations", plainly)
+def diagnosed(paths, vehicle, out, console, **options):
+    """Stand for the diagnosis, which tests/suite/commands/test_example.py makes in full (slow)."""
+    inspect.signature(DIAGNOSE).bind(paths, vehicle, out, console, **options)
+    assert load_vehicle(vehicle) and len(read_flights(flight_files(paths))[0]) == 3
+    (out / "report.html").write_text("as the command writes it")
+    entry = {"value": [0.004, 0.001, None], "ci95": [[0.003, 0.005], [0.0, 0.002], None]}
+    return {
+        "verdict": "named",
+        "effects": [{"name": "com_offset", "parameters": {"offset": entry}}],
+    }

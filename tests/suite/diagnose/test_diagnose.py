@@ -222,6 +222,7 @@ def test_where_another_controller_flew_every_log_needs_rotor_speeds(monkeypatch)
         diagnose(logs, LAGGED)
 
 
+@pytest.mark.slow
 def test_thresholds_are_those_that_are_given():
     logs = flights(with_effects(LAGGED, linear_drag=((0.1, 0.1, 0.05),)), duration_s=4.0)
     strict = diagnose(logs, LAGGED, limits=Thresholds(most_names=0))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from policies.networks import network
-from suite.train.gradient import encoder_gradient, make_gradient
+from suite.train.gradient import encoder_gradient, make_gradient, sampled_encoder_gradient
 from tests.support.canonical import NOISY, gradient_of
 from tests.support.training import (
     KEY,
@@ -48,6 +48,17 @@ def test_the_encoders_gradient_does_not_depend_on_its_chunks(two_pass, monkeypat
     whole = encoder_gradient(params, images, cotangents)
     monkeypatch.setattr("suite.train.gradient.CHUNK", 5)
     assert largest_difference(encoder_gradient(params, images, cotangents), whole) < 1e-5
+
+
+def test_the_encoders_gradient_from_every_other_image_is_right_on_average(two_pass):
+    params, rng = two_pass[2], np.random.default_rng(1)
+    images = jnp.asarray(rng.normal(size=(6, 2, 20, 20)), jnp.float32)
+    cotangents = jnp.asarray(rng.normal(size=(6, 2, 8)), jnp.float32)
+    whole = encoder_gradient(params, images.reshape(12, 20, 20), cotangents.reshape(12, 8))
+    keys = {int(jax.random.randint(key, (), 0, 2)): key for key in jax.random.split(KEY, 8)}
+    halves = [sampled_encoder_gradient(params, images, cotangents, 2, keys[k]) for k in (0, 1)]
+    mean = jax.tree.map(lambda one, other: (one + other) / 2, *halves)
+    assert largest_difference(mean, whole) < 1e-5
 
 
 @pytest.mark.slow

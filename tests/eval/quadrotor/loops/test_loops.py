@@ -54,7 +54,7 @@ def test_numpy_and_jax_fly_the_same_and_follow_the_rates(kind):
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(kind, marks=pytest.mark.slow if kind == "betaflight" else ())
+        pytest.param(kind, marks=pytest.mark.slow if kind in ("betaflight", "px4") else ())
         for kind in loops.KINDS
     ],
 )

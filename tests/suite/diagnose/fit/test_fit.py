@@ -5,9 +5,8 @@ import pytest
 
 from eval.effects import nameable_effects
 from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.windows import cut
 from suite.diagnose.fit.look import trusted
-from suite.diagnose.fit.model import BATCH, DIRECTIONS, RolloutModel, batches
+from suite.diagnose.fit.model import BATCH, DIRECTIONS, batches
 from suite.diagnose.fit.normal_equations import normal_equations_of, start_estimate
 from suite.diagnose.fit.parameters import candidates, effects_at, indices_of, make_space
 from suite.diagnose.fit.rivals import NamedEffect
@@ -20,7 +19,6 @@ from suite.diagnose.fit.whitening import (
     whiten,
     whitened_residual,
 )
-from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)
@@ -29,12 +27,12 @@ NEEDED = ("acc_b", "command")
 
 
 @pytest.fixture(scope="module")
-def flown():
-    """Return a model, windows with a drag that it lacks, and their slopes along everything."""
-    truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
-    windows, _ = cut(fly_all([truth] * 3, range(3), duration_s=4.0), LAGGED, False)
-    assert windows is not None
-    model = RolloutModel(LAGGED, SPACE, rotor_input=False, voltage=False)
+def flown(drag):
+    """Return a model, windows with a drag that it lacks, and their slopes along everything.
+
+    They are those of the shared diagnosis, for which the model's programs are compiled already.
+    """
+    model, windows = drag.model, drag.cut(1.0)
     begin = start_estimate(model, windows)
     return model, windows, model.linearise(begin.theta, begin.offset, windows, None)
 
@@ -107,6 +105,13 @@ def test_what_the_start_explains_is_projected_out(flown):
     residual = project_out_start(whitening, whitened_residual(whitening, linear))
     np.testing.assert_allclose(equations.chi2, (residual**2).sum(axis=(1, 2)))
     assert (whitening.slow_freedom >= -1e-9).all()
+    energy = []
+    for seed in range(10):
+        noise = np.random.default_rng(seed).standard_normal(linear.residual.shape)
+        white = linear._replace(residual=np.nan_to_num(sigma) * noise)
+        energy.append(normal_equations_of(whitening, white, 0).slow_energy.sum())
+    # Noise alone gives one for each degree of freedom that the start leaves.
+    assert np.mean(energy) == pytest.approx(whitening.slow_freedom.sum(), rel=0.05)
 
 
 def test_columns_that_depend_on_each_other_are_made_orthonormal_too():

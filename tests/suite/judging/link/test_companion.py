@@ -8,7 +8,7 @@ from eval.worlds.trial import TrialSpec
 from policies.spec import NoAnswer, PolicySpec
 from suite.judging.link.flights import write_log
 from suite.judging.link.messages import Note, SetPoint, State, Wire, dialect
-from suite.judging.link.watchdog import Limits
+from suite.judging.link.watchdog import Limits, trouble_between
 from tests.support.pilots import Steady
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
@@ -273,3 +273,13 @@ def test_depth_images_of_another_size_are_said_once(bench):
     said = [event for event in one.companion.events if "depth images" in event]
     assert len(said) == 1 and "64 x 48 pixels left out: the policy's are 32 x 24" in said[0]
     assert one.companion.misfit in said[0]
+
+
+@pytest.mark.parametrize(("off_m", "jumped"), [(0.45, False), (0.55, True)])
+def test_a_state_may_lie_half_a_metre_off_where_its_speed_leads(off_m, jumped):
+    """0.1 s at 3 m/s, and so much more."""
+    level, still = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+    vel_w = np.array([3.0, 0.0, 0.0])
+    last = State(1.0, still, level, vel_w, still)
+    state = State(1.1, np.array([0.3 + off_m, 0.0, 0.0]), level, vel_w, still)
+    assert (trouble_between(last, state, Limits()) is not None) == jumped
