@@ -15,7 +15,7 @@ from typing import final
 
 import numpy as np
 
-from policies.spec import ACTION_SIZE, NoAnswer, PolicyError, PolicySpec
+from policies.spec import Doubt, NoAnswer, PolicyError, PolicySpec
 
 Model = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(state, image, hidden) to (action, hidden) for exactly one block of rows, float32 arrays."""
@@ -43,6 +43,8 @@ class BlockPolicy:
     """Rows the model is called with."""
     rows: int = BLOCK
     """Rows of a block that are used, the first ones: `block`, or 1."""
+    notes: tuple[Doubt, ...] = ()
+    """What is assumed of it."""
 
     def start(self, n: int) -> np.ndarray:
         """Return the recurrent state at the start of n trials: zeros."""
@@ -51,7 +53,7 @@ class BlockPolicy:
     def act(
         self, hidden: np.ndarray, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return (action_b (n, 3) [m/s^2], hidden'); see `policies.policy.Policy.act`.
+        """Return (action (n, spec.action.size), hidden'); see `policies.policy.Policy.act`.
 
         Where the memory overflows the answer is NaN, which the judge counts and does not fly.
         """
@@ -59,7 +61,7 @@ class BlockPolicy:
         inputs = [np.asarray(x, np.float32) for x in (state, image, hidden)]
         if len(state) == self.rows == self.block:
             return _told(*self.model(*inputs))
-        actions = np.empty((len(state), ACTION_SIZE), np.float32)
+        actions = np.empty((len(state), self.spec.action.size), np.float32)
         remembered = np.empty_like(inputs[2])
         for low in range(0, len(state), self.rows):
             used = slice(low, min(low + self.rows, len(state)))
@@ -80,21 +82,22 @@ def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
     """Try a model that was just loaded, and return the policy in a form whose rows stand alone.
 
     The trial is of a block of random rows, twice, then of some of these rows each filling a whole
-    block. Where a row's answer depends on its place or on its neighbours, the policy that comes
-    back sends rows one by one.
+    block, and each among zeros. Where a row's answer depends on its place or on its neighbours by
+    rounding, the policy that comes back sends rows one by one.
 
     Args:
         policy: as it was loaded.
         where: the file it came from, for the message.
 
     Raises:
-        PolicyError: where the outputs have wrong shapes, or the same inputs give another answer.
+        PolicyError: where the outputs have wrong shapes, the same inputs give another answer, or
+            an answer depends on the other rows by more than rounding.
     """
     rng = np.random.default_rng(0)
     n = policy.block
     state, image, hidden = _drawn(policy, rng)
     first = policy.model(state, image, hidden)
-    expected = ((n, ACTION_SIZE), (n, *policy.hidden_shape))
+    expected = ((n, policy.spec.action.size), (n, *policy.hidden_shape))
     for name, value, shape in zip(("action", "hidden"), first, expected, strict=True):
         if value.shape != shape or value.dtype != np.float32:
             raise PolicyError(
@@ -106,12 +109,32 @@ def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
             f"{where}: the same inputs gave two answers; export the policy in evaluation mode, "
             "without dropout and sampling"
         )
+    one_by_one = False
     for row in rng.choice(n, min(n, 8), replace=False):
         everywhere = (np.repeat(x[row : row + 1], n, 0) for x in (state, image, hidden))
-        wanted = (np.repeat(x[row : row + 1], n, 0) for x in first)
-        if not _same(tuple(wanted), policy.model(*everywhere)):
-            return dataclasses.replace(policy, rows=1)
-    return policy
+        wanted = tuple(np.repeat(x[row : row + 1], n, 0) for x in first)
+        among_zeros = (np.where(np.arange(n).reshape(-1, *[1] * (x.ndim - 1)) == row, x, 0)
+                       for x in (state, image, hidden))  # fmt: skip
+        alone = tuple(x[row : row + 1] for x in policy.model(*among_zeros))
+        for found in (policy.model(*everywhere), alone):
+            _refuse_leaning(tuple(x[: len(found[0])] for x in wanted), found, where)
+            one_by_one |= not _same(tuple(x[: len(found[0])] for x in wanted), found)
+    return dataclasses.replace(policy, rows=1) if one_by_one else policy
+
+
+def _refuse_leaning(
+    wanted: tuple[np.ndarray, ...], found: tuple[np.ndarray, ...], where: str
+) -> None:
+    """Refuse answers that depend on the other rows by more than rounding, as by BatchNorm."""
+    for expected, value in zip(wanted, found, strict=True):
+        size = max(1.0, float(np.abs(expected).max(initial=0.0)))
+        apart = float(np.abs(value - expected).max(initial=0.0))
+        if apart > ROUNDING * size:
+            raise PolicyError(
+                f"{where}: a row's answer changes by {apart:.2g} with the other rows of its batch; "
+                "a layer takes statistics over the batch (BatchNorm in training mode): call "
+                "module.eval() before the export"
+            )
 
 
 def for_one_row(policy: BlockPolicy) -> BlockPolicy:
@@ -138,9 +161,9 @@ def _drawn(
     policy: BlockPolicy, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a block of random (state, image, hidden)."""
-    n, camera = policy.block, policy.spec.camera
+    n = policy.block
     state = rng.normal(size=(n, policy.spec.state_size)).astype(np.float32)
-    image = rng.normal(size=(n, camera.height, camera.width)).astype(np.float32)
+    image = rng.normal(size=(n, *policy.spec.image_shape)).astype(np.float32)
     hidden = rng.uniform(-1, 1, (n, *policy.hidden_shape)).astype(np.float32)
     return state, image, hidden
 

@@ -40,10 +40,11 @@ class Observation(NamedTuple):
 
     state: Any
     """(..., spec.state_size): velocity in body axes [m/s], the third row of R (world z in body
-    axes, free of yaw), the next gate's centre in body axes [m], the last action [m/s^2] and then
-    the spec's extras."""
+    axes, free of yaw), the next gate's centre in body axes [m], the last action as it was flown
+    (SI units of its kind) and then the spec's extras."""
     image: Any
-    """(..., H, W) inverse depth as the spec encodes it [1]; None where the view has none."""
+    """(..., *spec.image_shape) inverse depth as the spec encodes it [1]; None where the view has
+    none."""
 
 
 def view_of(
@@ -70,7 +71,8 @@ def observe(
     Args:
         spec: the policy's; its extras and its depth encoding count.
         view: what there is to see.
-        last_action_b: (..., 3) the previous action, in the body axes of its own time [m/s^2].
+        last_action_b: (..., spec.action.size) the previous action in SI units, in the body axes of
+            its own time.
         speed: (...,) how fast each is to fly, 0 to 1, where the spec has that input; the spec's own
             if None.
     """
@@ -85,10 +87,15 @@ def observe(
     state = xp.concatenate(numbers, axis=-1)
     if view.depth_m is None:
         return Observation(state, None)
-    return Observation(state, encode_depth(spec.depth, view.depth_m, spec.camera.range_m))
+    image = encode_depth(spec.depth, view.depth_m, spec.camera.range_m)
+    return Observation(state, image[..., None, :, :] if spec.depth.channel_axis else image)
 
 
 def encode_depth(encoding: DepthEncoding, depth_m: Array, range_m: float) -> Array:
     """Return planar depths [m] as the inverse depths that the network sees, of the same shape."""
     xp = depth_m.__array_namespace__()
-    return encoding.scale / xp.clip(depth_m, encoding.near, range_m) - encoding.offset
+    encoded = encoding.scale / xp.clip(depth_m, encoding.near, range_m) - encoding.offset
+    if not encoding.uint8:
+        return encoded
+    low, high = encoding.bounds(range_m)
+    return xp.rint(255.0 * (encoded - low) / (high - low))

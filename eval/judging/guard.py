@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
+from eval.vehicles.vehicle import Vehicle
 from policies.policy import Hidden, Policy
-from policies.spec import NoAnswer
+from policies.spec import ActionSpec, NoAnswer
 
 
 @dataclass(frozen=True)
@@ -17,25 +19,55 @@ class ActionLimits:
     """What an action may be."""
 
     size: float = 50.0
-    """Largest |action_b| [m/s^2]; longer ones are shortened. Over the net acceleration that a
-    thrust-to-weight ratio of 5 can make, so that it stops faults and not flying."""
+    """Largest |action_b| of an acceleration [m/s^2]; longer ones are shortened. Over the net
+    acceleration that a thrust-to-weight ratio of 5 can make, so that it stops faults and not
+    flying."""
     deadline_s: float | None = None
     """An answer of the policy that takes longer than this is late: it is not flown, and ends the
     trials that it was for as out of time [s]. None sets no deadline. With one, outcomes depend on
     the machine's load and do not repeat."""
+    action: ActionSpec = field(default_factory=ActionSpec)
+    """What the policy's output means."""
+    low: tuple[float, ...] = ()
+    """Least of each component in SI units, of other kinds of action than acceleration."""
+    high: tuple[float, ...] = ()
+    """Largest of each component."""
+
+
+def limits_of(limits: ActionLimits, action: ActionSpec, vehicle: Vehicle) -> ActionLimits:
+    """Return `limits` for a policy's kind of action: those of a command are the vehicle file's."""
+    low, high = (), ()
+    if action.kind == "ctbr":
+        rate = vehicle.controller.rate_max
+        low, high = (0.0, *(-most for most in rate)), (vehicle.full_thrust, *rate)
+    elif action.kind == "motors":
+        low, high = (0.0,) * 4, (1.0,) * 4
+    return replace(limits, action=action, low=low, high=high)
+
+
+def first_action(action: ActionSpec, vehicle: Vehicle) -> np.ndarray:
+    """Return what counts as the last action at the start of a trial, (size,) SI: hovering."""
+    if action.kind == "acceleration":
+        return np.zeros(3)
+    if action.kind == "ctbr":
+        return np.array([GRAVITY, 0.0, 0.0, 0.0])
+    share = np.full(4, GRAVITY / vehicle.full_thrust)
+    return np.sqrt(share) if action.motors == "speed" else share
 
 
 class Guarded(NamedTuple):
     """Actions fit to fly, and what was wrong with them."""
 
     action_b: np.ndarray
-    """(N, 3) float64 [m/s^2]."""
+    """(N, size) float64, SI units; (N, 3) [m/s^2] of an acceleration."""
     bad: np.ndarray
     """(N,) bool: not finite, replaced by the last good action."""
     limited: np.ndarray
-    """(N,) bool: shortened to the limit."""
+    """(N,) bool: shortened to the limit, or a component cut off at its limit."""
     late: np.ndarray
     """(N,) bool: came after the deadline or not at all, replaced by the last good action."""
+    largest: np.ndarray
+    """(N,) largest component of the policy's own output by size, before its scale; NaN if bad."""
 
 
 def ask(
@@ -59,7 +91,7 @@ def ask(
         state: (N, spec.state_size).
         image: (N, height, width).
         fresh: (N,) bool.
-        last_b: (N, 3) the action flown last, zero at the start of a trial [m/s^2].
+        last_b: (N, size) the action flown last in SI units, at first `first_action`.
 
     Raises:
         ValueError: where the answer is no array of actions.
@@ -69,7 +101,7 @@ def ask(
         answer, after = policy.act(hidden, state, image, fresh)
     except NoAnswer:
         nothing = np.zeros(len(last_b), bool)
-        return Guarded(last_b, nothing, nothing, ~nothing), hidden
+        return Guarded(last_b, nothing, nothing, ~nothing, np.full(len(last_b), np.nan)), hidden
     took_s = time.perf_counter() - asked
     return guard_action(limits, answer, last_b, took_s, policy.name), after
 
@@ -81,8 +113,8 @@ def guard_action(
 
     Args:
         limits: what an action may be.
-        action_b: what the policy returned; should be (N, 3) real numbers [m/s^2].
-        last_b: (N, 3) the action flown last, zero at the start of a trial [m/s^2].
+        action_b: what the policy returned; should be (N, size) real numbers.
+        last_b: (N, size) the action flown last in SI units, at first `first_action`.
         took_s: how long the answer took [s].
         policy: its name, for the message.
 
@@ -93,17 +125,21 @@ def guard_action(
     if action.shape != last_b.shape or action.dtype.kind not in "fiu":
         raise ValueError(
             f"policy {policy!r} returned actions of shape {action.shape} and type {action.dtype}; "
-            f"wanted real numbers of shape {last_b.shape}: one (x, y, z) in body axes for each "
-            "row of its input. Check the policy's output."
+            f"wanted real numbers of shape {last_b.shape}: one {limits.action.kind} for each row "
+            "of its input. Check the policy's output."
         )
-    action = action.astype(np.float64)
+    largest = np.abs(action).max(-1).astype(np.float64)
+    action = np.asarray(limits.action.to_si(action)).astype(np.float64)
     late = np.full(len(action), limits.deadline_s is not None and took_s > limits.deadline_s)
     bad = ~np.isfinite(action).all(-1) & ~late
     action = np.where((bad | late)[:, None], last_b, action)
+    if limits.high:
+        inside = np.clip(action, limits.low, limits.high)
+        return Guarded(inside, bad, (inside != action).any(-1), late, largest)
     # Scaled before squaring, so that a huge finite action does not overflow to infinity.
-    largest = np.abs(action).max(-1, keepdims=True)
-    unit = action / np.maximum(largest, 1e-30)
-    size = largest[:, 0] * np.sqrt((unit * unit).sum(-1))
+    longest = np.abs(action).max(-1, keepdims=True)
+    unit = action / np.maximum(longest, 1e-30)
+    size = longest[:, 0] * np.sqrt((unit * unit).sum(-1))
     limited = size > limits.size
     shortened = unit * (limits.size / np.sqrt(np.maximum((unit * unit).sum(-1), 1e-30)))[:, None]
-    return Guarded(np.where(limited[:, None], shortened, action), bad, limited, late)
+    return Guarded(np.where(limited[:, None], shortened, action), bad, limited, late, largest)

@@ -16,12 +16,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from eval.judging.ages import Delays
-from eval.judging.guard import ActionLimits, ask
+from eval.judging.guard import ActionLimits, ask, first_action, limits_of
+from eval.judging.outputs import Outputs
 from eval.judging.recorder import Recorder
 from eval.judging.sensors import SensorNoise, Sensors, check_noise
 from eval.logs.flight import Flight
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import REFERENCE, World, compiles, world_class
+from eval.worlds import REFERENCE, World, compiles, flown_by, world_class
 from eval.worlds.slots import fitting, layout_of
 from eval.worlds.trial import (
     DIVERGED,
@@ -209,7 +210,7 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     slots = options.slots if compiles(task.world) else min(options.slots, max(1, len(share)))
     world = world_class(task.world)(
         task.vehicle, policy.spec.camera, layout_of(task.tracks.values()), options.rules,
-        slots=slots, threads=options.threads,
+        slots=slots, threads=options.threads, **flown_by(task.world, policy.spec.action),
     )  # fmt: skip
     yield from _Slots(task, policy, world).run(share)
 
@@ -237,17 +238,21 @@ class _Slots:
         rate = policy.spec.rate_hz
         _check_rate(policy, task.vehicle, world.dt)
         self._task, self._policy, self._world = task, policy, world
+        action = policy.spec.action
+        self._limits = limits_of(task.options.limits, action, task.vehicle)
+        self._first = first_action(action, task.vehicle)
         self._steps_a_decision = 1 / (rate * world.dt)
         n = world.slots
         self._index = np.full(n, -1)
         self._trial: list[TrialSpec | None] = [None] * n
         self._decision = np.zeros(n)
-        self._action_b = np.zeros((n, 3))
+        self._action_b = np.tile(self._first, (n, 1))
+        self._outputs = Outputs(n, action)
         self._faults = np.zeros((n, 3), int)
         self._late = np.zeros(n, bool)
         self._fresh = np.ones(n, bool)
         self._hidden = policy.start(n)
-        self._recorder = Recorder(n, task.record.depth) if task.record else None
+        self._recorder = Recorder(n, task.record.depth, self._first) if task.record else None
         noise, range_m = task.options.noise, policy.spec.camera.range_m
         self._sensors = None if noise.is_none else Sensors(noise, n, rate, range_m)
         self._delays = None
@@ -278,7 +283,8 @@ class _Slots:
                 break
             self._index[slot], trial = waiting.pop()
             self._trial[slot] = trial
-            self._decision[slot], self._action_b[slot], self._faults[slot] = 0, 0.0, 0
+            self._decision[slot], self._action_b[slot], self._faults[slot] = 0, self._first, 0
+            self._outputs.start(slot)
             self._fresh[slot] = True
             if self._recorder:
                 self._recorder.start(slot)
@@ -303,10 +309,11 @@ class _Slots:
         state = np.where(flying[:, None], state, 0).astype(np.float32)
         image = image.astype(np.float32)
         guarded, self._hidden = ask(
-            self._task.options.limits, self._policy, self._hidden, state, image,
+            self._limits, self._policy, self._hidden, state, image,
             self._fresh | ~flying, self._action_b,
         )  # fmt: skip
         self._action_b = guarded.action_b
+        self._outputs.add(guarded, state)
         self._faults += np.stack([guarded.bad, guarded.limited, guarded.late], axis=-1)
         self._late = guarded.late
         flying = flying & ~guarded.late
@@ -368,4 +375,5 @@ class _Slots:
             bad_actions=int(self._faults[slot, 0]),
             limited_actions=int(self._faults[slot, 1]),
             late_actions=int(self._faults[slot, 2]),
+            **self._outputs.columns(slot),
         )

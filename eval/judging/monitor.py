@@ -16,7 +16,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from policies.policy import Hidden, Policy
-from policies.spec import PolicySpec
+from policies.spec import PolicyError, PolicySpec
 from tracks.geometry.camera import Camera, pixel_rays_b
 from tracks.input.ranges import Range
 
@@ -67,6 +67,15 @@ class Monitored:
     """What it may do."""
     interventions: int = field(default=0, compare=False)
     """Ways out taken so far, over all rows."""
+
+    def __post_init__(self) -> None:
+        """Refuse actions that say nothing about the path, and images that hide the depth."""
+        action, depth = self.policy.spec.action, self.policy.spec.depth
+        if action.kind != "acceleration" or not action.is_plain or depth.uint8:
+            raise PolicyError(
+                f"{self.policy.name}: the monitor is for accelerations in m/s^2 and float images; "
+                "fly it without --monitor"
+            )
 
     @property
     def name(self) -> str:

@@ -25,17 +25,19 @@ _EMPTY = (
 class Recorder:
     """Gathers the rows of the flights in N slots; a slot's flight is taken out when it ends."""
 
-    def __init__(self, slots: int, depth: bool) -> None:
+    def __init__(self, slots: int, depth: bool, first: np.ndarray | None = None) -> None:
         """Make a recorder.
 
         Args:
             slots: how many trials fly at once.
             depth: whether depth images are kept (3 kB each at 24 x 32).
+            first: (size,) the action before the first one; zeros of an acceleration without it.
         """
         self._depth = depth
         self._rows: list[list[tuple[Any, ...]]] = [[] for _ in range(slots)]
         self._images: list[list[np.ndarray]] = [[] for _ in range(slots)]
-        self._action = np.zeros((slots, 3))
+        self._first = np.zeros(3) if first is None else first
+        self._action = np.tile(self._first, (slots, 1))
         self._is_new = np.zeros(slots, bool)
         self._last_image = [np.zeros(0, np.float32)] * slots
 
@@ -43,7 +45,7 @@ class Recorder:
         """Begin the flight of a new trial in `slot`."""
         self._rows[slot], self._images[slot] = [], []
         self._is_new[slot] = False
-        self._action[slot] = 0.0
+        self._action[slot] = self._first
 
     def decided(self, slots: np.ndarray, action_b: np.ndarray, depth_m: np.ndarray) -> None:
         """Note the actions (N, 3) that the policy just gave for `slots` (k,) and what it saw."""

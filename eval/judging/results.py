@@ -102,10 +102,12 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
         raise ValueError(
             f"{path}: not a readable Parquet file ({error}); run suite eval again"
         ) from error
-    missing = [name for name in TrialResult._fields if rows and name not in rows[0]]
+    needed = set(TrialResult._fields) - set(TrialResult._field_defaults)
+    missing = sorted(name for name in needed if rows and name not in rows[0])
     if missing:
         raise ValueError(f"{path}: no column {missing[0]!r}; is it a trials.parquet of this suite?")
-    return [TrialResult(*(row[name] for name in TrialResult._fields)) for row in rows]
+    names = TrialResult._fields
+    return [TrialResult(**{name: row[name] for name in names if name in row}) for row in rows]
 
 
 class Journal:

@@ -6,14 +6,15 @@ rotors, effects) runs at every one. Pure, for numpy and JAX, over N vehicles at 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
-from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant
+from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant, unpacked
 from eval.quadrotor.stepper import Inputs, PlantState, hover_state, plant_step
 from eval.vehicles.vehicle import Controller, Vehicle
+from policies.spec import ActionSpec
 from tracks.common.masks import nowhere, packed, select
 from tracks.geometry.scene import Array
 
@@ -31,6 +32,11 @@ class Autopilot:
     """Length of a physics step [s]."""
     attitude_every: int
     """Physics steps a command of the attitude loop holds."""
+    action: ActionSpec = field(default_factory=ActionSpec)
+    """What is commanded: an acceleration goes through the attitude loop, body rates and thrust go
+    to the rate loop, motors past both."""
+    speed_max: float = 0.0
+    """A rotor's largest commanded speed [rad/s]."""
 
 
 class AutopilotState(NamedTuple):
@@ -44,11 +50,12 @@ class AutopilotState(NamedTuple):
     """(N, 3) wanted heading, horizontal unit vectors."""
 
 
-def make_autopilot(vehicle: Vehicle) -> Autopilot:
-    """Return what flies `vehicle`, at its rate loop's frequency."""
+def make_autopilot(vehicle: Vehicle, action: ActionSpec | None = None) -> Autopilot:
+    """Return what flies `vehicle` by a kind of action, at its rate loop's frequency."""
     dt = 1.0 / vehicle.controller.frequency
     every = max(1, round(vehicle.controller.frequency / ATTITUDE_HZ))
-    return Autopilot(make_plant(vehicle, dt), vehicle.controller, dt, every)
+    plant, speed_max = make_plant(vehicle, dt), vehicle.rotors.speed_max
+    return Autopilot(plant, vehicle.controller, dt, every, action or ActionSpec(), speed_max)
 
 
 def start_autopilot(
@@ -65,6 +72,10 @@ def start_autopilot(
     n = motion.pos_w.shape[0]
     plant = hover_state(autopilot.plant, (n,), xp, noise)
     hover = Command(xp.full((n,), GRAVITY), xp.zeros((n, 3)))
+    if autopilot.action.kind == "motors":
+        # What is remembered for the delay are rotor speeds, not a command.
+        past = xp.zeros_like(plant.past_commands) + plant.rotor_speed[..., None]
+        plant = plant._replace(past_commands=past)
     return packed(AutopilotState(plant, hover, level_heading(motion.rot_w)))
 
 
@@ -83,13 +94,13 @@ def autopilot_step(
         autopilot: from `make_autopilot`.
         state: from `start_autopilot` or the step before.
         motion: (N, ...) at the start of the step.
-        action_b: (N, 3) the policy's [m/s^2].
+        action_b: (N, size) the policy's, within its limits; (N, 3) [m/s^2] of an acceleration.
         gate_w: (N, 3) centre of the next gate, which the heading follows [m].
         step: (N,) physics steps flown; the attitude loop runs at multiples of `attitude_every`.
         noise: (N, 3) normal draws for random wind, or None.
     """
     state = attitude_step(autopilot, state, motion, action_b, gate_w, step)
-    inputs = Inputs(state.command, noise=noise)
+    inputs = Inputs(state.command, noise=noise, speed_cmd=speed_asked(autopilot, action_b))
     plant, wrench = plant_step(autopilot.plant, state.plant, motion, inputs, step * autopilot.dt)
     return packed(state._replace(plant=plant)), wrench
 
@@ -104,8 +115,14 @@ def attitude_step(
 ) -> AutopilotState:
     """Return the loops with the command that the attitude loop gives at a physics step, or holds.
 
-    The arguments are those of `autopilot_step`; the plant is left as it is.
+    The arguments are those of `autopilot_step`; the plant is left as it is. Body rates and thrust
+    act at once, at any step; motors have no command, and what is recorded of it is NaN.
     """
+    if autopilot.action.kind == "ctbr":
+        return state._replace(command=unpacked(action_b))
+    if autopilot.action.kind == "motors":
+        nothing = action_b * float("nan")
+        return state._replace(command=unpacked(nothing))
     due = step % autopilot.attitude_every == 0
     if nowhere(due):
         return state  # most steps hold the command
@@ -115,3 +132,11 @@ def attitude_step(
     command = attitude_command(autopilot.controller, force_w, motion.rot_w, heading_w)
     command = select(due, command, state.command)
     return AutopilotState(state.plant, command, select(due, heading_w, state.heading_w))
+
+
+def speed_asked(autopilot: Autopilot, action: Array) -> Array | None:
+    """Return the rotor speeds (N, 4) that motor commands ask for [rad/s]; None of other actions."""
+    if autopilot.action.kind != "motors":
+        return None
+    xp = action.__array_namespace__()
+    return autopilot.speed_max * (action if autopilot.action.motors == "speed" else xp.sqrt(action))

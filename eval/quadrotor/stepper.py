@@ -63,6 +63,8 @@ class Inputs(NamedTuple):
     """(...,) battery voltage at the start of the flight minus now [V]."""
     push_b: Array | None = None
     """(..., 6) further acceleration [m/s^2] and angular acceleration [rad/s^2] in body axes."""
+    speed_cmd: Array | None = None
+    """(..., 4) commanded rotor speeds in place of a command; delay and lag act on them [rad/s]."""
 
 
 class Feedback(NamedTuple):
@@ -160,21 +162,25 @@ def loop_look(
 
 
 def rotor_step(
-    plant: Plant, state: PlantState, command: Command, rate_b: Array
+    plant: Plant, state: PlantState, command: Any, rate_b: Array, speed_cmd: Array | None = None
 ) -> tuple[PlantState, RotorStep]:
-    """Return the state after one step and what the rotors do in it, under `command`."""
-    state, wanted = rotor_command(plant, state, command, rate_b)
+    """Return the state after one step and what the rotors do in it; see `rotor_command`."""
+    state, wanted = rotor_command(plant, state, command, rate_b, speed_cmd)
     rotors = follow(state.rotor_speed, wanted, plant.constants.time_constant, plant.dt)
     return state._replace(rotor_speed=rotors.end), rotors
 
 
 def rotor_command(
-    plant: Plant, state: PlantState, command: Command, rate_b: Array
+    plant: Plant, state: PlantState, command: Any, rate_b: Array, speed_cmd: Array | None = None
 ) -> tuple[PlantState, Array]:
-    """Return the state that remembers `command`, and the rotor speeds that are asked for now."""
+    """Return the state that remembers `command` or `speed_cmd`, and the rotor speeds now asked."""
     if plant.delay_weight.shape[-1] > 0:
-        past, acting = delayed(plant.delay_weight, state.past_commands, command.packed)
+        asked = command.packed if speed_cmd is None else speed_cmd
+        past, acting = delayed(plant.delay_weight, state.past_commands, asked)
         state, command = state._replace(past_commands=past), unpacked(acting)
+        speed_cmd = None if speed_cmd is None else acting
+    if speed_cmd is not None:
+        return state, speed_cmd
     memory, wanted = loop_look(plant, state.loop, command, rate_b, plant.dt)
     return state._replace(loop=memory), wanted
 
@@ -196,8 +202,7 @@ def plant_step(
         rotors = steady(inputs.rotor_speed)
         state = state._replace(rotor_speed=rotors.end)
     else:
-        assert inputs.command is not None, "neither a command nor rotor speeds are given"
-        state, rotors = rotor_step(plant, state, inputs.command, motion.rate_b)
+        state, rotors = rotor_step(plant, state, inputs.command, motion.rate_b, inputs.speed_cmd)
     winds, flow = wind_and_flow(plant, state.wind, motion, rotors, inputs, time_s)
     if uses_rotor_acc(plant):
         flow = flow._replace(rotor_acc=(rotors.end - before) / plant.dt)

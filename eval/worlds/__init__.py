@@ -16,6 +16,7 @@ import numpy as np
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import Progress, TrialSpec
 from policies.observation import View
+from policies.spec import ActionSpec
 from tracks.common.names import Registry
 from tracks.track import Track
 
@@ -71,7 +72,8 @@ class World(Protocol):
     than the file says; `nearest(vehicle)` the vehicle whose file says best what it flies. `cost` is
     what a trial costs over one in MuJoCo, for estimates; 1 without it. `compiles` is true where
     every number of slots is a program of its own: such a world is given all trials at once, in one
-    process and in as many slots as are asked for.
+    process and in as many slots as are asked for. `actions` are the kinds that it flies besides
+    acceleration; it then takes an argument `action`, a `policies.spec.ActionSpec`.
     """
 
     name: str
@@ -93,7 +95,7 @@ class World(Protocol):
         ...
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
-        """Fly each slot's action (N, 3) for its number of physics steps (N,).
+        """Fly each slot's action (N, size) for its number of physics steps (N,).
 
         A trial that ends stays where it ended. With `record` the rows come back: before every
         new command, and the state in which a trial ended.
@@ -115,6 +117,22 @@ def world_class(name: str) -> Any:
     if hasattr(world, "check"):
         world.check()
     return world
+
+
+def flown_by(name: str, action: ActionSpec) -> dict[str, ActionSpec]:
+    """Return the argument that makes the world `name` fly another kind of action, if it is one.
+
+    Raises:
+        ValueError: where that world flies accelerations alone.
+    """
+    if action.kind == "acceleration":
+        return {}
+    if action.kind not in getattr(WORLDS.find(name), "actions", ()):
+        raise ValueError(
+            f"world {name!r} flies no actions of kind {action.kind!r}; fly in 'mujoco', or give "
+            "its class `actions` and the argument `action` (docs/worlds.md)"
+        )
+    return {"action": action}
 
 
 def compiles(name: str) -> bool:

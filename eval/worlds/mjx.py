@@ -42,6 +42,7 @@ from eval.worlds.trial import (
     start_progress,
 )
 from policies.observation import View, view_of
+from policies.spec import ActionSpec
 from tracks.common.masks import select
 from tracks.formats.mujoco_scene import GROUND
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
@@ -75,6 +76,7 @@ class MjxWorld:
     name = "mjx"
     integrator = "euler"
     compiles = True
+    actions = ("ctbr", "motors")
 
     def __init__(
         self,
@@ -84,11 +86,12 @@ class MjxWorld:
         rules: Rules,
         slots: int,
         threads: int = 1,
+        action: ActionSpec | None = None,
     ) -> None:
         """Make the world; the arguments are those of `MujocoWorld`, `threads` is left to JAX."""
         self.slots = slots
         self._layout, self._rules, self._camera = layout, rules, camera
-        self._autopilot = make_autopilot(vehicle)
+        self._autopilot = make_autopilot(vehicle, action)
         self.dt = self._autopilot.dt
         free = mujoco.MjSpec()
         free.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -217,7 +220,7 @@ class MjxWorld:
         return view_of(pos_w, rot_w, vel_w, gate, after, nearest(self._camera, depth))
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
-        """Fly each slot's action (N, 3) for its number of physics steps (N,)."""
+        """Fly each slot's action (N, size) for its number of physics steps (N,)."""
         assert self._on_device is not None
         # Decisions are a step more or less apart; one length means one compiled program.
         self._most = most = max(self._most, int(steps.max(initial=0)))

@@ -9,7 +9,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from eval.judging.guard import ActionLimits, ask
+from eval.judging.guard import ActionLimits, Guarded, ask, first_action, limits_of
+from eval.judging.outputs import Outputs
 from eval.judging.sensors import SensorNoise, Sensors
 from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import Motion, uses_noise
@@ -55,7 +56,7 @@ def fly_trial(
     if noise and noise.is_late:
         raise ValueError("world 'reference' shows nothing late; fly in 'mujoco', which flies alike")
     rules, limits = rules or Rules(), limits or ActionLimits()
-    autopilot = make_autopilot(vehicle)
+    autopilot = make_autopilot(vehicle, policy.spec.action)
     dt, spec = autopilot.dt, policy.spec
     model = compile_model(track, vehicle, dt, layout_of([track]).solids)
     data = mujoco.MjData(model)
@@ -71,7 +72,11 @@ def fly_trial(
     if noise and not noise.is_none:
         sensors = Sensors(noise, 1, spec.rate_hz, spec.camera.range_m)
         sensors.start(0, trial, count)
-    action_b, bad, limited, late, decisions = np.zeros((1, 3)), 0, 0, 0, 0
+    limits, action_b = (
+        limits_of(limits, spec.action, vehicle),
+        first_action(spec.action, vehicle)[None],
+    )
+    outputs, bad, limited, late, decisions = Outputs(1, spec.action), 0, 0, 0, 0
     passed = passed_8s = passed_035 = 0
     speeds: list[float] = []
     before_w = data.qpos[:3].copy()
@@ -121,6 +126,7 @@ def fly_trial(
             last_b = np.repeat(action_b, rows, 0)
             guarded, hidden = ask(limits, policy, hidden, *inputs, fresh, last_b)
             action_b = guarded.action_b[:1]
+            outputs.add(Guarded(*(part[:1] for part in guarded)), state)
             bad, limited = bad + int(guarded.bad[0]), limited + int(guarded.limited[0])
             decisions += 1
             if guarded.late[0]:
@@ -163,6 +169,7 @@ def fly_trial(
         bad_actions=bad,
         limited_actions=limited,
         late_actions=late,
+        **outputs.columns(0),
     )
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.quadrotor.autopilot import AutopilotState, attitude_step
+from eval.quadrotor.autopilot import AutopilotState, attitude_step, speed_asked
 from eval.quadrotor.plant import Motion
 from eval.quadrotor.stepper import rotor_command, winds_on
 from eval.vehicles.vehicle import Vehicle
@@ -24,6 +24,7 @@ from eval.worlds import rotorpy_vehicle
 from eval.worlds.scene_slots import TO_CONTACTS, SceneSlots
 from eval.worlds.slots import Layout
 from eval.worlds.trial import Rules
+from policies.spec import ActionSpec
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import quat_to_rot, to_local
 
@@ -57,13 +58,14 @@ class RotorpyWorld(SceneSlots):
         rules: Rules,
         slots: int,
         threads: int = 1,
+        action: ActionSpec | None = None,
     ) -> None:
         """Make the world; the arguments are those of `SceneSlots`.
 
         Raises:
             ValueError: where RotorPy is not installed.
         """
-        super().__init__(vehicle, camera, layout, rules, slots, threads)
+        super().__init__(vehicle, camera, layout, rules, slots, threads, action)
         self._multirotor = Multirotor(vehicle, self.dt, slots)
 
     @staticmethod
@@ -95,7 +97,8 @@ class RotorpyWorld(SceneSlots):
     ) -> tuple[AutopilotState, Push]:
         loops = attitude_step(self._autopilot, self._loops, motion, action_b, gate_w, step)
         plant = self._autopilot.plant
-        state, wanted = rotor_command(plant, loops.plant, loops.command, motion.rate_b)
+        asked = speed_asked(self._autopilot, action_b)
+        state, wanted = rotor_command(plant, loops.plant, loops.command, motion.rate_b, asked)
         winds, air_vel_w = winds_on(plant, state.wind, motion, noise)
         loops = loops._replace(plant=state._replace(wind=winds))
         return loops, Push(wanted, motion.vel_w - air_vel_w)

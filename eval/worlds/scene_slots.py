@@ -33,6 +33,7 @@ from eval.worlds.trial import (
     start_progress,
 )
 from policies.observation import View, view_of
+from policies.spec import ActionSpec
 from tracks.common.masks import packed, select
 from tracks.geometry.camera import Camera
 from tracks.track import Track
@@ -49,6 +50,7 @@ class SceneSlots(ABC):
     """
 
     name: str
+    actions = ("ctbr", "motors")
 
     def __init__(
         self,
@@ -58,6 +60,7 @@ class SceneSlots(ABC):
         rules: Rules,
         slots: int,
         threads: int = 1,
+        action: ActionSpec | None = None,
     ) -> None:
         """Make the world.
 
@@ -68,10 +71,11 @@ class SceneSlots(ABC):
             rules: when a trial ends.
             slots: how many trials fly at once.
             threads: for physics and rays; the outcome is the same with any number.
+            action: what the policy commands; an acceleration without it.
         """
         self.slots = slots
         self._vehicle, self._layout, self._rules = vehicle, layout, rules
-        self._autopilot = make_autopilot(vehicle)
+        self._autopilot = make_autopilot(vehicle, action)
         self.dt = self._autopilot.dt
         self._eye = Eye(camera)
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
@@ -194,7 +198,7 @@ class SceneSlots(ABC):
         """
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
-        """Fly each slot's action (N, 3) for its number of physics steps (N,)."""
+        """Fly each slot's action (N, size) for its number of physics steps (N,)."""
         rows = []
         for done in range(int(steps.max(initial=0))):
             flying = (steps > done) & (self._progress.ended == FLYING)

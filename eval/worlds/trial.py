@@ -5,6 +5,7 @@ The rules are pure functions of arrays over many trials (N rows) and take numpy 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -70,6 +71,12 @@ class TrialResult(NamedTuple):
     late_actions: int
     """1 where the trial ended, as out of time, by an answer that came after the deadline, where one
     is set, or not at all; else 0."""
+    decisions: int = 0
+    """Answers of the policy; 0 in files that do not say."""
+    output_max: float = math.nan
+    """Largest component of the policy's own output by size, before its scale; NaN for none."""
+    action_up: float = math.nan
+    """Mean vertical component of wanted net accelerations [m/s^2]; NaN of other actions."""
 
     @property
     def trial(self) -> TrialSpec:

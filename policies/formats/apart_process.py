@@ -20,6 +20,7 @@ import subprocess
 import sys
 import time
 import weakref
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,24 +70,24 @@ class Apart:
     A process that gave no answer is killed; the next question goes to a fresh one.
     """
 
-    def __init__(self, model: bytes, where: str, kind: str, label: str = "") -> None:
+    def __init__(self, model: bytes, where: str, kind: str, labels: Sequence[str] = ()) -> None:
         """Start the process and load the model there.
 
         Args:
             model: a serialised model, or a library's path.
             where: the file it came from, for messages.
             kind: one of `apart_server.KINDS`.
-            label: name of a text that a torch file carries.
+            labels: names of texts that a torch file may carry; of a C library one, of its JSON.
 
         Raises:
             PolicyError: where the engine refuses it, or does not come to an end with it.
         """
         self._where, self._model = where, model
-        self._module, self._kind, self._wanted = KINDS[kind][0], kind, label
+        self._module, self._kind, self._wanted = KINDS[kind][0], kind, list(labels)
         self._engine = CALLED.get(self._module, self._module)
         about = self._start()
-        self.label = about.get("label", "")
-        """The text that was asked for; empty where there is none."""
+        self.labels: dict[str, str | bytes] = about.get("labels", {})
+        """The texts that were asked for; empty where there is none."""
         self.sizes: list[int] = about.get("sizes", [])
         """Of a C library: bytes of its memory, then the sizes of its observation."""
         self.inputs, self.outputs = (
@@ -115,7 +116,7 @@ class Apart:
             "load_s": LOAD_S + GRACE_S,
             "answer_s": ANSWER_S + GRACE_S,
         }
-        head = {"bytes": len(self._model), "kind": self._kind, "label": self._wanted, **limits}
+        head = {"bytes": len(self._model), "kind": self._kind, "labels": self._wanted, **limits}
         about, _ = self._ask(head, [self._model], LOAD_S, "loaded")
         if "error" in about:
             raise PolicyError(

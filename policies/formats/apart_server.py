@@ -65,8 +65,8 @@ def _exactly(file: IO[bytes], count: int) -> bytearray:
     return data
 
 
-def load_onnx(onnxruntime: Any, model: bytes, label: str) -> Loaded:
-    """Load an ONNX model; its label is read by who sent it."""
+def load_onnx(onnxruntime: Any, model: bytes, labels: list[str]) -> Loaded:
+    """Load an ONNX model; its labels are read by who sent it."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
@@ -80,27 +80,29 @@ def load_onnx(onnxruntime: Any, model: bytes, label: str) -> Loaded:
     return about, lambda feed: session.run(wanted, feed)
 
 
-def load_program(torch: Any, model: bytes, label: str) -> Loaded:
-    """Load a torch exported program and the text that it carries under `label`."""
-    extra = {label: ""}
+def load_program(torch: Any, model: bytes, labels: list[str]) -> Loaded:
+    """Load a torch exported program and the texts that it carries under `labels`."""
+    extra = dict.fromkeys(labels, "")
     program = torch.export.load(io.BytesIO(model), extra_files=extra)
     values = {node.name: node.meta.get("val") for node in program.graph.nodes}
     inputs = []
     for name in map(str, program.graph_signature.user_inputs):
         shape = getattr(values.get(name), "shape", ())
         inputs.append([name, "", [_size(n) for n in shape]])
-    about = {"inputs": inputs, "outputs": [], "label": extra[label]}
+    about = {"inputs": inputs, "outputs": [], "labels": extra}
     return about, _torch_run(torch, program.module(check_guards=False))
 
 
-def load_script(torch: Any, model: bytes, label: str) -> Loaded:
-    """Load TorchScript and the text that it carries under `label`; shapes are not known."""
-    extra = {label: ""}
+def load_script(torch: Any, model: bytes, labels: list[str]) -> Loaded:
+    """Load TorchScript and the texts that it carries under `labels`; shapes are not known."""
+    extra = dict.fromkeys(labels, "")
     module = torch.jit.load(io.BytesIO(model), map_location="cpu", _extra_files=extra).eval()
     inputs = [[argument.name, "", []] for argument in module.forward.schema.arguments[1:]]
-    text = extra[label]
-    text = text.decode(errors="replace") if isinstance(text, bytes) else text
-    return {"inputs": inputs, "outputs": [], "label": text}, _torch_run(torch, module)
+    texts = {
+        key: text.decode(errors="replace") if isinstance(text, bytes) else text
+        for key, text in extra.items()
+    }
+    return {"inputs": inputs, "outputs": [], "labels": texts}, _torch_run(torch, module)
 
 
 def _torch_run(torch: Any, module: Callable[..., Any]) -> Run:
@@ -125,7 +127,7 @@ def _torch_run(torch: Any, module: Callable[..., Any]) -> Run:
     return run
 
 
-def load_library(ctypes: Any, path: bytes, label: str) -> Loaded:
+def load_library(ctypes: Any, path: bytes, labels: list[str]) -> Loaded:
     """Load a C policy's shared library, whose path is all that was sent.
 
     Memories travel as float32 words, whatever they hold; so does the byte that says a row is fresh.
@@ -136,14 +138,19 @@ def load_library(ctypes: Any, path: bytes, label: str) -> Loaded:
     library.suite_json.restype = ctypes.c_char_p
     state_bytes, *sizes = (library.suite_size(number) for number in range(4))
     text = library.suite_json().decode(errors="replace")
-    about = {"inputs": [], "outputs": [], "label": text, "sizes": [state_bytes, *sizes]}
+    about = {
+        "inputs": [],
+        "outputs": [],
+        "labels": {labels[0]: text},
+        "sizes": [state_bytes, *sizes],
+    }
 
     def run(feed: dict[str, Any]) -> list[Any]:
         words = feed["memory"]
         rows = len(words)
         memory = np.ascontiguousarray(words.view(np.uint8)[:, :state_bytes])
         fresh = feed["fresh"].astype(np.uint8)
-        action = np.empty((rows, 3), np.float32)
+        action = np.empty(feed["action"].shape, np.float32)
         arrays = (memory, fresh, feed["state"], feed["image"], action)
         library.suite_rows(rows, *(ctypes.c_void_p(array.ctypes.data) for array in arrays))
         after = np.zeros(words.shape, np.float32)
@@ -153,7 +160,7 @@ def load_library(ctypes: Any, path: bytes, label: str) -> Loaded:
     return about, run
 
 
-KINDS: dict[str, tuple[str, Callable[[Any, bytes, str], Loaded]]] = {
+KINDS: dict[str, tuple[str, Callable[[Any, bytes, list[str]], Loaded]]] = {
     "onnx": ("onnxruntime", load_onnx),
     "program": ("torch", load_program),
     "script": ("torch", load_script),
@@ -176,7 +183,7 @@ def serve(source: IO[bytes], answers: IO[bytes]) -> None:
         most = min(most, allowed)
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     try:
-        about, run = load(engine, bytes(model), head["label"])
+        about, run = load(engine, bytes(model), head["labels"])
     except Exception as error:  # onnxruntime's own exceptions share no public base
         write_frame(answers, {"error": _lines(error)[0], "version": engine.__version__})
         return

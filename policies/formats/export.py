@@ -1,4 +1,4 @@
-"""Our policy written for other programs: torch exported program (.pt2), ONNX and C."""
+"""Policies as files: ours as torch program (.pt2), ONNX and C, anybody's torch module as ONNX."""
 
 from __future__ import annotations
 
@@ -6,17 +6,23 @@ import io
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from policies import shipped
+from policies import contract, shipped
 from policies.formats.policy_file import PolicyCheckpoint, load_policy_checkpoint
-from policies.formats.spec_json import KEY, embed
-from policies.spec import PolicyError
+from policies.formats.program_inputs import INPUTS
+from policies.formats.spec_json import labels
+from policies.spec import PolicyError, PolicySpec
 from tracks.common.files import replacing_file
 from tracks.common.names import unknown_name
 
 if TYPE_CHECKING:
+    import torch
+
     from policies.formats.c.forward import Observed
+
+MODULE_OPSET = 17
+"""Of a module's graph; old enough for the runtimes of companion computers."""
 
 
 def export_policy(
@@ -47,22 +53,83 @@ def export_policy(
     chosen = list(formats)
     check_formats(chosen, dtype)
     name, checkpoint = exported_checkpoint(name_or_folder)
-    label = embed(checkpoint.spec, name, checkpoint.seed)
+    texts = labels(checkpoint.spec, name, checkpoint.seed)
     written = []
     for wanted in chosen:
         if wanted == "c":
             from policies.formats.c.project import c_project
 
-            texts = c_project(checkpoint, name, dtype, observed).files
-            files = {file: text.encode() for file, text in texts.items()}
+            project = c_project(checkpoint, name, dtype, observed).files
+            files = {file: text.encode() for file, text in project.items()}
         else:
             _, write = _WRITERS[wanted]
-            files = {main_file(name, wanted): write(checkpoint, label)}
+            files = {main_file(name, wanted): write(checkpoint, texts)}
         for file, data in files.items():
             with replacing_file(out / file) as beside:
                 beside.write_bytes(data)
             written.append(out / file)
     return written
+
+
+def export_module(
+    module: torch.nn.Module,
+    path: str | Path,
+    told: PolicySpec | contract.Contract,
+    memory: tuple[int, ...] | None = None,
+) -> Path:
+    """Write a torch module as ONNX with its contract, and load it once as the judge does.
+
+    The module is exported in evaluation mode, with a free batch, by torch's exporter over
+    TorchScript, which needs no further package.
+
+    Args:
+        module: its forward takes (state, image) or (state, image, hidden), float32 with the batch
+            first, and returns the action, or (action, hidden).
+        path: ends in .onnx.
+        told: what the module was trained under: `env.unwrapped.contract`, or a spec.
+        memory: shape of one row's hidden state; None without memory.
+
+    Returns:
+        `path`.
+
+    Raises:
+        PolicyError: where torch cannot export it, or the judge refuses the file.
+    """
+    import onnx
+    import torch
+
+    from policies.policy import load_policy
+
+    spec = told if isinstance(told, PolicySpec) else contract.spec_of(told, str(path))
+    made = contract.contract_of(spec, memory or ())
+    sizes = [(spec.state_size,), spec.image_shape, *([memory] if memory else [])]
+    names = INPUTS[: len(sizes)]
+    example = tuple(torch.zeros(2, *size) for size in sizes)
+    outputs = ["action", "hidden_next"][: 1 + bool(memory)]
+    buffer: Any = io.BytesIO()  # which torch takes, its annotation forgets it
+    training = module.training
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that this exporter will go one day
+            torch.onnx.export(
+                module.eval(), example, buffer, input_names=list(names), output_names=outputs,
+                dynamic_axes={name: {0: "batch"} for name in (*names, *outputs)},
+                opset_version=MODULE_OPSET, dynamo=False,
+            )  # fmt: skip
+    except Exception as error:
+        text = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise PolicyError(
+            f"{path}: torch cannot export the module ({text}); its forward must take "
+            f"{', '.join(names)} and return {' and '.join(outputs)}"
+        ) from error
+    finally:
+        module.train(training)
+    proto = onnx.load_model_from_string(buffer.getvalue())
+    onnx.helper.set_model_props(proto, {contract.KEY: made.text})
+    with replacing_file(path) as beside:
+        beside.write_bytes(proto.SerializeToString())
+    load_policy(path)
+    return Path(path)
 
 
 def main_file(name: str, wanted: str) -> str:
@@ -98,8 +165,8 @@ def exported_checkpoint(name_or_folder: str | Path) -> tuple[str, PolicyCheckpoi
     return folder.resolve().name, load_policy_checkpoint(folder)
 
 
-def torch_program(checkpoint: PolicyCheckpoint, label: str) -> bytes:
-    """Return a policy as the bytes of a .pt2 file, `label` under `embedded_spec.KEY`."""
+def torch_program(checkpoint: PolicyCheckpoint, texts: dict[str, str]) -> bytes:
+    """Return a policy as the bytes of a .pt2 file that carries `texts` by their keys."""
     import torch
 
     from policies.formats.torch_twin import torch_twin
@@ -117,18 +184,18 @@ def torch_program(checkpoint: PolicyCheckpoint, label: str) -> bytes:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         program = torch.export.export(twin, example, dynamic_shapes=(batch, batch, batch))
-        torch.export.save(program, buffer, extra_files={KEY: label})
+        torch.export.save(program, buffer, extra_files=texts)
     return buffer.getvalue()
 
 
-def onnx_file(checkpoint: PolicyCheckpoint, label: str) -> bytes:
-    """Return a policy as the bytes of an .onnx file, `label` under `embedded_spec.KEY`."""
+def onnx_file(checkpoint: PolicyCheckpoint, texts: dict[str, str]) -> bytes:
+    """Return a policy as the bytes of an .onnx file that carries `texts` by their keys."""
     from policies.formats.onnx_graph import onnx_model
 
-    return onnx_model(checkpoint.params, checkpoint.spec, {KEY: label}).SerializeToString()
+    return onnx_model(checkpoint.params, checkpoint.spec, texts).SerializeToString()
 
 
-_WRITERS: dict[str, tuple[str, Callable[[PolicyCheckpoint, str], bytes]]] = {
+_WRITERS: dict[str, tuple[str, Callable[[PolicyCheckpoint, dict[str, str]], bytes]]] = {
     "torch": (".pt2", torch_program),
     "onnx": (".onnx", onnx_file),
 }

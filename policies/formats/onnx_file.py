@@ -8,15 +8,23 @@ from typing import Any
 
 import numpy as np
 import onnx
+import onnx.inliner
 
 from policies.block_policy import BlockPolicy, proven
 from policies.formats.apart_process import Apart
-from policies.formats.program_inputs import INPUTS, check_inputs
-from policies.formats.spec_json import KEY, extract
+from policies.formats.program_inputs import (
+    INPUTS,
+    check_inputs,
+    check_memory,
+    dropped_inputs,
+)
+from policies.formats.spec_json import extract
 from policies.spec import PolicyError
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
 _STANDARD = ("", "ai.onnx")
+NODES_MOST = 100_000
+"""Operators of a graph whose functions stand where they are called."""
 
 
 def load_onnx(path: Path) -> BlockPolicy:
@@ -27,8 +35,8 @@ def load_onnx(path: Path) -> BlockPolicy:
             outside its folder, or its inputs and outputs do not fit.
     """
     proto = read_checked(path)
-    text = next((entry.value for entry in proto.metadata_props if entry.key == KEY), None)
-    spec = extract(text, str(path))
+    said = extract({entry.key: entry.value for entry in proto.metadata_props}, str(path))
+    spec = said.spec
     loaded = Apart(proto.SerializeToString(), str(path), "onnx")
     for value in (*loaded.inputs, *loaded.outputs):
         if value.kind != "tensor(float)":
@@ -36,6 +44,8 @@ def load_onnx(path: Path) -> BlockPolicy:
     found = {value.name: value.shape for value in loaded.inputs}
     order = sorted(found, key=(*INPUTS, *found).index)
     block, hidden_shape = check_inputs({name: found[name] for name in order}, spec, str(path))
+    check_memory(said, hidden_shape, str(path))
+    notes = (*said.notes, *dropped_inputs(found, str(path)))
     outputs = [value.name for value in loaded.outputs]
     if len(outputs) != 1 + (hidden_shape != (0,)):
         raise PolicyError(
@@ -50,7 +60,8 @@ def load_onnx(path: Path) -> BlockPolicy:
         action, *after = loaded.run({name: feed[name] for name in found})
         return action, after[0] if after else hidden
 
-    return proven(BlockPolicy(path.name, spec, model, hidden_shape, block, block), str(path))
+    policy = BlockPolicy(path.name, spec, model, hidden_shape, block, block, notes)
+    return proven(policy, str(path))
 
 
 def read_checked(path: Path) -> onnx.ModelProto:
@@ -59,9 +70,9 @@ def read_checked(path: Path) -> onnx.ModelProto:
     Raises:
         PolicyError: where it is damaged, too large, not standard, or points outside its folder.
     """
-    proto = _graph_of(path)
-    if proto.functions or proto.training_info:
-        raise PolicyError(f"{path}: holds functions or training graphs; export inference alone")
+    proto = _inlined(path, _graph_of(path))
+    if proto.training_info:
+        raise PolicyError(f"{path}: holds training graphs; export inference alone")
     for graph in _graphs(proto.graph):
         for node in graph.node:
             _check_text(path, node.op_type, node.domain)
@@ -84,6 +95,40 @@ def read_checked(path: Path) -> onnx.ModelProto:
     except Exception as error:
         raise PolicyError(f"{path}: breaks the ONNX standard ({_first_line(error)})") from error
     return proto
+
+
+def _inlined(path: Path, proto: onnx.ModelProto) -> onnx.ModelProto:
+    """Return a graph whose local functions, as torch's exporter writes them, stand where called.
+
+    Raises:
+        PolicyError: where functions call themselves, or come to more than `NODES_MOST` operators.
+    """
+    if not proto.functions:
+        return proto
+    functions = {(f.domain, f.name): f for f in proto.functions}
+    sizes: dict[tuple[str, str], int] = {}
+
+    def size(nodes: Any, above: tuple[tuple[str, str], ...] = ()) -> int:
+        total = 0
+        for node in nodes:
+            key = (node.domain, node.op_type)
+            if key in above or len(above) > len(functions):
+                raise PolicyError(f"{path}: function {key[1]!r} calls itself; export it again")
+            if key in functions and key not in sizes:
+                sizes[key] = size(functions[key].node, (*above, key))
+            total += sizes.get(key, 1)
+            for attribute in node.attribute:
+                for graph in (attribute.g, *attribute.graphs):
+                    total += size(graph.node, above)
+        return total
+
+    if size(proto.graph.node) > NODES_MOST:
+        raise PolicyError(f"{path}: its functions come to more than {NODES_MOST} operators")
+    try:
+        return onnx.inliner.inline_local_functions(proto)
+    except Exception as error:
+        text = f"{path}: its local functions cannot be inlined ({_first_line(error)})"
+        raise PolicyError(f"{text}; export with torch.onnx.export(..., dynamo=False)") from None
 
 
 def files_of(path: Path) -> list[Path]:

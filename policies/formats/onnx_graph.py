@@ -16,7 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from policies.networks.network import LEAK
 from policies.networks.tree_arrays import image_weight, kernel_oihw, rows_are_outputs
-from policies.spec import ACTION_SIZE, PolicySpec
+from policies.spec import PolicySpec
 
 OPSET = 17
 IR_VERSION = 8
@@ -38,7 +38,7 @@ def onnx_model(
         _value("image", "batch", camera.height, camera.width),
         _value("hidden", "batch", width),
     ]
-    outputs = [_value("action", "batch", ACTION_SIZE), _value("hidden_next", "batch", width)]
+    outputs = [_value("action", "batch", spec.action.size), _value("hidden_next", "batch", width)]
     tensors = [
         numpy_helper.from_array(value, name) for name, value in _initializers(params, spec).items()
     ]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from policies import contract
 from policies.formats.checkpoint import CONFIG, WEIGHTS, check_shapes, load_arrays, save_arrays
 from policies.formats.spec_json import spec_from_json, spec_to_json
 from policies.spec import PolicyError, PolicySpec, check_network
@@ -57,7 +58,8 @@ def save_policy(
     Raises:
         OSError: where the disk refuses; what was there stays.
     """
-    extra = {"spec": spec_to_json(spec), "training": dict(training or {})}
+    told = contract.contract_of(spec, (spec.hidden_size,)).to_json()
+    extra = {"spec": spec_to_json(spec), contract.KEY: told, "training": dict(training or {})}
     return save_arrays(folder, params, kind=POLICY, seed=seed, extra=extra)
 
 
@@ -73,6 +75,10 @@ def load_policy_checkpoint(folder: Path) -> PolicyCheckpoint:
         raise PolicyError(f"{folder / CONFIG}: key 'spec' is missing; copy the whole folder again")
     spec = spec_from_json(stored.config["spec"], f"{folder / CONFIG}: spec")
     check_shapes(folder / WEIGHTS, stored.arrays, expected_shapes(spec, str(folder / CONFIG)))
+    if contract.KEY in stored.config:
+        where, own = f"{folder / CONFIG}: {contract.KEY}", contract.contract_of(spec)
+        told = contract.read_contract(stored.config[contract.KEY], where)
+        contract.refuse_other(told, own, where, "the spec beside it")
     return PolicyCheckpoint(stored.arrays, spec, stored.config)
 
 

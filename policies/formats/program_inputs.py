@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 from policies.block_policy import BLOCK
-from policies.formats.spec_json import KEY
-from policies.spec import EXTRAS, PolicyError, PolicySpec
+from policies.formats.spec_json import KEY, Said
+from policies.spec import EXTRAS, Doubt, PolicyError, PolicySpec
 
 INPUTS = ("state", "image", "hidden")
 """Names of a program's inputs, in order; a policy without memory leaves the last out."""
@@ -32,7 +33,7 @@ def check_inputs(
     Raises:
         PolicyError: where names, ranks or sizes are not those of an observation.
     """
-    if tuple(shapes) not in (INPUTS, INPUTS[:2]):
+    if not shapes or not set(shapes) <= set(INPUTS):
         raise PolicyError(inputs_message(where, tuple(shapes)))
     rows = {shape[0] for shape in shapes.values() if shape and isinstance(shape[0], int)}
     block = rows.pop() if rows else BLOCK
@@ -47,8 +48,9 @@ def check_inputs(
             f"{where}: inputs have shapes {shapes}; allowed are batches of 1 to {BLOCK_MOST} rows "
             f"and up to {HIDDEN_MOST} numbers in 'hidden'"
         )
-    image = (spec.camera.height, spec.camera.width)
-    for name, expected in (("state", (spec.state_size,)), ("image", image)):
+    for name, expected in (("state", (spec.state_size,)), ("image", spec.image_shape)):
+        if name not in shapes:
+            continue
         found = shapes[name][1:]
         free = len(found) == len(expected) and all(
             size == want or not isinstance(size, int)
@@ -58,14 +60,43 @@ def check_inputs(
             raise PolicyError(
                 f"{where}: input {name!r} has shape {shapes[name]}, expected (batch, "
                 f"{', '.join(map(str, expected))}); the camera's size, {', '.join(EXTRAS)} "
-                f"stand in {KEY}"
+                f"and the kind of action stand in {KEY} or in its contract"
             )
     return block, tuple(hidden)
+
+
+def check_memory(said: Said, hidden_shape: tuple[int, ...], where: str) -> None:
+    """Refuse a memory of another shape than the contract's.
+
+    Raises:
+        PolicyError: naming both.
+    """
+    told = said.contract.memory if said.contract else None
+    if told is not None and tuple(told) != (hidden_shape if hidden_shape != (0,) else ()):
+        raise PolicyError(
+            f"{where}: its contract says a memory of shape {list(told)}, its input 'hidden' has "
+            f"{list(hidden_shape)}; export the policy again with its own contract"
+        )
+
+
+def dropped_inputs(names: Iterable[str], where: str) -> tuple[Doubt, ...]:
+    """Return what to say where an exporter has left out an input that nothing uses."""
+    missing = [name for name in INPUTS[:2] if name not in names]
+    return tuple(
+        Doubt(
+            "dropped_input",
+            f"{where}: has no input {name!r}: exporters drop what no operator uses, and it flies "
+            "without",
+            f"where it should see it, use {name} in forward() and export again",
+        )
+        for name in missing
+    )
 
 
 def inputs_message(where: str, names: tuple[str, ...]) -> str:
     """Return the error's message for a program whose inputs have other names."""
     return (
         f"{where}: inputs are {', '.join(names) or 'none'}; expected {', '.join(INPUTS)} in this "
-        "order (hidden may be left out); see docs/policies.md"
+        "order (hidden may be left out); name forward()'s arguments so, or give input_names to "
+        "torch.onnx.export"
     )

@@ -1,15 +1,16 @@
-"""A `PolicySpec` as JSON, checked key by key when it is read.
+"""A `PolicySpec` as JSON, checked key by key when it is read; and what policy files say of theirs.
 
-A torch or ONNX file holds one: an object under the key `policy.json`.
+A torch, ONNX or C file holds an object under the key `policy.json`, a contract, both or nothing.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
-from policies.spec import PolicyError, PolicySpec, check_spec
+from policies import contract
+from policies.spec import Doubt, PolicyError, PolicySpec, check_spec
 from tracks.common.files import to_json
 from tracks.common.names import unknown_name
 from tracks.common.provenance import stamp
@@ -46,29 +47,70 @@ def spec_from_json(data: Any, where: str) -> PolicySpec:
 KEY = "policy.json"
 """Name of the extra file in a torch archive, and of the metadata entry in ONNX."""
 SCHEMA = 1
-KEYS = ("schema", "suite_version", "git_commit", "seed", "name", "spec")
-"""Of the object; what a policy says of itself stands under `spec`."""
+KEYS = ("schema", "suite_version", "git_commit", "seed", "name", "spec", contract.KEY)
+"""Of the object; what a policy says of itself stands under `spec` and `contract`."""
+
+
+class Said(NamedTuple):
+    """What a file says of its policy."""
+
+    spec: PolicySpec
+    """The default one where it says nothing."""
+    contract: contract.Contract | None
+    """As the file has it."""
+    notes: tuple[Doubt, ...]
+    """What is assumed."""
+
+
+def labels(spec: PolicySpec, name: str, seed: int | None) -> dict[str, str]:
+    """Return the texts that go into a policy's file, by their keys."""
+    return {KEY: embed(spec, name, seed), contract.KEY: contract.contract_of(spec).text}
 
 
 def embed(spec: PolicySpec, name: str, seed: int | None) -> str:
     """Return the text that goes under `KEY`."""
-    data = {**stamp(SCHEMA, seed), "name": name, "spec": spec_to_json(spec)}
-    return to_json(data)
+    known = contract.contract_of(spec).to_json()
+    about = {"name": name, "spec": spec_to_json(spec), contract.KEY: known}
+    return to_json({**stamp(SCHEMA, seed), **about})
 
 
-def extract(text: str | bytes | None, where: str) -> PolicySpec:
-    """Return the spec that a file holds; the default one where it holds none.
+def extract(texts: Mapping[str, str | bytes | None], where: str) -> Said:
+    """Return what a file says of its policy.
 
     Args:
-        text: what stands under `KEY`, or None.
+        texts: what stands under `KEY` and under `contract.KEY`, where it does.
         where: the file, for the message.
 
     Raises:
-        PolicyError: where the text is not JSON, of a newer schema, or not a spec.
+        PolicyError: where a text is not JSON, of a newer schema or no spec, or two contradict.
     """
+    about = _object(texts.get(KEY), f"{where}: {KEY}")
+    found = [(texts.get(contract.KEY), f"{where}: {contract.KEY}"),
+             (about.get(contract.KEY), f"{where}: {KEY}: {contract.KEY}")]  # fmt: skip
+    read = [(contract.read_contract(text, place), place) for text, place in found if text]
+    if "spec" in about:
+        spec = spec_from_json(about["spec"], f"{where}: {KEY}: spec")
+        own = contract.contract_of(spec)
+        for one, place in read:
+            contract.refuse_other(one, own, place, f"the spec in {KEY}")
+        return Said(spec, read[0][0] if read else None, ())
+    if read:
+        for one, place in read[1:]:
+            contract.refuse_other(one, read[0][0], place, f"the entry {contract.KEY}")
+        return Said(contract.spec_of(*read[0]), read[0][0], ())
+    spec = spec_from_json({}, where)
+    assumed = contract.summary(contract.contract_of(spec))
+    doubt = Doubt(
+        "no_contract",
+        f"{where}: no contract in it; assumed: {assumed}",
+        "where it was trained otherwise, export it with env.unwrapped.contract",
+    )
+    return Said(spec, None, (doubt,))
+
+
+def _object(text: str | bytes | None, where: str) -> dict[str, Any]:
     if not text:
-        return PolicySpec()
-    where = f"{where}: {KEY}"
+        return {}
     try:
         data: Any = parse_json(text, where)
     except InputError as error:
@@ -78,4 +120,4 @@ def extract(text: str | bytes | None, where: str) -> PolicySpec:
     for key in data:
         if key not in KEYS:
             raise PolicyError(f"{where}: {unknown_name('key', key, KEYS)}")
-    return spec_from_json(data.get("spec", {}), f"{where}: spec")
+    return data

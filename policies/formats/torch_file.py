@@ -8,15 +8,18 @@ evaluates expressions, all from the file; torch has no safe mode for it. The pro
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from policies import contract
 from policies.block_policy import BlockPolicy, Model, proven
 from policies.formats.apart_process import Apart
-from policies.formats.program_inputs import INPUTS, check_inputs, inputs_message
+from policies.formats.program_inputs import INPUTS, check_inputs, check_memory, inputs_message
 from policies.formats.spec_json import KEY, extract
-from policies.spec import ACTION_SIZE, NeedsTrust, PolicyError
+from policies.spec import NeedsTrust, PolicyError
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
 
@@ -28,11 +31,14 @@ def load_program(path: Path, trust: bool = False) -> BlockPolicy:
             fit.
     """
     loaded = _loaded(path, "program", "a torch exported program", trust)
-    spec = extract(loaded.label, str(path))
-    shapes = {port.name: port.shape for port in loaded.inputs}
+    said = extract(loaded.labels, str(path))
+    spec, shapes = said.spec, {port.name: port.shape for port in loaded.inputs}
+    _check_names(path, tuple(shapes))
     block, hidden_shape = check_inputs(shapes, spec, str(path))
+    check_memory(said, hidden_shape, str(path))
     model = _as_model(loaded, path, hidden_shape)
-    return proven(BlockPolicy(path.name, spec, model, hidden_shape, block, block), str(path))
+    policy = BlockPolicy(path.name, spec, model, hidden_shape, block, block, said.notes)
+    return proven(policy, str(path))
 
 
 def load_script(path: Path, trust: bool = False) -> BlockPolicy:
@@ -43,13 +49,12 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
             fit.
     """
     loaded = _loaded(path, "script", "TorchScript", trust)
-    spec = extract(loaded.label, str(path))
-    names = tuple(port.name for port in loaded.inputs)
-    if names not in (INPUTS, INPUTS[:2]):
-        raise PolicyError(inputs_message(str(path), names))
+    said = extract(loaded.labels, str(path))
+    spec, names = said.spec, tuple(port.name for port in loaded.inputs)
+    _check_names(path, names)
     hidden_shape = (spec.hidden_size,) if names == INPUTS else (0,)
     model = _as_model(loaded, path, hidden_shape)
-    return proven(BlockPolicy(path.name, spec, model, hidden_shape), str(path))
+    return proven(BlockPolicy(path.name, spec, model, hidden_shape, notes=said.notes), str(path))
 
 
 def _loaded(path: Path, kind: str, words: str, trust: bool) -> Apart:
@@ -65,7 +70,27 @@ def _loaded(path: Path, kind: str, words: str, trust: bool) -> Apart:
         raise PolicyError(str(error)) from None
     except OSError as error:
         raise PolicyError(f"{path}: cannot be read ({reason(error)}); check the file") from None
-    return Apart(data, str(path), kind, KEY)
+    if kind == "script" and _is_weights(data):
+        raise PolicyError(
+            f"{path}: this file contains weights without a program (a state_dict or a pickled "
+            "module); load them into the module and export it: examples/sb3_race.py"
+        )
+    return Apart(data, str(path), kind, (KEY, contract.KEY))
+
+
+def _check_names(path: Path, names: tuple[str, ...]) -> None:
+    if names not in (INPUTS, INPUTS[:2]):
+        raise PolicyError(inputs_message(str(path), names))
+
+
+def _is_weights(data: bytes) -> bool:
+    """Return whether an archive of torch's is what torch.save writes, which has no code."""
+    try:
+        names = zipfile.ZipFile(io.BytesIO(data)).namelist()
+    except zipfile.BadZipFile:
+        return False
+    pickled = any(name.endswith("data.pkl") for name in names)
+    return pickled and not any("/code/" in name for name in names)
 
 
 def _as_model(loaded: Apart, path: Path, hidden_shape: tuple[int, ...]) -> Model:
@@ -78,8 +103,8 @@ def _as_model(loaded: Apart, path: Path, hidden_shape: tuple[int, ...]) -> Model
         outputs = loaded.run({**feed, "hidden": hidden} if memory else feed)
         if len(outputs) != 1 + memory:
             raise PolicyError(
-                f"{path}: gives {len(outputs)} outputs, expected the tensors action (batch, "
-                f"{ACTION_SIZE}){' and hidden' if memory else ''}; see docs/policies.md"
+                f"{path}: gives {len(outputs)} outputs, expected the tensors action"
+                f"{' and hidden' if memory else ''}; see docs/policies.md"
             )
         action, *after = outputs
         return action, after[0] if memory else hidden

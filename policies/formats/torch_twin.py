@@ -10,7 +10,7 @@ from torch import nn
 
 from policies.networks.network import LEAK, flat_features
 from policies.networks.tree_arrays import image_weight, kernel_oihw, rows_are_outputs
-from policies.spec import ACTION_SIZE, PolicySpec
+from policies.spec import PolicySpec
 
 CONVOLUTIONS = ("conv1", "conv2", "conv3")
 LINEAR = ("state", "action")
@@ -30,7 +30,7 @@ class TorchTwin(nn.Module):
         self.image = nn.Linear(flat_features(spec), spec.hidden_size, bias=False)
         self.state = nn.Linear(spec.state_size, spec.hidden_size)
         self.gru = nn.GRUCell(spec.hidden_size, spec.hidden_size)
-        self.action = nn.Linear(spec.hidden_size, ACTION_SIZE, bias=False)
+        self.action = nn.Linear(spec.hidden_size, spec.action.size, bias=False)
         self.leak = nn.LeakyReLU(LEAK)
 
     def forward(

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from policies.networks.layers import conv_valid, gru_update, patch_product, uniform
-from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
+from policies.spec import EXTRAS, PolicySpec
 
 Params = dict[str, jax.Array]
 
@@ -57,7 +57,7 @@ def _drawn(key: jax.Array, spec: PolicySpec) -> Params:
         "gru.weight_hidden": ((hidden, 3 * hidden), hidden),
         "gru.bias_input": ((3 * hidden,), hidden),
         "gru.bias_hidden": ((3 * hidden,), hidden),
-        "action.weight": ((hidden, ACTION_SIZE), hidden),
+        "action.weight": ((hidden, spec.action.size), hidden),
     }
     drawn = uniform(key, {name: shape for name, (shape, _) in fan.items()})
     params = {name: (2 * drawn[name] - 1) * fan_in**-0.5 for name, (_, fan_in) in fan.items()}
@@ -84,7 +84,7 @@ def fitted(params: Params, seen: PolicySpec, spec: PolicySpec) -> Params:
                 f"the policy to start from has spec.{entry.name} {has}, and this run {wanted}; "
                 "train from nothing, or with the policy's own"
             )
-    rows, first = [params["state.weight"][:STATE_SIZE]], STATE_SIZE
+    rows, first = [params["state.weight"][: spec.base_size]], spec.base_size
     for key, count in EXTRAS.items():
         has, wanted = getattr(seen, key), getattr(spec, key)
         if has and not wanted:

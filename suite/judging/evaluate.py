@@ -66,6 +66,7 @@ def evaluate(
     """
     from eval.judging.results import write_results
     from eval.judging.tables import grids, markdown_table, summarise, with_interval
+    from policies.probe import notes_of
 
     course, out = read_course(evaluation), Path(out)
     refuse_other_run(out, evaluation)
@@ -87,13 +88,17 @@ def evaluate(
     journals = _open_journals(evaluation, course, fliers, out)
     announce(console, f"{flown} trials in the {evaluation.world} world", needs)
     say_notes(console, evaluation.world, course)
+    for doubt in dict.fromkeys(each for policy in policies for each in notes_of(policy)):
+        console.note(str(doubt))
     results: list[TrialResult] = []
     for flier, journal in zip(fliers, journals, strict=True):
         results += _fly_one(evaluation, course, flier, workers, journal, console)
     over = _over_plan(results, course)
+    actions = {flier.label: _actions(flier, results, console) for flier in fliers}
     summary = {
         **summarise(results),
         "over_plan": over,
+        "actions": actions,
         "judged": evaluation,
         "policies": [about_policy(flier.source, flier.policy) for flier in fliers],
         "sha256": file_digests(course.vehicle, course.tracks),
@@ -129,6 +134,21 @@ def _over_plan(results: Sequence[TrialResult], course: Course) -> list[OverPlan]
     if vehicle_table(course.vehicle) != vehicle_table(load_vehicle(VEHICLE)):
         return []
     return over_plan([row for row in results if row.track not in course.tracks])
+
+
+def _actions(flier: Flier, results: Sequence[TrialResult], console: Console) -> dict[str, Any]:
+    """Return what a policy's outputs were like in its trials, and print it."""
+    from eval.judging.outputs import actions_of
+
+    rows = [result for result in results if result.policy == flier.label]
+    found = actions_of(rows, flier.policy.spec.action)
+    if found["decisions"]:
+        console.say(
+            f"{flier.label}: {found['limited']:.1%} of {found['decisions']} actions were limited"
+        )
+    for warning in found["warnings"]:
+        console.note(f"warning: {flier.label}: {warning}")
+    return found
 
 
 def file_digests(vehicle: Vehicle, tracks: Mapping[str, Track]) -> dict[str, str]:

@@ -71,10 +71,14 @@ def neighbour_dependent(state, image, hidden):
     return state[:, :3] - state[:, :3].mean(0), hidden
 
 
-@pytest.mark.parametrize("model", [place_dependent, neighbour_dependent])
+def test_a_model_whose_rows_depend_on_each_other_is_refused():
+    with pytest.raises(PolicyError, match=r"other rows of its batch; .*module.eval\(\)"):
+        proven(BlockPolicy("x", PolicySpec(), neighbour_dependent, (0,)), "x")
+
+
 @pytest.mark.parametrize("block", [64, 7])
-def test_a_model_whose_rows_lean_on_each_other_is_fed_one_by_one(model, block):
-    policy = proven(BlockPolicy("x", PolicySpec(), model, (0,), block, block), "x")
+def test_a_model_that_rounds_by_place_is_fed_one_by_one(block):
+    policy = proven(BlockPolicy("x", PolicySpec(), place_dependent, (0,), block, block), "x")
     assert (policy.rows, policy.block) == (1, block)
     _, state, image = observe(0, 20)
     none = np.zeros(20, bool)

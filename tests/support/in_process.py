@@ -12,17 +12,17 @@ from policies.spec import NoAnswer, PolicyError
 class InProcess:
     """Stands for `Apart`, with its answers and its words where the engine refuses."""
 
-    def __init__(self, model, where, kind, label=""):
+    def __init__(self, model, where, kind, labels=()):
         name, load = KINDS[kind]
         engine = importlib.import_module(name)
         self._where = where
         try:
-            about, self._run = load(engine, model, label)
+            about, self._run = load(engine, model, labels)
         except Exception as error:
             raise PolicyError(
                 f"{where}: {name} {engine.__version__} cannot load it ({error}); {REMEDIES[name]}"
             ) from None
-        self.label = about.get("label", "")
+        self.labels = about.get("labels", {})
         self.inputs, self.outputs = (
             [Port(port, number, tuple(shape)) for port, number, shape in about[side]]
             for side in ("inputs", "outputs")

@@ -35,9 +35,9 @@ class Pursuit:
 
 @dataclass
 class Steady:
-    """Always wants the same acceleration in body axes."""
+    """Always gives the same action."""
 
-    action_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    action_b: tuple[float, ...] = (0.0, 0.0, 0.0)
     spec: PolicySpec = field(default_factory=PolicySpec)
     name: str = "steady"
 

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -85,8 +86,16 @@ class Table:
 
     def _typed(self, key: str, value: Any, kind: Any) -> Any:
         parts = get_args(kind)
+        if isinstance(kind, UnionType):  # something or nothing
+            return None if value is None else self._typed(key, value, parts[0])
         if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-            return self.table(key).read(kind)
+            if not isinstance(value, Mapping):
+                raise self.error(key, value, f"a table [{self._at(key)}]")
+            return Table(self._source, self._at(key), value).read(kind)
+        if parts[1:] == (...,):
+            if not isinstance(value, list | tuple):
+                raise self.error(key, value, "a list")
+            return tuple(self._typed(f"{key}[{i}]", v, parts[0]) for i, v in enumerate(value))
         if get_origin(kind) is tuple:
             if not isinstance(value, list | tuple) or len(value) != len(parts):
                 raise self.error(key, value, _words(kind))

@@ -11,8 +11,8 @@ import numpy as np
 
 from policies.formats.apart_process import ANSWER_BYTES, Apart
 from policies.formats.c.compiler import compiled_library
-from policies.formats.spec_json import extract
-from policies.spec import ACTION_SIZE, NeedsTrust, PolicyError, PolicySpec
+from policies.formats.spec_json import KEY, extract
+from policies.spec import Doubt, NeedsTrust, PolicyError, PolicySpec
 
 _STATE_MOST = 2**26
 """Bytes of one flight's `policy_state`."""
@@ -35,6 +35,8 @@ class CPolicy:
     """It, in its process."""
     state_bytes: int
     """Size of `policy_state`."""
+    notes: tuple[Doubt, ...] = ()
+    """What is assumed of it."""
 
     def start(self, n: int) -> np.ndarray:
         """Return the `policy_state` of n trials, reset: its bytes as (n, k) float32 words."""
@@ -43,14 +45,15 @@ class CPolicy:
     def act(
         self, hidden: np.ndarray, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return (action_b (n, 3) [m/s^2], hidden'); see `policies.policy.Policy.act`."""
-        actions = np.empty((len(hidden), ACTION_SIZE), np.float32)
+        """Return (action (n, spec.action.size), hidden'); see `policies.policy.Policy.act`."""
+        actions = np.empty((len(hidden), self.spec.action.size), np.float32)
         after = np.empty_like(hidden)
         most = max(1, ANSWER_BYTES // 2 // max(1, hidden[:1].nbytes))
         for low in range(0, len(hidden), most):
             rows = slice(low, low + most)
             feed = {"memory": hidden[rows], "fresh": fresh[rows], "state": state[rows]}
-            actions[rows], after[rows] = self.loaded.run({**feed, "image": image[rows]})
+            feed |= {"image": image[rows], "action": actions[rows]}
+            actions[rows], after[rows] = self.loaded.run(feed)
         return actions, after
 
 
@@ -68,9 +71,10 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
             "made the file, pass --trust; a policy to be shared needs none as .onnx"
         )
     library = compiled_library(file)
-    loaded = Apart(str(library).encode(), str(file), "library")
-    (state_bytes, *sizes), text = loaded.sizes, loaded.label
-    spec = extract(text, str(file))
+    loaded = Apart(str(library).encode(), str(file), "library", (KEY,))
+    (state_bytes, *sizes), text = loaded.sizes, loaded.labels[KEY]
+    said = extract(loaded.labels, str(file))
+    spec = said.spec
     expected = [spec.state_size, spec.camera.height, spec.camera.width]
     if sizes != expected or not 0 < state_bytes <= _STATE_MOST:
         raise PolicyError(
@@ -79,7 +83,7 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
             f"up to {_STATE_MOST} bytes; export it again"
         )
     named = json.loads(text).get("name") if text else None
-    policy = CPolicy(f"{named or file.stem}.c", spec, library, loaded, state_bytes)
+    policy = CPolicy(f"{named or file.stem}.c", spec, library, loaded, state_bytes, said.notes)
     return _proven(policy, file)
 
 
@@ -90,7 +94,7 @@ def _proven(policy: CPolicy, file: Path) -> CPolicy:
     hidden, fresh = policy.start(n), np.ones(n, bool)
     for _ in range(3):
         state = np.repeat(rng.normal(size=(1, spec.state_size)), n, 0)
-        image = np.repeat(rng.normal(size=(1, spec.camera.height, spec.camera.width)), n, 0)
+        image = np.repeat(rng.normal(size=(1, *spec.image_shape)), n, 0)
         action, hidden = policy.act(hidden, state, image, fresh)
         if any(row.tobytes() != action[0].tobytes() for row in action):
             raise PolicyError(

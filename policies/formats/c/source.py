@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from policies.contract import contract_of
 from policies.formats.c import arrays
 from policies.formats.c.arrays import array_text, blocked, float_text, multiply_adds, padded
 from policies.formats.c.quantised import Quantised
 from policies.formats.policy_file import PolicyCheckpoint
 from policies.networks.network import LEAK, flat_features
-from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
+from policies.spec import EXTRAS, PolicySpec
 from tracks.common.provenance import VERSION
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
@@ -25,8 +26,17 @@ _OBSERVATION = (
     ("velocity in body axes", "m/s"),
     ("third row of R: the world's z axis in body axes, (0, 0, 1) when level", "1"),
     ("from the drone to the centre of the next gate, in body axes", "m"),
-    ("the last action as it was flown, in the body axes of its own time; 0 at first", "m/s^2"),
 )
+_ACTIONS = {
+    "acceleration": """the wanted net acceleration in current body axes [m/s^2], gravity
+ *   already taken care of: zeros keep the velocity. Of it comes the wanted specific force
+ *   f = R action + (0, 0, 9.81); the wanted body z axis is along f, the collective thrust over the
+ *   mass is max(0, f . body z), the heading follows the direction to the gate, and the body rates
+ *   are attitude gain times attitude error.""",
+    "ctbr": """collective thrust per nominal mass along body z [m/s^2], then the
+ *   body rates about x, y and z [rad/s]; the vehicle's own rate loop follows them.""",
+    "motors": "the four rotors' shares of their largest $WHAT, 0 to 1.",
+}
 _EXTRA = {
     "second_gate": ("to the centre of the gate after the next (or the last), in body axes", "m"),
     "gate_axis": ("the next gate's flight direction, a unit vector in body axes", "1"),
@@ -43,7 +53,7 @@ def sources(
     Args:
         checkpoint: the policy.
         name: what it is called.
-        label: JSON that says where it comes from and what it expects (`embedded_spec.embed`).
+        label: JSON that says where it comes from and what it expects (`spec_json.embed`).
         layers: the large layers of 8 bits; None for float32.
     """
     definitions = _definitions(checkpoint, layers)
@@ -127,7 +137,9 @@ def _values(
         "RATE_LITERAL": float_text(spec.rate_hz),
         "OBSERVATION": _observation(spec),
         "STATE_SIZE": spec.state_size,
-        "ACTION_SIZE": ACTION_SIZE,
+        "ACTION": _ACTIONS[spec.action.kind].replace("$WHAT", spec.action.motors),
+        "CONTRACT": contract_of(spec).digest,
+        "ACTION_SIZE": spec.action.size,
         "HEIGHT": camera.height,
         "WIDTH": camera.width,
         "PITCH": float_text(camera.pitch_deg),
@@ -157,8 +169,9 @@ def _values(
 
 
 def _observation(spec: PolicySpec) -> str:
-    assert len(_OBSERVATION) * 3 == STATE_SIZE
     rows = [(3, *row) for row in _OBSERVATION]
+    last, unit = "the last action as it was flown (SI units, limited)", "as the action"
+    rows.append((spec.action.size, last, unit))
     rows += [(EXTRAS[key], *_EXTRA[key]) for key in EXTRAS if getattr(spec, key)]
     lines, first = [], 0
     for count, what, unit in rows:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.judging.guard import ActionLimits, guard_action
+from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
 from eval.quadrotor.attitude import (
     action_to_force,
     attitude_command,
@@ -19,9 +19,11 @@ from eval.quadrotor.attitude import (
     level_heading,
 )
 from eval.quadrotor.autopilot import ATTITUDE_HZ
+from eval.quadrotor.plant import unpacked
 from eval.vehicles.vehicle import Vehicle
 from policies.observation import observe, view_of
 from policies.policy import Policy
+from policies.spec import PolicyError
 from suite.judging.link.messages import Alive, Note, Packet, Picture, SetPoint, State, Wire
 from suite.judging.link.watchdog import (
     Clock,
@@ -65,7 +67,12 @@ class Companion:
             limits: of the watchdog.
         """
         self._policy, self._vehicle, self._wire, self._clock = policy, vehicle, wire, clock
-        self._limits = limits or Limits()
+        self._limits, self._kind = limits or Limits(), policy.spec.action.kind
+        if self._kind == "motors":
+            raise PolicyError(
+                f"{policy.name}: commands motors; a link takes body rates and thrust: fly a policy "
+                "of accelerations or ctbr"
+            )
         self._gates = track.scene.gates
         points = np.vstack([self._gates.center_w, np.reshape(track.start_pos_w, (1, 3))])
         self._box = box_of(points, self._limits)
@@ -75,7 +82,8 @@ class Companion:
         self._depth_at = self._heard_at = clock()
         self._clocks = ClockCheck(self._limits)
         self._hidden, self._fresh = policy.start(1), True
-        self._action_b, self._heading_w = np.zeros((1, 3)), np.zeros((1, 3))
+        self._action_b = first_action(policy.spec.action, vehicle)[None]
+        self._heading_w = np.zeros((1, 3))
         self._begun_s, self._next, self._late = 0.0, 0, 0
         self._last: State | None = None
         self.gate = 0
@@ -197,8 +205,10 @@ class Companion:
             return self._hand_over(trouble)
         to_gate_w = self._gates.center_w[None, self.gate] - state.pos_w
         self._heading_w = blend_heading(self._heading_w, to_gate_w, since_s)
-        force_w = action_to_force(self._action_b, rot_w)
-        command = attitude_command(self._vehicle.controller, force_w, rot_w, self._heading_w)
+        command = unpacked(self._action_b)
+        if self._kind == "acceleration":
+            force_w = action_to_force(self._action_b, rot_w)
+            command = attitude_command(self._vehicle.controller, force_w, rot_w, self._heading_w)
         thrust, rate_b = float(command.thrust[0]), command.rate_b[0]
         # A real autopilot's thrust is a share of its own; docs/fly.md says how to measure it.
         share = min(1.0, thrust / self._vehicle.full_thrust)
@@ -244,6 +254,7 @@ class Companion:
         )
         fresh = np.array([self._fresh])
         limits = ActionLimits(deadline_s=self._limits.deadline_s)
+        limits = limits_of(limits, self._policy.spec.action, self._vehicle)
         try:
             answer, self._hidden = self._policy.act(self._hidden, state_b, image, fresh)
             took_s = self._clock() - self._heard_at

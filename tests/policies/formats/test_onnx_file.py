@@ -5,6 +5,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from policies.block_policy import BlockPolicy
 from policies.formats import onnx_file
 from policies.formats.onnx_file import files_of
 from policies.policy import load_policy
@@ -40,6 +41,16 @@ def refused(path, said):
     assert str(path) in str(caught.value)
 
 
+def test_an_input_that_the_exporter_dropped_is_reported_and_the_policy_flies(tmp_path):
+    policy = load_policy(
+        save(tmp_path, model([PRODUCT], [value("state", "n", 12)], None, [MATRIX]))
+    )
+    state = np.ones((1, 12), np.float32)
+    action, _ = policy.act(policy.start(1), state, np.zeros((1, 24, 32)), np.zeros(1, bool))
+    assert isinstance(policy, BlockPolicy)
+    assert (action == 1).all() and "no input 'image'" in str(policy.notes)
+
+
 @pytest.mark.parametrize("rows", ["n", 5, 1])
 def test_a_policy_without_memory_and_of_any_batch_flies(tmp_path, rows):
     inputs = [value("image", rows, 24, 32), value("state", rows, 12)]
@@ -63,13 +74,31 @@ def test_custom_operators_are_refused_also_inside_branches(tmp_path):
     refused(save(tmp_path, model([helper.make_node("Evil", ["state"], ["action"])])), "standard")
 
 
-def test_functions_are_refused(tmp_path):
-    function = helper.make_function(
-        "local", "F", ["x"], ["y"], [helper.make_node("Abs", ["x"], ["y"])],
-        [helper.make_opsetid("", 17)],
-    )  # fmt: skip
-    proto = model([PRODUCT], tensors=[MATRIX], domains=("", "local"), functions=[function])
-    refused(save(tmp_path, proto), "holds functions")
+def function(name, op, domain=""):
+    nodes = [helper.make_node(op, ["x"], ["y"], domain=domain)]
+    opsets = [helper.make_opsetid("", 17), helper.make_opsetid("local", 1)]
+    return helper.make_function("local", name, ["x"], ["y"], nodes, opsets)
+
+
+def test_local_functions_are_inlined_and_endless_ones_refused(tmp_path):
+    nodes = [helper.make_node("F", ["state"], ["up"], domain="local"),
+             helper.make_node("MatMul", ["up", "w"], ["action"])]  # fmt: skip
+
+    def with_functions(*functions):
+        return model(nodes, tensors=[MATRIX], domains=("", "local"), functions=functions)
+
+    policy = load_policy(save(tmp_path, with_functions(function("F", "Abs"))))
+    state = np.full((1, 12), -2.0, np.float32)
+    action, _ = policy.act(policy.start(1), state, np.zeros((1, 24, 32)), np.zeros(1, bool))
+    np.testing.assert_array_equal(action, [[2, 2, 2]])
+    loop = with_functions(function("F", "G", "local"), function("G", "F", "local"))
+    refused(write_raw(tmp_path / "it.onnx", loop), "calls itself")
+    doubling = [function(f"F{k}", f"F{k + 1}", "local") for k in range(20)]
+    for each in doubling:
+        each.node.append(helper.make_node(each.node[0].op_type, ["y"], ["z"], domain="local"))
+    doubling[0].name = "F"
+    proto = with_functions(*doubling, function("F20", "Abs"))
+    refused(write_raw(tmp_path / "it.onnx", proto), "more than 100000 operators")
 
 
 def external(*locations, **entries):
@@ -150,7 +179,7 @@ def test_a_file_that_is_too_large_is_refused(exported, monkeypatch):
     ("inputs", "outputs", "said"),
     [
         ([value("obs", "n", 12)], None, "inputs are obs; expected state, image, hidden"),
-        ([value("state", "n", 12)], None, "inputs are state; expected"),
+        ([value("stated", "n", 12)], None, "inputs are stated; expected"),
         ([value("state", "n", 13), value("image", "n", 24, 32)], None, r"expected \(batch, 12\)"),
         ([value("state", "n", 12), value("image", "n", 1, 24, 32)], None, "24, 32"),
         ([value("state", 2, 12), value("image", 3, 24, 32)], None, "batch as first axis"),

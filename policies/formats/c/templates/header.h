@@ -16,11 +16,7 @@ $OBSERVATION
  *   where nothing is seen d counts as POLICY_DEPTH_FAR; d is the nearest of POLICY_CAMERA_RAYS x
  *   POLICY_CAMERA_RAYS rays through the pixel's parts.
  *
- *   action[POLICY_ACTION_SIZE]: the wanted net acceleration in current body axes [m/s^2], gravity
- *   already taken care of: zeros keep the velocity. Of it comes the wanted specific force
- *   f = R action + (0, 0, 9.81); the wanted body z axis is along f, the collective thrust over the
- *   mass is max(0, f . body z), the heading follows the direction to the gate, and the body rates
- *   are attitude gain times attitude error.
+ *   action[POLICY_ACTION_SIZE]: $ACTION
  *
  * Where an input is not finite the action is NaN and the memory stays: do not fly it.
  * A step takes $MACS multiply-adds, $WEIGHT_BYTES bytes of constants, sizeof(policy_state) bytes
@@ -46,6 +42,7 @@ $OBSERVATION
 
 /* SHA-256 of the checkpoint's weights.safetensors, and what diffracing-suite reads back. */
 #define POLICY_CHECKPOINT_SHA256 "$SHA256"
+#define POLICY_CONTRACT_SHA256 "$CONTRACT"
 #define POLICY_JSON \
 $JSON
 

@@ -1,0 +1,274 @@
+"""The contract of a policy: what its numbers mean, as one JSON with a digest that travels with it.
+
+It is made from a `PolicySpec`, stands in policy files, checkpoints and environments, and is read
+back by the judge, which refuses whatever it does not provide exactly so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from policies.spec import (
+    ACTIONS,
+    EXTRAS,
+    ActionSpec,
+    DepthEncoding,
+    PolicyError,
+    PolicySpec,
+    check_spec,
+)
+from tracks.common.files import to_json
+from tracks.common.names import unknown_name
+from tracks.common.toml_table import Table
+from tracks.geometry.camera import Camera
+from tracks.input.ranges import shown
+from tracks.input.reading import InputError, parse_json
+
+KEY = "contract"
+"""Name of the metadata entry in ONNX, of the extra file in torch, and of the key in JSON files."""
+VERSION = 1
+"""Of the contract's layout."""
+BODY = "body: x forward, y left, z up"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A part of the state observation."""
+
+    name: str
+    size: int
+    unit: str
+    frame: str
+    scale: float = 1.0
+    """What the policy is given times this is in `unit`."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """The depth image, which is encoded as scale_m / clip(depth, near_m, far_m) - offset."""
+
+    shape: tuple[int, ...]
+    encoding: str
+    dtype: str
+    """float32, or uint8: 0 at far_m to 255 at near_m."""
+    scale_m: float
+    near_m: float
+    far_m: float
+    offset: float
+    pitch_deg: float
+    fov_deg: tuple[float, float]
+    rays: int
+    """Across and down a pixel."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """The output; output * scale + offset is in `unit`."""
+
+    kind: str
+    names: tuple[str, ...]
+    unit: tuple[str, ...]
+    frame: str
+    scale: tuple[float, ...]
+    offset: tuple[float, ...]
+    limit: str
+    """What is done to larger ones."""
+
+
+@dataclass(frozen=True)
+class Contract:
+    """What a policy is given and what it answers."""
+
+    rate_hz: float
+    state: tuple[Entry, ...]
+    image: Image
+    action: Action
+    memory: tuple[int, ...] | None = None
+    """Shape of a row's hidden state; None where nothing is said of it."""
+    speed: float = 1.0
+    """Of the state's entry `speed`, where nobody says otherwise."""
+    version: int = VERSION
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 of the contract as canonical JSON, hex."""
+        text = json.dumps(dataclasses.asdict(self), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the contract as a dict of JSON values, with its digest."""
+        return {**dataclasses.asdict(self), "digest": self.digest}
+
+    @property
+    def text(self) -> str:
+        """The JSON that goes into a policy's file under `KEY`."""
+        return to_json(self.to_json())
+
+
+_ACTIONS = {
+    "acceleration": (("x", "y", "z"), ("m/s^2",) * 3, f"{BODY}; net, without gravity",
+                     "length up to 50 m/s^2"),
+    "ctbr": (("thrust", "roll_rate", "pitch_rate", "yaw_rate"), ("m/s^2", *("rad/s",) * 3),
+             f"{BODY}; thrust per nominal mass along z", "the vehicle file's"),
+    "motors": (("rotor_1", "rotor_2", "rotor_3", "rotor_4"), ("share of largest {}",) * 4,
+               "rotors in the vehicle file's order", "0 to 1"),
+}  # fmt: skip
+_EXTRAS = {
+    "second_gate": ("m", BODY),
+    "gate_axis": ("1", BODY),
+    "second_axis": ("1", BODY),
+    "speed_input": ("1", "0 (careful) to 1 (a race)"),
+}
+
+
+def contract_of(spec: PolicySpec, memory: tuple[int, ...] | None = None) -> Contract:
+    """Return the contract that a policy of `spec` has, with `memory`, the shape of its state."""
+    state = [
+        Entry("velocity", 3, "m/s", BODY),
+        Entry("world_z", 3, "1", BODY),
+        Entry("gate", 3, "m", BODY),
+        Entry("last_action", spec.action.size, "as the action in SI units", "as the action"),
+    ]
+    state += [Entry(key, EXTRAS[key], *_EXTRAS[key]) for key in EXTRAS if getattr(spec, key)]
+    camera, depth, action = spec.camera, spec.depth, spec.action
+    image = Image(
+        spec.image_shape, "inverse_depth", "uint8" if depth.uint8 else "float32", depth.scale,
+        depth.near, camera.range_m, depth.offset, camera.pitch_deg, camera.fov_deg, camera.rays,
+    )  # fmt: skip
+    names, units, frame, limit = _ACTIONS[action.kind]
+    units = tuple(unit.format(action.motors) for unit in units)
+    scale, offset = (_each(numbers, action.size) for numbers in (action.scale, action.offset))
+    output = Action(action.kind, names, units, frame, scale, offset, limit)
+    speed = spec.speed if spec.speed_input else 1.0
+    made = Contract(spec.rate_hz, tuple(state), image, output, memory, speed)
+    # Through the reader, so that 30 and 30.0 have one digest.
+    return Table("", "", dataclasses.asdict(made)).read(Contract)
+
+
+def spec_of(contract: Contract, where: str) -> PolicySpec:
+    """Return the spec by which the suite provides what a contract says.
+
+    Raises:
+        PolicyError: naming the first part that the suite does not provide, and what it does.
+    """
+    image, action = contract.image, contract.action
+    if action.kind not in ACTIONS:
+        raise PolicyError(f"{where}: {unknown_name('kind of action', action.kind, ACTIONS)}")
+    if len(image.shape) not in (2, 3):
+        raise PolicyError(
+            f"{where}: image.shape is {list(image.shape)}, allowed are (height, width) and (1, "
+            "height, width)"
+        )
+    names = [entry.name for entry in contract.state]
+    shares = "speed" if "speed" in "".join(action.unit) and action.kind == "motors" else "thrust"
+    memory = contract.memory or ()
+    own: dict[str, Any] = {"hidden_size": memory[0]} if len(memory) == 1 else {}
+    spec = PolicySpec(
+        rate_hz=contract.rate_hz,
+        camera=Camera(
+            image.pitch_deg, image.fov_deg, image.far_m, image.shape[-1], image.shape[-2],
+            image.rays,
+        ),
+        depth=DepthEncoding(
+            image.scale_m, image.near_m, image.offset, len(image.shape) == 3,
+            image.dtype == "uint8",
+        ),
+        action=ActionSpec(action.kind, _short(action.scale), _short(action.offset), shares),
+        speed=contract.speed,
+        **{key: key in names for key in EXTRAS},
+        **own,
+    )  # fmt: skip
+    try:
+        check_spec(spec, "")
+    except ValueError as error:
+        raise PolicyError(f"{where}: {error}") from None
+    provided = contract_of(spec, contract.memory)
+    for name, theirs, ours in _differences(contract, provided):
+        raise PolicyError(
+            f"{where}: {name} is {shown(theirs)}, the suite provides {shown(ours)}; convert inside "
+            "the policy's own module, and export it with the contract of the environment"
+        )
+    return spec
+
+
+def read_contract(text: str | bytes | Mapping[str, Any], where: str) -> Contract:
+    """Return the contract that a JSON text or its object holds.
+
+    Raises:
+        PolicyError: where it is no contract of this version, or its digest is another's.
+    """
+    try:
+        data = parse_json(text, where) if isinstance(text, str | bytes) else dict(text)
+        if not isinstance(data, dict):
+            raise TypeError("expected an object")
+        digest = data.pop("digest", None)
+        if data.get("version") != VERSION:
+            raise TypeError(f"version is {shown(data.get('version'))}, this suite reads {VERSION}")
+        found = Table("", "", data).read(Contract)
+    except (InputError, TypeError, ValueError) as error:
+        raise PolicyError(
+            f"{where}: no contract ({error}); take the text of env.unwrapped.contract"
+        ) from None
+    if digest not in (None, found.digest):
+        raise PolicyError(
+            f"{where}: its digest is {shown(digest)}, the contract's is {found.digest[:12]}…; it "
+            "was changed by hand: make it from a PolicySpec or take the environment's"
+        )
+    return found
+
+
+def refuse_other(contract: Contract, other: Contract, where: str, whose: str) -> None:
+    """Refuse a contract that differs from `other`, which is `whose`, in what both speak of.
+
+    Raises:
+        PolicyError: naming the first part that differs.
+    """
+    if None in (contract.memory, other.memory):
+        contract, other = (dataclasses.replace(one, memory=None) for one in (contract, other))
+    for name, theirs, ours in _differences(contract, other):
+        raise PolicyError(
+            f"{where}: its contract says {name} {shown(theirs)}, {whose} {shown(ours)}; export the "
+            "policy again with the contract that it was trained under"
+        )
+
+
+def summary(contract: Contract) -> str:
+    """Return the contract in one line."""
+    image, action = contract.image, contract.action
+    low_far = "" if image.dtype == "float32" else ", 0 to 255"
+    size = sum(entry.size for entry in contract.state)
+    scaled = "unscaled" if set(action.scale) == {1.0} and set(action.offset) == {0.0} else "scaled"
+    return (
+        f"{contract.rate_hz:g} Hz; state of {size} numbers in SI units; image "
+        f"{' x '.join(map(str, image.shape))}, camera {image.pitch_deg:g} deg up, "
+        f"{image.scale_m:g}/depth - {image.offset:g}{low_far}; action {action.kind} "
+        f"[{', '.join(dict.fromkeys(action.unit))}], {scaled}, {action.frame}"
+    )
+
+
+def _each(numbers: tuple[float, ...], size: int) -> tuple[float, ...]:
+    return tuple(map(float, numbers * size if len(numbers) == 1 else numbers))
+
+
+def _short(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    return numbers[:1] if len(set(numbers)) == 1 else numbers
+
+
+def _differences(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield (path, value, other value) of what differs in two trees of the same class."""
+    for key in (entry.name for entry in dataclasses.fields(one)):
+        a, b, path = getattr(one, key), getattr(other, key), f"{name}{key}"
+        if dataclasses.is_dataclass(a):
+            yield from _differences(a, b, f"{path}.")
+        elif a != b and key == "state":
+            for k, (mine, yours) in enumerate(zip(a, b, strict=False)):
+                yield from _differences(mine, yours, f"state[{k}].")
+            yield path, [each.name for each in a], [each.name for each in b]
+        elif a != b:
+            yield path, a, b

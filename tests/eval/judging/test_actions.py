@@ -1,0 +1,143 @@
+"""Kinds of action: who commands body rates or motors flies as who commands accelerations."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
+from eval.judging.judge import JudgeOptions, fly
+from eval.judging.outputs import actions_of
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import Rules, TrialSpec
+from policies.policy import load_policy
+from policies.spec import ActionSpec, PolicySpec
+from tests.support.courses import straight
+from tests.support.ctbr import AsCtbr
+from tests.support.pilots import Pursuit, Steady
+
+VEHICLE = load_vehicle("reference")
+RULES = Rules(time_limit_s=1.5)
+
+
+def flown(policy, world="mujoco", track=None, rules=RULES, slots=1):
+    track = track or straight()
+    options = JudgeOptions(slots=slots, workers=1, rules=rules)
+    trials = [TrialSpec(track.family, 0, 0)]
+    return fly(policy, trials, VEHICLE, world, options, tracks={track.family: track})[0]
+
+
+@pytest.mark.parametrize("world", ["mujoco", "reference"])
+@pytest.mark.parametrize("kind", ["ctbr", "motors"])
+def test_hovering_by_any_kind_of_action_stays_where_it_is(kind, world):
+    action = ActionSpec(kind, motors="speed")
+    hover = Steady(tuple(first_action(action, VEHICLE)), PolicySpec(action=action))
+    result = flown(hover, world)
+    assert result.ended_by == "timeout" and result.v_max < 0.1 and result.limited_actions == 0
+
+
+@pytest.mark.parametrize("kind", ["ctbr", "motors"])
+def test_worlds_agree_and_rotorpy_flies_commands_too(kind):
+    action = ActionSpec(kind)
+    tilt = first_action(action, VEHICLE) + ([0.5, 0.3, 0.2, 0.0] if kind == "ctbr" else [0.02] * 4)
+    policy = Steady(tuple(tilt), PolicySpec(action=action))
+    ends = {}
+    for world in ("mujoco", "reference", "mjx", "rotorpy"):
+        result = flown(policy, world, straight(height=30.0))
+        ends[world] = np.array([result.pos_x, result.pos_y, result.pos_z, result.v_max])
+    assert (ends["mujoco"] == ends["reference"]).all()
+    np.testing.assert_allclose(ends["mjx"], ends["mujoco"], atol=5e-3)
+    np.testing.assert_allclose(ends["rotorpy"], ends["mujoco"], atol=0.3)
+    assert ends["mujoco"][3] > 0.5
+
+
+def test_limits_are_the_vehicle_files():
+    limits = limits_of(ActionLimits(), ActionSpec("ctbr"), VEHICLE)
+    most = VEHICLE.controller.rate_max
+    asked, last = np.array([[99.0, 9.0, -9.0, 1.0]]), np.zeros((1, 4))
+    found = guard_action(limits, asked, last, 0.0, "p")
+    assert found.limited.all() and found.largest[0] == 99.0
+    assert found.action_b[0] == pytest.approx([VEHICLE.full_thrust, most[0], -most[1], 1.0])
+    normalised = ActionSpec("motors", (0.5,), (0.5,))
+    limits = limits_of(ActionLimits(), normalised, VEHICLE)
+    found = guard_action(limits, np.array([[-1.0, 0.0, 1.0, 2.0]]), last, 0.0, "p")
+    assert found.action_b.tolist() == [[0.0, 0.5, 1.0, 1.0]] and found.limited.all()
+
+
+def test_a_world_without_other_kinds_refuses_them(monkeypatch):
+    from eval.worlds.mujoco import MujocoWorld
+
+    monkeypatch.setattr(MujocoWorld, "actions", ())
+    with pytest.raises(ValueError, match="flies no actions of kind 'ctbr'"):
+        flown(Steady((9.81, 0, 0, 0), PolicySpec(action=ActionSpec("ctbr"))))
+
+
+def wrapped(count, rules):
+    """Return the trials of swift-keen and of itself with the attitude loop inside a wrapper."""
+    policy = load_policy("swift-keen")
+    families = ("zigzag", "circular", "ellipse", "random")
+    trials = [TrialSpec(families[k % 4], k % 10, k) for k in range(count)]
+    options = JudgeOptions(workers=1, rules=rules, slots=min(64, count))
+    return [fly(p, trials, VEHICLE, options=options) for p in (policy, AsCtbr(policy, VEHICLE))]
+
+
+def test_a_policy_flies_alike_with_the_attitude_loop_inside():
+    for plain, inside in zip(*wrapped(2, Rules(time_limit_s=2.0)), strict=True):
+        assert (plain.gates_passed, plain.ended_by) == (inside.gates_passed, inside.ended_by)
+        ends = [[getattr(r, f"pos_{axis}") for axis in "xyz"] for r in (plain, inside)]
+        np.testing.assert_allclose(ends[0], ends[1], atol=0.02)
+
+
+@pytest.mark.slow
+def test_in_200_pairs_the_outcome_is_the_same_in_99_of_100():
+    pairs = zip(*wrapped(200, Rules()), strict=True)
+    same = [(a.gates_passed, a.ended_by) == (b.gates_passed, b.ended_by) for a, b in pairs]
+    assert sum(same) >= 198, sum(same)
+
+
+@dataclass
+class Changed:
+    """Pursuit whose output is what a mistake makes of it."""
+
+    change: Callable[[np.ndarray], np.ndarray]
+    spec: PolicySpec = PolicySpec()
+    name: str = "changed"
+
+    def start(self, n):
+        return Pursuit().start(n)
+
+    def act(self, hidden, state, image, fresh):
+        action, hidden = Pursuit().act(hidden, state, image, fresh)
+        return np.asarray(self.change(action), np.float32), hidden
+
+
+@pytest.mark.parametrize(
+    ("change", "action", "fault"),
+    [
+        (lambda a: a, ActionSpec(), None),
+        (lambda a: a / 20, ActionSpec(), "action_scale"),
+        (lambda a: a / 20, ActionSpec(scale=(20.0,)), None),
+        (lambda a: a + np.array([0, 0, 9.81]), ActionSpec(), "action_gravity"),
+        (lambda a: 20 * a, ActionSpec(scale=(20.0,)), "action_limited"),
+        (lambda a: np.where(state_of(a), np.nan, a), ActionSpec(), "action_not_finite"),
+    ],
+)
+def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
+    policy = Changed(change, PolicySpec(action=action))
+    found = actions_of([flown(policy)], action)
+    assert [doubt.fault for doubt in found["warnings"]] == ([fault] if fault else [])
+    assert found["decisions"] >= 5
+    if fault == "action_limited":
+        assert found["limited"] > 0.5
+
+
+def state_of(action):
+    return np.arange(action.size).reshape(action.shape) % 3 == 1
+
+
+def test_a_scaled_policy_flies_as_the_plain_one():
+    plain = flown(Changed(lambda a: a))
+    scaled = flown(Changed(lambda a: a / 20, PolicySpec(action=ActionSpec(scale=(20.0,)))))
+    assert scaled.gates_passed == plain.gates_passed
+    assert scaled.pos_x == pytest.approx(plain.pos_x, abs=1e-4)
