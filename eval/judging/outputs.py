@@ -1,7 +1,8 @@
 """What a policy's outputs look like over trials: whether they are limited and scaled.
 
 Outputs of the wrong unit fly, badly, and look like a policy that has not learned. Their size and
-their mean along the vertical show which of the usual mistakes it is.
+their mean along the vertical show which of the usual mistakes it is; so do a few made-up
+observations, level flight towards a gate to one side: whoever flies through it accelerates there.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from eval.judging.guard import Guarded
 from eval.worlds.trial import TrialResult
+from policies.policy import Policy
 from policies.spec import ActionSpec, Doubt
 
 LIMITED_MOST = 0.05
@@ -22,6 +24,14 @@ UNIT = 1.0 + 1e-6
 UP_MOST = 6.0
 """A mean vertical acceleration above this contains gravity [m/s^2]: what is wanted over a flight
 changes the velocity, which stays small."""
+
+
+LIFT = 3.0
+"""Whoever wants more than this upwards, even towards a gate below, counts gravity in [m/s^2]."""
+CLEAR = 0.5
+"""Differences of an output between two sides below this say nothing [m/s^2]."""
+ASIDE_M, AHEAD_M, SPEED, STEPS = 2.0, 6.0, 3.0, 10
+"""How far aside and ahead the gate is [m], the speed towards it [m/s], and the steps of memory."""
 
 
 class Outputs:
@@ -49,7 +59,7 @@ class Outputs:
         up = float(self._up[slot]) / count if count and self._is_acceleration else np.nan
         return {
             "decisions": count,
-            "output_max": float(self._largest[slot]) if count else np.nan,
+            "output_max": float(self._largest[slot]) or np.nan,
             "action_up": up,
         }
 
@@ -73,6 +83,7 @@ def _warnings(
     results: Sequence[TrialResult], action: ActionSpec, limited: float, bad: float
 ) -> list[Doubt]:
     found, plain = [], action.kind == "acceleration" and action.is_plain
+    largest = [row.output_max for row in results]
     if limited > LIMITED_MOST:
         twice = "" if action.is_plain else ", and that module and contract do not both scale it"
         seen, fix = f"{limited:.0%} of its actions were limited", "check the unit of its output"
@@ -80,7 +91,7 @@ def _warnings(
     if bad:
         seen = f"{bad:.1%} of its actions were not finite and the last good one was flown"
         found.append(Doubt("action_not_finite", seen, "check its weights and its normalisation"))
-    if plain and max(row.output_max for row in results) <= UNIT:
+    if plain and np.nanmax([0.0, *largest]) <= UNIT and np.isfinite(largest).any():
         seen = "its outputs are always within -1 to 1 m/s^2 and look unscaled"
         fix = "export it with the contract of its environment, or give action.scale"
         found.append(Doubt("action_scale", seen, fix))
@@ -90,3 +101,74 @@ def _warnings(
         fix = "an action is the net acceleration: subtract 9.81 along the state's world_z"
         found.append(Doubt("action_gravity", seen, fix))
     return found
+
+
+def notes_of(policy: Policy) -> tuple[Doubt, ...]:
+    """Return what is assumed of a policy, and then what its answers look like."""
+    notes = getattr(policy, "notes", ())
+    return (*notes, *doubts(policy)) if notes else ()
+
+
+def doubts(policy: Policy) -> tuple[Doubt, ...]:
+    """Return every usual mistake of unit and frame that the policy's answers look like."""
+    if policy.spec.action.kind != "acceleration":
+        return ()
+    action, output = probed(policy)
+    left, right, above, below, _ = action
+    aside, up = left[1] - right[1], above[2] - below[2]
+    found, name = [], policy.name
+    if not np.isfinite(action).all():
+        seen = f"{name}: answers NaN or infinity in level flight towards a gate"
+        return (Doubt("action_not_finite", seen, "check its weights and its normalisation"),)
+    if aside < -CLEAR and up < -CLEAR:
+        seen = (
+            f"{name}: accelerates away from gates to its left and above, as if its action were FRD"
+        )
+        found.append(Doubt("action_frame", seen, "the suite's is FLU: negate y and z"))
+    elif min(aside, up) < -CLEAR:
+        axis, side = ("y", "left") if aside < up else ("z", "up")
+        seen = f"{name}: accelerates away from a gate aside along {axis}, as if {axis} were negated"
+        found.append(Doubt("action_frame", seen, f"the suite's {axis} points {side}: negate it"))
+    if action[:, 2].min() > LIFT:
+        seen = (
+            f"{name}: wants {action[:, 2].min():.1f} m/s^2 upwards and more in level flight, as if "
+        )
+        fix = "an action is the net acceleration: subtract 9.81 along the state's world_z"
+        found.append(Doubt("action_gravity", seen + "its action contained gravity", fix))
+    if policy.spec.action.is_plain and np.abs(output).max() <= UNIT:
+        seen = f"{name}: answers within -1 to 1 m/s^2 to gates far aside, as if unscaled"
+        fix = "export it with the contract of its environment, or give action.scale"
+        found.append(Doubt("action_scale", seen, fix))
+    return tuple(found)
+
+
+def probed(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
+    """Return the last actions (5, 3) [m/s^2] and all outputs (STEPS, 5, 3) that led to them.
+
+    The rows are gates to the left, to the right, above, below and straight ahead.
+    """
+    spec = policy.spec
+    aside = ASIDE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
+    state = np.zeros((len(aside), spec.state_size), np.float32)
+    state[:, 0], state[:, 5] = SPEED, 1.0
+    state[:, 6], state[:, 7:9] = AHEAD_M, aside
+    first = spec.base_size
+    for key, numbers in (("second_gate", 3), ("gate_axis", 3), ("second_axis", 3)):
+        if getattr(spec, key):
+            state[:, first : first + numbers] = (1, 0, 0)
+            if key == "second_gate":
+                state[:, first : first + 3] = state[:, 6:9] + (AHEAD_M, 0, 0)
+            first += numbers
+    if spec.speed_input:
+        state[:, -1] = spec.speed
+    far = 0.0 if spec.depth.uint8 else spec.depth.bounds(spec.camera.range_m)[0]
+    image = np.full((len(aside), *spec.image_shape), far, np.float32)
+    hidden, outputs, action = policy.start(len(aside)), [], state[:, 9:12]
+    for step in range(STEPS):
+        fresh = np.full(len(aside), step == 0)
+        output, hidden = policy.act(hidden, state, image, fresh)
+        outputs.append(output)
+        action = np.asarray(spec.action.to_si(output), np.float32)
+        size = np.linalg.norm(action, axis=-1, keepdims=True)
+        state[:, 9:12] = action * np.minimum(1.0, 50.0 / np.maximum(size, 1e-6))
+    return np.asarray(action, float), np.array(outputs, float)

@@ -20,7 +20,7 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[
         trials: short flights by which its actions are judged; 0 flies none.
         console: told the contract and the share of limited actions.
     """
-    from policies.probe import doubts
+    from eval.judging.outputs import doubts
 
     console.say(f"{policy.name}: {summary(contract_of(policy.spec))}")
     found = [_record("contract", *note) for note in getattr(policy, "notes", ())]

@@ -64,9 +64,9 @@ def evaluate(
     Raises:
         ValueError: for anything in `evaluation` that cannot be used, before the first flight.
     """
+    from eval.judging.outputs import notes_of
     from eval.judging.results import write_results
     from eval.judging.tables import grids, markdown_table, summarise, with_interval
-    from policies.probe import notes_of
 
     course, out = read_course(evaluation), Path(out)
     refuse_other_run(out, evaluation)

@@ -48,10 +48,10 @@ class AsCtbr:
         self.spec = replace(inner.spec, rate_hz=1 / autopilot.dt, action=ActionSpec("ctbr"))
 
     def start(self, n):
-        zeros = np.zeros(n)
-        nothing = np.zeros((n, 3))
+        step, decision, heading = np.zeros((3, n))
         hover = np.tile([9.81, 0.0, 0.0, 0.0], (n, 1))
-        return Memory(self.inner.start(n), zeros, zeros, nothing, zeros, hover, np.zeros((n, 2, 3)))
+        action_b, gates = np.zeros((n, 3)), np.zeros((n, 2, 3))
+        return Memory(self.inner.start(n), step, decision, action_b, heading, hover, gates)
 
     def act(self, hidden, state, image, fresh):
         m = hidden

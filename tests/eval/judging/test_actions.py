@@ -1,16 +1,17 @@
 """Kinds of action: who commands body rates or motors flies as who commands accelerations."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
 from eval.judging.judge import JudgeOptions, fly
-from eval.judging.outputs import actions_of
+from eval.judging.outputs import actions_of, doubts
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
+from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
 from policies.spec import ActionSpec, PolicySpec
 from tests.support.courses import straight
@@ -118,7 +119,6 @@ class Changed:
         (lambda a: a, ActionSpec(), None),
         (lambda a: a / 20, ActionSpec(), "action_scale"),
         (lambda a: a / 20, ActionSpec(scale=(20.0,)), None),
-        (lambda a: a + np.array([0, 0, 9.81]), ActionSpec(), "action_gravity"),
         (lambda a: 20 * a, ActionSpec(scale=(20.0,)), "action_limited"),
         (lambda a: np.where(state_of(a), np.nan, a), ActionSpec(), "action_not_finite"),
     ],
@@ -130,6 +130,26 @@ def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
     assert found["decisions"] >= 5
     if fault == "action_limited":
         assert found["limited"] > 0.5
+
+
+def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
+    found = actions_of([flown(Steady((0.0, 0.0, 9.81)))], ActionSpec())
+    assert "action_gravity" in [doubt.fault for doubt in found["warnings"]]
+    policy = load_policy("swift-small")
+    assert isinstance(policy, BlockPolicy) and doubts(policy) == ()
+    changes = {
+        "action_gravity": lambda a: a + np.array([0, 0, 9.81], np.float32),
+        "action_frame": lambda a: a * np.array([1, -1, -1], np.float32),
+        "action_scale": lambda a: a / 20,
+        "action_not_finite": lambda a: a * np.float32("nan"),
+    }
+    for fault, change in changes.items():
+
+        def model(*inputs, change=change):
+            action, hidden = policy.model(*inputs)
+            return change(action), hidden
+
+        assert [doubt.fault for doubt in doubts(replace(policy, model=model))] == [fault]
 
 
 def state_of(action):
