@@ -23,7 +23,7 @@ def pilot(state: np.ndarray) -> np.ndarray:
 
 def main(episodes: int) -> None:
     """Fly episodes on tracks of their own and print how each ended."""
-    env = RaceEnv(family="circular", level=0)
+    env = RaceEnv(track="circular", level=0)
     seen, info = env.reset(seed=1)
     for _ in range(episodes):
         total, steps, over = 0.0, 0, False

@@ -77,8 +77,10 @@ class Action:
     frame: str
     scale: tuple[float, ...]
     offset: tuple[float, ...]
+    clip: float
+    """Outputs are cut off at plus and minus this before they are scaled; 0: they are not."""
     limit: str
-    """What is done to larger ones."""
+    """What is done to larger ones in SI units."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ def contract_of(spec: PolicySpec, memory: tuple[int, ...] | None = None) -> Cont
     names, units, frame, limit = _ACTIONS[action.kind]
     units = tuple(unit.format(action.motors) for unit in units)
     scale, offset = (_each(numbers, action.size) for numbers in (action.scale, action.offset))
-    output = Action(action.kind, names, units, frame, scale, offset, limit)
+    output = Action(action.kind, names, units, frame, scale, offset, action.clip, limit)
     speed = spec.speed if spec.speed_input else 1.0
     made = Contract(spec.rate_hz, tuple(state), image, output, memory, speed)
     # Through the reader, so that 30 and 30.0 have one digest.
@@ -179,7 +181,9 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
             image.scale_m, image.near_m, image.offset, len(image.shape) == 3,
             image.dtype == "uint8",
         ),
-        action=ActionSpec(action.kind, _short(action.scale), _short(action.offset), shares),
+        action=ActionSpec(
+            action.kind, _short(action.scale), _short(action.offset), shares, action.clip
+        ),
         speed=contract.speed,
         **{key: key in names for key in EXTRAS},
         **own,

@@ -68,6 +68,8 @@ class ActionSpec:
     """SI value of an output of zero: one number for all, or one for each."""
     motors: str = "thrust"
     """Of kind motors: a rotor's share of its largest `thrust` or `speed`."""
+    clip: float = 0.0
+    """Outputs are cut off at plus and minus this before they are scaled; 0: they are not."""
 
     @property
     def size(self) -> int:
@@ -77,12 +79,13 @@ class ActionSpec:
     @property
     def is_plain(self) -> bool:
         """Whether outputs are in SI units as they are."""
-        return set(self.scale) == {1.0} and set(self.offset) == {0.0}
+        return set(self.scale) == {1.0} and set(self.offset) == {0.0} and not self.clip
 
     def to_si(self, output: Any) -> Any:
         """Return outputs (..., size) in SI units; plain ones are returned as they are."""
         if self.is_plain:
             return output
+        output = np.clip(output, -self.clip, self.clip) if self.clip else output
         return np.asarray(output, float) * np.asarray(self.scale) + np.asarray(self.offset)
 
 
@@ -159,6 +162,8 @@ def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
         raise unknown_name("kind of action", action.kind, ACTIONS)
     if action.motors not in ("thrust", "speed"):
         raise unknown_name("share of a motor", action.motors, ("thrust", "speed"))
+    if not 0.0 <= action.clip < np.inf:
+        raise ValueError(f"{where}action.clip is {action.clip:g}, allowed is 0 or more")
     for key in ("scale", "offset"):
         numbers = getattr(action, key)
         if len(numbers) not in (1, action.size) or not np.isfinite(numbers).all():

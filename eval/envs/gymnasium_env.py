@@ -1,104 +1,225 @@
-"""The race as a `gymnasium.Env`."""
+"""The race as `gymnasium.Env` and as `gymnasium.vector.VectorEnv`: ids in `eval.envs.register`."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 
-from eval.envs.race import ACTION_LIMIT, STATE_LIMIT, Race
-from eval.quadrotor.vehicle_file import load_vehicle
-from eval.vehicles.vehicle import Vehicle
-from eval.worlds.trial import Rules
-from policies.spec import ACTION_SIZE, PolicySpec
-from tracks.families import make_track
+from eval.envs.race import STATE_LIMIT
+from eval.envs.races import RaceConfig, Races
+from eval.worlds.trial import FLYING
+from policies.contract import Contract
+from policies.spec import PolicySpec
 
-SEEDS = 2**31
-"""Tracks are drawn with seeds below this."""
+Observation = dict[str, np.ndarray]
+RENDER_SCALE = 8
+"""Pixels of a rendered frame a pixel of the depth image."""
+
+
+def action_space(spec: PolicySpec) -> gymnasium.spaces.Box:
+    """Return the space of actions, -1 to 1."""
+    return gymnasium.spaces.Box(-1.0, 1.0, (spec.action.size,), np.float32)
+
+
+def observation_space(spec: PolicySpec) -> gymnasium.spaces.Dict:
+    """Return the space of what policies see: `state` and `image`."""
+    state = gymnasium.spaces.Box(-STATE_LIMIT, STATE_LIMIT, (spec.state_size,), np.float32)
+    if spec.depth.uint8:
+        image = gymnasium.spaces.Box(0, 255, spec.image_shape, np.uint8)
+    else:
+        low, high = spec.depth.bounds(spec.camera.range_m)
+        # A margin for the rounding of float32.
+        image = gymnasium.spaces.Box(low - 1e-4, high + 1e-4, spec.image_shape, np.float32)
+    return gymnasium.spaces.Dict({"state": state, "image": image})
 
 
 class RaceEnv(gymnasium.Env):
     """Fly the gates of a track in order with the judge's quadrotor and rules.
 
-    An action is the wanted net acceleration in body axes over `eval.envs.race.ACTION_LIMIT`, each
-    component from -1 to 1, as learning libraries want it; an observation is what policies see:
-    `state`, the paper's 12 numbers (more where `spec` has them), and `image`, the encoded
-    inverse depth. The reward is the progress towards the next gate [m], 1 a gate, and -5 for a
-    crash. `terminated` is every end by the judge's rules but the time limit, which is `truncated`.
-    A `reset` without a fixed track draws a new one.
+    An action is -1 to 1 a component; `contract` says what they mean, and goes into the file of a
+    policy that is trained here. An observation is what policies see: `state`, the paper's 12
+    numbers (more where the spec has them, SI units), and `image`, the encoded inverse depth. The
+    reward is a weighted sum of the terms `eval.envs.races.REWARDS`. `terminated` is every end but
+    the time limit, which is `truncated`; `info["ended_by"]` is the reason. A `reset` without a
+    fixed track draws a new one; `options` may hold the `track_seed` to fly.
     """
 
-    metadata = {"render_modes": []}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
 
-    def __init__(
-        self,
-        family: str = "zigzag",
-        level: int = 0,
-        track_seed: int | None = None,
-        vehicle: Vehicle | None = None,
-        spec: PolicySpec | None = None,
-        rules: Rules | None = None,
-    ) -> None:
+    def __init__(self, *, render_mode: str | None = None, **config: Any) -> None:
         """Make the environment.
 
         Args:
-            family: of the tracks.
-            level: 0 to 9.
-            track_seed: of one track flown every time; None draws one at each reset.
-            vehicle: what flies; `eval/vehicles/reference.toml` where it is left out.
-            spec: rate, camera and encoding of the observation.
-            rules: when an episode ends.
+            render_mode: "rgb_array" renders the depth image, white where it is near.
+            config: the fields of `eval.envs.races.RaceConfig`: track, level, track_seed, vehicle,
+                spec, action, channel_axis, uint8, rewards, rules.
+
+        Raises:
+            ValueError: for a value that cannot be used.
+            TypeError: for an argument that is none.
         """
-        self._family, self._level, self._track_seed = family, level, track_seed
-        self._vehicle = vehicle or load_vehicle("reference")
-        self._spec, self._rules = spec or PolicySpec(), rules or Rules()
-        camera, depth = self._spec.camera, self._spec.depth
-        low = depth.scale / max(camera.range_m, depth.near) - depth.offset
-        high = depth.scale / depth.near - depth.offset
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
-        self.observation_space = gymnasium.spaces.Dict(
-            {
-                "state": gymnasium.spaces.Box(
-                    -STATE_LIMIT, STATE_LIMIT, (self._spec.state_size,), np.float32
-                ),
-                "image": gymnasium.spaces.Box(
-                    # A margin for the rounding of float32.
-                    low - 1e-4, high + 1e-4, (camera.height, camera.width), np.float32,
-                ),
-            }
-        )  # fmt: skip
-        self._race: Race | None = None
+        self._races = Races(RaceConfig(**config), 1)
+        self.action_space = action_space(self._races.spec)
+        self.observation_space = observation_space(self._races.spec)
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": round(self._races.spec.rate_hz)}
+        self._started = False
+
+    @property
+    def contract(self) -> Contract:
+        """What goes into the file of a policy that is trained here."""
+        return self._races.contract
+
+    @property
+    def spec_of_policy(self) -> PolicySpec:
+        """The same as a spec."""
+        return self._races.spec
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode; `options` may hold the `track_seed` to fly."""
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode."""
         super().reset(seed=seed)
-        chosen = (options or {}).get("track_seed", self._track_seed)
-        track_seed = int(self.np_random.integers(SEEDS)) if chosen is None else int(chosen)
-        track = make_track(self._family, self._level, track_seed)
-        self._race = Race(track, self._vehicle, self._spec, self._rules)
-        self._data = mujoco.MjData(self._race.model)
-        self._race.place(self._data)
-        return self._race.observation(self._data), {"track_seed": track_seed, "gates": 0}
+        self._races.start([0], [self.np_random], (options or {}).get("track_seed"))
+        self._started = True
+        return self._observation(), self._races.info(0)
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Fly one action for a period of the policy's rate.
+
+        Raises:
+            RuntimeError: before the first `reset`, and after an episode's end.
+        """
+        if not self._started:
+            raise RuntimeError("call reset() before step()")
+        if self._races.ended[0] != FLYING:
+            how = self._races.ended_by(0)
+            raise RuntimeError(f"the episode has ended by {how}: call reset() before step()")
+        reward = self._races.step(np.reshape(action, (1, -1)))
+        info = self._races.info(0)
+        truncated = info["ended_by"] == "timeout"
+        terminated = bool(info["ended_by"]) and not truncated
+        return self._observation(), float(reward[0]), terminated, truncated, info
+
+    def _observation(self) -> Observation:
+        return {key: part[0] for key, part in self._races.observation().items()}
+
+    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return the depth image as (H, W, 3) uint8, or None without a render mode."""
+        if self.render_mode is None:
+            return None
+        image, depth = self._observation()["image"], self._races.spec.depth
+        low, high = (0, 255) if depth.uint8 else depth.bounds(self._races.spec.camera.range_m)
+        grey = np.squeeze((image.astype(float) - low) / (high - low))
+        pixels = np.kron(
+            (255 * np.clip(grey, 0, 1) ** 0.5).astype(np.uint8), np.ones((RENDER_SCALE,) * 2, int)
+        )
+        return np.repeat(pixels.astype(np.uint8)[..., None], 3, -1)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RaceEnv:
+        return self.__reduce__()[0](*self.__reduce__()[1])
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        """Travel as the arguments: the copy is as new, before its first `reset`."""
+        return _made, (type(self), vars(self._races.config), {"render_mode": self.render_mode})
+
+
+class RaceVectorEnv(VectorEnv):
+    """N races at once in one process; the numbers are those of N `RaceEnv`, to the bit.
+
+    Autoreset is `SAME_STEP`: a step that ends an episode returns the first observation of the next
+    one, and the last one of the old in `info["final_obs"]`, with its info in `info["final_info"]`.
+    """
+
+    def __init__(
+        self, num_envs: int = 1, *, threads: int = 1, render_mode: str | None = None, **config: Any
+    ) -> None:
+        """Make the environments.
+
+        Args:
+            num_envs: how many.
+            threads: for physics and images; the numbers are the same with any.
+            render_mode: none here; `RaceEnv` renders.
+            config: as in `RaceEnv`.
+        """
+        self._races = Races(RaceConfig(**config), num_envs, threads)
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self._made_of = {"num_envs": num_envs, "threads": threads, "render_mode": render_mode}
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+        self.single_action_space = action_space(self._races.spec)
+        self.single_observation_space = observation_space(self._races.spec)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._rngs: list[np.random.Generator] = []
+
+    @property
+    def contract(self) -> Contract:
+        """What goes into the file of a policy that is trained here."""
+        return self._races.contract
+
+    def reset(
+        self,
+        *,
+        seed: int | list[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start all episodes; environment i draws from `seed` + i, or from the list's i-th."""
+        seeds = seed if isinstance(seed, list) else [
+            None if seed is None else seed + k for k in range(self.num_envs)
+        ]  # fmt: skip
+        known = self._rngs or [None] * self.num_envs
+        self._rngs = [
+            rng if rng is not None and each is None else seeding.np_random(each)[0]
+            for rng, each in zip(known, seeds, strict=True)
+        ]
+        slots = list(range(self.num_envs))
+        self._races.start(slots, self._rngs, (options or {}).get("track_seed"))
+        return self._races.observation(), self._infos(slots)
 
     def step(
-        self, action: np.ndarray
-    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Fly one action for a period of the policy's rate.
+        self, actions: np.ndarray
+    ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Fly one action each, (N, size).
 
         Raises:
             RuntimeError: before the first `reset`.
         """
-        race = self._race
-        if race is None:
+        if not self._rngs:
             raise RuntimeError("call reset() before step()")
-        # Beyond the space there is nothing; what is no number stays one, for the guard to refuse.
-        action_b = ACTION_LIMIT * np.clip(np.asarray(action, float), -1.0, 1.0)
-        reward = race.advance(self._data, action_b, race.steps_to_decision())
-        info = {"gates": int(race.progress.gates[0]), "ended_by": race.ended_by}
-        truncated = race.ended_by == "timeout"
-        terminated = race.ended_by is not None and not truncated
-        return race.observation(self._data), reward, terminated, truncated, info
+        reward = self._races.step(actions)
+        how = [self._races.ended_by(slot) for slot in range(self.num_envs)]
+        truncated = np.array([each == "timeout" for each in how])
+        terminated = np.array([each not in (None, "timeout") for each in how])
+        over = np.flatnonzero(truncated | terminated).tolist()
+        seen, infos = self._races.observation(), {}
+        if over:
+            final = np.full(self.num_envs, None, object)
+            for slot in over:
+                final[slot] = {key: part[slot].copy() for key, part in seen.items()}
+            ended, last = truncated | terminated, self._infos(over)
+            infos = {"final_obs": final, "_final_obs": ended, "final_info": last,
+                     "_final_info": ended}  # fmt: skip
+            self._races.start(over, [self._rngs[slot] for slot in over])
+            seen = self._races.observation()
+        return seen, reward, terminated, truncated, self._infos(list(range(self.num_envs))) | infos
+
+    def _infos(self, slots: list[int]) -> dict[str, Any]:
+        infos: dict[str, Any] = {}
+        for slot in slots:
+            infos = self._add_info(infos, self._races.info(slot), slot)
+        return infos
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RaceVectorEnv:
+        return self.__reduce__()[0](*self.__reduce__()[1])
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        return _made, (type(self), vars(self._races.config), self._made_of)
+
+
+def _made(cls: type, config: dict[str, Any], rest: dict[str, Any]) -> Any:
+    return cls(**rest, **config)

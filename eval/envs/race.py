@@ -39,7 +39,7 @@ ACTION_LIMIT = 20.0
 STATE_LIMIT = 1e4
 """Components of the state observation are clipped to this; flights stay far below."""
 GATE_REWARD = 1.0
-"""For a gate passed; progress earns 1 a metre besides."""
+"""For a gate passed; the way that is left earns 1 a metre as it gets shorter."""
 CRASH_REWARD = -5.0
 """For an end other than all gates passed or time over."""
 
@@ -101,7 +101,7 @@ class Race:
         guarded = guard_action(limits, answer, self.action_b, 0.0, "of the environment's user")
         self.action_b = guarded.action_b
         self._decisions += 1
-        reward = 0.0
+        begun, left = int(self.progress.gates[0]), self._left()
         for _ in range(steps):
             if self.progress.ended[0] != FLYING:
                 break
@@ -123,12 +123,13 @@ class Race:
                 self._judge(data, bad_wrench=False)
             else:
                 self._judge(data, bad_wrench=True)
-            after = self.progress
-            nearer = _distance(gate_w, before.pos_w) - _distance(gate_w, after.pos_w)
-            reward += nearer + GATE_REWARD * float(after.gates[0] - before.gates[0])
-        if self.ended_by not in (None, "finished", "timeout"):
-            reward += CRASH_REWARD
-        return reward
+        reward = left - self._left() + GATE_REWARD * (int(self.progress.gates[0]) - begun)
+        crashed = self.ended_by not in (None, "finished", "timeout")
+        return reward + CRASH_REWARD * crashed
+
+    def _left(self) -> float:
+        progress = self.progress
+        return way_left(progress.pos_w[0], self._course.gates.center_w[0], int(progress.gates[0]))
 
     def _judge(self, data: mujoco.MjData, bad_wrench: bool) -> None:
         motion = motion_of(data)
@@ -159,5 +160,7 @@ class Race:
         }
 
 
-def _distance(a_w: np.ndarray, b_w: np.ndarray) -> float:
-    return float(np.sqrt(((a_w - b_w) ** 2).sum()))
+def way_left(pos_w: np.ndarray, centres_w: np.ndarray, gates: int) -> float:
+    """Return the way from pos_w (3,) to gate number `gates` and on from centre to centre [m]."""
+    way = np.vstack([pos_w, centres_w[gates:]])
+    return float(np.sqrt((np.diff(way, axis=0) ** 2).sum(-1)).sum())

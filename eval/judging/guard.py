@@ -129,9 +129,10 @@ def guard_action(
             "of its input. Check the policy's output."
         )
     largest = np.abs(action).max(-1).astype(np.float64)
+    finite = np.isfinite(action).all(-1)
     action = np.asarray(limits.action.to_si(action)).astype(np.float64)
     late = np.full(len(action), limits.deadline_s is not None and took_s > limits.deadline_s)
-    bad = ~np.isfinite(action).all(-1) & ~late
+    bad = ~(finite & np.isfinite(action).all(-1)) & ~late
     action = np.where((bad | late)[:, None], last_b, action)
     if limits.high:
         inside = np.clip(action, limits.low, limits.high)

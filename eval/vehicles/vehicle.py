@@ -98,6 +98,13 @@ class Vehicle:
     effects: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     """Values (the effect's NamedTuple) by the effect's name, see `eval.effects.EFFECTS`."""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled and copied: a read-only view of a dict cannot be."""
+        return {**vars(self), "effects": dict(self.effects)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, effects=MappingProxyType(state["effects"]))
+
     @property
     def full_thrust(self) -> float:
         """Nominal largest collective thrust per mass [m/s^2]; a share of it is a throttle."""

@@ -5,6 +5,7 @@ import warnings
 
 os.environ.setdefault("MUJOCO_GL", "disable")
 
+import gymnasium
 import numpy as np
 import pytest
 from absl.testing import absltest
@@ -29,11 +30,11 @@ EVEN = PolicySpec(rate_hz=50.0)  # a whole number of physics steps, so that the 
 
 
 def test_gymnasium_checker():
-    check_env(RaceEnv(rules=Rules(time_limit_s=0.5)), skip_render_check=True)
+    check_env(gymnasium.make("diffracing/Race-v0", rules=Rules(time_limit_s=0.5)).unwrapped)
 
 
 def test_gymnasium_tracks_are_set_by_the_seed():
-    env = RaceEnv("circular", 5, rules=Rules(time_limit_s=0.2))
+    env = RaceEnv(track="circular", level=5, rules=Rules(time_limit_s=0.2))
     first, info = env.reset(seed=3)
     again, info_again = env.reset(seed=3)
     assert info == info_again and all(np.array_equal(first[k], again[k]) for k in first)
@@ -80,7 +81,10 @@ def test_environments_fly_what_the_judge_flies(trial, spec):
     rules, policy = Rules(time_limit_s=2.5), Pursuit(spec=spec)
     expected = judged(policy, trial, rules)
 
-    env = RaceEnv(trial.track, trial.difficulty, trial.seed, spec=spec, rules=rules)
+    env = RaceEnv(
+        track=trial.track, level=trial.difficulty, track_seed=trial.seed, spec=spec, rules=rules,
+        vehicle="reference",
+    )  # fmt: skip
     observation, _ = env.reset()
     over, terminated, info, total = False, False, {}, 0.0
     while not over:
@@ -92,7 +96,7 @@ def test_environments_fly_what_the_judge_flies(trial, spec):
     assert terminated == (expected.ended_by != "timeout")
     end = np.array([expected.pos_x, expected.pos_y, expected.pos_z])
     # The action was divided and multiplied on its way.
-    assert env._race is not None and env._race.progress.pos_w[0] == pytest.approx(end, abs=1e-5)
+    assert env._races._progress("pos_w")[0] == pytest.approx(end, abs=1e-5)
 
     if spec is not EVEN:  # dm_control's period is one number of steps
         return
@@ -108,7 +112,7 @@ def test_environments_fly_what_the_judge_flies(trial, spec):
 
 
 def test_a_crash_costs_and_progress_pays():
-    env = RaceEnv("zigzag", 0, 0)
+    env = RaceEnv(track="zigzag", track_seed=0)
     env.reset()
     down = np.array([0, 0, -1], np.float32)
     rewards, over, info = [], False, {}
@@ -127,16 +131,22 @@ def test_a_crash_costs_and_progress_pays():
     assert total == pytest.approx(before - after, abs=1e-5)
 
 
-def test_nonsense_actions_do_not_break_it():
-    env = RaceEnv("zigzag", 0, 0)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_action_that_is_not_finite_ends_the_episode_with_a_message(value):
+    env = RaceEnv(track="zigzag", track_seed=0)
     env.reset()
-    for value in (np.nan, np.inf, 1e30):
-        observation, reward, *_ = env.step(np.full(3, value, np.float32))
-        assert np.isfinite(observation["state"]).all() and np.isfinite(reward)
+    seen, reward, terminated, truncated, info = env.step(np.full(3, value, np.float32))
+    assert (terminated, truncated, info["ended_by"]) == (True, False, "bad_action")
+    assert "not finite" in info["message"] and reward == -5.0
+    assert np.isfinite(seen["state"]).all()
+    with pytest.raises(RuntimeError, match="ended by bad_action: call reset"):
+        env.step(np.zeros(3, np.float32))
+    env.reset()
+    env.step(np.full(3, 1e30, np.float32))
 
 
 def test_an_action_beyond_the_space_is_its_nearest_within():
-    env, seen = RaceEnv("zigzag", 0, 0), []
+    env, seen = RaceEnv(track="zigzag", track_seed=0), []
     for ahead in (1.0, 1.7):
         env.reset(seed=0)
         seen.append(env.step(np.array([ahead, 0.2, 0.3], np.float32))[0]["state"])
@@ -145,7 +155,7 @@ def test_an_action_beyond_the_space_is_its_nearest_within():
 
 def test_the_second_gate_and_the_direction_are_shown_where_asked_for():
     spec = PolicySpec(second_gate=True, gate_axis=True, second_axis=True)
-    env = RaceEnv("zigzag", 0, 1, spec=spec)
+    env = RaceEnv(track="zigzag", track_seed=1, spec=spec)
     seen, _ = env.reset(seed=0)
     state = seen["state"]
     assert env.observation_space.contains(seen) and state.shape == (21,)

@@ -1,0 +1,286 @@
+"""Races in the judge's simulator, decision by decision: what the gymnasium environments wrap.
+
+N slots fly at once, each an episode by the judge's rules; a slot's numbers do not depend on the
+others, to the bit, so that one environment and N at once give the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.envs.race import ACTION_LIMIT, CRASH_REWARD, GATE_REWARD, STATE_LIMIT, way_left
+from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.mujoco import MujocoWorld
+from eval.worlds.slots import layout_of
+from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, steps_to_next
+from policies.contract import Contract, contract_of
+from policies.formats.policy_file import load_policy_checkpoint
+from policies.observation import observe
+from policies.shipped import locate
+from policies.spec import ActionSpec, PolicySpec
+from tracks.common.names import unknown_name
+from tracks.families import check_family, make_track
+from tracks.formats.custom import load_track
+from tracks.track import Track
+
+SEEDS = 2**31
+"""Tracks are drawn with seeds below this."""
+BAD_ACTION = "bad_action"
+"""How an episode ends, besides `eval.worlds.trial.ENDINGS`, by an action that is not finite."""
+
+
+class Moments(NamedTuple):
+    """A decision of N episodes, before and after it; what reward terms are made of."""
+
+    to_go_before: np.ndarray
+    """(N,) way left from gate to gate [m]."""
+    to_go: np.ndarray
+    """(N,) the same afterwards [m]."""
+    gates: np.ndarray
+    """(N,) gates passed in it."""
+    crashed: np.ndarray
+    """(N,) bool: ended, but not by all gates or the time limit."""
+    finished: np.ndarray
+    """(N,) bool."""
+    period_s: np.ndarray
+    """(N,) time flown [s]."""
+    action_change: np.ndarray
+    """(N,) Euclidean distance from the last action, in action-space units."""
+
+
+REWARDS: dict[str, tuple[float, Callable[[Moments], np.ndarray]]] = {
+    "progress": (1.0, lambda m: m.to_go_before - m.to_go),
+    "gate": (GATE_REWARD, lambda m: m.gates),
+    "crash": (CRASH_REWARD, lambda m: m.crashed),
+    "finish": (0.0, lambda m: m.finished),
+    "time": (0.0, lambda m: m.period_s),
+    "action_change": (0.0, lambda m: m.action_change),
+}
+"""Name of a reward term -> its usual weight, and the term."""
+
+
+@dataclass(frozen=True)
+class RaceConfig:
+    """What is raced; the arguments of the environments."""
+
+    track: str = "random"
+    """A family, or a track file (.toml). The judge's tables fly other families: train elsewhere."""
+    level: int | tuple[int, int] = 0
+    """Difficulty 0 to 9, or a range from which each episode draws."""
+    track_seed: int | None = None
+    """Of one track flown every time; None draws one for each episode."""
+    vehicle: str | Vehicle | Callable[[np.random.Generator], Vehicle] = "racer5"
+    """A shipped name, a file, a vehicle, or a function that draws one for each episode. The judge's
+    own is `reference`: training on it makes a comparison unfair."""
+    spec: PolicySpec | str | None = None
+    """Rate, camera, encoding and extras of the observation: a spec, or that of a shipped policy or
+    a checkpoint's folder."""
+    action: str = "acceleration"
+    """Kind of action: acceleration, ctbr or motors. Its components are -1 to 1."""
+    channel_axis: bool = False
+    """Whether images are (1, height, width)."""
+    uint8: bool = False
+    """Whether pixels are uint8, 0 to 255."""
+    rewards: Mapping[str, float] = field(default_factory=dict)
+    """Weights of reward terms by name, in place of those of `REWARDS`."""
+    rules: Rules = field(default_factory=Rules)
+    """When an episode ends."""
+
+
+def resolved_vehicle(config: RaceConfig, rng: np.random.Generator) -> Vehicle:
+    """Return the vehicle of an episode."""
+    vehicle = config.vehicle
+    if isinstance(vehicle, str):
+        return load_vehicle(vehicle)
+    return vehicle if isinstance(vehicle, Vehicle) else vehicle(rng)
+
+
+def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:
+    """Return the spec of the environment, whose actions are -1 to 1 of what `vehicle` can do."""
+    spec = config.spec or PolicySpec()
+    if isinstance(spec, str):
+        spec = load_policy_checkpoint(locate(spec)).spec
+    if config.channel_axis or config.uint8:
+        depth = replace(spec.depth, channel_axis=config.channel_axis, uint8=config.uint8)
+        spec = replace(spec, depth=depth)
+    if not spec.action.is_plain:
+        return spec
+    kind = config.action if spec.action.kind == "acceleration" else spec.action.kind
+    half = vehicle.full_thrust / 2
+    scales = {
+        "acceleration": ((ACTION_LIMIT,), (0.0,)),
+        "ctbr": ((half, *vehicle.controller.rate_max), (half, 0.0, 0.0, 0.0)),
+        "motors": ((0.5,), (0.5,)),
+    }
+    if kind not in scales:
+        raise unknown_name("kind of action", kind, scales)
+    return replace(spec, action=ActionSpec(kind, *scales[kind], spec.action.motors, clip=1.0))
+
+
+class Races:
+    """Episodes of one `RaceConfig` in N slots."""
+
+    def __init__(self, config: RaceConfig, slots: int, threads: int = 1) -> None:
+        """Check the configuration and make the simulator.
+
+        Raises:
+            ValueError: for an unknown track, vehicle, kind of action or reward term.
+        """
+        self.config, self.slots = config, slots
+        for name in config.rewards:
+            if name not in REWARDS:
+                raise unknown_name("reward term", name, REWARDS)
+        self._file: Track | None = None
+        if config.track.endswith(".toml"):
+            self._file = load_track(config.track)
+        else:
+            check_family(config.track)
+        self._drawn = callable(config.vehicle)
+        vehicle = resolved_vehicle(config, np.random.default_rng(0))
+        self.spec = resolved_spec(config, vehicle)
+        self.contract: Contract = contract_of(self.spec)
+        self._layout = layout_of([self._file] if self._file else [])
+        self._threads = threads
+        # A vehicle is one simulator's: where each episode draws its own, a slot has its own.
+        self._worlds = [self._world(vehicle, 1 if self._drawn else slots)]
+        self._worlds += [self._world(vehicle, 1) for _ in range(slots - 1) if self._drawn]
+        self._limits = limits_of(ActionLimits(), self.spec.action, vehicle)
+        self._first = first_action(self.spec.action, vehicle)
+        self._decision = np.zeros(slots)
+        self._action = np.tile(self._first, (slots, 1))
+        self._output = np.zeros((slots, self.spec.action.size))
+        self._centres_w: list[np.ndarray] = [np.zeros((1, 3))] * slots
+        self._bad = np.zeros(slots, bool)
+        self.track_seed, self.level = np.zeros(slots, int), np.zeros(slots, int)
+
+    def _world(self, vehicle: Vehicle, slots: int) -> MujocoWorld:
+        return MujocoWorld(
+            vehicle, self.spec.camera, self._layout, self.config.rules, slots, self._threads,
+            self.spec.action,
+        )  # fmt: skip
+
+    def start(
+        self, slots: list[int], rngs: list[np.random.Generator], track_seed: int | None = None
+    ) -> None:
+        """Begin an episode in each of `slots`, all that it draws coming from its generator."""
+        entries: list[tuple[int, Track, TrialSpec]] = []
+        for slot, rng in zip(slots, rngs, strict=True):
+            config, level = self.config, self.config.level
+            if not isinstance(level, int):
+                level = int(rng.integers(level[0], level[1] + 1))
+            seed = config.track_seed if track_seed is None else track_seed
+            seed = int(rng.integers(SEEDS)) if seed is None else int(seed)
+            track = self._file or make_track(config.track, level, seed)
+            if self._drawn:
+                self._worlds[slot] = self._world(resolved_vehicle(config, rng), 1)
+            self._centres_w[slot] = track.scene.gates.center_w
+            self.track_seed[slot], self.level[slot] = seed, level
+            self._decision[slot], self._action[slot], self._output[slot] = 0, self._first, 0.0
+            self._bad[slot] = False
+            name = config.track if self._file else track.family
+            entries.append((slot, track, TrialSpec(name, level, seed)))
+        if self._drawn:
+            for slot, track, trial in entries:
+                self._worlds[slot].load([(0, track, trial)])
+        elif entries:
+            self._worlds[0].load(entries)
+
+    def observation(self) -> dict[str, np.ndarray]:
+        """Return what policies see, (N, ...): `state` and `image`."""
+        views = [world.view(np.ones(world.slots, bool)) for world in self._worlds]
+        view = type(views[0])(*(np.concatenate(parts) for parts in zip(*views, strict=True)))
+        state, image = observe(self.spec, view, self._action)
+        state = np.nan_to_num(np.clip(state, -STATE_LIMIT, STATE_LIMIT))
+        return {
+            "state": state.astype(np.float32),
+            "image": image.astype(np.uint8 if self.spec.depth.uint8 else np.float32),
+        }
+
+    def step(self, output: np.ndarray) -> np.ndarray:
+        """Fly one action (N, size), -1 to 1, for a period of the policy's rate; return rewards."""
+        output = np.asarray(output, float)
+        fits = np.isfinite(output).all(-1)
+        flying = self.ended == FLYING
+        guarded = guard_action(self._limits, output, self._action, 0.0, "of the environment's user")
+        self._bad |= flying & ~fits
+        flying &= fits
+        before, to_go, time_s = self.gates, self.to_go, self.time_s
+        clipped = np.clip(np.nan_to_num(output), -1.0, 1.0)
+        change = np.sqrt(((clipped - self._output) ** 2).sum(-1)) * flying
+        self._action = np.where(flying[:, None], guarded.action_b, self._action)
+        self._output = np.where(flying[:, None], clipped, self._output)
+        period = 1.0 / (self.spec.rate_hz * self._worlds[0].dt)
+        steps = np.where(flying, np.maximum(1, steps_to_next(self._decision, period)), 0)
+        self._decision += flying
+        first = 0
+        for world in self._worlds:
+            rows = slice(first, first + world.slots)
+            world.advance(self._action[rows], steps[rows], False)
+            first += world.slots
+        ended = [self.ended_by(slot) for slot in range(self.slots)]
+        over = np.array([how not in (None, "finished", "timeout") for how in ended])
+        done = np.array([how == "finished" for how in ended])
+        moments = Moments(
+            to_go, self.to_go, self.gates - before, over & (flying | self._bad), done & flying,
+            self.time_s - time_s, change,
+        )  # fmt: skip
+        reward = np.zeros(self.slots)
+        for name, (usual, term) in REWARDS.items():
+            weight = self.config.rewards.get(name, usual)
+            if weight:
+                reward = reward + weight * term(moments)
+        return reward
+
+    def _progress(self, name: str) -> np.ndarray:
+        return np.concatenate([getattr(world.progress, name) for world in self._worlds])
+
+    @property
+    def ended(self) -> np.ndarray:
+        """(N,) as `eval.worlds.trial.Progress.ended`; a bad action counts as diverged."""
+        return np.where(self._bad, len(ENDINGS), self._progress("ended"))
+
+    @property
+    def gates(self) -> np.ndarray:
+        """(N,) gates passed."""
+        return self._progress("gates")
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """(N,) time flown [s]."""
+        return self._progress("step") * self._worlds[0].dt
+
+    @property
+    def to_go(self) -> np.ndarray:
+        """(N,) way left: to the next gate's centre and on from centre to centre [m]."""
+        parts = zip(self._progress("pos_w"), self._centres_w, self.gates, strict=True)
+        return np.array([way_left(pos_w, centres_w, gates) for pos_w, centres_w, gates in parts])
+
+    def ended_by(self, slot: int) -> str | None:
+        """Return one of `ENDINGS`, `BAD_ACTION`, or None while the episode goes on."""
+        if self._bad[slot]:
+            return BAD_ACTION
+        code = int(self.ended[slot])
+        return None if code == FLYING else ENDINGS[code - 1]
+
+    def info(self, slot: int) -> dict[str, Any]:
+        """Return what there is to say of an episode besides observation and reward."""
+        how = self.ended_by(slot)
+        world, own = (self._worlds[slot], 0) if self._drawn else (self._worlds[0], slot)
+        told = {
+            "track_seed": int(self.track_seed[slot]),
+            "level": int(self.level[slot]),
+            "gates": int(self.gates[slot]),
+            "time_s": float(self.time_s[slot]),
+            "ended_by": how or "",
+            "collided_with": world.collided_with(own) if how == "collision" else "",
+            "message": "",
+        }
+        if how == BAD_ACTION:
+            told["message"] = "the action is not finite: look for NaN in the learner's network"
+        return told
