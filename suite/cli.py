@@ -26,6 +26,7 @@ COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
     "blind": "test cases with hidden effects for the diagnosis: make, run, score",
     "check": "what is assumed of a policy file, and the usual mistakes of unit and frame",
+    "compare": "the success rates of evaluations on the same trials, with intervals and a test",
     "collect": "fly a policy and record every flight as a log",
     "diagnose": "name the physical effect that a vehicle file lacks, by flight logs",
     "identify": "find the numbers of a vehicle file in flight logs",

@@ -183,3 +183,60 @@ def paired_success(
         only_first,
         only_second,
     )
+
+
+def over_seeds(
+    first: np.ndarray, second: np.ndarray | None = None, seed: int = 0, draws: int = 4000
+) -> Interval:
+    """Return a mean, or the difference of two, with its 95 % interval over seeds and trials.
+
+    A hierarchical bootstrap: training seeds and trials are drawn anew, the same trials for all
+    seeds of a draw. With few seeds that is too narrow (Owen 2007, The pigeonhole bootstrap), so its
+    deviations are scaled to the variance of a two-way layout of random effects, and to Student's t
+    with Satterthwaite's (1946) degrees of freedom.
+
+    Args:
+        first: (S, T) values, such as successes, of S training seeds on T trials.
+        second: (R, T) of another method on the same trials, to be subtracted.
+        seed: of the draws.
+        draws: of the bootstrap.
+
+    Raises:
+        ValueError: with fewer than two seeds a method, fewer than two trials, or other trials.
+    """
+    from scipy.stats import t as student
+
+    groups = [np.asarray(group, float) for group in (first, second) if group is not None]
+    count = groups[0].shape[1]
+    for group in groups:
+        if group.ndim != 2 or min(group.shape) < 2 or group.shape[1] != count:
+            raise ValueError(
+                f"values are {[each.shape for each in groups]}; wanted (seeds, trials), two or "
+                "more of each, and the same trials"
+            )
+    signs = (1.0, -1.0)[: len(groups)]
+    value = sum(sign * group.mean() for sign, group in zip(signs, groups, strict=True))
+    of_trials = sum(sign * group.mean(0) for sign, group in zip(signs, groups, strict=True))
+    variance = (parts := [float(np.var(of_trials, ddof=1)) / count])[0]
+    freedom = [count - 1.0]
+    rng, drawn = np.random.default_rng(seed), np.zeros(draws)
+    trials = rng.multinomial(count, np.full(count, 1 / count), draws) / count
+    for sign, group in zip(signs, groups, strict=True):
+        n = len(group)
+        between = float(np.var(group.mean(1), ddof=1)) / n
+        rest = group - group.mean(1, keepdims=True) - group.mean(0) + group.mean()
+        noise = float((rest**2).sum()) / ((n - 1) * (count - 1)) / (n * count)
+        variance += between - noise
+        parts, freedom = [*parts, between, noise], [*freedom, n - 1.0, (n - 1.0) * (count - 1.0)]
+        seeds = rng.multinomial(n, np.full(n, 1 / n), draws) / n
+        drawn += sign * np.einsum("ds,st,dt->d", seeds, group, trials, optimize=True)
+    largest = max(variance, max(parts))
+    spread = float(drawn.std())
+    if not spread:
+        return Interval(float(value), float(value), float(value))
+    degrees = largest**2 / sum(part**2 / df for part, df in zip(parts, freedom, strict=True))
+    wide = sqrt(largest) * float(student.ppf(0.975, max(1.0, degrees))) / (1.959964 * spread)
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return Interval(
+        float(value), float(value + wide * (low - value)), float(value + wide * (high - value))
+    )

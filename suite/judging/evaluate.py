@@ -99,6 +99,7 @@ def evaluate(
         **summarise(results),
         "over_plan": over,
         "actions": actions,
+        "sentences": _sentences(results),
         "judged": evaluation,
         "policies": [about_policy(flier.source, flier.policy) for flier in fliers],
         "sha256": file_digests(course.vehicle, course.tracks),
@@ -116,6 +117,8 @@ def evaluate(
         journal.unlink()
     for grid in grids(summary):
         console.show(rich_table(grid))
+    for sentence in summary["sentences"]:
+        console.say(sentence)
     for one in (one for one in over if one.finished):
         whose = f"{one.policy}: " if len(over) > 1 else ""
         console.say(
@@ -134,6 +137,22 @@ def _over_plan(results: Sequence[TrialResult], course: Course) -> list[OverPlan]
     if vehicle_table(course.vehicle) != vehicle_table(load_vehicle(VEHICLE)):
         return []
     return over_plan([row for row in results if row.track not in course.tracks])
+
+
+def _sentences(results: Sequence[TrialResult]) -> list[str]:
+    """Return how the first policy differs from each other one over all trials, to be quoted."""
+    import numpy as np
+
+    from suite.judging.comparing import paired_sentence
+
+    flown: dict[str, dict[Any, bool]] = {}
+    for row in results:
+        flown.setdefault(row.policy, {})[row.trial] = row.success
+    (first, one), *others = flown.items()
+    return [
+        paired_sentence(first, name, *(np.array([each[t] for t in one]) for each in (one, other)))
+        for name, other in others
+    ]
 
 
 def _actions(flier: Flier, results: Sequence[TrialResult], console: Console) -> dict[str, Any]:

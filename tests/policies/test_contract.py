@@ -67,7 +67,7 @@ def test_a_contract_changed_by_hand_or_of_another_version_is_refused():
     data = contract_of(PolicySpec()).to_json()
     with pytest.raises(PolicyError, match="changed by hand"):
         read_contract({**data, "rate_hz": 50.0}, "here")
-    for key, value, said in (("version", 2, "version is 2"), ("rate", 1, "unknown key rate"),
+    for key, value, said in (("version", 2, "version is 2"), ("rate", 1, "'rate' at the top is"),
                              ("rate_hz", "fast", "rate_hz is 'fast'")):  # fmt: skip
         with pytest.raises(PolicyError, match=said):
             read_contract({**data, key: value}, "here")

@@ -1,0 +1,97 @@
+"""Comparisons of evaluations: published examples, coverage, and what is refused."""
+
+import json
+from math import erf, sqrt
+
+import numpy as np
+import pytest
+
+from eval.judging.results import write_results
+from eval.judging.statistics import mcnemar_exact, over_seeds
+from eval.worlds.trial import TrialResult
+from suite.commands import compare
+from suite.common.console import Quiet
+from suite.judging.comparing import paired, read_runs, seeds_of
+
+
+def test_mcnemars_exact_test():
+    """Binomial tails: 12 against 2 is 2 x P(X <= 2 | 14, 1/2) = 2 x 106 / 16384."""
+    assert mcnemar_exact(12, 2) == pytest.approx(212 / 16384)
+    assert mcnemar_exact(6, 0) == pytest.approx(0.03125)
+
+
+@pytest.mark.parametrize("two", [False, True])
+def test_the_hierarchical_bootstrap_covers_as_it_says(two):
+    rng, hit, count = np.random.default_rng(3), 0, 1000
+    seeds, trials, spread = 8, 60, 0.5
+
+    def mean(level):
+        return 0.5 * (1 + erf(level / sqrt(2 + spread**2) / sqrt(2)))
+
+    for _ in range(count):
+        tracks = rng.normal(0, 1, trials)
+
+        def flown(level, tracks=tracks):
+            skill = level + rng.normal(0, spread, (seeds, 1)) + tracks
+            return (rng.normal(size=(seeds, trials)) < skill).astype(float)
+
+        first, second = flown(0.8), flown(0.4)
+        found = over_seeds(first, second if two else None, draws=200)
+        truth = mean(0.8) - (mean(0.4) if two else 0.0)
+        hit += found.low <= truth <= found.high
+    assert 0.93 <= hit / count <= 0.97, hit
+
+
+def test_one_seed_or_other_trials_are_refused():
+    for values in ((np.ones((1, 5)),), (np.ones((2, 5)), np.ones((2, 4)))):
+        with pytest.raises(ValueError, match="two or more of each"):
+            over_seeds(*values)
+
+
+def result(seed, success):
+    return TrialResult(
+        "zigzag", 0, seed, "p", "v", "mujoco", success, 8 * success,
+        "finished" if success else "timeout", None, 0.0, 0.0, 0.0, 5.0, 6.0, 5.0, 8, 8, 0, 0, 0,
+    )  # fmt: skip
+
+
+def run_of(folder, successes, **judged):
+    rows = [result(seed, bool(success)) for seed, success in enumerate(successes)]
+    conditions = {"world": "mujoco", "time_limit_s": 20.0, "deadline_s": None, **judged}
+    summary = {"judged": conditions, "sha256": {"vehicle": "a"}}
+    write_results(folder, rows, table_markdown="", summary=summary, seed=0)
+    return folder
+
+
+def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
+    rng = np.random.default_rng(0)
+    a = run_of(tmp_path / "a", rng.random(40) < 0.9)
+    b = run_of(tmp_path / "b", rng.random(40) < 0.5)
+    found = paired(*read_runs(a), *read_runs(b))
+    assert found["trials"] == 40 and found["difference"].value > 0
+    assert "paired difference of +" in found["sentence"] and "McNemar" in found["sentence"]
+    answer = compare.run(compare.Config((a, b), seeds=True), Quiet())
+    assert "2 training seeds" in answer["comparisons"][0]["sentence"]
+    apart = run_of(tmp_path / "c", rng.random(40) < 0.5, time_limit_s=10.0)
+    with pytest.raises(ValueError, match=r"another time_limit_s \(20.0 and 10.0\)"):
+        paired(*read_runs(a), *read_runs(apart))
+    with pytest.raises(ValueError, match="10 trials were flown by one alone"):
+        paired(*read_runs(a), *read_runs(run_of(tmp_path / "d", [True] * 30)))
+    for folder, said in ((tmp_path, "no trials.parquet"), (None, "less than twice")):
+        with pytest.raises(ValueError, match=said):
+            compare.run(compare.Config((a, folder) if folder else (a,)), Quiet())
+
+
+def test_two_methods_are_compared_over_their_seeds(tmp_path):
+    rng = np.random.default_rng(1)
+    folders = {
+        name: run_of(tmp_path / name, rng.random(60) < rate)
+        for name, rate in (("a0", 0.9), ("a1", 0.95), ("b0", 0.4), ("b1", 0.3))
+    }
+    runs = {name: read_runs(folder)[0] for name, folder in folders.items()}
+    found = seeds_of([runs["a0"], runs["a1"]], [runs["b0"], runs["b1"]])
+    assert found["mean"].value == pytest.approx(
+        np.mean(found["success_by_seed"][0]) - np.mean(found["success_by_seed"][1])
+    )
+    assert "a difference of +" in found["sentence"] and len(found["spread"]) == 2
+    assert json.loads((tmp_path / "a0" / "summary.json").read_text())["judged"]
