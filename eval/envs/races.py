@@ -120,7 +120,8 @@ def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:
     }
     if kind not in scales:
         raise unknown_name("kind of action", kind, scales)
-    return replace(spec, action=ActionSpec(kind, *scales[kind], spec.action.motors, clip=1.0))
+    scale, offset = scales[kind]
+    return replace(spec, action=ActionSpec(kind, scale, offset, spec.action.motors, clip=1.0))
 
 
 class Races:

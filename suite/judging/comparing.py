@@ -130,7 +130,7 @@ def seeds_of(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, Any]:
         for group in (runs, others)
         if group
     ]
-    found = over_seeds(*groups)
+    found = over_seeds(groups[0], groups[1] if others else None)
     rates = [[float(rate) for rate in group.mean(1)] for group in groups]
     return {
         "trials": len(trials),
