@@ -33,18 +33,13 @@ FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 SENTENCE = re.compile(r"`suite ([^`]+)`")
 MADE_UP = {"hello", "COMMAND"}
 """Commands that a page speaks of and that are none."""
-PYTHON = [
-    pytest.param(body, id=f"{page.name}-{number}")
-    for page in PAGES
-    for number, body in enumerate(
-        re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    )
-]
-BLOCKS = [
-    pytest.param(bool(marked), body, id=f"{page.name}-{number}")
-    for page in PAGES
-    for number, (marked, body) in enumerate(BLOCK.findall(page.read_text(encoding="utf-8")))
-]
+TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
+BLOCKS = {
+    f"{page.name}-{number}": (bool(marked), body)
+    for page, text in TEXTS.items()
+    for number, (marked, body) in enumerate(BLOCK.findall(text))
+}
+"""Page and number -> whether the block is run, and its lines."""
 
 
 def _commands(body):
@@ -69,10 +64,13 @@ def _check(words):
                     assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
 
 
-@pytest.mark.parametrize(("marked", "body"), BLOCKS)
-def test_every_command_is_one_that_exists(marked, body):
-    for words in _commands(body):
-        _check(words)
+def test_every_command_is_one_that_exists():
+    for where, (_, body) in BLOCKS.items():
+        for words in _commands(body):
+            try:
+                _check(words)
+            except (AssertionError, SystemExit) as error:
+                raise AssertionError(f"{where}: {shlex.join(words)}: {error}") from error
 
 
 @functools.cache
@@ -96,13 +94,16 @@ def _check_sentence(text):
             assert word in _options(name), f"suite {name} has no option {word}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_within_a_sentence_exist_and_none_hides_in_another_fence(page):
-    text = page.read_text(encoding="utf-8")
-    for kind, body in FENCE.findall(text):
-        assert kind == "sh" or not re.match(r"(suite|make|pip) ", body), "fence it with ```sh"
-    for words in SENTENCE.findall(FENCE.sub("", text)):
-        _check_sentence(words)
+def test_commands_within_a_sentence_exist_and_none_hides_in_another_fence():
+    for page, text in TEXTS.items():
+        for kind, body in FENCE.findall(text):
+            hides = kind != "sh" and re.match(r"(suite|make|pip) ", body)
+            assert not hides, f"{page.name}: fence it with ```sh: {body}"
+        for words in SENTENCE.findall(FENCE.sub("", text)):
+            try:
+                _check_sentence(words)
+            except (AssertionError, SystemExit) as error:
+                raise AssertionError(f"{page.name}: suite {words}: {error}") from error
 
 
 @pytest.mark.parametrize("text", ["nothing", "eval --trails 3", "view runs/x --giff"])
@@ -117,10 +118,9 @@ def test_a_command_that_does_not_exist_is_found(words):
         _check(words)
 
 
-@pytest.mark.parametrize(
-    "body", [pytest.param(b.values[1], id=b.id) for b in BLOCKS if b.values[0]]
-)
-def test_marked_commands_run(body, tmp_path):
+@pytest.mark.parametrize("where", [where for where, (marked, _) in BLOCKS.items() if marked])
+def test_marked_commands_run(where, tmp_path):
+    body = BLOCKS[where][1]
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     done = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", body],
@@ -132,19 +132,20 @@ def test_marked_commands_run(body, tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("body", PYTHON)
-def test_python_on_a_page_imports_what_there_is(body):
-    for node in ast.walk(ast.parse(body)):
+def test_python_on_a_page_imports_what_there_is():
+    fences = [re.findall(r"```python\n(.*?)```", text, re.DOTALL) for text in TEXTS.values()]
+    trees = [ast.parse(body) for bodies in fences for body in bodies]
+    for node in (node for tree in trees for node in ast.walk(tree)):
         if isinstance(node, ast.ImportFrom) and node.module:
             module = importlib.import_module(node.module)
             assert all(hasattr(module, alias.name) for alias in node.names), node.module
 
 
-@pytest.mark.parametrize("page", [*PAGES, *ARCHIVE], ids=lambda page: page.name)
-def test_links_within_the_repository_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#]+)", page.read_text(encoding="utf-8")):
-        if "://" not in target:
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+def test_links_within_the_repository_lead_somewhere():
+    for page in (*PAGES, *ARCHIVE):
+        for target in re.findall(r"\]\(([^)#]+)", page.read_text(encoding="utf-8")):
+            if "://" not in target:
+                assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
 def test_the_readme_is_short_and_its_picture_small():
