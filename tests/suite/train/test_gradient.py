@@ -101,6 +101,7 @@ print(largest_difference(results[1], results[0]))
 """
 
 
+@pytest.mark.slow
 def test_two_devices_give_the_gradient_of_one(root):
     """Without noise, which each device draws for its own worlds; the sums differ in order."""
     done = subprocess.run(

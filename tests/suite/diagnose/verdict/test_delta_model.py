@@ -45,6 +45,7 @@ def test_a_network_that_was_not_fitted_changes_nothing(few):
     assert plain.rms > 2.0
 
 
+@pytest.mark.slow
 def test_where_measured_rotors_drive_it_sees_their_thrust():
     """A log of motors has no commands: what stands in their place must not count."""
     windows, _ = cut([fly(TRUTH, 0, duration_s=7.0, motors=True)], LAGGED, True, 0.5)

@@ -59,6 +59,7 @@ def test_noise_and_periods_that_flights_do_not_share_are_no_swing():
     assert find_swing([], []) is None
 
 
+@pytest.mark.slow
 def test_a_load_on_a_line_is_said_to_swing_with_its_period():
     found = diagnose_by_views(flights(4, seed=1, duration_s=10.0, speed=1.0, load=(0.08, 0.5)),
                               VEHICLE)  # fmt: skip
