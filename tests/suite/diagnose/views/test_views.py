@@ -138,6 +138,7 @@ def blown_at_one_heading():
     return flights(4, headings=(0.3,), **WIND)
 
 
+@pytest.mark.slow
 def test_a_wind_at_one_heading_is_one_of_a_set_and_with_two_headings_alone(blown_at_one_heading):
     one, _ = names(blown_at_one_heading)
     assert set(one) == {"constant_wind", "linear_drag"}
@@ -148,6 +149,7 @@ def test_a_wind_at_one_heading_is_one_of_a_set_and_with_two_headings_alone(blown
     assert velocity[:2] == pytest.approx([1.5, -2.0], abs=0.2)
 
 
+@pytest.mark.slow
 def test_flights_that_hardly_move_leave_wind_and_drag_beside_a_leaning_frame():
     faint = {**SLOW, "speed": 0.2, "noise": 2.0, "constant_wind": ((0.4, -0.5, 0.0),)}
     found, _ = names(flights(4, headings=(0.3,), **faint))
@@ -156,6 +158,7 @@ def test_flights_that_hardly_move_leave_wind_and_drag_beside_a_leaning_frame():
     assert whole >= {"frame_tilt", "thrust_tilt", "constant_wind + linear_drag"}
 
 
+@pytest.mark.slow
 def test_a_wind_is_named_alone_where_the_file_has_the_drag(blown_at_one_heading):
     found, _ = names(blown_at_one_heading, with_effects(VEHICLE, linear_drag=(SIDE,)))
     assert set(found) == {"constant_wind"} and not any("+" in n for n in found["constant_wind"])
