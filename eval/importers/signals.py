@@ -18,6 +18,10 @@ from eval.logs.columns import FlightLogError
 
 BACKWARDS_MAX = 0.05
 """A signal with a larger share of rows whose time does not increase is refused."""
+LARGEST = 1e20
+"""Larger numbers are damage in any unit (Unix time in ns is 1.8e18); their squares overflow."""
+LEAST_STEP = 1e-15
+"""Times closer than this do not count as increasing: what is divided by the step overflows."""
 
 
 class Signal(NamedTuple):
@@ -57,16 +61,20 @@ def signal(
         what: the signal, for messages.
 
     Raises:
-        FlightLogError: where time goes back too often: two flights in one file, or a wrong column.
+        FlightLogError: where time goes back too often: two flights in one file, or a wrong column;
+            where numbers are so large that they are damage.
     """
     time_s = np.asarray(time_s, dtype=np.float64)
+    if not len(time_s):
+        return None, None
     value = np.asarray(value, dtype=np.float64).reshape(len(time_s), -1)
     known = np.isfinite(time_s) & np.isfinite(value).all(axis=1)
     time_s, value = time_s[known], value[known]
     if not len(time_s):
         return None, None
+    _refuse_damage(time_s, value, name, what)
     forward = np.ones(len(time_s), dtype=bool)
-    forward[1:] = time_s[1:] > np.maximum.accumulate(time_s)[:-1]
+    forward[1:] = time_s[1:] - np.maximum.accumulate(time_s)[:-1] > LEAST_STEP
     back = int(np.sum(~forward))
     if back > BACKWARDS_MAX * len(time_s):
         row = int(np.argmin(forward)) + 1
@@ -78,6 +86,13 @@ def signal(
     note = f"{back} samples of {what!r} whose time does not increase are left out"
     finding = Finding("note", "time", note) if back else None
     return Signal(time_s[forward], value[forward]), finding
+
+
+def _refuse_damage(time_s: np.ndarray, value: np.ndarray, name: str, what: str) -> None:
+    largest = max(np.abs(time_s).max(), np.abs(value).max(initial=0.0))
+    if largest > LARGEST:
+        reason = f"holds numbers up to {largest:.3g}, allowed are {LARGEST:g}; log or copy it again"
+        raise FlightLogError(name, what, None, reason)
 
 
 def collect(

@@ -17,10 +17,12 @@ from typing import Any, TextIO
 from eval.worlds.trial import TrialResult, TrialSpec
 from tracks.common.files import plain, replacing_file, to_json, write_json, write_text
 from tracks.common.provenance import stamp
-from tracks.input.reading import LOG_BYTES, parse_json, read_bytes
+from tracks.input.reading import LOG_BYTES, check_file, parse_json, read_bytes
 
 SCHEMA = 1
 """Version of the result files."""
+MOST_TRIALS = 1_000_000
+"""Of a trials.parquet: some gigabyte in memory."""
 JOURNAL = "trials.journal.jsonl"
 """Name of the journal in the output folder."""
 
@@ -91,23 +93,51 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
     """Read the rows of a trials.parquet.
 
     Raises:
-        ValueError: where the file is none or lacks a column.
+        ValueError: where the file is none, lacks a column or holds another type in it.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    kinds = _kinds()
     try:
-        rows = pq.read_table(path).to_pylist()
-    except (pa.ArrowInvalid, OSError) as error:
+        check_file(path, LOG_BYTES)
+        with pq.ParquetFile(path) as file:
+            names, rows = file.schema_arrow.names, file.metadata.num_rows
+            missing = sorted(kinds.keys() - TrialResult._field_defaults.keys() - set(names))
+            there = [name for name in kinds if name in names]
+            table = file.read([] if missing or rows > MOST_TRIALS else there)
+    except MemoryError:  # Arrow's own is one as well
+        raise
+    except (pa.ArrowException, OSError) as error:
         raise ValueError(
             f"{path}: not a readable Parquet file ({error}); run suite eval again"
         ) from error
-    needed = set(TrialResult._fields) - set(TrialResult._field_defaults)
-    missing = sorted(name for name in needed if rows and name not in rows[0])
     if missing:
         raise ValueError(f"{path}: no column {missing[0]!r}; is it a trials.parquet of this suite?")
-    names = TrialResult._fields
-    return [TrialResult(**{name: row[name] for name in names if name in row}) for row in rows]
+    if rows > MOST_TRIALS:
+        raise ValueError(f"{path}: {rows:,} trials, allowed are up to {MOST_TRIALS:,}")
+    columns = [_cells(path, name, table[name], kinds[name]) for name in there]
+    return [TrialResult(**dict(zip(there, row, strict=True))) for row in zip(*columns, strict=True)]
+
+
+def _cells(path: str | os.PathLike[str], name: str, column: Any, kind: str) -> list[Any]:
+    """Return a column as Python's own values.
+
+    Raises:
+        ValueError: where they are of another kind than a trial's, or missing.
+    """
+    allowed = {"str": (str,), "int": (int,), "float": (float, int), "bool": (bool,)}
+    types = {*allowed[kind.split()[0]], *((type(None),) if "None" in kind else ())}
+    try:
+        cells = column.to_pylist()
+    except UnicodeDecodeError:
+        cells = [b""]
+    if not {type(cell) for cell in cells} <= types:
+        raise ValueError(
+            f"{path}: column {name!r} holds {column.type}, or cells without a value, where a "
+            f"trial has {kind}; is it a trials.parquet of this suite?"
+        )
+    return cells
 
 
 class Journal:

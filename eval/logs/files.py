@@ -25,6 +25,8 @@ METADATA = "flight"
 """Parquet metadata key and CSV column of the JSON text."""
 MOST_ROWS = 4_000_000
 """Of a flight log: more than an hour at 1 kHz, some gigabyte in memory."""
+MOST_CELLS = 100_000_000
+"""Of a flight log, rows times columns: all the columns that we know at `MOST_ROWS`."""
 PARQUET_MAGIC = b"PAR1"
 NOT_CSV = "neither a Parquet file nor CSV in UTF-8"
 
@@ -80,21 +82,58 @@ def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[s
     try:
         # A single handle on the file: `read_table` would take a folder's name for a column.
         with pyarrow.parquet.ParquetFile(path) as file:
-            _check_rows(path, file.metadata.num_rows)
-            table = file.read()
-    except (pa.ArrowException, OSError, ValueError) as error:
+            wanted, warnings = _wanted(path, file)
+            texts = [n for n in wanted if _is_text(file.schema_arrow.field(n).type)]
+            metadata = file.schema_arrow.metadata or {}
+        # A text stays coded as in the file: a long one of every row fits there, not in memory.
+        with pyarrow.parquet.ParquetFile(path, read_dictionary=texts) as file:
+            table = file.read(wanted)
+    except MemoryError:  # Arrow's own is one as well
+        raise
+    except (pa.ArrowException, OSError, KeyError) as error:
         first = str(error).splitlines()[0]
         reason = f"a corrupt Parquet file ({first}); copy or record it again"
         raise FlightLogError(str(path), None, None, reason) from None
-    metadata = table.schema.metadata or {}
     text = metadata.get(METADATA.encode())
     decoded = None if text is None else text.decode(errors="replace")
-    return _arrays(table, path), decoded, []
+    return _arrays(table, path), decoded, warnings
+
+
+def _wanted(path: Path, file: Any) -> tuple[list[str], list[str]]:
+    """Return the columns to read, and a warning about those that are left out."""
+    rows, names, schema = file.metadata.num_rows, file.schema_arrow.names, file.schema_arrow
+    for name in names:
+        if names.count(name) > 1:
+            raise FlightLogError(str(path), name, None, "this column is there twice")
+    nested = {name for name in names if pa.types.is_nested(schema.field(name).type)}
+    if known := sorted(nested & KNOWN):
+        raise FlightLogError(str(path), known[0], None, "its cells hold lists; give a number each")
+    wanted = [name for name in names if name not in nested]
+    if rows * len(wanted) > MOST_CELLS:
+        wanted = [name for name in wanted if name in KNOWN]
+    if not wanted:
+        wanted = names  # refused by their number
+    _check_size(path, rows, len(wanted))
+    left = len(names) - len(wanted)
+    text = f"{path}: {left} of {len(names)} columns are left out: they hold lists, or are too many"
+    return wanted, [text] if left else []
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return any(
+        test(kind)
+        for test in (
+            pa.types.is_string,
+            pa.types.is_large_string,
+            pa.types.is_binary,
+            pa.types.is_large_binary,
+        )
+    )
 
 
 def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
     names = _csv_header(path)
-    _check_text(path)
+    _check_text(path, len(names))
     bad_rows: list[Any] = []
 
     def remember(row: Any) -> str:
@@ -140,14 +179,20 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
     return columns, text if isinstance(text, str) else None, warnings
 
 
-def _check_rows(path: Path, rows: int) -> None:
-    """Refuse more rows than fit, before they are read."""
+def _check_size(path: Path, rows: int, columns: int) -> None:
+    """Refuse more numbers than fit, before they are read."""
+    reason = "cut it into flights, or log less often"
     if rows > MOST_ROWS:
-        reason = f"{rows:,} rows; at most {MOST_ROWS:,}: cut it into flights, or log less often"
-        raise FlightLogError(str(path), None, None, reason)
+        reason = f"{rows:,} rows; at most {MOST_ROWS:,}: {reason}"
+    elif rows * columns > MOST_CELLS:
+        size = f"{rows:,} rows of {columns:,} columns"
+        reason = f"{size}; at most {MOST_CELLS:,} cells: leave columns out, {reason}"
+    else:
+        return
+    raise FlightLogError(str(path), None, None, reason)
 
 
-def _check_text(path: Path) -> None:
+def _check_text(path: Path, columns: int) -> None:
     """Refuse other bytes than UTF-8, which pyarrow trips over in a row that it tells of."""
     lines = 0
     decode = codecs.getincrementaldecoder("utf-8")().decode
@@ -159,7 +204,7 @@ def _check_text(path: Path) -> None:
         decode(b"", True)
     except UnicodeDecodeError:
         raise FlightLogError(str(path), None, None, NOT_CSV) from None
-    _check_rows(path, lines)
+    _check_size(path, lines, columns)
 
 
 def _csv_header(path: Path) -> list[str]:
@@ -181,7 +226,12 @@ def _arrays(table: pa.Table, path: Path) -> dict[str, np.ndarray]:
             raise FlightLogError(str(path), name, None, "this column is there twice")
         if pa.types.is_null(column.type) or pa.types.is_decimal(column.type):
             column = column.cast(pa.float64())
-        columns[name] = column.to_numpy()
+        if pa.types.is_dictionary(column.type):
+            column = column.unify_dictionaries().combine_chunks()
+            cells = np.array([*column.dictionary.to_pylist(), None], object)
+            columns[name] = cells[column.indices.fill_null(len(cells) - 1).to_numpy()]
+        else:
+            columns[name] = column.to_numpy()
     return columns
 
 

@@ -148,9 +148,16 @@ def _signals(
     parts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def take(signal: str, kind: str, value: Callable[[Any], list[float]]) -> None:
-        if kind in messages and signal not in parts:
-            time_s = np.array([(when - origin) * 1e-9 for when, _ in messages[kind]])
-            parts[signal] = (time_s, np.array([value(m) for _, m in messages[kind]], dtype=float))
+        if kind not in messages or signal in parts:
+            return
+        time_s = np.array([(when - origin) * 1e-9 for when, _ in messages[kind]])
+        try:
+            rows = np.array([value(message) for _, message in messages[kind]], dtype=float)
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            types = " or ".join(KINDS[kind])
+            reason = f"messages of another definition than {types} has ({error}); log them again"
+            raise FlightLogError(name, signal, None, reason) from None
+        parts[signal] = (time_s, rows)
 
     def pose(message: Any) -> Any:
         return message.pose.pose if hasattr(message.pose, "pose") else message.pose

@@ -31,6 +31,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
 from eval.logs.files import read_head
+from tracks.input.ranges import is_number
 
 SUMMARY = "PX4 ULog (.ulg)"
 TAKES_MAP = TAKES_SOURCE = False
@@ -73,10 +74,14 @@ def read(path: Path, options: ImportOptions) -> Recording:
         raise FlightLogError(str(path), None, None, "not a ULog file (its first bytes differ)")
     log = _load(path)
     topics: dict[str, Topic] = {}
-    for data in sorted(log.data_list, key=lambda data: -data.multi_id):
-        topics[data.name] = data.data
     sides, findings = _motor_side(log.initial_parameters)
     findings += _health(log)
+    for data in sorted(log.data_list, key=lambda data: -data.multi_id):
+        if "timestamp" in data.data:
+            topics[data.name] = data.data
+        else:
+            text = f"the topic {data.name} has no timestamp (damaged?): left out"
+            findings.append(Finding("doubt", "file", text))
     parts: dict[str, Part] = {}
     for name, readers in _READERS.items():
         for topic, reader in readers:
@@ -227,12 +232,19 @@ _READERS: dict[str, list[tuple[str, Callable[[Topic], Part | None]]]] = {
 }
 
 
-def _motor_side(parameters: Mapping[str, float]) -> tuple[Any, list[Finding]]:
-    names = [[f"CA_ROTOR{k}_P{axis}" for axis in "XY"] for k in range(4)]
-    if all(name in parameters for pair in names for name in pair):
-        side = tuple((float(parameters[x]), -float(parameters[y])) for x, y in names)
-        if all(abs(x) + abs(y) > 0 for x, y in side):
-            return side, []
+def _parameter(parameters: Mapping[str, Any], name: str) -> float:
+    """Return a parameter, 0 where it is missing or, in a damaged file, no number."""
+    value = parameters.get(name, 0.0)
+    return float(value) if is_number(value) else 0.0
+
+
+def _motor_side(parameters: Mapping[str, Any]) -> tuple[Any, list[Finding]]:
+    side = tuple(
+        (_parameter(parameters, f"CA_ROTOR{k}_PX"), -_parameter(parameters, f"CA_ROTOR{k}_PY"))
+        for k in range(4)
+    )
+    if all(abs(x) + abs(y) > 0 for x, y in side):
+        return side, []
     text = "the log does not say where its motors are; taken as PX4's quadrotor X"
     return QUAD_X, [Finding("note", "motors", text)]
 
@@ -245,8 +257,7 @@ def _health(log: Any) -> list[Finding]:
         lost = sum(dropout.duration for dropout in log.dropouts) / 1000.0
         text = f"{len(log.dropouts)} dropouts, {lost:.2g} s in all (a slow memory card)"
         findings.append(Finding("note", "file", text))
-    factor = float(log.initial_parameters.get("THR_MDL_FAC", 0.0))
-    if factor == 0.0:
+    if _parameter(log.initial_parameters, "THR_MDL_FAC") == 0.0:
         text = "THR_MDL_FAC is 0: PX4's thrust is the motors' signal, and rises faster than linear"
         findings.append(Finding("note", "thrust", text))
     return findings

@@ -1,13 +1,17 @@
 """Result files and the journal."""
 
 import json
+import os
 
+import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from eval.judging.results import JOURNAL, Journal, read_trials, write_results
 from eval.judging.tables import NOTE, markdown_table, summarise
-from eval.worlds.trial import TrialSpec
+from eval.worlds.trial import TrialResult, TrialSpec
+from suite.common.errors import explain
 from tests.support.judged_cells import ROWS
 
 COLUMNS = """track difficulty seed policy vehicle world success gates_passed ended_by collided_with
@@ -79,3 +83,35 @@ def test_journal_of_something_else_is_refused(tmp_path):
     path.write_text(path.read_text() + "{}\n")
     with pytest.raises(ValueError, match="line 2"):
         Journal(path, {"policy": "ours", "world": "mujoco"})
+
+
+@pytest.mark.parametrize(
+    ("column", "cells", "said"),
+    [
+        ("seed", pa.array(["a", "b"]), "'seed' holds string"),
+        ("success", pa.array([2.5, 3.5]), "'success' holds double"),
+        ("time_s", pa.array([[1.0], [2.0]]), "'time_s' holds list"),
+        ("gates_passed", pa.array([1, None]), "cells without a value"),
+        ("policy", pa.array([b"\xff", b"a"]), "'policy' holds binary"),
+        ("policy", None, "no column 'policy'"),
+    ],
+)
+def test_trials_of_other_types_are_refused_by_column(tmp_path, column, cells, said):
+    summary = summarise(ROWS[:2])
+    write_results(tmp_path, ROWS[:2], table_markdown="", summary=summary, seed=7)
+    path = tmp_path / "trials.parquet"
+    table = pq.read_table(path).drop(column)
+    pq.write_table(table if cells is None else table.append_column(column, cells), path)
+    with pytest.raises(ValueError, match=f"trials.parquet: .*{said}") as met:
+        read_trials(path)
+    assert explain(met.value) is not None
+
+
+def test_a_pipe_or_too_many_rows_are_no_trials(tmp_path):
+    os.mkfifo(tmp_path / "pipe.parquet")
+    with pytest.raises(ValueError, match="a named pipe"):
+        read_trials(tmp_path / "pipe.parquet")
+    fields = {name: pa.array(np.zeros(2_000_000, np.int8)) for name in TrialResult._fields}
+    pq.write_table(pa.table(fields), tmp_path / "many.parquet")
+    with pytest.raises(ValueError, match="2,000,000 trials, allowed are up to 1,000,000"):
+        read_trials(tmp_path / "many.parquet")

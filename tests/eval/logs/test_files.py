@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
@@ -130,3 +131,50 @@ def test_a_log_of_too_many_rows_is_refused_unread(tmp_path, kind, monkeypatch):
     monkeypatch.setattr(read, "read_csv" if kind == "csv" else "read", None)
     with pytest.raises(FlightLogError, match="rows; at most 149"):
         read_flight(path)
+
+
+def wide(path, rows=4_000_000, more=26):
+    """Write a Parquet file of few bytes and of more cells than a log may have."""
+    zeros = pa.array(np.zeros(rows, np.int8))
+    table = pa.table({"time": zeros} | {f"u{k}": zeros for k in range(more)})
+    pyarrow.parquet.write_table(table, path)
+    return path
+
+
+def test_of_more_cells_than_fit_only_known_columns_are_read(tmp_path):
+    read, _, warnings = files.read_columns(wide(tmp_path / "wide.parquet"))
+    assert list(read) == ["time"] and "26 of 27 columns are left out" in warnings[0]
+
+
+def test_more_cells_than_fit_are_refused_by_their_number(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "MOST_CELLS", 1000)
+    for kind in KINDS:
+        path = write_table(tmp_path / f"in.{kind}", columns())
+        with pytest.raises(
+            FlightLogError, match=r"150 rows of \d+ columns; at most 1,000 cells|151"
+        ):
+            read_flight(path)
+    path = write_table(tmp_path / "in.parquet", {"a": np.zeros(600), "b": np.zeros(600)})
+    with pytest.raises(FlightLogError, match="600 rows of 2 columns; at most 1,000 cells"):
+        read_flight(path)
+
+
+def test_out_of_memory_is_said_as_such(tmp_path, monkeypatch):
+    path = write_table(tmp_path / "in.parquet", columns())
+
+    def read(self, *args, **kwargs):
+        raise pa.ArrowMemoryError("realloc of size 12600000000 failed")
+
+    monkeypatch.setattr(pyarrow.parquet.ParquetFile, "read", read)
+    with pytest.raises(MemoryError):
+        read_flight(path)
+
+
+def test_texts_stay_coded_and_lists_are_left_out(tmp_path):
+    mode = np.array(["x" * 2**20, None] * 75, object)
+    table = columns() | {"mode": mode, "list": np.array([[1.0, 2.0]] * 150).tolist()}
+    log = read_flight(write_table(tmp_path / "in.parquet", table))
+    assert list(log.extra) == ["mode"] and log.extra["mode"][1] is None
+    assert log.extra["mode"][0] is log.extra["mode"][2], "one text in memory for all rows"
+    with pytest.raises(FlightLogError, match="pos_x: its cells hold lists"):
+        read_flight(write_table(tmp_path / "in.parquet", table | {"pos_x": table["list"]}))

@@ -1,0 +1,103 @@
+"""Logs that are damaged, or of other definitions than their format's: one line, no traceback."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from eval.importers import import_log
+from eval.importers.formats import px4
+from eval.importers.options import ImportOptions
+from eval.importers.signals import signal
+from eval.logs.columns import FlightLogError
+from tests.support import foreign_logs as made
+from tests.support import ros_messages
+from tests.support.imported import flight, text, write
+
+
+@pytest.fixture
+def ulog(tmp_path, monkeypatch):
+    """Return a function that imports a ULog file after `damage` was done to what pyulog read."""
+    path, load = made.write_ulog(tmp_path / "log.ulg", span=(0, 3)), px4._load
+
+    def imported(damage):
+        def damaged(path):
+            log = load(path)
+            damage(log)
+            return log
+
+        monkeypatch.setattr(px4, "_load", damaged)
+        return import_log(path, None, ImportOptions(full_thrust=30.0))
+
+    return imported
+
+
+def test_a_topic_without_a_timestamp_is_left_out(ulog):
+    def damage(log):
+        (topic,) = (each for each in log.data_list if each.name == "esc_status")
+        topic.data["timestamq"] = topic.data.pop("timestamp")
+
+    log, findings = ulog(damage)
+    assert log.rotor_speed is None and "esc_status has no timestamp" in text(findings, "file")
+
+
+@pytest.mark.parametrize("value", ["0.1", b"\xff", None, float("nan")])
+def test_a_parameter_that_is_no_number_is_as_one_that_is_missing(ulog, value):
+    odd = {"THR_MDL_FAC": value, "CA_ROTOR0_PX": value, "CA_ROTOR0_PY": value}
+    _, findings = ulog(lambda log: log.initial_parameters.update(odd))
+    assert "quadrotor X" in text(findings, "motors")
+    assert "THR_MDL_FAC is 0" in text(findings, "thrust")
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("geometry_msgs/Vector3 angular_velocity\n", "geometry_msgs/Vector3 angular_speed\n"),
+        ("geometry_msgs/Vector3 angular_velocity\n", "float64[3] angular_velocity\n"),
+        ("geometry_msgs/Vector3 angular_velocity\n", "std_msgs/Header angular_velocity\n"),
+    ],
+)
+def test_messages_of_another_definition_are_refused(tmp_path, monkeypatch, before, after):
+    """What was written under the true definition is read under the other one."""
+    assert before in ros_messages.IMU
+    path = made.write_mcap(tmp_path / "log.mcap", span=(0, 2))
+    from mcap_ros2.decoder import DecoderFactory
+
+    decoder_for = DecoderFactory.decoder_for
+
+    class Odd:
+        def __init__(self, message):
+            self.header = message.header
+            if "speed" not in after:
+                self.angular_velocity = [0.0] * 3 if "float64" in after else message.header
+
+    def other(self, encoding, schema):
+        decode = decoder_for(self, encoding, schema)
+        return (lambda data: Odd(decode(data))) if schema.name.endswith("Imu") else decode
+
+    monkeypatch.setattr(DecoderFactory, "decoder_for", other)
+    with pytest.raises(FlightLogError, match="another definition than sensor_msgs/Imu"):
+        import_log(path)
+
+
+def test_a_table_without_rows_is_refused(tmp_path):
+    columns = {name: pa.array([], pa.float64()) for name in flight(end=2.0)}
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    with pytest.raises(FlightLogError, match="holds no position"):
+        import_log(tmp_path / "log.parquet")
+
+
+@pytest.mark.parametrize(
+    ("column", "factor"), [("time", 1e300), ("time", 1e-310), ("pos", 1e300), ("rate", 1e300)]
+)
+def test_numbers_beyond_any_unit_are_refused_without_a_warning(tmp_path, column, factor):
+    columns = flight(end=3.0)
+    columns[column] = columns[column] * factor
+    with pytest.raises(FlightLogError, match="1e\\+20|does not increase"):
+        import_log(write(tmp_path / "log.csv", columns))
+
+
+def test_steps_of_time_that_nothing_can_be_divided_by_are_no_steps():
+    time = np.array([0.0, 1e-310, 1.0, 2.0, *range(3, 60)])
+    found, finding = signal(time, np.zeros(len(time)), "log", "gyro")
+    assert found is not None and len(found.time_s) == len(time) - 1 and finding is not None
