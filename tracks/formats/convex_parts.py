@@ -1,13 +1,18 @@
-"""Convex closed parts of a mesh file: what MuJoCo collides and the depth image shows alike."""
+"""Convex closed parts of a mesh file: what MuJoCo collides and the depth image shows alike.
+
+Run by `mesh_reader.py` in a process of its own: trimesh follows what a file refers to and takes the
+memory that it asks for. Materials are left out; the buffers of a glTF are read as plain files.
+"""
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tracks.input.reading import MESH_BYTES, check_file
+from tracks.input.reading import MESH_BYTES, InputError, read_bytes, reason
 
 if TYPE_CHECKING:
     import trimesh
@@ -22,7 +27,24 @@ _SLIVER = 1e-12
 """A triangle's area over that of a square of its part's largest extent at which it is none."""
 
 
-def load_convex_parts(path: Path) -> list[np.ndarray]:
+class _Beside:
+    """The files beside a mesh, for its loader: buffers of a glTF, with the limits of the mesh."""
+
+    def __init__(self, folder: Path, left: int) -> None:
+        self._folder, self._left = folder.resolve(), left
+
+    def get(self, name: str) -> bytes:
+        path = (self._folder / name).resolve()
+        if not path.is_relative_to(self._folder):
+            raise InputError(f"{path}: is not below the folder of the mesh that refers to it")
+        data = read_bytes(path, self._left)
+        self._left -= len(data)
+        return data
+
+    __getitem__ = get
+
+
+def convex_parts(path: Path) -> list[np.ndarray]:
     """Return the connected parts of a mesh file, each as triangles (M, 3, 3) in file units.
 
     Objects of an OBJ file or a scene are looked at one by one, so that they may touch. Triangles
@@ -30,18 +52,28 @@ def load_convex_parts(path: Path) -> list[np.ndarray]:
 
     Raises:
         ValueError: where the file cannot be read, or a part is open or not convex, naming both.
+        MemoryError: where it takes more than this process may have.
     """
-    # Here, so that tracks without meshes do not pay for the import.
     import trimesh
 
-    if not path.exists():
-        raise ValueError(f"{path}: no such mesh file")
-    check_file(path, MESH_BYTES)
-    options: dict[str, Any] = {"split_objects": True} if path.suffix.lower() == ".obj" else {}
+    kind = path.suffix.lower()[1:]
+    options: dict[str, Any] = {"split_objects": True} if kind == "obj" else {}
+    if kind not in ("stl", "off"):
+        options["skip_materials"] = True
     try:
-        found = trimesh.load_scene(path, **options).dump()
+        data = read_bytes(path, MESH_BYTES)
+        beside: Any = _Beside(path.parent, MESH_BYTES - len(data))
+        scene = trimesh.load_scene(io.BytesIO(data), kind, beside, **options)
+        found = scene.dump()
+    except InputError:
+        raise
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read as a mesh ({reason(error)})") from None
+    except MemoryError:
+        raise
     except Exception as error:  # the loaders raise whatever they like on a damaged file
-        raise ValueError(f"{path}: cannot be read as a mesh ({error})") from None
+        said = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(f"{path}: cannot be read as a mesh ({said})") from None
     meshes = [mesh for mesh in found if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     if not meshes or not all(np.isfinite(mesh.vertices).all() for mesh in meshes):
         raise ValueError(f"{path}: holds no triangles or corners that are not finite")

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from tracks.common.toml_table import REQUIRED, Table, read_toml
-from tracks.formats.convex_parts import load_convex_parts, thickness
+from tracks.formats.convex_parts import thickness
+from tracks.formats.mesh_reader import load_convex_parts
 from tracks.geometry.gates import frame_boxes, rectangle, regular_polygon
 from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
@@ -258,14 +259,16 @@ def _sphere(table: Table) -> tuple:
 
 
 def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
-    meshes, labels = [], []
+    placed = []
     for number, table in enumerate(top.tables("meshes")):
         file = top.path.parent / table.text("file")
         position, rot = _place(table, "position", (0.0, 0.0, 0.0)), rotation(table)
         scale = table.number("scale", 1.0, least=1e-6, most=1e6)
-        name = names(table, "meshes", number)
+        placed.append((table, file, position, rot, scale, names(table, "meshes", number)))
         table.close()
-        parts = load_convex_parts(file)
+    meshes, labels = [], []
+    files = load_convex_parts([file for _, file, *_ in placed])
+    for (table, _, position, rot, scale, name), parts in zip(placed, files, strict=True):
         for part, triangles in enumerate(parts):
             mesh = scale * triangles @ rot.T + position
             _check_mesh(table, scale, part, mesh)

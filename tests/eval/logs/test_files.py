@@ -150,9 +150,7 @@ def test_more_cells_than_fit_are_refused_by_their_number(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "MOST_CELLS", 1000)
     for kind in KINDS:
         path = write_table(tmp_path / f"in.{kind}", columns())
-        with pytest.raises(
-            FlightLogError, match=r"150 rows of \d+ columns; at most 1,000 cells|151"
-        ):
+        with pytest.raises(FlightLogError, match=r"15. rows of \d+ columns; at most 1,000"):
             read_flight(path)
     path = write_table(tmp_path / "in.parquet", {"a": np.zeros(600), "b": np.zeros(600)})
     with pytest.raises(FlightLogError, match="600 rows of 2 columns; at most 1,000 cells"):

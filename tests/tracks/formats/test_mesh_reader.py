@@ -1,0 +1,110 @@
+"""Mesh files that refer to others, unpack to much or never end are refused, and cost little."""
+
+import json
+import os
+import signal
+import time
+import zipfile
+
+import numpy as np
+import pytest
+import trimesh
+
+from tracks.formats import mesh_reader
+from tracks.formats.mesh_reader import load_convex_parts
+
+CUBE = trimesh.creation.box((1, 1, 1)).export(file_type="obj")
+
+
+@pytest.mark.parametrize("side", ["pipe", "20 GB", "device", "missing"])
+def test_materials_are_left_alone(tmp_path, side):
+    """On a pipe that nobody writes to, reading would wait for ever."""
+    place = tmp_path / "it.mtl"
+    if side == "pipe":
+        os.mkfifo(place)
+    elif side == "20 GB":
+        with place.open("wb") as file:
+            file.truncate(20 * 2**30)  # a hole: takes no room on the disk
+    elif side == "device":
+        place.symlink_to("/dev/zero")
+    (tmp_path / "it.obj").write_text("mtllib it.mtl\nusemtl a\n" + CUBE)
+    (parts,) = _within(30.0, lambda: load_convex_parts([tmp_path / "it.obj"]))
+    assert [part.shape for part in parts] == [(12, 3, 3)]
+
+
+def _within(seconds, work):
+    """Return what `work` returns; fail where that takes longer, also in a system call."""
+
+    def fail(signum, frame):
+        raise TimeoutError
+
+    before, started = signal.signal(signal.SIGALRM, fail), time.monotonic()
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        return work()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+        assert time.monotonic() - started < seconds
+
+
+@pytest.mark.parametrize("ending", ["zip", "tar.gz", "3mf", "bz2", "dae", "mtl", ""])
+def test_archives_and_other_kinds_are_refused_unread(tmp_path, ending):
+    path = tmp_path / f"it.{ending}"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("it.obj", CUBE)
+    with pytest.raises(ValueError, match=r"must end in one of .obj, .stl, .ply, .off, .glb, .gltf"):
+        load_convex_parts([path])
+
+
+def gltf(folder, buffer=None, count=None):
+    """Write a cube as a glTF, with another buffer or another count of corners."""
+    scene = trimesh.Scene(trimesh.creation.box((1, 1, 1)))
+    files = scene.export(file_type="gltf")
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    tree = json.loads(files["model.gltf"])
+    if buffer:
+        tree["buffers"][0]["uri"] = buffer
+    if count:
+        tree["accessors"] = [
+            {k: v for k, v in each.items() if k != "bufferView"} | {"count": count}
+            for each in tree["accessors"]
+        ]
+    (folder / "model.gltf").write_text(json.dumps(tree))
+    return folder / "model.gltf"
+
+
+def test_buffers_of_a_gltf_are_plain_files_beside_it(tmp_path):
+    (parts,) = load_convex_parts([gltf(tmp_path)])
+    assert np.ptp(parts[0].reshape(-1, 3), axis=0) == pytest.approx(1.0)
+    os.mkfifo(tmp_path / "pipe.bin")
+    with pytest.raises(ValueError, match="pipe.bin: cannot be read: it is a named pipe"):
+        load_convex_parts([gltf(tmp_path, "pipe.bin")])
+    with pytest.raises(ValueError, match="not below the folder of the mesh"):
+        load_convex_parts([gltf(tmp_path, "../secret.bin")])
+
+
+def test_more_memory_than_allowed_is_refused_by_its_size(tmp_path):
+    with pytest.raises(ValueError, match=r"model.gltf: .*(memory|cannot be read)"):
+        load_convex_parts([gltf(tmp_path, count=1_500_000_000)])
+    assert len(load_convex_parts([gltf(tmp_path)])[0][0]) == 12, "the next one is read"
+
+
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [
+        ("import time; time.sleep(100)", "cannot be read as a mesh within 0.5 s"),
+        ("import os; os.abort()", "ended with -6"),
+        ("import sys; sys.stdout.write('{'); sys.exit(3)", "to the end, its reader ended with"),
+    ],
+)
+def test_a_reader_that_hangs_or_dies_is_named_and_replaced(tmp_path, monkeypatch, program, said):
+    (tmp_path / "it.obj").write_text(CUBE)
+    with monkeypatch.context() as patch:
+        patch.setattr(mesh_reader, "READ_S", 0.5 if "sleep" in program else 60.0)
+        patch.setattr(mesh_reader, "_PROGRAM", program)
+        mesh_reader._end(mesh_reader._process())
+        with pytest.raises(ValueError, match=f"it.obj: .*{said}"):
+            load_convex_parts([tmp_path / "it.obj"])
+    assert len(load_convex_parts([tmp_path / "it.obj"])[0][0]) == 12
