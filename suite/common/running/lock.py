@@ -1,14 +1,15 @@
 """One writer a folder: a lock that is the system's, with a word about who holds it.
 
-The lock is `flock` on the file .lock in the folder, so it ends with the process that holds it,
-however that ends, and the file that a killed process leaves says nothing any more.
+The lock is `flock` on a file in the folder, so it ends with the process that holds it, however that
+ends. Nothing is written into that file, which may be another program's by its name; who holds it
+stands in a second one, which is written beside and renamed. What a killed process leaves of both
+says nothing any more.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import shlex
 import sys
@@ -17,12 +18,11 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from tracks.common.files import folder_while_used, sweep_parts, to_json
+from tracks.common.files import folder_while_used, sweep_parts, write_json
 from tracks.input.reading import InputError, read_json
 
-LOCK = ".lock"
-"""Name of the file in the folder; gone when the command ends."""
-_BUSY = (errno.EAGAIN, errno.EACCES)
+LOCK, HOLDER = ".suite-lock", ".suite-lock.json"
+"""Names of the two files in the folder; gone when the command ends."""
 _UNKNOWN = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
@@ -37,15 +37,36 @@ def one_writer(folder: Path) -> Iterator[None]:
         ValueError: where another command writes there: which, since when, and what to do.
         OSError: where the folder cannot be made or written.
     """
+    from filelock import FileLock, Timeout
+
     with folder_while_used(folder):
-        handle = _take(folder)
+        path = folder / LOCK
+        lock = FileLock(path, timeout=0, mode=0o644, fallback_to_soft=False)
+        if path.exists() and (not path.is_file() or path.stat().st_size):
+            raise ValueError(
+                f"{path} is not the suite's, whose own is an empty file; move it away, or give "
+                "another --out"
+            )
+        try:
+            lock.acquire()
+        except Timeout:
+            raise ValueError(
+                f"{folder} is being written by {_holder(folder)}; wait until it is through, end "
+                "it, or give another --out"
+            ) from None
+        except OSError as error:
+            if error.errno not in _UNKNOWN:
+                raise
         try:
             sweep_parts(folder)
+            write_json(folder / HOLDER, _about())
             yield
         finally:
-            # Gone before it is free: whoever opened it meanwhile finds that it is not there.
-            (folder / LOCK).unlink(missing_ok=True)
-            os.close(handle)
+            # Gone before it is free: whoever waits for it finds that it is not there and begins
+            # anew. The other way round, it would take away the lock of who came next.
+            for name in (HOLDER, LOCK):
+                (folder / name).unlink(missing_ok=True)
+            lock.release()
 
 
 @contextmanager
@@ -58,38 +79,6 @@ def one_writer_each(folders: list[Path]) -> Iterator[None]:
         yield
 
 
-def _take(folder: Path) -> int:
-    path = folder / LOCK
-    while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _is_at(handle, path):
-                os.truncate(handle, 0)
-                os.pwrite(handle, (to_json(_about()) + "\n").encode(), 0)
-                return handle
-        except OSError as error:
-            if error.errno in _BUSY:
-                os.close(handle)
-                raise ValueError(
-                    f"{folder} is being written by {_holder(path)}; wait until it is through, end "
-                    "it, or give another --out"
-                ) from None
-            if error.errno in _UNKNOWN:
-                return handle
-            os.close(handle)
-            raise
-        # Its holder ended between our opening and our locking, and took the file along.
-        os.close(handle)
-
-
-def _is_at(handle: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(handle), os.stat(path))
-    except FileNotFoundError:
-        return False
-
-
 def _about() -> dict[str, object]:
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     since = datetime.now(UTC).isoformat(timespec="seconds")
@@ -97,9 +86,9 @@ def _about() -> dict[str, object]:
             "since": since}  # fmt: skip
 
 
-def _holder(path: Path) -> str:
+def _holder(folder: Path) -> str:
     try:
-        about = read_json(path)
+        about = read_json(folder / HOLDER)
         return (
             f"`{about['command']}` (pid {about['pid']} on {about['host']}, since {about['since']})"
         )

@@ -1,15 +1,17 @@
 """One writer a folder: who comes second is told who was first, and nobody waits for the dead."""
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
 import textwrap
+import threading
 
 import pytest
 
 from suite import cli
-from suite.common.running.lock import LOCK, one_writer, one_writer_each
+from suite.common.running.lock import HOLDER, LOCK, one_writer, one_writer_each
 
 
 def test_the_second_is_told_who_was_first(tmp_path, monkeypatch):
@@ -36,18 +38,80 @@ def test_a_folder_in_which_nothing_came_is_not_left(tmp_path):
 
 
 def test_a_lock_that_a_killed_command_left_is_taken_over(tmp_path):
-    (tmp_path / LOCK).write_text('{"command": "suite train", "pid": 1, "host": "x", "since": "y"}')
+    (tmp_path / LOCK).touch()
+    (tmp_path / HOLDER).write_text('{"command": "suite train", "pid": 1, "host": "x"}')
     with one_writer(tmp_path):
-        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
+        assert json.loads((tmp_path / HOLDER).read_text())["pid"] == os.getpid()
+    assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("text", ["", "[" * 100_000, "[]"])
+@pytest.mark.parametrize("text", ["", "[" * 100_000, "[]", '{"command": "\x1b[31m", "pid": 1}'])
 def test_a_holder_that_says_nothing_still_holds(tmp_path, text):
     with one_writer(tmp_path):
-        (tmp_path / LOCK).write_text(text)
+        (tmp_path / HOLDER).write_text(text)
         with pytest.raises(ValueError, match="being written by another command"):
             with one_writer(tmp_path):
                 pass
+
+
+def test_files_of_others_are_left_as_they_are(tmp_path):
+    """Neither a lock of another program, nor what a link of our lock's name leads to."""
+    (tmp_path / ".lock").write_text("another program's")
+    (tmp_path / "target").write_text("precious")
+    for name in (LOCK, HOLDER, ".lock"):
+        with contextlib.suppress(FileExistsError):
+            os.link(tmp_path / "target", tmp_path / name)
+        with contextlib.suppress(ValueError):
+            with one_writer(tmp_path):
+                pass
+        assert (tmp_path / "target").read_text() == "precious"
+        assert (tmp_path / ".lock").read_text() == "another program's"
+        (tmp_path / LOCK).unlink(missing_ok=True)
+
+
+def test_a_lock_that_is_not_ours_is_not_taken(tmp_path):
+    (tmp_path / LOCK).write_text("foreign")
+    with pytest.raises(ValueError, match="is not the suite's"):
+        with one_writer(tmp_path):
+            pass
+    assert (tmp_path / LOCK).read_text() == "foreign"
+
+
+def test_the_lock_is_gone_before_it_is_free(tmp_path, monkeypatch):
+    """Who comes when the file is being taken away must not get in: its own would go as well."""
+    unlink, met = os.unlink, []
+
+    def contend(path, *args, **kwargs):
+        if os.fspath(path).endswith(LOCK) and not met:
+            met.append(True)
+            with pytest.raises(ValueError, match="is being written"):
+                with one_writer(tmp_path / "run"):
+                    pass
+        unlink(path, *args, **kwargs)
+
+    monkeypatch.setattr(os, "unlink", contend)
+    with one_writer(tmp_path / "run"):
+        (tmp_path / "run" / "result").touch()
+    assert met
+
+
+def test_of_many_that_come_and_go_one_is_inside(tmp_path):
+    inside, twice, done = [], [], []
+
+    def come_and_go():
+        while len(done) < 20 and not twice:
+            with contextlib.suppress(ValueError), one_writer(tmp_path):
+                inside.append(1)
+                twice.extend(inside[1:])
+                done.append(1)
+                inside.pop()
+
+    threads = [threading.Thread(target=come_and_go) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not twice
 
 
 def test_a_kill_frees_the_folder_and_what_it_left_is_swept(tmp_path):
