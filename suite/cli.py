@@ -21,6 +21,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 from suite.common.running.interrupts import end_at_once, ends_in_seconds
+from suite.common.startup import check_names, keep_compiled, open_streams, pin
 
 COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
@@ -67,6 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = list(sys.argv[1:] if argv is None else argv)
     try:
         with ends_in_seconds():
+            check_names(args)
             code = _dispatch(args)
             sys.stdout.flush()
             return code
@@ -178,10 +180,11 @@ def _once_a_value(options: Any) -> Iterator[str]:
 
 
 def _run(name: str, args: list[str]) -> int:
-    from suite.common.compiled import keep_compiled
     from suite.common.console import Console, stdout_kept_clean
     from tracks.common.work.threads import one_thread_a_product, set_threads
 
+    for variable in pin():
+        _complain(f"{variable} of the environment is set aside: it would change every result")
     keep_compiled()
     set_threads()
     one_thread_a_product()
@@ -206,13 +209,16 @@ def _run(name: str, args: list[str]) -> int:
 
 
 def _complain(message: str) -> None:
-    print(f"suite: {message}", file=sys.stderr)
+    from tracks.common.names import printable
+
+    print(f"suite: {printable(message)}", file=sys.stderr)
 
 
 def entry() -> None:
     """Be the program `suite`."""
     from suite.common.running.hosts import several
 
+    open_streams()
     code = main()
     # Whoever leaves others early would wait for them.
     if code == INTERRUPTED or (code and several()):

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, TextIO
 
 from eval.worlds.trial import TrialResult, TrialSpec
-from tracks.common.files import plain, replacing_file, to_json, write_json, write_text
+from tracks.common.files import naming, plain, replacing_file, to_json, write_json, write_text
 from tracks.common.provenance import stamp
 from tracks.input.reading import LOG_BYTES, check_file, parse_json, read_bytes
 
@@ -198,10 +198,11 @@ class Journal:
 
     def append(self, result: TrialResult) -> None:
         """Add a finished trial; it is with the operating system when this returns."""
-        if self._file is None:
-            self._file = open(self.path, "a", encoding="utf-8")
-        self._file.write(to_json(result._asdict()) + "\n")
-        self._file.flush()
+        with naming(self.path):
+            if self._file is None:
+                self._file = open(self.path, "a", encoding="utf-8")
+            self._file.write(to_json(result._asdict()) + "\n")
+            self._file.flush()
         self.done[result.trial] = result
 
     def missing(self, trials: Iterable[TrialSpec]) -> list[TrialSpec]:

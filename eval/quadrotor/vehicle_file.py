@@ -20,7 +20,7 @@ from eval.quadrotor.loops import KINDS, NOMINAL
 from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Vector, Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
 from tracks.common.files import write_text
-from tracks.common.names import unknown_name
+from tracks.common.names import printable, unknown_name
 from tracks.common.toml_table import REQUIRED, Table, to_toml
 from tracks.geometry.camera import Camera
 from tracks.input.reading import InputError, read_toml, reason
@@ -114,7 +114,7 @@ def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = 
     """
     table = vehicle_table(vehicle)
     parse_vehicle(table)
-    head = "".join(f"# {line}\n" for line in comment.splitlines())
+    head = "".join(f"# {printable(line)}\n" for line in comment.splitlines())
     write_text(path, head + to_toml(table))
 
 

@@ -9,8 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING, Protocol
 
+from tracks.common.names import printable
+
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.console import Console as RichConsole
+    from rich.console import ConsoleOptions, RenderableType
+    from rich.segment import Segment
 
 PLAIN_PERIOD_S = 10.0
 """Where standard error is no terminal, progress is a plain line this often [s]."""
@@ -29,18 +33,18 @@ class Console:
 
     def say(self, text: str = "") -> None:
         """Print a line of the command's result (on standard error under --json)."""
-        print(text, flush=True)
+        print(printable(text), flush=True)
 
     def show(self, table: RenderableType) -> None:
         """Print a rich table; as wide as it needs where standard output is no terminal."""
         from rich.console import Console as RichConsole
 
         wide = None if sys.stdout.isatty() else 200
-        RichConsole(file=sys.stdout, width=wide).print(table)
+        RichConsole(file=sys.stdout, width=wide).print(_Printable(table))
 
     def note(self, text: str) -> None:
         """Print a line about the work itself, on standard error."""
-        print(text, file=sys.stderr, flush=True)
+        print(printable(text), file=sys.stderr, flush=True)
 
     @contextmanager
     def progress(
@@ -77,6 +81,17 @@ class Console:
         yield update
 
 
+class _Printable:
+    """A table whose texts are as they may be printed; rich's own control codes stay."""
+
+    def __init__(self, table: RenderableType) -> None:
+        self._table = table
+
+    def __rich_console__(self, console: RichConsole, options: ConsoleOptions) -> Iterator[Segment]:
+        for part in console.render(self._table, options):
+            yield part if part.control else part._replace(text=printable(part.text))
+
+
 class Quiet(Console):
     """Leaves the lines of a result out and keeps progress: who called has lines of its own."""
 
@@ -100,11 +115,11 @@ def _bar(label: str, total: float, begun: float) -> Iterator[Update]:
         TextColumn("{task.fields[note]}"),
     )
     with Progress(*columns, console=RichConsole(stderr=True), transient=True) as bars:
-        task = bars.add_task(label, total=total, note="")
+        task = bars.add_task(printable(label), total=total, note="")
         bars.update(task, completed=begun)
 
         def update(done: float, note: str = "") -> None:
-            bars.update(task, completed=done, note=note)
+            bars.update(task, completed=done, note=printable(note))
 
         yield update
 

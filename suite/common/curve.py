@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tracks.common.files import to_json, write_text
+from tracks.common.files import naming, to_json, write_text
 
 CURVE = "metrics.jsonl"
 """A row a gradient step."""
@@ -16,7 +16,7 @@ WATCHED = "validation.jsonl"
 
 def append(folder: Path, rows: list[dict[str, Any]], name: str = CURVE) -> None:
     """Add rows to the curve called `name` in `folder`."""
-    with (folder / name).open("a", encoding="utf-8") as file:
+    with naming(folder / name), (folder / name).open("a", encoding="utf-8") as file:
         file.writelines(to_json(row) + "\n" for row in rows)
 
 

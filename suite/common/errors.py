@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dis
 import errno
+import os
 from pathlib import Path
 from types import TracebackType
 
@@ -26,13 +27,13 @@ _ROOT = Path(__file__).resolve().parents[2]
 _ROOMS = tuple(str(_ROOT / room) for room in ("tracks", "policies", "eval", "suite"))
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _UNUSABLE = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENXIO, errno.EINVAL)
+_OURS = (errno.EBADF, errno.EFAULT, errno.EDOM, errno.ERANGE, errno.ENOTSOCK, errno.ECHILD)
+"""What the system says of a mistake in the program, not of the machine that it runs on."""
 _NO_SUCH_INPUT = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError)
-
-
 _NUL = "embedded null"
 """In what Python says of such a name."""
-SHOWN = 300
-"""Characters of a file's name in a message."""
+_NO_BACKEND = ("Unable to initialize backend", "Unknown backend")
+"""At the start of what JAX says where JAX_PLATFORMS names what is not there."""
 
 
 class WorkFailed(RuntimeError):
@@ -58,6 +59,10 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     if isinstance(error, ModuleNotFoundError) and not _is_ours(error.name):
         hint = "install the suite with its requirements (make env, or pip install -e .)"
         return FAILED, f"the package {error.name!r} is missing: {hint}"
+    if isinstance(error, RuntimeError) and str(error).startswith(_NO_BACKEND):
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        first = str(error).splitlines()[0][:SHOWN]
+        return UNUSABLE, f"JAX_PLATFORMS is {asked!r} in the environment: {first}; unset it"
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return FAILED, "out of memory: use fewer trials, a smaller batch, or a larger machine"
     return None
@@ -70,7 +75,7 @@ def _explain_os(error: OSError) -> tuple[int, str] | None:
         return FAILED, f"the disk is full{where}; {hint}"
     if isinstance(error, (*_NO_SUCH_INPUT, PermissionError)) or error.errno in _UNUSABLE:
         return UNUSABLE, f"{(error.strerror or 'cannot be used').lower()}{where}"
-    if error.errno and error.filename:
+    if error.errno and error.errno not in _OURS:
         return FAILED, f"{(error.strerror or 'the system refuses').lower()}{where}"
     return None
 

@@ -26,8 +26,49 @@ PART = ".part"
 """Ending of what is being written, or what a killed process left of it."""
 PART_NAME = re.compile(r"\.(.+?)-(?:(\d+)-)?[a-z0-9_]{8}\.part")
 """Of it: what it becomes, and the process that makes it."""
+LONGEST_STEM = 200
+"""Bytes of a file's name in that of what is written beside it: systems allow 255."""
 SWEPT_DEPTH = 4
 """Folders within each other that are looked through for it."""
+
+
+def user_cache(environment: Mapping[str, str] | None = None) -> Path:
+    """Return the suite's own folder in the user's cache, made if missing.
+
+    Where there is no home (a container's user may have none), or it cannot be written, it is a
+    folder for temporary files that is the user's alone.
+
+    Args:
+        environment: variables; those of this process if not given.
+    """
+    values = os.environ if environment is None else environment
+    try:
+        place = values.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        folder = Path(place) / "diffracing-suite"
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if os.access(folder, os.W_OK):
+            return folder
+    except (OSError, RuntimeError):  # RuntimeError: nobody knows where home is
+        pass
+    folder = Path(tempfile.gettempdir()) / f"diffracing-suite-{os.getuid()}"
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    # What lies there is loaded as code: it must be nobody else's.
+    if found.st_uid != os.getuid() or found.st_mode & 0o022 or not folder.is_dir():
+        folder = Path(tempfile.mkdtemp(prefix="diffracing-suite-"))
+    return folder
+
+
+@contextmanager
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Let errors of the system that name no file, as those of a full disk, name `path`."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno and error.filename is None:
+            error.filename = os.fspath(path)
+        raise
 
 
 @contextmanager
@@ -45,8 +86,9 @@ def replacing_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     folder = Path(tempfile.mkdtemp(prefix=_prefix(final), suffix=PART, dir=final.parent))
     beside = folder / final.name
     try:
-        yield beside
-        _sync(beside)
+        with naming(final):
+            yield beside
+            _sync(beside)
         os.replace(beside, final)
         _sync(final.parent)
     finally:
@@ -70,9 +112,10 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     beside.mkdir()
     retired = parent / "replaced"
     try:
-        yield beside
-        for written in sorted(beside.rglob("*")):
-            _sync(written)
+        with naming(final):
+            yield beside
+            for written in sorted(beside.rglob("*")):
+                _sync(written)
         if final.exists():
             os.replace(final, retired)
         os.replace(beside, final)
@@ -93,7 +136,7 @@ def recover_folder(path: str | os.PathLike[str]) -> None:
     final = Path(path)
     if final.exists():
         return
-    for part in final.parent.glob(f".{glob.escape(final.name)}-*.part"):
+    for part in final.parent.glob(f".{glob.escape(_stem(final))}-*.part"):
         if _is_being_written(part.name):
             continue
         if (part / "replaced").is_dir() and (part / final.name).is_dir():
@@ -169,7 +212,8 @@ def sweep_parts(folder: str | os.PathLike[str]) -> list[Path]:
             names.remove(name)
             match = PART_NAME.fullmatch(name)
             if match and not _is_being_written(name):
-                recover_folder(Path(place, match[1]))
+                for whole in os.listdir(Path(place, name)):  # of a long name the start stands there
+                    recover_folder(Path(place, whole))
                 shutil.rmtree(Path(place, name), ignore_errors=True)
                 swept.append(Path(place, name))
         if depth >= SWEPT_DEPTH:
@@ -179,7 +223,12 @@ def sweep_parts(folder: str | os.PathLike[str]) -> list[Path]:
 
 def _prefix(final: Path) -> str:
     # Who writes it stands in the name, so that another process can tell whether it still does.
-    return f".{final.name}-{os.getpid()}-"
+    return f".{_stem(final)}-{os.getpid()}-"
+
+
+def _stem(final: Path) -> str:
+    """Return the start of a name that leaves room for what is added to it beside the file."""
+    return os.fsencode(final.name)[:LONGEST_STEM].decode(errors="ignore")
 
 
 def _is_being_written(part: str) -> bool:
@@ -210,7 +259,8 @@ def _sync(path: Path) -> None:
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write `text` to `path` as UTF-8, whole or not at all."""
     with replacing_file(path) as beside:
-        beside.write_text(text, encoding="utf-8")
+        # A name that is not UTF-8, as a folder's above may be, is written as an escape.
+        beside.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:

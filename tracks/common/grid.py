@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, NamedTuple
 
+from tracks.common.names import printable
+
 if TYPE_CHECKING:
     from rich.table import Table
+
+
+_TAG = re.compile(r"<(?=[A-Za-z/!?])")
 
 
 class Cell(NamedTuple):
@@ -47,8 +53,13 @@ def markdown(grid: Grid) -> str:
     """Return a table as Markdown."""
     rows = [[cell.text for cell in row] for row in grid.rows]
     lines = [list(grid.headers), ["---"] * len(grid.headers), *rows]
-    text = "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in r) + " |" for r in lines)
+    text = "\n".join("| " + " | ".join(map(markdown_cell, row)) + " |" for row in lines)
     return "\n\n".join(part for part in (grid.title, text, grid.note) if part) + "\n"
+
+
+def markdown_cell(text: str) -> str:
+    """Return a text that may hold names from elsewhere: no control characters, no HTML."""
+    return _TAG.sub("&lt;", printable(text, keep="")).replace("|", "\\|")
 
 
 def rich_table(grid: Grid) -> Table:

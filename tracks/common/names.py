@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
+from unicodedata import category
 
 LONGEST = 80
 """Characters of a name that are looked at, and shown; a file's key may be of megabytes."""
@@ -20,6 +21,22 @@ def closest(name: str, allowed: Iterable[str]) -> str | None:
     lowered = {entry.lower(): entry for entry in allowed}
     match = difflib.get_close_matches(name[:LONGEST].lower(), lowered, n=1, cutoff=0.6)
     return lowered[match[0]] if match else None
+
+
+def printable(text: str, keep: str = "\n\t") -> str:
+    """Return a text from elsewhere as it may be printed: control characters as escapes.
+
+    A name or a path may hold what a terminal takes for an order, such as to change its title or to
+    type; also what turns the direction of writing, and half characters.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        c.encode("unicode_escape", "surrogatepass").decode()
+        if c not in keep and (category(c)[0] == "C" or category(c) in ("Zl", "Zp"))
+        else c
+        for c in text
+    )
 
 
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> ValueError:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from tracks.common.names import closest
+from tracks.common.names import closest, printable
 from tracks.input import reading
 from tracks.input.ranges import is_number, shown
 
@@ -137,10 +137,10 @@ class Table:
         return value
 
     def text(self, key: str, default: str = REQUIRED) -> str:
-        """Return a text that is not empty."""
+        """Return a text that is not empty and holds no control characters."""
         value = self._get(key, default, "a text")
-        if not isinstance(value, str) or not value:
-            raise self.error(key, value, "a text that is not empty")
+        if not isinstance(value, str) or not value or printable(value, keep="") != value:
+            raise self.error(key, value, "a printable text that is not empty")
         return value
 
     def texts(self, key: str) -> list[str]:

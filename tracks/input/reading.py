@@ -87,8 +87,12 @@ def parse_json(text: str | bytes, where: str) -> Any:
     """
     try:
         value = json.loads(text)
+        if b"\\ud" in (text if isinstance(text, bytes) else text.encode()).lower():
+            json.dumps(value, ensure_ascii=False).encode()
     except RecursionError:
         raise _too_deep(where) from None
+    except UnicodeEncodeError:
+        raise InputError(f"{where}: holds half a character, which no file can name") from None
     except ValueError as error:
         raise InputError(f"{where}: not JSON ({error})") from None
     _check_depth(value, where)

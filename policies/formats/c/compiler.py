@@ -12,7 +12,7 @@ from pathlib import Path
 
 from policies.formats.c.source import TEMPLATES
 from policies.spec import PolicyError
-from tracks.common.files import replacing_file
+from tracks.common.files import replacing_file, user_cache
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes
 
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=fast", "-fPIC", "-shared")
@@ -89,9 +89,8 @@ def compiled_library(policy_c: Path) -> Path:
 
 
 def _cache() -> Path:
-    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     # A home that machines share must not hand one's instructions to another.
-    folder = Path(home) / "diffracing-suite" / "c" / (platform.node() or "here")
+    folder = user_cache() / "c" / (platform.node() or "here")
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     return folder
 

@@ -14,9 +14,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from suite.common.compiled import home, keep_compiled
 from suite.common.running.lock import one_writer
-from tracks.common.files import replacing_folder
+from suite.common.startup import keep_compiled
+from tracks.common.files import replacing_folder, user_cache
 from tracks.common.work.travel import pack
 
 Result = TypeVar("Result")
@@ -90,7 +90,7 @@ def fill(folder: Path, files: Mapping[str, bytes]) -> None:
 @contextmanager
 def _place(name: str) -> Iterator[Path]:
     """Be alone in a folder of that name in the user's cache, or else in one for this once."""
-    place = home() / "pieces" / name
+    place = user_cache() / "pieces" / name
     with ExitStack() as stack:
         try:
             stack.enter_context(one_writer(place))

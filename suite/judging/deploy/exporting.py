@@ -15,6 +15,7 @@ from suite.common.console import Console
 from suite.judging.content import policy_digest
 from suite.judging.deploy.parity import Parity, observed_flights, parity
 from tracks.common.files import check_no_input, write_json, write_text
+from tracks.common.grid import markdown_cell
 from tracks.common.provenance import VERSION, stamp
 from tracks.input.reading import read_json
 
@@ -124,8 +125,9 @@ def card_text(
         ("memory of the caller", f"{memory_bytes(spec, dtype == 'int8')} bytes"),
         ("licence", _LICENCE),
     )
-    table = "\n".join(f"| {key} | {value} |" for key, value in rows)
-    return f"# {name}, {dtype}, in C\n\n| | |\n| --- | --- |\n{table}\n\n{_success(asked)}"
+    table = "\n".join(f"| {key} | {markdown_cell(value)} |" for key, value in rows)
+    title = f"# {markdown_cell(name)}, {dtype}, in C"
+    return f"{title}\n\n| | |\n| --- | --- |\n{table}\n\n{_success(asked)}"
 
 
 def _success(asked: str) -> str:

@@ -1,0 +1,82 @@
+"""What a command finds when it starts: streams, environment variables and names, made usable.
+
+One place, before anything slow is imported: JAX reads its settings when it is imported, and a file
+that takes the number of a closed stream would get what is printed.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from collections.abc import Iterable, MutableMapping
+
+from tracks.common.files import user_cache
+
+PINNED = (
+    *("JAX_ENABLE_X64", "JAX_DEFAULT_DTYPE_BITS", "JAX_NUMPY_DTYPE_PROMOTION"),
+    *("JAX_NUMPY_RANK_PROMOTION", "JAX_DEFAULT_MATMUL_PRECISION", "JAX_DEFAULT_PRNG_IMPL"),
+    *("JAX_THREEFRY_PARTITIONABLE", "JAX_ENABLE_CUSTOM_PRNG"),
+)
+"""Variables that would change what every command computes; set aside."""
+
+
+def open_streams() -> None:
+    """Give a process without standard input, output or error the null device in its place.
+
+    What cannot be printed in the terminal's encoding is printed as an escape.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
+    sys.stdin = sys.stdin or open(0, encoding="utf-8", closefd=False)
+    sys.stdout = sys.stdout or open(1, "w", encoding="utf-8", closefd=False)
+    sys.stderr = sys.stderr or open(2, "w", encoding="utf-8", closefd=False)
+    for stream in (sys.stdout, sys.stderr):
+        reconfigure = getattr(stream, "reconfigure", None)  # a test's own stream has none
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")
+
+
+def check_names(args: Iterable[str]) -> None:
+    """Refuse words of a command line that no result file could name.
+
+    Raises:
+        ValueError: for one that is not UTF-8.
+    """
+    for arg in args:
+        try:
+            arg.encode()
+        except UnicodeEncodeError:
+            raise ValueError(
+                f"{arg!r} is not UTF-8, so result files cannot name it; rename the file or folder, "
+                "and set LC_ALL to a UTF-8 locale such as C.UTF-8"
+            ) from None
+
+
+def pin(environment: MutableMapping[str, str] | None = None) -> list[str]:
+    """Set aside variables that would change what is computed, in place, and return their names."""
+    values = os.environ if environment is None else environment
+    return [name for name in PINNED if values.pop(name, "")]
+
+
+def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
+    """Have JAX keep compiled programs in the user's cache, where nothing else was asked for.
+
+    XLA takes 15 s over the model of a diagnosis and longer over a trainer; a second call of the
+    same command reads what the first one compiled.
+
+    Args:
+        environment: changed in place; that of this process if not given. A
+            JAX_COMPILATION_CACHE_DIR that is there, also an empty one, is left as it is.
+    """
+    values = os.environ if environment is None else environment
+    if "JAX_COMPILATION_CACHE_DIR" not in values:
+        # A home that machines share must not hand one's instructions to another.
+        folder = user_cache(values) / "jax" / (platform.node() or "here")
+        values["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    # XLA complains of its own tuning hints, which are no processor feature, at every program that
+    # it loads; what goes wrong in earnest is raised as an exception.
+    values.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
