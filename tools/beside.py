@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from suite.common.compiled import keep_compiled
+from suite.common.startup import keep_compiled
 from tracks.common.work import usable_cores
 from tracks.common.work.threads import set_threads
 

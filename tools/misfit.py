@@ -24,7 +24,7 @@ from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.blind.cases import CONTINUOUS, Case
 from suite.blind.outside import Law, Push
 from suite.blind.simulators import simulator_for
-from suite.common.compiled import keep_compiled
+from suite.common.startup import keep_compiled
 from suite.diagnose.data.colour import Noise, measured_noise
 from suite.diagnose.data.windows import cut
 from suite.diagnose.diagnose import diagnose

@@ -1,5 +1,7 @@
 """Logs that are damaged, or of other definitions than their format's: one line, no traceback."""
 
+from typing import Any
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -72,7 +74,7 @@ def test_messages_of_another_definition_are_refused(tmp_path, monkeypatch, befor
                 self.angular_velocity = [0.0] * 3 if "float64" in after else message.header
 
     def other(self, encoding, schema):
-        decode = decoder_for(self, encoding, schema)
+        decode: Any = decoder_for(self, encoding, schema)
         return (lambda data: Odd(decode(data))) if schema.name.endswith("Imu") else decode
 
     monkeypatch.setattr(DecoderFactory, "decoder_for", other)

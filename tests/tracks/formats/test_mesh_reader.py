@@ -5,6 +5,7 @@ import os
 import signal
 import time
 import zipfile
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import trimesh
 from tracks.formats import mesh_reader
 from tracks.formats.mesh_reader import load_convex_parts
 
-CUBE = trimesh.creation.box((1, 1, 1)).export(file_type="obj")
+CUBE = str(trimesh.creation.box((1, 1, 1)).export(file_type="obj"))
 
 
 @pytest.mark.parametrize("side", ["pipe", "20 GB", "device", "missing"])
@@ -60,7 +61,7 @@ def test_archives_and_other_kinds_are_refused_unread(tmp_path, ending):
 def gltf(folder, buffer=None, count=None):
     """Write a cube as a glTF, with another buffer or another count of corners."""
     scene = trimesh.Scene(trimesh.creation.box((1, 1, 1)))
-    files = scene.export(file_type="gltf")
+    files: Any = scene.export(file_type="gltf")
     for name, data in files.items():
         (folder / name).write_bytes(data)
     tree = json.loads(files["model.gltf"])
