@@ -220,8 +220,8 @@ def entry() -> None:
 
     open_streams()
     code = main()
-    # Whoever leaves others early would wait for them.
-    if code == INTERRUPTED or (code and several()):
+    # Whoever leaves others early would wait for them, as for a cluster that does not answer.
+    if code == INTERRUPTED or (code and (several() or "distributed" in sys.modules)):
         end_at_once(code)
     raise SystemExit(code)
 

@@ -17,7 +17,13 @@ from tracks.common.work.threads import share_threads
 
 Result = TypeVar("Result")
 
-WorkersOption = Annotated[str | None, tyro.conf.arg(metavar="N|ADDRESS")]
+WorkersOption = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="N|ADDRESS",
+        help_behavior_hint="(a cluster's owner can run code here: name your own)",
+    ),
+]
 """As a command's option; `asked_workers` reads it."""
 
 

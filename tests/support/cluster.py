@@ -26,19 +26,22 @@ class Cluster:
 
 
 @contextlib.contextmanager
-def cluster(folder, nodes=2, memory="3GB", **environment):
-    """Be a cluster of `nodes` machines with a worker each; skip where the extra is missing."""
+def cluster(folder, nodes=2, memory="3GB", tls=(), **environment):
+    """Be a cluster of `nodes` machines with a worker each; skip where the extra is missing.
+
+    `tls` are the options of its scheduler and workers that make it one of encrypted messages.
+    """
     pytest.importorskip("distributed", reason="needs the extra `cluster`")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    address = f"tcp://127.0.0.1:{port}"
+    address = f"{'tls' if tls else 'tcp'}://127.0.0.1:{port}"
     started = []
     try:
-        place = ["--host", "127.0.0.1", "--port", str(port)]
+        place = ["--host", address.rpartition(":")[0], "--port", str(port), *tls]
         started.append(_start(["scheduler", *place, "--no-dashboard"], folder, environment))
         for _ in range(nodes):
-            limits = ["--nworkers", "1", "--nthreads", "1", "--memory-limit", memory]
+            limits = ["--nworkers", "1", "--nthreads", "1", "--memory-limit", memory, *tls]
             where = ["--local-directory", str(folder), "--no-dashboard"]
             started.append(_start(["worker", address, *limits, *where], folder, environment))
         _wait(address, nodes)

@@ -24,7 +24,7 @@ Workers = int | str
 """So many processes of this machine, or the address of a cluster's scheduler."""
 MOST = 256
 """Processes of this machine."""
-_PROTOCOLS = ("tcp", "tls", "ws", "wss", "ucx")
+_PROTOCOLS = ("tcp", "tls", "ws", "wss")
 
 
 def read_workers(text: str | None, option: str = "--workers") -> Workers | None:

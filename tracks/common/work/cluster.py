@@ -3,6 +3,9 @@
 Work and pieces travel as bytes, so a machine needs the same suite and no file of ours. The work
 itself is the result of a task: every machine fetches it once, and where the machine that held it
 dies the scheduler makes it anew, as it does the pieces that were under way there.
+
+Dask's own messages hold pickles, which its client unpacks: who runs the scheduler or a worker can
+run code in this process. Results are no safer than that, so they travel as pickles as well.
 """
 
 from __future__ import annotations
@@ -37,6 +40,8 @@ Result = TypeVar("Result")
 
 ANSWER_S = 10.0
 """A scheduler has this long to answer [s]."""
+GRACE_S = 1.0
+"""Later than that we stop waiting ourselves [s]."""
 ALONE_S = 60.0
 """A scheduler may be without workers for this long [s]."""
 AHEAD = 4
@@ -48,6 +53,11 @@ COUNT_S = 5.0
 ADVICE = (
     "on a machine with the suite and its extra `cluster`, `dask scheduler` starts one and "
     "`dask worker ADDRESS --nworkers N --nthreads 1` gives it N processes"
+)
+TLS_ADVICE = (
+    "give this machine the scheduler's authority and a certificate with its key, as the "
+    "environment's DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ...__TLS__CLIENT__CERT and "
+    "...__TLS__CLIENT__KEY (docs/scaling.md)"
 )
 
 
@@ -139,18 +149,32 @@ def _connected(address: str) -> Iterator[Any]:
             "pip install 'diffracing-suite[cluster]'"
         ) from error
     # What goes wrong is raised; its log of what is mended without us is not for people.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            # Of any type: what it returns is a coroutine only where it is asked to be.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+    logging.getLogger("tornado").setLevel(logging.CRITICAL + 1)
+    met: SimpleQueue[Any] = SimpleQueue()
+
+    def connect() -> None:
+        try:
             client: Any = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
+            met.put((client, client.nthreads()))
+        except Exception as error:  # of whatever kind, by what the other side sends
+            met.put(error)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        # Beside this thread: it waits on a port that is silent for longer than it was told.
+        threading.Thread(target=connect, daemon=True).start()
+        try:
+            found = met.get(timeout=ANSWER_S + GRACE_S)
+        except Empty:
+            found = TimeoutError()
+    if isinstance(found, Exception):
+        advice = TLS_ADVICE if address.startswith(("tls:", "wss:")) else ADVICE
         raise UnusableCluster(
-            f"--workers {address}: no scheduler of a Dask cluster answers there; {ADVICE}"
-        ) from error
+            f"--workers {address}: no scheduler of a Dask cluster answers there; {advice}"
+        ) from found
+    client, threads = found
     try:
-        threads = client.nthreads()
         if not threads:
             raise UnusableCluster(f"--workers {address}: the cluster has no workers; {ADVICE}")
         if max(threads.values()) > 1:

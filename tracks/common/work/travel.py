@@ -72,7 +72,8 @@ def let_views_travel() -> None:
 
 
 unpack: Callable[[bytes], Any] = pickle.loads
-"""Of bytes that `pack` made; only what our own processes send is unpacked."""
+"""Of bytes that `pack` made. Who sends them can run code here: processes of ours, and whoever runs
+a cluster that `--workers` names."""
 
 
 def failure(error: Exception) -> Failure:

@@ -1,7 +1,11 @@
 """Pieces on a real cluster of two nodes: results by number, what goes wrong, what dies."""
 
 import os
+import shutil
 import signal
+import subprocess
+import sys
+import textwrap
 import threading
 import time
 from functools import partial
@@ -10,7 +14,7 @@ from types import MappingProxyType
 import pytest
 
 from tests.support.cluster import cluster
-from tracks.common.work import WorkerDied, crew, work_off
+from tracks.common.work import WorkerDied, crew, read_workers, work_off
 from tracks.common.work.cluster import UnusableCluster
 from tracks.common.work.travel import software
 
@@ -98,6 +102,80 @@ def test_an_address_that_does_not_answer_says_what_to_do(two_nodes, monkeypatch)
     monkeypatch.setattr("tracks.common.work.cluster.ANSWER_S", 0.5)
     with pytest.raises(UnusableCluster, match=r"--workers tcp://127\.0\.0\.1:9: .*dask scheduler"):
         crew("tcp://127.0.0.1:9")
+
+
+BEHAVIOURS = {
+    "silent": "time.sleep(100)",
+    "garbage": "c.sendall(b'HTTP/1.1 400 Bad' * 99); time.sleep(100)",
+    "gone": "c.close()",
+}
+
+
+@pytest.mark.parametrize("how", BEHAVIOURS)
+def test_a_port_of_something_else_is_refused_in_the_time_that_is_promised(how):
+    """In a process of its own, as Dask's client tries on beside when we gave it up."""
+    pytest.importorskip("distributed")
+    code = textwrap.dedent(f"""
+        import os, socket, threading, time
+        from tracks.common.work import cluster, crew
+        def serve():
+            while True:
+                c, _ = port.accept()
+                threading.Thread(target=behave, args=(c,), daemon=True).start()
+        def behave(c):
+            {BEHAVIOURS[how]}
+        port = socket.create_server(("127.0.0.1", 0))
+        threading.Thread(target=serve, daemon=True).start()
+        import distributed
+        cluster.ANSWER_S, began = 1.0, time.monotonic()
+        try:
+            crew(f"tcp://127.0.0.1:{{port.getsockname()[1]}}")
+        except cluster.UnusableCluster as error:
+            print(error, flush=True)
+        os._exit(time.monotonic() - began > 10.0)
+    """)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and not done.stderr, done.stderr
+    assert "no scheduler of a Dask cluster answers there" in done.stdout
+    assert len(done.stdout.splitlines()) == 1
+
+
+def test_what_needs_another_package_is_no_address():
+    with pytest.raises(ValueError, match="--workers is 'ucx://head:8786'"):
+        read_workers("ucx://head:8786")
+
+
+@pytest.mark.parametrize("command", ["eval", "collect", "loop"])
+def test_the_help_says_who_can_run_code_here(command, capsys):
+    from suite import cli
+
+    assert cli.main([command, "--help"]) == 0
+    assert "owner can run code here" in " ".join(capsys.readouterr().out.replace("│", "").split())
+
+
+@pytest.mark.slow
+def test_messages_are_encrypted_where_the_address_says_so(tmp_path, monkeypatch):
+    if shutil.which("openssl") is None:
+        pytest.skip("needs openssl, which makes the certificates")
+    key, cert = tmp_path / "key.pem", tmp_path / "cert.pem"
+    made = ["-newkey", "rsa:2048", "-nodes", "-keyout", str(key), "-out", str(cert)]
+    subject = ["-subj", "/CN=127.0.0.1", "-days", "2"]
+    subprocess.run(["openssl", "req", "-x509", *made, *subject], check=True, capture_output=True)
+    where = {"CA_FILE": cert, "CLIENT__CERT": cert, "CLIENT__KEY": key}
+    tls = ("--tls-ca-file", str(cert), "--tls-cert", str(cert), "--tls-key", str(key))
+    import dask
+
+    names = {"CA_FILE": "ca-file", "CLIENT__CERT": "client.cert", "CLIENT__KEY": "client.key"}
+    options = {f"distributed.comm.tls.{names[k]}": str(v) for k, v in where.items()}
+    with pytest.raises(UnusableCluster, match="DASK_DISTRIBUTED__COMM__TLS__CA_FILE"):
+        crew("tls://127.0.0.1:9")
+    with dask.config.set(options), cluster(tmp_path, nodes=1, tls=tls) as found:
+        results = []
+        work_off(partial(tens, {0: 10}), [[1, 2]], found.address, lambda n, r: results.append(r))
+        assert [ten for _, ten, _ in results] == [10, 20] and found.address.startswith("tls://")
+        with dask.config.set({"distributed.comm.tls.ca-file": None}):
+            with pytest.raises(UnusableCluster):
+                crew(found.address)
 
 
 def test_an_interrupt_ends_it_and_keeps_what_came(two_nodes):
