@@ -21,7 +21,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 from suite.common.running.interrupts import end_at_once, ends_in_seconds
-from suite.common.startup import check_names, keep_compiled, open_streams, pin
+from suite.common.startup import check_names, hush, keep_compiled, open_streams, pin
 
 COMMANDS: dict[str, str] = {
     "bench": "time a hot path against a plain implementation of the same",
@@ -219,6 +219,7 @@ def entry() -> None:
     from suite.common.running.hosts import several
 
     open_streams()
+    hush()
     code = main()
     # Whoever leaves others early would wait for them, as for a cluster that does not answer.
     if code == INTERRUPTED or (code and (several() or "distributed" in sys.modules)):

@@ -209,6 +209,10 @@ class Journal:
         """Return the trials that are yet to be flown."""
         return [trial for trial in trials if trial not in self.done]
 
+    def others(self, trials: Iterable[TrialSpec]) -> int:
+        """Return how many finished trials are none of `trials`."""
+        return len(self.done.keys() - set(trials))
+
     def close(self) -> None:
         """Close the file, which stays where it is; `append` opens it again."""
         if self._file is not None:

@@ -41,6 +41,9 @@ class Config:
     link: str = ""
     """udpin:HOST:PORT or udpout:HOST:PORT of a vehicle that speaks MAVLink; one flight. Without it
     the vehicle is simulated in real time, on this machine's loopback."""
+    signing_key: Path | None = None
+    """File of the link's passphrase: with --link, messages are signed as MAVLink 2 says, and those
+    of the vehicle must be. Without it whoever reaches the link can speak for the vehicle."""
     confirm: bool = False
     """I have read docs/fly.md and did what it asks for: with --link, set points leave."""
     limits: tyro.conf.OmitArgPrefixes[Limits] = Limits()
@@ -66,6 +69,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         WorkFailed: where no vehicle answered.
     """
     from suite.judging.link.commanded import fly_commanded
+    from suite.judging.link.messages import signing_key
 
     asked = Evaluation(
         track=config.track,
@@ -83,4 +87,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             f"--link {config.link}: set points would move a vehicle; read docs/fly.md, do what it "
             "asks for, then give --confirm as well"
         )
-    return fly_commanded(asked, config.policy, config.link, config.limits, config.out, console)
+    if config.signing_key and not config.link:
+        raise ValueError("--signing-key is of a real link, and no --link is given")
+    return fly_commanded(
+        asked, config.policy, config.link, config.limits, config.out, console,
+        signing_key(config.signing_key),
+    )  # fmt: skip

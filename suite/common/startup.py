@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
+import warnings
 from collections.abc import Iterable, MutableMapping
 
 from tracks.common.files import user_cache
@@ -38,6 +39,13 @@ def open_streams() -> None:
         reconfigure = getattr(stream, "reconfigure", None)  # a test's own stream has none
         if reconfigure is not None:
             reconfigure(errors="backslashreplace")
+
+
+def hush() -> None:
+    """Leave numpy's warnings out, here and in processes of ours: errors have lines of their own."""
+    if not sys.warnoptions and "PYTHONWARNINGS" not in os.environ:
+        warnings.simplefilter("ignore", RuntimeWarning)
+        os.environ["PYTHONWARNINGS"] = "ignore::RuntimeWarning"
 
 
 def check_names(args: Iterable[str]) -> None:

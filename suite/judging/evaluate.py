@@ -113,8 +113,10 @@ def evaluate(
         seed=evaluation.seed,
     )
     write_run_record(out, evaluation, evaluation.seed)
-    for journal in out.glob("journal-*.jsonl"):  # those of an earlier command are done with, too
-        journal.unlink()
+    kept = {journal.path for journal in journals if journal.others(course.trials)}
+    for path in out.glob("journal-*.jsonl"):  # those of an earlier command are done with, too
+        if path not in kept:
+            path.unlink()
     for grid in grids(summary):
         console.show(rich_table(grid))
     for sentence in summary["sentences"]:
@@ -242,6 +244,11 @@ def _fly_one(
         missing = journal.missing(course.trials)
         if len(missing) < len(course.trials):
             console.note(f"{label}: {len(course.trials) - len(missing)} trials were flown before")
+        if others := journal.others(course.trials):
+            console.note(
+                f"{label}: {others} further trials were flown before and are not asked for now: "
+                f"the table is without them, {journal.path.name} keeps them"
+            )
         with console.progress(label, len(course.trials)) as update:
 
             def keep(result: TrialResult, flight: object) -> None:

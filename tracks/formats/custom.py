@@ -10,6 +10,7 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,11 +22,16 @@ from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
 from tracks.track import Track
 
+if TYPE_CHECKING:
+    import trimesh
+
 _START_BEHIND_M = 2.5
 FARTHEST_M = 1e5
 """Of a place from the origin, along each axis: as far as a flight log may go."""
 LEAST_M, MOST_M = 1e-3, 1e5
 """Of a length."""
+MOST_TABLES = 1000
+"""Gates, and solids of each kind, of a track: a second of reading."""
 _RESERVED = (
     *("ground", "parked", "quadrotor box"),
     *(f"rotor_{number} {part}" for number in range(1, 5) for part in ("arm", "disk")),
@@ -47,7 +53,7 @@ def load_track(path: str | os.PathLike[str]) -> Track:
     top = read_toml(Path(path))
     top.whole("schema", 1, least=1, most=1)
     name = top.text("name", top.path.stem)
-    gate_tables = top.tables("gates")
+    gate_tables = _tables(top, "gates")
     if not gate_tables:
         raise ValueError(f"{top.path}: holds no gate; add at least one [[gates]]")
     gates = _gates(gate_tables)
@@ -77,7 +83,7 @@ def load_track(path: str | os.PathLike[str]) -> Track:
     sizes = tuple(len(mesh) for mesh in meshes)
     all_names = (*frame_names, *solid_names)
     track = Track(name, 0, 0, 0.0, scene, start_pos_w, start_yaw, all_names, sizes)
-    _refuse_start_inside(top, track)
+    _refuse_inside(top, track, frame_names)
     return track
 
 
@@ -106,11 +112,18 @@ class _Names:
         return label
 
 
+def _tables(top: Table, kind: str) -> list[Table]:
+    tables = top.tables(kind)
+    if len(tables) > MOST_TABLES:
+        raise top.error(kind, len(tables), f"up to {MOST_TABLES} of them")
+    return tables
+
+
 def _read(
     top: Table, kind: str, read: Callable[[Table], tuple], names: _Names
 ) -> tuple[list[tuple], list[str]]:
     rows, labels = [], []
-    for number, table in enumerate(top.tables(kind)):
+    for number, table in enumerate(_tables(top, kind)):
         rows.append(read(table))
         labels.append(names(table, kind, number))
         table.close()
@@ -228,16 +241,32 @@ def _start(top: Table, gates: Gates) -> tuple[np.ndarray, float]:
     return pos_w, float(np.deg2rad(yaw_deg))
 
 
-def _refuse_start_inside(top: Table, track: Track) -> None:
+def _refuse_inside(top: Table, track: Track, frame_names: list[str]) -> None:
+    """Refuse a start, and an opening with all of its corners, that a solid holds."""
     # Here, so that only those who read a track pay for the import of trimesh.
     from tracks.formats.meshes import solid_meshes
 
+    gates, frames = track.scene.gates, set(frame_names)
+    corners_w = gates.center_w[:, None] + gates.opening_g @ np.swapaxes(gates.rot_w[:, :, 1:], 1, 2)
     for name, mesh in solid_meshes(track):
-        # All solids are convex: inside is on one side of every face, whichever way they are wound.
-        side = np.sum((track.start_pos_w - mesh.triangles[:, 0]) * mesh.face_normals, axis=-1)
-        if np.all(side < 0) or np.all(side > 0):
+        if _holds(mesh, track.start_pos_w):
             allowed = f"a position outside of every solid; this one is inside {name!r}"
             raise top.error("start.position", track.start_pos_w.tolist(), allowed)
+        if name in frames:
+            continue
+        # A solid is convex: with the corners of an opening it holds all of it.
+        shut = _holds(mesh, corners_w).all(axis=-1)
+        if shut.any():
+            gate = int(np.argmax(shut))
+            allowed = f"a place outside of every solid; the opening is inside {name!r}"
+            raise top.error(f"gates[{gate}].center", gates.center_w[gate].tolist(), allowed)
+
+
+def _holds(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """Return which points (..., 3) a convex mesh holds."""
+    side = np.sum((points[..., None, :] - mesh.triangles[:, 0]) * mesh.face_normals, axis=-1)
+    # Inside is on one side of every face, whichever way they are wound.
+    return np.all(side < 0, axis=-1) | np.all(side > 0, axis=-1)
 
 
 def _box(table: Table) -> tuple:
@@ -260,7 +289,7 @@ def _sphere(table: Table) -> tuple:
 
 def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
     placed = []
-    for number, table in enumerate(top.tables("meshes")):
+    for number, table in enumerate(_tables(top, "meshes")):
         file = top.path.parent / table.text("file")
         position, rot = _place(table, "position", (0.0, 0.0, 0.0)), rotation(table)
         scale = table.number("scale", 1.0, least=1e-6, most=1e6)

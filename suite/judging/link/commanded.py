@@ -52,7 +52,13 @@ class LinkFlights:
 
 
 def fly_commanded(
-    asked: Evaluation, policy: str, link: str, limits: Limits, out: Path, console: Console
+    asked: Evaluation,
+    policy: str,
+    link: str,
+    limits: Limits,
+    out: Path,
+    console: Console,
+    key: bytes | None = None,
 ) -> dict[str, Any]:
     """Fly and write logs and fly.json into `out`.
 
@@ -77,7 +83,7 @@ def fly_commanded(
     out.mkdir(parents=True, exist_ok=True)
     interrupt = None
     if link:
-        found = _real(flier, course, link, limits, out, console)
+        found = _real(flier, course, link, limits, out, console, key)
     else:
         flights: list[Flight] = []
         try:
@@ -109,7 +115,13 @@ def _judged(policy: Policy, course: Course, rules: Rules) -> list[bool]:
 
 
 def _real(
-    policy: Policy, course: Course, address: str, limits: Limits, out: Path, console: Console
+    policy: Policy,
+    course: Course,
+    address: str,
+    limits: Limits,
+    out: Path,
+    console: Console,
+    key: bytes | None,
 ) -> dict[str, Any]:
     from eval.worlds.trial import track_of
     from suite.judging.link.flights import warm_up
@@ -123,7 +135,7 @@ def _real(
         raise ValueError(f"--out {out} holds an earlier flight; give each one a folder of its own")
     (trial,) = course.trials
     warm_up(policy)
-    wire = Wire(COMPANION, VEHICLE)
+    wire = Wire(COMPANION, VEHICLE, key)
     link = UdpLink(address, wire.speaks)
     track = track_of(course.tracks, trial)
     companion = Companion(policy, track, course.vehicle, wire, time.monotonic, limits)

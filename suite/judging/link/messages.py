@@ -18,7 +18,11 @@ minus our z, and forward, right and down likewise. Both changes are the same hal
 
 from __future__ import annotations
 
+import copy
+import hashlib
+import time
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +30,7 @@ import numpy as np
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN
 from suite.common.errors import WorkFailed
 from tracks.geometry.rotation import quat_to_rot, to_local, to_world
+from tracks.input.reading import read_bytes, reason
 
 PACKET = 253
 """Bytes of an image in one message."""
@@ -33,6 +38,8 @@ MOST_PACKETS = 65535
 """Of one image."""
 IGNORE_ATTITUDE = 128
 """Bit of SET_ATTITUDE_TARGET's type mask."""
+SIGNING_EPOCH_S = 1420070400
+"""Begin of 2015, from which signatures count their time [s]."""
 LOCAL_NED, BODY_FRD = 1, 12
 """MAVLink's numbers of the frames."""
 _HEAD = b"P5\n%d %d\n65535\n"
@@ -102,6 +109,23 @@ def dialect() -> Any:
     return common
 
 
+def signing_key(path: Path | None) -> bytes | None:
+    """Return the key (32 bytes) of a passphrase's file, as ground stations make it; None without.
+
+    Raises:
+        ValueError: where the file cannot be read or is empty.
+    """
+    if path is None:
+        return None
+    try:
+        phrase = read_bytes(path, 4096).strip()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {reason(error)}") from None
+    if not phrase:
+        raise ValueError(f"{path}: is empty; write the passphrase of the link into it")
+    return hashlib.sha256(phrase).digest()
+
+
 class Wire:
     """One end of a link: our values to bytes, bytes to our values.
 
@@ -109,10 +133,21 @@ class Wire:
     and `broken`.
     """
 
-    def __init__(self, own: int, other: int) -> None:
-        """Make an end with the MAVLink system numbers of itself and of whom it listens to."""
+    def __init__(self, own: int, other: int, key: bytes | None = None) -> None:
+        """Make an end of a link.
+
+        Args:
+            own: MAVLink's system number of itself.
+            other: that of whom it listens to.
+            key: 32 bytes; with it messages are signed as MAVLink 2 says, and those that are not, or
+                were sent before, count as broken.
+        """
         self._dialect = dialect()
         self._out = self._dialect.MAVLink(None, srcSystem=own, srcComponent=1)
+        self._signing = self._dialect.MAVLink(None).signing
+        for signing in (self._out.signing, self._signing) if key else ():
+            signing.secret_key, signing.sign_outgoing = key, True
+            signing.timestamp = int((time.time() - SIGNING_EPOCH_S) * 1e5)
         self._own, self._other = own, other
         self.foreign = 0
         self.broken = 0
@@ -150,7 +185,7 @@ class Wire:
 
     def speaks(self, datagram: bytes) -> bool:
         """Say whether a datagram is of whom this end listens to."""
-        messages, _ = self._parsed(datagram)
+        messages, _ = self._parsed(datagram, keep=False)
         return any(
             message.get_type() != "BAD_DATA" and message.get_srcSystem() == self._other
             for message in messages
@@ -172,12 +207,17 @@ class Wire:
                         found += self._ours(message)
         return found
 
-    def _parsed(self, datagram: bytes) -> tuple[list[Any], bool]:
+    def _parsed(self, datagram: bytes, keep: bool = True) -> tuple[list[Any], bool]:
         """Return a datagram's messages, and whether its end is cut off."""
         # A parser of its own for each: what is cut off must not swallow what comes next.
         parser = self._dialect.MAVLink(None)
         parser.robust_parsing = True
-        return parser.parse_buffer(datagram) or [], parser.buf_len() > 0
+        parser.signing = copy.deepcopy(self._signing)
+        messages = parser.parse_buffer(datagram) or []
+        if keep and not any(message.get_type() == "BAD_DATA" for message in messages):
+            # The times of what was signed rightly; a forged one must not move them.
+            self._signing = parser.signing
+        return messages, parser.buf_len() > 0
 
     def _ours(self, message: Any) -> list[Message]:
         kind = message.get_type()
