@@ -187,3 +187,10 @@ def test_a_vehicle_is_written_so_that_it_can_be_read(tmp_path):
     (tmp_path / "it.toml").write_text(text)
     with pytest.raises(ValueError, match="a printable text"):
         load_vehicle(tmp_path / "it.toml")
+
+
+def test_warnings_of_numbers_are_not_for_people(root, tmp_path):
+    text = (Path(cli.__file__).parents[1] / "eval/vehicles/racer5.toml").read_text()
+    (tmp_path / "it.toml").write_text(text.replace("mass = 0.75", "mass = 1e300"))
+    done = suite(root, ["eval", "--vehicle", "it.toml", "--trials", "1"], cwd=tmp_path)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr

@@ -204,3 +204,28 @@ def test_the_mjx_world_flies_more_trials_than_it_has_slots(pilots, tmp_path):
         for world in ("mjx", "mujoco")
     ]
     assert len(ends[0]) == 150 and ends[0] == ends[1]
+
+
+def test_trials_that_are_not_asked_for_again_are_kept_and_said(pilots, tmp_path, capsys):
+    """A command that goes on with fewer trials must not lose what the first one has flown."""
+    from eval.judging.results import Journal
+
+    asked = ["--track", "zigzag", "--policy", pilots["diver"]]
+    keep = Journal.append
+
+    def three(self, result):
+        keep(self, result)
+        if len(self.done) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Journal, "append", three)
+        assert _eval(tmp_path, *asked, "--trials", "4") == 130
+    capsys.readouterr()
+    assert _eval(tmp_path, *asked, "--trials", "1") == 0
+    assert "2 further trials were flown before and are not asked for now" in _told(capsys)
+    assert len(read_trials(tmp_path / "trials.parquet")) == 1
+    assert _eval(tmp_path, *asked, "--trials", "4") == 0
+    assert "3 trials were flown before" in _told(capsys)
+    seeds = [row.seed for row in read_trials(tmp_path / "trials.parquet")]
+    assert seeds == [0, 1, 2, 3] and not list(tmp_path.glob("journal*"))

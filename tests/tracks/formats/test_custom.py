@@ -197,3 +197,25 @@ def test_parts_of_a_mesh_have_names_of_their_own(tmp_path):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ValueError, match="none.toml: cannot be read"):
         load_track(tmp_path / "none.toml")
+
+
+def test_a_gate_inside_a_solid_is_refused(tmp_path):
+    """It can be flown by nobody; one whose opening stands out of the solid can."""
+    gate = "[[gates]]\ncenter = [0, 0, 1.5]\nwidth = 1.0\nheight = 1.0\n"
+    gate += "[start]\nposition = [-9, 0, 1]\n"
+    box = '[[boxes]]\nname = "hall"\ncenter = [0, {y}, 1.5]\nsize = [2, 3, 3]\n'
+    path = tmp_path / "track.toml"
+    path.write_text(gate + box.format(y=0.0))
+    with pytest.raises(ValueError, match=r"gates\[0\].center is .*the opening is inside 'hall'"):
+        load_track(path)
+    path.write_text(gate + box.format(y=1.2))
+    assert load_track(path).names[-1] == "hall"
+
+
+@pytest.mark.parametrize("kind", ["gates", "spheres", "meshes"])
+def test_more_gates_and_solids_than_can_be_read_in_time_are_refused(tmp_path, kind):
+    gate = "[[gates]]\ncenter = [0, 0, 1.5]\nwidth = 1.0\nheight = 1.0\n"
+    path = tmp_path / "track.toml"
+    path.write_text(gate + f"[[{kind}]]\n" * 20_000)
+    with pytest.raises(ValueError, match=rf"{kind} is 2000[01], allowed is up to 1000 of them"):
+        load_track(path)

@@ -1,0 +1,56 @@
+"""Messages that are signed: forged, unsigned and repeated ones are left out."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from suite import cli
+from suite.judging.link.messages import Note, SetPoint, Wire, signing_key
+
+pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
+
+POINT = SetPoint(np.array([0.5, -0.25, 2.0]), 0.375)
+
+
+@pytest.fixture
+def key(tmp_path):
+    (tmp_path / "phrase").write_text("correct horse\n")
+    return signing_key(tmp_path / "phrase")
+
+
+def test_what_is_signed_is_heard_once(key):
+    vehicle, companion = Wire(1, 2, key), Wire(2, 1, key)
+    sent = companion.encoded(POINT)
+    assert vehicle.speaks(sent) and vehicle.speaks(sent), "to look is not to take"
+    assert len(vehicle.decoded([sent])) == 1 and vehicle.broken == 0
+    assert vehicle.decoded([sent]) == [] and vehicle.broken == 1, "sent again by someone else"
+    assert vehicle.decoded([companion.encoded(Note("a"))]) == [Note("a")]
+
+
+def test_what_is_not_signed_or_by_another_is_left_out(key):
+    vehicle, companion = Wire(1, 2, key), Wire(2, 1, key)
+    first = companion.encoded(POINT)
+    forged = bytearray(companion.encoded(Note("b")))
+    forged[-8:-6] = b"\xff\xff"  # of a later time, so that no true one would be later
+    for odd in (Wire(2, 1).encoded(POINT), Wire(2, 1, bytes(32)).encoded(POINT), bytes(forged)):
+        assert vehicle.decoded([odd]) == [] and not vehicle.speaks(odd)
+    assert vehicle.broken == 3 and len(vehicle.decoded([first])) == 1
+
+
+def test_without_a_key_nothing_is_signed():
+    sent = Wire(2, 1).encoded(POINT)
+    assert sent[2] == 0, "no flag of a signature"
+    assert len(Wire(1, 2).decoded([sent])) == 1 == len(Wire(1, 2).decoded([sent]))
+
+
+def test_a_key_is_of_a_file_with_a_phrase_and_of_a_real_link(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert signing_key(None) is None
+    (tmp_path / "empty").touch()
+    with pytest.raises(ValueError, match="write the passphrase"):
+        signing_key(tmp_path / "empty")
+    with pytest.raises(ValueError, match="cannot be read"):
+        signing_key(Path("nowhere"))
+    assert cli.main(["fly", "--signing-key", "empty"]) == 2
+    assert "no --link is given" in capsys.readouterr().err
