@@ -1,9 +1,11 @@
 """Odd inputs of every kind: each is used, or refused in a line; no traceback, no wait.
 
-At a small size with all tests; `pytest -m slow tests/test_fuzz.py` tries 10,000.
+At a small size with all tests; `pytest -m slow tests/test_fuzz.py` tries 1,000 of each kind of our
+own files and 10,000 of each foreign format.
 """
 
 import json
+import resource
 import time
 import warnings
 from dataclasses import replace
@@ -11,10 +13,13 @@ from pathlib import Path
 
 import onnx
 import pytest
+import trimesh
 from hypothesis import HealthCheck, given, settings
 
+from eval.importers import import_log
 from eval.importers.formats.table import read_map
-from eval.judging.results import Journal
+from eval.importers.options import ImportOptions
+from eval.judging.results import Journal, read_trials, write_trials
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies import shipped
@@ -26,17 +31,24 @@ from suite.judging.requests import Evaluation
 from suite.train.config import check
 from suite.train.overrides import override
 from suite.train.presets import preset, with_quadrotor
+from tests.support import foreign_logs
+from tests.support.judged_cells import ROWS
 from tests.support.mutations import changes, mutated_bytes, mutated_json, mutated_toml
 from tracks.common.files import plain
 from tracks.formats.custom import load_track
+from tracks.formats.mesh_reader import load_convex_parts
 
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = (
     *("set", "vehicle", "track", "mapping", "checkpoint", "policy.onnx", "flight.parquet"),
     *("flight.csv", "run.json", "journal"),
 )
-EACH = 1000
+FOREIGN = ("ulg", "mcap", "blackbox", "usd", "trials.parquet", "obj", "stl", "glb", "ply")
+"""Formats that other programs write, or that others hand over."""
+EACH, EACH_FOREIGN = 1000, 10_000
 """Inputs of each kind at full size."""
+MEMORY_BYTES = 2 * 2**30
+"""This process never has more; that which reads meshes has a limit of its own."""
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture]
 WITHIN_S = 10.0
 """None takes longer."""
@@ -86,6 +98,36 @@ def an_onnx():
     return onnx.helper.make_model(graph).SerializeToString()
 
 
+def a_foreign_file(kind, folder):
+    """Return the bytes of a short flight, a table or a mesh as other programs write it."""
+    path, short = folder / "whole", (0.0, 1.2)
+    if kind == "ulg":
+        return foreign_logs.write_ulog(path, short, rate=100.0).read_bytes()
+    if kind == "mcap":
+        return foreign_logs.write_mcap(path, short).read_bytes()
+    if kind == "blackbox":
+        return foreign_logs.write_blackbox(path, short, rate=200.0).read_bytes()
+    if kind == "usd":
+        return foreign_logs.write_usd(path, short).read_bytes()
+    if kind == "trials.parquet":
+        write_trials(path, ROWS, {})
+        return path.read_bytes()
+    data = trimesh.creation.icosphere(1).export(file_type=kind)
+    return data.encode() if isinstance(data, str) else data
+
+
+def foreign_reader(kind):
+    """Return what reads a foreign file."""
+    if kind == "trials.parquet":
+        return read_trials
+    if kind in ("obj", "stl", "glb", "ply"):
+        return lambda path: load_convex_parts([path])
+    # Of a partial log more is read than of one whose first fault ends it.
+    options = ImportOptions(partial=True, full_thrust=30.0)
+    name = {"ulg": "px4", "usd": "crazyflie", "blackbox": "betaflight"}.get(kind, kind)
+    return lambda path: import_log(path, name, options)
+
+
 def drawn_and_used(kind, folder):
     """Return the strategy of a kind of input, and what uses one."""
     recipe = with_quadrotor(preset("swift"), load_vehicle("racer5"))
@@ -99,6 +141,11 @@ def drawn_and_used(kind, folder):
 
         return use
 
+    if kind in FOREIGN:
+        valid = a_foreign_file(kind, folder)
+        read = filed(foreign_reader(kind), f"odd.{kind}")
+        read(valid)
+        return mutated_bytes(valid), read
     if kind == "set":
         return changes(recipe), lambda change: check(override(recipe, [change]))
     if kind == "vehicle":
@@ -138,12 +185,13 @@ def fuzz(kind, folder, count):
     each()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", (*KINDS, *FOREIGN))
 def test_odd_inputs_are_used_or_refused_in_a_line(kind, tmp_path):
     fuzz(kind, tmp_path, 20)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_ten_thousand_odd_inputs_are_used_or_refused_in_a_line(kind, tmp_path):
-    fuzz(kind, tmp_path, EACH)
+@pytest.mark.parametrize("kind", (*KINDS, *FOREIGN))
+def test_many_odd_inputs_are_used_or_refused_in_a_line(kind, tmp_path):
+    fuzz(kind, tmp_path, EACH_FOREIGN if kind in FOREIGN else EACH)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 < MEMORY_BYTES

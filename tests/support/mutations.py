@@ -17,8 +17,12 @@ JSON_ONLY = ("null", "NaN", "Infinity")
 
 
 def mutated_bytes(valid: bytes) -> st.SearchStrategy[bytes]:
-    """Return `valid` with one to four places overwritten, cut out, doubled or filled."""
-    place = st.integers(0, max(len(valid) - 1, 0))
+    """Return `valid` with one to four places overwritten, cut out, doubled or filled.
+
+    Half of them are in the first 2000 bytes, where most formats say what follows.
+    """
+    last = max(len(valid) - 1, 0)
+    place = st.one_of(st.integers(0, last), st.integers(0, min(last, 2000)))
     length = st.integers(0, 64)
     change = st.tuples(st.sampled_from("wxdtz"), place, length, st.binary(max_size=16))
 
