@@ -144,7 +144,7 @@ BAD = {
     ),
     "not printable": (
         GATE + '[[spheres]]\nname = "a\\u0000b"\ncenter=[0,0,0]\nradius=1\n',
-        "a printable name",
+        "a printable",
     ),
     "start": ("[start]\nposition = [0, 0, -1]\n" + GATE, "start.position.*above the ground"),
     "start in a box": (
