@@ -264,7 +264,8 @@ def _refuse_inside(top: Table, track: Track, frame_names: list[str]) -> None:
 
 def _holds(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     """Return which points (..., 3) a convex mesh holds."""
-    side = np.sum((points[..., None, :] - mesh.triangles[:, 0]) * mesh.face_normals, axis=-1)
+    origin = np.asarray(mesh.triangles)[:, 0]
+    side = np.sum((points[..., None, :] - origin) * mesh.face_normals, axis=-1)
     # Inside is on one side of every face, whichever way they are wound.
     return np.all(side < 0, axis=-1) | np.all(side > 0, axis=-1)
 
