@@ -109,8 +109,9 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
     except MemoryError:  # Arrow's own is one as well
         raise
     except (pa.ArrowException, OSError) as error:
+        first = str(error).splitlines()[0]  # Arrow says more than a line of a damaged file
         raise ValueError(
-            f"{path}: not a readable Parquet file ({error}); run suite eval again"
+            f"{path}: not a readable Parquet file ({first}); run suite eval again"
         ) from error
     if missing:
         raise ValueError(f"{path}: no column {missing[0]!r}; is it a trials.parquet of this suite?")
