@@ -138,7 +138,8 @@ def _cells(path: str | os.PathLike[str], name: str, column: Any, kind: str) -> l
             f"{path}: column {name!r} holds {column.type}, or cells without a value, where a "
             f"trial has {kind}; is it a trials.parquet of this suite?"
         )
-    return cells
+    # One NaN for all, so that equal trials are equal.
+    return [math.nan if cell != cell else cell for cell in cells]
 
 
 class Journal:
@@ -246,7 +247,7 @@ def _result(entry: Any) -> TrialResult:
     if not isinstance(entry, dict) or entry.keys() != set(TrialResult._fields):
         raise ValueError("its keys are not those of a trial")
     values = dict(entry)
-    for name, kind in TrialResult.__annotations__.items():
+    for name, kind in _kinds().items():
         if kind == "float" and values[name] is None:  # JSON has no NaN
             values[name] = math.nan
         elif isinstance(values[name], str):  # a million trials have a handful of words
