@@ -42,14 +42,22 @@ class Eye:
         self._rays_b = cast_rays_b(camera)
 
     def image(
-        self, model: mujoco.MjModel, data: mujoco.MjData, pos_w: np.ndarray, rot_w: np.ndarray
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        pos_w: np.ndarray,
+        rot_w: np.ndarray,
+        group: int | None = None,
     ) -> np.ndarray:
         """Return the planar depth image (H, W) [m] from pos_w (3,) and rot_w (3, 3).
 
-        The quadrotor itself is not seen. The solids' places must be computed in `data`. Rays have
-        an optical-axis component of 1, so the ray parameter is the planar depth; rays that hit
-        nothing read as the range.
+        The quadrotor itself is not seen, and of a `group` of geoms nothing but that. The solids'
+        places must be computed in `data`. Rays have an optical-axis component of 1, so the ray
+        parameter is the planar depth; rays that hit nothing read as the range.
         """
+        groups = None
+        if group is not None:
+            groups = (np.arange(mujoco.mjNGROUP) == group).astype(np.uint8)
         rays_w = (self._rays_b[:, None, :] * rot_w).sum(-1)
         count = len(rays_w)
         geom, depth = np.empty(count, np.int32), np.empty(count)
@@ -58,7 +66,7 @@ class Eye:
             data,
             pos_w,
             rays_w.ravel(),
-            None,
+            groups,
             True,
             BODY,
             geom,

@@ -7,7 +7,6 @@ the contacts of its current state computed, so that a state is judged before it 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import mujoco
@@ -34,8 +33,11 @@ from eval.worlds.trial import (
 )
 from policies.observation import View, view_of
 from policies.spec import ActionSpec
-from tracks.common.masks import packed, select
+from tracks.common.masks import packed, select, take
+from tracks.formats.mujoco_scene import MESH_GROUP
 from tracks.geometry.camera import Camera
+from tracks.geometry.scene import Scene, stack
+from tracks.geometry.tiles import depth_images, make_tiles
 from tracks.track import Track
 
 TO_CONTACTS = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -70,20 +72,21 @@ class SceneSlots(ABC):
             layout: what every track that will be loaded fits into.
             rules: when a trial ends.
             slots: how many trials fly at once.
-            threads: for physics and rays; the outcome is the same with any number.
+            threads: for physics; the outcome is the same with any number.
             action: what the policy commands; an acceleration without it.
         """
         self.slots = slots
         self._vehicle, self._layout, self._rules = vehicle, layout, rules
         self._autopilot = make_autopilot(vehicle, action)
         self.dt = self._autopilot.dt
-        self._eye = Eye(camera)
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._eye, self._tiles = Eye(camera), make_tiles(camera)
         self._threads = threads
         self._course = empty_course(slots, layout)
         self._progress = start_progress(np.zeros((slots, 3)))
         self._progress = self._progress._replace(ended=np.full(slots, -1, np.int32))
         self._models: list[mujoco.MjModel] = []
+        self._scene: Scene | None = None
+        self._meshes: dict[int, mujoco.MjData] = {}
         self._noise: list[Gusts] | None = None
         if uses_noise(self._autopilot.plant):
             self._noise = [Gusts(IDLE)] * slots
@@ -101,8 +104,6 @@ class SceneSlots(ABC):
         self._applied = self._batch.bind("qfrc_applied")
         self._contacts = self._batch.bind("ncon")
         self._xmat = self._batch.bind("xmat")
-        # Rays want the solids' places only, and those do not move: one MjData a slot serves all.
-        self._seen = [mujoco.MjData(model)] * self.slots
 
     def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
         """Start trials from (slot, track, trial)."""
@@ -111,9 +112,13 @@ class SceneSlots(ABC):
             if not self._models:
                 self._build(model)
             self._models[slot] = model
-            self._seen[slot] = mujoco.MjData(model)
-            mujoco.mj_kinematics(model, self._seen[slot])
             gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
+            scene = stack([track.scene._replace(gates=gates)], self._layout.solids, np.float64)
+            here = np.arange(self.slots) == slot
+            self._scene = select(here, scene, self._scene or scene)
+            if track.mesh_sizes:  # which do not move: places computed once serve all images
+                self._meshes[slot] = mujoco.MjData(model)
+                mujoco.mj_kinematics(model, self._meshes[slot])
             for field, value in zip(self._course.gates, gates, strict=True):
                 field[slot] = value
             self._course.count[slot] = len(track.scene.gates.center_w)
@@ -157,20 +162,16 @@ class SceneSlots(ABC):
     def view(self, wanted: np.ndarray) -> View:
         """Return what can be observed now."""
         motion = self._motion()
-        camera = self._eye.camera
+        camera, slots = self._eye.camera, np.flatnonzero(wanted)
         depth = np.full((self.slots, camera.height, camera.width), camera.range_m)
-
-        def look(slot: int) -> None:
-            depth[slot] = self._eye.image(
-                self._models[slot], self._seen[slot], motion.pos_w[slot], motion.rot_w[slot]
-            )
-
-        slots = np.flatnonzero(wanted).tolist()
-        if self._pool is None:
-            for slot in slots:
-                look(slot)
-        else:
-            list(self._pool.map(look, slots, chunksize=8))
+        scene, pos_w, rot_w = take((self._scene, motion.pos_w, motion.rot_w), slots)
+        depth[slots] = depth_images(self._tiles, scene, pos_w, rot_w)
+        for slot in slots.tolist():
+            if slot in self._meshes:
+                model, data = self._models[slot], self._meshes[slot]
+                pose = motion.pos_w[slot], motion.rot_w[slot]
+                meshes = self._eye.image(model, data, *pose, MESH_GROUP)
+                depth[slot] = np.minimum(depth[slot], meshes)
         gate = next_gate(self._course, self._progress.gates)
         after = next_gate(self._course, self._progress.gates + 1)
         return view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, after, depth)

@@ -44,3 +44,19 @@ def batch(track: Track, n: int, to=None) -> Scene:
     """Return the track's scene `n` times, padded to the counts `to`."""
     to = counts(track.scene) if to is None else to
     return jax.tree.map(jnp.asarray, stack([track.scene] * n, to))
+
+
+def by_mujoco(model, data, pos_w, rot_w, rays_b, range_m):
+    """Return planar depths (P, R) [m] by mj_multiRay, and the geoms hit."""
+    depths, hits = [], []
+    for pos, rot in zip(pos_w, rot_w, strict=True):
+        direction = np.ascontiguousarray(rays_b @ rot.T)
+        length = np.linalg.norm(direction, axis=-1)
+        geom, distance = np.zeros(len(rays_b), np.int32), np.zeros(len(rays_b))
+        mujoco.mj_multiRay(
+            model, data, pos, (direction / length[:, None]).ravel(), None, True, -1,
+            geom, distance, None, len(rays_b), mujoco.mjMAXVAL,
+        )  # fmt: skip
+        depths.append(np.where(distance < 0, range_m, np.minimum(distance / length, range_m)))
+        hits.append(geom)
+    return np.array(depths), np.array(hits)

@@ -6,6 +6,7 @@ A traced mask holds nothing yet, and a compiled program is the same whatever it 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -50,9 +51,18 @@ def packed(tree: Any) -> Any:
     lies as its parts do; without this a row's last bit could depend on the rows beside it.
     Arrays of JAX have one layout and are passed on.
     """
+    return _mapped(lambda x: np.ascontiguousarray(x) if isinstance(x, np.ndarray) else x, tree)
+
+
+def take(tree: Any, rows: Any) -> Any:
+    """Return an array, or nested tuples and dicts of such, indexed with `rows`."""
+    return _mapped(lambda x: x[rows], tree)
+
+
+def _mapped(function: Callable[[Any], Any], tree: Any) -> Any:
     if isinstance(tree, dict):
-        return {name: packed(part) for name, part in tree.items()}
+        return {name: _mapped(function, part) for name, part in tree.items()}
     if isinstance(tree, tuple):
-        parts = [packed(part) for part in tree]
+        parts = [_mapped(function, part) for part in tree]
         return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
-    return np.ascontiguousarray(tree) if isinstance(tree, np.ndarray) else tree
+    return function(tree)

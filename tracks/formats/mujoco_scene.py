@@ -16,6 +16,8 @@ from tracks.geometry.scene import Counts, Scene, pad
 
 GROUND = "ground"
 PARKED = "parked"
+MESH_GROUP = 1
+"""Geom group of meshes, for rays that shall meet nothing else."""
 _BAR = "/"
 
 
@@ -118,7 +120,8 @@ def _add_meshes(
         # Only the vertices: MuJoCo collides and casts rays against their convex hull.
         vertices = np.unique(corners, axis=0)
         spec.add_mesh(name=name, uservert=vertices.ravel().tolist())
-        spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+        kind = mujoco.mjtGeom.mjGEOM_MESH
+        spec.worldbody.add_geom(name=name, type=kind, meshname=name, group=MESH_GROUP)
 
 
 def _quats(rot: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from tests.support.scene_poses import POSES, batch, free_poses, model_of
+from tests.support.scene_poses import POSES, batch, by_mujoco, free_poses, model_of
 from tracks.families import FAMILIES, MAX_COUNTS, make_track
 from tracks.formats.custom import load_track
 from tracks.geometry.camera import Camera, optical_axis_b, pixel_rays_b
@@ -17,22 +17,6 @@ from tracks.geometry.scene import stack
 CAMERA = Camera()
 RAYS = pixel_rays_b(CAMERA)
 render = jax.jit(depth_image, static_argnames=("range_m", "limits"))
-
-
-def by_mujoco(model, data, pos_w, rot_w, rays_b, range_m):
-    """Return planar depths (P, R) [m] by mj_multiRay, and the geoms hit."""
-    depths, hits = [], []
-    for pos, rot in zip(pos_w, rot_w, strict=True):
-        direction = np.ascontiguousarray(rays_b @ rot.T)
-        length = np.linalg.norm(direction, axis=-1)
-        geom, distance = np.zeros(len(rays_b), np.int32), np.zeros(len(rays_b))
-        mujoco.mj_multiRay(
-            model, data, pos, (direction / length[:, None]).ravel(), None, True, -1,
-            geom, distance, None, len(rays_b), mujoco.mjMAXVAL,
-        )  # fmt: skip
-        depths.append(np.where(distance < 0, range_m, np.minimum(distance / length, range_m)))
-        hits.append(geom)
-    return np.array(depths), np.array(hits)
 
 
 def assert_same_but_at_silhouettes(depth, expected):

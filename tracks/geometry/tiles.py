@@ -1,0 +1,289 @@
+"""Planar depth images of many cameras at once (numpy): what MuJoCo's rays see, but faster.
+
+The image is cut into tiles of a few rays. A ray is only held against solids that reach into its
+tile, which are few; the planes between tiles go through the eye, so a solid's support in the
+direction of their normals says on which sides of them it is. Depths agree with MuJoCo's rays to
+rounding (1e-9 m), but for rays that graze an edge. Everything is a chain of single operations on
+double-precision numbers, so that an image depends on its own camera and scene and on nothing else
+in the batch.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tracks.common.masks import take
+from tracks.geometry.camera import Camera
+from tracks.geometry.cull import Bounds, bounds
+from tracks.geometry.rotation import to_local
+from tracks.geometry.scene import Boxes, Rods, Scene
+
+TILE = 6
+"""Rays across and down a tile, or as many as a pixel has."""
+PAIRS_AT_ONCE = 1024
+"""Solids in tiles that are cast together: what is worked on stays in the processor's cache."""
+RAYS_AT_ONCE = 1 << 20
+"""Of several images, to bound the memory."""
+_TINY, _FAR = 1e-200, 1e290
+"""What keeps divisors from zero, and a depth beyond every other."""
+
+
+class Tiles(NamedTuple):
+    """A camera's rays (1, left, up) in the camera's axes, tile by tile."""
+
+    camera: Camera
+    axes_b: np.ndarray
+    """(3, 3) columns: the optical axis, left and up, in body axes."""
+    left: np.ndarray
+    """(T, columns of tiles) of the T rays across a tile."""
+    up: np.ndarray
+    """(T, rows of tiles) of the T rays down a tile."""
+    left_edges: np.ndarray
+    """(columns of tiles + 1,) between the tiles."""
+    up_edges: np.ndarray
+    """(rows of tiles + 1,)."""
+
+
+class _Shape(NamedTuple):
+    """Convex solids of one kind in the axes of the camera that sees them, one a column."""
+
+    center: np.ndarray
+    """(3, V)."""
+    axes: tuple[np.ndarray, ...]
+    """Of the sides or the rod, (3, V) each."""
+    halves: tuple[np.ndarray, ...]
+    """(V,) how far the solid reaches along each."""
+    radius: np.ndarray
+    """(V,) around that; 0 of boxes."""
+
+    def take(self, index: np.ndarray) -> _Shape:
+        return take(self, (..., index))
+
+
+Linear = Callable[[np.ndarray], np.ndarray]
+"""Vectors (3, P) to their products (T, T, P) with the rays of P tiles."""
+Cast = Callable[[_Shape, Linear, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""(solids, products, squares of the rays) to where (T, T, P) rays enter and leave."""
+
+
+def make_tiles(camera: Camera) -> Tiles:
+    """Return the rays of `camera.cast_rays_b` in tiles; those at the far edges may look past it."""
+    pixels = max(1, TILE // camera.rays)
+    side = pixels * camera.rays
+    pitch = np.deg2rad(camera.pitch_deg)
+    sine, cosine = np.sin(pitch), np.cos(pitch)
+    axes_b = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+    rays, edges = [], []
+    for count, fov in zip((camera.width, camera.height), camera.fov_deg, strict=True):
+        half, tiles = np.tan(np.deg2rad(fov) / 2), -(-count // pixels)
+        ray = half * (1 - (2 * np.arange(tiles * side) + 1) / (count * camera.rays))
+        rays.append(np.ascontiguousarray(ray.reshape(tiles, side).T))
+        edges.append(half * (1 - 2 * np.arange(tiles + 1) * pixels / count))
+    return Tiles(camera, axes_b, *rays, *edges)
+
+
+def depth_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
+    """Return the planar depth images (N, H, W) [m]; what is beyond the range reads as the range.
+
+    Args:
+        tiles: of the camera.
+        scene: batched, (N, ...); its triangles are not seen.
+        pos_w: (N, 3) camera positions [m].
+        rot_w: (N, 3, 3) body to world.
+    """
+    camera, n = tiles.camera, len(pos_w)
+    most = max(1, RAYS_AT_ONCE // (camera.width * camera.height * camera.rays**2))
+    images = np.empty((n, camera.height, camera.width))
+    for low in range(0, n, most):
+        part = slice(low, low + most)
+        images[part] = _some_images(tiles, *take((scene, pos_w, rot_w), part))
+    return images
+
+
+def _some_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
+    camera, side = tiles.camera, len(tiles.up)
+    rows, columns = tiles.up.shape[1], tiles.left.shape[1]
+    # Axes of each camera in the world, (N, 3, 3), written out: see `tracks.geometry.rotation`.
+    axes_w = (rot_w[:, :, :, None] * tiles.axes_b).sum(-2)
+    depth = np.full((len(pos_w) * rows * columns, side * side), camera.range_m)
+    for (name, ball), cast in zip(bounds(scene), (_box, _cylinder, _capsule, _sphere), strict=True):
+        frame, number, rank = _in_view(tiles, ball, pos_w, axes_w)
+        solids = take(getattr(scene, name), (frame, number))
+        shape = _shape(solids, pos_w[frame], axes_w[frame])
+        across, down = _tiles_met(tiles, shape, flat=name == "cylinders")
+        which, row, column = np.nonzero(down[:, :, None] & across[:, None, :])
+        tile = (frame[which] * rows + row) * columns + column
+        # Solids of one rank are in images of their own, so no tile comes twice in a stretch.
+        stops = np.flatnonzero(np.diff(rank[which], append=-1)) + 1
+        for low in range(0, len(which), PAIRS_AT_ONCE):
+            high = min(low + PAIRS_AT_ONCE, len(which))
+            pairs = slice(low, high)
+            found = _first(
+                *cast(shape.take(which[pairs]), *_products(tiles, row[pairs], column[pairs]))
+            )
+            found = np.ascontiguousarray(found.reshape(side * side, -1).T)
+            inner = stops[(stops > low) & (stops < high)].tolist()
+            for start, end in zip([low, *inner], [*inner, high], strict=True):
+                met = tile[start:end]
+                depth[met] = np.minimum(depth.take(met, axis=0), found[start - low : end - low])
+    depth = depth.reshape(len(pos_w), rows, columns, side, side).transpose(0, 1, 3, 2, 4)
+    depth = depth.reshape(len(pos_w), rows * side, columns * side)
+    np.minimum(depth, _ground(tiles, pos_w, axes_w), out=depth)
+    depth = depth[:, : camera.height * camera.rays, : camera.width * camera.rays]
+    parts = range(camera.rays)
+    return functools.reduce(
+        np.minimum, (depth[:, i :: camera.rays, j :: camera.rays] for i in parts for j in parts)
+    )
+
+
+def _ground(tiles: Tiles, pos_w: np.ndarray, axes_w: np.ndarray) -> np.ndarray:
+    """Return the depths (N, rays down, rays across) of the ground, which is seen from above."""
+    axis, left, up = axes_w[:, 2].T[..., None]
+    down = -(axis + up * tiles.up.T.ravel())[:, :, None] - (left * tiles.left.T.ravel())[:, None]
+    height = np.where(pos_w[:, 2] < 0, np.inf, pos_w[:, 2])
+    return np.divide(height[:, None, None], np.maximum(down, _TINY, out=down), out=down)
+
+
+def _in_view(
+    tiles: Tiles, ball: Bounds, pos_w: np.ndarray, axes_w: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (V,) frame, number and rank in its frame of the solids whose `ball` is in view.
+
+    In the order of the ranks.
+    """
+    away = ball.center_w - pos_w[:, None]
+    depth, left, up = np.moveaxis(to_local(axes_w[:, None], away), -1, 0)
+    radius = ball.radius
+    seen = (depth + radius > 0) & (depth - radius < tiles.camera.range_m)
+    for offset, edges in ((left, tiles.left_edges), (up, tiles.up_edges)):
+        most, least = edges[0], edges[-1]
+        seen &= offset - most * depth < radius * np.sqrt(1 + most * most)
+        seen &= offset - least * depth > -radius * np.sqrt(1 + least * least)
+    frame, number = np.nonzero(seen)
+    rank = np.arange(len(frame)) - np.searchsorted(frame, frame)
+    order = np.argsort(rank, kind="stable")
+    return frame[order], number[order], rank[order]
+
+
+def _shape(solids: Any, pos_w: np.ndarray, axes_w: np.ndarray) -> _Shape:
+    """Return solids (V, ...) in the axes (V, 3, 3) of cameras at pos_w (V, 3)."""
+
+    def turned(vector_w: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(to_local(axes_w, vector_w).T)
+
+    center = turned(solids.center_w - pos_w)
+    if isinstance(solids, Boxes):
+        axes = tuple(turned(solids.rot_w[:, :, i]) for i in range(3))
+        return _Shape(center, axes, tuple(solids.half_size.T), np.zeros(len(pos_w)))
+    if isinstance(solids, Rods):
+        return _Shape(center, (turned(solids.axis_w),), (solids.half_length,), solids.radius)
+    return _Shape(center, (), (), solids.radius)
+
+
+def _tiles_met(tiles: Tiles, shape: _Shape, flat: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return which columns (V, columns) and rows (V, rows) of tiles each solid reaches into."""
+    met = []
+    for side, edges in ((1, tiles.left_edges), (2, tiles.up_edges)):
+
+        def along(vector: np.ndarray, side: int = side, edges: np.ndarray = edges) -> np.ndarray:
+            """Return the product (V, edges) with the normals of the planes through the edges."""
+            return vector[side, :, None] - edges * vector[0, :, None]
+
+        square = 1 + edges * edges
+        reach = shape.radius[:, None] * np.sqrt(square)
+        if flat:
+            across = square - along(shape.axes[0]) ** 2
+            reach = shape.radius[:, None] * np.sqrt(np.maximum(across, 0.0))
+        for axis, half in zip(shape.axes, shape.halves, strict=True):
+            reach = reach + np.abs(along(axis)) * half[:, None]
+        middle = along(shape.center)
+        met.append((middle - reach <= 0)[:, :-1] & (middle + reach >= 0)[:, 1:])
+    return met[0], met[1]
+
+
+def _products(tiles: Tiles, row: np.ndarray, column: np.ndarray) -> tuple[Linear, np.ndarray]:
+    """Return what multiplies vectors with the rays of P tiles, and the rays' own squares."""
+    left, up = tiles.left[:, column], tiles.up[:, row]
+
+    def linear(vector: np.ndarray) -> np.ndarray:
+        across, down = vector[0] + vector[1] * left, vector[2] * up
+        return across + down[:, None]
+
+    return linear, (1 + left * left) + (up * up)[:, None]
+
+
+def _first(enter: np.ndarray, leave: np.ndarray) -> np.ndarray:
+    """Return where solids are first met, 0 from inside."""
+    missed = enter > leave
+    missed |= leave <= 0
+    return np.maximum(enter, missed * _FAR, out=enter)  # many times faster than `numpy.where`
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _slab(center: np.ndarray, half: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the interval in which |t rate - center| <= half."""
+    rate += _TINY
+    inverse = np.divide(1.0, rate, out=rate)
+    middle = center * inverse
+    spread = np.abs(inverse, out=inverse)
+    spread *= half
+    return middle - spread, np.add(middle, spread, out=middle)
+
+
+def _ball(
+    square: np.ndarray, half: np.ndarray, excess: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the interval in which square t^2 - 2 half t + excess <= 0; far to near if in none."""
+    discriminant = half * half
+    discriminant -= square * excess
+    missed = (discriminant < 0) * _FAR
+    root = np.sqrt(np.maximum(discriminant, 0.0, out=discriminant), out=discriminant)
+    inverse = 1.0 / np.maximum(square, _TINY)
+    return (half - root) * inverse + missed, (half + root) * inverse - missed
+
+
+def _box(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    enter, leave = np.full_like(square, -np.inf), np.full_like(square, np.inf)
+    for axis, half in zip(shape.axes, shape.halves, strict=True):
+        near, far = _slab(_dot(shape.center, axis), half, linear(axis))
+        np.maximum(enter, near, out=enter)
+        np.minimum(leave, far, out=leave)
+    return enter, leave
+
+
+def _sphere(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    center = shape.center
+    excess = _dot(center, center) - shape.radius * shape.radius
+    return _ball(square, linear(center), excess)
+
+
+def _cylinder(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    (axis,), (half,), center, radius = shape.axes, shape.halves, shape.center, shape.radius
+    along, rate = _dot(center, axis), linear(axis)
+    excess = _dot(center, center) - along * along - radius * radius
+    enter, leave = _ball(square - rate * rate, linear(center) - along * rate, excess)
+    near, far = _slab(along, half, rate)
+    return np.maximum(enter, near), np.minimum(leave, far)
+
+
+def _capsule(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The parts overlap, so the stay in the whole is from the first entry to the last exit."""
+    (axis,), (half,) = shape.axes, shape.halves
+    parts = [_cylinder(shape, linear, square)]
+    parts += [
+        _sphere(shape._replace(center=shape.center + sign * half * axis), linear, square)
+        for sign in (-1.0, 1.0)
+    ]
+    for enter, leave in parts:
+        missed = (enter > leave) * _FAR
+        enter += missed
+        leave -= missed
+    enters, leaves = zip(*parts, strict=True)
+    return np.minimum.reduce(enters), np.maximum.reduce(leaves)
