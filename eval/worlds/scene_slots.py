@@ -112,19 +112,17 @@ class SceneSlots(ABC):
             if not self._models:
                 self._build(model)
             self._models[slot] = model
-            gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
-            scene = stack([track.scene._replace(gates=gates)], self._layout.solids, np.float64)
-            here = np.arange(self.slots) == slot
-            self._scene = select(here, scene, self._scene or scene)
             if track.mesh_sizes:  # which do not move: places computed once serve all images
                 self._meshes[slot] = mujoco.MjData(model)
                 mujoco.mj_kinematics(model, self._meshes[slot])
-            for field, value in zip(self._course.gates, gates, strict=True):
-                field[slot] = value
             self._course.count[slot] = len(track.scene.gates.center_w)
             if self._noise is not None:
                 self._noise[slot] = Gusts(trial)
         ids = np.array([slot for slot, _, _ in entries], np.int32)
+        started = np.zeros(self.slots, bool)
+        started[ids] = True
+        self._scene = self._scene_with([track.scene for _, track, _ in entries], ids, started)
+        self._course = self._course._replace(gates=self._scene.gates)
         self._batch.set_models(self._models)
         self._batch.reset(ids, stage=_NOTHING)
         for slot, track, _ in entries:
@@ -132,13 +130,26 @@ class SceneSlots(ABC):
         self._batch.forward(ids, stage=TO_CONTACTS)
 
         motion = self._motion()
-        started = np.zeros(self.slots, bool)
-        started[ids] = True
         noise = self._draws(np.where(started, -1, self._progress.step))
         fresh = start_autopilot(self._autopilot, motion, noise)
         self._loops = packed(select(started, fresh, getattr(self, "_loops", fresh)))
         self._progress = select(started, start_progress(motion.pos_w), self._progress)
         self._judge(started, np.zeros(self.slots, bool))
+
+    def _scene_with(self, scenes: list[Scene], ids: np.ndarray, started: np.ndarray) -> Scene:
+        """Return the scenes of all slots, but for the meshes, with `scenes` in the slots `ids`."""
+        layout = self._layout
+        padded = [
+            scene._replace(
+                gates=pad_gates(scene.gates, layout.gates, layout.corners),
+                triangles=scene.triangles[:0],
+            )
+            for scene in scenes
+        ]
+        number = np.zeros(self.slots, int)
+        number[ids] = np.arange(len(ids))
+        new = take(stack(padded, layout.solids._replace(triangles=0), np.float64), number)
+        return select(started, new, self._scene or new)
 
     def _motion(self) -> Motion:
         rot_w = self._xmat[:, BODY].reshape(self.slots, 3, 3).copy()

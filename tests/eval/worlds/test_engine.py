@@ -8,9 +8,13 @@ import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.engine import BODY, Eye, compile_model, contact_name, motion_of, start_state
+from eval.worlds.mujoco import MujocoWorld
+from eval.worlds.scene_slots import TO_CONTACTS
 from eval.worlds.slots import layout_of
+from eval.worlds.trial import Rules, TrialSpec
 from tests.support.courses import straight
 from tracks.formats.custom import load_track
+from tracks.formats.mujoco_scene import MESH_GROUP
 from tracks.geometry.camera import Camera, pixel_rays_b
 
 VEHICLE = load_vehicle("reference")
@@ -95,3 +99,27 @@ def test_a_contact_has_the_solids_name(wall):
     data.qpos[0] = 2.9
     mujoco.mj_step1(model, data)
     assert data.ncon > 0 and contact_name(model, data) == "the wall"
+
+
+def test_a_world_sees_what_mujocos_rays_see_meshes_too(root):
+    track = load_track(root / "tracks" / "examples" / "yard.toml")
+    assert track.mesh_sizes
+    layout, camera = layout_of([track]), Camera(rays=2)
+    world = MujocoWorld(VEHICLE, camera, layout, Rules(), slots=12)
+    world.load([(slot, track, TrialSpec("yard.toml", 0, slot)) for slot in range(12)])
+    model = compile_model(track, VEHICLE, world.dt, layout.solids)
+    data = mujoco.MjData(model)
+    yaw = np.arange(12) * np.pi / 6
+    world._qpos[:, :2] += np.stack([np.cos(yaw), np.sin(yaw)], -1)
+    world._qpos[:, 3], world._qpos[:, 6] = np.cos(yaw / 2), np.sin(yaw / 2)
+    world._batch.forward(np.arange(12, dtype=np.int32), stage=TO_CONTACTS)
+    wanted = yaw < 6.0
+    images, meshes = world.view(wanted).depth_m, 0
+    mujoco.mj_kinematics(model, data)
+    for slot in np.flatnonzero(wanted):
+        pose = world._qpos[slot, :3].copy(), world._xmat[slot, BODY].reshape(3, 3).copy()
+        expected = Eye(camera).image(model, data, *pose)
+        assert (np.abs(images[slot] - expected) > 1e-9).mean() < 2e-3  # rays that graze an edge
+        meshes += (Eye(camera).image(model, data, *pose, MESH_GROUP) < camera.range_m).sum()
+    assert meshes > 50
+    assert (images[~wanted] == camera.range_m).all()
