@@ -42,6 +42,8 @@ from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import check_family
 from tracks.track import Track
 
+COMPILED_SLOTS = 64
+"""Worlds that compile a program for their number of slots fly in multiples of this."""
 MOST_A_PIECE = 640
 """Trials; more are several pieces, where several processes share them."""
 Trial = TypeVar("Trial")
@@ -65,10 +67,10 @@ class Record:
 class JudgeOptions:
     """How trials are flown; `threads` and `workers` touch no outcome."""
 
-    slots: int = 64
+    slots: int = 128
     """Trials in the air at once, and rows of every call of the policy."""
     threads: int = 1
-    """Of physics and rays, in each process."""
+    """Of physics, in each process."""
     workers: Workers | None = None
     """Who shares the trials; None takes a process a core where there is work for them."""
     rules: Rules = field(default_factory=Rules)
@@ -188,7 +190,7 @@ def _workers(task: Task, trials: int) -> Workers:
     if asked is not None:
         return asked
     # A process takes seconds to start, and a policy object may not be of the kind that travels.
-    if compiles(task.world) or _is_policy(task.policy) or trials < 4 * task.options.slots:
+    if compiles(task.world) or _is_policy(task.policy) or trials < 2 * task.options.slots:
         return 1
     return usable_cores()
 
@@ -206,8 +208,9 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
             )  # fmt: skip
             yield index, result, None
         return
-    # A slot that stays empty only costs time.
-    slots = options.slots if compiles(task.world) else min(options.slots, max(1, len(share)))
+    # A slot that stays empty only costs time, but one more number of slots may cost a compilation.
+    block = COMPILED_SLOTS if compiles(task.world) else 1
+    slots = min(options.slots, block * max(1, math.ceil(len(share) / block)))
     world = world_class(task.world)(
         task.vehicle, policy.spec.camera, layout_of(task.tracks.values()), options.rules,
         slots=slots, threads=options.threads, **flown_by(task.world, policy.spec.action),

@@ -175,17 +175,20 @@ class SceneSlots(ABC):
         motion = self._motion()
         camera, slots = self._eye.camera, np.flatnonzero(wanted)
         depth = np.full((self.slots, camera.height, camera.width), camera.range_m)
-        scene, pos_w, rot_w = take((self._scene, motion.pos_w, motion.rot_w), slots)
-        depth[slots] = depth_images(self._tiles, scene, pos_w, rot_w)
-        for slot in slots.tolist():
-            if slot in self._meshes:
-                model, data = self._models[slot], self._meshes[slot]
-                pose = motion.pos_w[slot], motion.rot_w[slot]
-                meshes = self._eye.image(model, data, *pose, MESH_GROUP)
-                depth[slot] = np.minimum(depth[slot], meshes)
+        depth[slots] = self._images(slots, *take(motion[:2], slots))
         gate = next_gate(self._course, self._progress.gates)
         after = next_gate(self._course, self._progress.gates + 1)
         return view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, after, depth)
+
+    def _images(self, slots: np.ndarray, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
+        """Return what the cameras in `slots` (K,) see from pos_w (K, 3) and rot_w (K, 3, 3)."""
+        depth = depth_images(self._tiles, take(self._scene, slots), pos_w, rot_w)
+        for row, slot in enumerate(slots.tolist()):
+            if slot in self._meshes:
+                model, data = self._models[slot], self._meshes[slot]
+                meshes = self._eye.image(model, data, pos_w[row], rot_w[row], MESH_GROUP)
+                depth[row] = np.minimum(depth[row], meshes)
+        return depth
 
     @abstractmethod
     def _control(

@@ -29,7 +29,7 @@ SECONDS_A_TRIAL = 0.15
 START_SECONDS = 6.0
 """To import, compile the policy and the first scenes."""
 PROCESS_BYTES = 1.0e9
-"""Memory of one process that flies 64 trials at once."""
+"""Memory of one process that flies 128 trials at once."""
 
 
 def default_policy() -> str:

@@ -47,8 +47,8 @@ class Evaluation:
     time_limit_s: TimeLimit = 20.0
     """A trial ends at this time; a long course of your own needs more than the tables' 20 [s]."""
     deadline_s: Annotated[float, Range(0.0, 3600.0, above=True)] | None = None
-    """An answer of the policy that takes longer ends the trials that it was for (up to 64, which it
-    is asked about at once), as out of time [s]."""
+    """An answer of the policy that takes longer ends the trials that it was for (up to 128, which
+    it is asked about at once), as out of time [s]."""
     trust: bool = False
     """Also load policy files that can run code on this machine."""
     monitor: bool = False

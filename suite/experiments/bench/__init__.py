@@ -5,6 +5,7 @@ from __future__ import annotations
 BENCHES: dict[str, str] = {
     "train": "gradient steps a second against a plain torch-eager loop of the same method",
     "policy": "a step of the shipped policy exported as C against ONNX Runtime, on one thread",
+    "judge": "trials a second of processor time against the same with MuJoCo's own rays",
     "diagnose": "refits a minute of six numbers against mujoco.sysid on the same flights",
 }
 """Name -> one-line summary; NAME.py has `run() -> Comparison`."""

@@ -1,0 +1,79 @@
+"""`suite bench judge`: trials judged in MuJoCo, against the same with MuJoCo's own rays.
+
+The shipped policy flies level 9 of every family in one process. The baseline casts the rays of an
+image with `mj_multiRay`, one camera after the other, and flies 64 trials at once. Both are timed by
+the process's own processor time, which other work on the machine hardly changes.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from eval.judging.judge import JudgeOptions, fly
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds import WORLDS
+from eval.worlds.mujoco import MujocoWorld
+from eval.worlds.trial import Rules, TrialResult, TrialSpec
+from policies.policy import load_policy
+from suite.experiments.bench.compare import Comparison, Figure, in_turn
+from suite.judging.flying import default_policy
+from tracks.families import JUDGED
+
+TRIALS = 192
+BASELINE = "mujoco, its own rays"
+
+
+class OwnRays(MujocoWorld):
+    """The world `mujoco` with images by MuJoCo's rays."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._seen: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
+
+    def _images(self, slots: np.ndarray, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
+        images = []
+        for row, slot in enumerate(slots.tolist()):
+            model = self._models[slot]
+            if self._seen.get(slot, (None, None))[0] is not model:
+                self._seen[slot] = model, mujoco.MjData(model)
+                mujoco.mj_kinematics(*self._seen[slot])
+            images.append(self._eye.image(*self._seen[slot], pos_w[row], rot_w[row]))
+        return np.array(images)
+
+
+def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> Comparison:
+    """Time both in turn, and count the trials that end alike.
+
+    Args:
+        policy: who flies, by name or folder; by default the shipped one.
+        trials: of one pass.
+        time_limit_s: of a trial [s].
+    """
+    if BASELINE not in WORLDS:
+        WORLDS.register(BASELINE, OwnRays)
+    flier, vehicle = load_policy(policy or default_policy()), load_vehicle("reference")
+    specs = [TrialSpec(JUDGED[k % 3], 9, k // 3) for k in range(trials)]
+    ended: dict[str, list[TrialResult]] = {}
+
+    def judged(world: str, slots: int) -> None:
+        options = JudgeOptions(slots=slots, workers=1, rules=Rules(time_limit_s=time_limit_s))
+        ended[world] = fly(flier, specs, vehicle, world, options)
+
+    ours = partial(judged, "mujoco", JudgeOptions().slots)
+    seconds = in_turn(ours, partial(judged, BASELINE, 64), repeats=3, clock=time.process_time)
+    pairs = list(zip(*ended.values(), strict=True))
+    alike = sum((a.ended_by, a.gates_passed) == (b.ended_by, b.gates_passed) for a, b in pairs)
+    details = {
+        "policy": flier.name,
+        "rays_a_pixel": flier.spec.camera.rays**2,
+        "trials": trials,
+        "trials_that_end_alike": alike,
+        "images_a_trial": float(np.mean([a.time_s for a, _ in pairs])) * flier.spec.rate_hz,
+    }
+    rates = (Figure(trials / s, "trials/s of processor time") for s in seconds)
+    return Comparison("judge", *rates, details=details)
