@@ -75,5 +75,5 @@ def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> C
         "trials_that_end_alike": alike,
         "images_a_trial": float(np.mean([a.time_s for a, _ in pairs])) * flier.spec.rate_hz,
     }
-    rates = (Figure(trials / s, "trials/s of processor time") for s in seconds)
-    return Comparison("judge", *rates, details=details)
+    rates = [Figure(trials / taken, "trials/s of processor time") for taken in seconds]
+    return Comparison("judge", rates[0], rates[1], details=details)

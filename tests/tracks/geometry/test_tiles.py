@@ -127,5 +127,7 @@ def test_inside_a_solid_the_depth_is_zero_and_below_the_ground_it_is_not_seen():
 
 
 def test_no_camera_makes_no_image():
-    track = make_track("zigzag", 0, 0)
-    assert seen(FINE, track, np.zeros((0, 3)), np.zeros((0, 3, 3))).shape == (0, 24, 32)
+    nothing = take(
+        (batched(make_track("zigzag", 0, 0), 1), np.zeros((1, 3)), np.eye(3)[None]), slice(0)
+    )
+    assert depth_images(make_tiles(FINE), *nothing).shape == (0, 24, 32)
