@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import is_dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -214,8 +215,16 @@ def _complain(message: str) -> None:
     print(f"suite: {printable(message)}", file=sys.stderr)
 
 
+def _without_working_folder() -> None:
+    """Keep the working folder off the module path: its eval.py would stand for our package."""
+    root, here = Path(__file__).resolve().parents[1], Path.cwd()
+    if here != root:
+        sys.path[:] = [path for path in sys.path if path and Path(path).absolute() != here]
+
+
 def entry() -> None:
     """Be the program `suite`."""
+    _without_working_folder()
     from suite.common.running.hosts import several
 
     open_streams()

@@ -10,7 +10,7 @@ from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Vehicle
 from tracks.formats.mujoco_scene import add_scene, solid_name
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
-from tracks.geometry.scene import Counts
+from tracks.geometry.scene import Counts, counts
 from tracks.track import Track
 
 BODY = 1
@@ -92,6 +92,24 @@ def contact_name(model: mujoco.MjModel, data: mujoco.MjData) -> str:
     deepest = min(data.contact, key=lambda contact: contact.dist)
     own = [int(model.geom_bodyid[geom]) == BODY for geom in deepest.geom]
     return solid_name(model.geom(int(deepest.geom[1 if own[0] else 0])).name)
+
+
+def refuse_start_contact(name: str, track: Track, vehicle: Vehicle) -> None:
+    """Refuse a track on which `vehicle` touches something before it has flown.
+
+    Raises:
+        ValueError: naming the track, the start and what is touched.
+    """
+    model = compile_model(track, vehicle, 1.0 / vehicle.controller.frequency, counts(track.scene))
+    data = mujoco.MjData(model)
+    data.qpos[:] = start_state(track)
+    mujoco.mj_forward(model, data)
+    if data.ncon:
+        half = " x ".join(f"{2 * size:g}" for size in vehicle.body.half_size)
+        raise ValueError(
+            f"{name}: at start.position {np.round(track.start_pos_w, 3).tolist()} the body of "
+            f"{vehicle.name!r} ({half} m) touches {contact_name(model, data)}; move the start away"
+        )
 
 
 def start_state(track: Track) -> np.ndarray:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 TRIALS_A_PROCESS = 128
 """Fewer trials than this are not worth another process, which takes seconds to start."""
+GATE_MOST_M, TRACK_MOST_M = 50.0, 5000.0
+"""Larger ones are asked about: a file in millimetres is a thousand times as large [m]."""
 SECONDS_A_TRIAL = 0.15
 """Of one core in MuJoCo, for a trial of about 13 s on 70 solids."""
 START_SECONDS = 6.0
@@ -123,6 +125,7 @@ def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Cou
     from eval.effects import EFFECTS
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds import differences, world_class
+    from eval.worlds.engine import refuse_start_contact
 
     world_class(wanted.world)
     check_ranges(wanted, options=True)
@@ -137,8 +140,24 @@ def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Cou
             "which nothing acts by chance are the same at every seed; gusts and noise are not"
             for name in tracks
         ]
+    for name, track in tracks.items():
+        refuse_start_contact(name, track, vehicle)
+        notes += _in_millimetres(name, track)
     trials = trial_list(names, levels, wanted.trials, wanted.seed, once)
     return Course(trials, tracks, vehicle, flown_otherwise, notes)
+
+
+def _in_millimetres(name: str, track: Track) -> list[str]:
+    """Return a question where gates or the whole track are of no size that is flown in metres."""
+    gates = track.scene.gates
+    opening = float((gates.opening_g.max(1) - gates.opening_g.min(1)).max())
+    extent = float((gates.center_w.max(0) - gates.center_w.min(0)).max())
+    if opening <= GATE_MOST_M and extent <= TRACK_MOST_M:
+        return []
+    return [
+        f"{name}: its largest gate is {opening:g} m wide and its gates lie {extent:g} m apart; is "
+        "the file in millimetres? Lengths are in metres: divide them by 1000"
+    ]
 
 
 def log_name(track: str, difficulty: int, seed: int) -> str:

@@ -1,0 +1,50 @@
+"""Judge a plain function: a policy of rsl_rl, brax or your own, as it is in memory, without a file.
+
+The function here is a small network of JAX with random weights on top of a line that pulls to the
+gate. Run: python examples/jax_policy.py [TRIALS]
+"""
+
+from __future__ import annotations
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from eval.judging.judge import JudgeOptions, fly
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import TrialSpec
+from policies.block_policy import BlockPolicy, proven
+from policies.spec import ActionSpec, PolicySpec
+
+SPEC = PolicySpec(rate_hz=50.0, action=ActionSpec(scale=(20.0,), clip=1.0))  # actions -1 to 1
+
+
+def network(weights: jax.Array, state: jax.Array, image: jax.Array) -> jax.Array:
+    """Return actions (N, 3), -1 to 1, from state (N, 12) and image (N, 24, 32)."""
+    vel_b, gate_b = state[:, 0:3], state[:, 6:9]
+    ahead = gate_b / jnp.maximum(jnp.linalg.norm(gate_b, axis=-1, keepdims=True), 0.1)
+    seen = jnp.tanh(image.reshape(len(image), -1) @ weights)
+    return (2.5 * ahead - vel_b) / 10.0 + 0.01 * seen
+
+
+def main(trials: int) -> None:
+    """Fly the function in the judge and print how it went."""
+    weights = 0.01 * jax.random.normal(jax.random.key(0), (24 * 32, 3))
+    compiled = jax.jit(lambda state, image: network(weights, state, image))
+
+    def model(
+        state: np.ndarray, image: np.ndarray, hidden: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return np.asarray(compiled(state, image)), hidden  # (0,) hidden: without memory
+
+    policy = proven(BlockPolicy("jax", SPEC, model, (0,)), "jax_policy")
+    asked = [TrialSpec("random", 0, seed) for seed in range(trials)]
+    results = fly(policy, asked, load_vehicle("racer5"), options=JudgeOptions(workers=1))
+    for result in results:
+        print(f"seed {result.seed}: {result.gates_passed} gates, {result.ending}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if sys.argv[1:] else 10)

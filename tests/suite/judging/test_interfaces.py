@@ -1,0 +1,73 @@
+"""What a person is told about a policy file, a track file and a working folder of their own."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.engine import refuse_start_contact
+from policies.contract import contract_of
+from suite.commands import check
+from suite.common.console import Quiet
+from suite.judging.flying import _in_millimetres
+from tests.support.courses import straight
+
+
+def test_a_start_that_touches_the_ground_or_a_frame_is_refused():
+    vehicle, track = load_vehicle("racer5"), straight()
+    refuse_start_contact("here", track, vehicle)
+    low = replace(track, start_pos_w=np.array([*track.start_pos_w[:2], 0.02]))
+    with pytest.raises(ValueError, match="here: at start.position .* touches ground; move"):
+        refuse_start_contact("here", low, vehicle)
+
+
+def test_a_track_in_millimetres_is_asked_about():
+    track = straight()
+    assert _in_millimetres("here", track) == []
+    gates = track.scene.gates._replace(center_w=1000 * track.scene.gates.center_w)
+    gates = gates._replace(opening_g=1000 * gates.opening_g)
+    large = replace(track, scene=track.scene._replace(gates=gates))
+    assert "millimetres" in _in_millimetres("here", large)[0]
+
+
+def test_an_eval_py_in_the_working_folder_does_not_stand_for_ours(tmp_path, root):
+    (tmp_path / "eval.py").write_text("raise SystemExit('mine')\n")
+    code = f"import sys; sys.path[:0] = ['', {str(root)!r}]; sys.argv[1:] = ['info', '--json']\n"
+    code += "from suite.cli import entry; entry()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0 and "mine" not in done.stderr, done.stderr
+
+
+def test_check_reports_the_contract_and_what_looks_wrong(tmp_path):
+    answer = check.run(check.Config("swift-small", trials=1), Quiet())
+    assert answer["findings"] == [] and answer["contract"]["digest"]
+    with pytest.raises(ValueError, match="--policy is missing"):
+        check.run(check.Config(), Quiet())
+
+
+def test_check_reports_a_file_that_says_nothing_and_is_unscaled(tmp_path):
+    import torch
+
+    from policies.formats.export import export_module
+    from policies.spec import PolicySpec
+
+    class Unscaled(torch.nn.Module):
+        def forward(self, state, image):
+            return torch.tanh(state[:, 6:9]) + 0 * image.mean((1, 2))[:, None]
+
+    import onnx
+
+    path = export_module(Unscaled(), tmp_path / "it.onnx", PolicySpec())
+    proto = onnx.load(path)
+    del proto.metadata_props[:]
+    onnx.save(proto, path)
+    answer = check.run(check.Config(str(path), trials=1), Quiet())
+    faults = [finding["fault"] for finding in answer["findings"]]
+    assert faults[0] == "no_contract" and "action_scale" in faults
+    assert "30 Hz" in answer["findings"][0]["evidence"]
+    assert answer["contract"]["digest"] == contract_of(PolicySpec()).digest
