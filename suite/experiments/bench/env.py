@@ -34,6 +34,6 @@ def run(envs: int = ENVS, decisions: int = DECISIONS, repeats: int = 3) -> Compa
                     env.reset()
 
     seconds = in_turn(ours, baseline, repeats)
-    rates = (Figure(envs * decisions / each, "decisions/s") for each in seconds)
+    first, second = (Figure(envs * decisions / each, "decisions/s") for each in seconds)
     details = {"environments": envs, "image": "24 x 32", "vehicle": "racer5"}
-    return Comparison("env", *rates, details=details)
+    return Comparison("env", first, second, details=details)
