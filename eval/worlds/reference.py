@@ -126,7 +126,7 @@ def fly_trial(
             last_b = np.repeat(action_b, rows, 0)
             guarded, hidden = ask(limits, policy, hidden, *inputs, fresh, last_b)
             action_b = guarded.action_b[:1]
-            outputs.add(Guarded(*(part[:1] for part in guarded)), state)
+            outputs.add(Guarded(*(part[:1] for part in guarded)), state.astype(np.float32))
             bad, limited = bad + int(guarded.bad[0]), limited + int(guarded.limited[0])
             decisions += 1
             if guarded.late[0]:
