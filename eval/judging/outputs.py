@@ -56,10 +56,10 @@ class Outputs:
     def columns(self, slot: int) -> dict[str, Any]:
         """Return what a `TrialResult` says of the outputs in `slot`."""
         count = int(self._count[slot])
-        up = float(self._up[slot]) / count if count and self._is_acceleration else np.nan
+        up = float(self._up[slot]) / count if count and self._is_acceleration else 0.0
         return {
             "decisions": count,
-            "output_max": float(self._largest[slot]) or np.nan,
+            "output_max": float(self._largest[slot]),
             "action_up": up,
         }
 
@@ -91,7 +91,7 @@ def _warnings(
     if bad:
         seen = f"{bad:.1%} of its actions were not finite and the last good one was flown"
         found.append(Doubt("action_not_finite", seen, "check its weights and its normalisation"))
-    if plain and np.nanmax([0.0, *largest]) <= UNIT and np.isfinite(largest).any():
+    if plain and 0.0 < max(largest) <= UNIT:
         seen = "its outputs are always within -1 to 1 m/s^2 and look unscaled"
         fix = "export it with the contract of its environment, or give action.scale"
         found.append(Doubt("action_scale", seen, fix))

@@ -5,7 +5,6 @@ The rules are pure functions of arrays over many trials (N rows) and take numpy 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -73,10 +72,10 @@ class TrialResult(NamedTuple):
     is set, or not at all; else 0."""
     decisions: int = 0
     """Answers of the policy; 0 in files that do not say."""
-    output_max: float = math.nan
-    """Largest component of the policy's own output by size, before its scale; NaN for none."""
-    action_up: float = math.nan
-    """Mean vertical component of wanted net accelerations [m/s^2]; NaN of other actions."""
+    output_max: float = 0.0
+    """Largest component of the policy's own output by size, before its scale; 0 for none."""
+    action_up: float = 0.0
+    """Mean vertical component of wanted net accelerations [m/s^2]; 0 of other actions."""
 
     @property
     def trial(self) -> TrialSpec:

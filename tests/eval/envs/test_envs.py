@@ -12,6 +12,7 @@ from absl.testing import absltest
 from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
 
+from eval.envs import register
 from eval.envs.race import ACTION_LIMIT
 from eval.judging.judge import JudgeOptions, fly
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -30,6 +31,7 @@ EVEN = PolicySpec(rate_hz=50.0)  # a whole number of physics steps, so that the 
 
 
 def test_gymnasium_checker():
+    register()
     check_env(gymnasium.make("diffracing/Race-v0", rules=Rules(time_limit_s=0.5)).unwrapped)
 
 
