@@ -28,7 +28,7 @@ DOORS = (
 )  # fmt: skip
 
 
-def _imported(path, top_level_only=False):
+def imported(path, top_level_only=False):
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in tree.body if top_level_only else ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -45,7 +45,7 @@ def test_imports_go_one_way(room):
         f"{path.relative_to(ROOT)} imports {name}"
         for path in FILES
         if path.relative_to(ROOT).parts[0] == room
-        for name in _imported(path)
+        for name in imported(path)
         if name.split(".")[0] in to_the_right
     ]
     assert not wrong
@@ -82,19 +82,10 @@ def test_rooms_open_empty_and_their_folders_without_a_heavy_library():
         f"{path.relative_to(ROOT)} imports {name}"
         for path in FILES
         if path.name == "__init__.py"
-        for name in _imported(path, top_level_only=True)
+        for name in imported(path, top_level_only=True)
         if name.split(".")[0] not in (light if path.parent.parent == ROOT else (*light, "numpy"))
     ]
     assert not heavy
-
-
-def test_no_file_is_longer_than_400_lines():
-    long = {
-        str(path.relative_to(ROOT)): lines
-        for path in FILES
-        if (lines := len(path.read_text(encoding="utf-8").splitlines())) > 400
-    }
-    assert not long
 
 
 def test_every_package_is_typed_and_has_an_init():

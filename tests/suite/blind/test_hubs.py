@@ -20,9 +20,3 @@ def test_torque_of_hubs_in_a_turning_body(name, plane):
     torque = np.cross(place, force).sum(axis=0)
     found = damping_of_hubs([{"name": name, "parameters": {"coefficient": K}}], PLAIN)
     np.testing.assert_allclose(-found * rate_b * PLAIN.inertia, torque, rtol=1e-3, atol=1e-9)
-
-
-def test_other_effects_bring_none():
-    assert not damping_of_hubs(
-        [{"name": "thrust_scale", "parameters": {"scale": 0.9}}], PLAIN
-    ).any()

@@ -29,6 +29,12 @@ def effect(name, *alternatives, **parameters):
     return {"name": name, "alternatives": list(alternatives), "parameters": table}
 
 
+def hidden(name, **parameters):
+    """Return the truth of a case with an effect that no other looks like."""
+    one = {"name": name, "parameters": parameters, "multiple": 2.0, "required": [], "allowed": []}
+    return {"kind": "single", "effects": [one]}
+
+
 def said(*effects, verdict="named", after=0.5, floor=0.5):
     return {
         "verdict": verdict,
@@ -59,26 +65,14 @@ def test_sets_are_held_to_what_the_data_can_tell(effects, found, extra):
 
 
 def test_two_effects_need_both():
-    second = {**TRUTH["effects"][0], "name": "mass_offset", "required": [], "allowed": []}
-    pair = {"kind": "pair", "effects": [*TRUTH["effects"], second]}
+    pair = {"kind": "pair", "effects": [*TRUTH["effects"], *hidden("mass_offset")["effects"]]}
     one, other = effect("rotor_drag", "linear_drag"), effect("mass_offset")
     assert score_case("c", pair, said(other, one), 1.0).exact
     assert not score_case("c", pair, said(one), 1.0).found
 
 
 def test_intervals_count_by_component_and_leave_out_what_cannot_be_seen():
-    truth = {
-        "kind": "single",
-        "effects": [
-            {
-                "name": "com_offset",
-                "parameters": {"offset": [0.001, 0.002, None]},
-                "multiple": 2.0,
-                "required": [],
-                "allowed": [],
-            }
-        ],
-    }
+    truth = hidden("com_offset", offset=[0.001, 0.002, None])
     found = effect("com_offset", offset=[[0.0, 0.002], [0.003, 0.004], None])
     assert score_case("c", truth, said(found), 1.0).covered == (True, False)
     other = effect("torque_trim", "com_offset", offset=[[0.0, 1.0]])
@@ -86,18 +80,7 @@ def test_intervals_count_by_component_and_leave_out_what_cannot_be_seen():
 
 
 def test_a_weak_motor_is_matched_by_its_number():
-    truth = {
-        "kind": "single",
-        "effects": [
-            {
-                "name": "weak_motor",
-                "parameters": {"scale": [1.0, 1.0, 0.9, 1.0]},
-                "multiple": 2.0,
-                "required": [],
-                "allowed": [],
-            }
-        ],
-    }
+    truth = hidden("weak_motor", scale=[1.0, 1.0, 0.9, 1.0])
     found = effect("weak_motor", scale=[0.88, 0.92])
     found["parameters"]["index"] = {"value": 3}
     assert score_case("c", truth, said(found), 1.0).covered == (True,)
@@ -145,16 +128,15 @@ def test_a_diagnosis_that_failed_is_not_one_that_rightly_named_nothing():
 
 
 def test_damping_by_moving_hubs_is_there_where_its_size_is_right():
-    hidden = {"kind": "single", "effects": [{**TRUTH["effects"][0], "name": "rotor_drag"}]}
     drag, hubs = effect("rotor_drag", "linear_drag"), np.array([0.0, 0.0, 0.05])
 
     def found(*size):
         damping = effect("angular_damping")
         damping["parameters"] = {"coefficient": {"value": list(size), "ci95": [None] * 3}}
-        return score_case("c", hidden, said(drag, damping), 1.0, hubs)
+        return score_case("c", TRUTH, said(drag, damping), 1.0, hubs)
 
     right = found(0.0, 0.0, 0.06)
     assert (right.exact, right.extra, right.brought) == (True, 0, 1)
     assert found(0.0, 0.0, 0.2).extra == found(0.06, 0.0, 0.0).extra == 1
     assert found(0.2, 0.0, 0.06).extra == 1
-    assert score_case("c", hidden, said(drag), 1.0, hubs).exact
+    assert score_case("c", TRUTH, said(drag), 1.0, hubs).exact

@@ -1,19 +1,12 @@
 """Who flies a case: what the diagnosis is given of it, and what it is not."""
 
-import json
-
 import numpy as np
 import pytest
 
-from eval.logs.flight_log import read_flight
-from eval.quadrotor.vehicle_file import load_vehicle
-from suite.blind import make as make_module
 from suite.blind.build import build
 from suite.blind.cases import Case
 from suite.blind.continuous.timing import draw_conditions
-from suite.blind.make import make_set, open_answers
 from suite.blind.simulators import simulator_for
-from suite.common.console import Console
 
 SINGLE = Case(
     "single", ("linear_drag",), 6.0, "bare", "estimator", (6, 70_001), simulator="continuous"
@@ -30,6 +23,8 @@ def test_a_continuous_case_is_the_same_to_the_bit_and_its_vehicle_has_the_loop_t
     conditions = first.answer["conditions"]
     assert first.nominal.controller.frequency == conditions["loop_hz"]
     assert first.nominal.name == "bare" and not first.nominal.effects
+    about = dict(first.logs[0].about)
+    assert about == {"source": "suite blind", "vehicle": "bare"}, "nothing of the conditions"
     assert first.recordings[0].dt == 0.002, "for the oracle"
     spacing = np.median(np.diff(first.logs[0].time_s))
     assert spacing == pytest.approx(1.0 / conditions["row_hz"], rel=0.1)
@@ -54,21 +49,3 @@ def test_conditions_are_drawn_from_the_cases_seed():
     assert not simulator_for(
         Case("null", (), 0.0, "bare", "full", (1, 1)), np.random.default_rng()
     ).conditions
-
-
-def test_a_set_of_continuous_cases_gives_nothing_away(tmp_path, monkeypatch):
-    cases = {"case_001": SINGLE, "case_002": NULL}
-    monkeypatch.setitem(make_module.DRAWERS, "continuous", lambda seed, count: cases)
-    make_set(tmp_path, 6, None, Console(), "continuous")
-    answers = open_answers(tmp_path)
-    assert answers["case_001"]["case"]["simulator"] == "continuous"
-    for name in cases:
-        folder = tmp_path / "cases" / name
-        log = read_flight(folder / "flight_1.parquet")
-        vehicle = load_vehicle(str(folder / "vehicle.toml"))
-        about = dict(log.about)
-        assert about.pop("source") == "suite blind" and about.pop("vehicle") == vehicle.name
-        assert about.pop("seed") is None
-        assert set(about) == {"schema", "suite_version", "git_commit"}
-        assert vehicle.controller.frequency == answers[name]["conditions"]["loop_hz"]
-        assert "conditions" not in json.dumps(log.about)

@@ -38,33 +38,18 @@ def test_an_error_raised_on_purpose_in_a_worker_process_is_a_message():
     assert explained is not None and explained[0] == 2
 
 
-@pytest.mark.parametrize(
-    ("number", "code"),
-    [
-        (errno.EROFS, 2),
-        (errno.ENAMETOOLONG, 2),
-        (errno.ELOOP, 2),
-        (errno.ENXIO, 2),
-        (errno.EACCES, 2),
-        (errno.ENOSPC, 1),
-        (errno.EIO, 1),
-        (errno.EMFILE, 1),
-    ],
-)
-def test_what_the_system_refuses_is_one_line_with_the_file(number, code):
-    told = explain(OSError(number, os.strerror(number), "runs/x"))
-    assert told is not None and told[0] == code and "runs/x" in told[1]
+def test_what_the_system_refuses_is_one_line_with_the_file():
+    usage = ("EROFS", "ENAMETOOLONG", "ELOOP", "ENXIO", "EACCES")
+    for name in (*usage, "ENOSPC", "EIO", "EMFILE"):
+        number = getattr(errno, name)
+        told = explain(OSError(number, os.strerror(number), "runs/x"))
+        assert told is not None and told[0] == (2 if name in usage else 1), name
+        assert "runs/x" in told[1]
 
 
-def test_a_name_of_any_length_is_shown_short():
-    with pytest.raises(OSError) as met:
-        open("x" * 10_000)
+@pytest.mark.parametrize(("name", "words"), [("x" * 10_000, "xxx"), ("a\0b", "NUL")])
+def test_a_name_that_cannot_be_is_a_short_message(name, words):
+    with pytest.raises((OSError, ValueError)) as met:
+        open(name)
     told = explain(met.value)
-    assert told is not None and told[0] == 2 and len(told[1]) < 400
-
-
-def test_a_name_with_nul_is_a_message():
-    with pytest.raises(ValueError) as met:
-        open("a\0b")
-    told = explain(met.value)
-    assert told is not None and told[0] == 2 and "NUL" in told[1]
+    assert told is not None and told[0] == 2 and words in told[1] and len(told[1]) < 400

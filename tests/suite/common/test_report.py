@@ -1,7 +1,11 @@
 """A report as one HTML file."""
 
 import base64
+import struct
 
+from matplotlib.figure import Figure
+
+from suite.common.charts import DPI, png
 from suite.common.report import Details, Links, Picture, Report, Section, ranged, write_report
 from tracks.common.grid import Cell, Grid
 
@@ -31,3 +35,9 @@ def test_a_page_holds_everything_and_escapes_what_is_text(tmp_path):
 
 def test_a_mean_with_its_least_and_most():
     assert ranged(2.0, 1.25, 3.0, 1) == "2.0 [1.2, 3.0]"
+
+
+def test_a_figure_is_a_png_file_of_its_size():
+    file = png(Figure(figsize=(2.0, 1.0)))
+    assert file.startswith(b"\x89PNG")
+    assert struct.unpack(">II", file[16:24]) == (2 * DPI, DPI)

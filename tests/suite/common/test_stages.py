@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 
 from suite.common.console import Console
-from suite.common.stages import MARK, Estimate, Stage, claim, do_stages
+from suite.common.stages import MARK, Estimate, Stage, announce, claim, do_stages
 
 
 @dataclass(frozen=True)
@@ -57,3 +57,10 @@ def test_a_folder_of_another_configuration_is_refused(tmp_path):
     (tmp_path / "run.json").write_text("{}")
     with pytest.raises(ValueError, match="not the record of a run"):
         claim(tmp_path, Settings(), 0)
+
+
+def test_an_estimate_is_said_and_missing_memory_is_warned_of(capsys):
+    announce(Console(), "training", Estimate(seconds=130, memory_bytes=2e9))
+    assert capsys.readouterr().err == "training: about 2 min 10 s and 2.0 GB of memory\n"
+    announce(Console(), "training", Estimate(seconds=1, memory_bytes=1e18))
+    assert "warning" in capsys.readouterr().err

@@ -92,29 +92,3 @@ def test_spread_and_pooled_interval_by_hand():
     line = [cell.text for cell in _main([field], 10).rows[0]]
     assert line[2:5] == ["90 [80, 100]", "[74, 97]", "95"]
     assert line[8:11] == ["6.0 [5.0, 7.0]", "7.0", "6.5"]
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["--seed", "0"], "--seed 0 is one of --training-seeds"),
-        (["--training-seeds", "1", "1"], "--training-seeds is 1 1"),
-        (["--only", "field 0.41"], "Did you mean 'field 0.4'?"),
-        (["--preset", "smal"], "Did you mean 'small'?"),
-        (["--workers", "0"], "--workers is '0'"),
-        (["--set", "episode.batch=9"], "this command sets episode.batch; give --worlds"),
-        (["--set", "episode.gates=6"], "this command sets episode.gates; all fly 4"),
-        (["--set", "loss.projection=3"], "this command sets loss.projection; it is compared"),
-        (
-            ["--set", "loss.field_gain=0"],
-            "loss.field_gain is 0, allowed is a number above: the field",
-        ),
-        (["--trials", "0"], "--trials is 0"),
-        (["--seconds", "0"], "--seconds is 0"),
-    ],
-)
-def test_what_cannot_be_used_is_said_before_anything_is_trained(args, words, tmp_path, capsys):
-    assert reproduce(tmp_path, "ablation", *args) == 2
-    said = capsys.readouterr().err
-    assert words in said and len(said.strip().splitlines()) == 1
-    assert not list(tmp_path.iterdir())

@@ -20,27 +20,57 @@ def test_an_experiment_that_does_not_exist_is_code_2(capsys):
 
 
 @pytest.mark.parametrize(
-    ("args", "words"),
+    ("line", "words"),
     [
-        (["table2", "--trials", "0"], "--trials is 0"),
-        (["table2", "--policy", "racr"], "Did you mean 'racer'?"),
-        (["table2", "--delta-policy", "nowhere/policy"], "nowhere/policy: no such file"),
-        (["table2", "--vehicle", "referense"], "Did you mean 'reference'?"),
-        (["worlds", "--policy", "{folder}/mine.pt2"], "suite reproduce does of no policy"),
-        (["robustness", "--only", "linear_darg"], "Did you mean 'linear_drag'?"),
-        (["robustness", "--policy", "racer", "--policy", "racer"], "--policy racer is given twice"),
-        (["seeds", "--policies", "racer", "racer"], "--policies racer is given twice"),
-        (["seeds", "--preset", "smal"], "Did you mean 'small'?"),
-        (["seeds", "--training-seeds", "1", "1"], "--training-seeds is 1 1"),
-        (["seeds", "--policies", "racer", "--trials", "0"], "--trials is 0"),
-        (["seeds", "--workers", "0"], "--workers is '0'"),
+        ("table2 --trials 0", "--trials is 0"),
+        ("table2 --policy racr", "Did you mean 'racer'?"),
+        ("table2 --delta-policy nowhere/policy", "nowhere/policy: no such file"),
+        ("table2 --vehicle referense", "Did you mean 'reference'?"),
+        ("worlds --policy {folder}/mine.pt2", "suite reproduce does of no policy"),
+        ("worlds --world reference", "--world reference: flies as mujoco does"),
+        ("worlds --world rotorpi", "Did you mean 'rotorpy'?"),
+        ("worlds --world mjx --world mjx", "--world mjx is given twice"),
+        ("robustness --only linear_darg", "Did you mean 'linear_drag'?"),
+        ("robustness --policy racer --policy racer", "--policy racer is given twice"),
+        ("seeds --policies racer racer", "--policies racer is given twice"),
+        ("seeds --preset smal", "Did you mean 'small'?"),
+        ("seeds --training-seeds 1 1", "--training-seeds is 1 1"),
+        ("seeds --policies racer --trials 0", "--trials is 0"),
+        ("seeds --workers 0", "--workers is '0'"),
+        ("ablation --seed 0", "--seed 0 is one of --training-seeds"),
+        ("ablation --training-seeds 1 1", "--training-seeds is 1 1"),
+        ("ablation --only field@0.41", "Did you mean 'field 0.4'?"),
+        ("ablation --set episode.batch=9", "this command sets episode.batch; give --worlds"),
+        ("ablation --set episode.gates=6", "this command sets episode.gates; all fly 4"),
+        ("ablation --set loss.projection=3", "this command sets loss.projection; it is compared"),
+        ("ablation --set loss.field_gain=0", "loss.field_gain is 0, allowed is a number above"),
+        ("ablation --seconds 0", "--seconds is 0"),
+        ("schemes --seed 0", "--seed 0 is one of --training-seeds"),
+        ("schemes --only pop", "Did you mean 'ppo'?"),
+        ("schemes --worlds 6", "allowed with PPO are multiples of its 4 minibatches"),
+        ("schemes --measurements 0", "--measurements is 0"),
+        ("schemes --set loss.progress=1.2", "this command sets loss.progress; give --progress"),
+        ("randomisation --only linear_dra", "linear_drag"),
+        ("randomisation --without winds", "Did you mean 'wind'?"),
+        ("randomisation --preset swift --without mass", "unknown spread 'mass'"),
+        ("randomisation --iterations 0", "--iterations is 0"),
+        ("randomisation --workers 99", "--workers is 99"),
+        ("randomisation --trials 2 --training-seeds 0 1 2 3 4 5 6", "are shared among 7"),
+        ("hidden_worlds --only weak@roter", "Did you mean 'weak rotor'?"),
+        ("hidden_worlds --set seed=3", "this command sets seed; give --training-seeds"),
+        ("hidden_worlds --vehicle crazyflie21", "'heavy battery' cannot be made of --vehicle"),
+        ("hidden_worlds --trials 1001", "--trials is 1001, allowed is 1 to 1000"),
+        ("hidden_worlds --seed 4294967000", "--seed is 4294967000, allowed is 0 to 4294466295"),
     ],
 )
-def test_what_cannot_be_used_is_said_before_anything_is_flown(args, words, sky, tmp_path, capsys):
+def test_what_cannot_be_used_is_said_before_anything_is_done(
+    line, words, sky, made, tmp_path, capsys
+):
     program, place = tmp_path / "mine.pt2", tmp_path / "place"
     program.touch()
     place.mkdir()
-    assert reproduce(place, *(arg.format(folder=tmp_path) for arg in args)) == 2
+    args = [word.replace("@", " ").format(folder=tmp_path) for word in line.split()]
+    assert reproduce(place, *args) == 2
     said = capsys.readouterr().err
     assert words in said and len(said.strip().splitlines()) == 1
-    assert not sky.flown and not list(place.iterdir())
+    assert not sky.flown and not made and not list(place.iterdir())

@@ -95,19 +95,3 @@ def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeyp
     monkeypatch.setattr(hidden_worlds, "run_loop", broken)
     args = ["--policy", "racer", "--only", "weak rotor"]
     assert reproduce(tmp_path, "hidden_worlds", *args) == 1
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["--only", "weak roter"], "Did you mean 'weak rotor'?"),
-        (["--set", "seed=3"], "this command sets seed; give --training-seeds"),
-        (["--vehicle", "crazyflie21"], "hidden world 'heavy battery' cannot be made of --vehicle"),
-        (["--trials", "1001"], "--trials is 1001, allowed is 1 to 1000"),
-        (["--seed", "4294967000"], "--seed is 4294967000, allowed is 0 to 4294466295"),
-    ],
-)
-def test_what_cannot_be_used_is_code_2(args, words, loops, tmp_path, capsys):
-    assert reproduce(tmp_path, "hidden_worlds", *args) == 2
-    assert words in capsys.readouterr().err
-    assert not loops

@@ -79,25 +79,3 @@ def test_curves_and_first_times_by_hand():
     assert first_times(ours, 2) == [(200, 2.0), (100, 3.0)]
     assert first_times(ours, 3) == [(200, 2), (200, 6)]
     assert first_times(ppo, 1) == [(200, 8.0)] and first_times(ppo, 2) == []
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["--seed", "0"], "--seed 0 is one of --training-seeds"),
-        (["--only", "pop"], "Did you mean 'ppo'?"),
-        (["--worlds", "6"], "--worlds is 6, allowed with PPO are multiples of its 4 minibatches"),
-        (["--measurements", "0"], "--measurements is 0"),
-        (["--set", "loss.progress=1.2"], "this command sets loss.progress; give --progress"),
-        (["--set", "loss.projection=1"], "this command sets loss.projection; it is compared"),
-        (
-            ["--set", "loss.field_gain=0"],
-            "loss.field_gain is 0, allowed is a number above: the field",
-        ),
-    ],
-)
-def test_what_cannot_be_used_is_said_before_anything_is_trained(args, words, tmp_path, capsys):
-    assert reproduce(tmp_path, "schemes", *args) == 2
-    said = capsys.readouterr().err
-    assert words in said and len(said.strip().splitlines()) == 1
-    assert not list(tmp_path.iterdir())

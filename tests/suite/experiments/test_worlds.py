@@ -43,22 +43,3 @@ def test_why_is_told_by_the_controls(rotorpy):
     assert mine == {0: "rounding", 1: "air", 2: "rest"} and set(mine.values()) == set(WHY)
     assert [change["why"] for change in found if change["column"] in (single, aired)] == [None] * 2
     assert found[0]["endings"][base] == results["p", base][0].ending
-
-
-def test_a_world_that_flies_as_mujoco_does_is_refused(sky, tmp_path, capsys):
-    assert reproduce(tmp_path, "worlds", "--world", "reference") == 2
-    said = capsys.readouterr().err
-    assert "--world reference: flies as mujoco does" in said and "give one of mjx, rotorpy" in said
-    assert reproduce(tmp_path, "worlds", "--world", "rotorpi") == 2
-    assert "Did you mean 'rotorpy'?" in capsys.readouterr().err
-    assert reproduce(tmp_path, "worlds", "--world", "mjx", "--world", "mjx") == 2
-    assert "--world mjx is given twice" in capsys.readouterr().err
-    assert not sky.flown
-
-
-def test_flights_are_kept_by_world(sky, rotorpy, tmp_path):
-    first = ["--policy", "racer", "--trials", "1", "--difficulty", "0", "--world"]
-    assert reproduce(tmp_path, "worlds", *first, "rotorpy") == 0
-    count = len(sky.flown)
-    assert reproduce(tmp_path, "worlds", *first, "rotorpy") == 0
-    assert len(sky.flown) == count

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from eval.judging.statistics import Interval, bootstrap_mean
+from eval.judging.statistics import bootstrap_mean
 from eval.worlds.trial import TrialResult
-from suite.loop.compare import Line, compare, grids, points, told_apart, verdict
-from tracks.common.grid import markdown, rich_table
+from suite.loop.compare import Line, compare, grids, verdict
 
 
 def _result(seed, success, v_mean, gates=8, level=0):
@@ -60,21 +59,6 @@ def test_no_difference_is_called_none():
     assert cell.tone == "" and cell.text.startswith("+0 [")
     speed = grids(lines)[2].rows[-1][6]
     assert speed.text == "+0.00 [+0.00, +0.00]"
-
-
-def test_tables_read_alike_as_markdown_and_in_a_terminal():
-    rows = [_result(k, k < 5, 3.0) for k in range(10)]
-    grid = grids(compare({"before": rows, "without": rows, "with": rows}))[0]
-    assert len(markdown(grid).splitlines()) == 2 + 2 + len(grid.rows)
-    table = rich_table(grid)
-    assert table.row_count == len(grid.rows) and len(table.columns) == len(grid.headers)
-
-
-def test_a_difference_is_told_by_its_interval():
-    assert told_apart(Interval(0.1, 0.01, 0.2)) == "more than"
-    assert told_apart(Interval(-0.1, -0.2, -0.01)) == "fewer than"
-    assert told_apart(Interval(0.1, 0.0, 0.2)) == "not to be told from"
-    assert points(Interval(-0.001, -0.05, 0.123)) == "+0 points [-5, +12]"
 
 
 def test_bootstrap_of_a_mean_is_that_of_the_central_limit():

@@ -164,22 +164,6 @@ def test_measured_flights_are_others_than_the_judged_and_noisy(whole):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["train", "fly"])
-def test_a_stopped_loop_comes_to_the_same(whole, kind, tmp_path, monkeypatch, root, capfd):
-    out, _ = whole
-    monkeypatch.chdir(root)
-    stub = Stub(monkeypatch)
-    again = tmp_path / "again"
-    for number in [1, 4, 7] if kind == "train" else [2, 5, 8, 14, 22]:
-        stub.stop_after = (kind, number)
-        assert cli.main(["loop", *ARGS, "--out", str(again)]) == 130
-        assert not (again / "loop.json").exists()
-    assert cli.main(["loop", *ARGS, "--out", str(again)]) == 0
-    assert "done before" in capfd.readouterr().err
-    assert (out / "table.md").read_text() == (again / "table.md").read_text()
-
-
-@pytest.mark.slow
 def test_without_delta_the_same_comes_of_half_the_stages(whole, tmp_path, monkeypatch, root):
     monkeypatch.chdir(root)
     stub, out = Stub(monkeypatch), tmp_path / "out"
@@ -221,6 +205,10 @@ def test_the_example_hides_one_effect(root):
     assert set(true.effects) - set(simulated.effects) == {"com_offset"}
     assert hidden_effects(simulated, true) == "com_offset (offset [0.012, 0.0, 0.0] m)"
     assert hidden_effects(true, simulated) == "no com_offset"
+    assert hidden_effects(simulated, replace(simulated, mass=0.8)) == "other nominal values"
+    trimmed = with_effects(simulated, {"torque_trim": TorqueTrim(np.array([0.01, 0.0, 0.0]))})
+    told = hidden_effects(simulated, replace(trimmed, mass=0.8))
+    assert told == "torque_trim (torque [0.01, 0.0, 0.0] N m); other nominal values"
 
 
 def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root, tmp_path):
@@ -243,45 +231,19 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
     assert "linear_drag: RotorPy's drag goes with the rotors' speed" in plain[1]
 
 
-def test_the_verdict_says_who_is_told_from_whom():
-    won = {"nominal": 39, "before": 10, "control": 12, "delta": 20, "named": 36, "both": 40}
-    results = {
-        name: [trial_result(k, k < count, k % 2) for k in range(40)] for name, count in won.items()
-    }
-    stand = standings(results, ("before", "control", "nominal"))
-    words = verdict(stand, answer([NAMED]), 40)
-    assert (
-        "In the hidden world 25 % of 40 trials succeed, in the simulation's vehicle 98 %" in words
-    )
-    assert "more than the same fine-tuning without it (30 %; difference +60 points [+" in words
-
-
-def test_the_verdict_does_not_claim_what_the_intervals_do_not_hold():
-    results = {
-        name: [trial_result(k, k < 20) for k in range(40)]
-        for name in ("nominal", "before", "control", "delta", "named", "both")
-    }
-    results["nominal"] = [trial_result(k, True) for k in range(40)]
-    words = verdict(standings(results, ("before", "control", "nominal")), answer([NAMED]), 40)
-    assert "not to be told from the same fine-tuning without it" in words
-    assert "below the policy where nothing is hidden" in words
-
-
 @pytest.mark.parametrize(
-    ("nominal", "named", "how"),
-    [(39, 40, "not to be told from"), (20, 40, "above"), (40, 20, "below")],
+    ("nominal", "control", "named", "how"),
+    [
+        (39, 12, 36, "25 % of 40 trials succeed, in the simulation's vehicle 98 %"),
+        (39, 12, 36, "more than the same fine-tuning without it (30 %; difference +60 points [+"),
+        (40, 20, 20, "not to be told from the same fine-tuning without it"),
+        (39, 10, 40, ", and not to be told from the policy where nothing is hidden"),
+        (20, 10, 40, ", and above the policy where nothing is hidden"),
+        (40, 10, 20, ", and below the policy where nothing is hidden"),
+    ],
 )
-def test_the_verdict_says_what_came_back_of_what_was_lost(nominal, named, how):
-    won = dict.fromkeys(("before", "control"), 10) | {"nominal": nominal, "named": named}
+def test_the_verdict_claims_what_the_intervals_hold(nominal, control, named, how):
+    won = {"nominal": nominal, "before": 10, "control": control, "named": named}
     results = {name: [trial_result(k, k < count) for k in range(40)] for name, count in won.items()}
     words = verdict(standings(results, ("before", "control", "nominal")), answer([NAMED]), 40)
-    assert f", and {how} the policy where nothing is hidden" in words
-
-
-def test_what_is_hidden_may_be_nominal_too():
-    simulated = load_vehicle("reference")
-    other = replace(simulated, mass=0.8)
-    assert hidden_effects(simulated, other) == "other nominal values"
-    trimmed = with_effects(simulated, {"torque_trim": TorqueTrim(np.array([0.01, 0.0, 0.0]))})
-    told = hidden_effects(simulated, replace(trimmed, mass=0.8))
-    assert told == "torque_trim (torque [0.01, 0.0, 0.0] N m); other nominal values"
+    assert how in words

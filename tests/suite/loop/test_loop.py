@@ -1,13 +1,10 @@
 """The declarations, the stages that they ask for, and what a report is made of."""
 
-import io
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
-from matplotlib.image import imread
 
 from suite.common.errors import WorkFailed
 from suite.common.report import Picture
@@ -18,7 +15,6 @@ from suite.delta.run import FLOWN, errors
 from suite.loop import charts, delta_action, hidden_effect, work
 from suite.loop.compare import compare
 from suite.loop.config import resolve
-from suite.loop.report import errors_row
 from suite.loop.variants import DeltaModel, Variant
 from suite.loop.work import LoopRun, Quiet, plan
 from suite.train.config import PointMassConfig
@@ -81,14 +77,7 @@ def test_flights_that_cannot_be_fitted_end_the_loop_with_advice(tmp_path, monkey
     assert not is_done(tmp_path / "delta")
 
 
-def test_running_means_keep_a_line_and_smooth_a_step():
-    line = np.linspace(0.0, 1.0, 200)
-    np.testing.assert_allclose(charts._smooth(line)[10:-10], line[10:-10])
-    step = charts._smooth(np.repeat([0.0, 1.0], 100))
-    assert step[50] == 0 and step[150] == 1 and 0.3 < step[99] < 0.7
-
-
-@pytest.mark.parametrize("levels", [1, 2, 4])
+@pytest.mark.parametrize("levels", [1, 4])
 def test_names_of_cells_do_not_run_into_each_other(levels, monkeypatch):
     trials = [
         trial_result(0, True, level)._replace(track=track)
@@ -103,21 +92,6 @@ def test_names_of_cells_do_not_run_into_each_other(levels, monkeypatch):
         boxes = [label.get_window_extent() for label in axes.get_xticklabels()]
         apart = [right.x0 - left.x1 for left, right in pairwise(boxes)]
         assert len(boxes) == 3 * levels + 1 and min(apart) > 0
-
-
-def test_curves_that_are_not_there_are_left_out():
-    rows = [{"iteration": k, "gates": k, "collided": 0.5, "speed": 3.0} for k in range(5)]
-    alone, both = (
-        imread(io.BytesIO(charts.training_chart(curves)))
-        for curves in ({"before": rows}, {"before": rows, "without": rows, "with": []})
-    )
-    assert alone.shape == both.shape and not np.array_equal(alone, both)
-
-
-def test_errors_are_told_with_their_share_where_asked():
-    errors = {"position_m": 0.1234, "velocity_m_s": 2.0}
-    assert [cell.text for cell in errors_row("a", errors)] == ["a", "0.123", "2.000"]
-    assert errors_row("a", errors, base_m=0.2468)[-1].text == "50 %"
 
 
 FIT = {"params": {}, "without": ReplayErrors(0.4, 0.8), "with_delta": ReplayErrors(0.1, 0.3)}

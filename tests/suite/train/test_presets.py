@@ -6,15 +6,8 @@ import pytest
 
 from suite import cli
 from suite.train import losses
-from suite.train.config import TrainConfig, check
-from suite.train.presets import PRESETS, at_rate, chosen_model, preset
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_presets(name):
-    config = preset(name)
-    assert isinstance(config, TrainConfig) and PRESETS[name].__doc__
-    assert config.optimizer.iterations > 0 and config.episode.batch > 0
+from suite.train.config import check
+from suite.train.presets import at_rate, chosen_model, preset
 
 
 def test_a_model_is_asked_for_by_name_or_the_recipes_own():
@@ -22,11 +15,8 @@ def test_a_model_is_asked_for_by_name_or_the_recipes_own():
     quad = chosen_model(swift, "quad", "racer5")
     assert quad.quadrotor is not None and quad.quadrotor.vehicle.name == "racer5"
     assert chosen_model(quad, "point", None) == swift == chosen_model(swift, None, None)
-
-
-def test_a_vehicle_for_a_point_mass_is_refused():
     with pytest.raises(ValueError, match="the point mass has none: add --model quad"):
-        chosen_model(preset("swift"), None, "reference")
+        chosen_model(swift, None, "reference")
 
 
 def test_swift_quad_varies_its_quadrotors_widely_around_any_vehicle_that_is_asked_for():
@@ -47,35 +37,16 @@ def test_swift_quad_varies_its_quadrotors_widely_around_any_vehicle_that_is_aske
     assert chosen_model(own, "point", None).quadrotor is None
 
 
-def test_swift_30_decides_twice_as_often_on_rollouts_as_long():
-    slow, fast = preset("swift-quad"), preset("swift-30")
-    check(fast)
+def test_each_swift_recipe_changes_what_it_says_of_the_one_before():
+    names = ("swift-quad", "swift-30", "swift-ahead", "swift-sure", "swift-keen")
+    slow, fast, ahead, sure, keen = map(preset, names)
     assert fast.spec == replace(slow.spec, rate_hz=30.0)
-    seconds = [config.episode.steps / config.spec.rate_hz for config in (slow, fast)]
-    assert seconds[0] == seconds[1] and fast.loss.tilt > 0.0 == slow.loss.tilt
-
-
-def test_swift_ahead_sees_how_the_gate_after_faces_and_trains_as_swift_30():
-    before, ahead = preset("swift-30"), preset("swift-ahead")
-    check(ahead)
-    spec = replace(before.spec, second_axis=True)
-    optimizer = replace(before.optimizer, iterations=ahead.optimizer.iterations)
-    assert ahead == replace(before, spec=spec, optimizer=optimizer)
-
-
-def test_swift_sure_has_a_nearer_sight_back_and_dearer_solids_than_swift_ahead():
-    before, sure = preset("swift-ahead"), preset("swift-sure")
-    check(sure)
-    assert sure.spec == before.spec and sure.quadrotor == before.quadrotor
-    assert sure.loss.gradient_decay > before.loss.gradient_decay
-    for weight in ("clearance", "collide"):
-        dearer = getattr(sure.loss, weight) / getattr(before.loss, weight)
-        assert dearer == pytest.approx(1.4)
-
-
-def test_swift_keen_trains_as_swift_sure_and_has_a_finer_eye_in_flight():
-    sure, keen = preset("swift-sure"), preset("swift-keen")
-    check(keen)
+    assert slow.episode.steps / 15.0 == fast.episode.steps / 30.0
+    optimizer = replace(fast.optimizer, iterations=ahead.optimizer.iterations)
+    spec = replace(fast.spec, second_axis=True)
+    assert ahead == replace(fast, spec=spec, optimizer=optimizer)
+    assert (sure.spec, sure.quadrotor) == (ahead.spec, ahead.quadrotor)
+    assert sure.loss.gradient_decay > ahead.loss.gradient_decay
     camera = replace(sure.spec.camera, rays=2)
     assert keen == replace(sure, spec=replace(sure.spec, camera=camera))
 

@@ -152,14 +152,6 @@ def test_the_field_enters_as_the_paper_says(float64):
     assert largest_difference({k: change[k] for k in used}, {k: expected[k] for k in used}) < 1e-6
 
 
-def test_more_of_the_same_worlds_give_the_same_gradient(float64):
-    worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
-    many = jax.tree.map(lambda x: jnp.concatenate([jnp.asarray(x)] * 3), worlds)
-    once, again = (plain_gradient(params, w, None, 5.0) for w in (worlds, many))
-    used = [name for name in once if np.abs(np.array(once[name])).max() > 0]
-    assert largest_difference({k: again[k] for k in used}, {k: once[k] for k in used}) < 1e-9
-
-
 @pytest.mark.parametrize(("steps", "batch"), [pytest.param(4, 2, marks=pytest.mark.slow), (8, 6)])
 def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64, steps, batch):
     """A world that hangs still: every step pulls alike, so the mean is one step's pull."""

@@ -103,20 +103,18 @@ def at_first_gate(config, ahead_m):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("pass_first", "progress"), [(True, -3.0), (False, 3.0)])
-def test_the_step_that_passes_a_gate_is_progress_to_the_next_where_asked(pass_first, progress):
+@pytest.mark.parametrize(
+    ("ahead_m", "pass_first", "progress"),
+    [(0.02, True, -3.0), (0.02, False, 3.0), (1.0, False, -3.0)],
+)
+def test_progress_of_the_step_that_passes_a_gate_and_of_the_one_before(
+    ahead_m, pass_first, progress
+):
     loss = {"progress": 1.0, "pass_first": pass_first}
     config = small_config(2, 1, physics=STILL, loss=loss)
-    term, passed = flown(config, at_first_gate(config, 0.02))
-    assert passed.all()
+    term, passed = flown(config, at_first_gate(config, ahead_m))
+    assert passed.all() == (ahead_m < 0.1)
     np.testing.assert_allclose(term, progress, atol=0.2)
-
-
-def test_the_step_before_is_progress_to_the_gate():
-    config = small_config(2, 1, physics=STILL, loss={"progress": 1.0})
-    term, passed = flown(config, at_first_gate(config, 1.0))
-    assert not passed.any()
-    np.testing.assert_allclose(term, -3.0, atol=0.2)
 
 
 def test_hovering_above_the_frame_there_is_progress_to_be_made_backwards():

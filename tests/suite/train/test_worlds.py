@@ -20,27 +20,21 @@ def test_gates_heights_follow_the_setting():
     assert np.ptp(wide, axis=1).mean() > 1.4 * np.ptp(usual, axis=1).mean()
 
 
-def test_worlds_beside_a_gate_have_missed_it():
-    config = small_config(batch=60, rest_share=0.0, missed_share=1.0, start_speed=5.0)
-    worlds = sample_worlds(config, 0)
-    gates, rows = worlds.scene.gates, np.arange(60)
-    turn = gates.rot_w[rows, worlds.target]
-    local = np.einsum("bij,bi->bj", turn, worlds.pos_w - gates.center_w[rows, worlds.target])
-    assert np.all(np.abs(local[:, 0] - 0.25) < 0.96)
-    assert np.mean(np.hypot(local[:, 1], local[:, 2]) > 0.85) > 0.9
-    assert np.all(local[:, 2] < 1.81) and np.any(local[:, 2] > 1.0)
-    assert np.linalg.norm(worlds.vel_w, axis=-1).max() < 5.0
-
-
-@pytest.mark.parametrize(("share", "least", "most"), [(0.0, 0.0, 0.1), (0.5, 0.35, 0.65)])
+@pytest.mark.parametrize(
+    ("share", "least", "most"), [(0.0, 0.0, 0.1), (0.5, 0.35, 0.65), (1.0, 0.9, 1.0)]
+)
 def test_as_many_have_missed_a_gate_as_are_asked_for(share, least, most):
-    worlds = sample_worlds(small_config(batch=80, rest_share=0.0, missed_share=share), 3)
+    config = small_config(batch=80, rest_share=0.0, missed_share=share, start_speed=5.0)
+    worlds = sample_worlds(config, 3)
     gates, rows = worlds.scene.gates, np.arange(80)
     turn = gates.rot_w[rows, worlds.target]
     local = np.einsum("bij,bi->bj", turn, worlds.pos_w - gates.center_w[rows, worlds.target])
     beside = np.hypot(local[:, 1], local[:, 2])
     missed = (np.abs(local[:, 0] - 0.25) < 0.96) & (beside > 0.85) & (beside < 1.85)
     assert least <= missed.mean() <= most
+    assert np.linalg.norm(worlds.vel_w, axis=-1).max() < 5.0
+    if share == 1.0:
+        assert np.all(local[:, 2] < 1.81) and np.any(local[:, 2] > 1.0)
 
 
 def test_how_fast_to_fly_is_drawn_where_it_is_an_input_and_moves_nothing_else():

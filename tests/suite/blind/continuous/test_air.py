@@ -33,29 +33,32 @@ def effect(**values):
     return SimpleNamespace(**values)
 
 
-def test_linear_drag():
+FAST = {"air_b": np.array([[3.0, -4.0, 12.0]])}
+SPINNING_UP = {"spin_up": np.array([[100.0, -50.0, 0.0, 25.0]])}
+BY_HAND = [
     # -0.5 kg x (0.3, 0.2, 0.1) 1/s x (3, -4, 2) m/s
-    force = FORCES["linear_drag"](effect(coefficient=(0.3, 0.2, 0.1)), moment())
-    np.testing.assert_allclose(force, [[-0.45, 0.4, -0.1]], atol=1e-15)
-
-
-def test_quadratic_drag():
+    (FORCES, "linear_drag", {"coefficient": (0.3, 0.2, 0.1)}, {}, [-0.45, 0.4, -0.1]),
     # |v| = sqrt(9 + 16 + 144) = 13; -0.5 x 13 x (0.01, 0.02, 0.03) x (3, -4, 12)
-    at = moment(air_b=np.array([[3.0, -4.0, 12.0]]))
-    force = FORCES["quadratic_drag"](effect(coefficient=(0.01, 0.02, 0.03)), at)
-    np.testing.assert_allclose(force, [[-0.195, 0.52, -2.34]], atol=1e-15)
-
-
-def test_rotor_drag():
+    (FORCES, "quadratic_drag", {"coefficient": (0.01, 0.02, 0.03)}, FAST, [-0.195, 0.52, -2.34]),
     # -1e-5 kg/rad x 3800 rad/s x (3, -4, 0) m/s
-    force = FORCES["rotor_drag"](effect(coefficient=1e-5), moment())
-    np.testing.assert_allclose(force, [[-0.114, 0.152, 0.0]], atol=1e-15)
-
-
-def test_translational_lift():
+    (FORCES, "rotor_drag", {"coefficient": 1e-5}, {}, [-0.114, 0.152, 0.0]),
     # 0.5 kg x 0.02 1/m x 25 m^2/s^2, up
-    force = FORCES["translational_lift"](effect(coefficient=0.02), moment())
-    np.testing.assert_allclose(force, [[0.0, 0.0, 0.25]], atol=1e-15)
+    (FORCES, "translational_lift", {"coefficient": 0.02}, {}, [0.0, 0.0, 0.25]),
+    # v x e3 = (v_y, -v_x, 0): 1e-6 x 3800 x (-4, -3, 0). Flying forward pitches the nose up.
+    (TORQUES, "blade_flapping", {"coefficient": 1e-6}, {}, [-0.0152, -0.0114, 0.0]),
+    (TORQUES, "torque_trim", {"torque": (0.01, -0.02, 0.003)}, {}, [0.01, -0.02, 0.003]),
+    # sum s Omega = 1000 - 900 + 1100 - 800 = 400; w x e3 = (-1, -2, 0)
+    (TORQUES, "rotor_gyroscopic", {"rotor_inertia": 1e-5}, {}, [0.004, 0.008, 0.0]),
+    # 100 + 50 + 0 - 25 = 125 (clockwise ones count against): -2e-5 x 125
+    (TORQUES, "rotor_spin_up", {"rotor_inertia": 2e-5}, SPINNING_UP, [0.0, 0.0, -0.0025]),
+    # -(0.002, 0.003, 0.004) x (1, 2, 3) x (2, -1, 0.5)
+    (TORQUES, "angular_damping", {"coefficient": (1.0, 2.0, 3.0)}, {}, [-0.004, 0.006, -0.006]),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "values", "given", "hand"), BY_HAND)
+def test_forces_and_torques(kind, name, values, given, hand):
+    np.testing.assert_allclose(kind[name](effect(**values), moment(**given)), [hand], atol=1e-15)
 
 
 def test_inflow():
@@ -87,45 +90,18 @@ def test_ground_effect_sees_a_bank_and_is_capped():
     assert THRUSTS["ground_effect"](values, low, np.ones((1, 4)))[0, 0] == pytest.approx(1.5)
 
 
-def test_battery_sag_by_time_and_by_voltage():
-    by_time = THRUSTS["battery_sag"](effect(rate=0.01, per_volt=0.0), moment(), np.ones((1, 4)))
-    np.testing.assert_allclose(by_time, 0.96)
-    by_volt = THRUSTS["battery_sag"](effect(rate=0.0, per_volt=0.1), moment(), np.ones((1, 4)))
-    np.testing.assert_allclose(by_volt, 0.95)
-    before = moment(time_s=np.array([[-1.0]]))
-    kept = THRUSTS["battery_sag"](effect(rate=0.01, per_volt=0.0), before, np.ones((1, 4)))
-    np.testing.assert_allclose(kept, 1.0)
+@pytest.mark.parametrize(
+    ("values", "given", "share"),
+    [
+        ({"rate": 0.01, "per_volt": 0.0}, {}, 0.96),
+        ({"rate": 0.0, "per_volt": 0.1}, {}, 0.95),
+        ({"rate": 0.01, "per_volt": 0.0}, {"time_s": np.array([[-1.0]])}, 1.0),
+    ],
+)
+def test_battery_sag_by_time_and_by_voltage(values, given, share):
+    found = THRUSTS["battery_sag"](effect(**values), moment(**given), np.ones((1, 4)))
+    np.testing.assert_allclose(found, share)
 
 
 def test_thrusts_are_added_to_before_they_are_scaled():
     assert list(THRUSTS) == ["inflow", "ground_effect", "battery_sag"]
-
-
-def test_blade_flapping():
-    # v x e3 = (v_y, -v_x, 0): 1e-6 x 3800 x (-4, -3, 0). Flying forward pitches the nose up.
-    torque = TORQUES["blade_flapping"](effect(coefficient=1e-6), moment())
-    np.testing.assert_allclose(torque, [[-0.0152, -0.0114, 0.0]], atol=1e-16)
-
-
-def test_torque_trim():
-    torque = TORQUES["torque_trim"](effect(torque=(0.01, -0.02, 0.003)), moment())
-    np.testing.assert_array_equal(torque, [[0.01, -0.02, 0.003]])
-
-
-def test_rotor_gyroscopic():
-    # sum s Omega = 1000 - 900 + 1100 - 800 = 400; w x e3 = (-1, -2, 0)
-    torque = TORQUES["rotor_gyroscopic"](effect(rotor_inertia=1e-5), moment())
-    np.testing.assert_allclose(torque, [[0.004, 0.008, 0.0]], atol=1e-16)
-
-
-def test_rotor_spin_up():
-    # 100 + 50 + 0 - 25 = 125 (clockwise ones count against): -2e-5 x 125
-    at = moment(spin_up=np.array([[100.0, -50.0, 0.0, 25.0]]))
-    torque = TORQUES["rotor_spin_up"](effect(rotor_inertia=2e-5), at)
-    np.testing.assert_allclose(torque, [[0.0, 0.0, -0.0025]], atol=1e-16)
-
-
-def test_angular_damping():
-    # -(0.002, 0.003, 0.004) x (1, 2, 3) x (2, -1, 0.5)
-    torque = TORQUES["angular_damping"](effect(coefficient=(1.0, 2.0, 3.0)), moment())
-    np.testing.assert_allclose(torque, [[-0.004, 0.006, -0.006]], atol=1e-16)

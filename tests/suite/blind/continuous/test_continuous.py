@@ -1,6 +1,5 @@
 """The engine shares nothing with the model that fits, and converges."""
 
-import ast
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from suite.blind.continuous.timing import Conditions
 from suite.blind.continuous_flight import fly_continuous, with_loop
 from suite.diagnose.plans.sensors import SENSORS
 from suite.diagnose.plans.trajectory import Trajectory
+from tests.suite.test_imports import imported
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 FOLDER = Path(suite.blind.continuous.__file__).parent
@@ -23,16 +23,9 @@ WAYS = (
 )
 
 
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
-def test_no_module_of_the_engine_imports_the_model_that_fits(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        names = []
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "imports are absolute"
-            names = [node.module or ""]
-        for name in names:
+def test_no_module_of_the_engine_imports_the_model_that_fits():
+    for path in FOLDER.glob("*.py"):
+        for name in imported(path):
             if name.split(".")[0] in ("eval", "suite", "tracks", "policies"):
                 assert name.startswith(ALLOWED), f"{path.name} imports {name}"
 

@@ -20,15 +20,17 @@ def pilot(seen):
     return command, command
 
 
+def fly_at(stamps, **step):
+    start = np.zeros((1, 13))
+    start[0, POS], start[0, VEL], start[0, QUAT] = [0, 0, 9], [2, 1, 0], [1, 0, 0, 0]
+    plan, battery = schedule(stamps, 0.002, 0.0, **step), Battery(16, 0.1, 0.3)
+    return fly(quadrotor_of(PLAIN), plan, start, pilot, np.random.default_rng(0), battery)
+
+
 @pytest.fixture(scope="module")
 def flown():
     stamps = jittered_stamps(np.random.default_rng(1), 1, -0.1, 4.1, 200.0, 0.3)
-    start = np.zeros((1, 13))
-    start[0, POS], start[0, VEL], start[0, QUAT] = [0, 0, 9], [2, 1, 0], [1, 0, 0, 0]
-    plan = schedule(stamps, 0.002, 0.0)
-    return fly(
-        quadrotor_of(PLAIN), plan, start, pilot, np.random.default_rng(0), Battery(16, 0.1, 0.3)
-    )
+    return fly_at(stamps)
 
 
 def logged(flown, rng=None, conditions=EVEN, noise=NOISE, **faults):
@@ -79,18 +81,10 @@ def test_a_clock_offset_logs_poses_of_another_moment_and_the_rest_of_now(flown, 
 
 
 def test_states_between_the_ends_of_steps_are_those_of_a_finer_flight():
-    start = np.zeros((1, 13))
-    start[0, POS], start[0, VEL], start[0, QUAT] = [0, 0, 9], [2, 1, 0], [1, 0, 0, 0]
     stamps = np.arange(0.0, 0.501, 0.01)[:, None]
-
-    def run(step_s):
-        plan = schedule(stamps, 0.002, 0.0, step_s)
-        return fly(
-            quadrotor_of(PLAIN), plan, start, pilot, np.random.default_rng(0), Battery(16, 0.1, 0.3)
-        )
-
+    coarse, fine = (fly_at(stamps, step_s=step_s) for step_s in (1e-3, 1e-4))
     wanted = np.random.default_rng(3).uniform(0.0, 0.5, 500)
-    apart = np.abs(state_at(run(1e-3), 0, wanted) - state_at(run(1e-4), 0, wanted)).max(axis=0)
+    apart = np.abs(state_at(coarse, 0, wanted) - state_at(fine, 0, wanted)).max(axis=0)
     assert apart[POS].max() < 1e-7 and apart[VEL].max() < 3e-5 and apart[QUAT].max() < 3e-5
 
 

@@ -8,21 +8,7 @@ import pytest
 from policies.spec import PolicySpec
 from suite.train.dynamics import point_mass
 from suite.train.ppo import critic
-from tests.support.training import boxes_worlds, small_config
-from tracks.geometry.gates import square_gates
-from tracks.geometry.scene import Gates, Spheres
-
-
-def worlds_with(sphere_w, radius):
-    """Return a world of two gates of 1 m at 50 m of height, whose frames are no solids."""
-    worlds = boxes_worlds(small_config(1, 1))
-    zero, one = np.zeros(2), np.ones(2)
-    centers = np.array([[0.0, 0, 50], [0, 4, 50]])
-    gates = Gates(*(x[None] for x in square_gates(centers, zero, one, 0.2 * one, 0.1 * one)))
-    boxes = type(worlds.scene.boxes)(*(array[:, :0] for array in worlds.scene.boxes))
-    spheres = Spheres(np.array([[sphere_w]], float), np.array([[radius]]))
-    scene = worlds.scene._replace(gates=gates, boxes=boxes, spheres=spheres)
-    return jax.tree.map(jnp.asarray, worlds._replace(scene=scene))
+from tests.suite.train.ppo.test_reward import worlds_with
 
 
 def test_the_features_of_a_state():

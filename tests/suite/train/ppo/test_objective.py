@@ -43,12 +43,6 @@ def test_advantages_are_those_of_a_plain_loop():
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
-def test_with_a_trace_of_one_an_advantage_is_the_return_less_the_value():
-    reward, value = jnp.asarray([[1.0], [2.0], [4.0]]), jnp.asarray([[0.5], [0.0], [0.0], [8.0]])
-    found = advantages(reward, value, jnp.zeros((3, 1), bool), 0.5, 1.0)
-    assert float(found[0, 0]) == pytest.approx(1 + 2 / 2 + 4 / 4 + 8 / 8 - 0.5)
-
-
 def rollout_of(actor, seed=1, done=False):
     """Return embeddings and sequences of actions drawn from the actor itself."""
     rng = np.random.default_rng(seed)

@@ -1,17 +1,15 @@
 """A rollout with exploration: its density, and worlds that start again."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from policies.networks import network
-from suite.train.ppo.config import ppo_like
 from suite.train.ppo.objective import Actor, Sequences, action_means
 from suite.train.ppo.rollout import log_probability, make_rollout
-from tests.support.training import boxes_worlds, fresh_params, small_config
+from tests.suite.train.ppo.test_run import CONFIG
+from tests.support.training import boxes_worlds, fresh_params
 
 
 def test_the_density_is_a_normal_one():
@@ -22,11 +20,6 @@ def test_the_density_is_a_normal_one():
     assert float(found) == pytest.approx(np.log(density.prod()))
 
 
-DELAYS = {"image_delay": 2, "state_delay": 1, "depth_noise": 0.02}
-CONFIG = replace(
-    ppo_like(small_config(4, 6, physics=DELAYS, image_stride=2), iterations=3),
-    epochs=2, minibatches=2, critic_epochs=2, critic_size=8,
-)  # fmt: skip
 roll = jax.jit(make_rollout(CONFIG.shared))
 
 

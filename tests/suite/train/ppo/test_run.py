@@ -11,7 +11,8 @@ from policies.formats.policy_file import load_policy_checkpoint
 from suite.common import curve
 from suite.common.console import Console
 from suite.train.ppo import run
-from suite.train.ppo.config import ppo_like
+from suite.train.ppo.config import PpoConfig, ppo_like
+from suite.train.presets import preset
 from tests.support.training import SPEC, boxes_worlds, small_config
 
 DELAYS = {"image_delay": 2, "state_delay": 1, "depth_noise": 0.02}
@@ -65,7 +66,20 @@ def test_a_stopped_run_resumes_exactly_and_leaves_a_policy(tmp_path, monkeypatch
         run.train_ppo(replace(CONFIG, discount=0.5), whole, Console())
 
 
-def test_an_image_stride_that_does_not_divide_the_steps_is_refused(tmp_path):
+def test_ppo_like_a_training_has_its_worlds_and_ppos_own_settings():
+    config = replace(preset("swift-quad"), seed=4)
+    found = ppo_like(config, iterations=7)
+    for part in ("spec", "physics", "quadrotor", "loss", "episode", "seed"):
+        assert getattr(found, part) == getattr(config, part), part
+    assert found.iterations == 7 and found.rate == PpoConfig().rate
+    assert found.shared == replace(config, optimizer=found.shared.optimizer)
+    assert found.shared.optimizer.iterations == 7
+
+
+def test_minibatches_and_strides_that_do_not_divide_are_refused(tmp_path):
+    for wrong in (3, 0):
+        with pytest.raises(ValueError, match=r"minibatches is \d, allowed are divisors .*\(4\)"):
+            make_update(replace(CONFIG, minibatches=wrong))
     config = replace(CONFIG, episode=replace(CONFIG.episode, image_stride=4))
     with pytest.raises(ValueError, match=r"image_stride is 4, allowed are divisors .*\(6\)"):
         run.train_ppo(config, tmp_path / "run", Console())
