@@ -159,23 +159,9 @@ def test_windows_of_two_parts_have_one_grid(logs):
     assert row_s == pytest.approx(0.01)
     with pytest.raises(ValueError, match="no window of 0.5 s"):
         cut_quadrotor_windows([slow], config, 0.5, 0.3, row_s)
-    assert len(cut_quadrotor_windows([slow], config, 0.5, 0.3)[0].pos_w) > 0
-
-
-def test_flights_of_hardly_another_rate_have_burn_ins_as_long(logs):
-    """Decisions that lie 2 % further apart are fewer in the time before a window."""
-    slower = replace(logs[0], time_s=1.02 * logs[0].time_s)
-    windows, _ = cut_quadrotor_windows([slower, logs[1]], QuadrotorConfig(BARE), 0.5, 0.3)
-    alone, _ = cut_quadrotor_windows([logs[1]], QuadrotorConfig(BARE), 0.5, 0.3)
-    assert windows.burn_in.seen.shape[1] == alone.burn_in.seen.shape[1] - 1
-    count = len(alone.burn_in.seen)
-    np.testing.assert_array_equal(windows.burn_in.seen[-count:], alone.burn_in.seen[:, 1:])
-
-
-def test_logs_without_actions_are_refused(logs):
-    bare = replace(logs[0], extra={})
     with pytest.raises(ValueError, match="action_x.*suite collect"):
-        cut_quadrotor_windows([bare], QuadrotorConfig(load_vehicle("reference")), 1.0, 0.2)
+        cut_quadrotor_windows([replace(logs[0], extra={})], config, 0.5, 0.3)
+    assert len(cut_quadrotor_windows([slow], config, 0.5, 0.3)[0].pos_w) > 0
 
 
 def test_a_load_on_a_line_hangs_still_where_a_window_starts_and_then_swings(logs):

@@ -32,6 +32,9 @@ def test_logs_become_a_checkpoint_with_its_report(tmp_path):
     with pytest.raises(ValueError, match="no flight logs in"):
         fit_delta(config, PHYSICS, [tmp_path / "out"], tmp_path / "again", Console())
     assert not (tmp_path / "again").exists()
+    twice = [tmp_path / "logs", tmp_path / "logs" / "a" / ".." / "0.parquet"]
+    (tmp_path / "logs" / "a").mkdir()
+    assert len(flight_files(twice)) == 3, "a flight that is named twice counts once"
 
 
 @pytest.mark.parametrize("share", [0.01, 0.25, 0.5, 0.99])
@@ -64,12 +67,3 @@ def test_what_cannot_be_split_is_refused():
     for share in (0.0, 1.0, float("nan")):
         with pytest.raises(ValueError, match=f"held_out is {share}"):
             split(log * 2, share, 0)
-
-
-def test_a_flight_that_is_named_twice_counts_once(tmp_path):
-    """It would be fitted and held out, and its errors taken for two flights'."""
-    for name in "ab":
-        (tmp_path / f"{name}.parquet").touch()
-    twice = [tmp_path, tmp_path / "a.parquet", tmp_path / "x" / ".." / "b.parquet"]
-    (tmp_path / "x").mkdir()
-    assert flight_files(twice) == [tmp_path / "a.parquet", tmp_path / "b.parquet"]

@@ -77,29 +77,12 @@ def test_flights_are_the_same_where_policy_and_vehicle_were_moved(
     assert cli.main([*args, str(vehicle)]) == 0
     moved = vehicle.rename(tmp_path / "moved.toml")
     monkeypatch.setattr(eval.judging.judge, "fly", None)
+    (row,) = json.loads((out / "flights.json").read_text())["flights"]
+    assert row["file"] is None and row["time_s"] < 1, "a flight of under a second is no log"
+    assert not list(out.glob("*.parquet"))
     assert cli.main([*args, str(moved)]) == 0, "nothing is flown again"
     moved.write_text(moved.read_text().replace("mass = 0.75", "mass = 0.76"))
     assert cli.main([*args, str(moved)]) == 2
-
-
-def test_tracks_whose_logs_would_have_one_name_are_refused(pilots, tmp_path, capfd):
-    for name in "ab":
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "course.toml").write_text(COURSE)
-    tracks = ",".join(str(tmp_path / name / "course.toml") for name in "ab")
-    args = ["collect", "--policy", pilots["diver"], "--track", tracks]
-    assert cli.main([*args, "--out", str(tmp_path / "out")]) == 2
-    assert "more than one is called 'course'" in capfd.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_flight_of_under_a_second_is_no_log(pilots, tmp_path, capfd):
-    out = tmp_path / "flights"
-    args = ["collect", "--policy", pilots["diver"], "--track", "zigzag", "--difficulty", "0"]
-    assert cli.main([*args, "--trials", "1", "--out", str(out)]) == 0
-    (row,) = json.loads((out / "flights.json").read_text())["flights"]
-    assert row["file"] is None and row["time_s"] < 1
-    assert not list(out.glob("*.parquet"))
 
 
 def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
@@ -125,8 +108,16 @@ def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
     assert "1 without a log, 0 of them under 1 s" in said.out
 
 
-def test_a_world_that_records_nothing_leaves_no_journal_in_the_way(pilots, tmp_path, capfd):
-    args = ["collect", "--policy", pilots["diver"], "--out", str(tmp_path / "flights")]
-    assert cli.main([*args, "--world", "reference"]) == 2
-    assert "'reference' records no flights; record in 'mujoco'" in capfd.readouterr().err
-    assert not (tmp_path / "flights").exists()
+def test_what_cannot_be_recorded_is_refused(pilots, tmp_path, capfd):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "course.toml").write_text(COURSE)
+    tracks = ",".join(str(tmp_path / name / "course.toml") for name in "ab")
+    for args, words in (
+        (["--track", tracks], "more than one is called 'course'"),
+        (["--world", "reference"], "'reference' records no flights; record in 'mujoco'"),
+    ):
+        asked = ["--policy", pilots["diver"], "--out", str(tmp_path / "out")]
+        assert cli.main(["collect", *args, *asked]) == 2
+        assert words in capfd.readouterr().err
+        assert not (tmp_path / "out").exists()

@@ -51,9 +51,6 @@ def test_a_digest_changes_with_any_byte_of_what_flies_and_no_other(tmp_path):
     assert len(set(seen)) == 3
     (folder / "card.md").write_text("words")
     assert policy_digest(str(folder)) == seen[-1]
-
-
-def test_a_digest_changes_with_weights_beside_an_onnx_file(tmp_path):
     path, seen = onnx_file(tmp_path), []
     for scale in (1, 2):
         (tmp_path / "w.bin").write_bytes(np.full(300, scale, np.float32).tobytes())

@@ -108,25 +108,6 @@ def test_a_run_does_not_say_itself_that_it_is_to_be_trusted(tmp_path, capsys):
     assert "pass --trust" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["--seed", "3"], "--seed is 3, but"),
-        (["--speed", "0.5"], "--speed is 0.5, but"),
-        (["--track", "zigzag"], "flown again as they were"),
-    ],
-)
-def test_options_of_a_policy_are_refused_for_a_run(args, words, tmp_path, capsys):
-    (tmp_path / "trials.parquet").touch()
-    assert cli.main(["view", str(tmp_path), *args]) == 2
-    assert words in " ".join(capsys.readouterr().err.split())
-
-
-def test_a_policy_has_no_trials_that_failed_yet(capsys, tmp_path):
-    assert cli.main(["view", "swift-30", "--pick", "failed", "--out", str(tmp_path)]) == 2
-    assert "--pick is failed, but swift-30 is no run" in " ".join(capsys.readouterr().err.split())
-
-
 def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp_path, capfd):
     out, limit = tmp_path / "out", ["--time-limit-s", "1.2"]
     flown = ["--track", "zigzag", "--trials", "1", "--policy", pilots["pursuit"], *limit]
@@ -142,7 +123,25 @@ def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp
     assert "--time-limit-s is 0.0, allowed is" in " ".join(capfd.readouterr().err.split())
 
 
-def test_a_recording_shows_the_camera_of_who_flew(pilots, tmp_path):
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("{run} --seed 3", "--seed is 3, but"),
+        ("{run} --speed 0.5", "--speed is 0.5, but"),
+        ("{run} --track zigzag", "flown again as they were"),
+        ("swift-30 --pick failed", "--pick is failed, but swift-30 is no run"),
+        ("swift --difficulty 0 --speed 0.4", "--speed 0.4: swift takes no speed"),
+        ("swift-30 --difficulty 0 --speed 1.4", "--speed is 1.4"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(line, words, tmp_path, capsys):
+    (tmp_path / "trials.parquet").touch()
+    args = line.format(run=tmp_path).split()
+    assert cli.main(["view", *args, "--out", str(tmp_path)]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_recording_shows_who_flew_and_asks_for_a_speed(pilots, tmp_path):
     seen = tmp_path / "seen"
     asked = ["view", pilots["other"], "--track", "zigzag", "--count", "1", "--out", str(seen)]
     assert cli.main(asked) == 0
@@ -151,6 +150,8 @@ def test_a_recording_shows_the_camera_of_who_flew(pilots, tmp_path):
     assert found[eye, "Pinhole:resolution"][1] == [[[36.0, 20.0]]]
     layout = found[f"{eye}/depth", "DepthImage:format"][1][0][0]
     assert (layout["width"], layout["height"]) == (36, 20)
+    evaluation, *_ = view._chosen(view.Config(run="swift-30", speed=0.4))
+    assert manners(evaluation.speed, monitor=False) == [Manner(speed=0.4)]
 
 
 def test_view_of_something_else_is_refused(tmp_path, capsys):
@@ -161,13 +162,3 @@ def test_view_of_something_else_is_refused(tmp_path, capsys):
     (tmp_path / "trials.parquet").write_text("no parquet")
     assert cli.main(["view", str(tmp_path)]) == 2
     assert "run.json" in capsys.readouterr().err
-
-
-def test_view_asks_a_policy_for_a_speed(capsys, tmp_path):
-    evaluation, *_ = view._chosen(view.Config(run="swift-30", speed=0.4))
-    assert manners(evaluation.speed, monitor=False) == [Manner(speed=0.4)]
-    asked = ["view", "--out", str(tmp_path), "--difficulty", "0", "--speed"]
-    assert cli.main([*asked, "0.4", "swift"]) == 2
-    assert "--speed 0.4: swift takes no speed" in capsys.readouterr().err
-    assert cli.main([*asked, "1.4", "swift-30"]) == 2
-    assert "--speed is 1.4" in capsys.readouterr().err

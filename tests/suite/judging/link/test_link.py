@@ -261,6 +261,8 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     asked = ["fly", "--out", str(tmp_path), "--link", "udpin:127.0.0.1:0"]
     assert cli.main(asked) == 2
     assert "docs/fly.md" in capsys.readouterr().err
+    assert cli.main([*asked, "--silence-s", "-1"]) == 2
+    assert "silence-s" in capsys.readouterr().err
     assert cli.main([*asked, "--confirm", "--trials", "3"]) == 2
     assert "--link flies one flight" in capsys.readouterr().err
 
@@ -343,31 +345,19 @@ def test_a_flight_in_real_time_over_the_loopback(tmp_path, capsys):
     assert flight["success"] or flight["handed_over"] or flight["vehicle_slips"]
 
 
-def test_limits_are_checked_before_anything_flies(capsys, tmp_path):
-    assert cli.main(["fly", "--out", str(tmp_path), "--silence-s", "-1"]) == 2
-    assert "silence-s" in capsys.readouterr().err
-    assert replace(Limits(), tilt_deg=45.0).tilt_deg == 45.0
-
-
-def test_a_speed_is_asked_of_policies_that_take_one(capsys, tmp_path, monkeypatch):
-    asked = ["fly", "--out", str(tmp_path), "--policy"]
+def test_a_speed_and_the_judges_monitor_fly_in_real_time_too(capsys, tmp_path, monkeypatch):
+    asked, flown = ["fly", "--out", str(tmp_path), "--policy"], []
     assert cli.main([*asked, "swift", "--speed", "0.3"]) == 2
     assert "--speed 0.3: swift takes no speed" in capsys.readouterr().err
-    flown = []
     monkeypatch.setattr(commanded, "_real", lambda policy, *_: flown.append(policy) or {})
     link = ["--link", "udpin:127.0.0.1:0", "--confirm"]
     assert cli.main([*asked, "swift-30", "--speed", "0.3", *link]) == 0
     assert cli.main([*asked, "swift-30", *link]) == 0
     assert [policy.spec.speed for policy in flown] == [0.3, load_policy("swift-30").spec.speed]
-
-
-def test_the_judges_monitor_flies_in_real_time_too(capsys, tmp_path, monkeypatch):
-    flown = []
-    monkeypatch.setattr(commanded, "_real", lambda policy, *_: flown.append(policy) or {})
-    link = ["--link", "udpin:127.0.0.1:0", "--confirm", "--monitor", "--json"]
-    assert cli.main(["fly", "--out", str(tmp_path), "--policy", "swift", *link]) == 0
+    capsys.readouterr()
+    assert cli.main([*asked, "swift", *link, "--monitor", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
-    (policy,) = flown
+    policy = flown[-1]
     assert isinstance(policy, Monitored) and isinstance(policy.policy, BlockPolicy)
     assert policy.policy.block == 1
     assert (answer["policy"]["name"], answer["interventions"]) == ("swift+monitor", 0)
