@@ -1,6 +1,6 @@
 """Policies under conditions at a small size: every condition once, and two on the same trials."""
 
-from tests.support.documents import another_racer, page, reproduce
+from tests.support.documents import page, reproduce
 
 
 def test_robustness(sky, tmp_path, capfd):
@@ -19,18 +19,3 @@ def test_robustness(sky, tmp_path, capfd):
     assert len(numbers["conditions"]) == 1 + 2 + 5 + 5
     assert text.count("| 0 % [0, 56] |") == 13
     assert (tmp_path / "docs" / "robustness-2.png").is_file()
-
-
-def test_two_policies_fly_the_same_trials_under_every_condition(sky, tmp_path):
-    other = tmp_path / "other"
-    another_racer(other, 1001)
-    both = ["--policy", "racer", "--policy", str(other)]
-    args = [*both, "--only", "depth noise", "--trials", "1", "--difficulty", "0"]
-    assert reproduce(tmp_path, "robustness", *args) == 0
-    text, numbers = page(tmp_path, "robustness")
-    assert "| other - racer |" in text and "| racer: success |" in text
-    assert "Growing disturbances" in text and "Every effect" not in text
-    # The same network on the same trials under the same noise: no difference in any number.
-    for condition in numbers["conditions"]:
-        one, two = condition["policies"].values()
-        assert one == two

@@ -7,17 +7,11 @@ import numpy as np
 import pytest
 
 from eval.judging.results import write_results
-from eval.judging.statistics import mcnemar_exact, over_seeds
+from eval.judging.statistics import over_seeds
 from eval.worlds.trial import TrialResult
 from suite.commands import compare
 from suite.common.console import Quiet
 from suite.judging.comparing import paired, read_runs, seeds_of
-
-
-def test_mcnemars_exact_test():
-    """Binomial tails: 12 against 2 is 2 x P(X <= 2 | 14, 1/2) = 2 x 106 / 16384."""
-    assert mcnemar_exact(12, 2) == pytest.approx(212 / 16384)
-    assert mcnemar_exact(6, 0) == pytest.approx(0.03125)
 
 
 @pytest.mark.parametrize("two", [False, True])

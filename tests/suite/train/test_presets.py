@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 
-from suite import cli
 from suite.train import losses
 from suite.train.config import check
 from suite.train.presets import at_rate, chosen_model, preset
@@ -63,13 +62,6 @@ def test_another_rate_keeps_rollouts_and_delays_in_seconds():
     assert (odd.episode.steps, odd.episode.image_stride) == (120, 4)
     late = at_rate(preset("paper"), 30.0).physics
     assert (late.state_delay, late.image_delay) == (2, 4)
-
-
-@pytest.mark.slow
-def test_the_gpu_preset_trains_on_what_there_is_at_a_small_size(tmp_path):
-    small = ["--iterations", "2", "--set", "episode.batch=8", "episode.steps=4"]
-    assert cli.main(["train", "--preset", "gpu", *small, "--out", str(tmp_path / "run")]) == 0
-    assert len((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()) == 2
 
 
 def test_the_papers_preset_has_the_papers_weights():

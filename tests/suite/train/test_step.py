@@ -128,19 +128,3 @@ def test_hovering_above_the_frame_there_is_progress_to_be_made_backwards():
         worlds = worlds._replace(pos_w=worlds.pos_w + 1.2 * turn[:, :, 2], vel_w=-2 * turn[:, :, 0])
         terms[approach] = np.asarray(flown(config, worlds)[0])
     assert np.all(terms[0.0] > -0.3) and np.all(terms[1.5] < -0.8)
-
-
-def test_beyond_the_last_gate_progress_goes_straight_on():
-    loss = {"progress": 1.0, "approach_m": 1.5}
-    config = small_config(2, 1, physics=STILL, loss=loss)
-    worlds = at_first_gate(config, -3.0)
-    first = worlds.scene.gates.center_w[:, 0]
-    center = np.array(worlds.scene.gates.center_w)
-    center[:, -1] = first
-    turn = np.array(worlds.scene.gates.rot_w)
-    turn[:, -1] = turn[:, 0]
-    gates = worlds.scene.gates._replace(center_w=center, rot_w=turn)
-    worlds = worlds._replace(
-        scene=worlds.scene._replace(gates=gates), target=np.full(2, center.shape[1], np.int32)
-    )
-    np.testing.assert_allclose(flown(config, worlds)[0], -3.0, atol=0.2)

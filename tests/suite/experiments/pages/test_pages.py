@@ -9,7 +9,6 @@ import pytest
 from eval.judging.statistics import Interval
 from suite.common.console import Console
 from suite.common.report import Picture
-from suite.experiments.pages import charts
 from suite.experiments.pages.document import (
     BEGIN,
     END,
@@ -19,9 +18,7 @@ from suite.experiments.pages.document import (
     write_document,
 )
 from suite.experiments.pages.tables import points_cell
-from tests.support.judged_cells import cell
 from tracks.common.grid import Cell, table
-from tracks.families import JUDGED
 
 PNG = b"\x89PNG"
 
@@ -79,13 +76,3 @@ def test_differences_are_coloured_by_what_they_tell():
     assert points_cell(Interval(0.1, 0.02, 0.2)) == Cell("+10 [+2, +20]", "good")
     assert points_cell(Interval(-0.1, -0.2, -0.02)).tone == "bad"
     assert points_cell(Interval(-0.001, -0.1, 0.1)) == Cell("+0 [-10, +10]", "")
-
-
-def test_charts_are_pictures():
-    cells = [cell(track, level, 0.5) for track in JUDGED for level in (0, 3)]
-    for made in (
-        charts.level_chart(cells),
-        charts.cells_chart({"p": cells}),
-        charts.cells_chart({"p$x^{$": cells}),
-    ):
-        assert made.startswith(PNG)

@@ -2,21 +2,13 @@
 
 import math
 
-import pytest
-
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
 from suite.common.console import Console
-from suite.experiments.ablation import Config as AblationConfig
-from suite.experiments.schemes import Config as SchemesConfig
 from suite.experiments.study import disturbed
 from suite.experiments.study.conditions import Condition
-from suite.experiments.study.intervals import Spread
-from suite.experiments.study.judging import Flier, Order, flown, trials_of
-from suite.experiments.study.options import check, judged_seeds
-from suite.experiments.study.summary import summaries
-from suite.experiments.study.training import Row, Study, Trained
-from suite.experiments.worlds import Config as WorldsConfig
+from suite.experiments.study.judging import Flier, Order, flown
+from suite.experiments.study.training import Row, Study
 from suite.train.presets import preset
 
 VEHICLE = load_vehicle("reference")
@@ -30,34 +22,6 @@ def test_rows_take_turns_where_they_are_to_meet_the_same_load():
     assert [(key, c.seed) for key, c in turns.pieces()] == [("a", 4), ("b", 4), ("a", 5), ("b", 5)]
 
 
-def test_a_summary_leaves_out_what_diverged():
-    def run(row, seed, gates, diverged=""):
-        return Trained(row, seed, "", 1.0, 0.0, "c", diverged, [{"gates": gates}])
-
-    rows = [Row("a", "words", RECIPE), Row("b", "", RECIPE)]
-    runs = [run("a", 0, 1.0), run("b", 0, 9.0, "it diverged"), run("a", 1, 2.0)]
-    one, two = summaries(rows, [*runs, run("a", 2, 9.0, "it diverged")])
-    assert (one.seeds, one.diverged, one.values("gates")) == (3, 1, [1.0, 2.0])
-    assert one.at[-1]["gates"] == Spread(1.5, 1.0, 2.0)
-    assert one.text("gates") == "1.50 [1.00, 2.00]" and one.text("gates", digits=0)[0] == "2"
-    assert two.text("gates") == "diverged" and not two.at
-
-
-@pytest.mark.parametrize(
-    ("config", "words"),
-    [
-        (AblationConfig(worlds=0), "--worlds is 0"),
-        (AblationConfig(seed=2), "--seed 2 is one of --training-seeds"),
-        (AblationConfig(training_seeds=()), "--training-seeds is empty"),
-        (SchemesConfig(seconds=0.1), r"--seconds is 0\.1"),
-        (WorldsConfig(difficulty="10"), "level 10 is not 0 to 9"),
-    ],
-)
-def test_options_are_checked_by_their_fields_names(config, words):
-    with pytest.raises(ValueError, match=words):
-        check(config)
-
-
 def test_the_same_flier_in_two_orders_flies_a_trial_once(sky, tmp_path):
     one, two = TrialSpec("zigzag", 0, 1), TrialSpec("zigzag", 0, 2)
     flier = Flier("racer", VEHICLE)
@@ -65,12 +29,6 @@ def test_the_same_flier_in_two_orders_flies_a_trial_once(sky, tmp_path):
     found = flown(orders, tmp_path, Console(), "flying")
     assert len(sky.flown) == 2 and found["b"] == found["a"][1:]
     assert [row.trial for row in found["a"]] == [one, two]
-
-
-def test_trials_and_their_seeds():
-    config = WorldsConfig(trials=2, seed=7, difficulty="0,3")
-    assert len(trials_of(config)) == 3 * 2 * 2 and judged_seeds(config) == "7 to 8"
-    assert {trial.seed for trial in trials_of(config, (9,))} == {7, 8}
 
 
 def test_several_policies_under_one_name_fly_one_after_the_other(sky, tmp_path):
