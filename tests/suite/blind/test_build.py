@@ -1,10 +1,16 @@
-"""A case is built the same to the bit, and what is hidden is in its logs."""
+"""A case is built the same to the bit, and what is hidden acts as strongly as it says."""
 
 import numpy as np
 import pytest
 
+from eval.effects import EFFECTS, nameable_effects
 from suite.blind.build import build
 from suite.blind.cases import Case
+from suite.blind.oracle.strength import columns_in_table, detectable_along, given_vehicle
+from suite.blind.outside import KINDS as OUTSIDE
+from suite.blind.outside import changed_values, draw_change, make_outside
+from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.blind import SINGLE
 
 pytestmark = pytest.mark.usefixtures("short_flights")
@@ -35,3 +41,39 @@ def test_outside_cases_say_how_much_the_catalogue_cannot_explain():
     outside = built.answer["outside"]
     assert built.answer["verdict"] == "unknown" and not built.truth.effects
     assert outside["multiple"] == pytest.approx(6.0, rel=0.25) or outside["strength"] == 0.3
+
+
+BARE = given_vehicle("bare")
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_physics_outside_the_catalogue_moves_the_vehicle(name):
+    way = Trajectory("climb", duration_s=2.0, speed=3.0, size=1.0)
+    plain = fly(BARE, BARE, [way])[0]
+    moved = fly(BARE, BARE, [way], extra=make_outside(name, OUTSIDE[name].usual, BARE.mass))[0]
+    pushed = (
+        np.abs(moved.extra.force_b).max() + np.abs(moved.acting.thrust - moved.command.thrust).max()
+    )
+    assert pushed > 0.0 and np.abs(moved.motion.pos_w - plain.motion.pos_w).max() > 1e-5
+
+
+def test_a_hanging_load_weighs_what_it_weighs():
+    flight = fly(
+        BARE, BARE, [Trajectory("hover", 1.0)], extra=make_outside("slung_load", 0.03, BARE.mass)
+    )[0]
+    assert flight.extra.force_b[0, 2] == pytest.approx(-0.03 * 9.81, rel=1e-6)
+
+
+def test_a_strength_is_the_multiple_of_the_table_or_cut_at_a_bound():
+    nominal = given_vehicle("bare")
+    for name in nameable_effects():
+        vehicle = nominal if name not in ("constant_wind", "gusts") else given_vehicle("dragged")
+        rng = np.random.default_rng(3)
+        change, multiple = draw_change(rng, vehicle, "full", name, 2.0)
+        values = changed_values(vehicle, "full", name, change, rng)
+        assert multiple <= 2.0 and np.abs(change).max() > 0.0, name
+        direction = change / np.linalg.norm(change)
+        unit = detectable_along(vehicle.name, "full", name, direction)
+        assert np.linalg.norm(change) / unit == pytest.approx(multiple, rel=1e-6), name
+        assert len(columns_in_table(vehicle.name, "full", name)) == len(change)
+        assert isinstance(values, EFFECTS[name].values)

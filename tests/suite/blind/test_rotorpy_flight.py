@@ -1,10 +1,10 @@
-"""What the blind set has RotorPy fly."""
+"""What the blind set has RotorPy fly, and the damping by its moving hubs."""
 
 import numpy as np
 import pytest
 
 from eval.quadrotor.plant import Motion
-from suite.blind.rotorpy_flight import check_effects, fly_rotorpy
+from suite.blind.rotorpy_flight import check_effects, damping_of_hubs, fly_rotorpy
 from suite.diagnose.plans.follow import FlightFailed
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import Trajectory
@@ -48,3 +48,19 @@ def test_a_flight_into_the_ground_fails():
     pytest.importorskip("rotorpy")
     with pytest.raises(FlightFailed, match=r"flight 1 failed at \d\.\d\d s"):
         fly_rotorpy(LAGGED, LAGGED, [Trajectory("hover", 0.5, height=0.0)], 100.0)
+
+
+K = 2e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "plane"), [("rotor_drag", (1.0, 1.0, 0.0)), ("inflow", (0.0, 0.0, 1.0))]
+)
+def test_torque_of_hubs_in_a_turning_body(name, plane):
+    place = np.asarray(PLAIN.rotors.position)
+    speed = np.sqrt(PLAIN.mass * 9.81 / 4 / PLAIN.rotors.thrust_coefficient)
+    rate_b = np.array([0.7, -1.1, 2.0])
+    force = -K * speed * np.cross(rate_b, place) * plane
+    torque = np.cross(place, force).sum(axis=0)
+    found = damping_of_hubs([{"name": name, "parameters": {"coefficient": K}}], PLAIN)
+    np.testing.assert_allclose(-found * rate_b * PLAIN.inertia, torque, rtol=1e-3, atol=1e-9)

@@ -1,11 +1,13 @@
-"""A report as one HTML file."""
+"""A report as one HTML file, and what people write for levels and tracks."""
 
 import base64
 import struct
 
+import pytest
 from matplotlib.figure import Figure
 
 from suite.common.charts import DPI, png
+from suite.common.choices import parse_levels, parse_tracks
 from suite.common.report import Details, Links, Picture, Report, Section, ranged, write_report
 from tracks.common.grid import Cell, Grid
 
@@ -41,3 +43,24 @@ def test_a_figure_is_a_png_file_of_its_size():
     file = png(Figure(figsize=(2.0, 1.0)))
     assert file.startswith(b"\x89PNG")
     assert struct.unpack(">II", file[16:24]) == (2 * DPI, DPI)
+
+
+@pytest.mark.parametrize(
+    ("text", "levels"),
+    [("3", [3]), ("0,3, 9", [0, 3, 9]), ("7-9,0,8", [7, 8, 9, 0]), ("all", list(range(10)))],
+)
+def test_levels(text, levels):
+    assert parse_levels(text) == levels
+
+
+@pytest.mark.parametrize("text", ["10", "-1", "3-1", "", "easy", "1,,2", "0-10"])
+def test_levels_that_are_none_are_refused_by_name(text):
+    with pytest.raises(ValueError, match="--difficulty"):
+        parse_levels(text)
+
+
+def test_tracks():
+    assert parse_tracks("all") == ["zigzag", "circular", "ellipse"]
+    assert parse_tracks("ellipse,my/course.toml") == ["ellipse", "my/course.toml"]
+    with pytest.raises(ValueError, match="Did you mean 'zigzag'"):
+        parse_tracks("ellipse,zigzg")

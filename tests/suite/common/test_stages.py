@@ -1,12 +1,14 @@
-"""Stages in folders: done once, found again, refused for another configuration."""
+"""Stages in folders, the record of a run, and what people are told of both."""
 
 import json
 from dataclasses import dataclass
 
 import pytest
 
-from suite.common.console import Console
+from suite.common.console import Console, duration, size
+from suite.common.provenance import refuse_other_run, run_record, write_run_record
 from suite.common.stages import MARK, Estimate, Stage, announce, claim, do_stages
+from suite.judging.requests import Collection, Evaluation
 
 
 @dataclass(frozen=True)
@@ -64,3 +66,68 @@ def test_an_estimate_is_said_and_missing_memory_is_warned_of(capsys):
     assert capsys.readouterr().err == "training: about 2 min 10 s and 2.0 GB of memory\n"
     announce(Console(), "training", Estimate(seconds=1, memory_bytes=1e18))
     assert "warning" in capsys.readouterr().err
+
+
+def test_a_run_record_holds_what_is_needed_to_repeat_it(tmp_path):
+    config = Estimate(seconds=1.0, memory_bytes=2.0)
+    write_run_record(tmp_path, config, seed=3)
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert record["config"] == {"seconds": 1.0, "memory_bytes": 2.0}
+    assert record["seed"] == 3 and record["schema"] == 1
+    assert set(record) >= {"suite_version", "git_commit", "python", "packages", "machine"}
+    assert run_record(config, None)["config_type"] == "suite.common.stages.Estimate"
+
+
+def test_a_folder_of_another_kind_of_run_is_refused(tmp_path):
+    refuse_other_run(tmp_path, Evaluation())  # nothing is there
+    write_run_record(tmp_path, Evaluation(), 0)
+    refuse_other_run(tmp_path, Evaluation(trials=3))
+    with pytest.raises(ValueError, match="holds a run of another kind .* give another --out"):
+        refuse_other_run(tmp_path, Collection())
+    (tmp_path / "run.json").write_text("[]")
+    refuse_other_run(tmp_path, Collection())  # none of ours
+
+
+def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch):
+    from suite.experiments.study.training import commit_of
+
+    for commit in ("aaa", "aaa", "bbb"):
+        monkeypatch.setattr(
+            "suite.common.provenance.stamp", lambda c=commit, **_: {"git_commit": c}
+        )
+        write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3, goes_on=True)
+    assert json.loads((tmp_path / "run.json").read_text())["earlier_commits"] == ["aaa"]
+    assert commit_of(tmp_path / "policy") == "aaa, bbb"
+    write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3)
+    assert commit_of(tmp_path / "policy") == "bbb", "another run in the same folder"
+    assert commit_of(tmp_path / "none" / "policy") == "unknown"
+
+
+def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
+    now = [0.0]
+    with Console().progress("flying", 100, clock=lambda: now[0]) as update:
+        for done in range(101):
+            now[0] = done * 0.5
+            update(done, "3.1 m/s")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 5
+    assert lines[0] == "flying: 20 of 100, 40 s left, 3.1 m/s"
+
+
+def test_the_time_left_counts_only_what_was_done_since_it_began(capsys):
+    now = [0.0]
+    with Console().progress("training", 100, clock=lambda: now[0], begun=80) as update:
+        now[0] = 12.0
+        update(90)
+    assert capsys.readouterr().err == "training: 90 of 100, 12 s left\n"
+
+
+def test_figures_for_people():
+    assert [duration(s) for s in (0.44, 9.96, 59.6, 200, 7500)] == [
+        "0.4 s",
+        "10 s",
+        "1 min 00 s",
+        "3 min 20 s",
+        "2 h 05 min",
+    ]
+    assert [size(b) for b in (5, 812e3, 2.06e9)] == ["5 B", "812 kB", "2.1 GB"]

@@ -1,4 +1,4 @@
-"""Three policies on the same trials, compared pair by pair."""
+"""Policies on the same trials, compared pair by pair."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,9 @@ import pytest
 from eval.judging.statistics import bootstrap_mean
 from eval.worlds.trial import TrialResult
 from suite.loop.compare import Line, compare, grids, verdict
+from suite.loop.hidden_effect import LABELS
+from suite.loop.standings import cell_grid, overall_grid, standings
+from tests.support.loops import trial_result
 
 
 def _result(seed, success, v_mean, gates=8, level=0):
@@ -69,3 +72,26 @@ def test_bootstrap_of_a_mean_is_that_of_the_central_limit():
     assert found.high - found.value == pytest.approx(half, rel=0.1)
     assert found.value - found.low == pytest.approx(half, rel=0.1)
     assert np.isnan(bootstrap_mean(np.array([]))).all()
+
+
+def test_standings_are_paired_by_trial():
+    won = {"nominal": 39, "before": 10, "control": 12, "delta": 20, "named": 36, "both": 40}
+    results = {
+        name: [trial_result(k, k < count, k % 2) for k in range(40)] for name, count in won.items()
+    }
+    stand = standings(results, ("before", "control", "nominal"))
+    named = stand[4]
+    assert named.success.value == pytest.approx(0.9) and named.gates.value == pytest.approx(7.5)
+    assert [d.against for d in named.differences] == ["before", "control", "nominal"]
+    assert named.differences[0].success.value == pytest.approx(26 / 40)
+    # 26 pairs, all one way: 2 / 2^26 by hand.
+    assert named.differences[0].p_value == pytest.approx(2 / 2**26)
+    assert named.by_cell["zigzag 0"].value == pytest.approx(18 / 20)
+    assert [d.against for d in stand[1].differences] == ["control", "nominal"]
+    grid = overall_grid(stand, ("before", "control", "nominal"), LABELS, 40)
+    assert {len(row) for row in grid.rows} == {len(grid.headers)}
+    assert grid.rows[4][2].tone == "good" and grid.rows[1][2].text == ""
+    cells = cell_grid(stand, LABELS)
+    assert len(cells.rows) == 2 and cells.rows[0][5].text.startswith("90 [")
+    with pytest.raises(ValueError, match="same trials"):
+        standings({**results, "both": results["both"][::-1]}, ("before",))

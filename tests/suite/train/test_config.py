@@ -1,12 +1,15 @@
-"""A run's configuration is a value, and what no training can be made with is refused."""
+"""Recipes by name, settings changed by name, and what no training can be made with."""
 
+import math
 from dataclasses import replace
 
 import pytest
 
 from suite.common.console import Console
-from suite.train.config import check
-from suite.train.presets import PRESETS, preset
+from suite.train import losses
+from suite.train.config import TrainConfig, check
+from suite.train.overrides import check_owned, override
+from suite.train.presets import PRESETS, at_rate, chosen_model, preset
 from suite.train.run import train
 from tests.support.training import small_config
 
@@ -38,3 +41,130 @@ def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_is_within_the_limits(name):
     check(preset(name))
+
+
+def test_settings_are_changed_by_name():
+    changes = ("loss.progress=1.2", "episode.batch = 8", "physics.drag=(0, 0.5)", "seed=3")
+    config = override(TrainConfig(), changes)
+    assert config.loss.progress == 1.2 and config.episode.batch == 8 and config.seed == 3
+    assert config.physics.drag == (0.0, 0.5) and isinstance(config.physics.drag[0], float)
+    whole = override(TrainConfig(), ["loss.progress=1"]).loss.progress
+    assert isinstance(whole, float) and whole == 1.0
+    assert override(TrainConfig(), ["loss.crash_depth_m=inf"]).loss.crash_depth_m == math.inf
+    camera = override(TrainConfig(), ["spec.camera.width=48"]).spec.camera
+    assert camera.width == 48 and camera.height == TrainConfig().spec.camera.height
+
+
+def test_what_only_the_point_mass_reads_is_refused_through_quadrotors():
+    run = preset("direct")
+    for change in ("physics.wind_std=(3,3,1)", "physics.action_delay=(0,2)"):
+        with pytest.raises(ValueError, match=r"is of the point mass.*set one of quadrotor\."):
+            override(run, [change])
+    assert override(run, ["physics.image_delay=2"]).physics.image_delay == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "need", "given"),
+    [
+        ("loss.projection_decay=1", "loss.projection", "3"),
+        ("loss.speed_range=(3, 9)", "spec.speed_input", "True"),
+        ("episode.race_share=0.9", "spec.speed_input", "True"),
+    ],
+)
+def test_what_would_do_nothing_is_refused(change, need, given):
+    run = preset("racer")
+    with pytest.raises(ValueError, match=rf"does nothing where {need} is (0|False)"):
+        override(run, [change])
+    # In whatever order they are given.
+    assert override(run, [change, f"{need}={given}"]) == override(run, [f"{need}={given}", change])
+
+
+def test_what_a_command_sets_itself_is_refused_with_what_to_do_instead():
+    check_owned(["loss.progress=1"], {"loss.prog": "", "spec": ""})
+    with pytest.raises(ValueError, match=r"--set 'spec.rate_hz=30': this command sets spec"):
+        check_owned(["spec.rate_hz=30"], {"spec": "take another policy"})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("loss.progres=1", "Did you mean 'progress'"),
+        ("los.progress=1", "Did you mean 'loss'"),
+        ("loss=1", "has parts, set one of clearance"),
+        ("loss.progress.more=1", "'more' is below a setting that has no parts"),
+        ("quadrotor.mass_std=0.1", "this run has no quadrotor; take a preset"),
+        ("loss.progress=inf", "loss.progress is inf, allowed is"),
+        ("loss.progress", "write FIELD=VALUE"),
+        ("loss.progress=fast", "'fast' does not fit, the setting is like"),
+        ("episode.batch=3.5", "(int)"),
+        ("physics.drag=(1,2,3)", "(tuple)"),
+        ("physics.drag=(1,'a')", "(float)"),
+    ],
+)
+def test_wrong_settings_are_refused_by_name(change, words):
+    with pytest.raises(ValueError) as error:
+        override(TrainConfig(), [change])
+    assert words in str(error.value) and change in str(error.value)
+
+
+def test_a_model_is_asked_for_by_name_or_the_recipes_own():
+    swift = preset("swift")
+    quad = chosen_model(swift, "quad", "racer5")
+    assert quad.quadrotor is not None and quad.quadrotor.vehicle.name == "racer5"
+    assert chosen_model(quad, "point", None) == swift == chosen_model(swift, None, None)
+    with pytest.raises(ValueError, match="the point mass has none: add --model quad"):
+        chosen_model(swift, None, "reference")
+
+
+def test_swift_quad_varies_its_quadrotors_widely_around_any_vehicle_that_is_asked_for():
+    own = preset("swift-quad")
+    check(own)
+    assert own.quadrotor is not None and own.quadrotor.vehicle.name == "racer5"
+    other = chosen_model(own, "quad", "crazyflie21").quadrotor
+    assert other is not None and other.vehicle.name == "crazyflie21"
+    # What is a torque or a length goes with the vehicle's, all else is the recipe's.
+    small, racer = other.vehicle.inertia, own.quadrotor.vehicle.inertia
+    share = (small[0] + small[1]) / (racer[0] + racer[1])
+    assert other.trim_std == pytest.approx(share * own.quadrotor.trim_std) and share < 0.01
+    assert 0.2 < other.com_std_m / own.quadrotor.com_std_m < 0.5
+    sizes = {"trim_std": own.quadrotor.trim_std, "com_std_m": own.quadrotor.com_std_m}
+    assert replace(other, vehicle=own.quadrotor.vehicle, **sizes) == own.quadrotor
+    again = chosen_model(own, "quad", "racer5")
+    assert again == own, "to the bit"
+    assert chosen_model(own, "point", None).quadrotor is None
+
+
+def test_each_swift_recipe_changes_what_it_says_of_the_one_before():
+    names = ("swift-quad", "swift-30", "swift-ahead", "swift-sure", "swift-keen")
+    slow, fast, ahead, sure, keen = map(preset, names)
+    assert fast.spec == replace(slow.spec, rate_hz=30.0)
+    assert slow.episode.steps / 15.0 == fast.episode.steps / 30.0
+    optimizer = replace(fast.optimizer, iterations=ahead.optimizer.iterations)
+    spec = replace(fast.spec, second_axis=True)
+    assert ahead == replace(fast, spec=spec, optimizer=optimizer)
+    assert (sure.spec, sure.quadrotor) == (ahead.spec, ahead.quadrotor)
+    assert sure.loss.gradient_decay > ahead.loss.gradient_decay
+    camera = replace(sure.spec.camera, rays=2)
+    assert keen == replace(sure, spec=replace(sure.spec, camera=camera))
+
+
+def test_another_rate_keeps_rollouts_and_delays_in_seconds():
+    slow = preset("swift-quad")
+    fast = at_rate(slow, 30.0)
+    check(fast)
+    assert (fast.episode.steps, fast.episode.image_stride) == (180, 6)
+    assert fast.physics.action_delay == (0.0, 2.0), "not 3: the point mass holds no more"
+    assert at_rate(fast, 15.0).episode == slow.episode and at_rate(slow, 15.0) == slow
+    odd = at_rate(slow, 20.0)
+    check(odd)
+    assert (odd.episode.steps, odd.episode.image_stride) == (120, 4)
+    late = at_rate(preset("paper"), 30.0).physics
+    assert (late.state_delay, late.image_delay) == (2, 4)
+
+
+def test_the_papers_preset_has_the_papers_weights():
+    loss = preset("paper").loss
+    assert (loss.clearance, loss.collide) == (3.0, 3.0)
+    assert (loss.acceleration, loss.jerk, loss.progress) == (1e-2, 1e-3, 0.4)
+    assert loss.progress_norm == loss.projection == 0.0
+    assert (losses.BARRIER_HEIGHT, losses.BARRIER_SLOPE, losses.FIELD_DECAY) == (2.0, -32.0, 0.3)

@@ -1,7 +1,6 @@
 """A run in a folder: the same curve with and without stops, kills and faults."""
 
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -16,9 +15,7 @@ from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import delta_network
 from suite.common import curve
 from suite.common.console import Console
-from suite.common.errors import WorkFailed
 from suite.train import run, training_loop
-from suite.train.dynamics import point_mass
 from tests.support.training import boxes_worlds, fresh_params, small_config
 
 CONFIG = small_config(physics={"depth_noise": 0.02})
@@ -135,26 +132,6 @@ def test_a_kill_in_the_middle_of_saving_leaves_a_run_that_resumes(
     assert_same_run(tmp_path, whole)
 
 
-def test_a_kill_between_the_two_renames_of_the_state_loses_nothing(whole, tmp_path, monkeypatch):
-    go_on = stop_at(monkeypatch, 4)
-    with pytest.raises(KeyboardInterrupt):
-        run.train(CONFIG, tmp_path, Console())
-    go_on()
-    part = tmp_path / ".state-x.part"
-    (part / "replaced").mkdir(parents=True)
-    os.replace(tmp_path / "state", part / "state")
-    done = []
-
-    def counted(*args):
-        update = update_of(*args)
-        return lambda *a: (done.append(0), update(*a))[1]
-
-    monkeypatch.setattr(run, "make_update", counted)
-    run.train(CONFIG, tmp_path, Console())
-    assert len(done) == 3
-    assert_same_run(tmp_path, whole)
-
-
 BARE = """
 import os, sys
 class Blocker:
@@ -190,23 +167,6 @@ def test_a_bare_machine_trains_and_a_real_kill_while_saving_loses_nothing(whole,
     assert_same_run(tmp_path, whole)
 
 
-def test_numbers_that_are_not_finite_stop_the_run_before_they_are_kept(tmp_path, monkeypatch):
-    def worlds(config, iteration):
-        good = boxes_worlds(config, iteration)
-        if iteration < 2:
-            return good
-        assert isinstance(good.constants, point_mass.PointMassParams)
-        lag = good.constants.lag * np.float32(np.nan)
-        return good._replace(constants=good.constants._replace(lag=lag))
-
-    monkeypatch.setattr(run, "sample_worlds", worlds)
-    with pytest.raises(WorkFailed, match="diverged at iteration 2: .*loss, .* not finite"):
-        run.train(CONFIG, tmp_path, Console())
-    stored = load_arrays(tmp_path / "state", kind="training")
-    assert stored.config["training"]["iteration"] == 2
-    assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1]
-
-
 def test_a_folder_with_another_run_is_refused(whole):
     other = replace(CONFIG, episode=replace(CONFIG.episode, rest_share=0.5))
     with pytest.raises(ValueError, match="differs in episode"):
@@ -216,16 +176,6 @@ def test_a_folder_with_another_run_is_refused(whole):
         run.train(CONFIG, whole, Console(), fresh_params(), delta)
     with pytest.raises(ValueError, match="remove the folder"):
         run.train(replace(CONFIG, seed=1), whole, Console())
-
-
-def test_a_finished_run_is_not_done_again(whole, monkeypatch):
-    def never(*_):
-        raise AssertionError("trained again")
-
-    monkeypatch.setattr(run, "make_update", never)
-    outcome = run.train(CONFIG, whole, Console())
-    assert outcome.iterations == 6 and outcome.policy == whole / "policy"
-    assert outcome.last["loss"] == curve.read(whole)[-1]["loss"]
 
 
 def test_a_delta_action_stays_as_it_is_while_the_policy_is_trained_under_it(whole, tmp_path):

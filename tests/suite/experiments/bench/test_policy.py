@@ -1,13 +1,16 @@
-"""The benchmark of a policy's step, on a small policy."""
+"""Benchmarks: two implementations timed in turn, and the engines of a policy."""
 
 import json
+from itertools import count
 from pathlib import Path
 
 import pytest
 
 from policies.formats.c.compiler import find_compiler
 from suite import cli
-from suite.experiments.bench import policy
+from suite.common.errors import WorkFailed
+from suite.experiments.bench import diagnose, policy, sysid_baseline
+from suite.experiments.bench.compare import Comparison, Figure, in_turn
 from tests.support.small_policy import small_checkpoint
 
 
@@ -28,3 +31,27 @@ def test_every_engine_is_timed_and_the_ratio_is_of_the_times(tmp_path, monkeypat
     assert rows["C int8"]["weight_bytes"] < 0.4 * rows["C float32"]["weight_bytes"]
     estimate = rows["C float32"]["estimate_cortex_m7_480mhz_ms"]
     assert estimate == pytest.approx(rows["C float32"]["multiply_adds"] * 3.0 / 480e3)
+
+
+def test_bench_times_both_sides_in_turn():
+    calls = []
+    ticks = count()
+    ours, baseline = in_turn(
+        lambda: calls.append("ours"),
+        lambda: (calls.append("baseline"), next(ticks), next(ticks)),
+        repeats=3,
+        clock=lambda: next(ticks),
+    )
+    assert calls == ["ours", "baseline"] * 4
+    assert (ours, baseline) == (1, 3)
+    figures = Figure(6.0, "steps/s"), Figure(2.0, "steps/s")
+    assert Comparison("a", *figures).ratio == pytest.approx(3.0)
+
+
+def test_without_a_compiler_or_packages_it_says_what_to_install(monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(WorkFailed, match="no C compiler"):
+        policy.run()
+    monkeypatch.setattr(sysid_baseline, "is_installed", lambda: False)
+    with pytest.raises(WorkFailed, match=r"pip install 'mujoco\[sysid\]'"):
+        diagnose.run()

@@ -1,4 +1,4 @@
-"""The trainer's baseline compares like with like: the same loss and gradient."""
+"""The trainer's baseline compares like with like: the same worlds, loss and gradient."""
 
 from dataclasses import replace
 
@@ -11,6 +11,7 @@ from suite.experiments.bench import train
 from suite.experiments.bench.torch_baseline import Baseline, to_torch
 from suite.train.gradient import make_gradient
 from tests.support.training import fresh_params
+from tracks.geometry.scene import PARKED_Z
 
 
 @pytest.fixture(scope="module")
@@ -48,3 +49,21 @@ def test_the_baseline_refuses_what_its_preset_does_not_have():
         config = replace(base, **{part: replace(getattr(base, part), **change)})
         with pytest.raises(ValueError, match=f"{part}.{next(iter(change))} is .* preset paper"):
             Baseline(config, params)
+
+
+def test_every_world_has_64_solids_where_the_drone_flies():
+    worlds = train.bench_worlds(train.bench_config(6, 12))
+    kinds = (worlds.scene.boxes, *worlds.scene[2:5])
+    assert sum(part.center_w.shape[1] for part in kinds) == 64 == sum(train.SOLIDS)
+    for part in kinds:
+        assert np.all(part.center_w[..., 2] > PARKED_Z / 2)
+        assert all(np.all(np.isfinite(array)) for array in part)
+
+
+@pytest.mark.slow
+def test_ours_is_at_least_two_and_a_half_times_as_fast():
+    result = train.run()
+    assert result.details["solids"] == 64
+    if result.warnings:
+        pytest.skip(result.warnings[0])
+    assert result.ratio >= 2.5

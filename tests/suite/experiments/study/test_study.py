@@ -1,15 +1,23 @@
-"""The study by hand: what is trained in which order, summed up over seeds, and flown once."""
+"""The study by hand: what is trained and flown in which order, kept under which name, summed up."""
 
+import json
 import math
+from importlib.metadata import EntryPoint, EntryPoints
+
+import numpy as np
+import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
 from suite.common.console import Console
-from suite.experiments.study import disturbed
+from suite.experiments.study import cache, disturbed
+from suite.experiments.study.cache import added_digest, code_digest, digest
 from suite.experiments.study.conditions import Condition
+from suite.experiments.study.intervals import nested
 from suite.experiments.study.judging import Flier, Order, flown
-from suite.experiments.study.training import Row, Study
+from suite.experiments.study.training import Row, Study, curve_of
 from suite.train.presets import preset
+from tracks.common import names as registry
 
 VEHICLE = load_vehicle("reference")
 RECIPE = preset("racer")
@@ -45,3 +53,79 @@ def test_several_policies_under_one_name_fly_one_after_the_other(sky, tmp_path):
     assert len(points[wind]) == 2 and len(sky.flown) == 2 * 3, "the undisturbed once for both"
     numbers = disturbed.tested_numbers(points[wind][1], tested)["policies"]["both"]
     assert numbers["success"].value == 0 and math.isclose(numbers["change"].value, 0)
+
+
+def test_time_leaves_compilation_out(tmp_path):
+    seconds = [(0, 30.0, True), (1, 2.0, False), (2, 11.0, True), (3, 3.0, False), (4, 4.0, False)]
+    rows = [{"iteration": k, "seconds": s, "cold": cold} for k, s, cold in seconds]
+    watched = [{"iteration": k, "gates": float(k)} for k in (0, 3, 5)]
+    for name, lines in (("metrics.jsonl", rows), ("validation.jsonl", watched)):
+        (tmp_path / name).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    points, compiling = curve_of(tmp_path, 10)
+    assert [(p["steps"], p["time"], p["gates"]) for p in points] == [
+        (0, 0.0, 0.0), (30, 3 + 2 + 3, 3.0), (50, 3 + 2 + 3 + 3 + 4, 5.0),
+    ]  # fmt: skip
+    assert compiling == 27 + 8
+
+
+def test_intervals_are_as_wide_as_seeds_differ():
+    steady, torn = np.full((4, 400), 0.0), np.zeros((4, 400))
+    steady[:, ::2] = torn[::2] = 1.0
+    one, other = nested(list(steady)).difference, nested(list(torn)).difference
+    assert one.value == other.value == 0.5
+    assert other.low <= 0.01 and other.high >= 0.99
+    # Half of 1,600 trials in all, whatever the seed.
+    assert one.high - one.low == pytest.approx(4 * np.sqrt(0.25 / 1600), rel=0.1)
+
+
+def test_seeds_with_more_trials_weigh_more():
+    assert nested([np.ones(30), np.zeros(10)]).difference.value == 0.75
+
+
+def test_the_cache_is_named_by_all_code_that_flies(tmp_path, monkeypatch):
+    for room, name in (("eval", "judge.py"), ("eval", "view/video.py"), ("suite", "cli.py")):
+        path = tmp_path / room / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("one")
+    monkeypatch.setattr(cache, "ROOT", tmp_path)
+    code_digest.cache_clear()
+
+    def now():
+        code_digest.cache_clear()
+        return code_digest("eval")
+
+    first = now()
+    (tmp_path / "suite" / "cli.py").write_text("two")
+    (tmp_path / "eval" / "view" / "video.py").write_text("two")
+    assert now() == first, "neither flies"
+    (tmp_path / "eval" / "judge.py").write_text("two")
+    second = now()
+    (tmp_path / "eval" / "judge.py").rename(tmp_path / "eval" / "jury.py")
+    assert len({first, second, now()}) == 3
+    code_digest.cache_clear()
+    assert digest({"a": 1}) != digest({"a": 2}) and len(digest(load_vehicle("reference"))) == 16
+
+
+def test_the_cache_is_named_by_what_other_packages_add(tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "_installed", lambda: EntryPoints([]))
+    assert added_digest() is None
+    monkeypatch.syspath_prepend(tmp_path)
+    single, package = tmp_path / "extra_drag.py", tmp_path / "extra_tracks" / "spiral.py"
+    package.parent.mkdir()
+    for path in (single, package, package.with_name("__init__.py")):
+        path.write_text("FORCE = 1")
+    entries = EntryPoints(
+        [
+            EntryPoint("drag", "extra_drag:FORCE", "diffracing_suite.effects"),
+            EntryPoint("spiral", "extra_tracks.spiral:FORCE", "diffracing_suite.tracks"),
+            EntryPoint("gone", "extra_gone:FORCE", "diffracing_suite.tracks"),
+            EntryPoint("other", "extra_other:FORCE", "another_program.effects"),
+        ]
+    )
+    monkeypatch.setattr(registry, "_installed", lambda: entries)
+    found = [added_digest()]
+    for path in (single, package):
+        path.write_text("FORCE = 2")
+        found.append(added_digest())
+    assert None not in found and len(set(found)) == 3
+    assert [entry.name for entry in registry.added_entries()] == ["drag", "gone", "spiral"]
