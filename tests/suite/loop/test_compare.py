@@ -12,12 +12,8 @@ from tests.support.loops import trial_result
 
 
 def _result(seed, success, v_mean, gates=8, level=0):
-    ended = "finished" if success else "collision"
-    rest = dict.fromkeys(TrialResult._fields[-5:], 0)
-    return TrialResult(
-        "zigzag", level, seed, "p", "v", "w", success, gates, ended, None, 0.0, 0.0, 0.0,
-        5.0, v_mean + 1, v_mean, **rest,
-    )  # fmt: skip
+    flown = trial_result(seed, success, level)
+    return flown._replace(gates_passed=gates, v_max=v_mean + 1, v_mean=v_mean)
 
 
 def test_differences_are_of_the_same_trials():
