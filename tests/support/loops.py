@@ -65,7 +65,8 @@ class Small:
 
 def trial_result(seed, success, level=0):
     """Return a trial of the zigzag that was won, or that ended after three gates."""
-    rest = dict.fromkeys(TrialResult._fields[-5:], 0)
+    counts = ("gates_8s", "gates_035", "bad_actions", "limited_actions", "late_actions")
+    rest = dict.fromkeys(counts, 0)
     return TrialResult(
         "zigzag", level, seed, "p", "v", "w", success, 8 if success else 3, "finished", None,
         0.0, 0.0, 0.0, 5.0, 4.0, 3.0, **rest,

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from eval.judging.statistics import bootstrap_mean
-from eval.worlds.trial import TrialResult
 from suite.loop.compare import Line, compare, grids, verdict
 from suite.loop.hidden_effect import LABELS
 from suite.loop.standings import cell_grid, overall_grid, standings
