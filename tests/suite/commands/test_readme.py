@@ -145,13 +145,6 @@ def test_links_within_the_repository_lead_somewhere():
                 assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
-def test_the_readme_is_short_and_its_picture_small():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 160
-    picture = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)[0]
-    assert (ROOT / picture).stat().st_size < 3e6
-
-
 def test_the_site_is_whole_and_loads_nothing_from_elsewhere(tmp_path):
     # The tool says that its own next version may never come; nothing of ours hangs on that.
     quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}

@@ -86,12 +86,3 @@ def test_a_loop_needs_none_of_our_files_where_it_runs(tmp_path):
     vehicle.unlink()
     there = loop_by_content(loop_of(Job(asked, tmp_path / "there", tmp_path / "reads")))
     assert here == there and set(here.digests) == {"policy", "vehicle", "world"}
-
-
-def test_a_loop_that_fails_otherwise_fails_the_document(loops, tmp_path, monkeypatch):
-    def broken(config, out, console):
-        raise WorkFailed("the training diverged")
-
-    monkeypatch.setattr(hidden_worlds, "run_loop", broken)
-    args = ["--policy", "racer", "--only", "weak rotor"]
-    assert reproduce(tmp_path, "hidden_worlds", *args) == 1

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS
-from suite.blind.oracle.strength import given_vehicle
 from suite.diagnose.data.noise import noise_of
 from suite.diagnose.fit.model import RolloutModel
 from suite.diagnose.fit.normal_equations import half_widths95, start_estimate
 from suite.experiments.bench import diagnose, sysid_baseline
-from suite.experiments.bench.rigid_body import REFITTED, _drawn, make_task
+from suite.experiments.bench.rigid_body import REFITTED, make_task
 
 
 @pytest.fixture(scope="module")
@@ -59,18 +57,6 @@ def test_a_rotation_is_told_with_its_sign():
     expected[0, 5] = 2 * np.sin(half)
     np.testing.assert_allclose(sysid_baseline._difference(turned, still), expected, atol=1e-12)
     np.testing.assert_allclose(sysid_baseline._difference(-turned, still), expected, atol=1e-12)
-
-
-def test_the_truth_is_off_by_usual_sizes_and_leaves_what_cannot_be_seen():
-    nominal = given_vehicle("bare")
-    drawn = _drawn(nominal, np.random.default_rng(1))
-    assert tuple(drawn) == REFITTED
-    (offset,) = EFFECTS["mass_offset"].parameters
-    low, high = offset.typical
-    assert low <= abs(drawn["mass_offset"].offset) <= high
-    (place,) = EFFECTS["com_offset"].parameters
-    com = np.asarray(drawn["com_offset"].offset)
-    assert place.unseen and not com[list(place.unseen)].any() and com.any()
 
 
 def test_a_task_says_what_is_fitted_and_repeats_by_its_seed():

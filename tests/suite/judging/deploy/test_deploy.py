@@ -164,12 +164,3 @@ def test_the_engines_that_are_timed_are_one_policy(folder, tmp_path):
         action = in_c()
         np.testing.assert_allclose(action, np.asarray(usual()), atol=1e-4)
         np.testing.assert_allclose(action, torch.as_tensor(in_torch()).numpy(), atol=1e-4)
-
-
-def test_engines_are_timed_in_turn(monkeypatch):
-    calls = []
-    monkeypatch.setattr(latency, "BLOCK", 2)
-    monkeypatch.setattr(latency, "WARM", 1)
-    times = latency.time_in_turn({n: lambda n=n: calls.append(n) for n in "ab"}, rounds=2)
-    assert "".join(calls) == "aaabbbaaabbb"
-    assert times["a"].median_s <= times["a"].p99_s <= times["a"].max_s
