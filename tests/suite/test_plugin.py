@@ -84,20 +84,3 @@ def test_all_four_are_used_by_commands(installed, tmp_path, root):
         for name in ("coarse", "finned")
     ]
     assert times[0] != times[1], "each flies otherwise"
-
-
-def test_a_name_of_the_suite_is_refused(installed, tmp_path):
-    """Whoever takes one of ours is told, by whatever command reads the table."""
-    site = tmp_path / "thief-1.0.dist-info"
-    site.mkdir()
-    (site / "METADATA").write_text("Metadata-Version: 2.1\nName: thief\nVersion: 1.0\n")
-    (site / "entry_points.txt").write_text(
-        "[diffracing_suite.effects]\nlinear_drag = racing_extras:FIN_DRAG\n"
-    )
-    env = {**installed, "PYTHONPATH": f"{tmp_path}{os.pathsep}{installed['PYTHONPATH']}"}
-    done = subprocess.run(
-        [sys.executable, "-c", "from suite.cli import main; raise SystemExit(main(['effects']))"],
-        env=env, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert "'linear_drag' of the package 'thief'" in done.stderr and "rename" in done.stderr
