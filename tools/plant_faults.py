@@ -47,7 +47,7 @@ FAULTS = (
     Fault("tracks", "share = -before[..., 0] /", "share = before[..., 0] /", "test_crossing"),
     Fault(
         "tracks", "2 * (x * y - w * z), 2 * (x * z + w * y)",
-        "2 * (x * y + w * z), 2 * (x * z + w * y)", "test_rotation",
+        "2 * (x * y + w * z), 2 * (x * z + w * y)", "test_geometry",
     ),
     Fault(
         "tracks", "half_u * (1 - (2 * np.arange(camera.width) + 1) /",
@@ -56,13 +56,13 @@ FAULTS = (
     Fault(
         "tracks", "along = jnp.clip((away * rods.axis_w).sum(-1), -rods",
         "along = jnp.clip((away * rods.axis_w).sum(-1), 0.0 * rods",
-        "test_obstacles test_clearance",
+        "test_clearance",
     ),
     Fault("tracks", "center_w, angle + turn * np.pi / 2", "center_w, angle + np.pi / 2",
-          "test_circular test_families"),
+          "test_families"),
     # policies: networks, observation, C
     Fault("policies", "new + update * (hidden - new)", "hidden + update * (new - hidden)",
-          "test_gru"),
+          "test_layers"),
     Fault("policies", "numbers = [vel_b, rot_w[..., 2, :]", "numbers = [vel_b, rot_w[..., :, 2]",
           "test_observation"),
     Fault("policies", "x < -8.0f ? -8.0f : x > 8.0f ? 8.0f : x", "x", "test_c"),
@@ -82,16 +82,16 @@ FAULTS = (
     Fault("eval/quadrotor", "steps * (1.0 - left**2)", "steps * (1.0 - left)", "test_rotors"),
     Fault("eval/quadrotor", "xp.where(age == whole + 1.0, part",
           "xp.where(age == whole - 1.0, part",
-          "quadrotor/test_delay"),
+          "quadrotor/test_rotors"),
     Fault("eval/quadrotor", "xp.where(known, hx * gy - hy * gx, 0.0)",
           "xp.where(known, hy * gx - hx * gy, 0.0)", "test_attitude"),
     # eval: units of importers
     Fault("eval/importers", '0.01, "V": 1.0, "mV": 1e-3}', '0.01, "V": 1.0, "mV": 1e-2}',
-          "formats/test_betaflight test_units"),
+          "formats/test_betaflight importers/test_frames"),
     Fault("eval/importers", '"Hz": float(2.0 * np.pi)', '"Hz": float(np.pi)',
-          "mapping/test_apply mapping/test_file test_units"),
+          "importers/test_mapping importers/test_frames"),
     Fault("eval/importers", '"mrad/s": 1e-3', '"mrad/s": 1e-2',
-          "mapping/test_apply mapping/test_file test_units"),
+          "importers/test_mapping importers/test_frames"),
     # eval: judging, statistics
     Fault("eval/worlds", "xp.where(free & (rot_w[:, 2, 2] < 0), TIPPED",
           "xp.where(free & (rot_w[:, 2, 2] < 0.05), TIPPED", "test_trial"),

@@ -3,23 +3,17 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from policies.observation import View, observe, view_of
 from policies.spec import PolicySpec
-from tests.policies.conftest import SPEC, lively
+from tests.policies.conftest import SPEC
 from tracks.geometry.camera import Camera
 from tracks.geometry.gates import square_gates
 
 SECOND = replace(SPEC, second_gate=True)
 AXIS = replace(SPEC, gate_axis=True)
 BOTH = replace(SECOND, gate_axis=True)
-
-
-@pytest.fixture(scope="module")
-def second():
-    return lively(SECOND, 3)
 
 
 def state_of(spec, pos_w, vel_w, rot_w, gate_w, last_b, second_w, axis_w, second_axis_w=None):
@@ -34,7 +28,7 @@ def test_the_last_three_numbers_are_the_second_gate_in_body_axes():
     pos, vel, gate, last, second = rng.normal(size=(5, 3))
     known = pos, vel, turn.as_matrix(), gate, last, second, np.array([1.0, 0.0, 0.0])
     without, seen = state_of(PolicySpec(), *known), state_of(SECOND, *known)
-    assert without.shape == (12,)
+    assert without.shape == (12,) == (PolicySpec().state_size,)
     np.testing.assert_array_equal(seen[:12], without)
     np.testing.assert_allclose(seen[12:], turn.inv().apply(second - pos), atol=1e-12)
 

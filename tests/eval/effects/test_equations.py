@@ -48,28 +48,42 @@ def test_rotors_alone():
     near(torque, [-0.16, -0.12, -0.022])
 
 
-def test_linear_drag():
-    force, torque = added(linear_drag=((0.3, 0.2, 0.1),))
-    near(force, [-0.675, 0.3, -0.075])
-    near(torque, 0.0)
+UNEVEN = np.array([1200.0, 1000.0, 1200.0, 1000.0])
+FORCE = {
+    "linear_drag": (((0.3, 0.2, 0.1),), [-0.675, 0.3, -0.075]),
+    # |v| = sqrt(14) = 3.7416574
+    "quadratic_drag": (((0.01, 0.02, 0.04),), [-0.084187291, 0.112249722, -0.112249722]),
+    "rotor_drag": ((2e-5,), [-0.24, 0.16, 0.0]),
+    "translational_lift": ((0.01,), [0.0, 0.0, 0.0975]),
+}
+"""Parameters, and the force [N] on the moving body; none has a torque."""
+TORQUE = [
+    ("blade_flapping", (1e-6,), SPEED, [-0.008, -0.012, 0.0]),
+    ("torque_trim", ((0.01, -0.02, 0.003),), SPEED, [0.01, -0.02, 0.003]),
+    ("angular_damping", ((1.0, 2.0, 0.5),), SPEED, [-0.0025, -0.0084, 0.001075]),
+    ("rotor_gyroscopic", (2e-5,), UNEVEN, [-0.016, 0.008, 0.0]),
+    # Ahead of the rotors' centre the weight pitches the nose down (+y), on the left it rolls left.
+    ("com_offset", ((0.01, 0.0, 0.0),), SPEED, [0.0, 0.064, 0.0]),
+    ("com_offset", ((0.0, 0.01, 0.0),), SPEED, [-0.064, 0.0, 0.0]),
+    ("com_offset", ((0.0, 0.0, 0.01),), SPEED, [0.0, 0.0, 0.0]),
+]
+"""Parameters, rotor speeds, and the torque [N m] on the moving body; none has a force."""
+
+
+def test_forces_and_torques_by_hand():
+    for name, (parameters, expected) in FORCE.items():
+        force, torque = added(**{name: parameters})
+        near(force, expected)
+        near(torque, 0.0)
+    for name, parameters, speed, expected in TORQUE:
+        force, torque = added(speed=speed, **{name: parameters})
+        near(force, 0.0)
+        near(torque, expected)
 
 
 def test_drags_take_the_true_mass():
     force = wrench(with_effects(linear_drag=((0.3, 0.2, 0.1),), mass_offset=(0.25,))).force_b
     near(force, [-0.9, 0.4, 6.3])
-
-
-def test_quadratic_drag():
-    # |v| = sqrt(14) = 3.7416574
-    force, torque = added(quadratic_drag=((0.01, 0.02, 0.04),))
-    near(force, [-0.084187291, 0.112249722, -0.112249722])
-    near(torque, 0.0)
-
-
-def test_rotor_drag():
-    force, torque = added(rotor_drag=(2e-5,))
-    near(force, [-0.24, 0.16, 0.0])
-    near(torque, 0.0)
 
 
 def test_inflow():
@@ -78,18 +92,6 @@ def test_inflow():
     # One rotor faster than the others loses more: rotor 3, rear left.
     _, torque = added(speed=np.array([1000.0, 1000.0, 1500.0, 1000.0]), inflow=(1e-4,))
     near(torque, [-0.05 * 0.1, -0.05 * 0.075, 0.0])
-
-
-def test_translational_lift():
-    force, torque = added(translational_lift=(0.01,))
-    near(force, [0.0, 0.0, 0.0975])
-    near(torque, 0.0)
-
-
-def test_blade_flapping():
-    force, torque = added(blade_flapping=(1e-6,))
-    near(force, 0.0)
-    near(torque, [-0.008, -0.012, 0.0])
 
 
 def test_ground_effect():
@@ -206,19 +208,6 @@ def test_mass_offset():
     near(acc, [0.0, 0.0, 9.81 * 0.75 / 0.85 - 9.81])
 
 
-def test_com_offset():
-    # Ahead of the rotors' centre the weight pitches the nose down (+y), on the left it rolls left.
-    near(added(com_offset=((0.01, 0.0, 0.0),))[1], [0.0, 0.064, 0.0])
-    near(added(com_offset=((0.0, 0.01, 0.0),))[1], [-0.064, 0.0, 0.0])
-    near(added(com_offset=((0.0, 0.0, 0.01),))[1], 0.0)
-
-
-def test_torque_trim():
-    force, torque = added(torque_trim=((0.01, -0.02, 0.003),))
-    near(force, 0.0)
-    near(torque, [0.01, -0.02, 0.003])
-
-
 def test_inertia_scale_and_rate_gain():
     start, command = at_rest(), Command(np.array(9.81), np.array([1.0, -1.0, 0.5]))
     cases: list[tuple[dict[str, Any], list[float]]] = [
@@ -239,20 +228,12 @@ def test_gyroscopic_terms_of_the_true_inertia():
     near(accelerations(plant, MOVING, none)[1], [0.0022 / 0.005, 0.00035 / 0.0021, 0.0058 / 0.0043])
 
 
-def test_rotor_gyroscopic():
-    speed = np.array([1200.0, 1000.0, 1200.0, 1000.0])
-    force, torque = added(speed=speed, rotor_gyroscopic=(2e-5,))
-    near(force, 0.0)
-    near(torque, [-0.016, 0.008, 0.0])
-
-
 def test_rotor_spin_up():
     """From a hover to 1200 and 1000 rad/s in 2 ms: 400 rad/s more counter-clockwise than clockwise.
 
     Against 400 / 0.002 x 1e-5 = 2 N m the body turns clockwise.
     """
-    speed = np.array([1200.0, 1000.0, 1200.0, 1000.0])
-    force, torque = added(speed=speed, rotor_spin_up=(1e-5,))
+    force, torque = added(speed=UNEVEN, rotor_spin_up=(1e-5,))
     near(force, 0.0)
     near(torque, [0.0, 0.0, -2.0])
     # Rotors that are told by a command to turn as they do push nothing.
@@ -260,10 +241,6 @@ def test_rotor_spin_up():
     still = Motion(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
     inputs = Inputs(command=Command(np.asarray(9.81), np.zeros(3)))
     near(plant_step(plant, hover_state(plant, ()), still, inputs, 0.0)[1].torque_b, 0.0)
-
-
-def test_angular_damping():
-    near(added(angular_damping=((1.0, 2.0, 0.5),))[1], [-0.0025, -0.0084, 0.001075])
 
 
 def test_weak_motor():
@@ -322,5 +299,6 @@ def test_clock_offset_logs_an_older_pose(xp):
 
 def test_every_effect_of_the_catalogue_has_its_own_test():
     source = Path(__file__).read_text(encoding="utf-8")
-    by_hand = [name for name in EFFECTS if f"{name}=(" in source or f'"{name}": (' in source]
+    forms = "{}=(", '"{}": (', '("{}", ('
+    by_hand = [name for name in EFFECTS if any(form.format(name) in source for form in forms)]
     assert by_hand == list(EFFECTS)

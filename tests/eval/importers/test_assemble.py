@@ -1,4 +1,4 @@
-"""A recording becomes a checked flight log, or is refused for what it lacks."""
+"""A recording becomes a checked flight log, or is refused for what it lacks; what is reported."""
 
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ import pytest
 
 from eval.importers import import_log
 from eval.importers.assemble import assemble
+from eval.importers.findings import Finding, asked_of, said
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, Signal
 from eval.logs.columns import FlightLogError
@@ -95,3 +96,33 @@ def test_a_partial_log_keeps_what_is_there_and_says_what_can_be_asked(tmp_path):
     back = read_flight(tmp_path / "log.parquet", partial=True)
     np.testing.assert_array_equal(back.thrust_cmd, log.thrust_cmd)
     assert back.partial == log.partial
+
+
+def test_the_serious_come_first_and_the_rest_in_order():
+    findings = (
+        Finding("ok", "units", "as they should be"),
+        Finding("note", "rows", "at 100 Hz"),
+        Finding("doubt", "velocity", "is off"),
+        Finding("note", "motors", "put in order"),
+        Finding("corrected", "attitude", "is xyzw"),
+    )
+    assert said(findings) == [
+        "corrected attitude: is xyzw",
+        "doubt     velocity: is off",
+        "note      rows: at 100 Hz",
+        "note      motors: put in order",
+        "ok        units: as they should be",
+    ]
+
+
+def test_motor_commands_and_positions_tell_weight_and_balance():
+    rows = {"pos": np.zeros((3, 3)), "pwm": np.zeros((3, 4))}
+    text = asked_of(rows, ["quat", "rate"]).text
+    assert "no attitude and no body rates" in text
+    assert "balance of the rotors in hover" in text
+    assert "its torque" not in text
+
+
+def test_a_path_alone_tells_nothing_more():
+    text = asked_of({"pos": np.zeros((3, 3))}, ["quat", "rate", "command"]).text
+    assert text.endswith("nothing but its path")

@@ -1,4 +1,4 @@
-"""An import as a whole: what is read can be written, and is cut where that is asked for."""
+"""An import as a whole: formats are detected, what is read can be written, cut and refused."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
+from eval.importers.formats import FORMATS, detect
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
 from eval.logs.flight_log import read_flight, write_flight
 from tests.support import foreign_logs as made
 from tests.support import known_flight
-from tests.support.imported import levels, near
+from tests.support.imported import flight, levels, near, write
 
 FULL = ImportOptions(full_thrust=30.0)
 
@@ -52,6 +53,7 @@ def test_a_source_is_asked_of_what_knows_of_sources(tmp_path):
 
 
 LOGS = Path(__file__).resolve().parents[4] / "shared" / "real_logs"
+
 real = pytest.mark.skipif(not LOGS.is_dir(), reason="the logs are not on this machine")
 
 
@@ -118,3 +120,39 @@ def test_crazyswarm2_has_thrust_by_the_mass_beside_it_and_torque():
     np.testing.assert_allclose(log.thrust_cmd, log.extra["cmd_force"] / 0.0333)
     assert 6.0 < np.nanmean(log.thrust_cmd) < 10.0
     assert log.rate_cmd_b is None
+
+
+def test_unknown_formats_and_files(tmp_path):
+    with pytest.raises(ValueError, match="Did you mean 'px4'"):
+        import_log(tmp_path / "x", "px")
+    with pytest.raises(FlightLogError, match="cannot be read"):
+        import_log(tmp_path / "none.ulg")
+    noise = tmp_path / "noise.bin"
+    noise.write_bytes(bytes(range(256)) * 40)
+    for name in (None, *FORMATS):
+        with pytest.raises(FlightLogError, match=r"noise\.bin"):
+            import_log(noise, name)
+
+
+def test_any_bytes_are_refused_without_a_crash(tmp_path):
+    rng = np.random.default_rng(3)
+    heads = [b"ULog\x01\x12\x35\x01", b"\xbc\x02\x00\x01\x00", b"\x89MCAP0\r\n", b"PAR1", b"time,"]
+    for k in range(40):
+        path = tmp_path / f"file{k}"
+        path.write_bytes(heads[k % len(heads)] + rng.bytes(int(rng.integers(0, 400))))
+        with pytest.raises(FlightLogError, match=path.name):
+            import_log(path)
+
+
+def test_each_format_is_told_by_its_first_bytes(tmp_path):
+    table = write(tmp_path / "table.csv", flight(end=1.5))
+    files = {
+        "px4": made.write_ulog(tmp_path / "log.ulg", span=(0, 2)),
+        "betaflight": made.write_blackbox(tmp_path / "log.csv", span=(0, 2)),
+        "crazyflie": made.write_usd(tmp_path / "log00", span=(0, 2)),
+        "mcap": made.write_mcap(tmp_path / "log.mcap", span=(0, 2)),
+        "table": table,
+    }
+    for name, path in files.items():  # by what is in it, whatever it is called
+        assert detect(path.rename(tmp_path / "renamed"), ImportOptions()) == name
+    assert files.keys() == set(FORMATS)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from eval.logs import files
+from eval.logs.files import first_line, read_head
 from eval.logs.flight_log import (
     FlightLog,
     FlightLogError,
@@ -176,3 +177,20 @@ def test_texts_stay_coded_and_lists_are_left_out(tmp_path):
     assert log.extra["mode"][0] is log.extra["mode"][2], "one text in memory for all rows"
     with pytest.raises(FlightLogError, match="pos_x: its cells hold lists"):
         read_flight(write_table(tmp_path / "in.parquet", table | {"pos_x": table["list"]}))
+
+
+def test_a_head_is_the_first_bytes_only(tmp_path):
+    path = tmp_path / "log"
+    path.write_bytes(b"time,x\n" + bytes(20000))
+    head = read_head(path)
+    assert head == path.read_bytes()[: len(head)] and 1000 < len(head) < 20000
+    assert first_line(head) == b"time,x"
+    assert first_line(b"no end") == b"no end"
+
+
+def test_no_file_and_an_empty_one_are_refused_by_name(tmp_path):
+    with pytest.raises(FlightLogError, match=r"none\.ulg: .*cannot be read: No such file"):
+        read_head(tmp_path / "none.ulg")
+    (tmp_path / "empty.ulg").touch()
+    with pytest.raises(FlightLogError, match=r"empty\.ulg: .*the file is empty"):
+        read_head(tmp_path / "empty.ulg")

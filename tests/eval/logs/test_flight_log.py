@@ -25,6 +25,8 @@ from tests.support.log_tables import KINDS, assert_same, columns, write_table
 def test_our_flight_round_trips_bit_for_bit_with_its_extras(tmp_path, kind):
     flight = smooth_flight(small_track())
     log = log_from_flight(flight)
+    for name in ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b"):
+        np.testing.assert_array_equal(getattr(log, name), getattr(flight, name), err_msg=name)
     path = write_flight(tmp_path / f"a.{kind}", log)
     back = read_flight(path)
     assert_same(log, back)

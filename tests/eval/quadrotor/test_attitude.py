@@ -14,8 +14,11 @@ from eval.vehicles.vehicle import Controller
 from tracks.geometry.rotation import exp_rot
 
 CONTROLLER = Controller(rate_gain=(20.0, 20.0, 8.0), frequency=500.0)
+
 NORTH = np.array([1.0, 0.0, 0.0])
+
 LEVEL = np.eye(3)
+
 HOVER = np.array([0.0, 0.0, 9.81])
 
 
@@ -28,12 +31,6 @@ def test_action_is_in_body_axes_and_gravity_in_the_world():
     np.testing.assert_allclose(
         action_to_force(np.array([1.0, 0.0, 0.5]), yawed), [0.0, 1.0, 10.31], atol=1e-12
     )
-
-
-def test_hover_asks_for_hover():
-    thrust, rate = command(HOVER)
-    assert thrust == pytest.approx(9.81)
-    np.testing.assert_allclose(rate, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -77,6 +74,7 @@ def test_upside_down_rolls_over():
 
 
 DIRECTIONS = st.lists(st.floats(-1, 1), min_size=3, max_size=3).map(np.array)
+
 ANGLES = st.floats(-np.pi, np.pi)
 
 
@@ -115,15 +113,6 @@ def test_the_error_is_the_turn_to_the_goal(direction, start, heading):
     if np.linalg.norm(flat) > 0.01 and up_w @ rot_w[:, 2] > -0.999:
         turned = tilted @ exp_rot(yaw)
         np.testing.assert_allclose(turned[:, 0], flat / np.linalg.norm(flat), atol=1e-4)
-
-
-def test_tilt_is_corrected_whatever_the_heading():
-    """The thrust's direction does not wait for the heading: no yaw in the tilt's rates."""
-    force = [3.0, -2.0, 9.0]
-    rates = [
-        command(force, LEVEL, np.array([np.cos(a), np.sin(a), 0.0])).rate_b for a in (0.0, 1.0, 3.0)
-    ]
-    np.testing.assert_allclose([rate[:2] for rate in rates], [rates[0][:2]] * 3)
 
 
 SLOPE = jax.jit(

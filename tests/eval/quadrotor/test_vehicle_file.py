@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from eval.quadrotor.vehicle_file import (
     SHIPPED,
@@ -40,14 +38,6 @@ def test_reference_is_what_the_tables_fly():
     assert vehicle.effects["linear_drag"].coefficient == (0.18, 0.18, 0.72)
     assert vehicle.effects["quadratic_drag"].coefficient == (0.01, 0.01, 0.04)
     assert len(vehicle.effects) == 3
-
-
-def test_what_may_be_left_out_has_the_documented_default():
-    vehicle = load_vehicle("racer5")
-    assert vehicle.controller.attitude_gain == (8.0, 8.0, 4.0)
-    assert vehicle.body.half_size == (0.064, 0.064, 0.025)
-    assert vehicle.camera.fov_deg == (78.4, 63.8)
-    assert (vehicle.camera.pitch_deg, vehicle.camera.range_m) == (15.0, 10.0)
 
 
 def test_every_effect_survives_a_round_trip(tmp_path):
@@ -184,9 +174,3 @@ def test_unreadable_files_are_refused(tmp_path):
         load_vehicle(path)
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
         load_vehicle("racer")
-
-
-@given(st.integers(0, 10**6))
-def test_tables_and_vehicles_are_two_views_of_one_thing(seed):
-    vehicle = drawn_effects(np.random.default_rng(seed), PLAIN)
-    assert parse_vehicle(vehicle_table(vehicle)) == vehicle

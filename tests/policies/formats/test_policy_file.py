@@ -1,4 +1,4 @@
-"""Policies as checkpoints, and what they refuse."""
+"""Policies and Delta Action networks as checkpoints, and what they refuse."""
 
 import json
 from dataclasses import replace
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from policies.formats.checkpoint import CONFIG
-from policies.formats.policy_file import load_policy_checkpoint, save_policy
-from policies.networks import network
+from policies.formats.policy_file import load_delta, load_policy_checkpoint, save_delta, save_policy
+from policies.networks import delta_network, network
 from policies.spec import PolicyError, PolicySpec
 from tracks.geometry.camera import Camera
 
@@ -87,14 +87,20 @@ def test_a_policy_without_a_spec_and_weights_of_another_network_are_refused(tmp_
         load_policy_checkpoint(folder)
 
 
-def test_nan_weights_are_refused(tmp_path, params):
-    bad = params | {"action.weight": params["action.weight"].at[0, 0].set(jnp.nan)}
-    with pytest.raises(PolicyError, match="'action.weight' holds 1 of 48"):
-        load_policy_checkpoint(save_policy(tmp_path / "p", bad, SPEC, seed=None))
-
-
 def test_weights_of_another_state_are_refused(tmp_path, params):
     wider = replace(SPEC, second_gate=True)
     folder = save_policy(tmp_path / "torn", params, wider, seed=1)
     with pytest.raises(PolicyError, match=r"state\.weight"):
         load_policy_checkpoint(folder)
+
+
+def test_a_delta_comes_back_and_a_policy_is_none(tmp_path, params):
+    delta = delta_network.init(jax.random.key(0))
+    back = load_delta(save_delta(tmp_path / "d", delta, seed=1, fit={"epochs": 2}))
+    assert back.config["fit"] == {"epochs": 2}
+    for name, value in delta.items():
+        np.testing.assert_array_equal(back.params[name], value)
+    with pytest.raises(PolicyError, match="kind is 'policy', expected 'delta'"):
+        load_delta(save_policy(tmp_path / "p", params, SPEC, seed=None))
+    with pytest.raises(PolicyError, match=r"'output.bias' is float32 \(4,\)"):
+        load_delta(save_delta(tmp_path / "d", delta | {"output.bias": jnp.zeros(4)}, seed=1))

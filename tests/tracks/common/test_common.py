@@ -1,23 +1,31 @@
 """The small pieces that every room leans on."""
 
+import io
+import subprocess
 import tomllib
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
+from tracks.common import provenance
+from tracks.common.grid import Cell, html_table, markdown, rich_table, table
 from tracks.common.names import closest, unknown_name
 from tracks.common.provenance import VERSION, git_commit, stamp
 from tracks.common.toml_table import read_toml, to_toml
 
 KEYS = st.text("abcdefgh_", min_size=1, max_size=6)
+
 ENTRIES = st.one_of(
     st.booleans(),
     st.integers(-(2**60), 2**60),
     st.floats(allow_nan=False),
     st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
 )
+
 VALUES = ENTRIES | st.lists(ENTRIES, max_size=4)
+
 TABLES = st.recursive(
     st.dictionaries(KEYS, VALUES, max_size=4),
     lambda inside: st.dictionaries(KEYS, st.one_of(VALUES, inside), max_size=4),
@@ -55,3 +63,77 @@ def test_a_table_names_the_file_and_the_key_that_is_wrong(tmp_path):
         gate.close()
     with pytest.raises(ValueError, match=r"the file has no 'name'; add it \(a text\)"):
         table.text("name")
+
+
+EFFECTS = ("linear_drag", "quadratic_drag", "rotor_drag", "motor_lag", "gusts")
+
+
+def test_a_part_of_names_has_those_that_hold_it():
+    part, none = (str(unknown_name("effect", name, EFFECTS)) for name in ("drag", "xy"))
+    assert "Did you mean 'linear_drag', 'quadratic_drag', 'rotor_drag'?" in part
+    assert "Did you mean" not in none and "Known: linear_drag" in none
+
+
+GRID = table(
+    ["name", "v [m/s]"], [["a|b", Cell("<3>", "bad")], ["all", "5 [4, 6]"]], "Title", "Below."
+)
+
+
+def test_markdown():
+    assert markdown(GRID) == (
+        "Title\n\n| name | v [m/s] |\n| --- | --- |\n"
+        "| a\\|b | <3> |\n| all | 5 [4, 6] |\n\nBelow.\n"
+    )
+
+
+def test_a_terminal_shows_brackets_and_notes_as_they_are():
+    file = io.StringIO()
+    screen = Console(width=80, file=file)
+    screen.print(rich_table(GRID))
+    said = file.getvalue()
+    assert all(text in said for text in ("Title", "v [m/s]", "<3>", "5 [4, 6]", "Below."))
+
+
+def test_html_is_escaped_and_sums_up_where_it_is_told_to():
+    page = html_table(GRID)
+    assert "<caption>Title</caption>" in page and '<td class="bad">&lt;3&gt;</td>' in page
+    assert 'class="sum"' not in page and '<p class="note">Below.</p>' in page
+    summed = html_table(GRID.__class__("", GRID.headers, GRID.rows, strong_last=True))
+    assert '<tr class="sum"><td>all</td>' in summed and summed.count("sum") == 1
+
+
+def git(root, *what):
+    me = ["-c", "user.name=me", "-c", "user.email=me@here", "-c", "commit.gpgsign=false"]
+    subprocess.run(["git", "-C", str(root), *me, *what], check=True, capture_output=True)
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    monkeypatch.setattr(provenance, "_ROOT", tmp_path)
+    assert provenance.git_commit.__wrapped__() is None, "a folder without history has no commit"
+    git(tmp_path, "init", "--quiet")
+    (tmp_path / "code.py").write_text("one\n")
+    git(tmp_path, "add", "code.py")
+    git(tmp_path, "commit", "--quiet", "-m", "one")
+    return tmp_path
+
+
+def test_what_differs_from_the_commit_is_in_its_name(checkout):
+    def name() -> str:
+        return provenance.git_commit.__wrapped__() or ""
+
+    clean = name()
+    assert len(clean) == 40
+    (checkout / "new.txt").write_text("no part of the code")
+    assert name() == clean
+    (checkout / "code.py").write_text("two\n")
+    two = name()
+    (checkout / "code.py").write_text("three\n")
+    three = name()
+    assert len({two, three}) == 2 and all(n.startswith(f"{clean}-dirty-") for n in (two, three))
+    (checkout / "code.py").write_text("two\n")
+    assert name() == two
+    git(checkout, "add", "code.py")
+    assert name() == two, "what is staged is as much another state"
+    (checkout / "code.py").write_text("one\n")
+    assert name() == clean

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 from tracks.common import files
-from tracks.common.names import closest, unknown_name
-from tracks.common.provenance import stamp
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_beside_it(tmp_path):
@@ -88,19 +86,6 @@ def test_json_is_strict_and_takes_what_the_suite_holds():
         "pair": {"left": 1, "right": "x"},
         "3": [1],
     }
-
-
-def test_an_unknown_name_is_told_the_nearest_and_all():
-    error = unknown_name("track", "Elipse", ["zigzag", "circular", "ellipse"])
-    assert "'Elipse'" in str(error) and "Did you mean 'ellipse'?" in str(error)
-    assert "zigzag, circular, ellipse" in str(error)
-    assert closest("qqq", ["zigzag"]) is None
-
-
-def test_a_stamp_carries_version_commit_and_seed():
-    keys = stamp(schema=1, seed=7)
-    assert list(keys) == ["schema", "suite_version", "git_commit", "seed"]
-    assert (keys["schema"], keys["seed"]) == (1, 7)
 
 
 def _part(folder, name, writer):

@@ -1,15 +1,16 @@
-"""The families have the numbers they promise, from (family, level, seed) alone."""
+"""The families' layouts, gates and obstacles, from (family, level, seed) alone."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
+from functools import cache
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from tracks.families import FAMILIES, LEVELS, MAX_COUNTS, make_track, random_track
+from tracks.families import FAMILIES, JUDGED, LEVELS, MAX_COUNTS, make_track, random_track
+from tracks.formats.meshes import solid_meshes
 from tracks.geometry.scene import counts
-from tracks.track import Track
-
-SEEDS = range(12)
+from tracks.track import Track, first_gates
 
 
 def arrays(track: Track) -> list[np.ndarray]:
@@ -17,9 +18,8 @@ def arrays(track: Track) -> list[np.ndarray]:
     return [*parts, track.start_pos_w, np.array([track.start_yaw, track.difficulty])]
 
 
-def tracks_of(
-    family: str, levels: Sequence[int] = LEVELS, seeds: Sequence[int] = SEEDS
-) -> list[Track]:
+@cache
+def tracks_of(family: str, levels: Iterable[int] = LEVELS, seeds: Iterable[int] = range(12)):
     return [make_track(family, level, seed) for level in levels for seed in seeds]
 
 
@@ -81,7 +81,7 @@ def test_the_difficulty_is_anywhere_within_its_level():
 
 
 def test_the_bound_on_solids_is_tight():
-    most = np.max([counts(t.scene) for f in FAMILIES for t in tracks_of(f, [8, 9], range(60))], 0)
+    most = np.max([counts(t.scene) for f in FAMILIES for t in tracks_of(f, (8, 9), range(60))], 0)
     assert most[0] == MAX_COUNTS.boxes
     assert np.all(np.array(MAX_COUNTS)[1:4] - most[1:4] <= 2)
 
@@ -89,7 +89,7 @@ def test_the_bound_on_solids_is_tight():
 def test_about_half_of_the_closed_tracks_are_reversed():
     for family in ("circular", "ellipse"):
         turns = []
-        for track in tracks_of(family, [0], range(200)):
+        for track in tracks_of(family, (0,), range(200)):
             x, y = track.scene.gates.center_w[:, :2].T
             turns.append(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0)
         assert 70 < sum(turns) < 130
@@ -133,3 +133,239 @@ def test_random_tracks_take_a_difficulty_and_advance_the_generator():
     assert not np.array_equal(first.scene.gates.center_w, second.scene.gates.center_w)
     with pytest.raises(ValueError, match="difficulty is 1.5"):
         random_track(1.5, rng)
+
+
+@pytest.mark.parametrize("family", JUDGED)
+def test_gate_sizes_heights_and_frames(family):
+    widest = 0.22 if family == "ellipse" else 0.25
+    for track in tracks_of(family):
+        d, gates = track.difficulty, track.scene.gates
+        side = np.ptp(gates.opening_g, axis=1)
+        assert np.allclose(side[:, 0], side[:, 1])
+        assert np.all(np.abs(side - (1.2 - 0.4 * d)) <= 0.05 + 1e-12)
+        assert np.all((gates.frame_width >= 0.15) & (gates.frame_width <= widest))
+        assert np.allclose(gates.frame_depth, 0.03 + 0.03 * d)
+        assert np.all((gates.center_w[:, 2] >= 0.8) & (gates.center_w[:, 2] <= 2.0))
+        assert np.allclose(gates.rot_w[:, 2, 2], 1)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_gate_can_be_reached_by_a_body_of_20_cm(family):
+    assert unreachable_gates(make_track(family, 9, 4)) == []
+
+
+def unreachable_gates(track: Track, step: float = 0.2, body: float = 0.2) -> list[int]:
+    """Return the gates to which no connected free cells lead from the one before."""
+    gates = track.scene.gates
+    normal = gates.rot_w[:, :, 0]
+    leave = np.concatenate([track.start_pos_w[None], gates.center_w[:-1] + 0.6 * normal[:-1]])
+    reach = gates.center_w - 0.6 * normal
+    low = np.minimum(leave, reach).min(0) - 4
+    low[2] = 0.3
+    high = np.maximum(leave, reach).max(0) + 4
+    high[2] = 4.0
+    axes = [np.arange(a, b, step) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    free = np.ones(grid.shape[:3], bool)
+    for _, mesh in solid_meshes(track):
+        # All solids are convex: outside of any face plane, pushed out by the body, is outside.
+        box = [
+            slice(max(int((lo - a[0]) / step) - 2, 0), int((hi - a[0]) / step) + 3)
+            for lo, hi, a in zip(*mesh.bounds, axes, strict=True)
+        ]
+        part = grid[tuple(box)]
+        normals, corner = mesh.face_normals, mesh.triangles[:, 0]
+        height = part @ normals.T - np.sum(normals * corner, axis=-1)
+        if height.size:
+            free[tuple(box)] &= height.max(-1) > body
+    labels = np.zeros(free.shape, np.int32)
+    ndimage.label(free, output=labels)
+
+    def label(point: np.ndarray) -> int:
+        return int(labels[tuple(np.round((point - low) / step).astype(int))])
+
+    return [i for i in range(8) if label(leave[i]) != label(reach[i]) or not label(reach[i])]
+
+
+def yaw_of(track: Track) -> np.ndarray:
+    normal = track.scene.gates.rot_w[:, :, 0]
+    return np.arctan2(normal[:, 1], normal[:, 0])
+
+
+def test_zigzag_is_a_line_of_35_m_that_strays():
+    lateral_used = 0.0
+    for track in tracks_of("zigzag"):
+        d, t = track.difficulty, np.arange(8) / 7
+        center = track.scene.gates.center_w
+        assert np.all(np.abs(center[:, 0] - 5 * np.arange(8)) <= t + 1e-12)
+        assert np.all(np.abs(center[:, 1]) <= (1 + 3 * d) * t + 1e-12)
+        assert np.all(np.abs(center[:, 2] - 1.4) <= (0.1 + 0.9 * d) * t + 1e-12)
+        assert np.all(np.abs(yaw_of(track)) <= np.deg2rad(30) * d)
+        lateral_used = max(lateral_used, np.max(np.abs(center[1:, 1]) / ((1 + 3 * d) * t[1:])))
+        back = center[0] - track.start_pos_w
+        assert 2 <= back[0] <= 3 and np.allclose(back[1:], 0)
+    assert lateral_used > 0.95
+
+
+def test_circular_keeps_to_its_circle_both_ways_round():
+    ways = set()
+    for track in tracks_of("circular"):
+        d, gates = track.difficulty, track.scene.gates
+        noise = 0.2 + 0.8 * d
+        radius = np.hypot(*gates.center_w[:, :2].T)
+        assert np.all(radius > 5 - noise * np.sqrt(2)) and np.all(radius < 8 + noise * np.sqrt(2))
+        angle = np.unwrap(np.arctan2(gates.center_w[:, 1], gates.center_w[:, 0]))
+        way = np.sign(angle[-1] - angle[0])
+        assert abs(angle[-1] - angle[0]) == pytest.approx(2 * np.pi * 7 / 8, abs=0.8)
+        ways.add(way)
+        across = np.cross(gates.center_w, gates.rot_w[:, :, 0])[:, 2]
+        assert np.all(np.sign(across) == way)
+    assert ways == {-1.0, 1.0}
+
+
+def test_ellipse_has_two_apexes_and_two_straights_flown_along_the_tangent():
+    for track in tracks_of("ellipse"):
+        d, gates = track.difficulty, track.scene.gates
+        half_x, half_y = 2.5 * (3.14 + 1.66 * d), 2.5 * (1.41 - 0.61 * d)
+        x = np.array([half_x, 5, 0, -5, -half_x, -5, 0, 5])
+        y = half_y * np.sqrt(1 - (x / half_x) ** 2) * [0, 1, 1, 1, 0, -1, -1, -1]
+        both_ways = [(np.stack([x, way * y], -1), way) for way in (1, -1)]
+        fits = [(np.roll(xy, s, axis=0), way) for xy, way in both_ways for s in range(8)]
+        error = [np.abs(xy - gates.center_w[:, :2]).max() for xy, _ in fits]
+        assert min(error) <= 0.2 + 0.8 * d + 1e-9
+        xy, way = fits[int(np.argmin(error))]
+        tangent = np.arctan2(way * xy[:, 0] / half_x**2, -way * xy[:, 1] / half_y**2)
+        off = (yaw_of(track) - tangent + np.pi) % (2 * np.pi) - np.pi
+        assert np.all(np.abs(off) <= np.deg2rad(30) * d + 1e-9)
+
+
+def obstacle_numbers(track: Track) -> dict[str, int]:
+    kinds = {"plate": 0, "small": 0, "pillar": 0, "ground": 0}
+    for name in track.names[32:]:
+        kinds[name.split()[0]] += 1
+    return kinds
+
+
+def test_things_on_the_ground_lie_or_stand_on_it():
+    seen = {"cylinder": 0, "capsule": 0}
+    for track in tracks_of("circular", (9,)):
+        scene = track.scene
+        rods = [*zip(*scene.cylinders, strict=True), *zip(*scene.capsules, strict=True)]
+        first = len(scene.boxes.center_w)
+        for name, (center, axis, radius, half) in zip(track.names[first:], rods, strict=False):
+            if name.startswith("ground cylinder"):
+                assert np.allclose(axis, [0, 0, 1]) and center[2] == half
+                seen["cylinder"] += 1
+            elif name.startswith("ground capsule"):
+                assert abs(axis[2]) < 1e-9 and center[2] == radius
+                seen["capsule"] += 1
+    assert min(seen.values()) > 5
+
+
+@pytest.mark.parametrize("family", JUDGED)
+def test_obstacle_numbers_follow_the_difficulty(family):
+    lost = 0
+    for track in tracks_of(family):
+        d, have = track.difficulty, obstacle_numbers(track)
+        if family == "circular":
+            # The radius is not stored: 5 to 8 m, so counts are 5/8 of the full ones or more.
+            assert 7 * int((1 + 3 * d) * 5 / 8) - 2 <= have["plate"] <= 7 * int(1 + 3 * d)
+            assert have["ground"] <= 28
+            continue
+        assert have["plate"] <= 7 * int(1 + 3 * d) and have["small"] <= 7 * int(1 + 3 * d)
+        assert have["pillar"] <= 7 and have["ground"] <= 28
+        lost += 14 * int(1 + 3 * d) + 7 - have["plate"] - have["small"] - have["pillar"]
+    assert lost <= 3
+
+
+def test_every_kind_of_obstacle_has_its_sizes():
+    seen = set()
+    for track in tracks_of("zigzag"):
+        scene = track.scene
+        solids = [
+            *(("box", *s) for s in zip(*scene.boxes, strict=True)),
+            *(("cylinder", *s) for s in zip(*scene.cylinders, strict=True)),
+            *(("capsule", *s) for s in zip(*scene.capsules, strict=True)),
+            *(("sphere", *s) for s in zip(*scene.spheres, strict=True)),
+        ]
+        for name, (kind, center, *shape) in list(zip(track.names, solids, strict=True))[32:]:
+            what = name.split()[0]
+            seen.add((what, kind))
+            if what == "plate":
+                half = shape[1]
+                assert 0.2 <= half[0] == half[1] <= 0.5 and 0.02 <= half[2] <= 0.04
+                assert 0.5 <= center[2] <= 3
+            elif what == "pillar":
+                half, radius = (shape[1][2], shape[1][0]) if kind == "box" else (shape[2], shape[1])
+                assert 0.5 <= half <= 1.5 and radius <= 0.5 and center[2] == half
+            elif kind == "box":
+                assert np.all((shape[1] >= 0.05) & (shape[1] <= 0.25))
+                assert what == "small" or center[2] == shape[1][2]
+            else:
+                radius = shape[0] if kind == "sphere" else shape[1]
+                assert 0.1 <= radius <= 0.3
+            if what == "small":
+                assert 0.5 <= center[2] <= 3
+    assert seen == {
+        *(("small", kind) for kind in ("box", "cylinder", "capsule", "sphere")),
+        *(("ground", kind) for kind in ("box", "cylinder", "capsule", "sphere")),
+        ("plate", "box"),
+        ("pillar", "box"),
+        ("pillar", "cylinder"),
+    }
+
+
+def surface_points(track: Track) -> np.ndarray:
+    """Return points on every obstacle."""
+    meshes = [mesh for _, mesh in solid_meshes(track)[32:]]
+    return np.concatenate([part for m in meshes for part in (m.vertices, m.triangles_center)])
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_gates_and_start_are_free_of_obstacles(family):
+    for level, seed in ((0, 1), (5, 2), (9, 3), (9, 6)):
+        track = make_track(family, level, seed)
+        if len(track.names) == 32:
+            continue
+        gates, points = track.scene.gates, surface_points(track)
+        for center, rot in zip(gates.center_w, gates.rot_w, strict=True):
+            local = (points - center) @ rot
+            near = np.abs(local[:, 0]) < 1.5
+            assert np.all(np.hypot(local[near, 1], local[near, 2]) > 0.39)
+        way = gates.center_w[0] - track.start_pos_w
+        share = np.clip((points - track.start_pos_w) @ way / (way @ way), 0, 1)
+        gap = points - track.start_pos_w - share[:, None] * way
+        assert np.linalg.norm(gap, axis=-1).min() > 0.5
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_obstacles_keep_their_distance_from_all_gates(family):
+    nearest = np.inf
+    for track in tracks_of(family):
+        scene = track.scene
+        solids = (scene.cylinders, scene.capsules, scene.spheres)
+        center = np.concatenate([scene.boxes.center_w[32:], *(kind.center_w for kind in solids)])
+        gap = center[:, None, :2] - scene.gates.center_w[None, :, :2]
+        nearest = min(nearest, np.linalg.norm(gap, axis=-1).min(initial=np.inf))
+    assert 1.5 <= nearest < 1.6
+
+
+@pytest.mark.parametrize("count", [1, 4, 8])
+def test_the_first_gates_of_a_track(count):
+    track = make_track("random", 7, 3)
+    short = first_gates(track, count)
+    for field, whole in zip(short.scene.gates, track.scene.gates, strict=True):
+        np.testing.assert_array_equal(field, whole[:count])
+    have, had = counts(short.scene), counts(track.scene)
+    assert had.boxes - have.boxes == 4 * (8 - count) and have[1:] == had[1:]
+    boxes = short.scene.boxes.center_w
+    np.testing.assert_array_equal(boxes[: 4 * count], track.scene.boxes.center_w[: 4 * count])
+    np.testing.assert_array_equal(boxes[4 * count :], track.scene.boxes.center_w[32:])
+    assert len(short.names) == sum(have) and "gate 0 frame" in short.names[0]
+    assert short.names[4 * count :] == track.names[32:]
+
+
+@pytest.mark.parametrize("count", [0, 9])
+def test_more_gates_than_there_are_or_none(count):
+    with pytest.raises(ValueError, match=f"{count} gates of a track that has 8"):
+        first_gates(make_track("random", 0, 0), count)

@@ -58,118 +58,84 @@ def test_a_start_left_out_is_before_gate_0_and_faces_it(tmp_path):
 
 
 def test_clockwise_polygons_are_turned_round(tmp_path):
-    gate = GATE.replace(
-        "width = 1.0\nheight = 1.0", "polygon = [[0, 0.5], [0.5, -0.4], [-0.5, -0.4]]"
-    )
+    gate = with_polygon("[[0, 0.5], [0.5, -0.4], [-0.5, -0.4]]")
     opening = load_track(write(tmp_path, gate)).scene.gates.opening_g[0]
     after = np.roll(opening, -1, axis=0)
     assert np.all(opening[:, 0] * after[:, 1] - opening[:, 1] * after[:, 0] > 0)
 
 
-BAD = {
-    "no gate": ("schema = 1\n", "holds no gate"),
-    "not toml": ("gates = [\n", "is not TOML"),
-    "unknown key at the top": ("gate = 3\n" + GATE, "key 'gate'.*Did you mean 'gates'"),
-    "unknown key": (GATE + "yaw = 3\n", r"key 'yaw' in \[gates\[0\]\].*Did you mean 'yaw_deg'"),
-    "schema": ("schema = 2\n" + GATE, "schema is 2, allowed is"),
-    "missing": ("[[gates]]\nwidth = 1\nheight = 1\n", r"\[gates\[0\]\] has no 'center'"),
-    "missing height": ("[[gates]]\ncenter=[0,0,1]\nwidth = 1\n", r"has no 'height'"),
-    "no opening": ("[[gates]]\ncenter = [0, 0, 1]\n", "allowed is one of: width and height"),
-    "two openings": (GATE + "radius = 0.5\n", r"\['width', 'radius'\], allowed is one of"),
-    "not a number": (
-        GATE.replace("width = 1.0", 'width = "1"'),
-        "width is '1'.*a number from 0.001",
-    ),
-    "a boolean": (GATE.replace("width = 1.0", "width = true"), "width is True"),
-    "nan": (GATE.replace("1.5]", "nan]"), r"gates\[0\].center.*allowed is a list of 3 numbers"),
-    "two numbers": (GATE.replace(", 1.5]", "]"), "center is .0, 0.*list of 3 numbers"),
-    "negative": (GATE + "frame_width = -0.1\n", "frame_width is -0.1.*from 0.001"),
-    "a gate at the end of the world": (GATE.replace("1.5]", "1e300]"), "each from -100000 to"),
-    "an opening for nobody": (GATE.replace("width = 1.0", "width = 1e-300"), "width is 1e-300"),
-    "a number of hundreds of digits": (
-        GATE.replace("1.5]", "9" * 400 + "]"),
-        r"characters\), allowed is a list of 3",
-    ),
-    "underground": (GATE.replace("1.5]", "0.3]"), "at least 0.20 m higher"),
-    "few corners": (
-        GATE.replace("width = 1.0\nheight = 1.0", "radius = 1\ncorners = 2"),
-        "corners is 2.*from 3 to 64",
-    ),
-    "dented": (
-        GATE.replace(
-            "width = 1.0\nheight = 1.0",
-            "polygon = [[-1, -1], [1, -1], [0.1, 0], [1, 1], [-1, 1]]",
-        ),
+BOX = "width = 1.0\nheight = 1.0"
+START = "[start]\nposition = [0, 0, 1]\n"
+NAMED = GATE + '[[spheres]]\nname = "%s"\ncenter=[0,0,0]\nradius=1\n'
+
+
+def with_polygon(corners):
+    return GATE.replace(BOX, f"polygon = {corners}")
+
+
+BAD = [
+    ("schema = 1\n", "holds no gate"),
+    ("gates = [\n", "is not TOML"),
+    ("gate = 3\n" + GATE, "key 'gate'.*Did you mean 'gates'"),
+    (GATE + "yaw = 3\n", r"key 'yaw' in \[gates\[0\]\].*Did you mean 'yaw_deg'"),
+    ("schema = 2\n" + GATE, "schema is 2, allowed is"),
+    ("[[gates]]\nwidth = 1\nheight = 1\n", r"\[gates\[0\]\] has no 'center'"),
+    ("[[gates]]\ncenter=[0,0,1]\nwidth = 1\n", r"has no 'height'"),
+    ("[[gates]]\ncenter = [0, 0, 1]\n", "allowed is one of: width and height"),
+    (GATE + "radius = 0.5\n", r"\['width', 'radius'\], allowed is one of"),
+    (GATE.replace("width = 1.0", 'width = "1"'), "width is '1'.*a number from 0.001"),
+    (GATE.replace("width = 1.0", "width = true"), "width is True"),
+    (GATE.replace("1.5]", "nan]"), r"gates\[0\].center.*allowed is a list of 3 numbers"),
+    (GATE.replace(", 1.5]", "]"), "center is .0, 0.*list of 3 numbers"),
+    (GATE + "frame_width = -0.1\n", "frame_width is -0.1.*from 0.001"),
+    (GATE.replace("1.5]", "1e300]"), "each from -100000 to"),
+    (GATE.replace("width = 1.0", "width = 1e-300"), "width is 1e-300"),
+    (GATE.replace("1.5]", "9" * 400 + "]"), r"characters\), allowed is a list of 3"),
+    (GATE.replace("1.5]", "0.3]"), "at least 0.20 m higher"),
+    (GATE.replace(BOX, "radius = 1\ncorners = 2"), "corners is 2.*from 3 to 64"),
+    (with_polygon("[[-1, -1], [1, -1], [0.1, 0], [1, 1], [-1, 1]]"), "polygon is.*convex"),
+    (
+        with_polygon("[[0, 1], [-0.6, -0.8], [0.95, 0.3], [-0.95, 0.3], [0.6, -0.8]]"),
         "polygon is.*convex",
     ),
-    "star": (
-        GATE.replace(
-            "width = 1.0\nheight = 1.0",
-            "polygon = [[0, 1], [-0.6, -0.8], [0.95, 0.3], [-0.95, 0.3], [0.6, -0.8]]",
-        ),
-        "polygon is.*convex",
-    ),
-    "beside its centre": (
-        GATE.replace("width = 1.0\nheight = 1.0", "polygon = [[1, -1], [2, -1], [2, 1], [1, 1]]"),
-        "around",
-    ),
-    "polygon of no size": (
-        GATE.replace(
-            "width = 1.0\nheight = 1.0", "polygon = [[0, 1e-10], [1e-10, -1e-10], [-1e-10, -1e-10]]"
-        ),
+    (with_polygon("[[1, -1], [2, -1], [2, 1], [1, 1]]"), "around"),
+    (
+        with_polygon("[[0, 1e-10], [1e-10, -1e-10], [-1e-10, -1e-10]]"),
         "polygon is.*sides of 0.001 m at least",
     ),
-    "flat polygon": (
-        GATE.replace("width = 1.0\nheight = 1.0", "polygon = [[0, 1], [0, 2]]"),
-        "list of 3 or more",
-    ),
-    "no table array": ("spheres = 3\n" + GATE, "spheres is 3, allowed is tables"),
-    "sphere": (GATE + "[[spheres]]\ncenter=[0,0,0]\nradius=0\n", r"spheres\[0\].radius is 0"),
-    "size": (GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[1,1,0]\n", r"boxes\[0\].size is \[1, 1, 0\]"),
-    "axis": (
+    (with_polygon("[[0, 1], [0, 2]]"), "list of 3 or more"),
+    ("spheres = 3\n" + GATE, "spheres is 3, allowed is tables"),
+    (GATE + "[[spheres]]\ncenter=[0,0,0]\nradius=0\n", r"spheres\[0\].radius is 0"),
+    (GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[1,1,0]\n", r"boxes\[0\].size is \[1, 1, 0\]"),
+    (
         GATE + "[[capsules]]\ncenter=[0,0,0]\nradius=1\nlength=1\naxis=[0,0,0]\n",
         "of a length from 1e-06",
     ),
-    "quat": (GATE + "quat_wxyz = [0, 0, 0, 0]\n", "quat_wxyz.*of a length from 1e-06"),
-    "large quat": (GATE + "quat_wxyz = [1e200, 0, 0, 0]\n", r"quat_wxyz is .*to 1e\+06"),
-    "both rotations": (GATE + "quat_wxyz = [1, 0, 0, 0]\nyaw_deg = 3\n", "key 'yaw_deg'"),
-    "twice": (
-        GATE + 2 * '[[spheres]]\nname = "x"\ncenter=[0,0,0]\nradius=1\n',
-        r"spheres\[1\].name is 'x'",
-    ),
-    "reserved": (GATE + '[[spheres]]\nname = "ground"\ncenter=[0,0,0]\nradius=1\n', "'ground'"),
-    "MuJoCo's": (
-        GATE + '[[spheres]]\nname = "quadrotor box"\ncenter=[0,0,0]\nradius=1\n',
-        "none of 'ground', 'parked', 'quadrotor box'",
-    ),
-    "not printable": (
-        GATE + '[[spheres]]\nname = "a\\u0000b"\ncenter=[0,0,0]\nradius=1\n',
-        "a printable",
-    ),
-    "start": ("[start]\nposition = [0, 0, -1]\n" + GATE, "start.position.*above the ground"),
-    "start in a box": (
-        "[start]\nposition = [0, 0, 1]\n" + GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[3,3,3]\n",
+    (GATE + "quat_wxyz = [0, 0, 0, 0]\n", "quat_wxyz.*of a length from 1e-06"),
+    (GATE + "quat_wxyz = [1e200, 0, 0, 0]\n", r"quat_wxyz is .*to 1e\+06"),
+    (GATE + "quat_wxyz = [1, 0, 0, 0]\nyaw_deg = 3\n", "key 'yaw_deg'"),
+    (NAMED % "x" + NAMED[len(GATE) :] % "x", r"spheres\[1\].name is 'x'"),
+    (NAMED % "ground", "'ground'"),
+    (NAMED % "quadrotor box", "none of 'ground', 'parked', 'quadrotor box'"),
+    (NAMED % "a\\u0000b", "a printable"),
+    ("[start]\nposition = [0, 0, -1]\n" + GATE, "start.position.*above the ground"),
+    (
+        START + GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[3,3,3]\n",
         "start.position is .*inside 'box 0'",
     ),
-    "start in a capsule": (
-        "[start]\nposition = [0, 0, 1]\n"
-        + GATE
-        + "[[capsules]]\ncenter=[0,0,0]\nradius=1\nlength=1\n",
-        "inside 'capsule 0'",
-    ),
-    "gate above, no start": (GATE + "pitch_deg = 90\n", "start.position is None.*straight up"),
-    "start key": ("[start]\nyaw = 1\n" + GATE, r"key 'yaw' in \[start\]"),
-    "no mesh": (GATE + '[[meshes]]\nfile = "none.stl"\n', "none.stl: no such mesh file"),
-}
+    (START + GATE + "[[capsules]]\ncenter=[0,0,0]\nradius=1\nlength=1\n", "inside 'capsule 0'"),
+    (GATE + "pitch_deg = 90\n", "start.position is None.*straight up"),
+    ("[start]\nyaw = 1\n" + GATE, r"key 'yaw' in \[start\]"),
+    (GATE + '[[meshes]]\nfile = "none.stl"\n', "none.stl: no such mesh file"),
+]
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_a_bad_file_is_refused_by_name(tmp_path, case):
-    text, said = BAD[case]
-    path = write(tmp_path, text)
-    with pytest.raises(ValueError, match=said) as caught:
-        load_track(path)
-    assert str(tmp_path) in str(caught.value)
+def test_a_bad_file_is_refused_by_name(tmp_path):
+    for text, said in BAD:
+        path = write(tmp_path, text)
+        with pytest.raises(ValueError, match=said) as caught:
+            load_track(path)
+        assert str(tmp_path) in str(caught.value), said
 
 
 def test_a_start_inside_a_mesh_is_refused_however_it_is_wound(tmp_path):
@@ -197,6 +163,103 @@ def test_parts_of_a_mesh_have_names_of_their_own(tmp_path):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ValueError, match="none.toml: cannot be read"):
         load_track(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+def test_meshes_come_from_any_common_file(tmp_path, suffix):
+    two = [trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere(2, 0.5)]
+    two[1].apply_translation([3, 0, 0])
+    trimesh.util.concatenate(two).export(tmp_path / f"two.{suffix}")
+    text = GATE + f'[[meshes]]\nfile = "two.{suffix}"\nposition = [0, 0, 1]\nscale = 0.5\n'
+    track = load_track(write(tmp_path, text))
+    assert sorted(track.mesh_sizes) == [12, 320]
+    assert np.allclose(
+        np.ptp(track.scene.triangles.reshape(-1, 3), axis=0), [1.75 + 0.25, 0.5, 0.5], atol=0.02
+    )
+
+
+def as_objects(meshes):
+    """Return an OBJ file's text with an object for each mesh, as a decomposition writes it."""
+    lines, first = [], 1
+    for number, mesh in enumerate(meshes):
+        lines += [f"o part {number}", *("v {} {} {}".format(*v) for v in mesh.vertices)]
+        lines += ["f {} {} {}".format(*(face + first)) for face in mesh.faces]
+        first += len(mesh.vertices)
+    return "\n".join(lines) + "\n"
+
+
+def test_parts_that_touch_are_objects_of_their_own(tmp_path):
+    left, right = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 2, 1))
+    right.apply_translation([1, 0, 0])
+    path = write(tmp_path, GATE + '[[meshes]]\nfile = "two.obj"\nposition = [0, 0, 1]\n')
+    (tmp_path / "two.obj").write_text(as_objects([left, right]))
+    assert load_track(path).mesh_sizes == (12, 12)
+
+
+def test_a_triangle_without_an_area_is_none(tmp_path):
+    """An edge is split by a point that only one of its two triangles knows: a sliver closes it."""
+    box = trimesh.creation.box((1, 1, 1))
+    (a, b, c), rest = box.faces[0], box.faces[1:]
+    middle = len(box.vertices)
+    vertices = np.vstack([box.vertices, box.vertices[[a, b]].mean(0)])
+    faces = np.vstack([rest, [[a, middle, c], [middle, b, c], [a, b, middle]]])
+    sliced = trimesh.Trimesh(vertices, faces, process=False)
+    assert sliced.is_watertight and sliced.area_faces.min() == 0.0
+    sliced.export(tmp_path / "box.ply")
+    path = write(tmp_path, GATE + '[[meshes]]\nfile = "box.ply"\nposition = [0, 20, 1]\n')
+    triangles = load_track(path).scene.triangles
+    sides = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    assert len(triangles) == 13 and np.linalg.norm(sides, axis=1).min() > 0.1
+    inside = "\n[start]\nposition = [0, 20, 1]\n"
+    with pytest.raises(ValueError, match=r"start.position is \[0.0, 20.0, 1.0\]"):
+        load_track(write(tmp_path, path.read_text() + inside))
+
+
+def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
+    path = write(tmp_path, GATE + '[[meshes]]\nfile = "part.stl"\n')
+    good = trimesh.creation.box((1, 1, 1))
+    dented = good.subdivide()
+    top = np.argmax(dented.vertices @ [0, 0, 1] - np.linalg.norm(dented.vertices[:, :2], axis=-1))
+    dented.vertices[top, 2] -= 0.8
+    dented.apply_translation([4, 0, 0])
+    trimesh.util.concatenate([good, dented]).export(tmp_path / "part.stl")
+    with pytest.raises(ValueError, match=r"part.stl: part \d of 2 .*not convex.*split it"):
+        load_track(path)
+    trimesh.Trimesh(good.vertices, good.faces[:-1]).export(tmp_path / "part.stl")
+    with pytest.raises(ValueError, match=r"part 0 of 1 .11 triangles. is not closed"):
+        load_track(path)
+    (tmp_path / "part.stl").write_bytes(b"nothing of the kind")
+    with pytest.raises(ValueError, match="part.stl"):
+        load_track(path)
+
+
+@pytest.mark.parametrize(
+    ("size", "keys", "said"),
+    [
+        ((1, 1, 1e-7), "", "0.001 m thick .*; part 0 has "),
+        ((1, 1, 1), "scale = 0.002\nposition = [9e4, 9e4, 9e4]", "thick where it stands; part 0"),
+        ((1, 1, 1), "scale = 1e6", r"within 100000 m .*; part 0 reaches 5e\+05"),
+    ],
+)
+def test_meshes_that_mujoco_finds_no_body_are_refused(tmp_path, size, keys, said):
+    """It stores corners as singles: far from the origin a small body is none."""
+    path = write(tmp_path, GATE + f'[[meshes]]\nfile = "part.stl"\n{keys}\n')
+    trimesh.creation.box(size).export(tmp_path / "part.stl")
+    with pytest.raises(ValueError, match=rf"track.toml: meshes\[0\].scale is .* {said}"):
+        load_track(path)
+
+
+def test_flat_and_tiny_meshes_are_refused(tmp_path):
+    path = write(tmp_path, GATE + '[[meshes]]\nfile = "part.stl"\nscale = 1e-4\n')
+    box = trimesh.creation.box((1, 1, 1))
+    box.export(tmp_path / "part.stl")
+    with pytest.raises(ValueError, match=r"scale is 0.0001, .* part 0 has 0.0001"):
+        load_track(path)
+    trimesh.Trimesh(box.vertices * [1, 1, 0], box.faces, process=False).export(
+        tmp_path / "part.stl"
+    )
+    with pytest.raises(ValueError, match=r"part.stl: part \d of \d .* is flat; give it"):
+        load_track(path)
 
 
 def test_a_gate_inside_a_solid_is_refused(tmp_path):

@@ -15,7 +15,9 @@ from tracks.geometry.clearance import distances, nearest_obstacle
 from tracks.geometry.scene import counts, stack
 
 BALL = 1e-3
+
 all_distances = jax.jit(distances)
+
 nearest = jax.jit(nearest_obstacle, static_argnames="limits")
 
 
@@ -140,14 +142,3 @@ def test_padding_and_culling_do_not_change_the_nearest():
     for k in range(8):
         culled, _ = nearest(scene, gates[:, k : k + 1], limits)
         assert np.allclose(culled[:, 0], distance[:, k], atol=1e-5)
-
-
-def test_in_a_gates_centre_the_frame_or_the_ground_is_nearest():
-    track = make_track("zigzag", 3, 8)
-    gates = track.scene.gates
-    every, _ = all_distances(unbatched(track.scene), jnp.asarray(gates.center_w))
-    half = np.ptp(gates.opening_g, axis=1)[:, 0] / 2
-    frame = np.asarray(every).reshape(8, -1)[:, :32].reshape(8, 8, 4)
-    own = frame[np.arange(8), np.arange(8)]
-    assert np.allclose(own, half[:, None], atol=1e-4)
-    assert np.allclose(np.asarray(every)[:, -1], gates.center_w[:, 2], atol=1e-5)

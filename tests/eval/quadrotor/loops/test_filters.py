@@ -1,9 +1,10 @@
-"""Filters against numbers worked by hand and their definition."""
+"""Filters by hand and by definition; each motor turns the body as its place and spin say."""
 
 import numpy as np
 import pytest
 
-from eval.quadrotor.loops.filters import Pair, butterworth, pt1, settled
+from eval.quadrotor.loops.filters import Pair, butterworth, layout_of, pt1, settled
+from eval.quadrotor.vehicle_file import load_vehicle
 
 
 def test_first_order_by_hand():
@@ -31,3 +32,10 @@ def test_a_settled_filter_stays_where_it_is():
     memory, out = butterworth(rest, np.array([2.0]), np.asarray(30.0), 0.002)
     np.testing.assert_allclose(out, 2.0)
     np.testing.assert_allclose(memory.first, rest.first)
+
+
+def test_left_motors_roll_right_rear_ones_pitch_down_clockwise_ones_yaw_left():
+    roll, pitch, yaw = layout_of(load_vehicle("crazyflie21").rotors)
+    np.testing.assert_allclose(roll, [-1, -1, 1, 1])
+    np.testing.assert_allclose(pitch, [-1, 1, 1, -1])
+    np.testing.assert_allclose(yaw, [-1, 1, -1, 1])

@@ -1,12 +1,21 @@
-"""Who works, as it is asked for; what goes to another machine, and what must be the same there."""
+"""Who works and with how many threads; what travels to another machine, and what it must share."""
 
 import copy
+import os
+import subprocess
+import sys
 
 import pytest
 
+from suite.cli import main
 from suite.common.errors import explain
-from tracks.common.work import MOST, core_shares, crew, read_workers
-from tracks.common.work.threads import usable_cores
+from tracks.common.work import MOST, core_shares, crew, read_workers, threads
+from tracks.common.work.threads import (
+    one_thread_a_product,
+    set_threads,
+    share_threads,
+    usable_cores,
+)
 from tracks.common.work.travel import PACKAGES, differences, failure, pack, raised, software, unpack
 
 
@@ -62,3 +71,80 @@ def test_an_error_travels_with_where_it_came_up():
     found = raised(elsewhere)
     assert explain(found) == (2, str(found)) and "linear_drag" in str(found)
     assert str(raised(failure(Stubborn("so")))) == "Stubborn: so"
+
+
+@pytest.mark.parametrize(("cores", "wanted"), [(1, "2"), (2, "2"), (16, "16")])
+def test_a_thread_a_core_and_at_least_two(cores, wanted, monkeypatch):
+    monkeypatch.setattr(threads, "usable_cores", lambda: cores)
+    own, asked = {}, {"NPROC": "1"}
+    for environment in (own, asked):
+        set_threads(environment)
+    assert own == {"NPROC": wanted} and asked == {"NPROC": "1"}
+    assert threads.threads(own) == int(wanted) and threads.threads({}) == cores
+
+
+def test_a_share_of_the_cores_takes_no_more_threads_than_it_needs(monkeypatch):
+    monkeypatch.setattr(threads, "usable_cores", lambda: 4)
+    for had, wanted in (("16", "4"), ("2", "2"), ("1", "1")):
+        environment = {"NPROC": had}
+        share_threads(environment)
+        assert environment == {"NPROC": wanted}
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1", "two", "1e3", "4097", "9" * 5000, "٣"])
+def test_what_is_no_number_is_refused_before_xla_ends_the_process(text):
+    with pytest.raises(ValueError, match=r"^NPROC is '.{0,40}' in the environment; allowed is 1"):
+        set_threads({"NPROC": text})
+
+
+GRADIENT = """
+import hashlib, sys
+import jax, jax.numpy as jnp, numpy as np
+from policies.networks import network
+from policies.spec import PolicySpec
+from tracks.common.work.threads import set_threads
+from suite.train.gradient import encoder_gradient
+set_threads()
+rng = np.random.default_rng(0)
+images = jnp.asarray(rng.uniform(size=(640, 24, 32)), jnp.float32)
+cotangents = jnp.asarray(rng.normal(size=(640, 192)), jnp.float32)
+params = network.init(jax.random.key(0), PolicySpec())
+gradient = jax.jit(encoder_gradient)(params, images, cotangents)
+digest = hashlib.sha256()
+for name in sorted(gradient):
+    digest.update(np.asarray(gradient[name]).tobytes())
+print(digest.hexdigest())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores are chosen as on Linux")
+def test_the_encoders_gradient_has_the_same_bits_on_any_number_of_cores():
+    """One core and all, and as many threads as larger machines have."""
+    one = min(os.sched_getaffinity(0))
+    found = set()
+    for number, pinned in ((None, True), (None, False), ("8", False), ("64", False)):
+        environment = {**os.environ, **({} if number is None else {"NPROC": number})}
+        done = subprocess.run(
+            [sys.executable, "-c", GRADIENT],
+            env=environment,
+            capture_output=True,
+            check=True,
+            preexec_fn=(lambda: os.sched_setaffinity(0, [one])) if pinned else None,
+        )
+        found.add(done.stdout)
+    assert len(found) == 1
+
+
+def test_numpys_setting_of_a_user_stays():
+    own = {"OMP_NUM_THREADS": "3"}
+    one_thread_a_product(own)
+    assert own == {"OMP_NUM_THREADS": "3"}
+
+
+def test_a_command_gives_numpy_one_thread(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    assert main(["effects"]) == 0
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
