@@ -78,7 +78,7 @@ FAULTS = (
     Fault("eval/effects", "constants.rotor_position_b - values.offset[",
           "constants.rotor_position_b + values.offset[", "test_equations test_effects"),
     Fault("eval/quadrotor", "(rate_cmd_b - rate_b) + cross(", "(rate_cmd_b - rate_b) - cross(",
-          "test_mixer test_stepper test_quadrotor"),
+          "quadrotor/test_rotors test_stepper test_quadrotor"),
     Fault("eval/quadrotor", "steps * (1.0 - left**2)", "steps * (1.0 - left)", "test_rotors"),
     Fault("eval/quadrotor", "xp.where(age == whole + 1.0, part",
           "xp.where(age == whole - 1.0, part",
@@ -87,7 +87,7 @@ FAULTS = (
           "xp.where(known, hy * gx - hx * gy, 0.0)", "test_attitude"),
     # eval: units of importers
     Fault("eval/importers", '0.01, "V": 1.0, "mV": 1e-3}', '0.01, "V": 1.0, "mV": 1e-2}',
-          "formats/test_betaflight importers/test_frames"),
+          "formats/test_foreign importers/test_frames"),
     Fault("eval/importers", '"Hz": float(2.0 * np.pi)', '"Hz": float(np.pi)',
           "importers/test_mapping importers/test_frames"),
     Fault("eval/importers", '"mrad/s": 1e-3', '"mrad/s": 1e-2',

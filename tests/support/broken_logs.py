@@ -111,16 +111,6 @@ def far_away(log, rng):
 
 
 BREAKAGES = (
-    dropped,
-    holed,
-    jittered,
-    doubled,
-    still,
-    grounded,
-    silent,
-    wild,
-    sparse,
-    short,
-    turned_over,
+    dropped, holed, jittered, doubled, still, grounded, silent, wild, sparse, short, turned_over,
     far_away,
-)
+)  # fmt: skip

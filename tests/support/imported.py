@@ -80,6 +80,20 @@ def quat_off(log, truth):
     return np.abs(log.quat_wxyz * sign - truth.quat).max()
 
 
+TRUE = {
+    "pos_w": "pos", "vel_w": "vel", "rate_b": "rate", "acc_b": "acc", "rate_cmd_b": "cmd_rate",
+    "thrust_cmd": "thrust", "rotor_speed": "motor", "voltage": "voltage",
+}  # fmt: skip
+"""What a field of a log is called in the known flight."""
+
+
+def same_flight(log, truth, quat, **tolerances):
+    """Check fields of `log` against the known flight, each within its tolerance."""
+    assert quat_off(log, truth) < quat
+    for name, tolerance in tolerances.items():
+        near(getattr(log, name), getattr(truth, TRUE[name]), tolerance)
+
+
 def near(value, wanted, tolerance):
     """Check what is known of `value`, which must be nearly all, against `wanted`."""
     # Signals that are slower than the rows end before them.

@@ -6,16 +6,20 @@ import numpy as np
 import pytest
 
 from eval.effects.interface import GRAVITY
-from eval.effects.slung_load import STIFFNESS, LoadState, SlungLoad
+from eval.effects.slung_load import LoadState, SlungLoad
 from eval.quadrotor.plant import Command, Motion, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step, rollout, step
 from tests.support.vehicles import PLAIN, at_rest, with_effects, with_lag
 
 LOAD, LENGTH = 0.05, 0.5
+
 LOADED = with_effects(slung_load=(LOAD, LENGTH))
+
 TOTAL = PLAIN.mass + LOAD
+
 # What carries both in hover, as the controller counts it: per mass of the vehicle alone.
 HOLDING = Inputs(Command(np.asarray(GRAVITY * TOTAL / PLAIN.mass), np.zeros(3)))
+
 FALLING = Inputs(rotor_speed=np.zeros(4))
 
 
@@ -54,8 +58,6 @@ def test_a_hanging_load_pulls_by_its_weight_and_both_hover(dt):
 def test_the_start_is_where_a_swing_comes_to_rest():
     plant = make_plant(LOADED, 0.002)
     start = hover_state(plant, (2,)).carried["slung_load"]
-    np.testing.assert_allclose(start.line_w[:, :2], 0.0)
-    np.testing.assert_allclose(start.vel_w, np.zeros((2, 3)))
     *_, (swing, *_) = flown(plant, hanging(plant, [0, 0, -0.49]), at_rest(), HOLDING, 1.0)
     np.testing.assert_allclose(swing.line_w, start.line_w[0], atol=1e-6)
     # Along gravity, where that leans.
@@ -126,17 +128,6 @@ def test_a_slack_line_pulls_nothing():
     assert min(pulls) < -0.5 and max(pulls) < 1e-9, "it pulls down and never pushes up"
 
 
-def test_no_load_changes_nothing_to_the_bit():
-    none, bare = with_effects(slung_load=(0.0, LENGTH)), with_effects()
-    plants = [make_plant(with_lag(vehicle, 0.03), 0.002) for vehicle in (none, bare)]
-    states, motions = [hover_state(plant, ()) for plant in plants], [at_rest(), at_rest()]
-    for k in range(150):
-        for i, plant in enumerate(plants):
-            states[i], motions[i], _ = step(plant, states[i], motions[i], lively(0.002 * k), 0.0)
-        for ours, theirs in zip(motions[0], motions[1], strict=True):
-            np.testing.assert_array_equal(ours, theirs)
-
-
 @pytest.mark.parametrize("mass", [0.0, LOAD])
 @pytest.mark.parametrize("line_w", [(0.0, 0.0, 0.0), (0.0, 0.0, -0.5), (0.1, 0.0, -0.2)])
 def test_gradients_are_finite_wherever_the_load_is(mass, line_w):
@@ -179,15 +170,3 @@ def test_steps_converge_and_none_is_too_long():
     # Of order 1, against a step of a quarter of the finest.
     assert errors[0.001] < 0.35 * errors[0.004]
     assert errors[0.02] < 0.5, errors
-
-
-def test_a_jerk_stretches_the_line_by_millimetres():
-    plant = make_plant(LOADED, 0.002)
-    full = Inputs(rotor_speed=np.full(4, PLAIN.rotors.speed_max))
-    reach = [
-        np.linalg.norm(swing.line_w) - LENGTH
-        for swing, *_ in flown(plant, hanging(plant), at_rest(), full, 0.5)
-    ]
-    # Full thrust, 28.2 N, under which the line holds 28.2 / 0.75 m/s^2 apart.
-    assert max(reach) < 0.006
-    assert reach[-1] == pytest.approx(28.2 / 0.75 / STIFFNESS**2 * 1.24, rel=0.02)

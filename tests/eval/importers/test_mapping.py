@@ -130,10 +130,7 @@ def test_attitude_set_points_become_rates_by_the_vehicles_gains(tmp_path, truth)
     turn = np.array([np.cos(half), np.sin(half), 0.0, 0.0])
     w, v = turned[:, :1], turned[:, 1:]
     wanted = np.concatenate(
-        [
-            w * turn[0] - v[:, :1] * turn[1],
-            v * turn[0] + w * turn[1:] + np.cross(v, turn[1:]),
-        ],
+        [w * turn[0] - v[:, :1] * turn[1], v * turn[0] + w * turn[1:] + np.cross(v, turn[1:])],
         axis=1,
     )
     columns = parts(truth) | {

@@ -93,10 +93,7 @@ class Slow(Pursuit):
 @pytest.mark.parametrize("world", ["mujoco", "reference"])
 @pytest.mark.parametrize(
     ("slow", "deadline_s"),
-    [
-        (Slow(3.0, 0.3), 0.2),
-        (Slow(3.0, 0.0, NoAnswer("it.onnx: does not come to an end")), None),
-    ],
+    [(Slow(3.0, 0.3), 0.2), (Slow(3.0, 0.0, NoAnswer("it.onnx: does not come to an end")), None)],
     ids=["late", "none"],
 )
 def test_a_late_answer_ends_the_trials_that_it_was_for_and_the_run_goes_on(slow, deadline_s, world):

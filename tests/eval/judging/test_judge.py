@@ -15,6 +15,7 @@ from tests.support.pilots import Pursuit, RandomNetwork, Steady
 from tracks.formats.custom import load_track
 
 VEHICLE = load_vehicle("reference")
+
 SHORT = Rules(time_limit_s=0.3)
 
 
@@ -148,17 +149,11 @@ def same(trials, found, expected):
     assert found == [expected[trial] for trial in trials]
 
 
-def test_repeats(expected):
-    same(TRIALS, results(TRIALS), expected)
-
-
-def test_order_and_subset(expected):
+def test_repetition_order_subset_and_threads(expected):
     order = [TRIALS[i] for i in np.random.default_rng(1).permutation(len(TRIALS))][:4]
     same(order, results(order), expected)
-
-
-def test_alone(expected):
     same(TRIALS[5:6], results(TRIALS[5:6]), expected)
+    same(TRIALS, results(TRIALS, slots=5, threads=2), expected)
 
 
 @pytest.mark.parametrize("slots", [3, 20])
@@ -167,18 +162,9 @@ def test_number_of_slots(expected, slots):
     same(TRIALS, results(TRIALS, slots), expected)
 
 
-def test_threads(expected):
-    same(TRIALS, results(TRIALS, slots=5, threads=2), expected)
-
-
 def test_processes(expected):
     policy = RandomNetwork  # made anew in each process
     same(TRIALS[:4], results(TRIALS[:4], workers=2, policy=policy), expected)
-
-
-def test_pursuit_by_a_scripted_policy_is_deterministic_too():
-    first = results(TRIALS[:4], slots=2, policy=Pursuit())
-    assert first == results(TRIALS[:4], slots=64, policy=Pursuit())
 
 
 def test_reference_world_flies_the_same(expected):

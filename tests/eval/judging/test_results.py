@@ -1,6 +1,7 @@
-"""Result files and the journal."""
+"""Result files, the journal, tables of cells and pairs, and planned laps."""
 
 import json
+import math
 import os
 
 import numpy as np
@@ -8,11 +9,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from eval.judging.plans import over_plan, plans
 from eval.judging.results import JOURNAL, Journal, read_trials, write_results
-from eval.judging.tables import NOTE, markdown_table, summarise
-from eval.worlds.trial import TrialResult, TrialSpec
+from eval.judging.tables import HEADERS, NOTE, grids, markdown_table, summarise
+from eval.worlds.trial import TrialResult, TrialSpec, track_of
 from suite.common.errors import explain
-from tests.support.judged_cells import ROWS
+from tests.support.judged_cells import ROWS, result
+from tracks.geometry.crossing import crossing
 
 COLUMNS = """track difficulty seed policy vehicle world success gates_passed ended_by collided_with
 pos_x pos_y pos_z time_s v_max v_mean gates_8s gates_035""".split()
@@ -115,3 +118,68 @@ def test_a_pipe_or_too_many_rows_are_no_trials(tmp_path):
     pq.write_table(pa.table(fields), tmp_path / "many.parquet")
     with pytest.raises(ValueError, match="2,000,000 trials, allowed are up to 1,000,000"):
         read_trials(tmp_path / "many.parquet")
+
+
+def test_paired_differences_are_on_the_same_trials():
+    other = [result(seed, policy="theirs", speed=4.0) for seed in (3, 2, 1)]
+    summary = summarise([*ROWS, *other, result(0, difficulty=9, policy="theirs")])
+    assert [cell.policy for cell in summary["cells"]] == ["ours", "theirs", "theirs"]
+    (pair,) = summary["paired"]
+    assert (pair.policy, pair.against, pair.trials) == ("theirs", "ours", 3)
+    assert pair.success.value == pytest.approx(1 / 3) and pair.p_value == 1.0
+    assert pair.v_mean == (-1.0, -1.0, -1.0)
+    assert "theirs - ours" in markdown_table(summary)
+
+
+def test_a_cell_without_a_finished_trial():
+    summary = summarise([result(0, False)])
+    assert math.isnan(summary["cells"][0].lap_s.value)
+    assert "collision 1" in markdown_table(summary)
+
+
+def test_cells_do_not_depend_on_what_else_is_in_the_table():
+    alone = summarise(ROWS)["cells"][0]
+    beside = summarise([result(5, difficulty=1), *ROWS])["cells"][1]
+    assert alone == beside
+
+
+def test_late_answers_are_counted_beside_the_endings():
+    rows = [
+        *ROWS,
+        *(result(seed, False)._replace(ended_by="timeout", late_actions=1) for seed in (7, 8)),
+    ]
+    (cell,) = summarise(rows)["cells"]
+    assert cell.late == 2 and cell.ended_by["timeout"] >= 2
+    ended = grids({"cells": [cell], "paired": []})[0].rows[0][-1].text
+    assert ended.endswith(f"timeout {cell.ended_by['timeout']}, of these 2 by a late answer")
+
+
+def test_one_table_for_the_cells_and_one_for_the_pairs():
+    (cells,) = grids(summarise(ROWS))
+    assert (cells.headers, cells.note) == (HEADERS, NOTE)
+    assert cells.rows[0][4].text == "75 % [30, 95]"
+    both = grids(summarise([*ROWS, result(3, policy="theirs")]))
+    assert [grid.headers[0] for grid in both] == ["policy", "difference"]
+
+
+def test_every_plan_passes_the_gates_of_its_track_in_order():
+    assert len(plans()) == 24
+    for trial, plan in plans().items():
+        track = track_of({}, trial)
+        assert np.abs(plan.pos_w[0] - track.start_pos_w).max() < 1e-3
+        assert plan.time_s[-1] == pytest.approx(plan.lap_s, abs=1e-3)
+        when = []
+        for center_w, rot_w, opening_g in zip(*track.scene.gates[:3], strict=True):
+            passed, _ = crossing(center_w, rot_w, opening_g, plan.pos_w[:-1], plan.pos_w[1:])
+            assert passed.any(), trial
+            when.append(np.flatnonzero(passed)[0])
+        assert when == sorted(when) and when[-1] == len(plan.pos_w) - 2, trial
+
+
+def test_the_ratio_is_of_finished_trials_on_planned_tracks():
+    rows = [result(0), result(1, False), result(2), result(0, policy="other", difficulty=4)]
+    (found,) = over_plan(rows)
+    lap_s = plans()[TrialSpec("zigzag", 3, 0)].lap_s
+    assert (found.policy, found.finished, found.planned) == ("ours", 1, 2)
+    assert found.ratio.value == pytest.approx(rows[0].time_s / lap_s)
+    assert np.isnan(over_plan([result(1, False)])[0].ratio.value)

@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 
 from eval.logs.columns import GROUPS
-from eval.logs.flight_log import (
-    FlightLogError,
-    log_from_columns,
-    read_flight,
-)
+from eval.logs.flight_log import FlightLogError, log_from_columns, read_flight
 from tests.support.log_tables import KINDS, STATE, columns, write_table
 
 

@@ -159,13 +159,3 @@ def test_level_heading():
     np.testing.assert_allclose(level_heading(pitched), [np.cos(0.5), np.sin(0.5), 0.0], atol=1e-12)
     down = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     np.testing.assert_allclose(np.linalg.norm(level_heading(down)), 1.0)
-
-
-def test_batches_are_rows():
-    rng = np.random.default_rng(0)
-    force, rot = rng.normal(size=(4, 5, 3)), exp_rot(rng.normal(size=(4, 5, 3)))
-    heading = level_heading(exp_rot(rng.normal(size=(4, 5, 3))))
-    together = attitude_command(CONTROLLER, force, rot, heading)
-    alone = attitude_command(CONTROLLER, force[2, 3], rot[2, 3], heading[2, 3])
-    np.testing.assert_allclose(together.rate_b[2, 3], alone.rate_b, atol=1e-12)
-    assert together.thrust.shape == (4, 5)

@@ -4,13 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from eval.quadrotor.model import (
-    BODY,
-    CAMERA,
-    COLLIDES,
-    compile_quadrotor,
-    rotor_name,
-)
+from eval.quadrotor.model import BODY, CAMERA, COLLIDES, compile_quadrotor, rotor_name
 from eval.quadrotor.vehicle_file import load_vehicle
 from tests.support.vehicles import PLAIN, with_effects
 from tracks.geometry.camera import optical_axis_b

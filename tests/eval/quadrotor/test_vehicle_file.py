@@ -83,50 +83,30 @@ def test_motors_that_cannot_hover_are_refused_where_a_firmware_drives_them():
 
 REFUSED = [
     ("mass", 0.0, "mass = 0.0.*must be from"),
-    ("mass", "heavy", "mass is 'heavy', allowed is a finite number"),
     ("mass", float("nan"), "mass is nan.*finite"),
-    ("mass", True, "mass is True.*number"),
-    ("mass", None, "the file has no 'mass'; add it"),
-    ("name", "", "name"),
     ("schema", 2, "schema is 2, allowed is 1"),
-    ("schema", True, "schema is True"),
     (
         "controller.kind",
         ["px4"],
         r"controller\.kind is \['px4'\], allowed is 'p' or 'betaflight' or ",
     ),
-    ("wings", 2, "key 'wings' at the top is unknown. Allowed: name"),
     ("massa", 2, "'massa' at the top is unknown. Did you mean 'mass'"),
-    ("inertia", [0.001, 0.001], "inertia.*list of 3"),
     ("inertia", [0.001, 0.001, 0.003], "inertia.*sum of the other two"),
     ("inertia", [0.001, -0.001, 0.001], "inertia.*must be from"),
-    ("rotors", 4, r"rotors is 4, allowed is a table \[rotors\]"),
     ("rotors.spin", [1, 1, -1, 2], r"rotors\.spin.*1 .*or -1"),
-    ("rotors.spin", [1, -1, 1], r"rotors\.spin.*list of 4"),
     ("rotors.spin", [1, 1, 1, 1], "independently"),
     ("rotors.spin", [1, -1, -1, 1], "independently"),
-    ("rotors.position", [[0, 0, 0]] * 3, r"rotors\.position.*4 lists"),
-    ("rotors.position", [[0.1, 0.1], [0, 0, 0], [0, 0, 0], [0, 0, 0]], r"position\[0\]"),
     ("rotors.position", [[0.2, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [0.2, 0.1, 0]], "between"),
     ("rotors.speed_max", 1000.0, "too weak to hover"),
     ("rotors.time_constant", -0.1, r"rotors\.time_constant = -0\.1.*from 0"),
     ("rotors.thrust_coefficient", 0.0, r"rotors\.thrust_coefficient"),
-    (
-        "rotors.torque",
-        0.0,
-        r"'torque' in \[rotors\] is unknown. Allowed: position, spin",
-    ),
     ("controller.frequency", 10.0, r"controller\.frequency.*from 50"),
     ("controller.rate_gain", [20.0, 20.0, 0.0], r"controller\.rate_gain"),
-    ("controller.rate_max", 6.0, r"controller\.rate_max.*list of 3"),
     ("body", {"half_size": [0.1, 0.1, 0.0]}, r"body\.half_size"),
     ("camera", {"fov_deg": [180.0, 60.0]}, r"camera\.fov_deg"),
-    ("camera", {"pitch": 3}, r"'pitch' in \[camera\] is unknown. Did you mean 'pitch_deg'"),
     ("effects", {"linear_drga": {}}, "linear_drga.*Did you mean 'linear_drag'"),
-    ("effects", {"linear_drag": {"coef": 1}}, r"'coef' in \[effects.linear_drag\] is unknown"),
     ("effects", {"linear_drag": {"coefficient": 0.3}}, r"linear_drag\.coefficient.*list of 3"),
     ("effects", {"linear_drag": {"coefficient": [0.1, 0.1, -0.1]}}, "from 0 to 5 1/s"),
-    ("effects", {"linear_drag": 3}, r"allowed is a table \[effects\.linear_drag\]"),
     ("effects", {"battery_sag": {}}, "give rate or per_volt"),
     ("effects", {"gusts": {"intensity": 1.0}}, r"\[effects.gusts\] has no 'length'; add it"),
     ("effects", {"mass_offset": {"offset": -0.7}}, r"mass_offset\.offset = -0\.7.*-0\.375"),
@@ -146,10 +126,7 @@ def test_a_bad_file_is_refused_by_key_and_value(tmp_path, key, value, message):
     inner = table
     for section in sections:
         inner = inner[section]
-    if value is None:
-        del inner[last]
-    else:
-        inner[last] = value
+    inner[last] = value
     path = tmp_path / "bad.toml"
     path.write_text(to_toml(table))
     with pytest.raises(VehicleFileError, match=message) as refusal:

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle, parse_vehicle, vehicle_table
-from eval.vehicles.vehicle import (
-    MotorMap,
-    command_of_thrust,
-    motor_speed,
-    motor_thrust,
-)
+from eval.vehicles.vehicle import MotorMap, command_of_thrust, motor_speed, motor_thrust
 from eval.vehicles.vehicle_check import check_vehicle
 from tests.support.vehicles import PLAIN
 
@@ -75,10 +70,7 @@ def test_motors_come_back_from_a_file_and_wrong_ones_are_refused():
     for motors, reason in (
         ({"thrust": [0.1, 0.1]}, r"\[motors\] has no 'voltage'"),
         ({"thrust": [0.1, -0.1], "voltage": 4.0}, "must grow"),
-        (
-            {"thrust": [0.1, 0.1], "voltage": 4.0, "volts": 1.0},
-            "Did you mean 'voltage'",
-        ),
+        ({"thrust": [0.1, 0.1], "voltage": 4.0, "volts": 1.0}, "Did you mean 'voltage'"),
     ):
         with pytest.raises(ValueError, match=reason):
             parse_vehicle({**table, "motors": motors})

@@ -5,13 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eval.view import colours, picture
+from eval.view import colours
 from eval.view.picture import write_grid, write_picture
 from eval.view.recording import Drone, write_recording
-from eval.view.video import (
-    VideoOptions,
-    write_video,
-)
+from eval.view.video import VideoOptions, write_video
 from tests.support.flights import rollout, small_track
 from tests.support.pixels import opened, share
 from tests.support.recordings import columns
@@ -79,13 +76,6 @@ def test_a_name_with_dollar_signs_is_a_name(tmp_path):
     write_picture(tmp_path / "one.png", *odd)
     write_grid(tmp_path / "grid.png", [odd])
     assert opened(tmp_path / "one.png").size[0] > 600
-
-
-@pytest.mark.parametrize(("passed", "words"), [(0, "0 gates"), (1, "1 gate"), (2, "2 gates")])
-def test_one_gate_is_one_gate(passed, words):
-    _, _, result = rollout()
-    said = picture._outcome(result._replace(gates_passed=passed), short=True)
-    assert said.endswith(f", {words} passed")
 
 
 def test_a_grid_has_a_panel_a_trial(tmp_path):

@@ -7,10 +7,8 @@ import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.collision import NEAR, box_distances, near_solids
-from eval.worlds.engine import compile_model
-from eval.worlds.slots import layout_of
 from tests.support.courses import straight
-from tracks.families import MAX_COUNTS, make_track
+from tracks.families import MAX_COUNTS
 from tracks.geometry.rotation import exp_rot
 from tracks.geometry.scene import Boxes, Rods, Spheres, counts, stack
 
@@ -46,46 +44,8 @@ def test_every_triangle_of_a_mesh_is_near():
     np.testing.assert_array_equal(near.triangles, triangles[None])
 
 
-def test_contacts_are_those_of_mujoco():
-    """Random poses close to solids of every kind: contact there, a distance of nought here."""
-    rng = np.random.default_rng(0)
-    track = make_track("circular", 9, 3)
-    model = compile_model(track, VEHICLE, 0.002, layout_of([track]).solids)
-    data = mujoco.MjData(model)
-    scene = track.scene
-    places = np.concatenate(
-        [scene.boxes.center_w, scene.cylinders.center_w, scene.capsules.center_w,
-         scene.spheres.center_w]
-    )  # fmt: skip
-    size = np.concatenate(
-        [np.linalg.norm(scene.boxes.half_size, axis=1),
-         np.hypot(scene.cylinders.radius, scene.cylinders.half_length),
-         scene.capsules.radius + scene.capsules.half_length, scene.spheres.radius]
-    )  # fmt: skip
-    n = 600
-    index = rng.integers(len(places), size=n)
-    away = rng.normal(size=(n, 3))
-    away *= (size[index] * rng.uniform(0, 1.1, n) / np.linalg.norm(away, axis=1))[:, None]
-    quat = rng.normal(size=(n, 4))
-    hits, rot = np.zeros(n, bool), np.zeros((n, 3, 3))
-    pos = places[index] + away
-    for i in range(n):
-        data.qpos[:3], data.qpos[3:] = pos[i], quat[i] / np.linalg.norm(quat[i])
-        mujoco.mj_step1(model, data)
-        hits[i], rot[i] = data.ncon > 0, data.xmat[1].reshape(3, 3)
-    gates = scene.gates
-    assert gates is not None
-    batch = jax.tree.map(lambda a: np.repeat(a, n, 0), stack([scene], MAX_COUNTS))
-    half = np.asarray(VEHICLE.body.half_size, np.float32)
-    found = jax.jit(box_distances)(
-        batch, pos.astype(np.float32), rot.astype(np.float32), half, np.zeros(3, np.float32)
-    )
-    found = (np.asarray(found) <= 0.0).any(-1)
-    assert 0.2 < hits.mean() < 0.8
-    assert (hits == found).mean() > 0.995
-
-
 GEOM = mujoco.mjtGeom
+
 SOLIDS = {
     "a wall": (GEOM.mjGEOM_BOX, (5.0, 0.05, 3.0)),
     "a bar": (GEOM.mjGEOM_BOX, (0.6, 0.05, 0.05)),
@@ -157,9 +117,7 @@ def test_no_contact_is_missed_and_none_made_up(name):
     scene = alone(geom, size)
     batch = jax.tree.map(lambda a: np.repeat(a, n, 0), stack([scene], counts(scene)))
     found = np.asarray(
-        jax.jit(box_distances)(
-            *jax.tree.map(np.float32, (batch, pos, rot, half_size, np.zeros(3))),
-        )
+        jax.jit(box_distances)(*jax.tree.map(np.float32, (batch, pos, rot, half_size, np.zeros(3))))
     )
     found = found[:, :-1].min(-1)
     met = found <= 0.0

@@ -85,12 +85,6 @@ def test_what_cannot_be_exported_is_refused(tmp_path, checkpoint, exported):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_exporting_again_replaces_the_file(tmp_path, checkpoint):
-    for _ in range(2):
-        assert export_policy(checkpoint, tmp_path, ["onnx"]) == [tmp_path / "tiny.onnx"]
-    assert [p.name for p in tmp_path.iterdir()] == ["tiny.onnx"]
-
-
 @pytest.mark.parametrize(
     "changes",
     [

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from policies.block_policy import BlockPolicy
-from policies.formats import apart_process as process
 from policies.formats import torch_file
 from policies.formats.spec_json import KEY
 from policies.policy import load_policy
@@ -20,7 +19,9 @@ from policies.spec import NoAnswer, PolicyError
 from tests.support.in_process import InProcess
 
 PROGRAM = "models/model.json"
+
 WEIGHTS = "data/weights/model_weights_config.json"
+
 SAMPLES = "data/sample_inputs/model.pt"
 
 
@@ -227,55 +228,6 @@ def test_a_module_that_fails_while_it_flies_gives_no_answer_and_flies_on(tmp_pat
         policy.act(policy.start(2), np.full((2, 12), 1e4), image, fresh)
     assert len(str(told.value).splitlines()) == 1
     assert policy.act(policy.start(2), np.ones((2, 12)), image, fresh)[0].all()
-
-
-class Endless(torch.nn.Module):
-    """Comes to no end with a vehicle that is faster than 1000 m/s."""
-
-    def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-        rounds = 0
-        while bool(state[:, 0].max() > 1e3):
-            rounds += 1
-        return state[:, :3] + float(rounds)
-
-
-def test_a_module_that_hangs_while_it_flies_is_ended_and_a_fresh_one_flies_on(
-    tmp_path, monkeypatch
-):
-    policy = load_policy(script(tmp_path, Endless()), trust=True)
-    monkeypatch.setattr(process, "ANSWER_S", 1.0)
-    image, fresh = np.zeros((2, 24, 32)), np.zeros(2, bool)
-    with pytest.raises(NoAnswer, match="it.pt: torch does not come to an end .*within 1 s"):
-        policy.act(policy.start(2), np.full((2, 12), 1e4), image, fresh)
-    monkeypatch.undo()
-    found, _ = policy.act(policy.start(2), np.full((2, 12), 7.0), image, fresh)
-    np.testing.assert_array_equal(found, np.full((2, 3), 7.0))
-
-
-class Stuck(torch.nn.Module):
-    """Comes to no end with anything."""
-
-    def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-        while bool(state.max() < float("inf")):
-            state = state.sin()
-        return state[:, :3]
-
-
-def test_a_module_that_hangs_as_it_is_tried_is_refused(tmp_path, monkeypatch):
-    path = script(tmp_path, Stuck())
-    monkeypatch.setattr(process, "ANSWER_S", 1.0)
-    with pytest.raises(PolicyError, match="it.pt: torch does not come to an end with it"):
-        load_policy(path, trust=True)
-
-
-class Double(torch.nn.Module):
-    def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-        return state[:, :3].double()
-
-
-def test_outputs_of_another_type_are_told(tmp_path):
-    with pytest.raises(PolicyError, match=r"output 0 is torch.float64, expected .* float32"):
-        load_policy(script(tmp_path, Double()), trust=True)
 
 
 def test_answers_are_those_of_torch_here_to_the_bit(exported):

@@ -1,4 +1,4 @@
-"""A fresh network can be trained, and a trained one goes on as one that sees more."""
+"""Fresh networks can be trained, and trained ones go on as ones that see more; the correction's."""
 
 from dataclasses import replace
 
@@ -7,17 +7,26 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+import torch
 
-from policies.networks import network
+from policies.networks import delta_network, network
+from policies.networks.network import LEAK
 from policies.spec import PolicySpec
 
 SPEC = PolicySpec(rate_hz=15.0)
+
 SMALL = PolicySpec(rate_hz=33.0, hidden_size=64)
+
 SECOND = replace(SMALL, second_gate=True)
+
 AXIS = replace(SMALL, gate_axis=True)
+
 BOTH = replace(SECOND, gate_axis=True)
+
 PACED = replace(AXIS, speed_input=True, speed=0.5)
+
 CLIMB_B = jnp.asarray([1.0, 0.0, 1.0])
+
 ADAMW = optax.adamw(2e-3, b2=0.99, weight_decay=1e-2)
 
 
@@ -135,3 +144,46 @@ def test_a_policy_of_another_size_is_refused():
     for words, changed in other.items():
         with pytest.raises(ValueError, match=words):
             network.fitted(params, SMALL, replace(SMALL, **changed))
+
+
+HIDDEN = delta_network.HIDDEN
+
+
+def inputs(n):
+    rng = np.random.default_rng(0)
+    return [jnp.asarray(rng.normal(size=(n, 3)), jnp.float32) for _ in range(3)]
+
+
+def test_a_fresh_one_corrects_nothing():
+    params = delta_network.init(jax.random.key(1))
+    correction, hidden = delta_network.step(params, delta_network.start(4), *inputs(4))
+    np.testing.assert_array_equal(correction, np.zeros((4, 3)))
+    assert hidden.shape == (4, HIDDEN) and float(jnp.abs(hidden).max()) > 0.01
+
+
+def test_a_step_is_that_of_the_same_layers_in_torch():
+    params = delta_network.init(jax.random.key(1))
+    rng = np.random.default_rng(1)
+    params = {
+        name: jnp.asarray(value + 0.1 * rng.normal(size=value.shape), jnp.float32)
+        for name, value in params.items()
+    }
+    hidden = jnp.asarray(rng.normal(size=(4, HIDDEN)), jnp.float32)
+    seen = inputs(4)
+    correction, after = delta_network.step(params, hidden, *seen)
+
+    held = {name: torch.from_numpy(np.array(value)) for name, value in params.items()}
+    cell = torch.nn.GRUCell(HIDDEN, HIDDEN)
+    bias_h = torch.cat([torch.zeros(2 * HIDDEN), held["gru.bias_new"]])
+    weights = held["gru.weight_input"].T, held["gru.weight_hidden"].T, held["gru.bias"], bias_h
+    for parameter, value in zip(cell.parameters(), weights, strict=True):
+        parameter.data = value
+    # Metres a second are a fifth, m/s^2 a tenth.
+    x = np.concatenate([seen[0] * 0.2, seen[1], seen[2] * 0.1], axis=1)
+    with torch.no_grad():
+        x = torch.from_numpy(x) @ held["input.weight"] + held["input.bias"]
+        x = torch.nn.functional.leaky_relu(x, LEAK)
+        expected = cell(x, torch.from_numpy(np.array(hidden)))
+        out = expected @ held["output.weight"] + held["output.bias"]
+    np.testing.assert_allclose(after, expected.numpy(), atol=2e-6, rtol=1e-5)
+    np.testing.assert_allclose(correction, out.numpy(), atol=2e-6, rtol=1e-5)

@@ -33,12 +33,6 @@ def test_the_path_beside_keeps_the_suffix_and_missing_folders_are_made(tmp_path)
     assert target.read_bytes() == b"x"
 
 
-def test_a_file_that_is_there_is_replaced(tmp_path):
-    for text in ("old", "new"):
-        files.write_text(tmp_path / "a.txt", text)
-    assert (tmp_path / "a.txt").read_text() == "new"
-
-
 def test_a_folder_is_replaced_whole(tmp_path):
     target = tmp_path / "checkpoint"
     for step in ("1", "2"):

@@ -36,10 +36,17 @@ def test_a_track_comes_from_its_name_alone(family):
 
 GOLDEN = {
     ("zigzag", 0, 0): -28.07574721,
+    ("zigzag", 5, 1): -28.72496547,
     ("zigzag", 9, 7): -1.76599018,
+    ("circular", 0, 2): 19.43255764,
     ("circular", 3, 1): -6.85258334,
+    ("circular", 9, 4): -17.67413879,
+    ("ellipse", 0, 6): -15.02192482,
     ("ellipse", 6, 2): 39.92945288,
+    ("ellipse", 9, 3): -49.71468475,
+    ("random", 1, 5): -46.53382366,
     ("random", 5, 3): 4.45124481,
+    ("random", 9, 8): 18.36345052,
 }
 
 
@@ -84,15 +91,6 @@ def test_the_bound_on_solids_is_tight():
     most = np.max([counts(t.scene) for f in FAMILIES for t in tracks_of(f, (8, 9), range(60))], 0)
     assert most[0] == MAX_COUNTS.boxes
     assert np.all(np.array(MAX_COUNTS)[1:4] - most[1:4] <= 2)
-
-
-def test_about_half_of_the_closed_tracks_are_reversed():
-    for family in ("circular", "ellipse"):
-        turns = []
-        for track in tracks_of(family, (0,), range(200)):
-            x, y = track.scene.gates.center_w[:, :2].T
-            turns.append(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0)
-        assert 70 < sum(turns) < 130
 
 
 @pytest.mark.parametrize(("family", "near", "far"), [("circular", 2, 4), ("ellipse", 2, 3)])
@@ -246,22 +244,6 @@ def obstacle_numbers(track: Track) -> dict[str, int]:
     return kinds
 
 
-def test_things_on_the_ground_lie_or_stand_on_it():
-    seen = {"cylinder": 0, "capsule": 0}
-    for track in tracks_of("circular", (9,)):
-        scene = track.scene
-        rods = [*zip(*scene.cylinders, strict=True), *zip(*scene.capsules, strict=True)]
-        first = len(scene.boxes.center_w)
-        for name, (center, axis, radius, half) in zip(track.names[first:], rods, strict=False):
-            if name.startswith("ground cylinder"):
-                assert np.allclose(axis, [0, 0, 1]) and center[2] == half
-                seen["cylinder"] += 1
-            elif name.startswith("ground capsule"):
-                assert abs(axis[2]) < 1e-9 and center[2] == radius
-                seen["capsule"] += 1
-    assert min(seen.values()) > 5
-
-
 @pytest.mark.parametrize("family", JUDGED)
 def test_obstacle_numbers_follow_the_difficulty(family):
     lost = 0
@@ -276,43 +258,6 @@ def test_obstacle_numbers_follow_the_difficulty(family):
         assert have["pillar"] <= 7 and have["ground"] <= 28
         lost += 14 * int(1 + 3 * d) + 7 - have["plate"] - have["small"] - have["pillar"]
     assert lost <= 3
-
-
-def test_every_kind_of_obstacle_has_its_sizes():
-    seen = set()
-    for track in tracks_of("zigzag"):
-        scene = track.scene
-        solids = [
-            *(("box", *s) for s in zip(*scene.boxes, strict=True)),
-            *(("cylinder", *s) for s in zip(*scene.cylinders, strict=True)),
-            *(("capsule", *s) for s in zip(*scene.capsules, strict=True)),
-            *(("sphere", *s) for s in zip(*scene.spheres, strict=True)),
-        ]
-        for name, (kind, center, *shape) in list(zip(track.names, solids, strict=True))[32:]:
-            what = name.split()[0]
-            seen.add((what, kind))
-            if what == "plate":
-                half = shape[1]
-                assert 0.2 <= half[0] == half[1] <= 0.5 and 0.02 <= half[2] <= 0.04
-                assert 0.5 <= center[2] <= 3
-            elif what == "pillar":
-                half, radius = (shape[1][2], shape[1][0]) if kind == "box" else (shape[2], shape[1])
-                assert 0.5 <= half <= 1.5 and radius <= 0.5 and center[2] == half
-            elif kind == "box":
-                assert np.all((shape[1] >= 0.05) & (shape[1] <= 0.25))
-                assert what == "small" or center[2] == shape[1][2]
-            else:
-                radius = shape[0] if kind == "sphere" else shape[1]
-                assert 0.1 <= radius <= 0.3
-            if what == "small":
-                assert 0.5 <= center[2] <= 3
-    assert seen == {
-        *(("small", kind) for kind in ("box", "cylinder", "capsule", "sphere")),
-        *(("ground", kind) for kind in ("box", "cylinder", "capsule", "sphere")),
-        ("plate", "box"),
-        ("pillar", "box"),
-        ("pillar", "cylinder"),
-    }
 
 
 def surface_points(track: Track) -> np.ndarray:

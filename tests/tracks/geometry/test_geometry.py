@@ -13,7 +13,6 @@ from tracks.geometry.gates import (
     frame_boxes,
     rectangle,
     regular_polygon,
-    square_gates,
     yaw_rotation,
 )
 from tracks.geometry.rotation import cross, exp_rot, quat_to_rot, rot_to_quat, to_local, to_world
@@ -133,14 +132,6 @@ def test_openings_are_counter_clockwise_and_round_ones_keep_their_clear_radius()
         assert np.all(opening[:, 0] * after[:, 1] - opening[:, 1] * after[:, 0] > 0)
     middle = (regular_polygon(12, 0.6) + np.roll(regular_polygon(12, 0.6), -1, axis=0)) / 2
     assert np.allclose(np.linalg.norm(middle, axis=-1), 0.6)
-
-
-def test_square_gates_fly_along_their_yaw():
-    yaw = np.array([0.0, np.pi / 2])
-    one = np.ones(2)
-    gates = square_gates(np.zeros((2, 3)), yaw, one, 0.2 * one, 0.05 * one)
-    assert np.allclose(gates.rot_w[:, :, 0], [[1, 0, 0], [0, 1, 0]])
-    assert np.allclose(gates.rot_w[:, :, 2], [[0, 0, 1], [0, 0, 1]])
 
 
 VECTORS = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)

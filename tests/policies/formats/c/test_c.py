@@ -9,7 +9,7 @@ import pytest
 from policies.formats import apart_process as process
 from policies.formats.c import arrays, quantised, source
 from policies.formats.c.c_file import load_c
-from policies.formats.c.compiler import STRICT, compiled_library, find_compiler
+from policies.formats.c.compiler import STRICT, find_compiler
 from policies.formats.c.forward import Observed
 from policies.formats.c.project import c_project, drawn, native_answers
 from policies.policy import load_policy
@@ -234,23 +234,13 @@ def test_c_that_hangs_or_crashes_in_flight_takes_nothing_with_it(fault, how, tmp
     assert policy.act(hidden, calm, image, fresh)[0].tobytes() == before.tobytes()
 
 
-def test_nothing_but_the_door_is_seen_from_outside(exports):
+def test_it_includes_only_math_and_its_header_says_sizes_and_weights(exports):
     export = exports["int8"]
     text = (export.folder / "policy.c").read_text()
     assert [line for line in text.splitlines() if line.startswith("#include")] == [
         "#include <math.h>",
         '#include "policy.h"',
     ]
-    names = subprocess.run(
-        ["nm", "-D", "--defined-only", compiled_library(export.folder / "policy.c")],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    if names.returncode == 0:
-        found = {line.split()[-1] for line in names.stdout.splitlines() if " T " in line}
-        assert {name for name in found if not name.startswith(("suite_", "_"))} == {
-            "policy_reset",
-            "policy_step",
-        }
     header = (export.folder / "policy.h").read_text()
     for said in ("POLICY_STATE_SIZE 12", "POLICY_IMAGE_HEIGHT 24", "POLICY_RATE_HZ 33.0f"):
         assert f"#define {said}" in header

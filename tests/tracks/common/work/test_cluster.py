@@ -60,10 +60,7 @@ def test_results_of_all_pieces_come_with_their_numbers_from_both_nodes(two_nodes
 
 @pytest.mark.parametrize(
     ("how", "error", "text"),
-    [
-        ("refuse", ValueError, "^wrong policy file$"),
-        ("break", ZeroDivisionError, None),
-    ],
+    [("refuse", ValueError, "^wrong policy file$"), ("break", ZeroDivisionError, None)],
 )
 def test_what_goes_wrong_there_is_said_here(two_nodes, how, error, text):
     with pytest.raises(error, match=text) as caught:
