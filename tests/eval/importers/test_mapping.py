@@ -124,37 +124,6 @@ mass = "mass"
     assert log.rate_cmd_b is None
 
 
-def test_attitude_set_points_become_rates_by_the_vehicles_gains(tmp_path, truth):
-    turned = truth.quat.copy()
-    half = 0.01  # 0.02 rad about body x
-    turn = np.array([np.cos(half), np.sin(half), 0.0, 0.0])
-    w, v = turned[:, :1], turned[:, 1:]
-    wanted = np.concatenate(
-        [w * turn[0] - v[:, :1] * turn[1], v * turn[0] + w * turn[1:] + np.cross(v, turn[1:])],
-        axis=1,
-    )
-    columns = parts(truth) | {
-        "w": cells(truth.rate),
-        "sp": cells(wanted),
-        "c": [repr(float(c)) for c in truth.thrust],
-    }
-    mapping = (
-        POSE
-        + """
-[rate]
-column = "w"
-[cmd_quat]
-column = "sp"
-[cmd_thrust]
-column = "c"
-"""
-    )
-    log, findings = imported(tmp_path, mapping, columns, vehicle=PLAIN)
-    gain = PLAIN.controller.attitude_gain[0]
-    near(log.rate_cmd_b, np.array([gain * 0.02, 0.0, 0.0]), 1e-6)
-    assert any(finding.subject == "set points" for finding in findings)
-
-
 def test_the_firmwares_mixer_turns_the_body_the_way_that_it_says():
     """Roll lifts the left motors, pitch (nose up) the front ones, yaw those that turn against it.
 
@@ -234,6 +203,12 @@ def test_every_shipped_mapping_is_read_by_its_name():
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
+        ('[pos]\ncolumn = "a"\nunit = "feet"', "pos.unit is 'feet', allowed is 'm' or 'cm'"),
+        ('[frames]\nworld = "enu"', "frames.world is 'enu'"),
+        ('[rate]\ncolumn = "a"\nsign = [1, -2, 1]', "1 or -1"),
+        ("[volts]", "key 'volts' at the top is unknown. Did you mean 'voltage'"),
+        ('[vel]\ncolumn = "a"\naxis = "body"', "Did you mean 'axes'"),
+        ("[time", "is not TOML"),
         ('[pwm]\ncolumns = ["a", "b", "c"]', "pwm.columns .* 4 column names"),
         ('[pwm]\ncolumn = "a"\nmixer = "x"', "pwm.mixer is 'x', allowed is 'crazyflie'"),
         ('[acc]\ncolumn = "a"\naxes = "ned"', "acc.axes is 'ned', allowed is 'body' or 'world'"),

@@ -13,7 +13,6 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from policies.formats import apart_process as process
-from policies.formats import apart_server as server
 from policies.formats.apart_process import Apart
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
@@ -32,6 +31,7 @@ def _proto(nodes, tensors=(), outputs=None, rows="n"):
 
 
 W = numpy_helper.from_array(np.eye(12, 3, dtype=np.float32), "w")
+
 PLAIN = _proto([helper.make_node("MatMul", ["state", "w"], ["action"])], [W])
 
 
@@ -166,17 +166,3 @@ def test_after_a_question_without_an_answer_the_next_goes_to_a_fresh_process(mon
     with pytest.raises(ProcessLookupError):
         os.kill(stopped, 0)
     np.testing.assert_array_equal(model.run(feed)[0], np.ones((2, 3)))
-
-
-def test_frames_come_through_whole():
-    with subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as echo:
-        assert echo.stdin and echo.stdout
-        head = {"arrays": [["a", [2, 3]], ["b", [0]]], "bytes": 5}
-        server.write_frame(echo.stdin, head, np.zeros(6, np.float32), b"12345")
-        found, data = server.read_frame(echo.stdout)
-        assert (
-            found == head and len(data) == server.data_bytes(head) == 29 and data.endswith(b"12345")
-        )
-        echo.stdin.close()
-        with pytest.raises(EOFError):
-            server.read_frame(echo.stdout)

@@ -120,27 +120,16 @@ def test_euler_angles_and_a_world_with_y_up(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "reason"),
     [
-        ('unit = "mm"', 'unit = "feet"', "pos.unit is 'feet', allowed is 'm' or 'cm' or 'mm'"),
-        ('world = "ned"', 'world = "enu"', "frames.world is 'enu'"),
-        ('"n", "e", "d"', '"n", "e"', "pos.columns is"),
-        ("sign = [1, -1, 1]", "sign = [1, -2, 1]", "1 or -1"),
-        ("[voltage]", "[volts]", "key 'volts' at the top is unknown. Did you mean 'voltage'"),
-        ('axes = "body"', 'axis = "body"', "Did you mean 'axes'"),
-        ("[time]", "[time", "is not TOML"),
-        ('"p", "q", "r"', '"p", "q", "rr"', "column rr: missing; did you mean 'r'"),
-        ('[time]\ncolumn = "stamp"\nunit = "ns"', "", "name it in the mapping's [time]"),
+        ('"p", "q", "r"', '"p", "q", "rr"', "log.csv.*column rr: missing; did you mean 'r'"),
+        ('[time]\ncolumn = "stamp"\nunit = "ns"', "", r"name it in the mapping's \[time\]"),
     ],
 )
-def test_bad_maps_are_refused_by_key(tmp_path, old, new, reason):
-    _, columns = _table()
+def test_columns_that_are_not_there_are_refused_by_name(tmp_path, old, new, reason):
     path, mapping = tmp_path / "log.csv", tmp_path / "map.toml"
-    pa_csv.write_csv(pa.table(columns), path)
-    assert old in MAP
+    pa_csv.write_csv(pa.table(_table()[1]), path)
     mapping.write_text(MAP.replace(old, new))
-    with pytest.raises(ValueError) as error:
+    with pytest.raises(ValueError, match=reason):
         import_log(path, None, ImportOptions(map=mapping))
-    assert reason in str(error.value)
-    assert ("map.toml" in str(error.value)) or ("log.csv" in str(error.value))
 
 
 def test_text_among_numbers_is_refused_with_its_row(tmp_path):
