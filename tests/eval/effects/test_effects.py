@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS, all_values, find_effect
-from eval.effects.interface import Effect, Parameter, Sample, along_z, as_arrays, neutral
+from eval.effects import EFFECTS, all_values
+from eval.effects.interface import Effect, Parameter, Sample, along_z, as_arrays
 from eval.effects.log_faults import apply_log_faults, lateness, measured, restored
 from eval.effects.mass_offset import EFFECT as MASS
 from eval.effects.slung_load import SlungLoad
@@ -17,7 +17,7 @@ from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from tests.support.faults import ImuFault, with_imu_fault
 from tests.support.flights import small_log
-from tests.support.vehicles import PLAIN, drawn_effects, with_effects
+from tests.support.vehicles import PLAIN, drawn_effects
 from tracks.geometry.rotation import exp_rot, quat_to_rot
 
 # All four rotors at 1000 rad/s push 1.6 N each; their torques about z cancel.
@@ -37,24 +37,6 @@ def test_neutral_values_change_nothing():
             states[i], one = plant_step(plant, states[i], MOVING, Inputs(command), 3.0)
             acting.append(np.concatenate(one))
         np.testing.assert_allclose(acting[1], acting[0], rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize("name", EFFECTS)
-def test_effect_acts(name):
-    """Anything but neutral is felt: in the wrench, in the constants or in the log."""
-    effect = EFFECTS[name]
-    drawn = drawn_effects(np.random.default_rng(3)).effects[name]
-    base = neutral(effect, PLAIN)
-    log = apply_log_faults({name: drawn}, small_log())
-    changed = any(np.any(log[key] != value) for key, value in small_log().items())
-    drag = with_effects(linear_drag=((0.3, 0.2, 0.1),)).effects
-    plants = [make_plant(PLAIN, 0.002, {**drag, name: values}) for values in (base, drawn)]
-    low = MOVING._replace(pos_w=np.array([0.0, 0.0, 0.1]))
-    inputs = Inputs(rotor_speed=SPEED + [100.0, 0.0, 100.0, 0.0], noise=np.ones(3))
-    wrenches = [plant_step(p, hover_state(p, ()), low, inputs, 20.0)[1] for p in plants]
-    pairs = [*zip(*wrenches, strict=True)]
-    pairs += zip(plants[0].constants, plants[1].constants, strict=True)
-    assert changed or any(np.any(np.asarray(a) != np.asarray(b)) for a, b in pairs)
 
 
 def test_numpy_and_jax_agree_on_the_whole_catalogue():
@@ -107,11 +89,6 @@ def test_parameters_with_a_batch_axis_are_one_vehicle_each():
             own, one = plant_step(alone, own, MOVING, row, 0.1 * k)
         np.testing.assert_allclose(acting.force_b[i], one.force_b, rtol=1e-10)
         np.testing.assert_allclose(acting.torque_b[i], one.torque_b, rtol=1e-9, atol=1e-12)
-
-
-def test_unknown_effect_names_the_nearest():
-    with pytest.raises(ValueError, match="'linear_drg'.*'linear_drag'"):
-        find_effect("linear_drg")
 
 
 class Flywheel(NamedTuple):

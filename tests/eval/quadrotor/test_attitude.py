@@ -1,4 +1,4 @@
-"""From an action to a command: frames, limits, and every attitude that has no obvious answer."""
+"""From an action to a command and a wrench: frames, limits, attitudes without obvious answer."""
 
 from dataclasses import replace
 
@@ -10,7 +10,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
+from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
+from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Controller
+from tests.support.vehicles import PLAIN
 from tracks.geometry.rotation import exp_rot
 
 CONTROLLER = Controller(rate_gain=(20.0, 20.0, 8.0), frequency=500.0)
@@ -159,3 +162,36 @@ def test_level_heading():
     np.testing.assert_allclose(level_heading(pitched), [np.cos(0.5), np.sin(0.5), 0.0], atol=1e-12)
     down = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     np.testing.assert_allclose(np.linalg.norm(level_heading(down)), 1.0)
+
+
+AUTOPILOT = make_autopilot(PLAIN)
+
+RESTING = Motion(
+    np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.zeros((2, 3))
+)
+
+AHEAD = np.tile([5.0, 0.0, 0.0], (2, 1))
+
+
+def test_the_attitude_loop_runs_at_100_hz():
+    assert (AUTOPILOT.dt, AUTOPILOT.attitude_every) == (0.002, 5)
+
+
+def test_no_action_hovers():
+    state = start_autopilot(AUTOPILOT, RESTING)
+    _, wrench = autopilot_step(AUTOPILOT, state, RESTING, np.zeros((2, 3)), AHEAD, np.zeros(2, int))
+    np.testing.assert_allclose(wrench.force_b, np.tile([0.0, 0.0, 0.75 * 9.81], (2, 1)))
+    np.testing.assert_allclose(wrench.torque_b, 0.0, atol=1e-12)
+
+
+def test_a_command_is_held_between_steps_of_the_attitude_loop():
+    state = start_autopilot(AUTOPILOT, RESTING)
+    aside = np.tile([0.0, 5.0, 0.0], (2, 1))
+    action_b = np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 3.0]])
+    after, _ = autopilot_step(AUTOPILOT, state, RESTING, action_b, aside, np.array([5, 6]))
+    np.testing.assert_allclose(after.command.thrust, [12.81, 9.81])
+    # 6 1/s for 10 ms towards a gate at 90 degrees.
+    turn = np.pi / 2 * (1 - np.exp(-0.06))
+    np.testing.assert_allclose(after.heading_w[0], [np.cos(turn), np.sin(turn), 0.0])
+    np.testing.assert_allclose(after.command.rate_b[:, 2], [4.0 * turn, 0.0])
+    np.testing.assert_array_equal(after.heading_w[1], state.heading_w[1])

@@ -1,18 +1,23 @@
-"""The checkpoint, the torch program and the ONNX file are one policy."""
+"""The checkpoint, the torch program and the ONNX file are one policy, layer for layer."""
 
 import json
 import shutil
 import zipfile
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import onnx
 import pytest
 import torch
+from onnx.reference import ReferenceEvaluator
 
 from policies.formats.export import export_policy
+from policies.formats.onnx_graph import IR_VERSION, OPSET, onnx_model
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.formats.spec_json import KEY
+from policies.formats.torch_twin import torch_twin
+from policies.networks import network
 from policies.policy import load_policy
 from policies.spec import PolicyError
 from tests.policies.conftest import SPEC, lively
@@ -105,3 +110,26 @@ def test_policies_of_other_inputs_and_sizes_are_one_policy_as_well(tmp_path, cha
         theirs = load_policy(path, trust=True)
         assert theirs.spec == spec
         np.testing.assert_allclose(rollout(theirs, 70, 5), expected, atol=5e-5, rtol=1e-5)
+
+
+def test_the_graph_and_the_twin_are_our_network(params):
+    rng = np.random.default_rng(0)
+    state, image, hidden = (
+        rng.normal(size=(3, *shape)).astype(np.float32) for shape in ((12,), (24, 32), (64,))
+    )
+    ours = network.step(params, *map(jnp.asarray, (hidden, state, image)))
+    feed = {"state": state, "image": image, "hidden": hidden}
+    graph = ReferenceEvaluator(onnx_model(params, SPEC, {"key": "text"})).run(None, feed)
+    with torch.no_grad():
+        twin = torch_twin(params, SPEC)(*map(torch.from_numpy, (state, image, hidden)))
+    for theirs in (graph, twin):
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(a, np.asarray(b), atol=2e-5, rtol=1e-5)
+
+
+def test_it_asks_for_old_standard_operators_only_and_carries_its_texts(params):
+    model = onnx_model(params, SPEC, {"key": "text"})
+    assert model.ir_version == IR_VERSION <= 8
+    assert [(o.domain, o.version) for o in model.opset_import] == [("", OPSET)] and OPSET <= 17
+    assert {node.domain for node in model.graph.node} == {""}
+    assert [(p.key, p.value) for p in model.metadata_props] == [("key", "text")]

@@ -101,17 +101,6 @@ def test_a_policy_that_sees_more_is_refused(seen, spec, key):
         network.fitted(params, seen, spec)
 
 
-def test_channels_and_hidden_size_decide_how_many_weights_there_are():
-    small = PolicySpec(hidden_size=96, channels=(16, 32, 32), second_gate=True, gate_axis=True)
-    params = network.init(jax.random.key(0), small)
-    convolutions = 4 * 16 + 9 * 16 * 32 + 9 * 32 * 32
-    dense = (2 * 4 * 32) * 96 + (18 + 1) * 96 + 6 * 96 * 96 + 6 * 96 + 96 * 3
-    assert sum(value.size for value in params.values()) == convolutions + dense == 96_448
-    states, images = jnp.ones((5, 18)), jnp.ones((5, 24, 32))
-    action, hidden = network.step(params, jnp.zeros((5, 96)), states, images)
-    assert action.shape == (5, 3) and hidden.shape == (5, 96)
-
-
 def test_at_twice_the_rate_a_memory_lasts_as_long():
     """Two decisions forget what one did, where little is forgotten in each."""
     params = network.init(jax.random.key(5), SMALL)

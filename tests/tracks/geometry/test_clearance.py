@@ -116,19 +116,6 @@ def test_meshes_are_as_far_as_trimesh_says(root):
         first += size
 
 
-def test_a_single_triangle_is_as_far_as_its_nearest_sample():
-    corners = np.array([[0.0, 0, 2], [2.0, 0.5, 2.5], [0.3, 1.5, 3.0]])
-    track = make_track("zigzag", 0, 0)
-    scene = track.scene._replace(triangles=corners[None])
-    share = np.stack(np.meshgrid(*[np.linspace(0, 1, 201)] * 2), -1).reshape(-1, 2)
-    share = share[share.sum(-1) <= 1 + 1e-9]
-    samples = corners[0] + share @ (corners[1:] - corners[0])
-    point = np.random.default_rng(0).uniform([-1, -1, 1], [3, 2.5, 4], (200, 3))
-    expected = np.linalg.norm(point[:, None] - samples, axis=-1).min(-1)
-    distance, _ = all_distances(unbatched(scene), jnp.asarray(point))
-    assert np.allclose(np.asarray(distance)[:, -2], expected, atol=0.01)
-
-
 def test_padding_and_culling_do_not_change_the_nearest():
     tracks = [make_track("circular", 9, 1), make_track("random", 9, 0)]
     scene = jax.tree.map(jnp.asarray, stack([t.scene for t in tracks], MAX_COUNTS))
