@@ -226,7 +226,7 @@ def test_rows_and_memory_are_told_by_the_shapes(shapes, found):
     ("shapes", "said"),
     [
         ({}, "inputs are none; expected state, image, hidden in this order"),
-        ({"image": IMAGE, "state": STATE}, "inputs are image, state; expected state, image"),
+        ({"state": STATE, "picture": IMAGE}, "inputs are state, picture; expected state, image"),
         ({"state": (2, 12), "image": (3, 24, 32)}, "all need the batch as first axis"),
         ({"state": STATE, "image": IMAGE, "hidden": ("batch", "n")}, "must be fixed"),
         ({"state": STATE, "image": IMAGE, "hidden": ("batch",)}, "must be fixed"),
