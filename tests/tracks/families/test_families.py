@@ -147,7 +147,7 @@ def test_every_gate_can_be_reached_by_a_body_of_20_cm(family):
     assert unreachable_gates(make_track(family, 9, 4)) == []
 
 
-def unreachable_gates(track: Track, step: float = 0.2, body: float = 0.2) -> list[int]:
+def unreachable_gates(track, step=0.2, body=0.2):
     """Return the gates to which no connected free cells lead from the one before."""
     gates = track.scene.gates
     normal = gates.rot_w[:, :, 0]
@@ -174,7 +174,7 @@ def unreachable_gates(track: Track, step: float = 0.2, body: float = 0.2) -> lis
     labels = np.zeros(free.shape, np.int32)
     ndimage.label(free, output=labels)
 
-    def label(point: np.ndarray) -> int:
+    def label(point):
         return int(labels[tuple(np.round((point - low) / step).astype(int))])
 
     return [i for i in range(8) if label(leave[i]) != label(reach[i]) or not label(reach[i])]
@@ -232,7 +232,7 @@ def test_ellipse_has_two_apexes_and_two_straights_flown_along_the_tangent():
         assert np.all(np.abs(off) <= np.deg2rad(30) * d + 1e-9)
 
 
-def surface_points(track: Track) -> np.ndarray:
+def surface_points(track):
     """Return points on every obstacle."""
     meshes = [mesh for _, mesh in solid_meshes(track)[32:]]
     return np.concatenate([part for m in meshes for part in (m.vertices, m.triangles_center)])
