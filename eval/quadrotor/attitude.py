@@ -115,9 +115,11 @@ def _tilt_error(xp: Any, up_b: Array) -> tuple[Array, Array]:
     tilted = across > SMALL**2
     sine = xp.sqrt(xp.where(tilted, across, 1.0))
     angle = xp.arctan2(xp.where(tilted, sine, 0.0), up_b[..., 2])
-    over = xp.where(up_b[..., 2] > 0.0, 0.0, xp.pi)
-    x = xp.where(tilted, -up_b[..., 1] * angle / sine, over)
-    y = xp.where(tilted, up_b[..., 0] * angle / sine, 0.0)
+    # Upright the ratio of angle and sine is 1: its slope is that of the tilt. Upside down there is
+    # no slope, and x is turned about. Taken from zero, so that an error of nothing is not -0.
+    upright = up_b[..., 2] > 0.0
+    x = xp.where(tilted, -up_b[..., 1] * angle / sine, xp.where(upright, 0.0 - up_b[..., 1], xp.pi))
+    y = xp.where(tilted, up_b[..., 0] * angle / sine, xp.where(upright, up_b[..., 0], 0.0))
     return x, y
 
 

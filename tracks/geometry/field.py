@@ -16,7 +16,10 @@ _TINY = 1e-9
 
 def _norm(vector: Array) -> Array:
     xp = vector.__array_namespace__()
-    return xp.sqrt((vector * vector).sum(-1))
+    square = (vector * vector).sum(-1)
+    # At zero the root's slope is infinite, times nothing: no number. At rest it counts as none.
+    some = square > 0.0
+    return xp.where(some, xp.sqrt(xp.where(some, square, 1.0)), 0.0)
 
 
 def magnetic_field(
