@@ -110,13 +110,6 @@ def test_interrupt_keeps_what_was_finished_and_the_rest_is_flown_later(tmp_path,
         assert [journal.done[trial] for trial in trials] == expected
 
 
-def test_a_policy_that_cannot_travel_is_refused_with_what_to_do():
-    policy = Pursuit()
-    setattr(policy, "unpicklable", lambda: None)  # noqa: B010
-    with pytest.raises(ValueError, match="functools.partial"):
-        fly(policy, [TrialSpec("zigzag", 0, 0)] * 2, VEHICLE, options=JudgeOptions(workers=2))
-
-
 TRIALS = [
     TrialSpec(track, level, 0) for track in ("zigzag", "circular", "ellipse") for level in (1, 6)
 ]
