@@ -187,10 +187,3 @@ def test_two_processes_train_as_one_and_go_on_after_a_kill_of_either(trainings, 
     (rows, arrays), (expected, weights) = trainings.result(out), trainings.result("one")
     assert rows == expected, "the curve of one process with the same devices, to the bit"
     assert all(np.array_equal(arrays[name], weights[name]) for name in weights)
-
-
-@pytest.mark.slow
-def test_processes_that_were_asked_for_different_trainings_are_told(trainings):
-    codes, said = ends(trainings.both("apart", seeds=(0, 1)))
-    assert sorted(codes) == [2, 2] or 2 in codes
-    assert any("they differ in the configuration" in words for words in said)
