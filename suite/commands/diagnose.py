@@ -58,7 +58,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for flights or a vehicle file that cannot be used.
     """
     from suite.delta.run import flight_files
-    from suite.diagnose.report.parameters_json import components, in_digits
+    from suite.diagnose.report.parameters_json import components
     from suite.diagnose.run import diagnose_files
 
     check_no_input(config.out / "vehicle.toml", [config.vehicle, config.fly], "--out")
@@ -81,14 +81,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     console.say(f"verdict: {result['verdict']}")
     for effect in result["effects"]:
         rivals = ", ".join(effect["alternatives"])
-        same = f" (these flights cannot tell it from {rivals})" if rivals else ""
+        same = f" (not distinguishable from {rivals} on these flights)" if rivals else ""
         console.say(f"  {effect['name']}{same}")
-        for label, value, span in components(effect["parameters"]):
-            if value is None:
-                console.say(f"    {label}: no flight can tell")
-            else:
-                shown, between = in_digits(value, span)
-                console.say(f"    {label}: {shown}" + (f", 95 %: {between}" if between else ""))
+        for one in sorted(components(effect), key=lambda one: not one.found):
+            shown, between = one.shown()
+            console.say(f"    {one.label}: {shown}" + (f", 95 %: {between}" if between else ""))
     gap = result["gap"]
     console.say(f"gap on held-out flights: {gap['before']:.2f} before, {gap['after']:.2f} after; "
                 f"{gap['noise_floor']:.2g} is the noise floor")  # fmt: skip

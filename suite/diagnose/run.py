@@ -12,6 +12,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.report import write_report
 from suite.delta.run import flight_files
+from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.diagnose import BeyondRollouts, diagnose
 from suite.diagnose.fit.parameters import refuse_own_motion
 from suite.diagnose.plans.plan import fly_plan, write_plan_of
@@ -69,6 +70,9 @@ def diagnose_files(
     logs, warnings = read_flights(flight_files(paths), partial=True)
     before, told = read_flights(flight_files(reference), partial=True) if reference else ([], [])
     warnings = [*warnings, *told]
+    logs, slow = without_slow_rotors(logs)
+    before, slow_before = without_slow_rotors(before)
+    warnings += [*slow, *slow_before]
     for warning in warnings:
         console.note(f"warning: {warning}")
     asked = {

@@ -20,7 +20,7 @@ from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.report import Links, Picture, Section
 from suite.diagnose.report.cells import grid
-from suite.diagnose.report.parameters_json import components, in_digits
+from suite.diagnose.report.parameters_json import components
 from suite.loop.charts import success_chart, tuning_chart
 from suite.loop.compare import BEFORE, points, told_apart
 from suite.loop.config import OWN, HiddenLoopConfig, LoopConfig
@@ -118,9 +118,9 @@ def verdict(
 def _diagnosis(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Section:
     gap = diagnosis["gap"]
     rows = [
-        (effect["name"], ", ".join(effect["alternatives"]), label, *in_digits(value, span))
+        (effect["name"], ", ".join(effect["alternatives"]), one.label, *one.shown())
         for effect in diagnosis["effects"]
-        for label, value, span in components(effect["parameters"])
+        for one in components(effect)
     ]
     headers = ["effect", "or", "parameter", "value", "95 %"]
     return Section(

@@ -21,6 +21,7 @@ from eval.quadrotor.plant import Command, Plant, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.resample import follow_lag, hold, interpolate
+from suite.diagnose.data.sampling import on_every_row
 from suite.diagnose.data.windows import step_s
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -127,7 +128,8 @@ def _stretches(
     if log.rotor_speed is None:
         return []
     dt, found = step_s(vehicle), []
-    good = np.isfinite(log.rotor_speed).all(axis=1) & np.isfinite(log.rate_b).all(axis=1)
+    rate_b = on_every_row(log, limits).rate_b
+    good = np.isfinite(log.rotor_speed).all(axis=1) & np.isfinite(rate_b).all(axis=1)
     rows = np.flatnonzero(good)
     holes = np.flatnonzero(np.diff(log.time_s[rows]) > limits.longest_hole_s)
     for part in np.split(rows, holes + 1):

@@ -14,6 +14,7 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.logs.velocity import velocity_from_position
+from suite.diagnose.data.sampling import on_every_row
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.rotation import quat_to_rot
 
@@ -121,6 +122,7 @@ def _comparisons(
     log: FlightLog, limits: Thresholds
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return gyro less turn (K, 3), change of the rates (K, 3) [rad/s^2] and blocks (K,)."""
+    log = on_every_row(log, limits)
     time, rate = log.time_s, log.rate_b
     count = max(1, round(limits.turn_span_s / float(np.median(np.diff(time)))))
     if len(time) < 4 * count:

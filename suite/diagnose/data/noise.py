@@ -11,14 +11,14 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 def rotor_noise(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
     """Return the noise of measured rotor speeds that are an input [rad/s], or too large a one.
 
-    A cubic over few rows is taken off the speeds themselves: what the rotors truly do within
-    30 ms counts as noise.
+    A cubic over few of their own rows is taken off the speeds themselves: what the rotors truly do
+    within 30 ms counts as noise.
     """
     rotors = SLICES["rotor speed"]
     speeds = np.zeros(np.asarray(windows.seen).shape)
     speeds[..., rotors] = windows.row_rotor_speed
     seen = np.zeros(speeds.shape, dtype=bool)
-    seen[..., rotors] = np.asarray(windows.seen)[..., 9:10]
+    seen[..., rotors] = windows.rotor_seen
     sigma = noise_of(speeds, windows._replace(seen=seen), limits.rotor_noise_rows, limits)
     return float(np.sqrt((sigma[rotors] ** 2).mean()))
 
@@ -32,33 +32,36 @@ def noise_of(
     """Return the standard deviation of each channel's noise, (19,) in its unit; NaN where unseen.
 
     `residual` (W, N, 19) is measured - simulated in `windows`; a polynomial is taken off
-    `rows_together` of them at a time, by default `limits.noise_rows`.
+    `rows_together` of a channel's own rows at a time, by default `limits.noise_rows`, or off all of
+    a window where it has fewer. A channel with too few rows for that in every window is given the
+    RMS of its residuals, which no noise exceeds.
     """
     block, degree = rows_together or limits.noise_rows, limits.noise_degree
     power: list[list[float]] = [[] for _ in range(CHANNELS)]
     freedom: list[list[int]] = [[] for _ in range(CHANNELS)]
     seen = np.asarray(windows.seen)
     for w in range(len(residual)):
-        for first in range(0, residual.shape[1] - block + 1, block):
-            rows = slice(first, first + block)
-            time = np.asarray(windows.row_s)[w, rows]
-            whole = seen[w, rows]
-            for mask in {column.tobytes() for column in whole.T}:
-                chosen = np.frombuffer(mask, dtype=bool)
-                if chosen.sum() < degree + 4:
-                    continue
-                channels = [c for c in range(CHANNELS) if whole[:, c].tobytes() == mask]
-                values = residual[w, rows][chosen][:, channels]
-                basis = np.linalg.qr(_powers(time[chosen], degree))[0]
+        for mask in {column.tobytes() for column in seen[w].T}:
+            own = np.flatnonzero(np.frombuffer(mask, dtype=bool))
+            channels = [c for c in range(CHANNELS) if seen[w, :, c].tobytes() == mask]
+            count = min(block, len(own))
+            if count < degree + 4:
+                continue
+            for first in range(0, len(own) - count + 1, count):
+                rows = own[first : first + count]
+                values = residual[w, rows][:, channels]
+                basis = np.linalg.qr(_powers(np.asarray(windows.row_s)[w, rows], degree))[0]
                 left = values - basis @ (basis.T @ values)
                 for channel, energy in zip(channels, (left**2).sum(axis=0), strict=True):
                     power[channel].append(float(energy))
-                    freedom[channel].append(int(chosen.sum()) - degree - 1)
+                    freedom[channel].append(count - degree - 1)
     sigma = np.full(CHANNELS, np.nan)
     for c in range(CHANNELS):
         if power[c]:
             n = np.array(freedom[c])
             sigma[c] = np.sqrt(typical_variance(np.array(power[c]), n))
+        elif seen[..., c].any():
+            sigma[c] = np.sqrt((residual[..., c][seen[..., c]] ** 2).mean())
     return np.maximum(sigma, np.repeat(limits.least_noise, [3, 3, 3, 3, 3, 4]))
 
 
@@ -74,19 +77,25 @@ def typical_variance(energy: np.ndarray, freedom: np.ndarray | int) -> np.ndarra
 def noise_like(speed: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
     """Return a draw of noise (T, R) as large as that of each rotor's `speed`; NaN where that is.
 
-    What it does to a sum over rows theirs does as well. Noise is what a cubic over few rows leaves.
+    What it does to a sum over rows theirs does as well. Noise is what a cubic over few of a rotor's
+    own rows leaves; a rotor with fewer rows than that is given none.
     """
+    draw = np.random.default_rng(0).standard_normal(speed.shape)
+    out = np.full(speed.shape, np.nan)
+    for k, column in enumerate(speed.T):
+        own = np.flatnonzero(np.isfinite(column))
+        out[own, k] = _rotor_sigma(column[own], limits) * draw[: len(own), k]
+    return out
+
+
+def _rotor_sigma(speed: np.ndarray, limits: Thresholds) -> float:
     block, degree = limits.rotor_noise_rows, limits.noise_degree
-    rows = len(speed) // block * block
-    blocks = speed[:rows].reshape(-1, block, speed.shape[1])
-    blocks = blocks[np.isfinite(blocks).all(axis=(1, 2))]
+    blocks = speed[: len(speed) // block * block].reshape(-1, block)
     if not len(blocks):
-        return np.zeros_like(speed)
+        return 0.0
     basis = np.linalg.qr(_powers(np.arange(block, dtype=float), degree))[0]
-    left = blocks - np.einsum("rp,qp,bqm->brm", basis, basis, blocks)
-    sigma = np.sqrt(typical_variance((left**2).sum(axis=1), block - degree - 1))
-    draw = sigma * np.random.default_rng(0).standard_normal(speed.shape)
-    return np.where(np.isfinite(speed), draw, np.nan)
+    left = blocks - blocks @ basis @ basis.T
+    return float(np.sqrt(typical_variance((left**2).sum(axis=1), block - degree - 1)))
 
 
 def _powers(time_s: np.ndarray, degree: int) -> np.ndarray:

@@ -17,8 +17,10 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.loops import NOMINAL
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.resample import interpolate
+from suite.diagnose.data.sampling import longest_gap_s, on_every_row, thinned
 from suite.diagnose.data.steps import LONGEST_S, StepGrid, padded_grid, step_grid, with_lost_rows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Array
 
 LENGTH_S = 1.0
@@ -96,7 +98,9 @@ class FlightWindows(NamedTuple):
     row_acc_b: Array
     row_rotor_speed: Array
     seen: Array
-    """(W, N, 19) bool: whether there is a value."""
+    """(W, N, 19) bool: whether there is a value that is compared."""
+    rotor_seen: Array
+    """(W, N, 4) bool: whether there is a rotor speed, compared or an input."""
 
 
 def step_s(vehicle: Vehicle) -> float:
@@ -134,8 +138,9 @@ def cut(
     places: list[tuple[int, int]] = []
     warnings: list[str] = []
     shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
-    for number, log in enumerate(logs):
-        starts = _starts(log, rotor_input, stride_s, limits.longest_hole_s)
+    states = [on_every_row(log, limits) for log in logs]
+    for number, (log, state) in enumerate(zip(logs, states, strict=True)):
+        starts = _starts(log, state.whole, rotor_input, stride_s, limits.longest_hole_s)
         if not starts:
             warnings.append(f"{log.name}: no stretch of {shortest_s:g} s without a hole")
         places += [(number, first) for first in starts]
@@ -145,7 +150,7 @@ def cut(
     drives = [_drive(logs[number], first, vehicle, longest_s) for number, first in places]
     drives = _of_one_shape(drives)
     parts = [
-        _window(logs[number], number, first, vehicle, rotor_input, drive)
+        _window(logs[number], states[number], number, first, vehicle, rotor_input, drive)
         for (number, first), drive in zip(places, drives, strict=True)
     ]
     return FlightWindows(*(np.stack(field) for field in zip(*parts, strict=True))), warnings
@@ -156,9 +161,12 @@ def take(windows: FlightWindows, chosen: Array) -> FlightWindows:
     return FlightWindows(*(np.asarray(field)[chosen] for field in windows))
 
 
-def _starts(log: FlightLog, rotor_input: bool, stride_s: float, hole_s: float) -> list[int]:
-    time, whole = log.time_s, log.whole
-    driven_s = time[_driven(log, rotor_input)]
+def _starts(
+    log: FlightLog, whole: np.ndarray, rotor_input: bool, stride_s: float, hole_s: float
+) -> list[int]:
+    """Return rows at which windows start, of those (T,) where the `whole` state is known."""
+    time = log.time_s
+    driven = [time[rows] for rows in _driven(log, rotor_input)]
     next_s, found = time[0] + BURN_IN_S + HISTORY_S, []
     while True:
         later = np.flatnonzero((time >= next_s - 1e-9) & whole)
@@ -169,7 +177,10 @@ def _starts(log: FlightLog, rotor_input: bool, stride_s: float, hole_s: float) -
         inside = time[(time >= begin_s - 1e-9) & (time <= end_s + 1e-9)]
         # What drives reaches back: the rotors follow it before the start, and it acts late.
         back_s = begin_s - BURN_IN_S - HISTORY_S
-        hole = max(_hole(inside, begin_s, end_s), _hole(driven_s, back_s, end_s))
+        hole = max(
+            longest_gap_s(inside, begin_s, end_s),
+            *(longest_gap_s(rows_s, back_s, end_s) for rows_s in driven),
+        )
         if len(inside) < 12 or hole > hole_s:
             next_s = begin_s + 0.1
         else:
@@ -177,22 +188,14 @@ def _starts(log: FlightLog, rotor_input: bool, stride_s: float, hole_s: float) -
             next_s = begin_s + stride_s
 
 
-def _driven(log: FlightLog, rotor_input: bool) -> np.ndarray:
-    """Return (T,) bool: rows that say what drives, and the rates that the loop looks at."""
+def _driven(log: FlightLog, rotor_input: bool) -> list[np.ndarray]:
+    """Return (T,) bool each: rows of what drives, and of the rates that the loop looks at."""
     if rotor_input:
         assert log.rotor_speed is not None
-        return np.all(np.isfinite(log.rotor_speed), axis=1)
+        return [np.isfinite(column) for column in log.rotor_speed.T]
     assert log.thrust_cmd is not None and log.rate_cmd_b is not None
-    known = [log.thrust_cmd[:, None], log.rate_cmd_b, log.rate_b]
-    return np.all(np.isfinite(np.concatenate(known, axis=1)), axis=1)
-
-
-def _hole(time_s: np.ndarray, since_s: float, until_s: float) -> float:
-    """Return the longest time [s] without a row, from the last row at or before `since_s` on."""
-    first = max(int(np.searchsorted(time_s, since_s + 1e-9)) - 1, 0)
-    rows = time_s[first : np.searchsorted(time_s, until_s + 1e-9)]
-    held = np.diff(rows, prepend=min(since_s, rows[0]), append=until_s) if len(rows) else [np.inf]
-    return float(np.max(held))
+    command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
+    return [np.isfinite(series).all(axis=1) for series in (command, log.rate_b)]
 
 
 class _Drive(NamedTuple):
@@ -252,11 +255,16 @@ def _rows(log: FlightLog, begin: float) -> np.ndarray:
     """Return the rows of the window from `begin` [s] on, thinned to `ROWS` at most."""
     time = log.time_s
     rows = np.flatnonzero((time >= begin - 1e-9) & (time <= begin + LENGTH_S + 1e-9))
-    return rows[:: -(-len(rows) // ROWS)]
+    blank = np.full((len(time), 1), np.nan)
+    signals = (log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b, log.acc_b, log.rotor_speed)
+    there = [(blank if values is None else values)[rows] for values in signals]
+    seen = np.stack([np.isfinite(values).all(axis=1) for values in there], axis=1)
+    return rows[thinned(seen, time[rows], ROWS)]
 
 
 def _window(
     log: FlightLog,
+    state: FlightLog,
     number: int,
     first: int,
     vehicle: Vehicle,
@@ -274,19 +282,19 @@ def _window(
     if log.voltage is not None and np.isfinite(log.voltage).any():
         first_volt = log.voltage[np.flatnonzero(np.isfinite(log.voltage))[0]]
         drop = first_volt - interpolate(middle, time, log.voltage[:, None])[:, 0]
-    rot_w = log.rot_w
     rows = _rows(log, begin)
     blank = np.full((len(time), 4), np.nan)
     acc = blank[:, :3] if log.acc_b is None else log.acc_b
     rotors = blank if log.rotor_speed is None else log.rotor_speed
     vel = np.full_like(log.vel_w, np.nan) if log.velocity_derived else log.vel_w
-    rot_rows = rot_w[rows]
+    rot_rows = quat_to_rot(log.quat_wxyz[rows])
     measured = [log.pos_w[rows], rot_rows, vel[rows], log.rate_b[rows], acc[rows], rotors[rows]]
     turned = np.isfinite(rot_rows.reshape(len(rows), 9).sum(axis=1, keepdims=True))
     attitude_seen = np.repeat(turned, 3, axis=1)
     seen = [attitude_seen if m.ndim == 3 else np.isfinite(m) for m in measured]
+    turning = seen[5]
     if rotor_input:
-        seen[5] = np.zeros_like(seen[5])  # an input is no measurement
+        seen[5] = np.zeros_like(turning)  # an input is no measurement
     seen[4][0] = False  # the force before the window is not simulated
     missing = ROWS - len(rows)
 
@@ -294,6 +302,7 @@ def _window(
         return np.concatenate([np.nan_to_num(values), np.zeros((missing, *values.shape[1:]))])
 
     mask = np.concatenate([np.concatenate(seen, axis=1), np.zeros((missing, CHANNELS), bool)])
+    turning = np.concatenate([turning, np.zeros((missing, 4), bool)])
     return FlightWindows(
         np.asarray(number),
         np.asarray(begin - time[0]),
@@ -306,13 +315,14 @@ def _window(
         rates,
         speed,
         drop,
-        log.pos_w[first],
-        rot_w[first],
-        log.vel_w[first],
-        log.rate_b[first],
+        state.pos_w[first],
+        quat_to_rot(state.quat_wxyz[first]),
+        state.vel_w[first],
+        state.rate_b[first],
         padded(time[rows] - begin),
         *(padded(values) for values in measured),
         seen=mask,
+        rotor_seen=turning,
     )
 
 
@@ -328,7 +338,11 @@ def _rotors(at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicl
     Between rows they run along the first-order response to one command. What a firmware's loop
     asks for changes all the time, by filtered slopes of rates: a smooth curve is nearer then.
     """
-    good = np.flatnonzero(np.isfinite(speed).all(axis=1))
+    return np.stack([_rotor(at, time, column, vehicle) for column in speed.T], axis=1)
+
+
+def _rotor(at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicle) -> np.ndarray:
+    good = np.flatnonzero(np.isfinite(speed))
     if remembers(vehicle):
         return CubicSpline(time[good], speed[good])(at)
     row = np.clip(np.searchsorted(time[good], at, side="right") - 1, 0, len(good) - 2)
@@ -336,4 +350,4 @@ def _rotors(at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicl
     span, passed = time[after] - time[before], at - time[before]
     lag = max(vehicle.rotors.time_constant, 1e-4)
     share = (1.0 - np.exp(-passed / lag)) / (1.0 - np.exp(-span / lag))
-    return speed[before] + share[:, None] * (speed[after] - speed[before])
+    return speed[before] + share * (speed[after] - speed[before])

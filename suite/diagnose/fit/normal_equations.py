@@ -111,9 +111,18 @@ def solve(
     """Return the change (K,) within [low, high] that lowers chi-square most.
 
     `scale` (K,), the usual size of each number, conditions the equations.
+
+    Raises:
+        ValueError: where something is not finite, which no bound would show.
     """
     if not len(gradient):
         return np.zeros(0)
+    for name, values in (("J'J", hessian), ("J'r", gradient), ("scale", scale)):
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"{name} of a fit of {len(gradient)} numbers has values that are not finite: a "
+                "signal of the flights has no noise estimate, or the model diverges on them"
+            )
     matrix = hessian * np.outer(scale, scale)
     ridge = 1e-9 * max(float(np.trace(matrix)) / len(matrix), 1e-12)
     factor = np.linalg.cholesky(matrix + ridge * np.eye(len(matrix)))

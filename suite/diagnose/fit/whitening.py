@@ -102,9 +102,9 @@ def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> flo
     White noise of rows adds up like errors that run straight between knots a tenth of a second
     apart and are smaller by the root of the rows that each stands for.
     """
-    rows = np.asarray(windows.seen)[..., 9].sum(axis=1).mean()
+    rows = np.asarray(windows.rotor_seen).sum(axis=1).min(axis=-1).mean()
     noise = rotor_noise(windows, limits)
-    return limits.rotor_knot_excess * noise * float(np.sqrt((KNOTS - 1) / rows))
+    return limits.rotor_knot_excess * noise * float(np.sqrt((KNOTS - 1) / max(rows, 1.0)))
 
 
 def whiten(whitening: Whitening, values: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.provenance import stamp
 from suite.delta.run import flight_files
+from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.fit.parameters import refuse_own_motion
 from suite.diagnose.identify.data.start import unknown_to_the_fits
 from suite.diagnose.identify.identify import Identified, identify
@@ -47,6 +48,8 @@ def identify_files(
     start = load_vehicle(vehicle)
     refuse_own_motion(start)
     logs, warnings = read_flights(flight_files(flights), partial=True)
+    logs, slow = without_slow_rotors(logs)
+    warnings = [*warnings, *slow]
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
     if beside := unknown_to_the_fits(start):
         warnings = [

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from suite.diagnose.data.kinematics import Kinematics
 from suite.diagnose.data.windows import STATE_GROUPS
+from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.plans.separating import advice
 from suite.diagnose.report.cells import short_name
 from suite.diagnose.report.parameters_json import parameters_json
@@ -110,10 +112,24 @@ def _effect(diagnosis: Diagnosis, name: str) -> dict[str, Any]:
             sorted(i for n in ones for i in n.candidate.indices),
             diagnosis.search.estimate.theta,
             dict(zip(diagnosis.search.indices, diagnosis.half_widths.tolist(), strict=True)),
+            _undecided(diagnosis, ones),
         ),
         "gap_removed": min(max(removed, 0.0), 1.0),
         "p_value": max(n.p_value for n in ones),
     }
+
+
+def _undecided(diagnosis: Diagnosis, ones: Sequence[NamedEffect]) -> list[int]:
+    """Return the places of an effect's other numbers, one at a time, that fit as well."""
+    taken = {i for one in ones for i in one.candidate.indices}
+    near = diagnosis.limits.rival_chi2
+    return [
+        i
+        for i, entry in enumerate(diagnosis.model.space.entries)
+        if entry.effect == ones[0].candidate.name and i not in taken
+        and any(one.worse_by.get(f"{entry.effect} {(entry.component or 0) + 1}", np.inf) <= near
+                for one in ones)
+    ]  # fmt: skip
 
 
 def _gusts(found: Turbulence | None) -> list[dict[str, Any]]:

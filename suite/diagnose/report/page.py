@@ -12,7 +12,7 @@ from suite.diagnose.fit.composites import in_words
 from suite.diagnose.report.cells import cells, grid, short_name
 from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
 from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
-from suite.diagnose.report.parameters_json import components, in_digits
+from suite.diagnose.report.parameters_json import components
 from suite.diagnose.report.result_sections import held_out_section, residual_section
 from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
@@ -98,15 +98,14 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
         (
             effect["name"],
             ", ".join(effect["alternatives"]) or "none",
-            label,
-            *in_digits(value, span),
+            one.label,
+            *one.shown(),
             "exempt" if effect["gap_removed"] is None else f"{100 * effect['gap_removed']:.0f} %",
-            f"{effect['p_value']:.2g}",
         )
         for effect in found["effects"]
-        for label, value, span in components(effect["parameters"])
+        for one in sorted(components(effect), key=lambda one: not one.found)
     ]
-    headers = ["effect", "cannot be told from", "parameter", "total", "95 %", "of the gap", "p"]
+    headers = ["effect", "not distinguishable from", "parameter", "total", "95 %", "of the gap"]
     words = [
         f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
         for effect in found["effects"]
@@ -114,7 +113,8 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
     words += in_words([(e["name"], *e["alternatives"]) for e in found["effects"]])
     note = (
         "Values are totals: what the vehicle file had of an effect is replaced. Of the gap: the "
-        "share that this effect takes away when it is added last."
+        "share that this effect takes away when it is added last. Chance gives a false name with "
+        f"a probability of at most {max(effect['p_value'] for effect in found['effects']):.1g}."
     )
     return [*words, grid("", headers, rows, note)]
 
@@ -173,8 +173,10 @@ def _candidates(diagnosis: Diagnosis) -> Section:
     scores, limits = diagnosis.search.first, diagnosis.limits
     named = {candidate.label for candidate in diagnosis.search.candidates}
     chance = scores[0].chance if scores else None
+    least = 1.0 / (1 + limits.sign_draws)
     rows = [
-        f"{s.candidate.label:32}{s.gain:>12.1f}{s.p_value:>8.4f}  "
+        f"{s.candidate.label:32}{s.gain:>12.1f}"
+        + (f"{s.p_value:>8.4f}  " if s.p_value > least else " " * 10)
         + ("named" if s.candidate.label in named else "")
         for s in scores
     ]
@@ -182,8 +184,9 @@ def _candidates(diagnosis: Diagnosis) -> Section:
         f"All {len(scores)} candidates, each fitted alone before anything was named. The gain is "
         "the fall of the whitened squared error on stretches that its fit did not see. The null: "
         f"the signs of whole stretches are shuffled {limits.sign_draws} times, and the best gain "
-        "of all candidates is taken each time; p is how often that is as large. One name follows "
-        f"another while p is at most {limits.name_p_value:g}; then all are refitted jointly."
+        "of all candidates is taken each time; p is how often that is as large, left out where it "
+        f"never is (below {least:.2g}). One name follows another while p is at most "
+        f"{limits.name_p_value:g}; then all are refitted jointly."
     )
     head = f"{'effect':32}{'gain':>12}{'p':>8}"
     return Section(

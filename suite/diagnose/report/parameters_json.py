@@ -3,29 +3,86 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from eval.effects import EFFECTS
 from suite.diagnose.fit.parameters import ParameterSpace
 
+UNSEEN = "not identifiable"
+"""In the place of a value that no flight can give."""
 
-def components(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield label, value and interval of every component, None where there is none."""
-    for name, entry in parameters.items():
+
+class Component(NamedTuple):
+    """One number of a named effect, for people."""
+
+    label: str
+    """Parameter, axis and unit."""
+    value: float | None
+    ci95: tuple[float, float] | None
+    neutral: float | None
+    """The value with which nothing acts, where it is the same for every vehicle."""
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a value that is not the neutral one, as far as its interval says."""
+        if self.value is None or self.ci95 is None or self.neutral is None:
+            return self.value is not None
+        return not self.ci95[0] <= self.neutral <= self.ci95[1]
+
+    def shown(self) -> tuple[str, str]:
+        """Return the value and its interval, in as many digits as the interval supports."""
+        if self.value is None:
+            return UNSEEN, ""
+        if self.ci95 is None:
+            return f"{self.value:.4g}", ""
+        numbers = (self.value, *self.ci95)
+        value, low, high = (in_digits(number, numbers) for number in numbers)
+        if not self.found:
+            value = f"not different from {self.neutral:g}"
+        return value, f"{low} to {high}"
+
+
+def in_digits(number: float, interval: Sequence[float]) -> str:
+    """Return `number` with two significant digits of half the width of (value, low, high)."""
+    half, size = 0.5 * (interval[2] - interval[1]), max(abs(n) for n in interval)
+    if half <= 0.0 or not np.isfinite(half):
+        return f"{number:.4g}"
+    last = int(np.floor(np.log10(half) + 1e-6)) - 1
+    if size < 1e-3 or last > 0:
+        return f"{number:.{max(int(np.floor(np.log10(size))) - last, 0)}e}" if size else "0"
+    return f"{number:.{-last}f}"
+
+
+def components(effect: Mapping[str, Any]) -> Iterator[Component]:
+    """Yield every number of a named `effect`, an entry of diagnosis.json."""
+    known = EFFECTS[effect["name"]].parameters if effect["name"] in EFFECTS else ()
+    neutrals = {p.name: p.neutral for p in known if not callable(p.neutral)}
+    one_at_a_time = {p.name for p in known if p.one_at_a_time}
+    for name, entry in effect["parameters"].items():
         value, span, unit = entry["value"], entry["ci95"], entry["unit"]
-        if not isinstance(value, list):
-            yield f"{name} [{unit}]", value, span
+        neutral = neutrals.get(name)
+        if name == "index" and one_at_a_time:
+            # Of several motors each has a line of its own, which says which.
+            if not isinstance(value, list):
+                sure = span is None or span[0] == span[1]
+                yield Component(name, *_one(value, None if sure else span), None)
             continue
+        if not isinstance(value, list):
+            yield Component(f"{name} [{unit}]", *_one(value, span), neutral)
+            continue
+        which = effect["parameters"].get("index", {}).get("value")
+        axes = which if name in one_at_a_time and isinstance(which, list) else "xyz"
         for k, one in enumerate(value):
-            yield f"{name} {k + 1} [{unit}]", one, span[k] if span else None
+            between = span[k] if span else None
+            yield Component(f"{name} {axes[k]} [{unit}]", *_one(one, between), neutral)
 
 
-def in_digits(value: float | None, span: Sequence[float] | None) -> tuple[str, str]:
-    """Return a component's value and its interval as cells show them."""
-    between = "" if span is None else f"{span[0]:.4g} to {span[1]:.4g}"
-    return "not seen" if value is None else f"{value:.4g}", between
+def _one(
+    value: float | None, span: Sequence[float] | None
+) -> tuple[float | None, tuple[float, float] | None]:
+    return value, None if span is None else (float(span[0]), float(span[1]))
 
 
 def parameters_json(
@@ -34,6 +91,7 @@ def parameters_json(
     indices: Sequence[int],
     theta: np.ndarray,
     half_width: Mapping[int, float],
+    undecided: Sequence[int] = (),
 ) -> dict[str, Any]:
     """Return the parameters of the effect `name` as diagnosis.json has them.
 
@@ -43,6 +101,7 @@ def parameters_json(
         indices: places of its numbers that were fitted, in order.
         theta: (P,) all numbers.
         half_width: of the 95 % intervals, by place.
+        undecided: places of its numbers that could stand in place of a fitted one.
     """
 
     def one(index: int) -> tuple[float, list[float]]:
@@ -54,9 +113,15 @@ def parameters_json(
     for parameter in EFFECTS[name].parameters:
         if parameter.one_at_a_time:
             values = [one(i) for i in indices]
-            which = [(space.entries[i].component or 0) + 1 for i in indices]
+            which = [_number(space, i) for i in indices]
             lone = len(which) == 1
-            found["index"] = {"value": which[0] if lone else which, "unit": "1", "ci95": None}
+            could = [*which, *(_number(space, i) for i in undecided)]
+            spans = [[min(could), max(could)]] if lone else [[k, k] for k in which]
+            found["index"] = {
+                "value": which[0] if lone else which,
+                "unit": "1",
+                "ci95": spans[0] if lone else spans,
+            }
             found[parameter.name] = {
                 "value": values[0][0] if lone else [v for v, _ in values],
                 "unit": parameter.unit,
@@ -74,3 +139,7 @@ def parameters_json(
             value, ci = one(at[None])
         found[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci}
     return found
+
+
+def _number(space: ParameterSpace, index: int) -> int:
+    return (space.entries[index].component or 0) + 1

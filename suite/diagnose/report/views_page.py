@@ -14,7 +14,7 @@ from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.fit.composites import in_words
 from suite.diagnose.report.cells import grid
 from suite.diagnose.report.charts import AFTER, BEFORE, FLOOR
-from suite.diagnose.report.parameters_json import components, in_digits
+from suite.diagnose.report.parameters_json import components
 from suite.diagnose.views.by_views import ViewsDiagnosis
 from suite.diagnose.views.fit.equations import left_of
 from tracks.common.grid import Grid
@@ -106,11 +106,11 @@ def _answer(told: Mapping[str, Any]) -> list[Part]:
             effect["name"],
             ", ".join(effect["alternatives"]) or "none",
             effect["view"],
-            label,
-            *in_digits(value, span),
+            one.label,
+            *one.shown(),
         )
         for effect in told["effects"]
-        for label, value, span in components(effect["parameters"])
+        for one in sorted(components(effect), key=lambda one: not one.found)
     ]
     if not rows:
         return ["Nothing was named: the vehicle file is as it was."]
@@ -119,7 +119,7 @@ def _answer(told: Mapping[str, Any]) -> list[Part]:
         for effect in told["effects"]
     ]
     words += in_words([(e["name"], *e["alternatives"]) for e in told["effects"]])
-    headers = ["effect", "cannot be told from", "view", "parameter", "total", "95 %"]
+    headers = ["effect", "not distinguishable from", "view", "parameter", "total", "95 %"]
     note = "Totals: what the vehicle file had of an effect is replaced. 95 % with flights as draws."
     words.append(grid("", headers, rows, note))
     words += [f"What would tell {line}." for line in told["separate_with"]]

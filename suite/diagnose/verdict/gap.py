@@ -108,11 +108,14 @@ def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) 
     offset = np.zeros((len(windows.flight), model.free))
     offset[:, :3] = late * windows.vel_w
     offset[:, 3:6] = late * windows.rate_b
-    rows = np.minimum(8, np.asarray(windows.seen)[:, :, 0].sum(axis=1) - 1)
+    moving = np.asarray(windows.seen)[:, :, SLICES["velocity"].start]
+    # The ninth row that has a velocity, or the last where there are fewer.
+    number = np.minimum(9, moving.sum(axis=1))[:, None]
+    rows = (moving & (np.cumsum(moving, axis=1) == number)).argmax(axis=1)
     at = np.arange(len(rows))
     span = np.asarray(windows.row_s)[at, rows][:, None]
     acc_w = (np.asarray(windows.row_vel_w)[at, rows] - windows.vel_w) / np.maximum(span, 1e-3)
-    offset[:, 6:9] = late * acc_w
+    offset[:, 6:9] = late * np.where(moving.any(axis=1)[:, None], acc_w, 0.0)
     return offset
 
 

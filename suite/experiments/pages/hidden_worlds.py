@@ -145,10 +145,10 @@ def named_grid(came: Sequence[Came], words: Mapping[str, str]) -> Grid:
     lines = []
     for one in came:
         values = [
-            f"{effect['name']} {label}: {value:.4g}"
+            f"{effect['name']} {part.label}: {part.shown()[0]}"
             for effect in one.diagnosis["effects"]
-            for label, value, _ in components(effect["parameters"])
-            if value is not None
+            for part in components(effect)
+            if part.value is not None
         ]
         gap = ", ".join(
             f"{one.diagnosis['gap'][name]:.2f}" for name in ("before", "after", "noise_floor")

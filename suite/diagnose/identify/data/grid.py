@@ -88,8 +88,7 @@ def grid_of(log: FlightLog) -> FlightGrid:
     for name, values in there.items():
         known[name] = (_joined if name in measured else _held)(time_s, values, grid)
     if "rotor_speed" in there:
-        noise = _noise(there["rotor_speed"], "rotor_speed" in in_turn)
-        known[ROTOR_NOISE] = _joined(time_s, noise, grid)
+        known[ROTOR_NOISE] = _joined(time_s, noise_like(there["rotor_speed"]), grid)
     if _whole_rows(log.quat_wxyz) > 1:
         known["rot_w"] = quat_to_rot(_attitude(time_s, log.quat_wxyz, grid))
         turning = _turning(time_s, log.quat_wxyz)
@@ -146,18 +145,6 @@ def _enough(values: np.ndarray) -> bool:
 
 def _whole_rows(values: np.ndarray) -> int:
     return int(np.isfinite(values.reshape(len(values), -1)).all(axis=1).sum())
-
-
-def _noise(speed: np.ndarray, in_turn: bool) -> np.ndarray:
-    """Return a draw of the noise (T, 4) of rotor speeds; of those logged in turn by own rows."""
-    if not in_turn:
-        return noise_like(speed)
-    own = [np.flatnonzero(np.isfinite(column)) for column in speed.T]
-    count = min(len(rows) for rows in own)
-    at = np.stack([rows[:count] for rows in own], axis=1)
-    out = np.where(np.isfinite(speed), 0.0, np.nan)
-    np.put_along_axis(out, at, noise_like(np.take_along_axis(speed, at, axis=0)), axis=0)
-    return out
 
 
 def _joined(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.actuators import wrench_difference
+from suite.diagnose.data.sampling import on_every_row
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.views.data.completed import completed
 from suite.diagnose.views.data.rotors import ActingRotors, acting_rotors
@@ -56,13 +57,13 @@ def ready(
     Raises:
         ValueError: where a log has nothing that turns or pushes, or none has a stretch.
     """
-    rotors = [acting_rotors(log, vehicle) for log in logs]
+    rotors = [acting_rotors(log, vehicle, limits) for log in logs]
     for log, one in zip(logs, rotors, strict=True):
         if one is None:
             needs = "[motors] in the vehicle file" if log.pwm is not None else "thrust or rotors"
             raise ValueError(f"{log.name}: nothing says how its rotors turned; it needs {needs}")
     acting = [one for one in rotors if one is not None]
-    whole = [completed(log) for log in logs]
+    whole = [on_every_row(completed(log), limits) for log in logs]
     rows = [
         rows_of(log, vehicle, one.speed, limits) for log, one in zip(whole, acting, strict=True)
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,9 @@ from eval.quadrotor.plant import make_plant, nominal_quadrotor
 from eval.vehicles.vehicle import Vehicle, motor_speed
 from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.resample import interpolate
+from suite.diagnose.data.sampling import on_every_row
 from suite.diagnose.data.steps import LONGEST_S
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 class ActingRotors(NamedTuple):
@@ -28,13 +31,20 @@ class ActingRotors(NamedTuple):
     """(N, 4) a draw of noise as large as the speed's own [rad/s]; None where none was measured."""
 
 
-def acting_rotors(log: FlightLog, vehicle: Vehicle) -> ActingRotors | None:
+def acting_rotors(
+    log: FlightLog, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
+) -> ActingRotors | None:
     """Return the speeds that turned in `log`, measured or as asked for; None where nothing says.
 
-    What was asked for is followed by the vehicle's lag.
+    They are those of every row, as far as no hole is in between. What was asked for is followed by
+    the vehicle's lag.
     """
+    noise = None
     if log.rotor_speed is not None:
-        noise = noise_like(log.rotor_speed)
+        drawn = replace(log, rotor_speed=noise_like(log.rotor_speed, limits))
+        noise = on_every_row(drawn, limits).rotor_speed
+    log = on_every_row(log, limits)
+    if log.rotor_speed is not None:
         return ActingRotors(log.rotor_speed, "measured rotor speeds", True, noise)
     if log.rotor_speed_cmd is not None:
         return ActingRotors(_lagged(log, vehicle, log.rotor_speed_cmd), "motor commands", True)

@@ -7,6 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from suite.common.report import html
+from suite.diagnose.fit.parameters import make_space
 from suite.diagnose.report import charts
 from suite.diagnose.report.cells import cells, grid, short_name
 from suite.diagnose.report.charts import (
@@ -18,11 +19,17 @@ from suite.diagnose.report.charts import (
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
 from suite.diagnose.report.page import _disagreement, page
-from suite.diagnose.report.parameters_json import components
+from suite.diagnose.report.parameters_json import (
+    UNSEEN,
+    components,
+    in_digits,
+    parameters_json,
+)
 from suite.diagnose.report.recording import write_rollouts
 from suite.diagnose.report.result_sections import held_out_section, residual_section
 from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
 from suite.diagnose.verdict.disagreement import by_group
+from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
 from tracks.common.grid import Grid
 
@@ -65,12 +72,32 @@ def test_a_comparison_with_a_black_box_is_in_the_json(drag, drag_checks):
     assert box["held_out"]["named"]["gap"] == drag.after.rms
 
 
-def test_components_of_a_vector_are_numbered():
-    entry = {"value": [1.0, None], "ci95": [[0.5, 1.5], None], "unit": "m"}
-    one = {"value": 2.0, "ci95": None, "unit": "1"}
-    assert list(components({"offset": entry, "scale": one})) == [
-        ("offset 1 [m]", 1.0, [0.5, 1.5]), ("offset 2 [m]", None, None), ("scale [1]", 2.0, None)
-    ]  # fmt: skip
+def test_components_are_named_by_axis_and_shown_in_digits_that_the_interval_supports():
+    entry = {"value": [0.012, 0.0004, None], "ci95": [[0.0119, 0.0121], [-0.001, 0.0018], None],
+             "unit": "m"}  # fmt: skip
+    x, y, z = components({"name": "com_offset", "parameters": {"offset": entry}})
+    assert (x.label, x.shown()) == ("offset x [m]", ("0.01200", "0.01190 to 0.01210"))
+    assert x.found and not y.found and not z.found
+    assert y.shown() == ("not different from 0", "-0.0010 to 0.0018")
+    assert z.shown() == (UNSEEN, "")
+    small = {"value": 1.21e-6, "ci95": [1.1e-6, 1.3e-6], "unit": "kg/rad"}
+    (only,) = components({"name": "rotor_drag", "parameters": {"coefficient": small}})
+    assert only.shown() == ("1.21e-06", "1.10e-06 to 1.30e-06")
+    assert in_digits(1234.56, (1234.56, 1200.0, 1270.0)) == "1235"
+
+
+def test_a_weak_motor_says_which_and_how_surely():
+    space = make_space(PLAIN)
+    at = [i for i, entry in enumerate(space.entries) if entry.effect == "weak_motor"]
+    theta, width = space.array("start"), dict.fromkeys(at, 0.01)
+    told = parameters_json(space, "weak_motor", [at[1]], theta, width, undecided=[at[2]])
+    assert (told["index"]["value"], told["index"]["ci95"]) == (2, [2, 3])
+    sure = parameters_json(space, "weak_motor", [at[1]], theta, width)
+    assert sure["index"]["ci95"] == [2, 2]
+    several = parameters_json(space, "weak_motor", [at[1], at[3]], theta, width)
+    assert several["index"] == {"value": [2, 4], "unit": "1", "ci95": [[2, 2], [4, 4]]}
+    labels = [one.label for one in components({"name": "weak_motor", "parameters": several})]
+    assert labels == ["scale 2 [1]", "scale 4 [1]"]
 
 
 def test_groups_leave_out_what_was_not_measured():

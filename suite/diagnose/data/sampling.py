@@ -1,0 +1,125 @@
+"""Signals that are logged at rates of their own, in rows that merge them.
+
+A log's rows are the times of all its signals together: of the signals that are slower, most rows
+have no value. Each signal counts on its own rows. Where a value is needed on another row it lies on
+a line between two of its own, but not across a hole; what is commanded is held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from eval.logs.flight_log import FlightLog
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+
+MEASURED = ("pos_w", "quat_wxyz", "vel_w", "rate_b", "rotor_speed")
+HELD = ("thrust_cmd", "rate_cmd_b", "torque_cmd_b", "pwm", "rotor_speed_cmd")
+
+
+def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
+    """Return `log` with every signal on every row, as far as no hole is in between.
+
+    A log whose signals share all rows comes back as it is.
+    """
+    filled = {}
+    for name in (*MEASURED, *HELD):
+        values = getattr(log, name)
+        if values is None or np.isfinite(values).all() or not np.isfinite(values).any():
+            continue
+        table = values.reshape(len(values), -1)
+        if name == "quat_wxyz":
+            table = _one_side(table)
+        columns = [_column(log.time_s, c, limits.longest_hole_s, name in HELD) for c in table.T]
+        table = np.stack(columns, axis=1)
+        if name == "quat_wxyz":
+            table = table / np.maximum(np.linalg.norm(table, axis=1, keepdims=True), 1e-12)
+        filled[name] = table.reshape(values.shape)
+    return replace(log, **filled) if filled else log
+
+
+def without_slow_rotors(
+    logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
+) -> tuple[list[FlightLog], list[str]]:
+    """Return `logs` without rotor speeds that are too slow to say what drove, and notes of it.
+
+    What a motor does between two of its rows is unknown where they are further apart than the
+    longest hole.
+    """
+    kept, notes = [], []
+    for log in logs:
+        spacing_s = 0.0 if log.rotor_speed is None else own_spacing_s(log.time_s, log.rotor_speed)
+        if spacing_s > limits.longest_hole_s:
+            notes.append(
+                f"{log.name}: rotor speeds at {1.0 / spacing_s:.2g} Hz are left out; at least "
+                f"{1.0 / limits.longest_hole_s:.3g} Hz say what the rotors did between two rows"
+            )
+            log = replace(log, rotor_speed=None)
+        kept.append(log)
+    return kept, notes
+
+
+def own_spacing_s(time_s: np.ndarray, values: np.ndarray) -> float:
+    """Return the median time [s] between a column's own rows, the slowest column's of (T, K).
+
+    Infinite where a column has fewer than two rows.
+    """
+    rows = [time_s[np.isfinite(column)] for column in values.T]
+    return max(float(np.median(np.diff(t))) if len(t) > 1 else np.inf for t in rows)
+
+
+def longest_gap_s(time_s: np.ndarray, since_s: float, until_s: float) -> float:
+    """Return the longest time [s] without a row, from the last row at or before `since_s` on."""
+    first = max(int(np.searchsorted(time_s, since_s + 1e-9)) - 1, 0)
+    rows = time_s[first : np.searchsorted(time_s, until_s + 1e-9)]
+    held = np.diff(rows, prepend=min(since_s, rows[0]), append=until_s) if len(rows) else [np.inf]
+    return float(np.max(held))
+
+
+def thinned(seen: np.ndarray, time_s: np.ndarray, most: int) -> np.ndarray:
+    """Return the places (at most `most`) of rows that say as much of every signal as can be.
+
+    Args:
+        seen: (N, K) bool: what the rows have of K signals.
+        time_s: (N,) [s].
+        most: rows that are kept at most.
+    """
+    step = -(-len(seen) // most)
+    if step <= 1 or (seen == seen[:1]).all():
+        return np.arange(0, len(seen), step)
+    # In each part the row that has most of what was not seen for longest.
+    last = np.full(seen.shape[1], time_s[0] - 1.0)
+    kept = []
+    for first in range(0, len(seen), step):
+        part = seen[first : first + step]
+        row = first + int((part * (time_s[first] - last + 1e-6)).sum(axis=1).argmax())
+        last = np.where(seen[row], time_s[row], last)
+        kept.append(row)
+    return np.array(kept)
+
+
+def _column(time_s: np.ndarray, column: np.ndarray, hole_s: float, held: bool) -> np.ndarray:
+    own = np.flatnonzero(np.isfinite(column))
+    if len(own) < 2:
+        return column
+    place = np.clip(np.searchsorted(own, np.arange(len(column)), side="right") - 1, 0, len(own) - 2)
+    before, after = own[place], own[place + 1]
+    if held:
+        whole = np.where(np.arange(len(column)) >= own[-1], column[own[-1]], column[before])
+    else:
+        whole = np.interp(time_s, time_s[own], column[own])
+    inside = (time_s >= time_s[own[0]]) & (held | (time_s <= time_s[own[-1]]))
+    since = np.where(time_s >= time_s[own[-1]], time_s - time_s[own[-1]], 0.0)
+    near = (time_s[after] - time_s[before] <= hole_s) & (since <= hole_s)
+    return np.where(np.isfinite(column), column, np.where(inside & near, whole, np.nan))
+
+
+def _one_side(quat: np.ndarray) -> np.ndarray:
+    """Return quaternions (T, 4) of which neighbours do not differ by sign alone."""
+    own = np.flatnonzero(np.isfinite(quat).all(axis=1))
+    flips = np.cumsum((quat[own][1:] * quat[own][:-1]).sum(axis=1) < 0.0)
+    out = quat.copy()
+    out[own[1:]] *= np.where(flips % 2, -1.0, 1.0)[:, None]
+    return out

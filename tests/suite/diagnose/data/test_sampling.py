@@ -1,0 +1,103 @@
+"""Signals at rates of their own: what lies between rows, what is left out, what is thinned."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from suite.diagnose.data.noise import noise_of, rotor_noise
+from suite.diagnose.data.sampling import on_every_row, thinned, without_slow_rotors
+from suite.diagnose.data.windows import SLICES, cut
+from suite.diagnose.fit.normal_equations import solve
+from tests.support.diagnosis_flights import NOISE, fly
+from tests.support.vehicles import PLAIN
+
+
+def on_rows(values, chosen):
+    """`values` on every row that is `chosen`, and nothing on the others."""
+    values = np.array(values)
+    values[~chosen] = np.nan
+    return values
+
+
+@pytest.fixture(scope="module")
+def log():
+    return fly(PLAIN, 0, duration_s=3.0, motors=True)
+
+
+@pytest.fixture(scope="module")
+def row(log):
+    return np.arange(len(log.time_s))
+
+
+def test_a_log_whose_signals_share_their_rows_is_left_as_it_is(log):
+    assert on_every_row(log) is log
+
+
+def test_a_slower_signal_is_joined_by_lines_a_command_is_held_and_a_hole_stays(log, row):
+    hole = (log.time_s > 1.0) & (log.time_s < 1.3)
+    sparse = replace(
+        log,
+        rate_b=on_rows(log.rate_b, (row % 2 == 0) & ~hole),
+        thrust_cmd=on_rows(log.thrust_cmd, row % 3 == 0),
+        quat_wxyz=on_rows(-log.quat_wxyz * np.where(row % 4, 1, -1)[:, None], row % 2 == 0),
+    )
+    whole = on_every_row(sparse)
+    inside = np.flatnonzero((row % 2 == 1) & ~hole & (row < row[-1]))[2:20]
+    middle = 0.5 * (log.rate_b[inside - 1] + log.rate_b[inside + 1])
+    np.testing.assert_allclose(whole.rate_b[inside], middle, atol=0.05)
+    assert np.isnan(whole.rate_b[hole][2:-2]).all()
+    np.testing.assert_array_equal(whole.thrust_cmd[4:6], log.thrust_cmd[3])
+    # Quaternions of either sign are one attitude: halfway between two is near both.
+    near = np.abs((whole.quat_wxyz[inside] * log.quat_wxyz[inside]).sum(axis=1))
+    assert near.min() > 0.999
+
+
+def test_rotor_speeds_at_three_hertz_are_left_out_with_the_bound(log, row):
+    slow = replace(log, rotor_speed=on_rows(log.rotor_speed, row % 30 == 0))
+    kept, notes = without_slow_rotors([log, slow])
+    assert kept[0] is log and kept[1].rotor_speed is None
+    (note,) = notes
+    assert "3.3 Hz" in note and "at least 10 Hz" in note
+
+
+@pytest.mark.parametrize("every", [2, 10])
+def test_windows_take_each_signal_by_its_own_rows(log, row, every):
+    sparse = replace(log, rate_b=on_rows(log.rate_b, row % every == 1))
+    windows, warnings = cut([sparse], PLAIN, True)
+    assert windows is not None and not warnings
+    seen = windows.seen.sum(axis=1)
+    assert (seen[:, SLICES["rates"]] <= 101 // every + 1).all() and (seen[:, 0] > 90).all()
+    assert np.isfinite(windows.rate_b).all() and np.isfinite(windows.burn_in_rate_b).all()
+    # Rotor speeds have their own rows, whatever those of the rates are.
+    assert windows.rotor_seen.sum(axis=1).min() > 90
+    assert rotor_noise(windows) == pytest.approx(NOISE["motor"], rel=0.5)
+    residual = 0.01 * np.random.default_rng(0).standard_normal(windows.seen.shape)
+    sigma = noise_of(residual, windows)
+    assert np.isfinite(sigma[SLICES["rates"]]).all()
+    np.testing.assert_allclose(sigma[SLICES["rates"]], 0.01, rtol=0.4)
+
+
+def test_a_signal_with_too_few_rows_is_given_a_bound_that_no_noise_exceeds(log, row):
+    windows, _ = cut([replace(log, rate_b=on_rows(log.rate_b, row % 25 == 0))], PLAIN, True)
+    assert windows is not None
+    residual = 0.01 * np.random.default_rng(0).standard_normal(windows.seen.shape)
+    np.testing.assert_allclose(noise_of(residual, windows)[SLICES["rates"]], 0.01, rtol=0.5)
+
+
+def test_rows_are_thinned_so_that_no_signal_is_lost():
+    time_s = 0.001 * np.arange(1000)
+    odd = np.arange(1000) % 2 == 1
+    seen = np.stack([odd, ~odd, np.arange(1000) % 50 == 7], axis=1)
+    kept = thinned(seen, time_s, 101)
+    assert len(kept) <= 101 and (np.diff(kept) > 0).all()
+    assert seen[kept].sum(axis=0).min() >= 18
+    np.testing.assert_array_equal(thinned(np.ones((250, 2), bool), time_s[:250], 101),
+                                  np.arange(0, 250, 3))  # fmt: skip
+
+
+def test_equations_that_are_not_finite_are_refused():
+    room, one = np.ones(2), np.eye(2)
+    for hessian, gradient in ((one * np.nan, room), (one, room * np.inf)):
+        with pytest.raises(ValueError, match="not finite"):
+            solve(hessian, gradient, -room, room, room)
