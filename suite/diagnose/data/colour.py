@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import get_lapack_funcs, solve_triangular
 from scipy.optimize import minimize, minimize_scalar
 
-from suite.diagnose.data.noise import noise_of, typical_variance
+from suite.diagnose.data.noise import at_least, noise_of, typical_variance
 from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -94,7 +94,7 @@ def measured_noise(
         energy, freedom, _ = _beside_polynomial(parts[name], process)
         sigma[SLICES[name]] = np.sqrt(typical_variance(energy.reshape(-1, 3), freedom))
         coloured[name] = (process.share, process.lasts_s)
-    return Noise(sigma, coloured)
+    return Noise(at_least(sigma, limits), coloured)
 
 
 def left_as_noise(
@@ -120,7 +120,7 @@ def left_as_noise(
         width = channels.stop - channels.start
         sigma[channels] = np.sqrt((energy.reshape(-1, width) / freedom).mean(axis=0))
         coloured[name] = (process.share, process.lasts_s)
-    return Noise(sigma, coloured)
+    return Noise(at_least(sigma, limits), coloured)
 
 
 def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray:

@@ -62,6 +62,11 @@ def noise_of(
             sigma[c] = np.sqrt(typical_variance(np.array(power[c]), n))
         elif seen[..., c].any():
             sigma[c] = np.sqrt((residual[..., c][seen[..., c]] ** 2).mean())
+    return at_least(sigma, limits)
+
+
+def at_least(sigma: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
+    """Return noise `sigma` (19,) where it is no less than rounding and the model's steps."""
     return np.maximum(sigma, np.repeat(limits.least_noise, [3, 3, 3, 3, 3, 4]))
 
 

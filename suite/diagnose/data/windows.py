@@ -15,6 +15,8 @@ from scipy.interpolate import CubicSpline
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.loops import NOMINAL
+from eval.quadrotor.plant import Command, make_plant
+from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.resample import interpolate
 from suite.diagnose.data.sampling import longest_gap_s, on_every_row, thinned
@@ -38,6 +40,8 @@ COMMANDS = (192, 1536)
 """The same of its commands: rows of 100 Hz, and of 1,000 Hz."""
 ROWS = 101
 """Measured rows in a window; a log that has more of them is thinned."""
+LEAST_START_ERROR = 1e-3
+"""Rotor speeds at a window's start are never known better than this [rad/s]."""
 CHANNELS = 19
 """pos_w 3, attitude 3, vel_w 3, rate_b 3, acc_b 3, rotor speeds 4."""
 STATE_GROUPS = ("position", "attitude", "velocity", "rates")
@@ -101,6 +105,8 @@ class FlightWindows(NamedTuple):
     """(W, N, 19) bool: whether there is a value that is compared."""
     rotor_seen: Array
     """(W, N, 4) bool: whether there is a rotor speed, compared or an input."""
+    start_rotor_error: Array
+    """(W,) how far off the burn-in leaves the rotor speeds [rad/s]; 0 where they are an input."""
 
 
 def step_s(vehicle: Vehicle) -> float:
@@ -323,7 +329,32 @@ def _window(
         *(padded(values) for values in measured),
         seen=mask,
         rotor_seen=turning,
+        start_rotor_error=np.asarray(0.0 if rotor_input else _start_error(state, begin, vehicle)),
     )
+
+
+def _start_error(log: FlightLog, begin: float, vehicle: Vehicle) -> float:
+    """Return the RMS error [rad/s] of rotor speeds that follow commands at the measured rates.
+
+    Between rows the rates are not known. By how far a line between every second row misses the row
+    in the middle, the loop is asked for other rotor speeds; a line between neighbours misses by a
+    quarter of it where rates are smooth and by about all of it where they are noise: half is taken.
+    """
+    near = (log.time_s > begin - BURN_IN_S - 1e-9) & (log.time_s <= begin + 1e-9)
+    time, rate_b = log.time_s[near], log.rate_b[near]
+    if len(time) < 3:
+        return LEAST_START_ERROR
+    share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2]))[:, None]
+    missed = rate_b[1:-1] - (rate_b[:-2] + share * (rate_b[2:] - rate_b[:-2]))
+    missed = missed[np.isfinite(missed).all(axis=1)]
+    if not len(missed):
+        return LEAST_START_ERROR
+    plant = make_plant(vehicle, step_s(vehicle))
+    hover = Command(np.full(4, GRAVITY), np.zeros((4, 3)))
+    rates = np.concatenate([np.zeros((1, 3)), 0.1 * np.eye(3)])
+    asked = np.asarray(wanted_speed(plant, hover, rates))
+    error = 0.5 * missed @ ((asked[1:] - asked[0]) / 0.1)
+    return max(float(np.sqrt((error**2).mean())), LEAST_START_ERROR)
 
 
 def _integral(time: np.ndarray, command: np.ndarray) -> np.ndarray:

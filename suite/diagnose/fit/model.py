@@ -85,8 +85,9 @@ class RolloutModel:
         """
         self.space = space
         self.size = len(space.entries)
-        self.free = STATE + (4 * KNOTS if rotor_input else 0)
-        """Numbers F that are free in each window: its start, and the rotor speeds' errors."""
+        self.free = STATE + 4 * (KNOTS if rotor_input else 1)
+        """Numbers F that are free in each window: its start, and the rotor speeds' errors, where
+        they are the input all along it."""
         self.starts = list(range(self.size, self.size + self.free))
         """Places of the free numbers among all directions."""
         base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}

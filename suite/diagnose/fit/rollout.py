@@ -54,7 +54,8 @@ def fly_windows(
         rotor_input: measured rotor speeds are the input, not the commands.
         voltage: the windows have a voltage.
         integrator: one of `eval.quadrotor.continuous.INTEGRATORS`.
-        offset: (B, F) of the start and of the rotor speeds' errors from what was measured.
+        offset: (B, F) of the start from what was measured and, last, of the rotor speeds: of their
+            errors at the knots where they are the input, else at the start from the burn-in's.
         windows: B of them.
         push: (B, KNOTS, 6) what pushes, as `Inputs.push_b` has it; none if not given.
         feedback: what pushes in place of `push`.
@@ -82,6 +83,7 @@ def fly_windows(
     else:
         before = jax.tree.map(lambda field: field[:burn_in], spans)
         begin_speed = _burned_in(plant, values, before, command[:burn_in], windows)
+        begin_speed = begin_speed + offset[:, STATE:]
     inputs = Inputs(
         unpacked(command[burn_in:]),
         rotor_speed,

@@ -2,8 +2,8 @@
 
 A window's start is measured with the same noise as its other rows. It is left free: what 12 small
 changes of it can explain is projected out of residuals and slopes, and what stays has the
-measurement's own white noise. Where measured rotor speeds are the input, their errors are free as
-well, but for rows that say how large they may be.
+measurement's own white noise. The rotor speeds' errors are free as well, but for rows that say how
+large they may be: all along a window where measured ones are the input, else at its start.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def make_whitening(
     filters = {name: colour_filter(noise, name, windows) for name in noise.coloured}
     count, rows, channels = weight.shape
     size = linear.offset.shape[1]
-    prior = np.full(size - STATE, 1.0 / rotor_spread(windows, limits) if size > STATE else 1.0)
+    prior = np.full(size - STATE, 1.0 / rotor_spread(windows, limits))
     slope = _filtered(linear.slope[..., -size:] * weight[..., None], filters)
     slope = slope.reshape(count, -1, size)
     held = np.zeros((count, size - STATE, size))
@@ -97,11 +97,16 @@ def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.nda
 
 
 def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
-    """Return how far the rotor speeds' error may be off at a knot [rad/s].
+    """Return how far rotor speeds may be off where they are free [rad/s].
+
+    That is at a knot where they are an input, else at the start.
 
     White noise of rows adds up like errors that run straight between knots a tenth of a second
     apart and are smaller by the root of the rows that each stands for.
     """
+    start = np.asarray(windows.start_rotor_error)
+    if start.all():
+        return float(np.sqrt((start**2).mean()))
     rows = np.asarray(windows.rotor_seen).sum(axis=1).min(axis=-1).mean()
     noise = rotor_noise(windows, limits)
     return limits.rotor_knot_excess * noise * float(np.sqrt((KNOTS - 1) / max(rows, 1.0)))
