@@ -31,6 +31,10 @@ class Config:
     integrator: Literal["auto", "continuous", "euler"] = "auto"
     """How the flights' bodies were moved: by the equations themselves, as every real one, by
     MuJoCo's Euler steps of the rate loop's period, or as the logs say."""
+    relevance: tuple[float, float, float] = (0.05, 0.5, 0.025)
+    """The least force [m/s^2], torque over inertia [rad/s^2] and drift after a second [m] that is a
+    finding: an effect below all three is left out, however sure. 0 0 0 reports all that is
+    significant."""
     compare_delta: bool = False
     """Fit a Delta Action Model to the same flights and show what it removes; takes minutes."""
     plan: bool = False
@@ -77,6 +81,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         recording=config.recording,
         seed=config.seed,
         reference=config.reference,
+        relevance=config.relevance,
     )
     console.say(f"verdict: {result['verdict']}")
     for effect in result["effects"]:

@@ -18,7 +18,7 @@ from suite.diagnose.data.input_source import (
     integrator_of,
     rotors_are_input,
 )
-from suite.diagnose.data.windows import FlightWindows, cut, take
+from suite.diagnose.data.windows import LENGTH_S, FlightWindows, cut, take
 from suite.diagnose.fit.composites import composites
 from suite.diagnose.fit.look import least_left
 from suite.diagnose.fit.model import Linearisation, RolloutModel
@@ -34,6 +34,8 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.confirmation import confirmed, control, without_names
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap, measure, worse
+from suite.diagnose.verdict.model_error import with_model_error
+from suite.diagnose.verdict.relevance import gap_matters, relevant_part
 from suite.diagnose.verdict.residual_structure import (
     ResidualStructure,
     disturbance_equations,
@@ -130,7 +132,10 @@ def _diagnose(
     if not good.all():
         broken = int((~good).sum())
         warnings.append(f"{broken} stretches left out: the model's flight from there diverges")
+    rough = _coarser(logs, vehicle, model, rotor_input, whole, limits)
     whole, linear = take(whole, good), _take(linear, good)
+    if rough is not None:
+        limits = with_model_error(model, begin, whole, linear, take(rough, good), limits)
     if or_else and least_left(model, whole, linear, limits) > limits.hopeless_chi2:
         raise BeyondRollouts
     told = information(linear, whole, model.size, limits)
@@ -159,12 +164,17 @@ def _diagnose(
             found, after = without_names(model, found, limits), before
     found, after, without, gone = confirmed(model, found, held, (before, after), limits)
     warnings += [f"{label}: withdrawn, held-out flights are no better for it" for label in gone]
+    found, after, sizes, small = relevant_part(model, found, held, (before, after), limits)
+    warnings += [f"{one.name}: left out, too small to matter: {one.size.words()}" for one in small]
 
     def leaves(
         found: SearchResult, gaps: tuple[Gap, Gap]
     ) -> tuple[ResidualStructure, Turbulence | None, Verdict]:
         """Return the structure in what is left over, its wind, and the verdict on it."""
         residual, turbulence = _left_over(model, found, seed, limits)
+        if not gap_matters(gaps[1], len(held.flight), limits):
+            label = "named" if found.named else "no_gap"
+            return residual, None, Verdict(label, share_left(*gaps) if found.named else 0.0)
         return residual, turbulence, verdict_on(found, residual, gaps, rotor_input, limits)
 
     (residual, turbulence, verdict), swing = leaves(found, (before, after)), None
@@ -201,6 +211,8 @@ def _diagnose(
         logs=logs,
         nominal=vehicle,
         rotor_input=rotor_input,
+        sizes=sizes,
+        negligible=small,
         held_out=names,
         held_windows=held,
         model=model,
@@ -209,6 +221,24 @@ def _diagnose(
         seed=seed,
         limits=limits,
     )
+
+
+def _coarser(
+    logs: Sequence[FlightLog],
+    vehicle: Vehicle,
+    model: RolloutModel,
+    rotor_input: bool,
+    whole: FlightWindows,
+    limits: Thresholds,
+) -> FlightWindows | None:
+    """Return the windows `whole` with steps of twice the length and half of the rotor speeds.
+
+    None where that changes nothing: a simulator's own steps, driven by commands.
+    """
+    if model.integrator == "euler" and not rotor_input:
+        return None
+    how = (rotor_input, LENGTH_S, limits, model.integrator, whole)
+    return cut(logs, vehicle, *how)[0]
 
 
 def _enough(count: int, limits: Thresholds) -> None:

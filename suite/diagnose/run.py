@@ -20,6 +20,7 @@ from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.report.recording import write_rollouts
 from suite.diagnose.run_views import diagnose_views, only_views
+from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.black_box import compare_black_box
 from suite.diagnose.verdict.checks import run_checks
 from suite.diagnose.verdict.delta_model import BlackBoxConfig
@@ -44,6 +45,7 @@ def diagnose_files(
     recording: bool = True,
     seed: int = 0,
     reference: Sequence[Path] = (),
+    relevance: tuple[float, float, float] = THRESHOLDS.relevance,
 ) -> dict[str, Any]:
     """Diagnose flights in files; write what was found and return what diagnosis.json holds.
 
@@ -60,10 +62,12 @@ def diagnose_files(
         recording: write a recording for rerun.
         seed: of all draws.
         reference: flights of the same vehicle before what changed: say what has changed since.
+        relevance: least force [m/s^2], torque [rad/s^2] and drift after a second [m] of a finding.
 
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
+    limits = replace(THRESHOLDS, relevance=relevance)
     vehicle = load_vehicle(vehicle_name)
     refuse_own_motion(vehicle)
     truth = None if fly is None else load_vehicle(fly)
@@ -91,13 +95,14 @@ def diagnose_files(
 
     def by_views() -> dict[str, Any]:
         told = [*warnings, *unused]
-        return noted(diagnose_views(logs, before, vehicle, out, console, SCHEMA, seed, told))
+        return noted(
+            diagnose_views(logs, before, vehicle, out, console, SCHEMA, seed, told, limits)
+        )
 
     if before or only_views(logs, vehicle):
         return by_views()
     try:
-        result = diagnose(logs, vehicle, drive, console.note, seed, integrator=integrator,
-                          or_else=True)  # fmt: skip
+        result = diagnose(logs, vehicle, drive, console.note, seed, limits, integrator, True)
     except BeyondRollouts:
         console.note("rollouts of a second leave these flights, whatever is fitted: by views")
         return by_views()

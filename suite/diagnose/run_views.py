@@ -14,6 +14,7 @@ from suite.common.report import write_report
 from suite.diagnose.data.windows import remembers
 from suite.diagnose.report.views_json import views_json
 from suite.diagnose.report.views_page import views_page
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.views.by_views import diagnose_by_views
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
@@ -40,6 +41,7 @@ def diagnose_views(
     schema: int,
     seed: int,
     warnings: Sequence[str] = (),
+    limits: Thresholds = THRESHOLDS,
 ) -> dict[str, Any]:
     """Diagnose `logs` by their views; write what was found and return what diagnosis.json holds.
 
@@ -52,11 +54,12 @@ def diagnose_views(
         schema: version of diagnosis.json.
         seed: of all draws.
         warnings: of the files.
+        limits: of every step.
 
     Raises:
         ValueError: for flights that cannot be used.
     """
-    result = diagnose_by_views(logs, vehicle, references, console.note, seed)
+    result = diagnose_by_views(logs, vehicle, references, console.note, seed, limits)
     told = views_json(result)
     told["warnings"] = [*warnings, *told["warnings"]]
     found = {**plain(told), **stamp(schema, seed)}

@@ -70,6 +70,10 @@ class Thresholds:
     """Noise below is rounding and the model's steps; pose [m, rad], velocity [m/s], rates [rad/s],
     accelerometer [m/s^2], rotor speed [rad/s]."""
 
+    relevance: tuple[float, float, float] = (0.05, 0.5, 0.025)
+    """What does less is no finding: a force [m/s^2], 0.5 % of the weight; a torque over the inertia
+    [rad/s^2]; and a drift after a second [m], which is that of such a force."""
+
     slow_degree: int = 5
     """Degree of the polynomials in which a model's error of a window would show."""
     rotor_knot_excess: float = 1.5

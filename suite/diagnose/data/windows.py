@@ -129,6 +129,7 @@ def cut(
     stride_s: float = LENGTH_S,
     limits: Thresholds = THRESHOLDS,
     integrator: str = "continuous",
+    coarser: FlightWindows | None = None,
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` and warnings; None where no flight has one.
 
@@ -140,6 +141,8 @@ def cut(
             twice.
         limits: the longest hole in a window.
         integrator: whose steps they are: those of "euler" are the rate loop's periods.
+        coarser: the same windows, to be cut with steps of twice the length, which those of "euler"
+            never are, and every second measured rotor speed.
     """
     places: list[tuple[int, int]] = []
     warnings: list[str] = []
@@ -153,10 +156,13 @@ def cut(
     if not places:
         return None, warnings
     longest_s = 1.0 / vehicle.controller.frequency if integrator == "euler" else LONGEST_S
+    if coarser is not None and integrator != "euler":
+        longest_s *= 2.0
     drives = [_drive(logs[number], first, vehicle, longest_s) for number, first in places]
-    drives = _of_one_shape(drives)
+    drives = _of_one_shape(drives, coarser)
+    every = 1 if coarser is None else 2
     parts = [
-        _window(logs[number], states[number], number, first, vehicle, rotor_input, drive)
+        _window(logs[number], states[number], number, first, vehicle, rotor_input, drive, every)
         for (number, first), drive in zip(places, drives, strict=True)
     ]
     return FlightWindows(*(np.stack(field) for field in zip(*parts, strict=True))), warnings
@@ -235,8 +241,11 @@ def _drive(log: FlightLog, first: int, vehicle: Vehicle, longest_s: float) -> _D
     return _Drive(grid(-BURN_IN_S, 0.0), grid(0.0, end), time, given)
 
 
-def _of_one_shape(drives: Sequence[_Drive]) -> list[_Drive]:
-    """Return `drives` with as many steps and commands each, so that few shapes are compiled."""
+def _of_one_shape(drives: Sequence[_Drive], like: FlightWindows | None) -> list[_Drive]:
+    """Return `drives` with as many steps and commands each, so that few shapes are compiled.
+
+    They are those of `like` where it is given.
+    """
 
     def most(counts: Iterable[int], sizes: Sequence[int]) -> int:
         count = max(counts)
@@ -246,6 +255,9 @@ def _of_one_shape(drives: Sequence[_Drive]) -> list[_Drive]:
     burn_in = most((len(d.burn_in.look_s) for d in drives), BURN_IN_STEPS)
     steps = most((len(d.window.look_s) for d in drives), STEPS)
     commands = most((len(d.command_s) for d in drives), COMMANDS)
+    if like is not None:
+        burn_in, steps = like.burn_in_rate_b.shape[1], like.rotor_speed.shape[1]
+        commands = like.command_s.shape[1]
     return [
         _Drive(
             padded_grid(d.burn_in, burn_in, at_front=True),
@@ -276,6 +288,7 @@ def _window(
     vehicle: Vehicle,
     rotor_input: bool,
     drive: _Drive,
+    every: int,
 ) -> FlightWindows:
     time, begin = log.time_s, log.time_s[first]
     before, window = drive.burn_in, drive.window
@@ -283,7 +296,7 @@ def _window(
     middle = begin + 0.5 * (window.edge_s[:-1] + window.edge_s[1:])
     speed = np.zeros((len(middle), 4))
     if log.rotor_speed is not None and rotor_input:
-        speed = _rotors(middle, time, log.rotor_speed, vehicle)
+        speed = _rotors(middle, time, log.rotor_speed, vehicle, every)
     drop = np.zeros(len(middle))
     if log.voltage is not None and np.isfinite(log.voltage).any():
         first_volt = log.voltage[np.flatnonzero(np.isfinite(log.voltage))[0]]
@@ -363,17 +376,21 @@ def _integral(time: np.ndarray, command: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros((1, 4)), np.cumsum(span[:, None] * command[:-1], axis=0)])
 
 
-def _rotors(at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """Return rotor speeds at `at` [s].
+def _rotors(
+    at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicle, every: int
+) -> np.ndarray:
+    """Return rotor speeds at `at` [s] from `every` so many rows.
 
     Between rows they run along the first-order response to one command. What a firmware's loop
     asks for changes all the time, by filtered slopes of rates: a smooth curve is nearer then.
     """
-    return np.stack([_rotor(at, time, column, vehicle) for column in speed.T], axis=1)
+    return np.stack([_rotor(at, time, column, vehicle, every) for column in speed.T], axis=1)
 
 
-def _rotor(at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    good = np.flatnonzero(np.isfinite(speed))
+def _rotor(
+    at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicle, every: int
+) -> np.ndarray:
+    good = np.flatnonzero(np.isfinite(speed))[::every]
     if remembers(vehicle):
         return CubicSpline(time[good], speed[good])(at)
     row = np.clip(np.searchsorted(time[good], at, side="right") - 1, 0, len(good) - 2)

@@ -13,6 +13,7 @@ from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.plans.separating import advice
 from suite.diagnose.report.cells import short_name
 from suite.diagnose.report.parameters_json import parameters_json
+from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.black_box import BlackBoxComparison
 from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
@@ -22,6 +23,9 @@ from suite.diagnose.verdict.turbulence import Turbulence
 
 SHOWN = 5
 """Shapes of the residual that are listed."""
+SIZES = ("force", "torque", "drift")
+"""Of an effect: mean acceleration over half a second [m/s^2], angular acceleration [rad/s^2] and
+distance after a second [m], as RMS over the flights."""
 DIGITS = 4
 """Of the errors by condition, which are many."""
 
@@ -35,11 +39,17 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     return {
         "verdict": diagnosis.verdict.label,
         "effects": effects + _gusts(diagnosis.turbulence),
+        "negligible": [
+            {"name": one.name, "size": one.size.as_json(), "relevant": False}
+            for one in diagnosis.negligible
+        ],
+        "relevance": dict(zip(SIZES, diagnosis.limits.relevance, strict=True)),
         "gap": {
             "measure": MEASURE,
             "before": before.rms,
             "after": after.rms,
             "noise_floor": 1.0,
+            "model_error": model_error(diagnosis),
             "before_ci95": before.ci95(seed, diagnosis.limits),
             "after_ci95": after.ci95(seed, diagnosis.limits),
             "horizon_s": HEADLINE_S,
@@ -116,7 +126,22 @@ def _effect(diagnosis: Diagnosis, name: str) -> dict[str, Any]:
         ),
         "gap_removed": min(max(removed, 0.0), 1.0),
         "p_value": max(n.p_value for n in ones),
+        "size": diagnosis.sizes[name].as_json(),
+        "relevant": True,
     }
+
+
+def model_error(diagnosis: Diagnosis) -> float:
+    """Return the share of the noise floor that is the model's own numerical error, 0 to 1.
+
+    It is that of the group of channels in which it is largest.
+    """
+    limits, sigma = diagnosis.limits, diagnosis.search.sigma
+    least = np.array(limits.least_noise)[: len(STATE_GROUPS)]
+    raised = least > np.array(THRESHOLDS.least_noise)[: len(STATE_GROUPS)]
+    whole = np.sqrt(np.nan_to_num(sigma[:12].reshape(-1, 3) ** 2).mean(axis=1))
+    share = np.where(raised, least / np.maximum(whole, 1e-12), 0.0)
+    return float(min(share.max(), 1.0))
 
 
 def _undecided(diagnosis: Diagnosis, ones: Sequence[NamedEffect]) -> list[int]:
@@ -147,6 +172,8 @@ def _gusts(found: Turbulence | None) -> list[dict[str, Any]]:
             },
             "gap_removed": None,
             "p_value": float(np.exp(-found.ratio)),
+            "size": None,
+            "relevant": True,
         }
     ]
 

@@ -27,6 +27,11 @@ def views_json(found: ViewsDiagnosis) -> dict[str, Any]:
     return {
         "verdict": found.verdict,
         "effects": effects_json(found),
+        "negligible": [
+            {"name": small.name, "size": small.size.as_json(), "relevant": False}
+            for one in found.results
+            for small in one.negligible
+        ],
         "gap": {
             "measure": MEASURE.format(
                 about=main.view.about, unit=main.view.unit, width=main.view.width_s
@@ -34,6 +39,7 @@ def views_json(found: ViewsDiagnosis) -> dict[str, Any]:
             "before": gap.rms(gap.before),
             "after": gap.rms(gap.after),
             "noise_floor": gap.rms(gap.floor),
+            "model_error": None,
             "horizon_s": main.view.width_s,
             "held_out": [short_name(name) for name in found.held_out],
             "channels": {one.view.name: _channels(one) for one in found.results},
@@ -112,6 +118,8 @@ def _lag_effect(found: ViewsDiagnosis, lag: RotorLag) -> dict[str, Any]:
         "parameters": parameters_json(found.space, LAG, [index], theta, {index: lag.half_width}),
         "gap_removed": lag.closed,
         "p_value": lag.p_value,
+        "size": None,
+        "relevant": True,
         "view": "commands",
     }
 
@@ -130,6 +138,8 @@ def _effect(found: ViewsDiagnosis, result: ViewResult, names: Sequence[ViewName]
         "parameters": parameters_json(found.space, effect, indices, theta, width),
         "gap_removed": min(max(removed, 0.0), 1.0),
         "p_value": max(name.p_value for name in names),
+        "size": result.size(names)[0].as_json(),
+        "relevant": True,
         "view": result.view.name,
     }
 

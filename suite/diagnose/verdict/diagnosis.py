@@ -14,6 +14,7 @@ from suite.diagnose.fit.model import RolloutModel
 from suite.diagnose.fit.search import SearchResult
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.gap import Gap
+from suite.diagnose.verdict.relevance import EffectSize, Negligible
 from suite.diagnose.verdict.residual_structure import ResidualStructure
 from suite.diagnose.verdict.turbulence import Turbulence
 from suite.diagnose.verdict.verdict import Verdict
@@ -43,6 +44,10 @@ class Diagnosis:
     """The vehicle that the simulation used."""
     rotor_input: bool
     """Whether measured rotor speeds were the model's input, not the commands."""
+    sizes: dict[str, EffectSize]
+    """What each named effect does on these flights, by its name."""
+    negligible: list[Negligible]
+    """What is significant and too small to matter."""
     held_out: list[str]
     """Names of what took no part in finding or fitting anything."""
     held_windows: FlightWindows

@@ -13,14 +13,21 @@ from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.hold_out import choose_held_out
 from suite.diagnose.fit.composites import composites
-from suite.diagnose.fit.parameters import ParameterSpace, candidates, make_space, with_fitted
+from suite.diagnose.fit.parameters import (
+    ParameterSpace,
+    candidates,
+    indices_of,
+    make_space,
+    with_fitted,
+)
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.relevance import EffectSize, Negligible, view_size
 from suite.diagnose.views.change.motion_change import search_motion_change
 from suite.diagnose.views.change.reference import changed_task, search_change
 from suite.diagnose.views.change.rotor_spread import RotorSpread, rotor_spread
 from suite.diagnose.views.data.flights import ViewFlights, parted, ready
 from suite.diagnose.views.data.view import FORCE, View
-from suite.diagnose.views.fit.equations import ViewTask, half_widths, left_of, look
+from suite.diagnose.views.fit.equations import ViewTask, fitted, half_widths, left_of, look
 from suite.diagnose.views.fit.model import ForceModel
 from suite.diagnose.views.fit.plausible import implausible
 from suite.diagnose.views.fit.search import ViewName, ViewSearch, search_view
@@ -43,6 +50,26 @@ class ViewResult:
     """What of the search's names stands, beside the other views'."""
     half_width: dict[int, float]
     """Of the 95 % interval, by the place of each named number."""
+    negligible: tuple[Negligible, ...] = ()
+    """What is significant and too small to matter."""
+
+    def left(self, by_axis: np.ndarray, limits: Thresholds) -> float:
+        """Return the share of the variance that is left, 0 where that is too little to matter."""
+        share = self.gap.share(by_axis)
+        rms = float(np.sqrt(share * self.gap.variance.sum()))
+        size = EffectSize(rms, 0.0, None) if self.view.in_world else EffectSize(0.0, rms, None)
+        return share if size.relevant(limits) else 0.0
+
+    def size(self, names: Sequence[ViewName]) -> tuple[EffectSize, EffectSize]:
+        """Return what `names` do together in this view, and the upper end of its interval."""
+        at = sorted({i for name in names for i in name.candidate.indices})
+        last = self.search.last
+        slope, away = last.data.slope[..., at], (last.theta - self.search.first.theta)[at]
+        wide = np.array([self.half_width[i] for i in at])
+        doubt = np.sqrt(((slope * wide) ** 2).sum(axis=-1))
+        inside = self.view.in_world
+        size, more = view_size(slope @ away, inside), view_size(doubt, inside)
+        return size, EffectSize(size.force + more.force, size.torque + more.torque, None)
 
 
 @dataclass(frozen=True)
@@ -117,10 +144,10 @@ def diagnose_by_views(
     known, spread, left_out = _reference_tasks(flights, model, vehicle, references, limits)
     say(f"views: {', '.join(view.about for view in flights.views)}; by {flights.source}")
     held_numbers, held_names = _held(logs, flights, model, limits)
-    fitted, held = parted(flights, held_numbers, limits)
+    inside, held = parted(flights, held_numbers, limits)
     results = []
     for view in flights.views:
-        task = ViewTask(view, model, fitted[view.name], limits)
+        task = ViewTask(view, model, inside[view.name], limits)
         if known and spread:
             found = search_change(known[view.name], task.flights, spread, among, seed)
             apart = changed_task(known[view.name], found.first.theta, held[view.name])
@@ -135,13 +162,19 @@ def diagnose_by_views(
         gap = judge(found, apart, flights.floor[view.name])
         widths = half_widths(found.last, found.indices) if found.named else []
         width = dict(zip(found.indices, map(float, widths), strict=True))
-        results.append(ViewResult(view, found, apart, gap, found.named, width))
+        result = ViewResult(view, found, apart, gap, found.named, width)
+        results.append(result if known else _relevant(result, limits))
         told = ", ".join(name.candidate.label for name in found.named) or "nothing"
         say(f"{view.name}: {told}; {100 * gap.share(gap.closed):.0f} % of the variance closed, "
             f"{100 * gap.share(gap.explainable):.0f} % by a black box")  # fmt: skip
     results, withdrawn = _confirmed(tuple(results))
     results, told = _one_cause(results)
     warnings = [*flights.notes, *left_out, *withdrawn, *told]
+    warnings += [
+        f"{one.name}: left out, too small to matter: {one.size.words()}"
+        for result in results
+        for one in result.negligible
+    ]
     for result in results:
         for name in result.names:
             far = implausible(space, result.search.last.theta, name.candidate, limits)
@@ -238,6 +271,31 @@ def _confirmed(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...],
     return tuple(kept), warnings
 
 
+def _relevant(result: ViewResult, limits: Thresholds) -> ViewResult:
+    """Return the result without names that do too little to matter on these flights."""
+    by_effect: dict[str, list[ViewName]] = {}
+    for name in result.names:
+        by_effect.setdefault(name.candidate.name, []).append(name)
+    sizes = {effect: result.size(names) for effect, names in by_effect.items()}
+    small = [effect for effect, (_, most) in sizes.items() if not most.relevant(limits)]
+    if not small:
+        return result
+    kept = tuple(name for name in result.names if name.candidate.name not in small)
+    task, theta = result.search.task, result.search.last.theta.copy()
+    gone = [i for n in result.names if n not in kept for i in n.candidate.indices]
+    theta[gone] = result.search.first.theta[gone]
+    last = look(task, theta, result.search.last.weights)
+    last = fitted(task, last, indices_of([name.candidate for name in kept]))
+    search = replace(result.search, named=kept, last=last)
+    return replace(
+        result,
+        search=search,
+        gap=judge(search, result.held, result.gap.floor),
+        names=kept,
+        negligible=tuple(Negligible(effect, sizes[effect][0]) for effect in small),
+    )
+
+
 def _one_cause(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...], list[str]]:
     """Return the results with one cause where one view's name could stand for another's.
 
@@ -284,9 +342,9 @@ def _verdict(
     if swing:
         return "partly" if named or lag else "unknown"
     if named:
-        left = [one.gap.share(one.gap.left) for one in named]
+        left = [one.left(one.gap.left, limits) for one in named]
         return "named" if max(left) <= limits.view_left_share else "partly"
-    could = [one.gap.share(one.gap.explainable) for one in results]
+    could = [one.left(one.gap.explainable, limits) for one in results]
     if max(could) > limits.view_left_share:
         return "partly" if lag else "unknown"
     return "named" if lag else "no_gap"
