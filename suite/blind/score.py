@@ -18,7 +18,7 @@ from suite.blind.cases import MULTIPLES, ROTORPY
 from suite.blind.make import load_manifest, open_answers, simulator_of
 from suite.blind.rotorpy_flight import damping_of_hubs, is_of_hubs
 from suite.blind.run import FAILED, TIMED
-from suite.diagnose.fit.parameters import effects_in
+from suite.diagnose.estimate.parameters import effects_in
 from tracks.common.files import write_json, write_text
 from tracks.common.grid import markdown, table
 from tracks.common.provenance import stamp

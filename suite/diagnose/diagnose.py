@@ -12,24 +12,22 @@ from eval.effects import EFFECTS
 from eval.effects.log_faults import lateness
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.checks.actuators import another_controller, integrator_of, rotors_are_input
+from suite.diagnose.data.flights import ready
 from suite.diagnose.data.hold_out import choose_held_out
-from suite.diagnose.data.input_source import (
-    another_controller,
-    integrator_of,
-    rotors_are_input,
-)
+from suite.diagnose.data.view import FORCE
+from suite.diagnose.data.whitening import Linearisation
 from suite.diagnose.data.windows import LENGTH_S, FlightWindows, cut, take
-from suite.diagnose.fit.composites import composites
-from suite.diagnose.fit.look import least_left
-from suite.diagnose.fit.model import Linearisation, RolloutModel
-from suite.diagnose.fit.normal_equations import (
-    half_widths95,
-    information,
-    start_estimate,
-)
-from suite.diagnose.fit.parameters import candidates, make_space, with_fitted
-from suite.diagnose.fit.permutation import folds_of
-from suite.diagnose.fit.search import SearchResult, search
+from suite.diagnose.estimate.intervals import half_widths95
+from suite.diagnose.estimate.parameters import candidates, make_space, with_fitted
+from suite.diagnose.estimate.permutation import folds_of
+from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.rollout_fit import information, start_estimate
+from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.evidence.view_equations import ViewTask
+from suite.diagnose.search.composites import composites
+from suite.diagnose.search.look import least_left
+from suite.diagnose.search.search import SearchResult, search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.confirmation import confirmed, control, without_names
 from suite.diagnose.verdict.diagnosis import Diagnosis
@@ -41,13 +39,9 @@ from suite.diagnose.verdict.residual_structure import (
     disturbance_equations,
     residual_structure,
 )
+from suite.diagnose.verdict.swing import Swing, swing_left
 from suite.diagnose.verdict.turbulence import Turbulence, find_turbulence
 from suite.diagnose.verdict.verdict import Verdict, share_left, verdict_on, with_swing
-from suite.diagnose.views.data.flights import ready
-from suite.diagnose.views.data.view import FORCE
-from suite.diagnose.views.fit.equations import ViewTask
-from suite.diagnose.views.fit.model import ForceModel
-from suite.diagnose.views.swing import Swing, swing_left
 
 
 class BeyondRollouts(Exception):

@@ -180,7 +180,7 @@ def resolve(
     """
     from eval.quadrotor.vehicle_file import load_vehicle
     from policies.formats.policy_file import load_policy_checkpoint
-    from suite.diagnose.fit.parameters import refuse_own_motion
+    from suite.diagnose.estimate.parameters import refuse_own_motion
     from suite.judging.content import policy_digest
     from suite.judging.flying import checkpoint_folder, default_policy
 

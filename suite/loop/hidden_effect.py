@@ -19,8 +19,7 @@ from eval.worlds import differences
 from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.report import Links, Picture, Section
-from suite.diagnose.report.cells import grid
-from suite.diagnose.report.parameters_json import components
+from suite.diagnose.report.parameters_json import components, grid
 from suite.loop.charts import success_chart, tuning_chart
 from suite.loop.compare import BEFORE, points, told_apart
 from suite.loop.config import OWN, HiddenLoopConfig, LoopConfig

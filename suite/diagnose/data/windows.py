@@ -18,8 +18,7 @@ from eval.quadrotor.loops import NOMINAL
 from eval.quadrotor.plant import Command, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.resample import interpolate
-from suite.diagnose.data.sampling import longest_gap_s, on_every_row, thinned
+from suite.diagnose.data.sampling import interpolate, longest_gap_s, on_every_row, thinned
 from suite.diagnose.data.steps import LONGEST_S, StepGrid, padded_grid, step_grid, with_lost_rows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.rotation import quat_to_rot
@@ -42,6 +41,10 @@ ROWS = 101
 """Measured rows in a window; a log that has more of them is thinned."""
 LEAST_START_ERROR = 1e-3
 """Rotor speeds at a window's start are never known better than this [rad/s]."""
+STATE = 12
+"""Numbers of the state in which a window starts: pos_w, rotation vector, vel_w, rate_b."""
+KNOTS = 11
+"""Places in a window between which what is free along it runs straight."""
 CHANNELS = 19
 """pos_w 3, attitude 3, vel_w 3, rate_b 3, acc_b 3, rotor speeds 4."""
 STATE_GROUPS = ("position", "attitude", "velocity", "rates")

@@ -12,14 +12,14 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.fit.parameters import candidates, make_space
+from suite.diagnose.data.flights import ViewFlights, ready
+from suite.diagnose.data.view import TORQUE
+from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.view_equations import ViewTask, half_widths, look
 from suite.diagnose.identify.fit import Z95
 from suite.diagnose.identify.numbers import Number
-from suite.diagnose.views.data.flights import ViewFlights, ready
-from suite.diagnose.views.data.view import TORQUE
-from suite.diagnose.views.fit.equations import ViewTask, half_widths, look
-from suite.diagnose.views.fit.model import ForceModel
-from suite.diagnose.views.fit.search import ViewSearch, search_view
+from suite.diagnose.search.view_search import ViewSearch, search_view
 
 EFFECT, KEY = "blade_flapping", "coefficient"
 UNIT = "N s^2/rad"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from suite.diagnose.fit.parameters import effects_in
+from suite.diagnose.estimate.parameters import effects_in
 from suite.diagnose.plans.trajectory import Trajectory
 
 _FAST_WOBBLE = Trajectory("figure_eight", speed=6.5, size=4.0, turn="wobble")

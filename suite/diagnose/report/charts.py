@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from suite.common.charts import plain_axes, png, titled
+from suite.diagnose.checks.black_box import BlackBoxComparison
+from suite.diagnose.checks.disagreement import UNITS, Disagreement, binned, by_group
 from suite.diagnose.data.windows import STATE_GROUPS
-from suite.diagnose.fit.permutation import CandidateScore
-from suite.diagnose.verdict.black_box import BlackBoxComparison
-from suite.diagnose.verdict.disagreement import UNITS, Disagreement, binned, by_group
+from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.verdict.gap import Gap
 
 BEFORE, AFTER, WRONG, BOX = "#8b93a1", "#2463c9", "#e0892b", "#7a5cb8"

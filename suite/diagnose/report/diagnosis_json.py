@@ -7,17 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from suite.diagnose.data.kinematics import Kinematics
+from suite.diagnose.checks.black_box import BlackBoxComparison
+from suite.diagnose.checks.checks import Checks
+from suite.diagnose.checks.disagreement import UNITS, Disagreement, binned, by_group, in_words
+from suite.diagnose.checks.kinematics import Kinematics
 from suite.diagnose.data.windows import STATE_GROUPS
-from suite.diagnose.fit.rivals import NamedEffect
 from suite.diagnose.plans.separating import advice
-from suite.diagnose.report.cells import short_name
-from suite.diagnose.report.parameters_json import parameters_json
+from suite.diagnose.report.parameters_json import parameters_json, short_name
+from suite.diagnose.search.rivals import NamedEffect
 from suite.diagnose.thresholds import THRESHOLDS
-from suite.diagnose.verdict.black_box import BlackBoxComparison
-from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
-from suite.diagnose.verdict.disagreement import UNITS, Disagreement, binned, by_group, in_words
 from suite.diagnose.verdict.gap import HEADLINE_S, HORIZONS_S, MEASURE, Gap
 from suite.diagnose.verdict.turbulence import Turbulence
 

@@ -6,11 +6,11 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from suite.common.report import Part, Section
-from suite.diagnose.data.actuators import ActuatorMismatch
-from suite.diagnose.data.kinematics import Kinematics
+from suite.diagnose.checks.actuators import ActuatorMismatch
+from suite.diagnose.checks.checks import Checks
+from suite.diagnose.checks.kinematics import Kinematics
 from suite.diagnose.data.windows import SLICES, UNITS
-from suite.diagnose.report.cells import grid, short_name
-from suite.diagnose.verdict.checks import Checks
+from suite.diagnose.report.parameters_json import grid, short_name
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from tracks.common.grid import Grid
 

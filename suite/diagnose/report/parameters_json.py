@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from eval.effects import EFFECTS
-from suite.diagnose.fit.parameters import ParameterSpace
+from suite.diagnose.estimate.parameters import ParameterSpace
+from tracks.common.grid import Cell, Grid
 
 UNSEEN = "not identifiable"
 """In the place of a value that no flight can give."""
@@ -143,3 +144,18 @@ def parameters_json(
 
 def _number(space: ParameterSpace, index: int) -> int:
     return (space.entries[index].component or 0) + 1
+
+
+def cells(*texts: str) -> list[Cell]:
+    """Return a row of cells without a tone."""
+    return [Cell(text) for text in texts]
+
+
+def grid(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]], note: str = "") -> Grid:
+    """Return a table of plain texts."""
+    return Grid(title, headers, [cells(*row) for row in rows], note=note)
+
+
+def short_name(name: str) -> str:
+    """Return a log's name without its folders."""
+    return name.replace("\\", "/").rsplit("/", 1)[-1]

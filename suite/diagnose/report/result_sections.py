@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from suite.common.report import Part, Picture, Section
+from suite.diagnose.checks.black_box import BlackBoxComparison
+from suite.diagnose.checks.checks import Checks
 from suite.diagnose.data.windows import UNITS
-from suite.diagnose.report.cells import grid
 from suite.diagnose.report.charts import (
     AFTER,
     BEFORE,
@@ -18,8 +19,7 @@ from suite.diagnose.report.charts import (
     gap_chart,
     labelled_gaps,
 )
-from suite.diagnose.verdict.black_box import BlackBoxComparison
-from suite.diagnose.verdict.checks import Checks
+from suite.diagnose.report.parameters_json import grid
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import MEASURE, Gap
 from tracks.common.grid import Grid

@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from suite.diagnose.by_views import ViewResult, ViewsDiagnosis
 from suite.diagnose.plans.separating import advice
-from suite.diagnose.report.cells import short_name
-from suite.diagnose.report.parameters_json import parameters_json
-from suite.diagnose.views.by_views import ViewResult, ViewsDiagnosis
-from suite.diagnose.views.fit.search import ViewName
-from suite.diagnose.views.judged import gap_without
-from suite.diagnose.views.rotor_lag import LAG, RotorLag
+from suite.diagnose.report.parameters_json import parameters_json, short_name
+from suite.diagnose.search.view_search import ViewName
+from suite.diagnose.verdict.rotor_lag import LAG, RotorLag
+from suite.diagnose.verdict.view_gap import gap_without
 
 MEASURE = (
     "RMS over the axes of what the model leaves of {about} on held-out flights [{unit}], both "

@@ -11,12 +11,11 @@ from matplotlib.figure import Figure
 from eval.effects import EFFECTS
 from suite.common.charts import png, titled
 from suite.common.report import Details, Links, Part, Picture, Report, Section
-from suite.diagnose.fit.composites import in_words
-from suite.diagnose.report.cells import grid
+from suite.diagnose.by_views import ViewsDiagnosis
+from suite.diagnose.evidence.view_equations import left_of
 from suite.diagnose.report.charts import AFTER, BEFORE, FLOOR
-from suite.diagnose.report.parameters_json import components
-from suite.diagnose.views.by_views import ViewsDiagnosis
-from suite.diagnose.views.fit.equations import left_of
+from suite.diagnose.report.parameters_json import components, grid
+from suite.diagnose.search.composites import in_words
 from tracks.common.grid import Grid
 
 STRETCH_S = 10.0

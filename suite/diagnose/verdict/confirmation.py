@@ -6,18 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from suite.diagnose.data.whitening import make_whitening
 from suite.diagnose.data.windows import FlightWindows
-from suite.diagnose.fit.model import RolloutModel
-from suite.diagnose.fit.normal_equations import (
-    Estimate,
-    fit,
-    normal_equations_of,
-    start_estimate,
-)
-from suite.diagnose.fit.parameters import Candidate, effects_in, indices_of
-from suite.diagnose.fit.rivals import NamedEffect
-from suite.diagnose.fit.search import SearchResult, refitted
-from suite.diagnose.fit.whitening import make_whitening
+from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
+from suite.diagnose.evidence.rollout_fit import Estimate, fit, normal_equations_of, start_estimate
+from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.search.rivals import NamedEffect
+from suite.diagnose.search.search import SearchResult, refitted
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.gap import HEADLINE_S, Gap, measure, true_starts
 

@@ -10,8 +10,8 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.windows import FlightWindows, cut
-from suite.diagnose.fit.model import RolloutModel
-from suite.diagnose.fit.search import SearchResult
+from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.search.search import SearchResult
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.gap import Gap
 from suite.diagnose.verdict.relevance import EffectSize, Negligible

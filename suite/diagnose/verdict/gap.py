@@ -14,11 +14,10 @@ import numpy as np
 
 from eval.effects.log_faults import lateness
 from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.windows import SLICES, STATE_GROUPS, FlightWindows
-from suite.diagnose.fit.model import Linearisation, RolloutModel
-from suite.diagnose.fit.normal_equations import normal_equations_of
-from suite.diagnose.fit.rollout import STATE
-from suite.diagnose.fit.whitening import make_whitening, rotor_spread
+from suite.diagnose.data.whitening import Linearisation, make_whitening, rotor_spread
+from suite.diagnose.data.windows import SLICES, STATE, STATE_GROUPS, FlightWindows
+from suite.diagnose.evidence.rollout_fit import normal_equations_of
+from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 HORIZONS_S = (0.1, 0.5, 1.0)

@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from suite.diagnose.data.colour import measured_noise
+from suite.diagnose.data.whitening import Linearisation, make_whitening, project_out_start, whiten
 from suite.diagnose.data.windows import SLICES, FlightWindows
-from suite.diagnose.fit.model import Linearisation, RolloutModel
-from suite.diagnose.fit.normal_equations import Estimate
-from suite.diagnose.fit.whitening import make_whitening, project_out_start, whiten
+from suite.diagnose.evidence.rollout_fit import Estimate
+from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.thresholds import Thresholds
 
 

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.data.windows import SLICES, FlightWindows
-from suite.diagnose.fit.model import RolloutModel
-from suite.diagnose.fit.normal_equations import half_widths95
-from suite.diagnose.fit.search import SearchResult, refitted
+from suite.diagnose.estimate.intervals import half_widths95
+from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.search.search import SearchResult, refitted
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.confirmation import without_names
 from suite.diagnose.verdict.gap import Gap, measure

@@ -16,8 +16,9 @@ from scipy.optimize import minimize
 from eval.effects import EFFECTS, constant_wind, gusts
 from eval.quadrotor.plant import Motion, assemble
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
-from suite.diagnose.fit.model import RolloutModel
-from suite.diagnose.fit.rollout import KNOTS, Flown
+from suite.diagnose.data.windows import KNOTS
+from suite.diagnose.evidence.rollout import Flown
+from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.residual_structure import DisturbanceEquations
 

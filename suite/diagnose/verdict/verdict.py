@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.data.windows import STATE_GROUPS
-from suite.diagnose.fit.search import SearchResult
+from suite.diagnose.search.search import SearchResult
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.gap import Gap
 from suite.diagnose.verdict.residual_structure import ResidualStructure

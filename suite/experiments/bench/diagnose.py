@@ -15,15 +15,12 @@ import numpy as np
 from suite.common.errors import WorkFailed
 from suite.diagnose.data.colour import measured_noise
 from suite.diagnose.data.noise import noise_of
-from suite.diagnose.fit.look import trusted
-from suite.diagnose.fit.model import RolloutModel
-from suite.diagnose.fit.normal_equations import (
-    NormalEquations,
-    fit,
-    half_widths95,
-    start_estimate,
-)
-from suite.diagnose.fit.whitening import make_whitening
+from suite.diagnose.data.whitening import make_whitening
+from suite.diagnose.estimate.gauss_newton import NormalEquations
+from suite.diagnose.estimate.intervals import half_widths95
+from suite.diagnose.evidence.rollout_fit import fit, start_estimate
+from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.search.look import trusted
 from suite.experiments.bench.compare import Comparison, Figure, in_turn
 from suite.experiments.bench.rigid_body import Task, make_task
 

@@ -16,7 +16,7 @@ import numpy as np
 from eval.effects import EFFECTS, all_values
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.windows import FlightWindows, cut
-from suite.diagnose.fit.parameters import ParameterSpace, make_space
+from suite.diagnose.estimate.parameters import ParameterSpace, make_space
 
 REFITTED = ("mass_offset", "com_offset", "inertia_scale")
 """Effects whose numbers are fitted; between them six that a flight can tell."""

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from eval.quadrotor.model import BODY, add_quadrotor, rotor_name
 from eval.quadrotor.plant import make_plant
 from suite.diagnose.data.windows import SLICES, step_s
-from suite.diagnose.fit.normal_equations import NormalEquations
+from suite.diagnose.estimate.gauss_newton import NormalEquations
 from suite.experiments.bench.rigid_body import Task
 
 POSE = 13

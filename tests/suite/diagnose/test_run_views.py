@@ -8,7 +8,7 @@ import numpy as np
 from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
-from suite.diagnose.run_views import only_views
+from suite.diagnose.run import only_views
 from tests.support.diagnosis_flights import fly
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import PLAIN, REMEMBERING

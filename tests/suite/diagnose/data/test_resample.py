@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from suite.diagnose.data.resample import follow_lag, hold, interpolate
+from suite.diagnose.data.sampling import follow_lag, hold, interpolate
 
 TIME = np.array([0.0, 0.1, 0.2, 0.3])
 

@@ -8,7 +8,7 @@ import pytest
 from suite.diagnose.data.noise import noise_of, rotor_noise
 from suite.diagnose.data.sampling import on_every_row, thinned, without_slow_rotors
 from suite.diagnose.data.windows import SLICES, cut
-from suite.diagnose.fit.normal_equations import solve
+from suite.diagnose.estimate.gauss_newton import solve
 from tests.support.diagnosis_flights import NOISE, fly
 from tests.support.vehicles import PLAIN
 

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.fit.composites import (
+from suite.diagnose.estimate.gauss_newton import NormalEquations, along_numbers
+from suite.diagnose.estimate.parameters import candidates, effects_in, make_space
+from suite.diagnose.search.composites import (
     COMPOSITES,
     acts_through,
     begin_of,
@@ -13,8 +15,6 @@ from suite.diagnose.fit.composites import (
     lent_at,
     usual_size,
 )
-from suite.diagnose.fit.normal_equations import NormalEquations, along_numbers
-from suite.diagnose.fit.parameters import candidates, effects_in, make_space
 from tests.support.vehicles import PLAIN
 
 SPACE = make_space(PLAIN)

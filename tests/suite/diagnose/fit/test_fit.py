@@ -5,20 +5,20 @@ import pytest
 
 from eval.effects import nameable_effects
 from suite.diagnose.data.colour import Noise
-from suite.diagnose.fit.look import trusted
-from suite.diagnose.fit.model import BATCH, DIRECTIONS, batches
-from suite.diagnose.fit.normal_equations import normal_equations_of, start_estimate
-from suite.diagnose.fit.parameters import candidates, effects_at, indices_of, make_space
-from suite.diagnose.fit.rivals import NamedEffect
-from suite.diagnose.fit.rollout import KNOTS, STATE
-from suite.diagnose.fit.search import search
-from suite.diagnose.fit.whitening import (
+from suite.diagnose.data.whitening import (
     make_whitening,
     orthonormal,
     project_out_start,
     whiten,
     whitened_residual,
 )
+from suite.diagnose.data.windows import KNOTS, STATE
+from suite.diagnose.estimate.parameters import candidates, effects_at, indices_of, make_space
+from suite.diagnose.evidence.rollout_fit import normal_equations_of, start_estimate
+from suite.diagnose.evidence.rollout_model import BATCH, DIRECTIONS, batches
+from suite.diagnose.search.look import trusted
+from suite.diagnose.search.rivals import NamedEffect
+from suite.diagnose.search.search import search
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)

@@ -6,8 +6,8 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.fit.model import RolloutModel
-from suite.diagnose.fit.parameters import candidates, make_space
+from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.plans.sensors import SENSORS, log_of
 from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import Trajectory, ordinary_flights

@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from suite.diagnose.fit.normal_equations import NormalEquations, half_widths95, products, solve
-from suite.diagnose.fit.parameters import candidates, make_space
-from suite.diagnose.fit.permutation import folds_of, score_candidates
+from suite.diagnose.estimate.gauss_newton import NormalEquations, products, solve
+from suite.diagnose.estimate.intervals import half_widths95
+from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.estimate.permutation import folds_of, score_candidates
 from tests.support.vehicles import PLAIN
 
 

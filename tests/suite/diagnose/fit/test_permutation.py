@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from suite.diagnose.fit.normal_equations import NormalEquations
-from suite.diagnose.fit.parameters import candidates, make_space
-from suite.diagnose.fit.permutation import folds_of, score_candidates
+from suite.diagnose.estimate.gauss_newton import NormalEquations
+from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.estimate.permutation import folds_of, score_candidates
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.vehicles import PLAIN
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from suite.diagnose.fit.composites import composites
-from suite.diagnose.fit.normal_equations import NormalEquations
-from suite.diagnose.fit.parameters import candidates, make_space
-from suite.diagnose.fit.rivals import (
+from suite.diagnose.estimate.gauss_newton import NormalEquations
+from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.search.composites import composites
+from suite.diagnose.search.rivals import (
     chi2_fall,
     could_be_best,
     flights_agree,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.windows import SLICES, cut
-from suite.diagnose.fit.model import RolloutModel
-from suite.diagnose.fit.parameters import make_space
+from suite.diagnose.estimate.parameters import make_space
+from suite.diagnose.evidence.rollout_model import RolloutModel
 from tests.support.continuous_flights import fly_finely
 from tests.support.diagnosis_flights import NOISE
 from tests.support.vehicles import PLAIN, with_effects

@@ -2,7 +2,7 @@
 
 import pytest
 
-from suite.diagnose.views.by_views import diagnose_by_views
+from suite.diagnose.by_views import diagnose_by_views
 from tests.support.real_flights import VEHICLE, flights
 
 

@@ -7,9 +7,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from suite.common.report import html
-from suite.diagnose.fit.parameters import make_space
+from suite.diagnose.checks.black_box import BlackBoxComparison, BlackBoxComparisons
+from suite.diagnose.checks.disagreement import by_group
+from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.report import charts
-from suite.diagnose.report.cells import cells, grid, short_name
 from suite.diagnose.report.charts import (
     black_box_chart,
     disagreement_chart,
@@ -21,14 +22,15 @@ from suite.diagnose.report.log_sections import actuators_section, logs_section, 
 from suite.diagnose.report.page import _disagreement, page
 from suite.diagnose.report.parameters_json import (
     UNSEEN,
+    cells,
     components,
+    grid,
     in_digits,
     parameters_json,
+    short_name,
 )
 from suite.diagnose.report.recording import write_rollouts
 from suite.diagnose.report.result_sections import held_out_section, residual_section
-from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
-from suite.diagnose.verdict.disagreement import by_group
 from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
 from tracks.common.grid import Grid

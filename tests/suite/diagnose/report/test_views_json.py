@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from suite.diagnose.report.views_json import MEASURE, effects_json, headline, views_json
-from suite.diagnose.views.rotor_lag import RotorLag
+from suite.diagnose.verdict.rotor_lag import RotorLag
 from tracks.common.files import plain
 
 

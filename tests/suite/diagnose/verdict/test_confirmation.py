@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from suite.diagnose.fit.rivals import NamedEffect
+from suite.diagnose.search.rivals import NamedEffect
 from suite.diagnose.verdict.confirmation import confirmed, without_names
 from suite.diagnose.verdict.gap import measure
 from suite.diagnose.verdict.verdict import verdict_on

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from suite.diagnose.data.windows import cut
-from suite.diagnose.verdict.disagreement import (
+from suite.diagnose.checks.disagreement import (
     CHANNELS,
     UNITS,
     Disagreement,
@@ -11,6 +10,7 @@ from suite.diagnose.verdict.disagreement import (
     conditions_of,
     in_words,
 )
+from suite.diagnose.data.windows import cut
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
 

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from suite.diagnose.fit.rollout import KNOTS, STATE
+from suite.diagnose.checks import black_box, checks
+from suite.diagnose.data.windows import KNOTS, STATE
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict import black_box, checks, diagnosis
+from suite.diagnose.verdict import diagnosis
 from suite.diagnose.verdict.gap import Gap, measure, noise_floor, start_noise, worse
 from suite.diagnose.verdict.residual_structure import (
     AXES,
@@ -18,8 +19,8 @@ from suite.diagnose.verdict.residual_structure import (
     ShapeScore,
     disturbance_equations,
     residual_structure,
+    shape_library,
 )
-from suite.diagnose.verdict.shapes import shape_library
 from suite.diagnose.verdict.turbulence import _likelihood, find_turbulence
 from suite.diagnose.verdict.verdict import Verdict, share_left, verdict_on
 

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.views.by_views import diagnose_by_views
-from suite.diagnose.views.explainable import closed_share, fit_black_box, inputs_of
-from suite.diagnose.views.fit.by_flight import centred
-from suite.diagnose.views.judged import judge
+from suite.diagnose.by_views import diagnose_by_views
+from suite.diagnose.evidence.moments import centred
+from suite.diagnose.verdict.view_gap import closed_share, fit_black_box, inputs_of, judge
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
 

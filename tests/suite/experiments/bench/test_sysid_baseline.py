@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.noise import noise_of
-from suite.diagnose.fit.model import RolloutModel
-from suite.diagnose.fit.normal_equations import half_widths95, start_estimate
+from suite.diagnose.estimate.intervals import half_widths95
+from suite.diagnose.evidence.rollout_fit import start_estimate
+from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.experiments.bench import diagnose, sysid_baseline
 from suite.experiments.bench.rigid_body import REFITTED, make_task
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.views.change.chance import chance_of
-from suite.diagnose.views.fit.compare import ViewData
-from suite.diagnose.views.fit.weigh import Weights, weighed
+from suite.diagnose.change.chance import chance_of
+from suite.diagnose.evidence.moments import ViewData
+from suite.diagnose.evidence.weigh import Weights, weighed
 
 FREEDOM = 12
 SIZES = np.random.default_rng(0).chisquare(FREEDOM, (999, 3)) / FREEDOM

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.fit.parameters import candidates, make_space
+from suite.diagnose.change.chance import RotorSpread, rotor_spread
+from suite.diagnose.change.reference import search_change
+from suite.diagnose.data.flights import ready
+from suite.diagnose.data.view import FORCE, TORQUE
+from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.view_equations import ViewTask
 from suite.diagnose.thresholds import THRESHOLDS
-from suite.diagnose.views.change.reference import search_change
-from suite.diagnose.views.change.rotor_spread import RotorSpread, rotor_spread
-from suite.diagnose.views.data.flights import ready
-from suite.diagnose.views.data.view import FORCE, TORQUE
-from suite.diagnose.views.fit.equations import ViewTask
-from suite.diagnose.views.fit.model import ForceModel
 from tests.support.real_flights import VEHICLE, flights
 
 SPACE = make_space(VEHICLE)

@@ -3,17 +3,13 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.fit.parameters import candidates, make_space
-from suite.diagnose.views.change.motion_change import (
-    own_changes,
-    search_motion_change,
-    within_flights,
-)
-from suite.diagnose.views.data.flights import ready
-from suite.diagnose.views.data.view import FORCE
-from suite.diagnose.views.fit.compare import ViewData
-from suite.diagnose.views.fit.equations import ViewTask
-from suite.diagnose.views.fit.model import ForceModel
+from suite.diagnose.change.motion_change import own_changes, search_motion_change, within_flights
+from suite.diagnose.data.flights import ready
+from suite.diagnose.data.view import FORCE
+from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.moments import ViewData
+from suite.diagnose.evidence.view_equations import ViewTask
 from tests.support.real_flights import VEHICLE, flights
 
 SPACE = make_space(VEHICLE)

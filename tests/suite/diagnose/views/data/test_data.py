@@ -8,13 +8,13 @@ import pytest
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import MotorMap
+from suite.diagnose.data.completed import completed
+from suite.diagnose.data.flights import parted, ready
+from suite.diagnose.data.rotors import acting_rotors
+from suite.diagnose.data.rows import rows_of
+from suite.diagnose.data.view import FORCE, TORQUE, smoothed
+from suite.diagnose.data.weak_form import weak_form
 from suite.diagnose.thresholds import THRESHOLDS
-from suite.diagnose.views.data.completed import completed
-from suite.diagnose.views.data.flights import parted, ready
-from suite.diagnose.views.data.rotors import acting_rotors
-from suite.diagnose.views.data.rows import rows_of
-from suite.diagnose.views.data.view import FORCE, TORQUE, smoothed
-from suite.diagnose.views.data.weak_form import weak_form
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
 

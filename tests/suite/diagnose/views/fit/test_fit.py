@@ -3,24 +3,23 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.fit.composites import composites
-from suite.diagnose.fit.parameters import Candidate, candidates, make_space
-from suite.diagnose.thresholds import THRESHOLDS
-from suite.diagnose.views.data.flights import ready
-from suite.diagnose.views.data.view import FORCE, TORQUE
-from suite.diagnose.views.fit.by_flight import centred, means_of, units_of
-from suite.diagnose.views.fit.compare import ViewData, compare
-from suite.diagnose.views.fit.equations import (
+from suite.diagnose.data.flights import ready
+from suite.diagnose.data.view import FORCE, TORQUE
+from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
+from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.moments import ViewData, centred, compare, means_of, units_of
+from suite.diagnose.evidence.view_equations import (
     ViewTask,
     chi2_by_flight,
     half_widths,
     in_means,
     look,
 )
-from suite.diagnose.views.fit.model import ForceModel
-from suite.diagnose.views.fit.plausible import at_bound, implausible, usual_first
-from suite.diagnose.views.fit.search import search_view
-from suite.diagnose.views.fit.weigh import Weights, blocks_of, equations_of, weighed, weights_of
+from suite.diagnose.evidence.weigh import Weights, blocks_of, equations_of, weighed, weights_of
+from suite.diagnose.search.composites import composites
+from suite.diagnose.search.plausible import at_bound, implausible, usual_first
+from suite.diagnose.search.view_search import search_view
+from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
 

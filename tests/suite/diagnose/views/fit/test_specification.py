@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
+from suite.diagnose.evidence.moments import ViewData
+from suite.diagnose.search.specification import changes_of, fast_share, holds_at_any_speed
 from suite.diagnose.thresholds import THRESHOLDS
-from suite.diagnose.views.fit.compare import ViewData
-from suite.diagnose.views.fit.specification import changes_of, fast_share, holds_at_any_speed
 
 ROWS, STEP_S = 1200, 0.05
 

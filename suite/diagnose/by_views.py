@@ -1,0 +1,368 @@
+"""From real flights to what they say that a vehicle file lacks, one view at a time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.change.chance import RotorSpread, rotor_spread
+from suite.diagnose.change.motion_change import search_motion_change
+from suite.diagnose.change.reference import changed_task, search_change
+from suite.diagnose.data.flights import ViewFlights, parted, ready
+from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.data.view import FORCE, View
+from suite.diagnose.estimate.parameters import (
+    ParameterSpace,
+    candidates,
+    indices_of,
+    make_space,
+    with_fitted,
+)
+from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.view_equations import ViewTask, fitted, half_widths, left_of, look
+from suite.diagnose.evidence.weigh import weights_of
+from suite.diagnose.search.composites import composites
+from suite.diagnose.search.plausible import implausible
+from suite.diagnose.search.view_search import ViewName, ViewSearch, search_view
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.relevance import EffectSize, Negligible, view_size
+from suite.diagnose.verdict.rotor_lag import LAG, RotorLag, another_lag
+from suite.diagnose.verdict.swing import Swing, swing_left
+from suite.diagnose.verdict.view_gap import ViewGap, judge
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """What one view found."""
+
+    view: View
+    search: ViewSearch
+    held: ViewTask
+    """The flights that took no part in it."""
+    gap: ViewGap
+    names: tuple[ViewName, ...]
+    """What of the search's names stands, beside the other views'."""
+    half_width: dict[int, float]
+    """Of the 95 % interval, by the place of each named number."""
+    negligible: tuple[Negligible, ...] = ()
+    """What is significant and too small to matter."""
+
+    def left(self, by_axis: np.ndarray, limits: Thresholds) -> float:
+        """Return the share of the variance that is left, 0 where that is too little to matter."""
+        share = self.gap.share(by_axis)
+        rms = float(np.sqrt(share * self.gap.variance.sum()))
+        size = EffectSize(rms, 0.0, None) if self.view.in_world else EffectSize(0.0, rms, None)
+        return share if size.relevant(limits) else 0.0
+
+    def size(self, names: Sequence[ViewName]) -> tuple[EffectSize, EffectSize]:
+        """Return what `names` do together in this view, and the upper end of its interval."""
+        at = sorted({i for name in names for i in name.candidate.indices})
+        last = self.search.last
+        slope, away = last.data.slope[..., at], (last.theta - self.search.first.theta)[at]
+        wide = np.array([self.half_width[i] for i in at])
+        doubt = np.sqrt(((slope * wide) ** 2).sum(axis=-1))
+        inside = self.view.in_world
+        size, more = view_size(slope @ away, inside), view_size(doubt, inside)
+        return size, EffectSize(size.force + more.force, size.torque + more.torque, None)
+
+
+@dataclass(frozen=True)
+class ViewsDiagnosis:
+    """What the views of real flights found."""
+
+    verdict: str
+    """no_gap, named, partly or unknown."""
+    results: tuple[ViewResult, ...]
+    """By view, in their order."""
+    space: ParameterSpace
+    flights: ViewFlights
+    held_out: list[str]
+    """Names of what took no part in finding or fitting."""
+    vehicle: Vehicle
+    """With what was named."""
+    spread: RotorSpread | None
+    """How the reference flights differ; None without."""
+    references: tuple[str, ...]
+    """Names of the reference flights."""
+    warnings: list[str]
+    seconds: float
+    swing: Swing | None = None
+    """In what the force view leaves with its names."""
+    lag: RotorLag | None = None
+    """Of the rotors, where it is not the given vehicle's."""
+
+    @property
+    def main(self) -> ViewResult:
+        """The view that says most: one that names something, else one where most can be said."""
+        return max(
+            self.results,
+            key=lambda one: (bool(one.names), one.gap.share(one.gap.explainable)),
+        )
+
+    @property
+    def named(self) -> list[tuple[ViewResult, ViewName]]:
+        """Every name that stands, with its view."""
+        return [(result, name) for result in self.results for name in result.names]
+
+
+def diagnose_by_views(
+    logs: Sequence[FlightLog],
+    vehicle: Vehicle,
+    references: Sequence[FlightLog] = (),
+    say: Callable[[str], None] = lambda _: None,
+    seed: int = 0,
+    limits: Thresholds = THRESHOLDS,
+) -> ViewsDiagnosis:
+    """Find what explains how `logs` differ from `vehicle`, or from `references` of it.
+
+    Args:
+        logs: flights, partial ones too; a fifth of them, at least one, is held out (of a lone
+            flight the last 30 %).
+        vehicle: what a simulation uses.
+        references: flights of the same vehicle before what changed.
+        say: told of the steps.
+        seed: of the null's draws.
+        limits: of every step.
+
+    Raises:
+        ValueError: for flights that cannot be used, or a lone reference flight.
+    """
+    began = time.monotonic()
+    flights = ready(logs, vehicle, limits)
+    logs = [logs[k] for k in flights.kept]
+    space = make_space(vehicle)
+    voltage = all(log.voltage is not None for log in [*logs, *references])
+    model = ForceModel(vehicle, space, voltage)
+    among = candidates(space, voltage, ())
+    whole = not any(log.partial for log in [*logs, *references])
+    known, spread, left_out = _reference_tasks(flights, model, vehicle, references, limits)
+    say(f"views: {', '.join(view.about for view in flights.views)}; by {flights.source}")
+    held_numbers, held_names = _held(logs, flights, model, limits)
+    inside, held = parted(flights, held_numbers, limits)
+    results = []
+    for view in flights.views:
+        task = ViewTask(view, model, inside[view.name], limits)
+        if known and spread:
+            found = search_change(known[view.name], task.flights, spread, among, seed)
+            apart = changed_task(known[view.name], found.first.theta, held[view.name])
+            apart = apart._replace(means=True)
+            if whole and not found.named:
+                moved = search_motion_change(known[view.name], task, among)
+                if moved:
+                    found, apart = moved, task._replace(flights=held[view.name])
+        else:
+            found = search_view(task, [*among, *composites(among)], seed)
+            apart = task._replace(flights=held[view.name])
+        gap = judge(found, apart, flights.floor[view.name])
+        widths = half_widths(found.last, found.indices) if found.named else []
+        width = dict(zip(found.indices, map(float, widths), strict=True))
+        result = ViewResult(view, found, apart, gap, found.named, width)
+        results.append(result if known else _relevant(result, limits))
+        told = ", ".join(name.candidate.label for name in found.named) or "nothing"
+        say(f"{view.name}: {told}; {100 * gap.share(gap.closed):.0f} % of the variance closed, "
+            f"{100 * gap.share(gap.explainable):.0f} % by a black box")  # fmt: skip
+    results, withdrawn = _confirmed(tuple(results))
+    results, told = _one_cause(results)
+    warnings = [*flights.notes, *left_out, *withdrawn, *told]
+    warnings += [
+        f"{one.name}: left out, too small to matter: {one.size.words()}"
+        for result in results
+        for one in result.negligible
+    ]
+    for result in results:
+        for name in result.names:
+            far = implausible(space, result.search.last.theta, name.candidate, limits)
+            warnings += [f"implausible: {one}, beyond three times what is usual" for one in far]
+    swing = None
+    for result in results:
+        if result.view.name == FORCE.name and not references:
+            every = ViewTask(result.view, model, flights.smoothed[FORCE.name], limits)
+            swing = swing_left(every, result.search.last.theta)
+    lag = None if references else another_lag(logs, vehicle, limits)
+    if lag:
+        say(f"commands and rotor speeds: {LAG}, {lag.time_constant:.3g} s")
+    return ViewsDiagnosis(
+        verdict=_verdict(results, swing, lag, limits),
+        results=results,
+        space=space,
+        flights=flights,
+        held_out=held_names,
+        vehicle=_with_names(vehicle, space, results, lag),
+        spread=spread,
+        references=tuple(log.name for log in references),
+        warnings=warnings,
+        seconds=time.monotonic() - began,
+        swing=swing,
+        lag=lag,
+    )
+
+
+def _reference_tasks(
+    flights: ViewFlights,
+    model: ForceModel,
+    vehicle: Vehicle,
+    references: Sequence[FlightLog],
+    limits: Thresholds,
+) -> tuple[dict[str, ViewTask], RotorSpread | None, tuple[str, ...]]:
+    """Return the reference flights' task by view, how they differ, and which were left out."""
+    if not references:
+        return {}, None, ()
+    before = ready(references, vehicle, limits)
+    if len(before.names) < 2:
+        raise ValueError(
+            "; ".join(
+                [
+                    f"--reference has {len(before.names)} flight; at least 2 are needed, better 3: "
+                    "how flights of one vehicle differ is taken from them",
+                    *before.notes,
+                ]
+            )
+        )
+    if before.views != flights.views or before.source != flights.source:
+        raise ValueError(
+            f"the reference flights are driven by {before.source} and allow "
+            f"{', '.join(view.name for view in before.views)}, the others by {flights.source} and "
+            f"{', '.join(view.name for view in flights.views)}: log both alike"
+        )
+    tasks = {
+        view.name: ViewTask(view, model, before.smoothed[view.name], limits)
+        for view in flights.views
+    }
+    after = [task._replace(flights=flights.smoothed[name]) for name, task in tasks.items()]
+    return tasks, rotor_spread([*tasks.values(), *after]), before.notes
+
+
+def _held(
+    logs: Sequence[FlightLog], flights: ViewFlights, model: ForceModel, limits: Thresholds
+) -> tuple[list[int], list[str]]:
+    """Return the numbers and the names of the flights that are held out."""
+    view = flights.views[0]
+    task = ViewTask(view, model, flights.smoothed[view.name], limits)
+    start = model.space.array("start")
+    first = look(task, start, weights_of(left_of(task, start), limits))
+    told = np.einsum("bkk->bk", first.block.hessian)
+    _, names = choose_held_out(logs, first.flight, np.zeros(len(told)), told, limits)
+    return [k for k, log in enumerate(logs) if log.name in names], names
+
+
+def _confirmed(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...], list[str]]:
+    """Return the results without names that make held-out flights worse, and warnings of them."""
+    kept, warnings = [], []
+    for one in results:
+        gap = one.gap
+        # Each flight's own trim weighs more on a lighter body: what is closed within flights counts
+        # as well, unless means are all that is looked at.
+        worse = gap.rms(gap.after) >= gap.rms(gap.before)
+        if one.names and worse and (one.held.means or gap.share(gap.closed) <= 0.0):
+            labels = ", ".join(name.candidate.label for name in one.names)
+            warnings.append(
+                f"{one.view.name}: {labels}: withdrawn, held-out flights are no better for it"
+            )
+            nothing = replace(one.search, named=(), last=one.search.first)
+            gap = judge(nothing, one.held, gap.floor)
+            one = replace(one, search=nothing, gap=gap, names=(), half_width={})
+        kept.append(one)
+    return tuple(kept), warnings
+
+
+def _relevant(result: ViewResult, limits: Thresholds) -> ViewResult:
+    """Return the result without names that do too little to matter on these flights."""
+    by_effect: dict[str, list[ViewName]] = {}
+    for name in result.names:
+        by_effect.setdefault(name.candidate.name, []).append(name)
+    sizes = {effect: result.size(names) for effect, names in by_effect.items()}
+    small = [effect for effect, (_, most) in sizes.items() if not most.relevant(limits)]
+    if not small:
+        return result
+    kept = tuple(name for name in result.names if name.candidate.name not in small)
+    task, theta = result.search.task, result.search.last.theta.copy()
+    gone = [i for n in result.names if n not in kept for i in n.candidate.indices]
+    theta[gone] = result.search.first.theta[gone]
+    last = look(task, theta, result.search.last.weights)
+    last = fitted(task, last, indices_of([name.candidate for name in kept]))
+    search = replace(result.search, named=kept, last=last)
+    return replace(
+        result,
+        search=search,
+        gap=judge(search, result.held, result.gap.floor),
+        names=kept,
+        negligible=tuple(Negligible(effect, sizes[effect][0]) for effect in small),
+    )
+
+
+def _one_cause(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...], list[str]]:
+    """Return the results with one cause where one view's name could stand for another's.
+
+    Of a candidate that two views name the one that knows its size better stands.
+    """
+    kept, told = list(results), list[str]()
+    for i, one in enumerate(kept):
+        for j, other in enumerate(kept):
+            if i == j:
+                continue
+            names = {name.candidate.name for name in other.names}
+            stays = []
+            for name in kept[i].names:
+                same = [n for n in other.names if n.candidate == name.candidate]
+                if same and _relative(other, name) < _relative(one, name):
+                    told.append(f"{name.candidate.label}: named by {one.view.name} as well")
+                elif not same and set(name.rivals) & names:
+                    cause = ", ".join(sorted(set(name.rivals) & names))
+                    told.append(
+                        f"{one.view.name}: {name.candidate.label} cannot be told from {cause}, "
+                        f"which {other.view.name} names"
+                    )
+                else:
+                    stays.append(name)
+            kept[i] = replace(kept[i], names=tuple(stays))
+    return tuple(kept), told
+
+
+def _relative(result: ViewResult, name: ViewName) -> float:
+    """Return the width of a name's numbers over their size."""
+    at = list(name.candidate.indices)
+    away = np.abs(result.search.last.theta[at] - result.search.first.theta[at])
+    return float(np.mean([result.half_width[i] for i in at]) / max(away.mean(), 1e-12))
+
+
+def _verdict(
+    results: Sequence[ViewResult], swing: Swing | None, lag: RotorLag | None, limits: Thresholds
+) -> str:
+    """Return what is said of the gap: what is named is judged by the views that name something.
+
+    Nothing that is fitted swings. A lag of the rotors is in no view.
+    """
+    named = [one for one in results if one.names]
+    if swing:
+        return "partly" if named or lag else "unknown"
+    if named:
+        left = [one.left(one.gap.left, limits) for one in named]
+        return "named" if max(left) <= limits.view_left_share else "partly"
+    could = [one.left(one.gap.explainable, limits) for one in results]
+    if max(could) > limits.view_left_share:
+        return "partly" if lag else "unknown"
+    return "named" if lag else "no_gap"
+
+
+def _with_names(
+    vehicle: Vehicle,
+    space: ParameterSpace,
+    results: Sequence[ViewResult],
+    lag: RotorLag | None,
+) -> Vehicle:
+    """Return `vehicle` with what was named, the lag too, in place of what it has of it."""
+    theta = space.array("start")
+    names = []
+    for one in results:
+        for name in one.names:
+            at = list(name.candidate.indices)
+            theta[at] = one.search.last.theta[at]
+            names.append(name.candidate.name)
+    besides = {LAG: EFFECTS[LAG].values(lag.time_constant)} if lag else None
+    return with_fitted(vehicle, space, theta, names, besides)

@@ -1,0 +1,1 @@
+"""What stands next to the names: log consistency, actuators, conditions, a black box."""

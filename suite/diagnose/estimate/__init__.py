@@ -1,0 +1,1 @@
+"""Numbers, their fit, intervals and chance."""

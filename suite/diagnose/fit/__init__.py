@@ -1,1 +1,0 @@
-"""The model, its normal equations, and the search for what is missing."""

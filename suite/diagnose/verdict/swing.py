@@ -1,0 +1,214 @@
+"""A force that swings: what a load that hangs on a line leaves of every model without one.
+
+What the force view leaves across the vertical has a narrow peak in its spectrum then, at one period
+in all flights, whatever was flown. A flight's own motion makes peaks as well, wherever a model is
+wrong: but then the force that is left is a small share of the acceleration at that period, while a
+load's pull is what moves the vehicle there. Spectra are compared by their likelihood (Whittle 1953)
+with and without a peak on a smooth background.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from eval.effects.interface import GRAVITY
+from suite.diagnose.data.view import SmoothedFlight
+from suite.diagnose.evidence.view_equations import ViewTask, left_of
+from suite.diagnose.search.rivals import flights_agree
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+
+STEP_HZ = 0.01
+"""Between the frequencies that are tried [Hz]."""
+BAND_HZ = (0.15, 3.0)
+"""Of the spectra that are looked at [Hz]."""
+CORNERS_HZ = (0.2, 0.5, 1.2)
+"""Of the smooth backgrounds that fall with frequency [Hz]."""
+WIDTHS = (0.03, 0.1)
+"""Half widths of a peak that are tried, over its frequency [1]."""
+HANN_BINS = 1.5
+"""Width of a Hann window's line, and how many bins tell as much as one that is independent."""
+ROUNDS = 60
+"""Of the fits of a spectrum."""
+
+
+class Swing(NamedTuple):
+    """A force that swings."""
+
+    period_s: float
+    ci95: tuple[float, float]
+    """Of the period [s]."""
+    share: float
+    """Of the power that is left between `BAND_HZ` [1]."""
+    p_value: float
+    """After Bonferroni over all periods."""
+
+    @property
+    def length_m(self) -> float:
+        """Return the length of a pendulum with this period [m], g T^2 / 4 pi^2."""
+        return GRAVITY * self.period_s**2 / (4.0 * np.pi**2)
+
+    @property
+    def words(self) -> str:
+        """Return what is said of it, and what a vehicle file needs to fly with it."""
+        low, high = self.ci95
+        return (
+            f"swings with {self.period_s:.2f} s period (95 % {low:.2f} to {high:.2f}), "
+            f"as a load on a line of {self.length_m:.2g} m would (to fly it, weigh the load and "
+            f"write mass and length = {self.length_m:.2g} into [effects.slung_load])"
+        )
+
+
+class Spectrum(NamedTuple):
+    """Power of one flight by frequency, both horizontal axes together."""
+
+    frequency_hz: np.ndarray
+    """(J,)."""
+    left: np.ndarray
+    """(J,) of the force that is left."""
+    moved: np.ndarray
+    """(J,) of the measured acceleration."""
+    width_hz: float
+    """Of a line."""
+
+
+def swing_left(task: ViewTask, theta: np.ndarray) -> Swing | None:
+    """Return the swing in what `task`, of the force view, leaves at the numbers `theta` (P,)."""
+    if not {0, 1} <= set(task.view.axes):
+        return None
+    data = left_of(task, theta)
+    left_b = [data.residual[data.flight == number] for number in range(len(task.flights))]
+    return find_swing(task.flights, left_b, task.limits)
+
+
+def find_swing(
+    flights: Sequence[SmoothedFlight],
+    left_b: Sequence[np.ndarray],
+    limits: Thresholds = THRESHOLDS,
+) -> Swing | None:
+    """Return the swing in what a model leaves of `flights`; None where there is none.
+
+    Args:
+        flights: of the force view.
+        left_b: what it leaves of each, (M, 3) body axes [m/s^2].
+        limits: what counts as sure.
+    """
+    pairs = zip(flights, left_b, strict=True)
+    spectra = [one for flight, left in pairs if (one := _spectrum(flight, left)) is not None]
+    if not spectra:
+        return None
+    longest, shortest = limits.swing_periods_s[1], limits.swing_periods_s[0]
+    tried = np.arange(1.0 / longest, 1.0 / shortest + STEP_HZ, STEP_HZ)
+    gains, heights = zip(*(_gains(one, tried) for one in spectra), strict=True)
+    each = np.array(gains)  # (F, widths, frequencies)
+    total = each.sum(axis=0)
+    width, at = np.unravel_index(int(total.argmax()), total.shape)
+    if not flights_agree(each[:, width, at]):
+        return None
+    most = float(total[width, at])
+    independent = (tried[-1] - tried[0]) / np.mean([one.width_hz for one in spectra])
+    chance = float(chi2.sf(2.0 * most, 2 * len(spectra))) * independent * len(WIDTHS)
+    centre = float(tried[at])
+    driven, share = _about(spectra, centre, [one[width, at] for one in heights])
+    if chance > limits.swing_p_value or share < limits.swing_share or driven < limits.swing_driven:
+        return None
+    near = tried[total[width] >= most - limits.profile_fall]
+    near = near[np.abs(near - centre) < 0.5 * centre]
+    low, high = near.min() - STEP_HZ, near.max() + STEP_HZ
+    return Swing(1.0 / centre, (1.0 / high, 1.0 / low), share, min(chance, 1.0))
+
+
+def _spectrum(flight: SmoothedFlight, left_b: np.ndarray) -> Spectrum | None:
+    """Return the spectrum of one flight; None where it is too short for one."""
+    middle = flight.form.middle_s
+    if len(middle) < 8:
+        return None
+    step = float(np.median(np.diff(middle)))
+    place = np.round((middle - middle[0]) / step).astype(int)
+    count = int(place[-1]) + 1
+    if count * step * BAND_HZ[0] < 1.0 or len(middle) < 0.7 * count:
+        return None
+    rot_w = np.asarray(flight.rows.rot_w)[flight.form.middle_row]
+    left_w = (rot_w @ left_b[..., None])[..., 0][:, :2]
+    yaw = np.arctan2(rot_w[:, 1, 0], rot_w[:, 0, 0])
+    since = np.linspace(-1.0, 1.0, len(middle))
+    # A push that turns with the heading, or creeps, is no swing.
+    zero, one = np.zeros_like(since), np.ones_like(since)
+    steady = np.stack(
+        [
+            np.stack([one, zero, since, zero, np.cos(yaw), -np.sin(yaw)], axis=1),
+            np.stack([zero, one, zero, since, np.sin(yaw), np.cos(yaw)], axis=1),
+        ],
+        axis=1,
+    )
+    powers = []
+    for series in (left_w, flight.measured[:, :2]):
+        columns = steady.reshape(-1, steady.shape[-1])
+        fit = np.linalg.lstsq(columns, series.reshape(-1), rcond=None)[0]
+        even = np.zeros((count, 2))
+        even[place] = series - steady @ fit
+        window = np.hanning(count)[:, None]
+        lines = np.fft.rfft(even * window, axis=0) / np.sqrt((window**2).sum())
+        powers.append((np.abs(lines) ** 2).sum(axis=1))
+    frequency = np.fft.rfftfreq(count, step)
+    inside = (frequency >= BAND_HZ[0]) & (frequency <= BAND_HZ[1])
+    if inside.sum() < 12:
+        return None
+    left, moved = (power[inside] for power in powers)
+    return Spectrum(frequency[inside], left, moved, HANN_BINS / (count * step))
+
+
+def _gains(one: Spectrum, tried_hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a peak at each frequency gains in log-likelihood, and its height.
+
+    Both are (widths, frequencies).
+    """
+    frequency = one.frequency_hz
+    smooth = [np.ones_like(frequency), frequency**2]
+    smooth += [1.0 / (1.0 + (frequency / corner) ** 2) ** 2 for corner in CORNERS_HZ]
+    background = np.stack(smooth)
+    without, _ = _fitted(one.left, background[None])
+    shapes = []
+    for width in WIDTHS:
+        half = np.hypot(width * tried_hz, 0.5 * one.width_hz)[:, None]
+        shapes.append(1.0 / (1.0 + ((frequency - tried_hz[:, None]) / half) ** 2) ** 2)
+    peaks = np.concatenate(shapes)[:, None]
+    whole = np.concatenate([np.broadcast_to(background, (len(peaks), *background.shape)), peaks], 1)
+    with_it, weights = _fitted(one.left, whole)
+    shape = (len(WIDTHS), len(tried_hz))
+    return (with_it - without).reshape(shape), weights[:, -1].reshape(shape)
+
+
+def _fitted(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the log-likelihood (C,) of sums of `shapes` (C, T, J), and their weights (C, T).
+
+    Power (J,) of two axes is twice an exponential variable about its mean; the weights are raised
+    and lowered in turn (Itakura and Saito's distance; Fevotte, Bertin and Durrieu 2009).
+    """
+    scale = shapes.mean(axis=2, keepdims=True)
+    unit = shapes / scale
+    weights = np.full(unit.shape[:2], float(power.mean()) / unit.shape[1])
+    for _ in range(ROUNDS):
+        said = np.einsum("ct,ctj->cj", weights, unit)
+        up = np.einsum("ctj,cj->ct", unit, power / said**2)
+        weights = weights * np.sqrt(up / np.einsum("ctj,cj->ct", unit, 1.0 / said))
+    said = np.einsum("ct,ctj->cj", weights, unit)
+    likelihood = -(2.0 / HANN_BINS) * (np.log(said) + power / said).sum(axis=1)
+    return likelihood, weights / scale[..., 0]
+
+
+def _about(
+    spectra: Sequence[Spectrum], centre_hz: float, heights: Sequence[float]
+) -> tuple[float, float]:
+    """Return the force that is left over the acceleration at a frequency, and the peak's share."""
+    left = moved = peak = whole = 0.0
+    for one, height in zip(spectra, heights, strict=True):
+        inside = np.abs(one.frequency_hz - centre_hz) <= one.width_hz
+        left += float(one.left[inside].sum())
+        moved += float(one.moved[inside].sum())
+        peak += float(np.minimum(height, one.left[inside]).sum())
+        whole += float(one.left.sum())
+    return float(np.sqrt(left / max(moved, 1e-12))), peak / max(whole, 1e-12)

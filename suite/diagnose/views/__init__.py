@@ -1,1 +1,0 @@
-"""Views of real flights: force and torque, each under what was measured of the rest."""

@@ -1,1 +1,0 @@
-"""Real flights made ready: completed, driven, smoothed."""

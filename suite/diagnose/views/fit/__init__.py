@@ -1,1 +1,0 @@
-"""What flights agree on: the model on their rows, its equations, searches for names."""
