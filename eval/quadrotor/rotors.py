@@ -2,7 +2,7 @@
 
 A delay that is no multiple of the step makes a step's command the mean of the two that share it,
 so that a delay has a gradient. A flight whose commands are all known needs no memory of them: the
-diagnosis takes means over its own steps (`suite/diagnose/fit/rollout.py`).
+diagnosis takes means over its own steps (`suite/diagnose/evidence/rollout.py`).
 """
 
 from __future__ import annotations

@@ -1,0 +1,90 @@
+"""How large an effect is on these flights, in units of practice; what is too small to matter."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from suite.diagnose.data.windows import SLICES
+from suite.diagnose.thresholds import Thresholds
+from suite.diagnose.verdict.gap import Gap
+from suite.diagnose.verdict.relevance import (
+    EffectSize,
+    gap_matters,
+    rollout_size,
+    sizes_of,
+    view_size,
+)
+
+LIMITS = Thresholds()
+
+
+def windows(until_s=1.0, without=()):
+    """Three windows of 101 rows, of which those up to a time have everything but some groups."""
+    row_s = np.tile(np.linspace(0.0, 1.0, 101), (3, 1))
+    seen = np.ones((3, 101, 19), bool) & (row_s <= until_s)[..., None]
+    for group in without:
+        seen[..., SLICES[group]] = False
+    found: Any = SimpleNamespace(row_s=row_s, seen=seen)
+    return found
+
+
+def pushed(acc=0.0, turn=0.0):
+    """What a held acceleration along x and a held turning about y move in a second."""
+    time = np.linspace(0.0, 1.0, 101)
+    moved = np.zeros((3, 101, 19))
+    moved[..., 0], moved[..., 6], moved[..., 10] = 0.5 * acc * time**2, acc * time, turn * time
+    return moved
+
+
+@pytest.mark.parametrize("until_s", [1.0, 0.25])
+@pytest.mark.parametrize("without", [(), ("velocity",)])
+def test_a_held_push_has_its_own_size_however_long_a_stretch_is_trusted(until_s, without):
+    size = rollout_size(pushed(0.08, 0.7), windows(until_s, (*without, "accelerometer")))
+    assert size.force == pytest.approx(0.08) and size.torque == pytest.approx(0.7)
+    assert size.drift == pytest.approx(0.04)
+
+
+def test_a_bias_of_the_accelerometer_counts_as_a_force():
+    moved = np.zeros((3, 101, 19))
+    moved[..., 12] = 0.06
+    assert rollout_size(moved, windows()).force == pytest.approx(0.06)
+    assert rollout_size(moved, windows(without=("accelerometer",))).force == 0.0
+
+
+def test_the_upper_end_of_a_size_holds_what_the_interval_allows():
+    slope = pushed(1.0)[..., None]
+    size, upper = sizes_of(slope, np.array([0.03]), np.array([0.01]), windows())
+    assert size.force == pytest.approx(0.03) and upper.force == pytest.approx(0.04)
+    assert not upper.relevant(LIMITS)
+    _, unsure = sizes_of(slope, np.array([0.03]), np.array([0.03]), windows())
+    assert unsure.relevant(LIMITS), "a small effect that may be large is no finding of none"
+
+
+@pytest.mark.parametrize(
+    "size", [EffectSize(0.05, 0, 0), EffectSize(0, 0.5, None), EffectSize(0, 0, 0.025)]
+)
+def test_one_threshold_is_enough_and_none_at_all_keeps_everything(size):
+    assert size.relevant(LIMITS)
+    below = EffectSize(*(0.99 * (value or 0.0) for value in size))
+    assert not below.relevant(LIMITS) and below.relevant(Thresholds(relevance=(0.0, 0.0, 0.0)))
+
+
+def test_a_views_size_is_in_its_own_unit():
+    moved = np.tile([0.3, 0.0, 0.4], (5, 1))
+    assert view_size(moved, True) == EffectSize(pytest.approx(0.5), 0.0, None)
+    assert view_size(moved, False) == EffectSize(0.0, pytest.approx(0.5), None)
+
+
+def test_a_gap_matters_beyond_its_noise_by_more_than_the_thresholds():
+    def gap(error, floor):
+        table = {h: dict.fromkeys(("position", "velocity", "rates"), (error, floor))
+                 for h in (0.1, 0.5, 1.0)}  # fmt: skip
+        return Gap(np.ones(4), np.ones(4), table)
+
+    assert not gap_matters(gap(0.004, 0.001), 400, LIMITS)
+    assert gap_matters(gap(0.04, 0.001), 400, LIMITS)
+    assert not gap_matters(gap(0.04, 0.05), 400, LIMITS)
+    assert gap_matters(gap(0.04, 0.04), 4, LIMITS), "few rollouts cannot say that it is small"
+    assert gap_matters(gap(0.0, 0.0), 400, Thresholds(relevance=(0.0, 0.0, 0.0)))
