@@ -11,7 +11,7 @@ from suite.diagnose.checks.checks import Checks
 from suite.diagnose.data.windows import UNITS
 from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
 from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
-from suite.diagnose.report.parameters_json import cells, components, grid, short_name
+from suite.diagnose.report.parameters_json import cells, components, grid, short_name, size_words
 from suite.diagnose.report.result_sections import held_out_section, residual_section
 from suite.diagnose.search.composites import in_words
 from suite.diagnose.verdict.diagnosis import Diagnosis
@@ -109,6 +109,7 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
         f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
         for effect in found["effects"]
     ]
+    words += [f"{size_words(effect)}." for effect in found["effects"]]
     words += in_words([(e["name"], *e["alternatives"]) for e in found["effects"]])
     note = (
         "Values are totals: what the vehicle file had of an effect is replaced. Of the gap: the "

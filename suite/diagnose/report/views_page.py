@@ -14,7 +14,7 @@ from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.by_views import ViewsDiagnosis
 from suite.diagnose.evidence.view_equations import left_of
 from suite.diagnose.report.charts import AFTER, BEFORE, FLOOR
-from suite.diagnose.report.parameters_json import components, grid
+from suite.diagnose.report.parameters_json import components, grid, size_words
 from suite.diagnose.search.composites import in_words
 from tracks.common.grid import Grid
 
@@ -117,6 +117,7 @@ def _answer(told: Mapping[str, Any]) -> list[Part]:
         f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
         for effect in told["effects"]
     ]
+    words += [f"{size_words(effect)}." for effect in told["effects"]]
     words += in_words([(e["name"], *e["alternatives"]) for e in told["effects"]])
     headers = ["effect", "not distinguishable from", "view", "parameter", "total", "95 %"]
     note = "Totals: what the vehicle file had of an effect is replaced. 95 % with flights as draws."
