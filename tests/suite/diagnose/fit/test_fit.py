@@ -97,7 +97,7 @@ def test_what_the_start_explains_is_projected_out(flown):
     sigma = np.where(windows.seen.any(axis=(0, 1)), 0.01, np.nan)
     whitening = make_whitening(linear, Noise(sigma, {}), windows)
     moved = np.random.default_rng(0).standard_normal((len(windows.flight), STATE))
-    slope = linear.slope[..., -STATE:]
+    slope = linear.start_slope
     by_start = np.einsum("wnck,wk->wnc", slope, moved)[..., None]
     left = project_out_start(whitening, whiten(whitening, by_start))
     assert np.abs(left).max() < 1e-6 * np.abs(whiten(whitening, by_start)).max()
