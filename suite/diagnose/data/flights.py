@@ -12,9 +12,17 @@ from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.checks.actuators import wrench_difference
 from suite.diagnose.data.completed import completed
 from suite.diagnose.data.rotors import ActingRotors, acting_rotors
-from suite.diagnose.data.rows import FlightRows, rows_of
 from suite.diagnose.data.sampling import on_every_row
-from suite.diagnose.data.view import FORCE, TORQUE, SmoothedFlight, View, calibrated, smoothed
+from suite.diagnose.data.view import (
+    FORCE,
+    TORQUE,
+    FlightRows,
+    SmoothedFlight,
+    View,
+    calibrated,
+    rows_of,
+    smoothed,
+)
 from suite.diagnose.data.weak_form import LEAST_ROWS
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 

@@ -10,11 +10,20 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+
+from eval.effects.interface import GRAVITY
+from eval.quadrotor.plant import Command, make_plant
+from eval.quadrotor.stepper import wanted_speed
+from eval.vehicles.vehicle import Vehicle
 
 LONGEST_S = 0.002
 """A step is about so long at most [s]; the integrator's error over a second is far below noise."""
 LOST = 1.75
 """Rows further apart than so many of their usual spacings have lost some between them."""
+
+LEAST_START_ERROR = 1e-3
+"""Rotor speeds at a window's start are never known better than this [rad/s]."""
 
 
 class StepGrid(NamedTuple):
@@ -102,3 +111,53 @@ def _kept(row_s: np.ndarray, shortest_s: float) -> np.ndarray:
     if len(kept) > 1 and row_s[-1] - row_s[kept[-1]] < shortest_s:
         kept.pop()
     return np.array([*kept, len(row_s) - 1])
+
+
+def rotors_at(
+    at_s: np.ndarray,
+    time_s: np.ndarray,
+    speed: np.ndarray,
+    vehicle: Vehicle,
+    smooth: bool,
+    every: int = 1,
+) -> np.ndarray:
+    """Return rotor speeds (S, 4) at `at_s` (S,) [s] from `every` so many of each rotor's own rows.
+
+    Between rows they run along the first-order response to one command. What a firmware's loop
+    asks for changes all the time, by filtered slopes of rates: a `smooth` curve is nearer then.
+    """
+    columns = []
+    for column in speed.T:
+        good = np.flatnonzero(np.isfinite(column))[::every]
+        if smooth:
+            columns.append(CubicSpline(time_s[good], column[good])(at_s))
+            continue
+        row = np.clip(np.searchsorted(time_s[good], at_s, side="right") - 1, 0, len(good) - 2)
+        before, after = good[row], good[row + 1]
+        span, passed = time_s[after] - time_s[before], at_s - time_s[before]
+        lag = max(vehicle.rotors.time_constant, 1e-4)
+        share = (1.0 - np.exp(-passed / lag)) / (1.0 - np.exp(-span / lag))
+        columns.append(column[before] + share * (column[after] - column[before]))
+    return np.stack(columns, axis=1)
+
+
+def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) -> float:
+    """Return the RMS error [rad/s] of rotor speeds that follow commands at measured rates (N, 3).
+
+    Between rows the rates are not known. By how far a line between every second row misses the row
+    in the middle, the loop is asked for other rotor speeds; a line between neighbours misses by a
+    quarter of it where rates are smooth and by about all of it where they are noise: half is taken.
+    """
+    if len(time_s) < 3:
+        return LEAST_START_ERROR
+    share = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
+    missed = rate_b[1:-1] - (rate_b[:-2] + share * (rate_b[2:] - rate_b[:-2]))
+    missed = missed[np.isfinite(missed).all(axis=1)]
+    if not len(missed):
+        return LEAST_START_ERROR
+    plant = make_plant(vehicle, LONGEST_S)
+    hover = Command(np.full(4, GRAVITY), np.zeros((4, 3)))
+    rates = np.concatenate([np.zeros((1, 3)), 0.1 * np.eye(3)])
+    asked = np.asarray(wanted_speed(plant, hover, rates))
+    error = 0.5 * missed @ ((asked[1:] - asked[0]) / 0.1)
+    return max(float(np.sqrt((error**2).mean())), LEAST_START_ERROR)

@@ -1,4 +1,4 @@
-"""Force and torque: what each view compares, flight by flight."""
+"""A flight as rows of what acts and what moves; force and torque, what each compares of them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,80 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.rows import FlightRows
+from eval.effects.interface import GRAVITY
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.sampling import interpolate
 from suite.diagnose.data.weak_form import WeakForm, weak_form
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from tracks.geometry.scene import Array
+
+
+class FlightRows(NamedTuple):
+    """N rows of one flight; those that miss something are filled and not `good`."""
+
+    time_s: Array
+    """(N,) since the flight's first row [s]."""
+    pos_w: Array
+    """(N, 3) [m]."""
+    rot_w: Array
+    """(N, 3, 3) body to world."""
+    vel_w: Array
+    """(N, 3) [m/s]."""
+    rate_b: Array
+    """(N, 3) [rad/s]."""
+    rotor_speed: Array
+    """(N, 4) that act then [rad/s]."""
+    voltage_drop: Array
+    """(N,) battery voltage at the start less now [V]; zeros where there is none."""
+    good: Array
+    """(N,) bool: nothing is missing."""
+
+    @property
+    def vel_b(self) -> Array:
+        """(N, 3) velocity in body axes [m/s]."""
+        return (np.swapaxes(self.rot_w, 1, 2) @ self.vel_w[..., None])[..., 0]
+
+
+def rows_of(
+    log: FlightLog,
+    vehicle: Vehicle,
+    rotor_speed: np.ndarray,
+    limits: Thresholds = THRESHOLDS,
+) -> FlightRows:
+    """Return the rows of `log` under rotors that turn with `rotor_speed` (N, 4) [rad/s].
+
+    Where the rotors of `vehicle` give too little for a flight and it stands still, it stands on the
+    ground: such rows, and those near to them, are not good.
+    """
+    rot_w = log.rot_w
+    parts = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
+    good = np.isfinite(np.concatenate(parts, axis=1)).all(axis=1)
+    good &= np.isfinite(rot_w).all(axis=(1, 2))
+    push = vehicle.rotors.thrust_coefficient * (rotor_speed**2).sum(axis=1)
+    stands = (push < limits.ground_thrust * vehicle.mass * GRAVITY) & (
+        np.linalg.norm(log.vel_w, axis=1) < limits.ground_speed
+    )
+    good &= ~_near(log.time_s, stands, limits.ground_margin_s)
+    drop = np.zeros(len(good))
+    if log.voltage is not None and np.isfinite(log.voltage).any():
+        now = interpolate(log.time_s, log.time_s, log.voltage[:, None])[:, 0]
+        drop = now[0] - now
+    pos_w, vel_w, rate_b, speed = (np.nan_to_num(part) for part in parts)
+    rot_w = np.where(np.isfinite(rot_w), rot_w, np.eye(3))
+    since = log.time_s - log.time_s[0]
+    return FlightRows(since, pos_w, rot_w, vel_w, rate_b, speed, drop, good)
+
+
+def _near(time_s: np.ndarray, marked: np.ndarray, margin_s: float) -> np.ndarray:
+    """Return which rows (N,) are within `margin_s` of one that is `marked` (N,)."""
+    if not marked.any():
+        return marked
+    at = time_s[marked]
+    place = np.searchsorted(at, time_s)
+    before = np.abs(time_s - at[np.maximum(place - 1, 0)])
+    after = np.abs(time_s - at[np.minimum(place, len(at) - 1)])
+    return np.minimum(before, after) <= margin_s
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,21 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.loops import NOMINAL
-from eval.quadrotor.plant import Command, make_plant
-from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import interpolate, longest_gap_s, on_every_row, thinned
-from suite.diagnose.data.steps import LONGEST_S, StepGrid, padded_grid, step_grid, with_lost_rows
+from suite.diagnose.data.steps import (
+    LONGEST_S,
+    StepGrid,
+    padded_grid,
+    rotors_at,
+    start_rotor_error,
+    step_grid,
+    with_lost_rows,
+)
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Array
@@ -39,8 +44,6 @@ COMMANDS = (192, 1536)
 """The same of its commands: rows of 100 Hz, and of 1,000 Hz."""
 ROWS = 101
 """Measured rows in a window; a log that has more of them is thinned."""
-LEAST_START_ERROR = 1e-3
-"""Rotor speeds at a window's start are never known better than this [rad/s]."""
 STATE = 12
 """Numbers of the state in which a window starts: pos_w, rotation vector, vel_w, rate_b."""
 KNOTS = 11
@@ -299,7 +302,8 @@ def _window(
     middle = begin + 0.5 * (window.edge_s[:-1] + window.edge_s[1:])
     speed = np.zeros((len(middle), 4))
     if log.rotor_speed is not None and rotor_input:
-        speed = _rotors(middle, time, log.rotor_speed, vehicle, every)
+        smooth = remembers(vehicle)
+        speed = rotors_at(middle, time, log.rotor_speed, vehicle, smooth, every)
     drop = np.zeros(len(middle))
     if log.voltage is not None and np.isfinite(log.voltage).any():
         first_volt = log.voltage[np.flatnonzero(np.isfinite(log.voltage))[0]]
@@ -349,56 +353,13 @@ def _window(
     )
 
 
-def _start_error(log: FlightLog, begin: float, vehicle: Vehicle) -> float:
-    """Return the RMS error [rad/s] of rotor speeds that follow commands at the measured rates.
-
-    Between rows the rates are not known. By how far a line between every second row misses the row
-    in the middle, the loop is asked for other rotor speeds; a line between neighbours misses by a
-    quarter of it where rates are smooth and by about all of it where they are noise: half is taken.
-    """
-    near = (log.time_s > begin - BURN_IN_S - 1e-9) & (log.time_s <= begin + 1e-9)
-    time, rate_b = log.time_s[near], log.rate_b[near]
-    if len(time) < 3:
-        return LEAST_START_ERROR
-    share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2]))[:, None]
-    missed = rate_b[1:-1] - (rate_b[:-2] + share * (rate_b[2:] - rate_b[:-2]))
-    missed = missed[np.isfinite(missed).all(axis=1)]
-    if not len(missed):
-        return LEAST_START_ERROR
-    plant = make_plant(vehicle, step_s(vehicle))
-    hover = Command(np.full(4, GRAVITY), np.zeros((4, 3)))
-    rates = np.concatenate([np.zeros((1, 3)), 0.1 * np.eye(3)])
-    asked = np.asarray(wanted_speed(plant, hover, rates))
-    error = 0.5 * missed @ ((asked[1:] - asked[0]) / 0.1)
-    return max(float(np.sqrt((error**2).mean())), LEAST_START_ERROR)
-
-
 def _integral(time: np.ndarray, command: np.ndarray) -> np.ndarray:
     """Return the integral (K, 4) of a held `command` (K, 4) from the first of `time` (K,) on."""
     span = np.diff(np.where(np.isfinite(time), time, time[np.isfinite(time)].max()))
     return np.concatenate([np.zeros((1, 4)), np.cumsum(span[:, None] * command[:-1], axis=0)])
 
 
-def _rotors(
-    at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicle, every: int
-) -> np.ndarray:
-    """Return rotor speeds at `at` [s] from `every` so many rows.
-
-    Between rows they run along the first-order response to one command. What a firmware's loop
-    asks for changes all the time, by filtered slopes of rates: a smooth curve is nearer then.
-    """
-    return np.stack([_rotor(at, time, column, vehicle, every) for column in speed.T], axis=1)
-
-
-def _rotor(
-    at: np.ndarray, time: np.ndarray, speed: np.ndarray, vehicle: Vehicle, every: int
-) -> np.ndarray:
-    good = np.flatnonzero(np.isfinite(speed))[::every]
-    if remembers(vehicle):
-        return CubicSpline(time[good], speed[good])(at)
-    row = np.clip(np.searchsorted(time[good], at, side="right") - 1, 0, len(good) - 2)
-    before, after = good[row], good[row + 1]
-    span, passed = time[after] - time[before], at - time[before]
-    lag = max(vehicle.rotors.time_constant, 1e-4)
-    share = (1.0 - np.exp(-passed / lag)) / (1.0 - np.exp(-span / lag))
-    return speed[before] + share * (speed[after] - speed[before])
+def _start_error(log: FlightLog, begin: float, vehicle: Vehicle) -> float:
+    """Return how far off the burn-in to `begin` [s] leaves the rotor speeds [rad/s]."""
+    near = (log.time_s > begin - BURN_IN_S - 1e-9) & (log.time_s <= begin + 1e-9)
+    return start_rotor_error(log.time_s[near], log.rate_b[near], vehicle)

@@ -17,8 +17,8 @@ from eval.quadrotor.plant import Motion, accelerations, assemble, nominal_quadro
 from eval.quadrotor.rotors import steady
 from eval.quadrotor.stepper import Inputs, wind_and_flow, wrench_on
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.rows import FlightRows
 from suite.diagnose.data.steps import LONGEST_S
+from suite.diagnose.data.view import FlightRows
 from suite.diagnose.estimate.parameters import ParameterLayout, ParameterSpace, effects_at
 from suite.diagnose.evidence.rollout_model import VehicleArrays
 

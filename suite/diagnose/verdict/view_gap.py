@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.rows import FlightRows
-from suite.diagnose.data.view import SmoothedFlight
+from suite.diagnose.data.view import FlightRows, SmoothedFlight
 from suite.diagnose.evidence.moments import ViewData, centred, units_of
 from suite.diagnose.evidence.view_equations import ViewTask, left_of
 from suite.diagnose.search.view_search import ViewSearch

@@ -57,27 +57,6 @@ def test_flights_of_the_vehicle_itself_have_no_gap():
     assert 0.8 < found["gap"]["before"] < 1.2
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("drive", ["commands", "motors"])
-@pytest.mark.parametrize("vehicle", [PLAIN, LAGGED], ids=["at once", "lagged"])
-def test_without_noise_the_models_own_error_is_no_finding(vehicle, drive):
-    logs = flights(vehicle, duration_s=5.0, noise=0.0, motors=True)
-    found = diagnosis_json(diagnose(logs, vehicle, drive))
-    assert (found["verdict"], found["effects"]) == ("no_gap", [])
-    assert all(not one["relevant"] for one in found["negligible"])
-
-
-@pytest.mark.slow
-def test_a_gyro_of_half_the_rate_and_no_commands_end_in_a_verdict():
-    logs = []
-    for log in flights(LAGGED, duration_s=5.0, motors=True):
-        rate_b = np.array(log.rate_b)
-        rate_b[1::2] = np.nan
-        logs.append(replace(log, rate_b=rate_b, thrust_cmd=None, rate_cmd_b=None))
-    found = diagnosis_json(diagnose(logs, LAGGED))
-    assert (found["verdict"], found["effects"]) == ("no_gap", [])
-
-
 REMEMBERED = with_lag(REMEMBERING, 0.03)
 
 
