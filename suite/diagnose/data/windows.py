@@ -213,7 +213,7 @@ def _driven(log: FlightLog, rotor_input: bool) -> list[np.ndarray]:
         return [np.isfinite(column) for column in log.rotor_speed.T]
     assert log.thrust_cmd is not None and log.rate_cmd_b is not None
     command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-    return [np.isfinite(series).all(axis=1) for series in (command, log.rate_b)]
+    return [np.asarray(np.isfinite(part).all(axis=1)) for part in (command, log.rate_b)]
 
 
 class _Drive(NamedTuple):

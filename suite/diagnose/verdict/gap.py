@@ -114,7 +114,7 @@ def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) 
     at = np.arange(len(rows))
     span = np.asarray(windows.row_s)[at, rows][:, None]
     acc_w = (np.asarray(windows.row_vel_w)[at, rows] - windows.vel_w) / np.maximum(span, 1e-3)
-    offset[:, 6:9] = late * np.where(moving.any(axis=1)[:, None], acc_w, 0.0)
+    offset[:, 6:9] = late * np.where(moving.any(axis=1, keepdims=True), acc_w, 0.0)
     return offset
 
 

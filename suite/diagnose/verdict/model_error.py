@@ -41,13 +41,13 @@ def with_model_error(
     noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
     apart = model.residual(at.theta, at.offset, coarser) - linear.residual
-    good = np.isfinite(apart).all(axis=(1, 2))
-    apart = np.where(good[:, None, None], apart, 0.0)
+    good = np.isfinite(apart).all(axis=(1, 2), keepdims=True)
+    apart = np.where(good, apart, 0.0)
     left = project_out_start(whitening, whiten(whitening, apart[..., None]))[..., 0]
     count, rows, channels = apart.shape
     over = left[:, : rows * channels].reshape(apart.shape)
     sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
-    seen = np.asarray(windows.seen) & good[:, None, None]
+    seen = np.asarray(windows.seen) & good
     power = (np.where(seen, over * sigma, 0.0) ** 2).sum(axis=(0, 1)) / np.maximum(
         seen.sum(axis=(0, 1)), 1
     )

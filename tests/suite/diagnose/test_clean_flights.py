@@ -14,11 +14,10 @@ LAGGED = with_lag(PLAIN, 0.03)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("drive", ["commands", "motors"])
 @pytest.mark.parametrize("vehicle", [PLAIN, LAGGED], ids=["at once", "lagged"])
-def test_without_noise_the_models_own_error_is_no_finding(vehicle, drive):
+def test_without_noise_the_models_own_error_is_no_finding(vehicle):
     logs = fly_all([vehicle] * 3, range(3), duration_s=5.0, noise=0.0, motors=True)
-    found = diagnosis_json(diagnose(logs, vehicle, drive))
+    found = diagnosis_json(diagnose(logs, vehicle, "commands"))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
     assert all(not one["relevant"] for one in found["negligible"])
 
