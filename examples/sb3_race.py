@@ -4,6 +4,7 @@ Run: pip install 'diffracing-suite[sb3]'; python examples/sb3_race.py runs/sb3 [
 suite eval --policy runs/sb3/policy.onnx --track random --trials 100
 """
 
+# pyright: reportMissingImports=false
 from __future__ import annotations
 
 import sys

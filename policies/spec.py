@@ -62,13 +62,13 @@ class ActionSpec:
     kind: str = "acceleration"
     """acceleration: wanted net acceleration, body axes [m/s^2]; ctbr: collective thrust per mass
     [m/s^2] and body rates [rad/s]; motors: four rotors' shares, 0 to 1, of `motors`."""
-    scale: tuple[float, ...] = (1.0,)
+    scale: Annotated[tuple[float, ...], Range(-1e6, 1e6)] = (1.0,)
     """SI units a unit of output: one number for all, or one for each."""
-    offset: tuple[float, ...] = (0.0,)
+    offset: Annotated[tuple[float, ...], Range(-1e6, 1e6)] = (0.0,)
     """SI value of an output of zero: one number for all, or one for each."""
     motors: str = "thrust"
     """Of kind motors: a rotor's share of its largest `thrust` or `speed`."""
-    clip: float = 0.0
+    clip: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Outputs are cut off at plus and minus this before they are scaled; 0: they are not."""
 
     @property

@@ -76,7 +76,7 @@ def onnx_steps(checkpoint: PolicyCheckpoint) -> tuple[Step, Step]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     providers = ["CPUExecutionProvider"]
-    session = onnxruntime.InferenceSession(onnx_file(checkpoint, ""), options, providers=providers)
+    session = onnxruntime.InferenceSession(onnx_file(checkpoint, {}), options, providers=providers)
     state, image = _inputs(checkpoint.spec)
     hidden = np.zeros((1, checkpoint.spec.hidden_size), np.float32)
     feed = {"state": state, "image": image, "hidden": hidden}

@@ -71,7 +71,9 @@ FUNCTIONS = [
 ]
 
 
-@pytest.mark.parametrize(("function", "takes"), FUNCTIONS, ids=lambda part: str(part)[:24])
+@pytest.mark.parametrize(
+    ("function", "takes"), FUNCTIONS, ids=lambda part: getattr(part, "__name__", part)
+)
 def test_rows_of_any_batch_are_as_each_alone(function, takes):
     rng, shapes = np.random.default_rng(0), [tuple(map(int, s.strip("-"))) for s in takes.split()]
     arrays = [rng.uniform(0.1, 1.0, (2, 3, *shape)) for shape in shapes]
