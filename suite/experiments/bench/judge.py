@@ -24,7 +24,7 @@ from suite.experiments.bench.compare import Comparison, Figure, in_turn
 from suite.judging.flying import default_policy
 from tracks.families import JUDGED
 
-TRIALS = 192
+TRIALS = 128
 BASELINE = "mujoco, its own rays"
 
 
@@ -65,7 +65,7 @@ def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> C
         ended[world] = fly(flier, specs, vehicle, world, options)
 
     ours = partial(judged, "mujoco", JudgeOptions().slots)
-    seconds = in_turn(ours, partial(judged, BASELINE, 64), repeats=3, clock=time.process_time)
+    seconds = in_turn(ours, partial(judged, BASELINE, 64), repeats=2, clock=time.process_time)
     pairs = list(zip(*ended.values(), strict=True))
     alike = sum((a.ended_by, a.gates_passed) == (b.ended_by, b.gates_passed) for a, b in pairs)
     details = {
