@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from suite.common.console import Console
 from tracks.common.files import check_no_input
-from tracks.input.ranges import Seed
+from tracks.input.ranges import Range, Seed
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Config:
     integrator: Literal["auto", "continuous", "euler"] = "auto"
     """How the flights' bodies were moved: by the equations themselves, as every real one, by
     MuJoCo's Euler steps of the rate loop's period, or as the logs say."""
-    relevance: tuple[float, float, float] = (0.05, 0.5, 0.025)
+    relevance: Annotated[tuple[float, float, float], Range(0.0, 1e6)] = (0.05, 0.5, 0.025)
     """The least force [m/s^2], torque over inertia [rad/s^2] and drift after a second [m] that is a
     finding: an effect below all three is left out, however sure. 0 0 0 reports all that is
     significant."""

@@ -85,7 +85,9 @@ def components(effect: Mapping[str, Any]) -> Iterator[Component]:
             yield Component(f"{name} [{unit}]", *_one(value, span), neutral)
             continue
         which = effect["parameters"].get("index", {}).get("value")
-        axes = which if name in one_at_a_time and isinstance(which, list) else "xyz"
+        axes = "xyz" if len(value) <= 3 else range(1, len(value) + 1)
+        if name in one_at_a_time and isinstance(which, list):
+            axes = which
         for k, one in enumerate(value):
             between = span[k] if span else None
             yield Component(f"{name} {axes[k]} [{unit}]", *_one(one, between), neutral)
