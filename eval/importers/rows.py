@@ -89,7 +89,8 @@ def row_times(
     Raises:
         FlightLogError: where pos, quat and rate share less than two samples of time.
     """
-    needed = [recording.signals[name] for name in NEEDED if name in recording.signals]
+    there = [name for name in NEEDED if name in recording.signals]
+    needed = [recording.signals[name] for name in there]
     first = max(s.time_s[0] for s in needed)
     last = min(s.time_s[-1] for s in needed)
     stop = last if end_s is None else min(last, first + end_s)
@@ -116,9 +117,9 @@ def row_times(
         else:
             spans = ", ".join(
                 f"{name} from {s.time_s[0]:.3f} to {s.time_s[-1]:.3f} s"
-                for name, s in zip(NEEDED, needed, strict=True)
+                for name, s in zip(there, needed, strict=True)
             )
-            reason = f"no time at which position, attitude and gyro are all there ({spans})"
+            reason = f"no time at which {' and '.join(there)} are there ({spans})"
         raise FlightLogError(recording.name, "time", None, reason)
     return time_s
 

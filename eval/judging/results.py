@@ -108,13 +108,15 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
             table = file.read([] if missing or rows > MOST_TRIALS else there)
     except MemoryError:  # Arrow's own is one as well
         raise
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         first = str(error).splitlines()[0]  # Arrow says more than a line of a damaged file
         raise ValueError(
             f"{path}: not a readable Parquet file ({first}); run suite eval again"
         ) from error
     if missing:
         raise ValueError(f"{path}: no column {missing[0]!r}; is it a trials.parquet of this suite?")
+    if twice := [name for name in there if names.count(name) > 1]:
+        raise ValueError(f"{path}: column {twice[0]!r} is there twice; run suite eval again")
     if rows > MOST_TRIALS:
         raise ValueError(f"{path}: {rows:,} trials, allowed are up to {MOST_TRIALS:,}")
     columns = [_cells(path, name, table[name], kinds[name]) for name in there]

@@ -90,7 +90,7 @@ def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[s
             table = file.read(wanted)
     except MemoryError:  # Arrow's own is one as well
         raise
-    except (pa.ArrowException, OSError, KeyError) as error:
+    except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
         first = str(error).splitlines()[0]
         reason = f"a corrupt Parquet file ({first}); copy or record it again"
         raise FlightLogError(str(path), None, None, reason) from None

@@ -97,13 +97,34 @@ def read(path: Path, options: ImportOptions) -> Recording:
     return Recording(str(path), signals, (*findings, *more), sides, about)
 
 
+class _Forward(io.BufferedReader):
+    """A file in which a parser that steps back over a body comes to where it was read.
+
+    Of a body that is cut off by the end pyulog has read less than it steps back by, and would go in
+    circles for ever.
+    """
+
+    _asked = _short = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        self._asked = size or 0
+        self._short = max(self._asked - len(data), 0)
+        return data
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        if whence == 1 and -offset >= self._asked > 0:
+            offset += self._short
+        return super().seek(offset, whence)
+
+
 def _load(path: Path) -> Any:
     from pyulog import ULog
 
     try:
         # pyulog prints what it makes of damaged files (a finding says it once), and leaves a file
         # that it opened itself open where it fails.
-        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
+        with _Forward(io.FileIO(path)) as file, contextlib.redirect_stdout(io.StringIO()):
             return ULog(file, list(TOPICS))
     except Exception as error:
         reason = f"a ULog file that cannot be read ({type(error).__name__}: {error})"

@@ -1,5 +1,8 @@
 """Logs that are damaged, or of other definitions than their format's: one line, no traceback."""
 
+import struct
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -41,6 +44,21 @@ def test_a_topic_without_a_timestamp_is_left_out(ulog):
 
     log, findings = ulog(damage)
     assert log.rotor_speed is None and "esc_status has no timestamp" in text(findings, "file")
+
+
+def test_a_size_beyond_the_end_is_no_circle(tmp_path):
+    """Of a damaged kind, among the definitions: pyulog itself would never come to an end."""
+    path = made.write_ulog(tmp_path / "log.ulg", span=(0, 3))
+    # Back by two bytes and the 150 of which there are 49: to where the part before begins.
+    part = struct.pack("<HB", 97, ord("I")) + bytes(97)
+    path.write_bytes(path.read_bytes()[:16] + part + struct.pack("<HB", 150, 0) + bytes(49))
+    code = (
+        "from pathlib import Path\n"
+        "from eval.importers.formats import px4\n"
+        f"log = px4._load(Path({str(path)!r}))\n"
+        "assert log.file_corruption and not log.data_list\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 @pytest.mark.parametrize("value", ["0.1", b"\xff", None, float("nan")])

@@ -110,6 +110,20 @@ def test_trials_of_other_types_are_refused_by_column(tmp_path, column, cells, sa
     assert explain(met.value) is not None
 
 
+def test_names_of_columns_that_are_damaged_are_refused(tmp_path):
+    summary = summarise(ROWS[:2])
+    write_results(tmp_path, ROWS[:2], table_markdown="", summary=summary, seed=7)
+    path = tmp_path / "trials.parquet"
+    table, whole = pq.read_table(path), path.read_bytes()
+    pq.write_table(table.append_column("seed", table["seed"]), path)
+    with pytest.raises(ValueError, match="'seed' is there twice"):
+        read_trials(path)
+    path.write_bytes(whole.replace(b"v_mean", b"\x80_mean"))
+    with pytest.raises(ValueError, match="not a readable Parquet file") as met:
+        read_trials(path)
+    assert explain(met.value) is not None
+
+
 def test_a_pipe_or_too_many_rows_are_no_trials(tmp_path):
     os.mkfifo(tmp_path / "pipe.parquet")
     with pytest.raises(ValueError, match="a named pipe"):
