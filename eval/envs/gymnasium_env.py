@@ -1,4 +1,4 @@
-"""The race as `gymnasium.Env` and as `gymnasium.vector.VectorEnv`: ids in `eval.envs.register`."""
+"""The race as `gymnasium.Env` and `gymnasium.vector.VectorEnv`; importing this registers `ID`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from eval.worlds.trial import FLYING
 from policies.contract import Contract
 from policies.spec import PolicySpec
 
+ID = "diffracing/Race-v0"
+"""For `gymnasium.make` and `gymnasium.make_vec`."""
 Observation = dict[str, np.ndarray]
 RENDER_SCALE = 8
 """Pixels of a rendered frame a pixel of the depth image."""
@@ -223,3 +225,12 @@ class RaceVectorEnv(VectorEnv):
 
 def _made(cls: type, config: dict[str, Any], rest: dict[str, Any]) -> Any:
     return cls(**rest, **config)
+
+
+# gymnasium loads no plugins: an import registers, as its own convention has it.
+if ID not in gymnasium.registry:
+    gymnasium.register(
+        id=ID,
+        entry_point=f"{__name__}:RaceEnv",
+        vector_entry_point=f"{__name__}:RaceVectorEnv",
+    )

@@ -12,7 +12,6 @@ from absl.testing import absltest
 from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
 
-from eval.envs import register
 from eval.envs.race import ACTION_LIMIT
 from eval.judging.judge import JudgeOptions, fly
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -25,14 +24,13 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of the renderers that dm_control looks for
     from eval.envs.dm_control_env import load
 
-from eval.envs.gymnasium_env import RaceEnv
+from eval.envs.gymnasium_env import ID, RaceEnv
 
 EVEN = PolicySpec(rate_hz=50.0)  # a whole number of physics steps, so that the judge flies alike
 
 
 def test_gymnasium_checker():
-    register()
-    check_env(gymnasium.make("diffracing/Race-v0", rules=Rules(time_limit_s=0.5)).unwrapped)
+    check_env(gymnasium.make(ID, rules=Rules(time_limit_s=0.5)).unwrapped)
 
 
 def test_gymnasium_tracks_are_set_by_the_seed():

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from eval.envs import register
-from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
+from eval.envs.gymnasium_env import ID, RaceEnv, RaceVectorEnv
 from eval.envs.races import REWARDS
 from eval.judging.judge import JudgeOptions, fly
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -18,7 +17,6 @@ from eval.worlds.trial import Rules, TrialSpec
 from policies.contract import read_contract
 from tests.support.pilots import Pursuit
 
-register()
 SHORT = Rules(time_limit_s=0.3)
 
 
@@ -47,9 +45,9 @@ def test_n_at_once_give_the_bits_of_n_single_ones_through_resets():
 
 
 def test_it_is_made_by_its_id_alone_and_many_at_once():
-    env = gymnasium.make("diffracing/Race-v0", track="zigzag", rules=SHORT)
+    env = gymnasium.make(ID, track="zigzag", rules=SHORT)
     assert isinstance(env.unwrapped, RaceEnv)
-    many = gymnasium.make_vec("diffracing/Race-v0", num_envs=2, rules=SHORT)
+    many = gymnasium.make_vec(ID, num_envs=2, rules=SHORT)
     assert isinstance(many, RaceVectorEnv)
     assert many.observation_space["state"].shape == (2, 12)
 
