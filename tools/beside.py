@@ -41,14 +41,12 @@ def trainer(name: str) -> tuple[Callable[[], None], int]:
     import jax
 
     from suite.train.presets import preset
-    from suite.train.update import device_mesh, make_update, start_state
+    from suite.train.update import make_update, start_state
     from suite.train.worlds import sample_worlds
 
     config = preset(name)
-    mesh = device_mesh(config)
-    update, number = make_update(config, mesh), 0
-    where = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
-    state, worlds = jax.device_put(start_state(config), where), sample_worlds(config, 0)
+    update, number, first = make_update(config), 0, jax.devices()[0]
+    state, worlds = jax.device_put(start_state(config), first), sample_worlds(config, 0)
 
     def iterate() -> None:
         nonlocal state, worlds, number

@@ -6,8 +6,6 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh
-from jax.sharding import PartitionSpec as P
 
 from policies.networks import delta_network, network
 from suite.train.config import TrainConfig
@@ -104,34 +102,3 @@ def make_gradient(
         return jax.tree.map(jnp.add, direct, through_images), loss, records
 
     return gradient
-
-
-def shard_gradient(
-    config: TrainConfig, mesh: Mesh
-) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
-    """Return the gradient shared by the devices of `mesh`, each with its part of the worlds.
-
-    Returns:
-        gradient(params, worlds, key, delta) -> (gradient, loss, records without
-        images); gradient and loss are means over all worlds, the records are gathered.
-    """
-    local = make_gradient(config)
-    axis = mesh.axis_names[0]
-
-    def part(
-        params: network.Params, worlds: Worlds, key: jax.Array, delta: delta_network.Params | None
-    ) -> tuple[network.Params, jax.Array, StepRecord]:
-        key = jax.random.fold_in(key, jax.lax.axis_index(axis))
-        gradient, loss, records = local(params, worlds, key, delta)
-        records = records._replace(image=jnp.zeros((config.episode.steps, 1)))
-        return jax.lax.pmean(gradient, axis), jax.lax.pmean(loss, axis), records
-
-    worlds_spec = P(axis)
-    records_spec = P(None, axis)
-    return jax.shard_map(
-        part,
-        mesh=mesh,
-        in_specs=(P(), worlds_spec, P(), P()),
-        out_specs=(P(), P(), records_spec),
-        check_vma=False,
-    )

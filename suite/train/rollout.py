@@ -95,8 +95,13 @@ def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
     return line[:, 0], line[:, 1:]
 
 
+def world_keys(key: jax.Array, worlds: Worlds) -> jax.Array:
+    """Return a key (B,) for each world, whichever other worlds are computed with it."""
+    return jax.vmap(jax.random.fold_in, (None, 0))(key, worlds.number)
+
+
 def make_sight(config: TrainConfig) -> Callable[..., Observation]:
-    """Return sight(worlds, state, target, last_action_b, key) -> what the policy is given.
+    """Return sight(worlds, state, target, last_action_b, keys (B,)) -> what the policy is given.
 
     The image has its noise, and carries no gradient to the state.
     """
@@ -109,7 +114,7 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
         state: DynamicsState,
         target: jax.Array,
         last_action_b: jax.Array,
-        key: jax.Array,
+        keys: jax.Array,
     ) -> Observation:
         # Scaling the rays across the optical axis changes the field of view; every world of an
         # iteration shares it, so that the rays stay one array.
@@ -120,7 +125,8 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
         image_m = depth_m.reshape(-1, camera.height, camera.width)
         view = view_in(worlds, state, target)._replace(depth_m=image_m)
         seen = observe(spec, view, last_action_b, worlds.wanted)
-        return seen._replace(image=seen.image + noise * jax.random.normal(key, image_m.shape))
+        grain = jax.vmap(lambda key: jax.random.normal(key, image_m.shape[1:]))(keys)
+        return seen._replace(image=seen.image + noise * grain)
 
     return sight
 
@@ -173,7 +179,8 @@ def make_rollout(
         ) -> tuple[RolloutCarry, StepRecord]:
             shift_now, key_now, number = inputs
             before, target = carry.state, carry.target
-            seen = sight(worlds, before, target, carry.action_b, key_now)
+            keys = world_keys(key_now, worlds)
+            seen = sight(worlds, before, target, carry.action_b, keys)
             embedding = encode(params, seen.image) + shift_now
             embedding, embeddings = queue(carry.embeddings, embedding)
             state, observed = queue(carry.observed, seen.state)
@@ -186,7 +193,7 @@ def make_rollout(
                 )
                 flown = action + correction
             _, target_w = target_gate(worlds.scene.gates, target)
-            after = dynamics.step(before, worlds.constants, flown, target_w, key_now)
+            after = dynamics.step(before, worlds.constants, flown, target_w, keys)
             made = make_step(weights, worlds, before, after, target)
             terms = losses.weighted(weights, made)
             target_after = target + made.passed

@@ -22,14 +22,9 @@ from suite.common.console import Console
 from suite.common.running import hosts
 from suite.common.stages import Estimate
 from suite.train.config import TrainConfig, check
+from suite.train.shards import check_processes
 from suite.train.training_loop import Method, Outcome, Run, Watch, flight_note, train_in_folder
-from suite.train.update import (
-    device_mesh,
-    make_update,
-    shared_out,
-    start_state,
-    state_place,
-)
+from suite.train.update import make_update, start_state
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
 from tracks.common.work import usable_cores
@@ -106,7 +101,7 @@ def train(
         WorkFailed: where the loss or the parameters stop being finite, or another process is gone.
     """
     check(config)
-    mesh = device_mesh(config)
+    check_processes(config)
     origin = {"config": plain(config), "from": _digest(params), "delta": _digest(delta)}
     hosts.agree({"the configuration": origin["config"], "--from": origin["from"],
                  "--delta": origin["delta"], "threads": threads() > 1})  # fmt: skip
@@ -114,11 +109,11 @@ def train(
         iterations=config.optimizer.iterations,
         frames=config.episode.batch * config.episode.steps,
         estimate=estimate(config),
-        worlds=lambda iteration: shared_out(sample_worlds(config, iteration), mesh),
-        make_update=lambda: make_update(config, mesh, delta),
+        worlds=lambda iteration: sample_worlds(config, iteration),
+        make_update=lambda: make_update(config, delta),
         note=functools.partial(flight_note, "loss"),
     )
-    run = Run(config, config.spec, config.seed, origin, folder, state_place(mesh))
+    run = Run(config, config.spec, config.seed, origin, folder)
     return train_in_folder(method, run, start_state(config, params), console, watch)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Sharding
 
 from policies.formats.checkpoint import load_arrays, read_config, save_arrays
 from policies.formats.policy_file import save_policy
@@ -99,8 +99,6 @@ class Run(NamedTuple):
     """What a folder's run must have been made from for it to be resumed, "config" among it."""
     folder: Path
     """Where it lives."""
-    place: Sharding
-    """Where the update leaves its state."""
 
 
 def train_in_folder(
@@ -118,7 +116,8 @@ def train_in_folder(
     if hosts.writes():
         refuse_other_run(folder, run.config)
         fresh = _resume(run, fresh)
-    state = jax.device_put(hosts.from_the_first(fresh), run.place)
+    # Where the update leaves it: placed otherwise, the second step would compile it again.
+    state = jax.device_put(hosts.from_the_first(fresh), jax.local_devices()[0])
     done = int(state.iteration)
     if not hosts.writes():
         state = _iterate(method, run, state, console, None) if done < method.iterations else state
@@ -162,15 +161,19 @@ def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watc
             watched.append({"iteration": done, **watch.measure(state.params)})
 
     try:
-        with console.progress("training", total, begun=first) as show:
+        with (
+            console.progress("training", total, begun=first) as show,
+            ThreadPoolExecutor(1) as ahead,
+        ):
             if _is_missing(watch, run.folder, first, total):
                 measure_if_due()
             for iteration in range(first, total):
                 started = time.monotonic()
                 with _others_there(iteration, run.folder):
+                    # The update waits for the devices: prepare the next worlds meanwhile.
+                    following = ahead.submit(method.worlds, iteration + 1)
                     after, numbers = update(state, worlds)
-                    # The device works meanwhile: prepare the next iteration's worlds.
-                    worlds = method.worlds(iteration + 1)
+                    worlds = following.result()
                     row = {key: float(value) for key, value in numbers.items()}
                 _check_finite(iteration, row, run.folder)
                 seconds = time.monotonic() - started
@@ -232,7 +235,6 @@ def _save(run: Run, state: Any) -> None:
         **run.origin,
         "iteration": int(state.iteration),
         "threads": threads(),
-        "devices": run.place.num_devices,
     }
     policy = run.folder / "policy"
     save_policy(policy, state.params, run.spec, seed=run.seed, training=described)
@@ -261,7 +263,7 @@ def _differences(theirs: Mapping[str, Any], mine: Mapping[str, Any], part: str =
 
 
 def _resume(run: Run, fresh: Any) -> Any:
-    origin, folder, devices = run.origin, run.folder, run.place.num_devices
+    origin, folder = run.origin, run.folder
     place = folder / "state"
     recover_folder(place)
     if not place.exists():
@@ -283,12 +285,6 @@ def _resume(run: Run, fresh: Any) -> Any:
             f"{folder} was trained with {before} threads of XLA, and here are {now}: sums would "
             f"round otherwise from here on. Set NPROC={before} in the environment to go on with "
             "the same bits, or give another --out"
-        )
-    if theirs.get("devices", devices) != devices:
-        raise ValueError(
-            f"{folder} was trained on {theirs['devices']} JAX devices, and here are {devices}: "
-            "each draws noise of its own. Give it as many again (docs/training.md, several "
-            "devices), or another --out"
         )
     stored = load_arrays(place, kind="training")
     state = jax.tree.map(jnp.asarray, tree_from_arrays(fresh, stored.arrays, str(place)))

@@ -40,6 +40,8 @@ class Worlds(NamedTuple):
     """(B,) 1 where a world starts on the way, with a recurrent state from an earlier rollout."""
     stop: Array
     """(B,) step at which a world leaves the loss."""
+    number: Array
+    """(B,) which world of the batch it is: its noise depends on that, not on who computes it."""
     fov_scale: Array
     """(B,) this iteration's scale of the rays across the optical axis."""
     wanted: Array | None = None
@@ -187,6 +189,7 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         hidden=np.zeros((batch, config.spec.hidden_size), np.float32),
         remembers=np.where(rests, 0.0, 1.0).astype(np.float32),
         stop=np.where(rests, rng.integers(earliest, episode.steps + 1, batch), episode.steps),
+        number=np.arange(batch, dtype=np.int32),
         fov_scale=np.full(batch, rng.uniform(*config.physics.fov_scale), np.float32),
         wanted=_wanted(config, iteration),
     )

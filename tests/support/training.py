@@ -49,7 +49,9 @@ def small_config(batch=4, steps=6, physics=None, loss=None, optimizer=None, **ep
         spec=SPEC,
         physics=PointMassConfig(**{"depth_noise": 0.0, **(physics or {})}),
         loss=LossConfig(**(loss or {})),
-        episode=EpisodeConfig(**{"batch": batch, "steps": steps, "stop_from": 1.0, **episode}),
+        episode=EpisodeConfig(
+            **{"batch": batch, "steps": steps, "stop_from": 1.0, "shards": 1, **episode}
+        ),
         optimizer=OptimizerConfig(**{"iterations": 6, "warmup": 1, **(optimizer or {})}),
     )
 

@@ -154,6 +154,22 @@ def from_the_first(tree: Any) -> Any:
     return multihost_utils.broadcast_one_to_all(tree)
 
 
+def gathered(trees: list[Any]) -> list[Any]:
+    """Return the trees of arrays of all processes, each of which gives as many, in their order."""
+    if not several():
+        return trees
+    import jax
+    from jax.experimental import multihost_utils
+
+    found = multihost_utils.process_allgather(trees)
+    count = jax.process_count()
+    return [
+        jax.tree.map(lambda leaf, process=process: leaf[process], tree)
+        for process in range(count)
+        for tree in found
+    ]
+
+
 def is_gone(error: Exception) -> bool:
     """Say whether an error of JAX says that another process is gone."""
     import jax

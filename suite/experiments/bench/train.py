@@ -37,7 +37,7 @@ ENOUGH_S = 100.0
 def bench_config(batch: int = BATCH, steps: int = STEPS) -> TrainConfig:
     """Return the preset `paper` at the bench's size, on one device."""
     base = preset("paper")
-    return replace(base, devices=1, episode=replace(base.episode, batch=batch, steps=steps))
+    return replace(base, episode=replace(base.episode, batch=batch, steps=steps))
 
 
 def bench_worlds(config: TrainConfig, seed: int = 0) -> Worlds:
@@ -78,11 +78,9 @@ def _beside(gates: Gates, missing: np.ndarray, rng: np.random.Generator) -> np.n
 def _ours(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
     import jax
 
-    from suite.train.update import device_mesh, make_update, start_state, state_place
+    from suite.train.update import make_update, start_state
 
-    mesh = device_mesh(config)
-    update = make_update(config, mesh)
-    state = jax.device_put(start_state(config), state_place(mesh))
+    update, state = make_update(config), jax.device_put(start_state(config), jax.devices()[0])
 
     def call() -> Any:
         nonlocal state

@@ -51,7 +51,8 @@ class Dynamics(NamedTuple):
     start: Callable[[Any, jax.Array, jax.Array, jax.Array], Any]
     """(constants, pos_w (B, 3), vel_w (B, 3), heading_w (B, 3)) -> body, upright."""
     step: Callable[[Any, Any, jax.Array, jax.Array, jax.Array], Any]
-    """(body, constants, action_b (B, 3), target_w (B, 3), key) -> body one policy period later."""
+    """(body, constants, action_b (B, 3), target_w (B, 3), keys (B,)) -> body one policy period
+    later."""
 
 
 def make_dynamics(config: TrainConfig) -> Dynamics:

@@ -268,13 +268,14 @@ def quadrotor_dynamics(
         constants: QuadrotorParams,
         action_b: jax.Array,
         target_w: jax.Array,
-        key: jax.Array,
+        keys: jax.Array,
     ) -> QuadrotorState:
         plant = plant_of(config, constants.effects, cut.dt)
         noise = None
         if uses_noise(plant):
-            shape = (cut.attitude, cut.physics, *body.pos_w.shape)
-            noise = jax.random.normal(jax.random.fold_in(key, 3), shape)
+            shape = (cut.attitude, cut.physics, 3)
+            gusts = jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, 3), shape))
+            noise = jnp.moveaxis(gusts(keys), 0, 2)
 
         def towards(heading_w: jax.Array, pos_w: jax.Array) -> jax.Array:
             return blend_heading(heading_w, target_w - pos_w, turn_s)

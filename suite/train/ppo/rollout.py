@@ -13,7 +13,7 @@ from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import make_dynamics
 from suite.train.ppo import critic
 from suite.train.ppo.reward import RewardTerms, make_reward
-from suite.train.rollout import make_sight, observed_at_start, queue
+from suite.train.rollout import make_sight, observed_at_start, queue, world_keys
 from suite.train.step import BODY_RADIUS_M, target_gate
 from suite.train.worlds import Worlds
 
@@ -103,14 +103,15 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
 
         def step(carry: EpisodeCarry, key: jax.Array) -> tuple[EpisodeCarry, Record]:
             before, target = carry.state, carry.target
-            seen = sight(worlds, before, target, carry.action_b, key)
+            keys = world_keys(key, worlds)
+            seen = sight(worlds, before, target, carry.action_b, keys)
             state, observed = queue(carry.observed, seen.state)
             image, images = queue(carry.images, seen.image)
             mean, hidden = network.step(params, carry.hidden, state, image)
             noise = jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
             action = mean + jnp.exp(log_deviation) * noise
             _, target_w = target_gate(worlds.scene.gates, target)
-            after = dynamics.step(before, worlds.constants, action, target_w, key)
+            after = dynamics.step(before, worlds.constants, action, target_w, keys)
             terms, clearance, passed = reward(worlds, before, after, target)
             done = clearance < BODY_RADIUS_M
             record = Record(

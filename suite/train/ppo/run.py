@@ -5,9 +5,6 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
-import jax
-from jax.sharding import SingleDeviceSharding
-
 from suite.common.console import Console
 from suite.common.stages import Estimate
 from suite.train import run as trainer
@@ -56,7 +53,6 @@ def train_ppo(
         make_update=lambda: make_update(config),
         note=functools.partial(flight_note, "reward"),
     )
-    place = SingleDeviceSharding(jax.devices()[0])
     origin = {"config": plain(config), "from": None, "delta": None, "method": "ppo"}
-    run = Run(config, config.spec, config.seed, origin, folder, place)
+    run = Run(config, config.spec, config.seed, origin, folder)
     return train_in_folder(method, run, start_state(config), console, watch)

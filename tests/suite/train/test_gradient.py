@@ -1,7 +1,5 @@
-"""The trainer's gradient: images outside the loop, in chunks, few of them, and over devices."""
+"""The trainer's gradient: images outside the loop, in chunks, and few of them."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import jax
@@ -79,33 +77,3 @@ def test_the_encoders_gradient_from_every_third_image_is_right_on_average():
     assert largest_difference(mean, whole) < 1e-4
     for gradient in found.values():
         np.testing.assert_allclose(gradient["action.weight"], whole["action.weight"], atol=1e-6)
-
-
-TWO_DEVICES = """
-import jax
-jax.config.update("jax_num_cpu_devices", 2)
-import numpy as np
-from jax.sharding import Mesh
-from suite.train.gradient import shard_gradient
-from suite.train.update import device_mesh
-from tests.support.training import boxes_worlds, fresh_params, largest_difference, small_config
-config = small_config()
-assert device_mesh(config).size == 2
-args = (fresh_params(), boxes_worlds(config), jax.random.key(0), None)
-results = []
-for count in (1, 2):
-    mesh = Mesh(np.array(jax.devices()[:count]), ("worlds",))
-    gradient, loss, records = jax.jit(shard_gradient(config, mesh))(*args)
-    results.append((gradient, loss, records.pos_w, records.terms))
-print(largest_difference(results[1], results[0]))
-"""
-
-
-@pytest.mark.slow
-def test_two_devices_give_the_gradient_of_one(root):
-    """Without noise, which each device draws for its own worlds; the sums differ in order."""
-    done = subprocess.run(
-        [sys.executable, "-c", TWO_DEVICES], capture_output=True, text=True, cwd=root
-    )
-    assert done.returncode == 0, done.stderr
-    assert float(done.stdout) < 1e-4

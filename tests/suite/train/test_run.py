@@ -23,13 +23,13 @@ make_update = run.make_update
 
 
 @cache
-def compiled_update(config, mesh):
-    return make_update(config, mesh)
+def compiled_update(config):
+    return make_update(config)
 
 
-def update_of(config, mesh, delta=None):
+def update_of(config, delta=None):
     """Return the trainer's update, compiled once for all tests."""
-    return compiled_update(config, mesh) if delta is None else make_update(config, mesh, delta)
+    return compiled_update(config) if delta is None else make_update(config, delta)
 
 
 @pytest.fixture(autouse=True)

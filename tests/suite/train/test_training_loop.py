@@ -2,8 +2,7 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,8 +44,7 @@ def counting(iterations=10, stop=None, bad=None) -> Method:
 
 def run_in(folder, config=CONFIG, start=None):
     origin = {"config": plain(config), "from": start, "delta": None}
-    place = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return Run(config, SPEC, config.seed, origin, folder, place)
+    return Run(config, SPEC, config.seed, origin, folder)
 
 
 def watch_of(seen):
@@ -122,13 +120,6 @@ def test_a_run_on_several_threads_does_not_go_on_with_one_and_goes_on_with_more(
         train_in_folder(counting(4), run_in(tmp_path), FRESH, Console())
     monkeypatch.setenv("NPROC", "16")
     assert train_in_folder(counting(4), run_in(tmp_path), FRESH, Console()).iterations == 4
-
-
-def test_a_run_on_some_devices_does_not_go_on_on_more(tmp_path):
-    run, two = run_in(tmp_path), SimpleNamespace(num_devices=2)
-    train_in_folder(counting(2), run, FRESH, Console())
-    with pytest.raises(ValueError, match=r"on 1 JAX devices, and here are 2: each .*as many again"):
-        train_in_folder(counting(4), run._replace(place=cast(Any, two)), FRESH, Console())
 
 
 def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):

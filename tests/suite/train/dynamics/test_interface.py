@@ -26,7 +26,9 @@ def started(config):
 def test_the_point_mass_is_stepped_with_the_runs_settings():
     worlds, dynamics, body = started(CONFIG)
     assert isinstance(worlds.constants, point_mass.PointMassParams)
-    found = dynamics.step(body, worlds.constants, ACTION, TARGET, jax.random.key(0))
+    found = dynamics.step(
+        body, worlds.constants, ACTION, TARGET, jax.random.split(jax.random.key(0), 2)
+    )
     expected = point_mass.step(body, worlds.constants, ACTION, TARGET, 0.4)
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(ours, theirs)
@@ -36,7 +38,9 @@ def test_a_vehicle_is_flown_as_a_quadrotor_of_the_same_interface():
     config = replace(CONFIG, quadrotor=QuadrotorConfig(PLAIN))
     worlds, dynamics, body = started(config)
     np.testing.assert_allclose(body.rot_w[:, 2, 2], 1.0, atol=1e-6, err_msg="upright")
-    after = jax.jit(dynamics.step)(body, worlds.constants, ACTION, TARGET, jax.random.key(0))
+    after = jax.jit(dynamics.step)(
+        body, worlds.constants, ACTION, TARGET, jax.random.split(jax.random.key(0), 2)
+    )
     np.testing.assert_allclose(worlds.constants.time_step, 1 / config.spec.rate_hz, rtol=1e-6)
     moved = np.asarray(after.pos_w - body.pos_w)
     wanted = worlds.vel_w / config.spec.rate_hz

@@ -73,12 +73,15 @@ def fly_trainer(config, actions, rate_hz):
     towards = jnp.tile(jnp.asarray([1.0, 0.0, 0.0]), (batch, 1))
     still = jnp.zeros((batch, 3))
     body = start(constants, still + jnp.asarray([0.0, 0.0, 10.0]), still, towards)
-    key, target = jax.random.key(0), jnp.tile(jnp.asarray(FAR_W), (batch, 1))
+    keys, target = (
+        jax.random.split(jax.random.key(0), batch),
+        jnp.tile(jnp.asarray(FAR_W), (batch, 1)),
+    )
 
     @jax.jit
     def fly(body, actions):
         def one(body, action):
-            body = step(body, constants, action, target, key)
+            body = step(body, constants, action, target, keys)
             return body, (body.pos_w, body.rot_w, body.vel_w)
 
         return jax.lax.scan(one, body, actions)[1]
@@ -176,7 +179,7 @@ def test_gradients_of_a_flight_are_those_of_finite_differences(float64, monkeypa
     effects = doubled(quadrotor.draw_effects(config, 2, rng))
     constants = QuadrotorParams(np.full(2, 1 / 15), effects)
     weight = [jnp.asarray(rng.normal(size=(2, 3))) for _ in range(3)]
-    still, key = jnp.zeros((2, 3)), jax.random.key(0)
+    still, keys = jnp.zeros((2, 3)), jax.random.split(jax.random.key(0), 2)
 
     @jax.jit
     @jax.value_and_grad
@@ -185,7 +188,7 @@ def test_gradients_of_a_flight_are_those_of_finite_differences(float64, monkeypa
         body = start(constants, still, vel_w, still + jnp.asarray([1.0, 0.0, 0.0]))
 
         def one(body, action):
-            body = step(body, constants, action, still, key)
+            body = step(body, constants, action, still, keys)
             parts = (body.pos_w, body.vel_w, body.rot_w[:, 2])
             return body, jnp.stack([w * part for w, part in zip(weight, parts, strict=True)])
 
@@ -246,7 +249,7 @@ def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatc
 
 def test_gradients_of_the_motion_fade_as_those_of_the_point_mass(float64):
     config = QuadrotorConfig(PLAIN, **ALIKE)
-    still, key = jnp.zeros((1, 3)), jax.random.key(0)
+    still, keys = jnp.zeros((1, 3)), jax.random.split(jax.random.key(0), 1)
     effects = doubled(quadrotor.draw_effects(config, 1, np.random.default_rng(0)))
     constants = QuadrotorParams(np.full(1, 0.05), effects)
 
@@ -255,7 +258,7 @@ def test_gradients_of_the_motion_fade_as_those_of_the_point_mass(float64):
         body = start(constants, pos_w, still, still + jnp.asarray([1.0, 0.0, 0.0]))
 
         def one(body, _):
-            return step(body, constants, still, still + 5.0, key), None
+            return step(body, constants, still, still + 5.0, keys), None
 
         return jax.lax.scan(one, body, length=3)[0].pos_w[0, 0]
 

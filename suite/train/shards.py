@@ -1,0 +1,156 @@
+"""A batch in shards: computed apart, at once where there are cores, and added up in one order.
+
+How many shards there are is a setting of the run; how many cores, devices and processes share them
+is the machine's affair. Every shard is computed by the same compiled program, and the shards'
+gradients are added in the order of the shards, so that the sums have the same bits everywhere.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from policies.networks import delta_network, network
+from suite.common.running import hosts
+from suite.train.config import TrainConfig
+from suite.train.gradient import make_gradient
+from suite.train.rollout import StepRecord, world_keys
+from suite.train.step import BODY_RADIUS_M
+from suite.train.worlds import Worlds
+from tracks.common.work import usable_cores
+
+
+class Shard(NamedTuple):
+    """What the worlds of a shard, or of a batch, come to."""
+
+    gradient: network.Params
+    """Mean over worlds."""
+    numbers: dict[str, jax.Array]
+    """Of the curve, means over worlds, scalars each."""
+    hidden: jax.Array
+    """(B, hidden) recurrent state of a random step of each world."""
+
+
+def flight_numbers(loss: jax.Array, records: StepRecord) -> dict[str, jax.Array]:
+    """Return a shard's numbers of the curve, means over its worlds.
+
+    Gates, collisions and speeds are those of steps that count in the loss, of which `counted` is
+    the share. `memory` is the mean size of the recurrent states: near 1 they are saturated, and
+    nothing that is seen reaches the action.
+    """
+    counts = records.alive > 0
+    speed = jnp.where(counts, records.speed, 0.0)
+    hit = counts & (records.clearance < BODY_RADIUS_M)
+    numbers = {
+        "loss": loss,
+        "gates": (records.passed & counts).sum(0).mean(),
+        "collided": hit.any(0).mean(),
+        "speed": speed.mean(),
+        "counted": counts.mean(),
+        "speed_max": speed.max(0).mean(),
+        "memory": jnp.abs(records.hidden).mean(),
+    }
+    return numbers | {f"loss_{k}": v.mean() for k, v in records.terms.items()}
+
+
+def curve_numbers(shard: Shard) -> dict[str, jax.Array]:
+    """Return the numbers of the curve, scalars each, of a whole batch: a row of metrics.jsonl."""
+    numbers = dict(shard.numbers)
+    numbers["speed"] = numbers["speed"] / jnp.maximum(numbers.pop("counted"), 1e-6)
+    squares = sum((leaf * leaf).sum() for leaf in shard.gradient.values())
+    return numbers | {"gradient_norm": jnp.sqrt(squares)}
+
+
+def sample_hidden(keys: jax.Array, records: StepRecord, before: jax.Array) -> jax.Array:
+    """Return the recurrent states (B, hidden) of a random step of each world.
+
+    A world that had left the loss by that step keeps the state `before`.
+
+    Args:
+        keys: (B,) of the worlds.
+        records: (T, B, ...).
+        before: (B, hidden).
+    """
+    steps, batch = records.alive.shape
+    step = jax.vmap(lambda key: jax.random.randint(key, (), 0, steps))(keys)
+    world = jnp.arange(batch)
+    taken = records.alive[step, world] > 0
+    return jnp.where(taken[:, None], records.hidden[step, world], before)
+
+
+def check_processes(config: TrainConfig) -> None:
+    """Refuse shards that the processes of a training cannot share evenly.
+
+    Raises:
+        ValueError: naming both numbers.
+    """
+    shards, processes = config.episode.shards, jax.process_count()
+    if shards % processes:
+        raise ValueError(
+            f"episode.shards is {shards}, allowed with {processes} processes are multiples of "
+            f"{processes}"
+        )
+
+
+def make_shards(
+    config: TrainConfig, delta: delta_network.Params | None = None
+) -> Callable[[network.Params, jax.Array, jax.Array, Worlds], list[Shard]]:
+    """Return shards(params, hidden, iteration, worlds) -> all shards of a batch, in order.
+
+    `worlds` is the whole batch, of which every process computes its share of the shards.
+
+    Args:
+        config: the run.
+        delta: a frozen Delta Action network whose correction is added to every action.
+    """
+    gradient_of, seed = make_gradient(config), jax.random.key(np.uint32(config.seed))
+    shards, size = config.episode.shards, config.episode.batch // config.episode.shards
+    each, devices = shards // jax.process_count(), jax.local_devices()
+    mine = range(each * jax.process_index(), each * (jax.process_index() + 1))
+    # Cores work where a thread waits for XLA; an accelerator needs one thread alone.
+    at_once = usable_cores() if jax.default_backend() == "cpu" else len(devices)
+    pool, compiled = ThreadPoolExecutor(min(len(mine), at_once)), False
+
+    @jax.jit
+    def computed(
+        params: network.Params, hidden: jax.Array, iteration: jax.Array, worlds: Worlds
+    ) -> Shard:
+        key = jax.random.fold_in(seed, iteration)
+        before = hidden[worlds.number]
+        worlds = worlds._replace(hidden=before * worlds.remembers[:, None])
+        gradient, loss, records = gradient_of(params, worlds, key, delta)
+        keys = world_keys(jax.random.fold_in(key, config.episode.batch), worlds)
+        return Shard(gradient, flight_numbers(loss, records), sample_hidden(keys, records, before))
+
+    def sharded(
+        params: network.Params, hidden: jax.Array, iteration: jax.Array, worlds: Worlds
+    ) -> list[Shard]:
+        nonlocal compiled
+
+        def one(shard: int) -> Shard:
+            part = jax.tree.map(lambda leaf: leaf[shard * size : (shard + 1) * size], worlds)
+            given = (params, hidden, iteration, part)
+            found = computed(*jax.device_put(given, devices[shard % len(devices)]))
+            return jax.block_until_ready(jax.device_put(found, devices[0]))
+
+        # Threads that come to a program at once would each compile it.
+        found = list(pool.map(one, mine) if compiled else map(one, mine))
+        compiled = True
+        return hosts.gathered(found)
+
+    return sharded
+
+
+def added_up(shards: list[Shard]) -> Shard:
+    """Return what the whole batch comes to: means of the shards, added in their order."""
+    gradient, numbers = jax.tree.map(
+        lambda *leaves: functools.reduce(jnp.add, leaves) / len(leaves),
+        *((shard.gradient, shard.numbers) for shard in shards),
+    )
+    return Shard(gradient, numbers, jnp.concatenate([shard.hidden for shard in shards]))

@@ -1,0 +1,135 @@
+"""Shards: the same bits on any number of cores, the numbers of the curve, remembered states."""
+
+import threading
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from suite.train import shards
+from suite.train.config import check
+from suite.train.shards import (
+    check_processes,
+    curve_numbers,
+    flight_numbers,
+    make_shards,
+    sample_hidden,
+)
+from suite.train.update import make_update, start_state
+from tests.support.canonical import NOISY, gradient_of
+from tests.support.training import (
+    boxes_worlds,
+    fresh_params,
+    largest_difference,
+    small_config,
+)
+
+KEY = jax.random.key(3)
+
+
+def test_a_batch_that_the_shards_do_not_divide_is_refused():
+    with pytest.raises(ValueError, match=r"episode\.batch is 6, allowed are multiples of episode"):
+        check(small_config(batch=6, shards=4))
+
+
+def test_several_processes_divide_the_shards(monkeypatch):
+    monkeypatch.setattr(shards.jax, "process_count", lambda: 3)
+    with pytest.raises(ValueError, match="shards is 4, allowed with 3 processes are multiples of"):
+        check_processes(small_config(batch=8, shards=4))
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """Return (config of four shards, state and numbers after three updates on one thread)."""
+    config = replace(NOISY, episode=replace(NOISY.episode, shards=4))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards, "usable_cores", lambda: 1)
+        return config, updated(config)
+
+
+def updated(config):
+    """Return state and numbers after three updates; the first one's rate is 0."""
+    update, state = make_update(config), start_state(config)
+    for number in range(3):
+        state, numbers = update(state, boxes_worlds(config, number))
+    return state, numbers
+
+
+def test_shards_have_the_gradient_of_the_whole_batch(noisy):
+    """The sums run in another order; noise is a world's own, whichever shard it is in."""
+    _, (state, numbers) = noisy
+    expected, curve = updated(NOISY)
+    assert largest_difference(state.params, expected.params) < 1e-3
+    assert largest_difference(state.hidden, expected.hidden) < 1e-3
+    assert largest_difference(numbers, curve) < 1e-3
+
+
+@pytest.mark.parametrize("cores", [2, 4])
+def test_any_number_of_cores_comes_to_the_same_bits(noisy, cores, monkeypatch):
+    monkeypatch.setattr(shards, "usable_cores", lambda: cores)
+    config, expected = noisy
+    jax.tree.map(np.testing.assert_array_equal, updated(config), expected)
+
+
+def test_shards_are_computed_at_once_and_stand_in_their_order(monkeypatch):
+    """Each of two threads waits for the other, so that one after the other would never end."""
+    monkeypatch.setattr(shards, "usable_cores", lambda: 2)
+    config = small_config(batch=4, shards=2)
+    both, names = threading.Barrier(2, timeout=60), set()
+    real = shards.jax.block_until_ready
+
+    def met(found):
+        if calls:
+            both.wait()
+            names.add(threading.current_thread().name)
+        return real(found)
+
+    calls = []
+    monkeypatch.setattr(shards.jax, "block_until_ready", met)
+    sharded, state = make_shards(config), start_state(config)
+    given = state.params, state.hidden, state.iteration, boxes_worlds(config)
+    cold = sharded(*given)
+    calls.append("warm")
+    warm = sharded(*given)
+    assert len(names) == 2
+    jax.tree.map(np.testing.assert_array_equal, warm, cold)
+
+
+def test_the_curve_is_of_steps_that_count():
+    worlds, params = boxes_worlds(NOISY), fresh_params()
+    worlds = worlds._replace(stop=np.array([1, 1, 1, 1]))
+    gradient, loss, records = gradient_of(NOISY)(params, worlds, KEY, None)
+    after = np.arange(6)[:, None] > 0
+    # What comes later would be a gate and a collision at 100 m/s.
+    records = records._replace(
+        passed=after & np.ones_like(records.passed),
+        speed=np.where(after, 100.0, records.speed),
+        clearance=np.where(after, -1.0, records.clearance),
+    )
+    shard = shards.Shard(gradient, flight_numbers(loss, records), records.hidden[0])
+    numbers = curve_numbers(shard)
+    first = np.mean(records.speed[0])
+    assert numbers["speed"] == pytest.approx(first, rel=1e-6)
+    assert numbers["speed_max"] == pytest.approx(first, rel=1e-6)
+    assert numbers["collided"] == numbers["gates"] == 0 and "counted" not in numbers
+    assert numbers["memory"] == pytest.approx(np.abs(records.hidden).mean())
+    assert 0 < numbers["memory"] < 0.5, "a fresh network's is far from saturated"
+
+
+def test_remembered_states_are_of_steps_that_counted():
+    worlds, params = boxes_worlds(NOISY), fresh_params()
+    worlds = worlds._replace(stop=np.array([6, 6, 6, 1]))
+    records = gradient_of(NOISY)(params, worlds, KEY, None)[2]
+    before = jnp.full((4, NOISY.spec.hidden_size), 9.0)
+    drawn = jax.jit(jax.vmap(lambda keys: sample_hidden(keys, records, before)))
+    seen = np.asarray(drawn(jax.random.split(KEY, (80, 4))))
+    for world in range(3):
+        known = np.asarray(records.hidden[:, world])
+        assert all(any(np.array_equal(row, k) for k in known) for row in seen[:, world])
+        assert len(np.unique(seen[:, world, 0])) == 6
+    last = seen[:, 3]
+    kept = (last == 9.0).all(-1)
+    assert 0 < kept.sum() < 80
+    assert np.array_equal(last[~kept], np.tile(records.hidden[0, 3], ((~kept).sum(), 1)))
