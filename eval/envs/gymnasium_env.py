@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -16,11 +16,16 @@ from eval.worlds.trial import FLYING
 from policies.contract import Contract
 from policies.spec import PolicySpec
 
+if TYPE_CHECKING:
+    from eval.view.chase import Scenery
+
 ID = "diffracing/Race-v0"
 """For `gymnasium.make` and `gymnasium.make_vec`."""
 Observation = dict[str, np.ndarray]
-RENDER_SCALE = 8
-"""Pixels of a rendered frame a pixel of the depth image."""
+RENDER_SIZE = 640, 360
+"""Width and height of a rendered frame [pixels]."""
+INSET = 4
+"""Share of a rendered frame's width that the depth image takes: one in so many."""
 
 
 def action_space(spec: PolicySpec) -> gymnasium.spaces.Box:
@@ -57,7 +62,8 @@ class RaceEnv(gymnasium.Env):
         """Make the environment.
 
         Args:
-            render_mode: "rgb_array" renders the depth image, white where it is near.
+            render_mode: "rgb_array" renders the drone from behind, and in the lower right corner
+                the depth image, without a display.
             config: the fields of `eval.envs.races.RaceConfig`: track, level, track_seed, vehicle,
                 spec, action, channel_axis, uint8, rewards, rules.
 
@@ -71,6 +77,7 @@ class RaceEnv(gymnasium.Env):
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(self._races.spec.rate_hz)}
         self._started = False
+        self._scenery: Scenery | None = None
 
     @property
     def contract(self) -> Contract:
@@ -88,7 +95,7 @@ class RaceEnv(gymnasium.Env):
         """Start an episode."""
         super().reset(seed=seed)
         self._races.start([0], [self.np_random], (options or {}).get("track_seed"))
-        self._started = True
+        self._started, self._scenery = True, None
         return self._observation(), self._races.info(0)
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -112,16 +119,22 @@ class RaceEnv(gymnasium.Env):
         return {key: part[0] for key, part in self._races.observation().items()}
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the depth image as (H, W, 3) uint8, or None without a render mode."""
+        """Return a picture (360, 640, 3) uint8 from behind the drone, None without a mode.
+
+        Raises:
+            RuntimeError: before the first `reset`.
+        """
         if self.render_mode is None:
             return None
-        image, depth = self._observation()["image"], self._races.spec.depth
-        low, high = (0, 255) if depth.uint8 else depth.bounds(self._races.spec.camera.range_m)
-        grey = np.squeeze((image.astype(float) - low) / (high - low))
-        pixels = np.kron(
-            (255 * np.clip(grey, 0, 1) ** 0.5).astype(np.uint8), np.ones((RENDER_SCALE,) * 2, int)
-        )
-        return np.repeat(pixels.astype(np.uint8)[..., None], 3, -1)
+        if not self._started:
+            raise RuntimeError("call reset() before render()")
+        from eval.view.chase import Drone, chase_image, inset, scenery_of
+
+        view, gates = self._races.view(), int(self._races.gates[0])
+        self._scenery = self._scenery or scenery_of(self._races.track(0))
+        drone = Drone(view.pos_w[0], view.rot_w[0], gates)
+        picture = chase_image(self._scenery, drone, view.vel_w[0], RENDER_SIZE)
+        return inset(picture, view.depth_m[0], self._races.spec.camera.range_m, INSET)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RaceEnv:
         return self.__reduce__()[0](*self.__reduce__()[1])

@@ -7,7 +7,7 @@ others, to the bit, so that one environment and N at once give the same.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from eval.worlds.slots import layout_of
 from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, steps_to_next
 from policies.contract import Contract, contract_of
 from policies.formats.policy_file import load_policy_checkpoint
-from policies.observation import observe
+from policies.observation import View, observe
 from policies.shipped import locate
 from policies.spec import ActionSpec, PolicySpec
 from tracks.common.names import unknown_name
@@ -76,8 +76,9 @@ class RaceConfig:
     track_seed: int | None = None
     """Of one track flown every time; None draws one for each episode."""
     vehicle: str | Vehicle | Callable[[np.random.Generator], Vehicle] = "racer5"
-    """A shipped name, a file, a vehicle, or a function that draws one for each episode. The judge's
-    own is `reference`: training on it makes a comparison unfair."""
+    """A shipped name, a file, a vehicle, or a function that draws one for each episode, all with
+    other values of the same effects (`suite.train.dynamics.spreads.race_settings` has the
+    trainer's). The judge's own is `reference`: training on it makes a comparison unfair."""
     spec: PolicySpec | str | None = None
     """Rate, camera, encoding and extras of the observation: a spec, or that of a shipped policy or
     a checkpoint's folder."""
@@ -142,61 +143,75 @@ class Races:
             self._file = load_track(config.track)
         else:
             check_family(config.track)
-        self._drawn = callable(config.vehicle)
-        vehicle = resolved_vehicle(config, np.random.default_rng(0))
+        vehicle = self._vehicle = resolved_vehicle(config, np.random.default_rng(0))
         self.spec = resolved_spec(config, vehicle)
         self.contract: Contract = contract_of(self.spec)
-        self._layout = layout_of([self._file] if self._file else [])
-        self._threads = threads
-        # A vehicle is one simulator's: where each episode draws its own, a slot has its own.
-        self._worlds = [self._world(vehicle, 1 if self._drawn else slots)]
-        self._worlds += [self._world(vehicle, 1) for _ in range(slots - 1) if self._drawn]
+        layout = layout_of([self._file] if self._file else [])
+        self._world = MujocoWorld(
+            vehicle, self.spec.camera, layout, config.rules, slots, threads, self.spec.action
+        )
         self._limits = limits_of(ActionLimits(), self.spec.action, vehicle)
         self._first = first_action(self.spec.action, vehicle)
         self._decision = np.zeros(slots)
         self._action = np.tile(self._first, (slots, 1))
         self._output = np.zeros((slots, self.spec.action.size))
-        self._centres_w: list[np.ndarray] = [np.zeros((1, 3))] * slots
+        self._tracks: list[Track] = []
         self._bad = np.zeros(slots, bool)
         self.track_seed, self.level = np.zeros(slots, int), np.zeros(slots, int)
-
-    def _world(self, vehicle: Vehicle, slots: int) -> MujocoWorld:
-        return MujocoWorld(
-            vehicle, self.spec.camera, self._layout, self.config.rules, slots, self._threads,
-            self.spec.action,
-        )  # fmt: skip
 
     def start(
         self, slots: list[int], rngs: list[np.random.Generator], track_seed: int | None = None
     ) -> None:
         """Begin an episode in each of `slots`, all that it draws coming from its generator."""
+        config = self.config
         entries: list[tuple[int, Track, TrialSpec]] = []
         for slot, rng in zip(slots, rngs, strict=True):
-            config, level = self.config, self.config.level
+            level = config.level
             if not isinstance(level, int):
                 level = int(rng.integers(level[0], level[1] + 1))
             seed = config.track_seed if track_seed is None else track_seed
             seed = int(rng.integers(SEEDS)) if seed is None else int(seed)
             track = self._file or make_track(config.track, level, seed)
-            if self._drawn:
-                self._worlds[slot] = self._world(resolved_vehicle(config, rng), 1)
-            self._centres_w[slot] = track.scene.gates.center_w
+            self._tracks = self._tracks or [track] * self.slots
+            self._tracks[slot] = track
             self.track_seed[slot], self.level[slot] = seed, level
             self._decision[slot], self._action[slot], self._output[slot] = 0, self._first, 0.0
             self._bad[slot] = False
             name = config.track if self._file else track.family
             entries.append((slot, track, TrialSpec(name, level, seed)))
-        if self._drawn:
-            for slot, track, trial in entries:
-                self._worlds[slot].load([(0, track, trial)])
-        elif entries:
-            self._worlds[0].load(entries)
+        drawn = [self._drawn(rng) for rng in rngs] if callable(config.vehicle) else None
+        if entries:
+            self._world.load(entries, drawn)
+
+    def _drawn(self, rng: np.random.Generator) -> Vehicle:
+        """Return the vehicle of an episode.
+
+        Raises:
+            ValueError: where it differs from the others in more than values of effects.
+        """
+        vehicle, first = resolved_vehicle(self.config, rng), self._vehicle
+        for part in fields(Vehicle):
+            ones, others = (getattr(each, part.name) for each in (vehicle, first))
+            if part.name == "effects":
+                ones, others = sorted(ones), sorted(others)
+            if ones != others:
+                raise ValueError(
+                    f"vehicle: the function drew {part.name} {ones} after {others}; draw values "
+                    "of the same effects around one vehicle (`with_effects`)"
+                )
+        return vehicle
+
+    def track(self, slot: int) -> Track:
+        """Return what is flown through."""
+        return self._tracks[slot]
+
+    def view(self) -> View:
+        """Return what can be observed, (N, ...)."""
+        return self._world.view(np.ones(self.slots, bool))
 
     def observation(self) -> dict[str, np.ndarray]:
         """Return what policies see, (N, ...): `state` and `image`."""
-        views = [world.view(np.ones(world.slots, bool)) for world in self._worlds]
-        view = type(views[0])(*(np.concatenate(parts) for parts in zip(*views, strict=True)))
-        state, image = observe(self.spec, view, self._action)
+        state, image = observe(self.spec, self.view(), self._action)
         state = np.nan_to_num(np.clip(state, -STATE_LIMIT, STATE_LIMIT))
         return {
             "state": state.astype(np.float32),
@@ -216,14 +231,10 @@ class Races:
         change = np.sqrt(((clipped - self._output) ** 2).sum(-1)) * flying
         self._action = np.where(flying[:, None], guarded.action_b, self._action)
         self._output = np.where(flying[:, None], clipped, self._output)
-        period = 1.0 / (self.spec.rate_hz * self._worlds[0].dt)
+        period = 1.0 / (self.spec.rate_hz * self._world.dt)
         steps = np.where(flying, np.maximum(1, steps_to_next(self._decision, period)), 0)
         self._decision += flying
-        first = 0
-        for world in self._worlds:
-            rows = slice(first, first + world.slots)
-            world.advance(self._action[rows], steps[rows], False)
-            first += world.slots
+        self._world.advance(self._action, steps, False)
         ended = [self.ended_by(slot) for slot in range(self.slots)]
         over = np.array([how not in (None, "finished", "timeout") for how in ended])
         done = np.array([how == "finished" for how in ended])
@@ -238,29 +249,26 @@ class Races:
                 reward = reward + weight * term(moments)
         return reward
 
-    def _progress(self, name: str) -> np.ndarray:
-        return np.concatenate([getattr(world.progress, name) for world in self._worlds])
-
     @property
     def ended(self) -> np.ndarray:
         """(N,) as `eval.worlds.trial.Progress.ended`; a bad action counts as diverged."""
-        return np.where(self._bad, len(ENDINGS), self._progress("ended"))
+        return np.where(self._bad, len(ENDINGS), self._world.progress.ended)
 
     @property
     def gates(self) -> np.ndarray:
         """(N,) gates passed."""
-        return self._progress("gates")
+        return self._world.progress.gates
 
     @property
     def time_s(self) -> np.ndarray:
         """(N,) time flown [s]."""
-        return self._progress("step") * self._worlds[0].dt
+        return self._world.progress.step * self._world.dt
 
     @property
     def to_go(self) -> np.ndarray:
         """(N,) way left: to the next gate's centre and on from centre to centre [m]."""
-        parts = zip(self._progress("pos_w"), self._centres_w, self.gates, strict=True)
-        return np.array([way_left(pos_w, centres_w, gates) for pos_w, centres_w, gates in parts])
+        parts = zip(self._world.progress.pos_w, self._tracks, self.gates, strict=True)
+        return np.array([way_left(pos, t.scene.gates.center_w, gates) for pos, t, gates in parts])
 
     def ended_by(self, slot: int) -> str | None:
         """Return one of `ENDINGS`, `BAD_ACTION`, or None while the episode goes on."""
@@ -272,14 +280,13 @@ class Races:
     def info(self, slot: int) -> dict[str, Any]:
         """Return what there is to say of an episode besides observation and reward."""
         how = self.ended_by(slot)
-        world, own = (self._worlds[slot], 0) if self._drawn else (self._worlds[0], slot)
         told = {
             "track_seed": int(self.track_seed[slot]),
             "level": int(self.level[slot]),
             "gates": int(self.gates[slot]),
             "time_s": float(self.time_s[slot]),
             "ended_by": how or "",
-            "collided_with": world.collided_with(own) if how == "collision" else "",
+            "collided_with": self._world.collided_with(slot) if how == "collision" else "",
             "message": "",
         }
         if how == BAD_ACTION:

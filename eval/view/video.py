@@ -17,8 +17,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from eval.logs.flight import Flight
 from eval.view import colours
-from eval.view.scene3d import SKY, Faces, Lines, cut_up, look_at, paint
-from eval.view.solids import track_solids
+from eval.view.chase import Drone, painted, scenery_of
+from eval.view.scene3d import SKY, Lines
 from eval.view.video_file import write_gif, write_mp4
 from eval.worlds.trial import TrialResult
 from tracks.common.files import replacing_file
@@ -26,9 +26,6 @@ from tracks.geometry.rotation import quat_to_rot
 from tracks.track import Track
 
 ENDINGS = (".mp4", ".gif")
-OVERSAMPLING = 2
-"""Frames are painted this much larger and then reduced, which smooths edges."""
-ARM_M, ROTOR_RADIUS_M = 0.12, 0.0635
 DEPTH_RANGE_M = 10.0
 TRAIL_S = 1.6
 """How long the path is shown behind the drone [s]."""
@@ -113,14 +110,7 @@ def video_frames(
     track: Track, flight: Flight, result: TrialResult, options: VideoOptions
 ) -> Iterator[Image.Image]:
     """Yield the frames of a video, one for each of `frame_times`."""
-    solids = track_solids(track)
-    corners = np.concatenate([solid.vertices[solid.faces] for solid in solids])
-    gate = np.repeat(
-        [-1 if solid.gate is None else solid.gate for solid in solids],
-        [len(solid.faces) for solid in solids],
-    )
-    corners, whose = cut_up(corners)
-    gate = gate[whose]
+    scenery = scenery_of(track)
     times = frame_times(flight, options)
     speed = np.linalg.norm(flight.vel_w, axis=1)
     top = colours.top_speed(speed)
@@ -131,22 +121,16 @@ def video_frames(
     decided = np.flatnonzero(flight.policy_step)
     seen = flight.depth_m if flight.depth_m is not None and len(flight.depth_m) else None
     beside = 0 if seen is None else round(options.size[0] * SIDE_SHARE)
-    big = ((options.size[0] - beside) * OVERSAMPLING, options.size[1] * OVERSAMPLING)
+    size = options.size[0] - beside, options.size[1]
     for time in times:
         k = int(np.searchsorted(flight.time_s, time, side="right")) - 1
         pos, eye, target = (_at(flight, values, time) for values in (flight.pos_w, eye_w, target_w))
         next_gate = int(flight.gate[k])
-        body = _drone_faces(pos, rot_w[k])
-        seen_past = _beyond(corners, eye, pos)
-        faces = Faces(
-            np.concatenate([corners[seen_past], body.corners_w]),
-            np.concatenate([_track_colour(gate[seen_past], next_gate), body.colour]),
-        )
         shown = (flight.time_s[:-1] > time - TRAIL_S) & (flight.time_s[1:] <= time)
         lines = Lines(pieces[shown], path_colour[shown], 0.03)
-        image = paint(look_at(eye, target, options.fov_deg, big), faces, lines)
+        drone = Drone(pos, rot_w[k], next_gate)
         frame = Image.new("RGB", options.size, SKY)
-        frame.paste(image.reduce(OVERSAMPLING))
+        frame.paste(painted(scenery, drone, (eye, target), options.fov_deg, size, lines))
         if seen is not None:
             number = int(np.searchsorted(decided, k, side="right")) - 1
             _paint_depth(frame, beside, seen[min(max(number, 0), len(seen) - 1)])
@@ -192,38 +176,6 @@ def _chase(
     eye = smooth - options.behind_m * ahead + up
     eye[:, 2] = np.maximum(eye[:, 2], 0.15)
     return eye, smooth + 1.2 * ahead + 0.15 * up
-
-
-def _beyond(corners_w: np.ndarray, eye_w: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
-    """Return which faces (F, 3, 3) are not before the drone, where they would hide it, (F,)."""
-    way = pos_w - eye_w
-    return ((corners_w - eye_w) @ way).max(axis=1) > way @ way
-
-
-def _track_colour(gate: np.ndarray, next_gate: int) -> np.ndarray:
-    colour = np.tile(np.array(colours.SOLID, dtype=float), (len(gate), 1))
-    colour[gate >= 0] = 0.55 * np.array(colours.AHEAD) + 0.45 * 255
-    colour[gate == next_gate] = colours.AHEAD
-    colour[(gate >= 0) & (gate < next_gate)] = colours.PASSED
-    return colour
-
-
-def _drone_faces(pos_w: np.ndarray, rot_w: np.ndarray) -> Faces:
-    """Return a body and four rotors, the front ones orange."""
-    x, y, z = 0.064, 0.064, 0.025
-    box = np.array([[i * x, j * y, k * z] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    body = [box[[q[0], q[a], q[a + 1]]] for q in quads for a in (1, 2)]
-    angle = np.linspace(0, 2 * np.pi, 13)
-    ring = ROTOR_RADIUS_M * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    parts, colour = list(body), [colours.DRONE] * len(body)
-    for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        middle = np.array([i * ARM_M / np.sqrt(2), j * ARM_M / np.sqrt(2), 0.03])
-        for a, b in zip(ring[:-1], ring[1:], strict=True):
-            parts += [np.array([middle, middle + a, middle + b])]
-            parts += [np.array([middle, middle + b, middle + a])]  # seen from below, too
-            colour += [colours.AHEAD if i > 0 else colours.SOLID_EDGE] * 2
-    return Faces(pos_w + np.array(parts) @ rot_w.T, np.array(colour, dtype=float))
 
 
 def _paint_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:

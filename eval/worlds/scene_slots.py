@@ -7,6 +7,8 @@ the contacts of its current state computed, so that a state is judged before it 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -14,7 +16,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from eval.quadrotor.autopilot import AutopilotState, make_autopilot, start_autopilot
-from eval.quadrotor.plant import Motion, uses_noise
+from eval.quadrotor.plant import MAX_DELAY, Motion, make_plant, uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows
 from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
@@ -76,7 +78,7 @@ class SceneSlots(ABC):
             action: what the policy commands; an acceleration without it.
         """
         self.slots = slots
-        self._vehicle, self._layout, self._rules = vehicle, layout, rules
+        self._vehicles, self._layout, self._rules = [vehicle] * slots, layout, rules
         self._autopilot = make_autopilot(vehicle, action)
         self.dt = self._autopilot.dt
         self._eye, self._tiles = Eye(camera), make_tiles(camera)
@@ -105,10 +107,22 @@ class SceneSlots(ABC):
         self._contacts = self._batch.bind("ncon")
         self._xmat = self._batch.bind("xmat")
 
-    def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
-        """Start trials from (slot, track, trial)."""
+    def load(
+        self,
+        entries: list[tuple[int, Track, TrialSpec]],
+        vehicles: Sequence[Vehicle] | None = None,
+    ) -> None:
+        """Start trials from (slot, track, trial).
+
+        Args:
+            entries: what is flown.
+            vehicles: one an entry, that have the effects of the world's with other values; where
+                some loads have them, all have.
+        """
+        if vehicles is not None:
+            self._change([slot for slot, _, _ in entries], vehicles)
         for slot, track, trial in entries:
-            model = compile_model(track, self._vehicle, self.dt, self._layout.solids)
+            model = compile_model(track, self._vehicles[slot], self.dt, self._layout.solids)
             if not self._models:
                 self._build(model)
             self._models[slot] = model
@@ -135,6 +149,17 @@ class SceneSlots(ABC):
         self._loops = packed(select(started, fresh, getattr(self, "_loops", fresh)))
         self._progress = select(started, start_progress(motion.pos_w), self._progress)
         self._judge(started, np.zeros(self.slots, bool))
+
+    def _change(self, slots: list[int], vehicles: Sequence[Vehicle]) -> None:
+        """Give each of `slots` a vehicle of its own."""
+        for slot, vehicle in zip(slots, vehicles, strict=True):
+            self._vehicles[slot] = vehicle
+        values = {}
+        for name, first in self._vehicles[0].effects.items():
+            rows = zip(*(vehicle.effects[name] for vehicle in self._vehicles), strict=True)
+            values[name] = type(first)(*(np.stack([np.asarray(x) for x in row]) for row in rows))
+        plant = make_plant(self._vehicles[0], self.dt, values, MAX_DELAY)
+        self._autopilot = replace(self._autopilot, plant=plant)
 
     def _scene_with(self, scenes: list[Scene], ids: np.ndarray, started: np.ndarray) -> Scene:
         """Return the scenes of all slots, but for the meshes, with `scenes` in the slots `ids`."""

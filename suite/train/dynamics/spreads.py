@@ -1,11 +1,14 @@
-"""What a recipe varies of its dynamics, name by name, and the same recipe without it."""
+"""What a recipe varies of its dynamics: by name, taken away, and as vehicles for environments."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from suite.train.config import PointMassConfig, TrainConfig
+import numpy as np
+
+from eval.vehicles.vehicle import Vehicle, with_effects
+from suite.train.config import PointMassConfig, QuadrotorConfig, TrainConfig
 
 STILL = (0.0, 0.0, 0.0)
 """No wind."""
@@ -46,6 +49,46 @@ def fixed(config: TrainConfig) -> TrainConfig:
     for name in spreads(config):
         config = spreads(config)[name]
     return config
+
+
+@dataclass(frozen=True)
+class DrawnVehicle:
+    """A function that draws a vehicle, as the trainer draws one for each world."""
+
+    config: QuadrotorConfig
+    """The vehicle and how far what varies is spread."""
+
+    def __call__(self, rng: np.random.Generator) -> Vehicle:
+        """Return the vehicle with drawn values of its effects."""
+        # The trainer of the point mass stays clear of the judge's physics.
+        from suite.train.dynamics.quadrotor import draw_effects
+
+        drawn = {
+            name: type(values)(*(np.asarray(value, float)[0].tolist() for value in values))
+            for name, values in draw_effects(self.config, 1, rng).items()
+        }
+        return with_effects(self.config.vehicle, drawn)
+
+
+def race_settings(recipe: str, vehicle: str = "racer5") -> dict[str, Any]:
+    """Return arguments of the environments in `eval.envs` for training as by a recipe.
+
+    They are what its policy observes (`spec`), and vehicles (`vehicle`) that vary as in its
+    training, or by the usual spreads where it trains through a point mass.
+
+    Args:
+        recipe: a name of `suite train`.
+        vehicle: a file or a shipped name, around which is drawn.
+
+    Raises:
+        ValueError: for an unknown recipe or vehicle.
+    """
+    from eval.quadrotor.vehicle_file import load_vehicle
+    from suite.train.presets import preset, with_quadrotor
+
+    config = with_quadrotor(preset(recipe), load_vehicle(vehicle))
+    assert config.quadrotor is not None
+    return {"spec": config.spec, "vehicle": DrawnVehicle(config.quadrotor)}
 
 
 def _of_point_mass(physics: PointMassConfig) -> dict[str, dict[str, Any]]:

@@ -96,7 +96,7 @@ def test_environments_fly_what_the_judge_flies(trial, spec):
     assert terminated == (expected.ended_by != "timeout")
     end = np.array([expected.pos_x, expected.pos_y, expected.pos_z])
     # The action was divided and multiplied on its way.
-    assert env._races._progress("pos_w")[0] == pytest.approx(end, abs=1e-5)
+    assert env._races._world.progress.pos_w[0] == pytest.approx(end, abs=1e-5)
 
     if spec is not EVEN:  # dm_control's period is one number of steps
         return

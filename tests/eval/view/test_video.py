@@ -8,14 +8,8 @@ import pytest
 from PIL import Image, ImageSequence
 
 from eval.view import colours
-from eval.view.video import (
-    DEPTH_RANGE_M,
-    VideoOptions,
-    _beyond,
-    frame_times,
-    video_frames,
-    write_video,
-)
+from eval.view.chase import _beyond
+from eval.view.video import DEPTH_RANGE_M, VideoOptions, frame_times, video_frames, write_video
 from eval.view.video_file import write_gif
 from tests.support.flights import rollout
 from tests.support.pixels import share

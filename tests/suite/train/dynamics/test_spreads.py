@@ -1,12 +1,17 @@
-"""Spreads by name, each left out alone, and what is left without any."""
+"""Spreads by name, each left out alone, what is left without any, and as vehicles drawn by them."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import Rules
 from suite.train.dynamics.quadrotor import draw_effects
-from suite.train.dynamics.spreads import fixed, spreads
+from suite.train.dynamics.spreads import fixed, race_settings, spreads
 from suite.train.presets import preset
 
 
@@ -45,3 +50,39 @@ def test_point_masses_without_spreads_have_the_middle_of_their_ranges():
     assert physics.action_delay == (0.75, 0.75) and physics.lag_mean == recipe.physics.lag_mean
     assert not (physics.lag_std or any(physics.wind_std) or physics.time_step_std)
     assert physics.depth_noise == 0 and physics.fov_scale == (1, 1)
+
+
+def test_environments_draw_their_vehicles_as_the_trainer_does():
+    settings = race_settings("swift-quad")
+    drawn, config = settings["vehicle"], settings["vehicle"].config
+    rng = np.random.default_rng(0)
+    many = [drawn(rng) for _ in range(60)]
+    mass = np.array([vehicle.effects["mass_offset"].offset for vehicle in many])
+    assert mass.std() == pytest.approx(config.mass_std * config.vehicle.mass, rel=0.3)
+    own = config.vehicle.effects.get("motor_lag")
+    assert own is None or len({vehicle.effects["motor_lag"] for vehicle in many}) == 60
+    assert copy.deepcopy(drawn) == pickle.loads(pickle.dumps(drawn)) == drawn
+
+
+def test_vehicles_of_their_own_fly_at_once_as_they_fly_alone():
+    settings = {**race_settings("swift-quad"), "track": "circular", "rules": Rules(0.3)}
+    many = RaceVectorEnv(3, **settings)
+    alone = [RaceEnv(**settings) for _ in range(3)]
+    seen, _ = many.reset(seed=5)
+    states = [env.reset(seed=5 + k)[0]["state"] for k, env in enumerate(alone)]
+    action = np.array([0.3, 0.1, 0.1], np.float32)
+    for _ in range(12):
+        assert np.array_equal(seen["state"], states)
+        seen, _, terminated, truncated, _ = many.step(np.tile(action, (3, 1)))
+        states = [env.step(action)[0]["state"] for env in alone]
+        for k in np.flatnonzero(terminated | truncated):
+            states[k] = alone[k].reset()[0]["state"]
+    speeds = np.linalg.norm(seen["state"][:, :3], axis=-1)
+    assert len(set(speeds.round(4).tolist())) == 3
+
+
+def test_vehicles_that_differ_in_more_than_effects_are_refused():
+    names = iter(("racer5", "racer5", "reference"))
+    env = RaceVectorEnv(2, vehicle=lambda rng: load_vehicle(next(names)))
+    with pytest.raises(ValueError, match="the function drew name reference after racer5"):
+        env.reset(seed=0)

@@ -1,0 +1,141 @@
+"""One picture of a drone on a track, from any eye or from behind it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from eval.view import colours
+from eval.view.scene3d import Faces, Lines, cut_up, look_at, paint
+from eval.view.solids import track_solids
+from tracks.track import Track
+
+OVERSAMPLING = 2
+"""Pictures are painted this much larger and then reduced, which smooths edges."""
+ARM_M, ROTOR_RADIUS_M = 0.12, 0.0635
+BEHIND_M, ABOVE_M, AHEAD_M = 1.5, 0.55, 1.2
+"""Where the eye of `chase_image` is, and how far before the drone it looks [m]."""
+NO_LINES = Lines(np.zeros((0, 2, 3)), np.zeros((0, 3)), 0.0)
+
+
+class Scenery(NamedTuple):
+    """The triangles of a track."""
+
+    corners_w: np.ndarray
+    """(F, 3, 3) [m]."""
+    gate: np.ndarray
+    """(F,) of which gate's frame each is a part, or -1."""
+
+
+class Drone(NamedTuple):
+    """A drone in a picture."""
+
+    pos_w: np.ndarray
+    """(3,) [m]."""
+    rot_w: np.ndarray
+    """(3, 3) body to world."""
+    gates: int
+    """Passed."""
+
+
+def scenery_of(track: Track) -> Scenery:
+    """Return what `painted` shows of a track."""
+    solids = track_solids(track)
+    corners, whose = cut_up(np.concatenate([solid.vertices[solid.faces] for solid in solids]))
+    gates = [-1 if solid.gate is None else solid.gate for solid in solids]
+    return Scenery(corners, np.repeat(gates, [len(solid.faces) for solid in solids])[whose])
+
+
+def painted(
+    scenery: Scenery,
+    drone: Drone,
+    eye_to_w: tuple[np.ndarray, np.ndarray],
+    fov_deg: float,
+    size: tuple[int, int],
+    lines: Lines = NO_LINES,
+) -> Image.Image:
+    """Return the picture from `eye_to_w`, where the eye is and what it looks at [m].
+
+    What stands between the eye and the drone is left out.
+
+    Args:
+        scenery: of the track.
+        drone: gates that it has passed are coloured so.
+        eye_to_w: (3,) each.
+        fov_deg: field of view across [deg].
+        size: width and height [pixels].
+        lines: drawn as well.
+    """
+    eye, target = eye_to_w
+    body = _drone_faces(drone.pos_w, drone.rot_w)
+    shown = _beyond(scenery.corners_w, eye, drone.pos_w)
+    faces = Faces(
+        np.concatenate([scenery.corners_w[shown], body.corners_w]),
+        np.concatenate([_track_colour(scenery.gate[shown], drone.gates), body.colour]),
+    )
+    big = size[0] * OVERSAMPLING, size[1] * OVERSAMPLING
+    return paint(look_at(eye, target, fov_deg, big), faces, lines).reduce(OVERSAMPLING)
+
+
+def chase_image(
+    scenery: Scenery, drone: Drone, vel_w: np.ndarray, size: tuple[int, int], fov_deg: float = 78.0
+) -> np.ndarray:
+    """Return (height, width, 3) uint8 from behind a drone that flies at vel_w (3,) [m/s]."""
+    # The heading helps out where the drone stands still.
+    way = vel_w[:2] + 0.5 * drone.rot_w[:2, 0]
+    ahead = np.append(way / max(float(np.linalg.norm(way)), 1e-6), 0.0)
+    eye = drone.pos_w - BEHIND_M * ahead + [0.0, 0.0, ABOVE_M]
+    eye[2] = max(eye[2], 0.15)
+    return np.asarray(painted(scenery, drone, (eye, drone.pos_w + AHEAD_M * ahead), fov_deg, size))
+
+
+def inset(picture: np.ndarray, depth_m: np.ndarray, range_m: float, share: int) -> np.ndarray:
+    """Return a picture (H, W, 3) with a depth image (h, w) [m] in its lower right corner.
+
+    Args:
+        picture: uint8.
+        depth_m: coloured up to `range_m`, the nearest pixel for each of the picture's.
+        range_m: the camera's [m].
+        share: the depth image takes one in so many of the picture's columns.
+    """
+    width = picture.shape[1] // share
+    height = min(picture.shape[0], max(1, width * depth_m.shape[0] // depth_m.shape[1]))
+    size = width, height
+    small = Image.fromarray(colours.depth_colours(depth_m, range_m))
+    out = picture.copy()
+    out[-height:, -width:] = np.asarray(small.resize(size, Image.Resampling.NEAREST))
+    return out
+
+
+def _beyond(corners_w: np.ndarray, eye_w: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
+    """Return which faces (F, 3, 3) are not before the drone, where they would hide it, (F,)."""
+    way = pos_w - eye_w
+    return ((corners_w - eye_w) @ way).max(axis=1) > way @ way
+
+
+def _track_colour(gate: np.ndarray, next_gate: int) -> np.ndarray:
+    colour = np.tile(np.array(colours.SOLID, dtype=float), (len(gate), 1))
+    colour[gate >= 0] = 0.55 * np.array(colours.AHEAD) + 0.45 * 255
+    colour[gate == next_gate] = colours.AHEAD
+    colour[(gate >= 0) & (gate < next_gate)] = colours.PASSED
+    return colour
+
+
+def _drone_faces(pos_w: np.ndarray, rot_w: np.ndarray) -> Faces:
+    """Return a body and four rotors, the front ones orange."""
+    x, y, z = 0.064, 0.064, 0.025
+    box = np.array([[i * x, j * y, k * z] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    body = [box[[q[0], q[a], q[a + 1]]] for q in quads for a in (1, 2)]
+    angle = np.linspace(0, 2 * np.pi, 13)
+    ring = ROTOR_RADIUS_M * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    parts, colour = list(body), [colours.DRONE] * len(body)
+    for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        middle = np.array([i * ARM_M / np.sqrt(2), j * ARM_M / np.sqrt(2), 0.03])
+        for a, b in zip(ring[:-1], ring[1:], strict=True):
+            parts += [np.array([middle, middle + a, middle + b])]
+            parts += [np.array([middle, middle + b, middle + a])]  # seen from below, too
+            colour += [colours.AHEAD if i > 0 else colours.SOLID_EDGE] * 2
+    return Faces(pos_w + np.array(parts) @ rot_w.T, np.array(colour, dtype=float))

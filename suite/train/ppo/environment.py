@@ -1,0 +1,214 @@
+"""The race in the trainer's worlds and dynamics, as pure functions: what PPO learns in.
+
+`make_race` has B worlds at once, for the trainer's own PPO; `JaxRace` is one world by the
+conventions of gymnax (Lange 2022), for learners that come from elsewhere. Both fly the same code.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from policies.contract import Contract, contract_of
+from policies.observation import Observation
+from policies.spec import ActionSpec, PolicySpec
+from suite.train.config import TrainConfig
+from suite.train.dynamics.interface import make_dynamics
+from suite.train.ppo.reward import COLLISION, RewardTerms, make_reward
+from suite.train.rollout import make_sight, observed_at_start, queue, world_keys
+from suite.train.step import BODY_RADIUS_M, target_gate
+from suite.train.worlds import Worlds, sample_worlds
+
+ACTION_LIMIT = 20.0
+"""What an action of 1 means in `JaxRace`, as in `eval.envs` [m/s^2]."""
+
+
+class Episode(NamedTuple):
+    """What an episode carries from step to step, (B, ...)."""
+
+    state: Any
+    """Of the dynamics."""
+    target: jax.Array
+    """(B,) gates passed, counted from the track's first."""
+    action_b: jax.Array
+    """(B, 3) the last action [m/s^2]."""
+    images: jax.Array
+    """(B, image_delay, height, width) on their way, oldest first."""
+    observed: jax.Array
+    """(B, state_delay, state_size) on their way, oldest first."""
+
+
+class Flown(NamedTuple):
+    """What a policy period brought, (B,) each."""
+
+    reward: RewardTerms
+    collided: jax.Array
+    """Bool: the drone touched a solid."""
+    passed: jax.Array
+    """Bool: a gate was passed."""
+
+
+class Race(NamedTuple):
+    """Pure functions over B worlds, with a key (B,) for each world's noise."""
+
+    start: Callable[[Worlds], Episode]
+    """worlds -> episodes."""
+    observe: Callable[[Worlds, Episode, jax.Array], tuple[Observation, Episode]]
+    """(worlds, episodes, keys) -> (what the policy is given, episodes'); once before each step."""
+    fly: Callable[[Worlds, Episode, jax.Array, jax.Array], tuple[Episode, Flown]]
+    """(worlds, episodes, action_b (B, 3) [m/s^2], keys) -> episodes a policy period later, and
+    what it brought."""
+
+
+def make_race(config: TrainConfig) -> Race:
+    """Return the race that `config` describes: its observation, dynamics, noise and delays."""
+    spec, physics = config.spec, config.physics
+    sight, reward, dynamics = make_sight(config), make_reward(config), make_dynamics(config)
+
+    def start(worlds: Worlds) -> Episode:
+        batch = worlds.pos_w.shape[0]
+        state = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
+        return Episode(
+            state=state,
+            target=jnp.asarray(worlds.target),
+            action_b=jnp.zeros((batch, 3)),
+            # An image of zeros is embedded as zeros, which is how the trainer's rollouts start.
+            images=jnp.zeros((batch, physics.image_delay, spec.camera.height, spec.camera.width)),
+            observed=observed_at_start(worlds, state, config),
+        )
+
+    def observe(worlds: Worlds, episode: Episode, keys: jax.Array) -> tuple[Observation, Episode]:
+        seen = sight(worlds, episode.state, episode.target, episode.action_b, keys)
+        state, observed = queue(episode.observed, seen.state)
+        image, images = queue(episode.images, seen.image)
+        return Observation(state, image), episode._replace(images=images, observed=observed)
+
+    def fly(
+        worlds: Worlds, episode: Episode, action_b: jax.Array, keys: jax.Array
+    ) -> tuple[Episode, Flown]:
+        before, target = episode.state, episode.target
+        _, target_w = target_gate(worlds.scene.gates, target)
+        after = dynamics.step(before, worlds.constants, action_b, target_w, keys)
+        terms, clearance, passed = reward(worlds, before, after, target)
+        episode = episode._replace(state=after, target=target + passed, action_b=action_b)
+        return episode, Flown(terms, clearance < BODY_RADIUS_M, passed)
+
+    return Race(start, observe, fly)
+
+
+def choose(where: jax.Array, ones: Any, others: Any) -> Any:
+    """Return the leaves (B, ...) of `ones` for worlds `where` (B,) is true, else of `others`."""
+    return jax.tree.map(lambda one, other: jax.vmap(jnp.where)(where, one, other), ones, others)
+
+
+class RaceState(NamedTuple):
+    """State of a `JaxRace`."""
+
+    world: jax.Array
+    """Which world of the pool is flown."""
+    episode: Episode
+    """Of a batch of one."""
+    steps: jax.Array
+    """Policy periods flown."""
+
+
+@dataclass(frozen=True)
+class JaxRace:
+    """One race as gymnax has it: pure, to be compiled and mapped by the learner.
+
+        env = JaxRace(TrainConfig(quadrotor=QuadrotorConfig(load_vehicle("racer5"))))
+        worlds = env.worlds(256)
+        seen, state = jax.vmap(env.reset, (0, None))(keys, worlds)
+        seen, state, reward, done, info = jax.vmap(env.step, (0, 0, 0, None))(
+            keys, state, action, worlds
+        )
+
+    Tracks are drawn before, as a pool of worlds (gymnax's `params`); `reset` picks one of them. An
+    observation is what policies see, with the delays and the noise of `config`. An action is -1 to
+    1 a component, as `contract` says. The motion is differentiable in the action. An episode ends
+    by a collision, by a tilt beyond 90 degrees, with the last gate or at the time limit.
+    """
+
+    config: TrainConfig
+    """Observation, dynamics, randomisation and tracks; of the losses r_q alone."""
+    time_limit_s: float = 20.0
+    """[s]."""
+    reward_scale: float = 0.01
+    """Rewards are those of `suite.train.ppo.reward` times this [1]."""
+
+    @property
+    def spec(self) -> PolicySpec:
+        """What the policy is given, and that it answers with -1 to 1."""
+        action = ActionSpec("acceleration", (ACTION_LIMIT,), (0.0,), clip=1.0)
+        return replace(self.config.spec, action=action)
+
+    @property
+    def contract(self) -> Contract:
+        """What goes into the file of a policy that is trained here."""
+        return contract_of(self.spec)
+
+    @functools.cached_property
+    def _race(self) -> Race:
+        # First used while the learner compiles, its arrays would belong to that compilation.
+        with jax.ensure_compile_time_eval():
+            return make_race(self.config)
+
+    def worlds(self, count: int, seed: int = 0) -> Worlds:
+        """Return a pool of `count` worlds: tracks, starts and vehicles, drawn by numpy."""
+        episode = replace(self.config.episode, batch=count)
+        drawn = sample_worlds(replace(self.config, episode=episode, seed=seed), 0)
+        return jax.tree.map(jnp.asarray, drawn)
+
+    def reset(self, key: jax.Array, worlds: Worlds) -> tuple[Observation, RaceState]:
+        """Start an episode in a world of the pool."""
+        pick, noise = jax.random.split(key)
+        world = jax.random.randint(pick, (), 0, worlds.pos_w.shape[0])
+        one = _one(worlds, world)
+        return self._seen(noise, one, RaceState(world, self._race.start(one), jnp.zeros((), int)))
+
+    def step(
+        self, key: jax.Array, state: RaceState, action: jax.Array, worlds: Worlds
+    ) -> tuple[Observation, RaceState, jax.Array, jax.Array, dict[str, jax.Array]]:
+        """Fly an action (3,) for a policy period; return (seen, state, reward, done, info).
+
+        After an episode's end it starts the next one, and `seen` is what is seen there. `info` has
+        the gates passed, and `collided`, `tipped`, `finished` and `truncated` (the time limit).
+        """
+        air, pick, noise = jax.random.split(key, 3)
+        one = _one(worlds, state.world)
+        output = jnp.clip(action, -1.0, 1.0)
+        keys = world_keys(air, one)
+        episode, flown = self._race.fly(one, state.episode, ACTION_LIMIT * output[None], keys)
+        steps = state.steps + 1
+        gates = episode.target[0]
+        tipped = episode.state.rot_w[0, 2, 2] < 0.0
+        finished = gates >= worlds.scene.gates.center_w.shape[1]
+        collided = flown.collided[0]
+        over = collided | tipped | finished
+        truncated = ~over & (steps >= round(self.time_limit_s * self.config.spec.rate_hz))
+        reward = self.reward_scale * (flown.reward.total()[0] + COLLISION * (tipped & ~collided))
+        info = {
+            "gates": gates, "collided": collided, "tipped": tipped, "finished": finished,
+            "truncated": truncated,
+        }  # fmt: skip
+        done = over | truncated
+        world = jax.random.randint(pick, (), 0, worlds.pos_w.shape[0])
+        world = jnp.where(done, world, state.world)
+        one = _one(worlds, world)
+        episode = choose(done[None], self._race.start(one), episode)
+        seen, after = self._seen(noise, one, RaceState(world, episode, jnp.where(done, 0, steps)))
+        return seen, after, reward, done, info
+
+    def _seen(self, key: jax.Array, one: Worlds, state: RaceState) -> tuple[Observation, RaceState]:
+        seen, episode = self._race.observe(one, state.episode, world_keys(key, one))
+        return Observation(seen.state[0], seen.image[0]), state._replace(episode=episode)
+
+
+def _one(worlds: Worlds, number: jax.Array) -> Worlds:
+    """Return a world of the pool as a batch of one."""
+    return jax.tree.map(lambda leaf: leaf[number][None], worlds)
