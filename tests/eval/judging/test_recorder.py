@@ -68,7 +68,7 @@ def test_the_next_trial_of_a_slot_begins_with_nothing():
 def test_recording_changes_nothing():
     levels = ((track, level) for track in ("zigzag", "circular") for level in (1, 6))
     trials = [TrialSpec(track, level, 0) for track, level in levels]
-    options, flights = JudgeOptions(slots=3, rules=Rules(time_limit_s=2.0)), {}
+    options, flights = JudgeOptions(slots=3, rules=Rules(time_limit_s=1.0)), {}
     policy = RandomNetwork()
     found = fly(
         policy, trials, VEHICLE, "mujoco", options,

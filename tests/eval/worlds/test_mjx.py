@@ -24,7 +24,7 @@ POSITION_TOLERANCE_M = 2e-4
 
 
 def both(trials, rules=None, record=None, vehicle=VEHICLE):
-    options = JudgeOptions(slots=12, workers=1, rules=rules or Rules())
+    options = JudgeOptions(slots=6, workers=1, rules=rules or Rules())
     found = []
     for world in ("mujoco", "mjx"):
         flights = []
@@ -43,7 +43,7 @@ def both(trials, rules=None, record=None, vehicle=VEHICLE):
 
 @pytest.fixture(scope="module")
 def few():
-    trials = [TrialSpec(t, 9, s) for t in ("zigzag", "circular", "ellipse") for s in range(4)]
+    trials = [TrialSpec(t, 9, s) for t in ("zigzag", "circular", "ellipse") for s in range(2)]
     return both(trials, Rules(time_limit_s=2.2), Record(depth=True))
 
 

@@ -116,17 +116,11 @@ def test_what_does_not_exist_is_found():
 
 
 @pytest.mark.parametrize("where", [where for where, (marked, _) in BLOCKS.items() if marked])
-def test_marked_commands_run(where, tmp_path):
-    body = BLOCKS[where][1]
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    done = subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", body],
-        cwd=tmp_path,
-        env={**os.environ, "PATH": path},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+def test_marked_commands_run(where, tmp_path, monkeypatch, capfd):
+    """One after the other in this process, where what the first compiles the next one has."""
+    monkeypatch.chdir(tmp_path)
+    for program, *words in _commands(BLOCKS[where][1]):
+        assert program == "suite" and cli.main(words) == 0, (words, capfd.readouterr().err)
 
 
 def test_python_on_a_page_imports_what_there_is():

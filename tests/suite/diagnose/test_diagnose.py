@@ -343,10 +343,6 @@ ALIKE = {
 """What half a minute of flight may leave open."""
 
 
-EVERY_TIME = ("gusts",)
-"""The rest with `-m slow` and in blind sets; an offset in examples/diagnose_a_log.py too."""
-
-
 @pytest.fixture(scope="module")
 def ways():
     return ordinary_flights(np.random.default_rng(5), duration_s=5.5)
@@ -363,10 +359,8 @@ def test_no_effect_is_forgotten():
     assert set(HIDDEN) == set(nameable_effects())
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=() if n in EVERY_TIME else pytest.mark.slow) for n in HIDDEN],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HIDDEN)
 def test_an_effect_is_named_alone(name, ways):
     truth = with_effects(GIVEN, **{**DRAG, name: HIDDEN[name]})
     logs = logged(truth, ways, list(EFFECTS).index(name))

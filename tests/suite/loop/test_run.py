@@ -78,7 +78,8 @@ def test_the_control_costs_the_same_training_on_the_same_tracks(whole):
     assert not np.array_equal(first[0][2], control[0][2]), "fine-tuning sees new tracks"
 
 
-@pytest.mark.parametrize("kind", ["fly", pytest.param("train", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["fly", "train"])
 def test_a_loop_stopped_again_and_again_comes_to_the_same(
     whole, kind, tmp_path, monkeypatch, capfd
 ):
@@ -139,3 +140,5 @@ def test_a_loop_goes_on_where_its_folder_was_moved(whole, tmp_path, monkeypatch)
     end = tmp_path / "end"
     assert not small.trained and not (end / "train").exists(), "a given policy is not trained"
     assert (end / "given" / "policy" / WEIGHTS).read_bytes() == (given / WEIGHTS).read_bytes()
+    one, two = (read_trials(run / "eval-before" / "trials.parquet") for run in (whole[0], end))
+    assert one == two, "as in the loop that trained it and was never stopped"

@@ -66,9 +66,8 @@ def test_shards_have_the_gradient_of_the_whole_batch(noisy):
     assert largest_difference(numbers, curve) < 1e-3
 
 
-@pytest.mark.parametrize("cores", [2, 4])
-def test_any_number_of_cores_comes_to_the_same_bits(noisy, cores, monkeypatch):
-    monkeypatch.setattr(shards, "usable_cores", lambda: cores)
+def test_any_number_of_cores_comes_to_the_same_bits(noisy, monkeypatch):
+    monkeypatch.setattr(shards, "usable_cores", lambda: 3)
     config, expected = noisy
     jax.tree.map(np.testing.assert_array_equal, updated(config), expected)
 
