@@ -204,7 +204,11 @@ def test_progress_is_the_papers_and_differentiates():
     np.testing.assert_allclose(
         progress_term(config, pos, vel, target, pos - target), expected, atol=1e-9
     )
-    for varied in (LossConfig(), LossConfig(progress=0.0, progress_norm=0.7)):
+    by_direction = LossConfig(progress=0.0, progress_norm=0.4)
+    expected /= np.linalg.norm(vel, axis=-1) + 1e-3
+    found = progress_term(by_direction, pos, vel, target, pos - target)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    for varied in (LossConfig(), by_direction):
         check_grads(
             lambda p, v, c=varied: progress_term(c, p, v, target, pos - target),
             (pos, vel), order=1, modes=["rev"], atol=1e-6, rtol=1e-6,
