@@ -1,6 +1,6 @@
 """Train PPO of Stable-Baselines3 on races, frames stacked in twos, and export it for the judge.
 
-Run: pip install 'diffracing-suite[sb3]'; python examples/sb3_race.py runs/sb3 [STEPS]; then
+Run: pip install 'diffracing-suite[sb3]'; python examples/sb3_race.py runs/sb3 [MINUTES]; then
 suite eval --policy runs/sb3/policy.onnx --track random --trials 100
 """
 
@@ -8,35 +8,45 @@ suite eval --policy runs/sb3/policy.onnx --track random --trials 100
 from __future__ import annotations
 
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecFrameStack
+from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
-from eval.envs.gymnasium_env import RaceEnv
+from eval.envs.sb3_env import RaceVecEnv
+from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.export import export_module
+from policies.spec import PolicySpec
+from tracks.geometry.camera import Camera
 
-SETTINGS = {"track": "random", "level": 0, "rewards": {"progress": 1.0, "gate": 5.0, "crash": -5.0}}
+SPEC = PolicySpec(rate_hz=15.0, camera=Camera(width=8, height=6))  # few pixels, few decisions
+RACER = load_vehicle("racer5")
+COARSE = replace(RACER, controller=replace(RACER.controller, frequency=250.0))  # half the steps
+SETTINGS = {"track": "random", "level": 0, "spec": SPEC, "vehicle": COARSE}
 
 
 class Judged(torch.nn.Module):
     """The actor as the judge calls it: what it remembers is the frame before, zeros at first."""
 
-    def __init__(self, model: PPO) -> None:
-        """Take the policy of a trained `model`."""
+    def __init__(self, model: PPO, seen: VecNormalize) -> None:
+        """Take the policy of a trained `model`, and how its observations were normalised."""
         super().__init__()
         self.policy = model.policy
+        run = seen.obs_rms["state"]
+        self.register_buffer("mean", torch.tensor(run.mean).float())
+        self.register_buffer("deviation", torch.tensor((run.var + 1e-8) ** 0.5).float())
 
     def forward(
         self, state: torch.Tensor, image: torch.Tensor, hidden: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the mean action, which the contract clips and scales, and this frame."""
-        count, size = state.shape[1], image.shape[1:]
-        before = hidden[:, count:].reshape(-1, *size)
+        state = ((state - self.mean) / self.deviation).clamp(-10.0, 10.0)
+        before = hidden[:, state.shape[1] :].reshape(-1, *image.shape[1:])
         frames = {
-            "state": torch.cat([hidden[:, :count], state], -1),
+            "state": torch.cat([hidden[:, : state.shape[1]], state], -1),
             "image": torch.cat([before, image], -1),
         }
         features = self.policy.extract_features(frames, self.policy.pi_features_extractor)
@@ -44,18 +54,22 @@ class Judged(torch.nn.Module):
         return self.policy.action_net(actor), torch.cat([state, image.flatten(1)], -1)
 
 
-def main(out: Path, steps: int, envs: int = 8, rollout: int = 256) -> Path:
-    """Train for `steps` decisions and return the file."""
-    vector = VecFrameStack(make_vec_env(RaceEnv, envs, seed=0, env_kwargs=SETTINGS), 2)
-    network = {"net_arch": [128, 128], "log_std_init": -1.0}
-    model = PPO("MultiInputPolicy", vector, n_steps=rollout, batch_size=256, gamma=0.99,
-                learning_rate=3e-4, seed=0, policy_kwargs=network, device="cpu")  # fmt: skip
-    model.learn(steps)
-    contract = RaceEnv(**SETTINGS).contract
-    memory = (12 + 24 * 32,)
+def main(out: Path, minutes: float, envs: int = 128, rollout: int = 16) -> Path:
+    """Train for some minutes and return the file."""
+    torch.set_num_threads(1)  # the network is small
+    races = RaceVecEnv(envs, **SETTINGS)
+    normalised = VecNormalize(VecMonitor(races), gamma=0.97, norm_obs_keys=["state"])
+    network = {"net_arch": [64, 64], "log_std_init": -2.0}
+    model = PPO("MultiInputPolicy", VecFrameStack(normalised, 2), n_steps=rollout, batch_size=256,
+                n_epochs=10, gamma=0.97, gae_lambda=0.9, learning_rate=1e-3, target_kl=0.05,
+                seed=0, policy_kwargs=network, device="cpu", verbose=1)  # fmt: skip
+    end = time.monotonic() + 60.0 * minutes
+    model.learn(10**9, lambda *_: time.monotonic() < end, log_interval=10)
     out.mkdir(parents=True, exist_ok=True)
-    return export_module(Judged(model), out / "policy.onnx", contract, memory)
+    memory = (SPEC.state_size + SPEC.camera.height * SPEC.camera.width,)
+    judged = Judged(model, normalised)
+    return export_module(judged, out / "policy.onnx", races.races.contract, memory)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]) if sys.argv[2:] else 1_000_000)
+    main(Path(sys.argv[1]), float(sys.argv[2]) if sys.argv[2:] else 25.0)

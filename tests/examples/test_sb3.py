@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eval.envs.gymnasium_env import RaceEnv
 from policies.contract import contract_of
 from policies.policy import load_policy
 
@@ -22,8 +23,8 @@ def test_what_it_exports_answers_as_its_model(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found.loader.exec_module(example)
-        policy = load_policy(example.main(tmp_path, 64, envs=1, rollout=32))
-    assert contract_of(policy.spec) == example.RaceEnv(**example.SETTINGS).contract
-    rows = np.ones((1, 12), np.float32), np.ones((1, 24, 32), np.float32)
+        policy = load_policy(example.main(tmp_path, 0.02, envs=2, rollout=8))
+    assert contract_of(policy.spec) == RaceEnv(**example.SETTINGS).contract
+    rows = np.ones((1, 12), np.float32), np.ones((1, 6, 8), np.float32)
     action, memory = policy.act(policy.start(1), *rows, np.ones(1, bool))
     assert action.shape == (1, 3) and memory[0, 0] == 1.0
