@@ -33,11 +33,12 @@ class Agent(nn.Module):
         """Make networks whose first actions are nearly zero."""
         super().__init__()
         size = SPEC.state_size + SPEC.camera.height * SPEC.camera.width
+        heads = nn.Linear(128, 3), nn.Linear(128, 1)
+        nn.init.normal_(heads[0].weight, std=0.001)
         self.actor, self.critic = (
             nn.Sequential(nn.Linear(size, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), head)
-            for head in (nn.Linear(128, 3), nn.Linear(128, 1))
+            for head in heads
         )
-        nn.init.normal_(self.actor[-1].weight, std=0.001)
         self.log_deviation = nn.Parameter(torch.full((3,), -1.5))
 
     def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:

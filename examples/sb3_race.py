@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -17,15 +16,12 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
 from eval.envs.sb3_env import RaceVecEnv
-from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.export import export_module
 from policies.spec import PolicySpec
 from tracks.geometry.camera import Camera
 
 SPEC = PolicySpec(rate_hz=15.0, camera=Camera(width=8, height=6))  # few pixels, few decisions
-RACER = load_vehicle("racer5")
-COARSE = replace(RACER, controller=replace(RACER.controller, frequency=250.0))  # half the steps
-SETTINGS = {"track": "random", "level": 0, "spec": SPEC, "vehicle": COARSE}
+SETTINGS = {"track": "random", "level": 0, "spec": SPEC}  # and the defaults
 
 
 class Judged(torch.nn.Module):
@@ -36,8 +32,8 @@ class Judged(torch.nn.Module):
         super().__init__()
         self.policy = model.policy
         run = seen.obs_rms["state"]
-        self.register_buffer("mean", torch.tensor(run.mean).float())
-        self.register_buffer("deviation", torch.tensor((run.var + 1e-8) ** 0.5).float())
+        self.mean = torch.tensor(run.mean).float()
+        self.deviation = torch.tensor((run.var + 1e-8) ** 0.5).float()
 
     def forward(
         self, state: torch.Tensor, image: torch.Tensor, hidden: torch.Tensor
@@ -45,10 +41,8 @@ class Judged(torch.nn.Module):
         """Return the mean action, which the contract clips and scales, and this frame."""
         state = ((state - self.mean) / self.deviation).clamp(-10.0, 10.0)
         before = hidden[:, state.shape[1] :].reshape(-1, *image.shape[1:])
-        frames = {
-            "state": torch.cat([hidden[:, : state.shape[1]], state], -1),
-            "image": torch.cat([before, image], -1),
-        }
+        states = torch.cat([hidden[:, : state.shape[1]], state], -1)
+        frames = {"state": states, "image": torch.cat([before, image], -1)}
         features = self.policy.extract_features(frames, self.policy.pi_features_extractor)
         actor = self.policy.mlp_extractor.forward_actor(features)
         return self.policy.action_net(actor), torch.cat([state, image.flatten(1)], -1)
@@ -67,8 +61,8 @@ def main(out: Path, minutes: float, envs: int = 128, rollout: int = 16) -> Path:
     model.learn(10**9, lambda *_: time.monotonic() < end, log_interval=10)
     out.mkdir(parents=True, exist_ok=True)
     memory = (SPEC.state_size + SPEC.camera.height * SPEC.camera.width,)
-    judged = Judged(model, normalised)
-    return export_module(judged, out / "policy.onnx", races.races.contract, memory)
+    contract = races.races.contract
+    return export_module(Judged(model, normalised), out / "policy.onnx", contract, memory)
 
 
 if __name__ == "__main__":

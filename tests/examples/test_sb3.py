@@ -14,7 +14,7 @@ from policies.policy import load_policy
 pytest.importorskip("stable_baselines3", reason="pip install 'diffracing-suite[sb3]'")
 
 
-def test_what_it_exports_answers_as_its_model(tmp_path):
+def test_what_it_exports_answers_as_its_model(tmp_path, monkeypatch):
     path = Path(__file__).resolve().parents[2] / "examples" / "sb3_race.py"
     assert len(path.read_text().splitlines()) <= 70
     found = importlib.util.spec_from_file_location("sb3_race", path)
@@ -23,8 +23,22 @@ def test_what_it_exports_answers_as_its_model(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found.loader.exec_module(example)
+        made, export = [], example.export_module
+        monkeypatch.setattr(
+            example, "export_module", lambda *given: made.append(given[0]) or export(*given)
+        )
         policy = load_policy(example.main(tmp_path, 0.02, envs=2, rollout=8))
     assert contract_of(policy.spec) == RaceEnv(**example.SETTINGS).contract
-    rows = np.ones((1, 12), np.float32), np.ones((1, 6, 8), np.float32)
-    action, memory = policy.act(policy.start(1), *rows, np.ones(1, bool))
-    assert action.shape == (1, 3) and memory[0, 0] == 1.0
+    (judged,) = made
+    rng, memory, before = np.random.default_rng(0), policy.start(1), None
+    for fresh in (True, False):  # the second decision sees the first one's frame as well
+        rows = rng.normal(size=(1, 12)), rng.uniform(0.0, 2.0, (1, 6, 8))
+        state, image = (row.astype(np.float32) for row in rows)
+        action, memory = policy.act(memory, state, image, np.array([fresh]))
+        seen = {"state": (state - judged.mean.numpy()) / judged.deviation.numpy(), "image": image}
+        seen["state"] = seen["state"].clip(-10.0, 10.0)
+        before = before or {key: np.zeros_like(part) for key, part in seen.items()}
+        frames = {key: np.concatenate([before[key], seen[key]], -1) for key in seen}
+        answer, _ = judged.policy.predict(frames, deterministic=True)
+        np.testing.assert_allclose(action, answer, atol=1e-5)
+        before = seen
