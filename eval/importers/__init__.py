@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from eval.importers.findings import Finding
     from eval.importers.options import ImportOptions
+    from eval.logs.faults.finding import Finding
     from eval.logs.flight_log import FlightLog
 
 

@@ -5,26 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from eval.importers.checks.airborne import airborne
-from eval.importers.checks.attitude import check_attitude
-from eval.importers.checks.delay import check_delay
 from eval.importers.checks.glitches import clean
-from eval.importers.checks.motion import (
-    check_accelerometer,
-    check_frames,
-    check_rate_command,
-    check_velocity,
-)
-from eval.importers.checks.units import check_units
-from eval.importers.checks.weight import check_weight
+from eval.importers.checks.late import check_delay
 from eval.importers.commands import order_motors, rates_wanted, thrust_command
-from eval.importers.findings import Finding, asked_of, said
+from eval.importers.findings import asked_of
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
 from eval.importers.rows import HOLE_S, HOLE_STEPS, NEEDED, own_rows, row_times, rows_at, slowest
-from eval.importers.signals import Recording, median_step
+from eval.importers.signals import Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
+from eval.logs.faults.check import DRIVE, POSE, Against, run_checks
+from eval.logs.faults.finding import Finding, said
 from eval.logs.flight_log import FlightLog, log_from_columns
 
+COARSE_HZ = 100.0
+"""The pose is checked on at most so many rows a second."""
 SLOW_HZ = 40.0
 """Signals that come more rarely than this are worth a word."""
 TEXTS = {
@@ -51,14 +46,17 @@ def assemble(
 
         recording, more = with_pose(recording, options)
         findings += more
+    recording = with_readings(recording, options.read)
     _need(recording, options.partial)
-    turning = {"quat", "rate"} <= recording.signals.keys()
-    if turning:
-        recording, more = check_units(recording, options.fix)
-        findings += more
-    recording, more = clean(recording) if options.fix else (recording, [])
+    against = Against(options.vehicle)
+    coarse = row_times(recording, COARSE_HZ, 0.0, None)
+    more, readings, _ = run_checks(rows_at(recording, coarse), POSE, against, options.fix)
     findings += more
-    if turning and options.pose is None:
+    if options.fix:
+        recording = with_readings(recording, readings)
+        recording, more = clean(recording)
+        findings += more
+    if {"quat", "rate"} <= recording.signals.keys() and options.pose is None:
         recording, more = check_delay(recording, options.fix)
         findings += more
     within, more = _flight(recording, options)
@@ -66,11 +64,13 @@ def assemble(
     time_s = row_times(recording, options.rate_hz, options.start_s, options.end_s, within)
     findings += _rates(recording, time_s)
     rows = rows_at(recording, time_s)
-    findings += _checks(rows, options.fix)
     findings += order_motors(rows, recording.motor_side, options.vehicle)
-    findings += check_weight(rows, options.vehicle, options.fix)
     findings += rates_wanted(rows, options.vehicle)
-    findings += thrust_command(rows, options)
+    more, readings, right = run_checks(rows, DRIVE, against, options.fix)
+    findings += more
+    rows = right if options.fix else rows
+    unsure = {f.signal for f in findings if f.status == "doubt"}
+    findings += thrust_command(rows, options, "accelerometer" not in unsure)
     findings += _pair(rows, options.partial)
     for name, own in own_rows(recording, time_s).items():
         rows[name] = np.where(own[:, None], rows[name], np.nan)
@@ -112,20 +112,6 @@ def _flight(
 ) -> tuple[tuple[float, float], list[Finding]]:
     """Return the first and the last time in the air [s]; all of it where the ground is kept."""
     return airborne(recording) if options.trim else ((-np.inf, np.inf), [])
-
-
-def _checks(rows: dict[str, np.ndarray], fix: bool) -> list[Finding]:
-    """Check the rows against each other, as far as they hold what a check needs."""
-    findings: list[Finding] = []
-    if {"quat", "rate"} <= rows.keys():
-        findings += check_attitude(rows, fix)
-    if {"pos", "quat"} <= rows.keys():
-        findings += check_velocity(rows, fix)
-        findings += check_frames(rows, fix)
-        findings += check_accelerometer(rows, fix)
-    if "rate" in rows:
-        findings += check_rate_command(rows, fix)
-    return findings
 
 
 def _rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:

@@ -14,13 +14,15 @@ from itertools import permutations
 
 import numpy as np
 
-from eval.importers.findings import Finding
 from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.options import ImportOptions
+from eval.logs.faults.finding import Finding
 from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
 
 SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 """Front right, rear right, rear left, front left: the order of the vehicles that are shipped."""
+FULL = (8.0, 200.0)
+"""What full throttle of a multirotor that flies gives [m/s^2]."""
 SIDES = ("front right", "rear right", "rear left", "front left")
 
 
@@ -55,14 +57,22 @@ def _directions(hubs: Sequence[Sequence[float]]) -> np.ndarray:
     return array / np.linalg.norm(array, axis=1, keepdims=True)
 
 
-def thrust_command(rows: dict[str, np.ndarray], options: ImportOptions) -> list[Finding]:
-    """Replace `throttle` of `rows` by `cmd_thrust` [m/s^2], in place, where that can be done."""
+def thrust_command(
+    rows: dict[str, np.ndarray], options: ImportOptions, by_acc: bool = True
+) -> list[Finding]:
+    """Replace `throttle` of `rows` by `cmd_thrust` [m/s^2], in place, where that can be done.
+
+    Args:
+        rows: see `eval.importers.rows`.
+        options: the vehicle, and what full throttle gives.
+        by_acc: fit it to the accelerometer where nothing else says it; not where that looks wrong.
+    """
     if "cmd_thrust" in rows or "throttle" not in rows:
         return []
     throttle = rows["throttle"][:, 0]
     if options.full_thrust is None and options.vehicle and options.vehicle.motors:
         return _by_motors(rows, options.vehicle, options.vehicle.motors)
-    full, findings = _full_thrust(rows, throttle, options)
+    full, findings = _full_thrust(rows, throttle, options, by_acc)
     if full is None:
         return findings
     rows["cmd_thrust"] = full * throttle[:, None]
@@ -80,7 +90,7 @@ def _by_motors(rows: dict[str, np.ndarray], vehicle: Vehicle, motors: MotorMap) 
 
 
 def _full_thrust(
-    rows: dict[str, np.ndarray], throttle: np.ndarray, options: ImportOptions
+    rows: dict[str, np.ndarray], throttle: np.ndarray, options: ImportOptions, by_acc: bool
 ) -> tuple[float | None, list[Finding]]:
     linear = "taking thrust as proportional to it"
     if options.full_thrust is not None:
@@ -90,24 +100,41 @@ def _full_thrust(
         full = options.vehicle.full_thrust
         text = f"normalised; full throttle is {full:.4g} m/s^2 by the vehicle file, {linear}"
         return full, [Finding("note", "thrust", text), *_hover(rows, full * throttle)]
-    if "acc" in rows:
-        acc = rows["acc"][:, 2]
-        good = np.isfinite(acc) & np.isfinite(throttle) & (throttle > 0.02)
-        if np.sum(good) > 100:
-            full = float(np.sum(acc[good] * throttle[good]) / np.sum(throttle[good] ** 2))
-            rest = float(np.std(acc[good] - full * throttle[good]))
-            if full > 0:
-                text = (
-                    f"normalised; full throttle is {full:.4g} m/s^2 by the accelerometer "
-                    f"({rest:.2g} m/s^2 are left), {linear}. A wrong thrust scale cannot be seen "
-                    "in this log; with --vehicle it can"
-                )
-                return full, [Finding("note", "thrust", text)]
+    if "acc" in rows and by_acc:
+        full, rest = _fitted_full(throttle, rows["acc"][:, 2])
+        if FULL[0] <= full <= FULL[1]:
+            text = (
+                f"normalised; full throttle is {full:.4g} m/s^2 by the accelerometer "
+                f"({rest:.2g} m/s^2 are left), {linear}. A wrong thrust scale cannot be seen "
+                "in this log; with --vehicle it can"
+            )
+            return full, [Finding("note", "thrust", text)]
+        if np.isfinite(full):
+            text = (
+                f"normalised; full throttle would be {full:.3g} m/s^2 by the accelerometer, and "
+                f"{FULL[0]:g} to {FULL[1]:g} is possible: left out; give --vehicle FILE or "
+                "--full-thrust M/S^2"
+            )
+            return None, [Finding("doubt", "thrust", text, "thrust_scale", full, 0.95,
+                                  "--full-thrust M/S^2")]  # fmt: skip
     text = (
         "normalised, and nothing says what full throttle gives: left out; "
         "give --vehicle FILE or --full-thrust M/S^2"
     )
     return None, [Finding("doubt", "thrust", text)]
+
+
+def _fitted_full(throttle: np.ndarray, acc: np.ndarray) -> tuple[float, float]:
+    """Return what full throttle gives by an accelerometer's z, and what is left [m/s^2]; or NaN.
+
+    By the median of their ratios, which garbage in a part of the log does not move.
+    """
+    good = np.isfinite(acc) & np.isfinite(throttle) & (throttle > 0.02) & (throttle <= 1.5)
+    if np.sum(good) <= 100:
+        return np.nan, np.nan
+    full = float(np.median(acc[good] / throttle[good]))
+    off = acc[good] - full * throttle[good]
+    return full, 1.4826 * float(np.median(np.abs(off - np.median(off))))
 
 
 def _hover(rows: dict[str, np.ndarray], thrust: np.ndarray) -> list[Finding]:

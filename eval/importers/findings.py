@@ -1,30 +1,10 @@
-"""What an import has to say about a log: checks, corrections, doubts, and what can be asked."""
+"""What can be asked of a log that lacks something."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-
-class Finding(NamedTuple):
-    """One statement about an imported log."""
-
-    level: str
-    """`ok` (checked and as it should be), `note` (worth knowing), `corrected` (found wrong and put
-    right), `doubt` (looks wrong, left as it is)."""
-    subject: str
-    """What it is about: `time`, `attitude`, `velocity`, `thrust`, ..."""
-    text: str
-    """One sentence with the figures that it rests on."""
-
-
-def said(findings: tuple[Finding, ...]) -> list[str]:
-    """Return the findings as lines for people, the serious ones first."""
-    order = ("corrected", "doubt", "note", "ok")
-    ranked = sorted(findings, key=lambda finding: order.index(finding.level))
-    return [f"{finding.level:9} {finding.subject}: {finding.text}" for finding in ranked]
-
+from eval.logs.faults.finding import Finding
 
 TEXTS = {"pos": "position", "quat": "attitude", "rate": "body rates", "command": "commands"}
 QUESTIONS = (

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.findings import Finding
 from eval.importers.frames import (
     attitude,
     body_vector,
@@ -23,6 +22,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import measured
 from eval.importers.signals import Recording, Signal, collect
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.finding import Finding
 
 Part = tuple[np.ndarray, np.ndarray]
 Find = Callable[[tuple[str, ...]], Part | None]

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.checks.units import TIMES
 from eval.importers.frames import BODIES, WORLDS
 from eval.logs.columns import GROUPS, KNOWN
+from eval.logs.faults.reading import TIMES
 from eval.logs.files import METADATA
 from tracks.common.names import unknown_name
 from tracks.common.toml_table import Table, read_toml

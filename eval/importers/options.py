@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from eval.logs.faults.reading import Readings
 from eval.vehicles.vehicle import Vehicle
 
 
@@ -40,5 +41,7 @@ class ImportOptions:
     """Leave out the time on the ground before take-off and after landing."""
     partial: bool = False
     """Take a log without position, attitude, rates or commands, and keep what is there."""
+    read: Readings = ()
+    """Other readings of signals, before anything is checked: see `eval.logs.faults.reading`."""
     fix: bool = True
     """Correct what the evidence shows overwhelmingly; otherwise only say it."""

@@ -14,15 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.importers.checks.attitude import as_read
-from eval.importers.checks.units import TIMES
-from eval.importers.findings import Finding
 from eval.importers.formats.table import read_table
 from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.options import ImportOptions
 from eval.importers.rows import averaged, continuous
 from eval.importers.signals import Recording, Signal, median_step
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.finding import Finding
+from eval.logs.faults.reading import TIMES, read_as
 from tracks.geometry.rotation import rot_to_quat
 
 FIRST_REACH_S = 15.0
@@ -38,11 +37,11 @@ ALIKE = 0.6
 SURE = 0.9
 """Correlation above which a reading of the quaternion is taken without trying others."""
 READINGS = (
-    ("xyzw", "xyzw", False),
-    ("world to body", "wxyz", True),
-    ("xyzw and world to body", "xyzw", True),
+    ("xyzw", "xyzw"),
+    ("world to body", "inverse"),
+    ("xyzw and world to body", "xyzw+inverse"),
 )
-"""What the attitude may be instead: words, its order, and whether it is inverse."""
+"""What the attitude may be instead: words, and the steps of `read_as`."""
 USUAL_STEP_S = 1.0 / 150.0
 """Cameras and trackers give 30 to 1000 poses a second."""
 LONG_S = 7200.0
@@ -134,8 +133,8 @@ def _best_reading(
     given = align(quat, rate, pose.name)
     if given.correlation > SURE:
         return quat, given, []
-    for words, order, inverse in READINGS:
-        other = Signal(quat.time_s, as_read(quat.value, order, inverse))
+    for words, steps in READINGS:
+        other = Signal(quat.time_s, read_as("quat", quat.value, steps))
         found = align(other, rate, pose.name)
         if fix and found.correlation > SURE:
             text = f"it turns as the gyro does only if it is {words}"

@@ -8,13 +8,15 @@ collective thrust from 0 to 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.importers.findings import Finding
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.finding import Finding
+from eval.logs.faults.reading import TIMES, Readings, read_as
 
 BACKWARDS_MAX = 0.05
 """A signal with a larger share of rows whose time does not increase is refused."""
@@ -107,6 +109,29 @@ def collect(
         if finding is not None:
             findings.append(finding)
     return signals, tuple(findings)
+
+
+def with_readings(recording: Recording, readings: Readings) -> Recording:
+    """Return a recording whose signals are read in another way; see `eval.logs.faults.reading`."""
+    signals = dict(recording.signals)
+    for name, steps in readings:
+        if name == "time":
+            scale = TIMES[steps]
+            signals = {n: Signal(s.time_s * scale, s.value) for n, s in signals.items()}
+        elif steps == "drop":
+            signals.pop(name, None)
+        elif name in signals:
+            samples = signals[name]
+            attitude = partial(_nearest_attitude, signals.get("quat"), samples.time_s)
+            signals[name] = samples._replace(value=read_as(name, samples.value, steps, attitude))
+    return replace(recording, signals=signals)
+
+
+def _nearest_attitude(quat: Signal | None, at: np.ndarray) -> np.ndarray:
+    if quat is None:
+        raise ValueError("--read from-body, from-world and plus-gravity need an attitude")
+    near = np.clip(np.searchsorted(quat.time_s, at), 0, len(quat.time_s) - 1)
+    return quat.value[near] / np.linalg.norm(quat.value[near], axis=1, keepdims=True)
 
 
 def median_step(time_s: np.ndarray) -> float:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
+
+import tyro
 
 from suite.common.console import Console
 from tracks.input.ranges import Range
@@ -11,40 +14,51 @@ from tracks.input.ranges import Range
 
 @dataclass(frozen=True)
 class Config:
-    """Check a policy's interface: its contract, and the usual mistakes of unit, frame and scale."""
+    """Check flights, a vehicle file and a policy for mistakes of unit, frame, sign and scale."""
 
+    flights: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Flight logs, or folders of them; `suite import` makes them of other programs' logs."""
+    vehicle: str = ""
+    """The vehicle file that the flights are held against, or a shipped vehicle's name."""
     policy: str = ""
     """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2, .pt or .c file."""
+    fix: bool = False
+    """Write the flights, with what is safe and unambiguous put right, into --out."""
+    out: Path = Path("checked")
+    """Folder for the flights of --fix."""
     trials: Annotated[int, Range(0, 1000)] = 4
-    """Short flights on easy tracks, by which the size of its actions is judged."""
+    """Short flights on easy tracks, by which the size of the policy's actions is judged."""
     trust: bool = False
     """Also load policy files that can run code on this machine."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
 
+def written(config: Config) -> list[Path]:
+    """Return the folders that the command writes into."""
+    return [config.out] if config.fix else []
+
+
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Load and fly the policy, and list what is assumed of it and what looks wrong.
+    """List what is assumed and what looks wrong.
 
     Raises:
-        ValueError: where no policy is given, or it is refused.
+        ValueError: where there is nothing to check, or something is refused.
     """
-    from policies.contract import contract_of
-    from policies.policy import load_policy
-    from suite.judging.checking import policy_findings
+    from suite.judging.checking import check_flight_files, check_policy
 
-    if not config.policy:
-        raise ValueError("--policy is missing; give a policy file or a shipped policy's name")
-    policy = load_policy(config.policy, config.trust)
-    contract = contract_of(policy.spec)
-    findings = policy_findings(policy, config.trials, console)
-    for finding in findings:
-        console.say(f"{finding['status']}: {finding['evidence']}; {finding['fix']}")
-    if not findings:
-        console.say(f"{policy.name}: nothing to report")
-    return {
-        "policy": policy.name,
-        "contract": contract.to_json(),
-        "findings": findings,
-        "not_identifiable": [],
-    }
+    if not config.flights and not config.policy and not config.vehicle:
+        raise ValueError("nothing to check: give flights, --vehicle or --policy")
+    answer: dict[str, Any] = {"findings": [], "not_identifiable": []}
+    policy = None
+    if config.policy:
+        policy, told = check_policy(config.policy, config.trust, config.trials, console)
+        answer |= told
+    if config.flights or config.vehicle:
+        out = config.out if config.fix else None
+        told = check_flight_files(config.flights, config.vehicle, policy, out, console)
+        told["findings"] = [*answer["findings"], *told["findings"]]
+        answer |= told
+    if not any(finding["status"] in ("doubt", "corrected") for finding in answer["findings"]):
+        console.say("nothing to report")
+    return answer

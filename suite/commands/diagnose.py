@@ -44,6 +44,8 @@ class Config:
     recording: bool = True
     """Write the held-out flights, measured and simulated, as a recording for rerun; --no-recording
     leaves it out."""
+    accept: tuple[str, ...] = ()
+    """Faults of the log's interface that are known (names of suite check): go on all the same."""
     seed: Seed = 0
     """Seed of the null's draws, of the intervals' and of simulated noise."""
     json: bool = False
@@ -82,6 +84,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         seed=config.seed,
         reference=config.reference,
         relevance=config.relevance,
+        accept=config.accept,
     )
     console.say(f"verdict: {result['verdict']}")
     for effect in result["effects"]:

@@ -24,6 +24,8 @@ class Config:
     """The vehicle file to write."""
     leave: tuple[str, ...] = ()
     """What to leave as it is: any of drag, motors, inertia, lag, loop."""
+    accept: tuple[str, ...] = ()
+    """Faults of the log's interface that are known (names of suite check): go on all the same."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -44,7 +46,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.out.suffix.lower() != ".toml":
         raise ValueError(f"--out is {str(config.out)!r}; its ending must be .toml")
     check_no_input(config.out, [config.vehicle], "--out")
-    result = identify_files(config.flights, config.vehicle, config.out, config.leave, console)
+    result = identify_files(
+        config.flights, config.vehicle, config.out, config.leave, console, config.accept
+    )
     console.say(f"driven by {DRIVEN[result['drive']]}")
     for key, entry in result["parameters"].items():
         values, spans = entry["value"], entry["ci95"]

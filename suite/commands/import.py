@@ -50,6 +50,9 @@ class Config:
     """Keep the time before take-off and after landing."""
     partial: bool = False
     """Take a log that lacks position, attitude, rates or commands, and keep what is there."""
+    read: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Read a signal in another way, SIGNAL=STEPS as rate=x,-y,-z+0.0610352, quat=xyzw, time=ms or
+    motor=2,1,4,3; may be given several times. What suite check prints as a fix."""
     no_fix: bool = False
     """Say what looks wrong, but correct nothing."""
     json: bool = False
@@ -63,8 +66,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for a file, a mapping or an option that cannot be used.
     """
     from eval.importers import import_log
-    from eval.importers.findings import said
     from eval.importers.options import ImportOptions
+    from eval.logs.faults.finding import said
+    from eval.logs.faults.reading import parse_readings
     from eval.logs.flight_log import columns_from_log, write_flight
     from eval.quadrotor.vehicle_file import load_vehicle
 
@@ -83,6 +87,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         mass=config.mass,
         trim=not config.keep_ground,
         partial=config.partial,
+        read=parse_readings(config.read),
         fix=not config.no_fix,
     )
     log, findings = import_log(config.file, config.format or None, options)
@@ -91,10 +96,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(line)
     for warning in log.warnings:
         console.say(f"note      file: {warning}")
-    rows = len(log.time_s)
-    console.say(
-        f"{rows} rows, {log.duration_s:.1f} s, up to {_top(log.speed):.1f} m/s: {config.out}"
-    )
+    rows, top = len(log.time_s), _top(log.speed)
+    speed = "no speed" if top is None else f"up to {top:.1f} m/s"
+    console.say(f"{rows} rows, {log.duration_s:.1f} s, {speed}: {config.out}")
     return {
         "flight": str(config.out),
         "rows": rows,
@@ -115,7 +119,7 @@ def _check(config: Config) -> None:
     check_no_input(config.out, [config.file, config.pose], "--out")
 
 
-def _top(speed: Any) -> float:
+def _top(speed: Any) -> float | None:
     import numpy as np
 
-    return float(np.nanmax(speed)) if np.isfinite(speed).any() else float("nan")
+    return float(np.nanmax(speed)) if np.isfinite(speed).any() else None

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from eval.logs.faults.check import Against, first_stage, lines_of
 from eval.logs.flight_log import FlightLog, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle
@@ -50,6 +51,7 @@ def diagnose_files(
     seed: int = 0,
     reference: Sequence[Path] = (),
     relevance: tuple[float, float, float] = THRESHOLDS.relevance,
+    accept: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Diagnose flights in files; write what was found and return what diagnosis.json holds.
 
@@ -67,6 +69,7 @@ def diagnose_files(
         seed: of all draws.
         reference: flights of the same vehicle before what changed: say what has changed since.
         relevance: least force [m/s^2], torque [rad/s^2] and drift after a second [m] of a finding.
+        accept: faults of the interface that are known, and go on all the same.
 
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
@@ -77,7 +80,8 @@ def diagnose_files(
     truth = None if fly is None else load_vehicle(fly)
     logs, warnings = read_flights(flight_files(paths), partial=True)
     before, told = read_flights(flight_files(reference), partial=True) if reference else ([], [])
-    warnings = [*warnings, *told]
+    findings = first_stage([*logs, *before], Against(vehicle), accept)
+    warnings = [*warnings, *told, *lines_of(findings)]
     logs, slow = without_slow_rotors(logs)
     before, slow_before = without_slow_rotors(before)
     warnings += [*slow, *slow_before]
@@ -95,6 +99,8 @@ def diagnose_files(
     def noted(found: dict[str, Any]) -> dict[str, Any]:
         for warning in found["warnings"][len(warnings) :]:
             console.note(f"warning: {warning}")
+        found["findings"] = findings
+        write_json(out / "diagnosis.json", found)
         return found
 
     def by_views() -> dict[str, Any]:
@@ -139,7 +145,6 @@ def diagnose_files(
         files.add("plan/plan.json")
     toml = (out / "vehicle.toml").read_text(encoding="utf-8")
     write_report(out / "report.html", page(result, found, checks, toml, files))
-    write_json(out / "diagnosis.json", found)
     return noted(found)
 
 

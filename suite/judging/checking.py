@@ -1,15 +1,93 @@
-"""What `suite check --policy` finds: a contract, the answers, and the actions in flight."""
+"""What `suite check` finds: a policy's contract and actions, and the interface of flights."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from policies.contract import contract_of, summary
-from policies.policy import Policy
+from policies.policy import Policy, load_policy
 from suite.common.console import Console
+from tracks.common.files import check_no_input
 
 TIME_LIMIT_S = 5.0
 """Of a flight [s]."""
+
+
+def check_policy(
+    name: str, trust: bool, trials: int, console: Console
+) -> tuple[Policy, dict[str, Any]]:
+    """Return the policy, and what the command answers of its interface.
+
+    Raises:
+        ValueError: where it is refused.
+    """
+    policy = load_policy(name, trust)
+    findings = policy_findings(policy, trials, console)
+    for finding in findings:
+        console.say(f"{finding['status']}: {finding['evidence']}; {finding['fix']}")
+    contract = contract_of(policy.spec).to_json()
+    return policy, {"policy": policy.name, "contract": contract, "findings": findings}
+
+
+def check_flight_files(
+    flights: Sequence[Path], vehicle: str, policy: Policy | None, out: Path | None, console: Console
+) -> dict[str, Any]:
+    """Return what the command answers of flights and a vehicle file.
+
+    Args:
+        flights: logs, or folders of them.
+        vehicle: a file or a shipped name; "" for none.
+        policy: whose rate and camera the flights should have.
+        out: folder for the flights as they are put right; None writes nothing.
+        console: told every finding.
+
+    Raises:
+        ValueError: for files that cannot be used.
+    """
+    from dataclasses import replace
+
+    from eval.logs.faults.check import Against, check_files, check_log, not_identifiable, with_fixes
+    from eval.logs.faults.finding import Finding, line
+    from eval.logs.flight_log import read_flights, write_flight
+    from eval.quadrotor.vehicle_file import load_vehicle
+    from suite.delta.run import flight_files
+
+    spec = None if policy is None else policy.spec
+    against = Against(
+        load_vehicle(vehicle) if vehicle else None,
+        None if spec is None else spec.rate_hz,
+        None if spec is None else spec.camera.fov_deg,
+    )
+    found: list[tuple[Finding, str | None]] = [(f, None) for f in check_files(against)]
+    logs, warnings = read_flights(flight_files(flights), partial=True) if flights else ([], [])
+    for warning in warnings:
+        console.note(f"warning: {warning}")
+    written = []
+    for log in logs:
+        findings, readings = check_log(log, against, out is not None)
+        found += [(finding, log.name) for finding in findings]
+        if out is not None:
+            path = out / Path(log.name).name
+            check_no_input(path, flights, "--out")
+            records = [finding._asdict() for finding in findings]
+            fixed = with_fixes(log, readings)
+            write_flight(path, replace(fixed, about={**fixed.about, "findings": records}))
+            written.append(str(path))
+    several = len(logs) > 1
+    for finding, flight in found:
+        if finding.status != "ok":
+            console.say((f"{Path(flight).name}: " if several and flight else "") + line(finding))
+    if written:
+        console.say(f"written: {', '.join(written)}")
+    return {
+        "flights": [log.name for log in logs],
+        "vehicle": vehicle or None,
+        "findings": [{**finding._asdict(), "flight": flight} for finding, flight in found],
+        "not_identifiable": not_identifiable([finding for finding, _ in found]),
+        "written": written,
+    }
 
 
 def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[str, Any]]:

@@ -61,17 +61,17 @@ def write(path, parts, keep=None):
 
 def of(findings, level):
     """The subjects of that level."""
-    return {finding.subject for finding in findings if finding.level == level}
+    return {finding.signal for finding in findings if finding.status == level}
 
 
 def levels(findings):
     """Level by subject."""
-    return {finding.subject: finding.level for finding in findings}
+    return {finding.signal: finding.status for finding in findings}
 
 
 def text(findings, subject):
     """All that is said of a subject."""
-    return " ".join(finding.text for finding in findings if finding.subject == subject)
+    return " ".join(finding.evidence for finding in findings if finding.signal == subject)
 
 
 def quat_off(log, truth):

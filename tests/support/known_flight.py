@@ -39,10 +39,26 @@ def fly(time):
     rate = (Rotation.from_matrix(before).inv() * after).as_rotvec() / (2 * h)
     thrust = np.linalg.norm(acc + GRAVITY, axis=1)
     cmd_rate = rate + 0.1 * np.sin(3 * time)[:, None] * np.array([1.0, 0.5, -0.5])
-    motor = 700.0 + 100.0 * np.sin(time[:, None] * [1.0, 1.3, 1.7, 2.1]) + [0.0, 200, 400, 600]
+    motor = _motors(thrust, rate, time)
     felt = np.einsum("tji,tj->ti", rot, acc + GRAVITY)
     voltage = 16.0 - 0.05 * time
     return Truth(time, pos, rot, vel, rate, thrust, cmd_rate, motor, felt, voltage)
+
+
+def _motors(thrust, rate, time):
+    """The rotor speeds that turn the body so: of 0.75 kg, the hubs in the shipped order."""
+    inertia, h = np.array([0.0025, 0.0021, 0.0043]), 1e-3
+    after, before = (
+        Rotation.from_matrix(_attitude(time + s)).inv()
+        * Rotation.from_matrix(_attitude(time + s + h))
+        for s in (0.0, -h)
+    )
+    change = (after.as_rotvec() - before.as_rotvec()) / h**2
+    torque = inertia * change + np.cross(rate, inertia * rate)
+    x, y = np.array([0.075, -0.075, -0.075, 0.075]), np.array([-0.1, -0.1, 0.1, 0.1])
+    mixer = np.stack([np.ones(4), y, -x, np.array([-1, 1, -1, 1]) * 2.2e-8 / 1.6e-6])
+    wanted = np.concatenate([0.75 * thrust[:, None], torque], axis=1)
+    return np.sqrt(np.maximum(wanted @ np.linalg.inv(mixer).T, 1e-3) / 1.6e-6)
 
 
 def _path(time, order):

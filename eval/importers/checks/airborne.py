@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from eval.importers.findings import Finding
 from eval.importers.signals import Recording, Signal
+from eval.logs.faults.finding import Finding
 
 RUNNING = 0.5
 """Motors that get this share of what they usually get in flight carry the vehicle."""

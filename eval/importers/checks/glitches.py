@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from eval.importers.findings import Finding
 from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.rows import continuous
 from eval.importers.signals import Recording, Signal, median_step
+from eval.logs.faults.finding import Finding
 from eval.logs.velocity import velocity_from_position
 
 ACC_MAX = 60.0

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.findings import Finding
 from eval.importers.formats.table import numbers
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.finding import Finding
 from eval.logs.files import first_line, read_columns
 
 SUMMARY = "CSV of blackbox_decode; needs --pose"

@@ -22,12 +22,12 @@ from zlib import crc32
 
 import numpy as np
 
-from eval.importers.findings import Finding
 from eval.importers.mapping import recording_of
 from eval.importers.mapping_file import read_map
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.finding import Finding
 from eval.logs.files import read_head
 from tracks.common.names import closest
 

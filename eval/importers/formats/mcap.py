@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from eval.importers.findings import Finding
 from eval.importers.mapping_file import motor_side_of
 from eval.importers.options import ImportOptions
 from eval.importers.rows import in_world
 from eval.importers.signals import Recording, Signal, collect
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.finding import Finding
 from eval.logs.files import read_head
 from tracks.common.toml_table import read_toml
 

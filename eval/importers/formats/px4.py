@@ -25,11 +25,11 @@ from typing import Any
 
 import numpy as np
 
-from eval.importers.findings import Finding
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, turn
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.finding import Finding
 from eval.logs.files import read_head
 from tracks.input.ranges import is_number
 

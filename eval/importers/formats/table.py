@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.importers.findings import Finding
 from eval.importers.mapping import recording_of
 from eval.importers.mapping_file import LogMap, own_map, read_map
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.finding import Finding
 from eval.logs.files import first_line, read_columns
 from eval.logs.flight_log import told_about
 from tracks.common.names import closest

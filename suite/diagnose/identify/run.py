@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from eval.logs.faults.check import Against, first_stage, lines_of
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
@@ -23,7 +24,12 @@ PARTS = ("drag", "motors", "inertia", "lag", "loop")
 
 
 def identify_files(
-    flights: Sequence[Path], vehicle: str, out: Path, leave: Sequence[str], console: Console
+    flights: Sequence[Path],
+    vehicle: str,
+    out: Path,
+    leave: Sequence[str],
+    console: Console,
+    accept: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Identify a vehicle from log files, and write its file.
 
@@ -33,6 +39,7 @@ def identify_files(
         out: the vehicle file to write.
         leave: of `PARTS`, what stays as it is.
         console: for people.
+        accept: faults of the interface that are known, and go on all the same.
 
     Returns:
         What `--json` prints.
@@ -48,8 +55,9 @@ def identify_files(
     start = load_vehicle(vehicle)
     refuse_own_motion(start)
     logs, warnings = read_flights(flight_files(flights), partial=True)
+    findings = first_stage(logs, Against(start), accept)
     logs, slow = without_slow_rotors(logs)
-    warnings = [*warnings, *slow]
+    warnings = [*warnings, *lines_of(findings), *slow]
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
     if beside := unknown_to_the_fits(start):
         warnings = [
@@ -71,6 +79,7 @@ def identify_files(
         "untold": list(found.untold),
         "left": found.left,
         "flights": list(found.flights),
+        "findings": findings,
         "warnings": [*warnings, *found.notes],
         **stamp(SCHEMA, None),
     }

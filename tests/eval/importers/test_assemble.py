@@ -7,10 +7,11 @@ import pytest
 
 from eval.importers import import_log
 from eval.importers.assemble import assemble
-from eval.importers.findings import Finding, asked_of, said
+from eval.importers.findings import asked_of
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, Signal
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.finding import Finding, said
 from eval.logs.flight_log import read_flight, write_flight
 from tests.support.imported import flight, write
 from tests.support.vehicles import PLAIN
@@ -60,7 +61,7 @@ def test_start_and_end_cut_more_than_the_time_on_the_ground():
     parts["motor"] = Signal(time_s, np.where(flying, 800.0, 50.0)[:, None] * np.ones(4))
     asked = ImportOptions(fix=False, start_s=0.1, end_s=1.6)
     log, findings = assemble(Recording("log", parts), "made", asked)
-    assert any("before take-off and the" in f.text for f in findings)
+    assert any("before take-off and the" in f.evidence for f in findings)
     assert log.rotor_speed is not None and log.rotor_speed.min() > 400.0
     assert log.duration_s == pytest.approx(1.2, abs=0.05)
     kept, _ = assemble(Recording("log", parts), "made", replace(asked, trim=False))
@@ -88,8 +89,8 @@ def test_a_partial_log_keeps_what_is_there_and_says_what_can_be_asked(tmp_path):
     assert log.partial == ("quat", "command")
     assert np.isnan(log.quat_wxyz).all()
     np.testing.assert_allclose(log.rate_b, parts["rate"], atol=1e-12)
-    said = [finding for finding in findings if finding.subject == "partial"]
-    assert "the vertical force" in said[0].text
+    said = [finding for finding in findings if finding.signal == "partial"]
+    assert "the vertical force" in said[0].evidence
     write_flight(tmp_path / "log.parquet", log)
     with pytest.raises(FlightLogError, match="a partial log, without quat, command"):
         read_flight(tmp_path / "log.parquet")
@@ -117,12 +118,12 @@ def test_the_serious_come_first_and_the_rest_in_order():
 
 def test_motor_commands_and_positions_tell_weight_and_balance():
     rows = {"pos": np.zeros((3, 3)), "pwm": np.zeros((3, 4))}
-    text = asked_of(rows, ["quat", "rate"]).text
+    text = asked_of(rows, ["quat", "rate"]).evidence
     assert "no attitude and no body rates" in text
     assert "balance of the rotors in hover" in text
     assert "its torque" not in text
 
 
 def test_a_path_alone_tells_nothing_more():
-    text = asked_of({"pos": np.zeros((3, 3))}, ["quat", "rate", "command"]).text
+    text = asked_of({"pos": np.zeros((3, 3))}, ["quat", "rate", "command"]).evidence
     assert text.endswith("nothing but its path")

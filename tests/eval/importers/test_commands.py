@@ -33,20 +33,20 @@ def test_full_throttle_is_what_is_told_or_built_or_felt(felt, options, full, by)
     found = thrust_rows(felt)
     (finding,) = thrust_command(found, options)
     np.testing.assert_allclose(found["cmd_thrust"], full * found["throttle"], rtol=1e-12)
-    assert finding.level == "note" and by in finding.text
+    assert finding.status == "note" and by in finding.evidence
 
 
 def test_a_vehicle_that_does_not_fit_what_was_felt_is_doubted():
     findings = thrust_command(thrust_rows(37.632 / 2), ImportOptions(vehicle=PLAIN))
-    assert [finding.level for finding in findings] == ["note", "doubt"]
-    assert "2.00 times what the accelerometer felt" in findings[1].text
+    assert [finding.status for finding in findings] == ["note", "doubt"]
+    assert "2.00 times what the accelerometer felt" in findings[1].evidence
 
 
 @pytest.mark.parametrize("found", [thrust_rows(), thrust_rows(25.0, count=50)])
 def test_where_nothing_tells_the_scale_thrust_is_left_out(found):
     (finding,) = thrust_command(found, ImportOptions())
-    assert "cmd_thrust" not in found and finding.level == "doubt"
-    assert "give --vehicle FILE or --full-thrust" in finding.text
+    assert "cmd_thrust" not in found and finding.status == "doubt"
+    assert "give --vehicle FILE or --full-thrust" in finding.evidence
 
 
 def test_a_thrust_that_is_there_stays():
@@ -61,7 +61,7 @@ def test_a_throttle_goes_through_the_vehicles_motors_with_the_battery():
     rows = {"throttle": np.full((3, 1), 0.5), "voltage": np.full((3, 1), 3.0)}
     findings = thrust_command(rows, ImportOptions(vehicle=vehicle))
     np.testing.assert_allclose(rows["cmd_thrust"], 4 * 0.159375 / vehicle.mass)
-    assert "with the battery's voltage" in findings[0].text
+    assert "with the battery's voltage" in findings[0].evidence
 
 
 def motor_rows():
@@ -81,7 +81,7 @@ def test_places_in_any_unit_set_the_order():
     (finding,) = order_motors(found, backwards, None)
     np.testing.assert_array_equal(found["motor"], [[40, 30, 20, 10]])
     np.testing.assert_array_equal(found["motor_cmd"], [[4, 3, 2, 1]])
-    assert finding.text == "put in the order of the shipped vehicles: the file's 4, 3, 2, 1"
+    assert finding.evidence == "put in the order of the shipped vehicles: the file's 4, 3, 2, 1"
 
 
 def test_the_vehicles_own_hubs_go_before_the_shipped_ones():
@@ -90,7 +90,7 @@ def test_the_vehicles_own_hubs_go_before_the_shipped_ones():
     found = motor_rows()
     (finding,) = order_motors(found, SHIPPED_ORDER, replace(PLAIN, rotors=turned))
     np.testing.assert_array_equal(found["motor"], [[20, 30, 40, 10]])
-    assert "vehicle 'plain'" in finding.text
+    assert "vehicle 'plain'" in finding.evidence
 
 
 def set_points(angle):
@@ -113,5 +113,5 @@ def test_the_error_times_the_gain_within_the_limit():
 
 def test_without_a_vehicle_they_are_left_out():
     given = set_points(0.1)
-    assert rates_wanted(given, None)[0].level == "doubt"
+    assert rates_wanted(given, None)[0].status == "doubt"
     assert set(given) == {"quat"}

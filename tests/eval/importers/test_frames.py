@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from eval.importers.checks.units import ANGLES, TIMES
 from eval.importers.formats import betaflight
 from eval.importers.frames import (
     attitude,
@@ -16,6 +15,7 @@ from eval.importers.frames import (
     world_vector,
 )
 from eval.importers.mapping_file import UNITS
+from eval.logs.faults.reading import TIMES
 
 ROOT_HALF = np.sqrt(0.5)
 
@@ -86,7 +86,6 @@ def test_every_unit_of_a_mapping_is_what_it_says():
 
 def test_every_unit_that_a_check_tries_is_what_it_says():
     assert TIMES == pytest.approx({name: ONE[name] for name in TIMES}, rel=1e-12)
-    assert ANGLES == pytest.approx({"rad": 1.0, "deg": ONE["deg"], "tenths": 0.1}, rel=1e-12)
 
 
 @pytest.mark.parametrize(

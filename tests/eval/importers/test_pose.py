@@ -79,7 +79,7 @@ def test_the_poses_own_faults_are_put_right(tmp_path):
         t, x, y, z, qw, qx, qy, qz = line.split(",")
         rows.append(",".join([f"{float(t) * 1e6:.1f}", x, y, z, qx, qy, qz, qw]))
     log, findings = _import(tmp_path, "\n".join(rows))
-    assert {"pose time", "pose attitude"} == {f.subject for f in findings if f.level == "corrected"}
+    assert {"pose time", "pose attitude"} == {f.signal for f in findings if f.status == "corrected"}
     truth = known_flight.fly(log.time_s + 1.0003)
     np.testing.assert_allclose(log.pos_w, truth.pos, atol=2e-3)
     np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-5)
@@ -90,10 +90,10 @@ def test_a_turned_marker_body_is_corrected_only_where_allowed(tmp_path):
     made.write_mocap(tmp_path / "pose.csv", span=(1, 11), turn=turn)
     log, findings = _import(tmp_path)
     truth = known_flight.fly(log.time_s + 1.0)
-    assert "pose axes" in {f.subject for f in findings if f.level == "corrected"}
+    assert "pose axes" in {f.signal for f in findings if f.status == "corrected"}
     np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-5)
     _, findings = _import(tmp_path, fix=False)
-    assert "pose axes" in {f.subject for f in findings if f.level == "doubt"}
+    assert "pose axes" in {f.signal for f in findings if f.status == "doubt"}
 
 
 def test_poses_of_another_flight_are_refused(tmp_path):

@@ -105,7 +105,7 @@ def test_unknown_samples_and_a_step_back_are_left_out():
     kept = np.delete(np.arange(40), [7, 20, 30])
     np.testing.assert_array_equal(found.time_s, kept)
     np.testing.assert_array_equal(found.value, kept[:, None])
-    assert finding.text == "1 samples of 'gyro' whose time does not increase are left out"
+    assert finding.evidence == "1 samples of 'gyro' whose time does not increase are left out"
 
 
 def test_a_time_that_goes_back_often_is_refused_with_its_first_row():

@@ -44,9 +44,9 @@ def test_an_eval_py_in_the_working_folder_does_not_stand_for_ours(tmp_path, root
 
 
 def test_check_reports_the_contract_and_what_looks_wrong(tmp_path):
-    answer = check.run(check.Config("swift-small", trials=1), Quiet())
+    answer = check.run(check.Config(policy="swift-small", trials=1), Quiet())
     assert answer["findings"] == [] and answer["contract"]["digest"]
-    with pytest.raises(ValueError, match="--policy is missing"):
+    with pytest.raises(ValueError, match="nothing to check"):
         check.run(check.Config(), Quiet())
 
 
@@ -66,7 +66,7 @@ def test_check_reports_a_file_that_says_nothing_and_is_unscaled(tmp_path):
     proto = onnx.load(path)
     del proto.metadata_props[:]
     onnx.save(proto, path)
-    answer = check.run(check.Config(str(path), trials=1), Quiet())
+    answer = check.run(check.Config(policy=str(path), trials=1), Quiet())
     faults = [finding["fault"] for finding in answer["findings"]]
     assert faults[0] == "no_contract" and "action_scale" in faults
     assert "30 Hz" in answer["findings"][0]["evidence"]

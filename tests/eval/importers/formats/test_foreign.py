@@ -18,10 +18,11 @@ FULL = ImportOptions(full_thrust=30.0)
 def test_px4_equals_the_flight(tmp_path):
     log, findings = import_log(made.write_ulog(tmp_path / "log.ulg"), None, FULL)
     truth = known_flight.fly(log.time_s)
-    # The file holds float32 and whole rpm. Rows stand at the positions, at 100 Hz.
+    # The file holds float32 and whole rpm. Rows stand at the positions, at 100 Hz; between the
+    # ESCs' samples, at 50 Hz, are lines.
     same_flight(
         log, truth, 1e-6, pos_w=2e-6, vel_w=2e-6, rate_b=1e-6, acc_b=1e-5, voltage=1e-5,
-        rotor_speed=0.1, thrust_cmd=1e-5, rate_cmd_b=1e-6,
+        rotor_speed=0.25, thrust_cmd=1e-5, rate_cmd_b=1e-6,
     )  # fmt: skip
     assert len(log.time_s) == 800
     assert {"corrected", "doubt"}.isdisjoint(levels(findings).values())
@@ -46,7 +47,7 @@ def test_px4_at_the_loggers_default_rates(tmp_path):
     made.write_ulog(path, (0, 12), 20.0, esc=False, pos_hz=10.0, gyro_hz=50.0, command_hz=50.0)
     log, findings = import_log(path, None, FULL)
     assert len(log.time_s) == pytest.approx(240, abs=3)
-    assert {"position", "attitude"} <= {f.subject for f in findings if "Hz only" in f.text}
+    assert {"position", "attitude"} <= {f.signal for f in findings if "Hz only" in f.evidence}
     assert np.isnan(log.pos_w[1::2]).all() and np.isnan(log.vel_w[1::2]).all()
     near(log.pos_w[::2], known_flight.fly(log.time_s[::2]).pos, 1e-5)
     assert log.whole.mean() > 0.48
@@ -101,15 +102,15 @@ def test_betaflights_tenfold_values_are_found(tmp_path, fix):
     pose = made.write_mocap(tmp_path / "pose.csv", span=(0, 10), offset=0.4)
     options = ImportOptions(pose=pose, full_thrust=30.0, fix=fix)
     log, findings = import_log(path, None, options)
-    level = {f.subject for f in findings if f.level == ("corrected" if fix else "doubt")}
-    assert {"units", "voltage"} <= level
-    assert "blackbox_high_resolution" in text(findings, "units")
+    level = {f.signal for f in findings if f.status == ("corrected" if fix else "doubt")}
+    assert {"gyro", "voltage"} <= level
+    assert "blackbox_high_resolution" in text(findings, "gyro")
     truth, tenfold = known_flight.fly(log.time_s), 1 if fix else 10
     near(log.rate_b, tenfold * truth.rate, 0.02 * tenfold)
     near(log.rate_cmd_b, tenfold * truth.cmd_rate, 0.04 * tenfold)
     near(log.voltage, tenfold * truth.voltage, 0.1 * tenfold)
     if fix:
-        assert level == {"units", "voltage"}
+        assert level == {"gyro", "rate command", "voltage"}
 
 
 def test_betaflight_counts_the_motors_poles(tmp_path):
@@ -229,10 +230,13 @@ def test_mcap_motors_are_put_in_order_by_a_map(tmp_path):
     near(np.asarray(plain.rotor_speed)[::4], known_flight.fly(plain.time_s[::4]).motor, 1e-6)
     # The file's motors 1 to 4: front left, rear left, rear right, front right.
     chosen.write_text("[frames]\nmotors = [[1, 1], [-1, 1], [-1, -1], [1, -1]]\n")
-    log, findings = import_log(path, None, ImportOptions(map=chosen, full_thrust=30.0))
+    asked = ImportOptions(map=chosen, full_thrust=30.0, fix=False)
+    log, findings = import_log(path, None, asked)
     turned = np.asarray(plain.rotor_speed)[:, ::-1]
     assert np.array_equal(np.asarray(log.rotor_speed), turned, equal_nan=True)
     assert "the file's 4, 3, 2, 1" in text(findings, "motors")
+    # That is not how they turn the body.
+    assert "motor_order" in {f.fault for f in findings if f.status == "doubt"}
     chosen.write_text('[frames]\nworld = "ned"\n')
     with pytest.raises(ValueError, match=r"'world' in \[frames\] is unknown"):
         import_log(path, None, ImportOptions(map=chosen))

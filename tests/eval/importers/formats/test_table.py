@@ -84,7 +84,7 @@ def test_a_mapped_table_equals_the_flight(tmp_path, kind):
     mapping.write_text(MAP)
     options = ImportOptions(map=mapping, full_thrust=30.0)
     log, findings = import_log(path, None, options)
-    assert not {f.subject for f in findings if f.level in ("corrected", "doubt")}
+    assert not {f.signal for f in findings if f.status in ("corrected", "doubt")}
     np.testing.assert_allclose(log.time_s, truth.time, atol=1e-9)
     same_flight(log, truth, 1e-6, **dict.fromkeys(TRUE, 1e-8))
     assert all(np.isfinite(getattr(log, name)).all() for name in TRUE)
@@ -111,7 +111,7 @@ def test_euler_angles_and_a_world_with_y_up(tmp_path):
         '[rate]\ncolumns = ["p", "q", "r"]\n[motor]\ncolumns = ["m1", "m2", "m3", "m4"]\n'
     )
     log, findings = import_log(path, None, ImportOptions(map=mapping))
-    assert not {f.subject for f in findings if f.level in ("corrected", "doubt")}
+    assert not {f.signal for f in findings if f.status in ("corrected", "doubt")}
     np.testing.assert_allclose(log.pos_w, truth.pos, atol=1e-9)
     np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-9)
     assert columns

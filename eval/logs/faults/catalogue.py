@@ -1,0 +1,67 @@
+"""The faults that a check can name, and the manoeuvre that shows each where a flight does not."""
+
+from __future__ import annotations
+
+ROTATE = "rotate the vehicle by hand, propellers off, by 90 deg and back about x, then y, then z"
+TILT = "fly 2 m forward and back, then 2 m left and back, briskly"
+PULSE = "propellers off or the vehicle held down: pulse motor 1, then 2, 3 and 4, a second each"
+STICKS = "hold a roll, a pitch and a yaw rate of 1 rad/s and of 3 rad/s for a second each"
+REST = "let the vehicle rest, level, for a second"
+FASTER = "log at twice the controller's rate"
+GROUND = "log from two seconds before the motors start"
+
+FAULTS: dict[str, tuple[str, str]] = {
+    "attitude": ("the attitude fits neither the path nor the gyro", ROTATE),
+    "attitude_sign": ("roll, pitch or yaw has the other sign", ROTATE),
+    "quaternion_order": ("the quaternion's columns are in another order", ROTATE),
+    "quaternion_direction": ("the quaternion maps world to body", ROTATE),
+    "world_frame": ("the world points down (NED), or east comes first", TILT),
+    "body_frame": ("the body is forward-right-down", ROTATE),
+    "position_axes": ("an axis of the position is inverted or swapped", TILT),
+    "position_unit": ("positions are in cm or mm", TILT),
+    "velocity_frame": ("the velocity is in other axes", TILT),
+    "velocity_unit": ("the velocity is in another unit", TILT),
+    "gyro_axes": ("axes of the gyro are inverted or swapped", ROTATE),
+    "gyro_frame": ("rates are in world axes", ROTATE),
+    "gyro_scale": ("the gyro's unit or scale", ROTATE),
+    "accelerometer_unit": (
+        "the accelerometer's unit or counts",
+        REST,
+    ),
+    "accelerometer_axes": ("axes of the accelerometer are inverted", ROTATE),
+    "accelerometer_gravity": ("gravity was taken out of the accelerometer", ROTATE),
+    "accelerometer_throttle_bias": ("vibration biases the accelerometer", PULSE),
+    "barometer_spin_up": ("the barometer's height falls as the motors start", GROUND),
+    "time_unit": ("times are in ms, us or ns", TILT),
+    "time_stamps": ("stamps are 0 or go back", "log again"),
+    "clock_offset": ("the pose is late against the gyro", ROTATE),
+    "motor_order": ("motors are in another order", PULSE),
+    "motor_spin": ("motors turn the other way round", PULSE),
+    "motor_dead": ("a motor never turns", PULSE),
+    "motor_count": ("not four motors turn", PULSE),
+    "motor_unit": ("rotor speeds are in another unit", "hover for two seconds"),
+    "motor_poles": ("eRPM was divided by the wrong number of pole pairs", "hover for two seconds"),
+    "rate_command_unit": ("commanded rates are in deg/s", STICKS),
+    "rate_command_sign": ("a commanded rate has the other sign", STICKS),
+    "rate_curve": ("the firmware maps sticks by another curve", STICKS),
+    "command_delay": ("commands act too late", STICKS),
+    "controller_rate": (
+        "the controller runs at another rate",
+        FASTER,
+    ),
+    "throttle_range": ("the throttle is not from 0 to 1", "hover for two seconds"),
+    "thrust_scale": ("thrust is not what the vehicle file says", "hover for two seconds"),
+    "voltage": ("the battery's voltage is impossible", "log the battery that drives the motors"),
+    "vehicle_mass": ("the mass was entered several times", "hover for two seconds"),
+    "vehicle_arms": ("the rotors' places are in mm", ""),
+    "vehicle_inertia": ("the inertia is another vehicle's or in another unit", ""),
+    "vehicle_thrust": ("thrust-to-weight is implausible", ""),
+    "camera_fov": ("the policy saw with another camera", ""),
+    "file": ("the file is damaged, or of another kind", "log again"),
+}
+"""Name -> what it is, and the manoeuvre that shows it."""
+
+
+def manoeuvre(fault: str) -> str:
+    """Return what to fly or do so that a log shows `fault`."""
+    return FAULTS[fault][1]

@@ -1,0 +1,204 @@
+"""All checks of a log, in the order in which one builds on the other; each is a pure function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from eval.logs.columns import GROUPS
+from eval.logs.faults.catalogue import FAULTS, manoeuvre
+from eval.logs.faults.clock import check_clock, check_time
+from eval.logs.faults.commands import check_controller_rate, check_rate_command, check_throttle
+from eval.logs.faults.finding import Finding, findings_of, line
+from eval.logs.faults.motors import check_lift, check_motors
+from eval.logs.faults.pose import Rows, check_pose, look_at_pose
+from eval.logs.faults.reading import Readings, read_rows, readings_in
+from eval.logs.faults.sensors import check_accelerometer_bias, check_barometer, check_voltage
+from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velocity
+from eval.logs.faults.vehicle import check_camera, check_vehicle_numbers
+from eval.logs.flight_log import FlightLog, columns_from_log, log_from_columns
+from eval.vehicles.vehicle import Vehicle
+from tracks.common.names import unknown_name
+
+LEAST_ROWS = 50
+"""Fewer rows show nothing."""
+
+
+@dataclass(frozen=True)
+class Against:
+    """What a log is held against."""
+
+    vehicle: Vehicle | None = None
+    policy_hz: float | None = None
+    policy_fov: tuple[float, float] | None = None
+
+
+Check = Callable[[Rows, Against], list[Finding]]
+POSE: tuple[Check, ...] = (
+    lambda rows, _: check_time(rows),
+    lambda rows, _: check_pose(rows, look_at_pose(rows)),
+    lambda rows, _: check_gyro(rows),
+    lambda rows, _: check_velocity(rows),
+    lambda rows, _: check_accelerometer(rows),
+)
+"""Where and how the vehicle was; each trusts those before it."""
+DRIVE: tuple[Check, ...] = (
+    lambda rows, _: check_voltage(rows),
+    lambda rows, against: check_motors(rows, against.vehicle),
+    lambda rows, against: check_lift(rows, against.vehicle),
+    lambda rows, _: check_throttle(rows),
+    lambda rows, against: check_rate_command(rows, against.vehicle),
+    lambda rows, _: check_accelerometer_bias(rows),
+    lambda rows, _: check_barometer(rows),
+)
+"""What drove it, and what else was measured."""
+
+
+def run_checks(
+    rows: Rows, checks: Sequence[Check], against: Against, fix: bool
+) -> tuple[list[Finding], Readings, dict[str, np.ndarray]]:
+    """Return the findings, the readings that put right what is overwhelming, and the rows by them.
+
+    Args:
+        rows: signal to (T, C), `time` to (T,); NaN where unknown.
+        checks: in order; each sees the rows as those before it put them right.
+        against: what the log is held against.
+        fix: report corrections as made; otherwise as doubts. Later checks see them made either way.
+    """
+    findings, readings, rows = [], (), dict(rows)
+    if len(rows["time"]) < LEAST_ROWS:
+        return findings, readings, rows
+    for check in checks:
+        for finding in check(rows, against):
+            if finding.status == "corrected":
+                more = readings_in(finding.fix)
+                rows = read_rows(rows, more)
+                readings += more
+                finding = finding if fix else finding._replace(status="doubt")
+            findings.append(finding)
+    return findings, readings, rows
+
+
+def check_log(
+    log: FlightLog, against: Against = Against(), fix: bool = False
+) -> tuple[list[Finding], Readings]:
+    """Return what is wrong with a log in our columns, and the readings that put it right.
+
+    What an import found and left open is repeated, where the same check does not come out again.
+    """
+    checks = (*POSE, lambda rows, _: check_clock(rows), *DRIVE)
+    findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
+    rates = {**_action_rows(log), **rows_of(log)}
+    findings += check_controller_rate(rates, against.policy_hz, "the policy")
+    again = {finding.fault for finding in findings if finding.fault}
+    stored = [f for f in findings_of(log.about) if f.status in ("doubt", "corrected")]
+    return [*(f for f in stored if f.fault not in again or not f.fault), *findings], readings
+
+
+def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
+    """Return a log with signals read in another way; what is missing in it stays missing."""
+    columns = columns_from_log(log)
+    rows = {"time": log.time_s}
+    for group, names in GROUPS.items():
+        if group != "time" and all(name in columns for name in names):
+            rows[group] = np.stack([columns[name] for name in names], axis=1)
+    pose = filled(log.time_s, rows["quat"]) if "quat" in rows else None
+    turned = read_rows({**rows, "quat": pose} if pose is not None else rows, readings)
+    if pose is not None:
+        turned["quat"] = read_rows({"time": log.time_s, "quat": rows["quat"]}, readings)["quat"]
+    for group, names in GROUPS.items():
+        if group in rows and group not in turned:
+            columns = {name: value for name, value in columns.items() if name not in names}
+        elif group in rows and group != "time":
+            columns |= dict(zip(names, turned[group].T, strict=True))
+    columns["time"] = turned["time"]
+    return log_from_columns(columns, log.about, log.name)
+
+
+def first_stage(
+    logs: Sequence[FlightLog], against: Against, accept: Sequence[str] = ()
+) -> list[dict[str, Any]]:
+    """Return the records of what the logs and the files show, before anything is concluded of it.
+
+    Args:
+        logs: flights.
+        against: what they are held against.
+        accept: faults that are known and go on all the same.
+
+    Raises:
+        ValueError: for a fault that a diagnosis would name as something else.
+    """
+    unknown = [fault for fault in accept if fault not in FAULTS]
+    if unknown:
+        raise unknown_name("fault", unknown[0], list(FAULTS))
+    found: list[tuple[Finding, str | None]] = [(f, None) for f in check_files(against)]
+    for log in logs:
+        found += [(finding, log.name) for finding in check_log(log, against)[0]]
+    stops = [(f, name) for f, name in found if f.is_open and f.fault not in accept]
+    if stops:
+        lines = [f"{name or 'the vehicle file'}: {line(f)}" for f, name in stops]
+        faults = " ".join(sorted({f.fault for f, _ in stops}))
+        raise ValueError(
+            "\n".join(["an effect named from these flights would be wrong:", *lines])
+            + f"\nput it right, or go on all the same with --accept {faults}"
+        )
+    return [{**f._asdict(), "flight": name} for f, name in found if f.status != "ok"]
+
+
+def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the records of doubts and notes with a name as warnings of a report."""
+    return [
+        f"{record['flight'] or 'vehicle file'}: {record['fault']}: {record['evidence']}"
+        for record in records
+        if record["fault"] and record["status"] in ("doubt", "note")
+    ]
+
+
+def check_files(against: Against) -> list[Finding]:
+    """Return what is wrong with the vehicle file and the policy's camera."""
+    found = [] if against.vehicle is None else check_vehicle_numbers(against.vehicle)
+    return found + check_camera(against.policy_fov, against.vehicle)
+
+
+def not_identifiable(findings: Sequence[Finding]) -> list[dict[str, str]]:
+    """Return which faults the flights do not show, and a manoeuvre that does."""
+    faults = {f.fault: f.evidence for f in findings if f.status == "not identifiable"}
+    return [
+        {"fault": fault, "why": why, "manoeuvre": manoeuvre(fault)} for fault, why in faults.items()
+    ]
+
+
+def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
+    """Return a log's signals on its rows, holes of slower signals filled by lines."""
+    columns = columns_from_log(log)
+    rows = {"time": log.time_s}
+    for group, names in GROUPS.items():
+        if group != "time" and all(name in columns for name in names):
+            value = np.stack([columns[name] for name in names], axis=1)
+            if np.isfinite(value).all(axis=1).sum() > LEAST_ROWS:
+                rows[group] = filled(log.time_s, value)
+    for name in ("throttle", "baro"):
+        if name in columns and np.asarray(columns[name]).dtype.kind in "fiu":
+            rows[name] = np.asarray(columns[name], dtype=np.float64)[:, None]
+    return rows
+
+
+def filled(time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return `value` (T, C) with lines through what is missing, holes of 0.5 s and more left."""
+    known = np.isfinite(value).all(axis=1)
+    if known.all() or known.sum() < 2:
+        return value
+    at = time_s[known]
+    out = np.stack([np.interp(time_s, at, column[known]) for column in value.T], axis=1)
+    after = np.clip(np.searchsorted(at, time_s), 1, len(at) - 1)
+    far = (at[after] - at[after - 1] > 0.5) & ~known
+    out[far | (time_s < at[0]) | (time_s > at[-1])] = np.nan
+    return out
+
+
+def _action_rows(log: FlightLog) -> Mapping[str, np.ndarray]:
+    action = log.action_b
+    return {} if action is None else {"action": action}

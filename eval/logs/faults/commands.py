@@ -1,0 +1,183 @@
+"""Commands: units, signs and curve of the rates, range of the throttle, delay, and how often."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eval.logs.faults.finding import Finding
+from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
+from eval.logs.faults.reading import option
+from eval.logs.faults.relation import match, pooled_scale, rms, smooth
+from eval.logs.faults.vectors import DEG
+from eval.vehicles.vehicle import Vehicle
+
+REACH_S, STEP_S = 0.3, 0.01
+"""Delays that are tried, and their distance [s]."""
+LATE_S = 0.06
+"""A response later than the loop, the rotors and the usual link make it by more than this [s]."""
+USUAL_S = 0.08
+"""What these make together where no vehicle file says it [s]."""
+GAIN = (0.8, 1.25)
+"""What the body does of a steady rate command, where nothing is wrong."""
+UNITS = {"in degrees per second": 1.0 / DEG, "ten times too large (blackbox_high_resolution)": 10.0}
+OPPOSITE = -0.5
+RANGES = (
+    ("0 to 1", 1.0, (0.03, 0.97), ""),
+    ("percent", 100.0, (8.0, 90.0), "0.01"),
+    ("0 to 1000", 1000.0, (100.0, 900.0), "0.001"),
+    ("1000 to 2000 us", 1000.0, (1080.0, 1920.0), "1000-2000"),
+    ("0 to 65535", 65535.0, (6000.0, 62000.0), f"{1.0 / 65535.0:.10g}"),
+)
+"""Range of a throttle, its span, where its median lies in flight, and what makes 0 to 1 of it."""
+RATE_OFF = 0.1
+"""A controller whose rate is off by a larger share runs at another one."""
+
+
+def check_throttle(rows: Rows) -> list[Finding]:
+    """Return in which range throttle and motor commands are, where it is not 0 to 1."""
+    found = []
+    for name, subject in (("throttle", "throttle"), ("pwm", "motor commands")):
+        value = rows.get(name)
+        if value is None or not np.isfinite(value).any():
+            continue
+        flying = value[np.isfinite(value).all(axis=1)].mean(axis=1)
+        middle, top = float(np.median(flying)), float(np.max(flying))
+        if top <= 1.5:
+            continue
+        fits = [r for r in RANGES if r[2][0] <= middle <= r[2][1]]
+        figures = f"half of its values are below {middle:.4g} and all below {top:.4g}"
+        if not fits:
+            text = f"{figures}: no range from 0 to 1, percent, 1000 or 65535"
+            found.append(Finding("doubt", subject, text, "throttle_range", top, 0.95))
+            continue
+        words, span, _, steps = fits[0]
+        text = f"{figures}: it goes from {words}, not from 0 to 1"
+        found.append(Finding("corrected", subject, text, "throttle_range", span, 0.98,
+                             option((name, steps))))  # fmt: skip
+    return found
+
+
+def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
+    """Return what is wrong with the commanded rates, by how the gyro follows them."""
+    if not {"cmd_rate", "rate"} <= rows.keys():
+        return []
+    time_s, subject = rows["time"], "rate command"
+    both = np.isfinite(rows["cmd_rate"]).all(axis=1) & np.isfinite(rows["rate"]).all(axis=1)
+    if both.sum() < 30:
+        return [Finding("note", subject, "too few to check")]
+    if min(rms(rows["cmd_rate"][both]), rms(rows["rate"][both])) == 0.0:
+        still = "it" if rms(rows["cmd_rate"][both]) == 0.0 else "the gyro"
+        return [Finding("note", subject, f"{still} is 0 throughout")]
+    rate = smooth(time_s, rows["rate"], WIDTH_S)
+    delay, command = _delayed(time_s, rows["cmd_rate"], rate)
+    if rms(rate) < CALM_RATE:
+        text = f"turns of {rms(rate):.2g} rad/s are too small to check it by"
+        return [Finding("not identifiable", subject, text, "rate_curve")]
+    found = match(command, rate)
+    alike = ", ".join(f"{v:+.2f}" for v in found.as_given)
+    figures = f"the gyro follows it after {1e3 * delay:.0f} ms with correlations {alike}"
+    if not found.seen.any():
+        text = f"{figures}: the gyro does not follow it"
+        return [Finding("doubt", subject, text, "rate_command_sign", None, 0.9)]
+    if found.is_turned or (found.as_given < OPPOSITE).any():
+        sign = [("-" if v < OPPOSITE else "") + "xyz"[k] for k, v in enumerate(found.as_given)]
+        axes = found.axes if found.is_turned else ",".join(sign)
+        text = f"{figures}; its axes are {axes}: check the signs"
+        sure = 0.98 if found.is_turned else 0.9
+        return [Finding("doubt" if sure < 0.95 else "corrected", subject, text,
+                        "rate_command_sign", None, sure, option(("cmd_rate", axes)))]  # fmt: skip
+    gain, low, high = pooled_scale(found)
+    for words, factor in UNITS.items():
+        if abs(np.log(gain * factor)) < np.log(1.4):
+            text = f"{figures}, by {gain:.3g} of it: it is {words}"
+            fix = option(("cmd_rate", f"{1.0 / factor:.10g}"))
+            return [Finding("corrected", subject, text, "rate_command_unit", factor, 0.98, fix)]
+    findings = []
+    bend = _bend(command, rate)
+    if np.isfinite(gain) and (high < GAIN[0] or low > GAIN[1] or abs(bend) > 0.35):
+        shape = f", and {1.0 + bend:.2g} times as much of large ones as of small ones"
+        text = f"{figures}, by {gain:.3g} of it ({low:.3g} to {high:.3g}){shape}: a stick map or "
+        text += "a rates curve that the log's commands do not have"
+        fix = "the firmware's rates curve for the map from sticks, or " + option(
+            ("cmd_rate", f"{gain:.4g}"))  # fmt: skip
+        findings.append(Finding("doubt", subject, text, "rate_curve", gain, 0.93, fix))
+    if delay > LATE_S + (USUAL_S if vehicle is None else _response(vehicle)):
+        text = f"{figures}: later than the rate loop, rotors and a link make it"
+        fix = "the link's or the logger's clock; a delay in the simulation: effects.command_delay"
+        findings.append(Finding("doubt", subject, text, "command_delay", delay, 0.93, fix))
+    return findings or [Finding("ok", subject, figures)]
+
+
+def _response(vehicle: Vehicle) -> float:
+    """Return how late the body follows a rate command by the vehicle file [s]."""
+    known = vehicle.effects.get("command_delay")
+    loop = 0.0 if vehicle.controller.settings is not None else vehicle.controller.rate_gain[0]
+    late = 0.03 if known is None else float(known.delay)
+    return late + vehicle.rotors.time_constant + (1.0 / loop if loop else 0.05)
+
+
+def _delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the delay [s] at which the smoothed rates follow the command best, and it then."""
+    step = float(np.median(np.diff(time_s)))
+    value = smooth(time_s, command, WIDTH_S)
+    best, delay, kept = -1.0, 0.0, value
+    for late in np.arange(0.0, REACH_S + 1e-9, max(STEP_S, step)):
+        count = round(late / step)
+        moved = np.full_like(value, np.nan)
+        moved[count:] = value[: len(value) - count]
+        both = np.isfinite(moved).all(axis=1) & np.isfinite(rate).all(axis=1)
+        if both.sum() < 30:
+            break
+        a, b = moved[both] - moved[both].mean(axis=0), rate[both] - rate[both].mean(axis=0)
+        size = np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0)
+        alike = float(
+            np.sum(b.std(axis=0) * np.abs(np.sum(a * b, axis=0)) / np.maximum(size, 1e-12))
+        )
+        if alike > best + 1e-6:
+            best, delay, kept = alike, float(late), moved
+    return delay, kept
+
+
+def _bend(command: np.ndarray, rate: np.ndarray) -> float:
+    """Return how much more of large commands the body does than of small ones, as a share."""
+    both = np.isfinite(command).all(axis=1) & np.isfinite(rate).all(axis=1)
+    size = np.abs(command[both])
+    limit = np.quantile(size, 0.9, axis=0)
+    k = int(np.argmax(limit))
+    c, r = command[both, k], rate[both, k]
+    large, small = np.abs(c) > 0.6 * limit[k], np.abs(c) < 0.4 * limit[k]
+    if limit[k] < 3.0 * CALM_RATE or min(large.sum(), small.sum()) < 50:
+        return 0.0
+    slopes = [float(c[m] @ r[m]) / max(float(c[m] @ c[m]), 1e-12) for m in (large, small)]
+    if slopes[1] < 0.1 or r[small].std() == 0.0 or np.corrcoef(c[small], r[small])[0, 1] < 0.7:
+        return 0.0
+    return slopes[0] / slopes[1] - 1.0
+
+
+def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> list[Finding]:
+    """Return whether commands change as often as a policy or a file says."""
+    name = next((n for n in ("action", "cmd_rate", "cmd_thrust", "motor_cmd", "pwm")
+                 if n in rows), None)  # fmt: skip
+    if wanted_hz is None or name is None:
+        return []
+    time_s, value = rows["time"], rows[name]
+    change = np.flatnonzero(np.any(np.diff(value, axis=0) != 0.0, axis=1)) + 1
+    row_hz = 1.0 / float(np.median(np.diff(time_s)))
+    if len(change) < 20:
+        text = "its commands hardly change"
+        return [Finding("not identifiable", "controller", text, "controller_rate")]
+    span = time_s[change[-1]] - time_s[change[0]]
+    steps = np.diff(time_s[change])
+    hz = (len(change) - 1) / float(span)
+    holds = float(np.median(steps))
+    figures = f"commands change {hz:.3g} times a second (each {1e3 * holds:.0f} ms)"
+    if hz > 0.9 * row_hz:
+        text = f"{figures}, with every row: log faster than the controller runs"
+        return [Finding("not identifiable", "controller", text, "controller_rate")]
+    if abs(hz / wanted_hz - 1.0) < RATE_OFF:
+        return [Finding("ok", "controller", figures)]
+    text = f"{figures}, and {whose} says {wanted_hz:g} Hz"
+    fix = (
+        f"the link or the computer that keeps it from {wanted_hz:g} Hz, or a policy of {hz:.0f} Hz"
+    )
+    return [Finding("doubt", "controller", text, "controller_rate", hz, 0.95, fix)]

@@ -1,0 +1,250 @@
+"""Motors: how many there are, their order and spin, the unit of their speeds, what they lift."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import permutations
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from eval.importers.frames import conjugate, turn
+from eval.logs.faults.finding import Finding
+from eval.logs.faults.pose import WIDTH_S, Rows
+from eval.logs.faults.reading import option
+from eval.logs.faults.relation import rms, smooth
+from eval.logs.velocity import velocity_from_position
+from eval.vehicles.vehicle import Vehicle, motor_thrust
+
+SPAN_S = 0.08
+"""Turns are differenced, and torques averaged, over this time [s]."""
+LAGS_S = (0.0, 0.02, 0.04, 0.06)
+"""By how much commands may lead the torques [s]."""
+CALM_TURN = 0.3
+"""Angular accelerations below this say nothing (root mean square) [rad/s^2]."""
+RIGHT, SURELY, WRONG, CLEAR = 0.3, 0.5, -0.3, 0.4
+"""An order whose torques correlate with the turns by more than the first about roll and pitch may
+be right, by more than the second it is; it must win by the fourth, in both halves of a flight."""
+AS_GIVEN = (0, 1, 2, 3)
+TURNING = 0.05
+"""A motor that never reaches this share of the fastest one does not turn."""
+FITS = 1.35
+"""Lift within this factor of the weight may be an effect, which a diagnosis names."""
+UNITS = {
+    "rpm in place of rad/s": 60.0 / (2.0 * np.pi),
+    "revolutions a second in place of rad/s": 1.0 / (2.0 * np.pi),
+    **{f"electrical, of {pairs} pole pairs": float(pairs) for pairs in (6, 7, 11, 12, 14)},
+    **{
+        f"electrical rpm of {pairs} pole pairs, in place of rad/s": pairs * 60.0 / (2.0 * np.pi)
+        for pairs in (6, 7, 11)
+    },
+}
+"""What rotor speeds may be too large by, in words."""
+NEAR, ALONE = 1.2, 1.1
+"""A factor within the first of the measured one may explain it; where just one is within the
+second, it does."""
+SAME = 1.07
+"""Lift within this factor of the weight is what the vehicle file says."""
+MAGNETS = (12, 14, 16, 22, 24, 28)
+POLES = {
+    f"{mine} poles were declared of {true}": true / mine
+    for mine in MAGNETS
+    for true in MAGNETS
+    if 0.5 <= mine / true <= 2.0 and mine != true
+}
+"""What speeds are too large by where eRPM was divided by the wrong number of pole pairs."""
+X_SHAPE = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
+"""Front right, rear right, rear left, front left: the order of the vehicles that are shipped."""
+X_SPIN = (1, -1, 1, -1)
+
+
+def check_motors(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
+    """Return which motors do not turn, and whether their order and spin fit how the body turns."""
+    name = next((n for n in ("motor", "pwm", "motor_cmd") if n in rows), None)
+    if name is None:
+        return []
+    speed = rows[name]
+    top = np.nanmax(np.abs(speed), axis=0) if np.isfinite(speed).any() else np.zeros(4)
+    still = [str(k + 1) for k in range(4) if not top[k] > TURNING * np.max(top)]
+    if still:
+        text = f"motors {', '.join(still)} of 4 never turn: a dead motor, or a wrong column"
+        return [Finding("doubt", "motors", text, "motor_dead", float(len(still)), 0.97,
+                        "the columns of the motors in --map")]  # fmt: skip
+    if "rate" not in rows:
+        return []
+    return _order(rows, name, vehicle)
+
+
+def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
+    """Return whether torques by the motors turn the body as they should, in every order."""
+    hubs = np.array(X_SHAPE if vehicle is None else [h[:2] for h in vehicle.rotors.position])
+    spin = np.array(X_SPIN if vehicle is None else vehicle.rotors.spin, dtype=float)
+    mixer = np.stack([hubs[:, 1], -hubs[:, 0], -spin * np.abs(hubs).max()], axis=0)
+    time_s, rate = rows["time"], rows["rate"]
+    thrust = _thrust(rows[name], name, vehicle, rows.get("voltage"))
+    count = max(1, round(SPAN_S / float(np.median(np.diff(time_s)))))
+    if len(time_s) < 20 * count:
+        return []
+    inertia = np.array([1.0, 1.0, 1.0] if vehicle is None else vehicle.inertia)
+    momentum = rate * inertia
+    change = (momentum[count:] - momentum[:-count]) / (time_s[count:] - time_s[:-count])[:, None]
+    gyroscopic = np.cross(rate, momentum)[: len(change)] if vehicle is not None else 0.0
+    turning = change + gyroscopic
+    size = rms(turning / inertia)
+    if size < CALM_TURN:
+        text = f"turns change by {size:.2g} rad/s^2 only, too little to check their order by"
+        return [Finding("not identifiable", "motors", text, "motor_order")]
+    full = np.concatenate([np.zeros((1, 4)), np.cumsum(thrust, axis=0)])
+    mean = (full[count:-1] - full[: -1 - count]) / count
+    step = float(np.median(np.diff(time_s)))
+    late = [np.roll(mean, round(lag / step), axis=0) for lag in LAGS_S]
+    mean = max(late, key=lambda one: float(np.sum(_correlations(one, turning) ** 2)))
+    scores = _scores(mean, turning, mixer)
+    half = len(mean) // 2
+    halves = [
+        _scores(mean[part], turning[part], mixer) for part in (slice(half), slice(half, None))
+    ]
+    given, best = scores[AS_GIVEN], _best(scores)
+    told = ", ".join(
+        f"{axis} {value:+.2f}" for axis, value in zip(("roll", "pitch", "yaw"), given, strict=True)
+    )
+    figures = f"correlations of their torques with how the body turns are {told}"
+    gain = float(scores[best][:2].sum() - given[:2].sum())
+    if gain > CLEAR and scores[best][:2].min() > RIGHT and all(best == _best(h) for h in halves):
+        order = ",".join(str(k + 1) for k in best)
+        text = f"{figures}; {scores[best][0]:+.2f}, {scores[best][1]:+.2f} in the order {order}"
+        names = [n for n in ("motor", "motor_cmd", "pwm") if n in rows]
+        clear = scores[best][:2].min() > SURELY and gain > 2.0 * CLEAR
+        status, sure = ("corrected", 0.99) if clear else ("doubt", 0.92)
+        fix = option(*((n, order) for n in names))
+        return [Finding(status, "motors", text, "motor_order", None, sure, fix)]
+    if given[:2].min() < WRONG:
+        sure, fix = (0.9, "the motors' columns") if given[:2].max() < RIGHT else (0.6, "")
+        text = f"{figures}: no order of them fits"
+        return [Finding("doubt", "motors", text, "motor_order", None, sure, fix)]
+    if given[:2].min() < RIGHT:
+        text = f"{figures}, too little to check their order by"
+        return [Finding("not identifiable", "motors", text, "motor_order")]
+    if given[2] < WRONG and all(h[AS_GIVEN][2] < WRONG for h in halves):
+        text = f"{figures}: all of them turn the other way round"
+        fix = "rotors.spin of the vehicle file, with the other signs"
+        return [Finding("doubt", "motors", text, "motor_spin", -1.0, 0.95, fix)]
+    return [Finding("ok", "motors", figures)]
+
+
+Scores = dict[tuple[int, ...], np.ndarray]
+"""By order of the motors: correlation of their torques with the turns about x, y and z."""
+
+
+def _scores(mean: np.ndarray, turning: np.ndarray, mixer: np.ndarray) -> Scores:
+    good = np.isfinite(mean).all(axis=1) & np.isfinite(turning).all(axis=1)
+    mean, turning = mean[good] - mean[good].mean(axis=0), turning[good] - turning[good].mean(axis=0)
+    return {
+        order: np.array([_alike((mean[:, order] @ mixer.T)[:, k], turning[:, k]) for k in range(3)])
+        for order in permutations(range(4))
+    }
+
+
+def _best(scores: Scores) -> tuple[int, ...]:
+    return max(scores, key=lambda order: float(scores[order][:2].sum()))
+
+
+def _thrust(
+    value: np.ndarray, name: str, vehicle: Vehicle | None, voltage: np.ndarray | None
+) -> np.ndarray:
+    """Return what rises with each motor's thrust (T, 4)."""
+    if name == "pwm" and vehicle is not None and vehicle.motors is not None:
+        return np.asarray(motor_thrust(vehicle.motors, value))
+    return value**2
+
+
+def _correlations(mean: np.ndarray, turning: np.ndarray) -> np.ndarray:
+    good = np.isfinite(mean).all(axis=1) & np.isfinite(turning).all(axis=1)
+    a, b = mean[good] - mean[good].mean(axis=0), turning[good] - turning[good].mean(axis=0)
+    size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
+    return (a.T @ b) / np.maximum(size, 1e-12)
+
+
+def _alike(first: np.ndarray, second: np.ndarray) -> float:
+    size = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return float(first @ second) / size if size > 0.0 else 0.0
+
+
+def check_lift(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
+    """Hold the rotors' thrust by the vehicle file against the force that bends the path."""
+    if "motor" not in rows:
+        return []
+    if vehicle is None:
+        text = "not checked against the weight; --vehicle makes it possible"
+        return [Finding("note", "rotor speeds", text)]
+    thrust = vehicle.rotors.thrust_coefficient * np.sum(rows["motor"] ** 2, axis=1)
+    lift = _lift(rows, thrust) / vehicle.mass
+    if not lift > 0.0:
+        return []
+    factor = float(np.sqrt(lift))
+    figures = f"by {vehicle.name!r} they lift {lift:.3g} times the weight"
+    if 1.0 / FITS < lift < FITS:
+        if abs(np.log(lift)) < np.log(SAME):
+            return [Finding("ok", "rotor speeds", figures)]
+        text = f"{figures}: an effect, which suite diagnose names, or a mass that is off"
+        return [Finding("note", "rotor speeds", text, "thrust_scale", lift, 0.9)]
+    return [_of_factor(rows, vehicle, factor, figures)]
+
+
+def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Finding:
+    """Return what speeds that lift `factor`^2 times the weight mean."""
+    near = _within(UNITS, NEAR, factor)
+    clear = _within(UNITS, ALONE, factor)
+    names = [n for n in ("motor", "motor_cmd") if n in rows]
+    if len(clear) == 1:
+        (words,) = clear
+        text = f"{figures}: they are {UNITS[words]:.3g} times too large ({words})"
+        others = " or ".join(name for name in near if name != words)
+        text += f"; if the vehicle file is far off, it may be {others}" if others else ""
+        fix = option(*((n, f"{1.0 / UNITS[words]:.10g}") for n in names))
+        about = ("motor_unit", UNITS[words], 0.97, fix)
+        return Finding("corrected", "rotor speeds", text, *about)
+    if near:
+        text = f"{figures}: they are {factor:.3g} times too large, which may be {' or '.join(near)}"
+        fix = option(*((n, f"{1.0 / factor:.4g}") for n in names))
+        return Finding("doubt", "rotor speeds", text, "motor_unit", factor, 0.95, fix)
+    poles = sorted(_within(POLES, 1.05, factor), key=lambda n: abs(np.log(factor / POLES[n])))
+    whole = [n for n in range(2, 9) if abs(np.log(factor**-2 / n)) < np.log(1.1)]
+    if whole:
+        text = f"{figures}: {vehicle.mass:g} kg may be the mass of {whole[0]} links, entered each"
+        fix = f"mass = {vehicle.mass / whole[0]:.3g} in the vehicle file"
+        return Finding("doubt", "mass", text, "vehicle_mass", factor**-2, 0.9, fix)
+    if poles:
+        declared, _, true = poles[0].split(" ")[0], None, poles[0].split(" ")[-1]
+        text = f"{figures}: {poles[0]}, or the mass or the thrust coefficient is wrong"
+        fix = f"--motor-poles {true}" if declared else ""
+        return Finding("doubt", "rotor speeds", text, "motor_poles", factor, 0.9, fix)
+    text = f"{figures}: the speeds' unit, the mass or the thrust coefficient is wrong"
+    fix = "mass or rotors.thrust_coefficient of the vehicle file"
+    return Finding("doubt", "rotor speeds", text, "motor_unit", factor, 0.9, fix)
+
+
+def _lift(rows: Rows, thrust: np.ndarray) -> float:
+    """Return the thrust over what the path needs of it [kg], drag along body z left out."""
+    time_s = rows["time"]
+    drag = np.zeros((len(time_s), 0))
+    need = np.full(len(time_s), GRAVITY)
+    if "quat" in rows and "pos" in rows:
+        quat, vel = conjugate(rows["quat"]), velocity_from_position(time_s, rows["pos"])
+        acc = smooth(time_s, velocity_from_position(time_s, vel), WIDTH_S)
+        need = turn(quat, acc + [0.0, 0.0, GRAVITY])[:, 2]
+        along = turn(quat, vel)[:, 2:]
+        drag = np.concatenate([along, along * np.linalg.norm(vel, axis=1, keepdims=True)], axis=1)
+    elif "acc" in rows:
+        need = rows["acc"][:, 2]
+    columns = np.concatenate([thrust[:, None], drag], axis=1)
+    good = np.isfinite(need) & np.isfinite(columns).all(axis=1)
+    if not good.any() or not np.any(thrust[good]):
+        return 0.0
+    share = float(np.linalg.lstsq(columns[good], need[good], rcond=None)[0][0])
+    return 1.0 / share if share > 0.0 else 0.0
+
+
+def _within(table: Mapping[str, float], limit: float, factor: float) -> list[str]:
+    """Return which entries of `table` are within the ratio `limit` of the measured `factor`."""
+    return [n for n, wrong in table.items() if abs(np.log(factor / wrong)) < np.log(limit)]

@@ -1,0 +1,321 @@
+"""How the attitude and the position are written: order, direction, frames, signs, unit of length.
+
+All readings are tried at once, by what no reading of one signal alone can satisfy: the force that
+bends the path (acceleration less gravity) is thrust, so it points along body z and upwards, but for
+drag; and the attitude turns as the gyro says, in whichever axes and unit the gyro is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from eval.importers.frames import conjugate, multiply, rotation_vector, turn
+from eval.logs.faults.finding import Finding
+from eval.logs.faults.reading import axes_matrix, option, read_as
+from eval.logs.faults.relation import Match, match, rms, smooth
+from eval.logs.velocity import velocity_from_position
+
+Rows = Mapping[str, np.ndarray]
+WIDTH_S, SPAN_S = 0.2, 0.06
+"""Everything is averaged over the first; the attitude is differenced over the second [s]."""
+POINTS = 1500
+"""At most so many rows take part."""
+CALM_RATE, CALM_ACC = 0.15, 0.5
+"""Below these, root mean square, turns [rad/s] and accelerations [m/s^2] say nothing."""
+GOOD, BAD, TIMES_BETTER = 0.45, 0.6, 2.0
+"""A reading is good below the first misfit and bad above the second; one that is good and better
+than a bad one by the third is overwhelming evidence."""
+RIGHT = 0.25
+"""Below this misfit nothing else is tried."""
+EACH = 0.06
+"""A reading must win by this for each step that it takes: the simplest that fits is right."""
+DRAG, BIAS = 1.2, 1.0
+"""Most drag [1/s] and constant side force [m/s^2] that are left out before a force is judged."""
+_ORDERS = ("", "xyzw")
+_SENSES = ("", "inverse")
+_FRAMES = ("", "ned", "frd", "ned+frd")
+_ANGLES = ("-roll", "-pitch", "-yaw")
+POSITIONS = (
+    ("", "x,y,z"),
+    ("x,-y,-z", "x,-y,-z"),
+    ("y,x,-z", "y,x,-z"),
+    ("-x,y,z", "-x,y,z"),
+    ("x,-y,z", "x,-y,z"),
+    ("x,y,-z", "x,y,-z"),
+    ("-y,x,z", "-y,x,z"),
+    ("y,-x,z", "y,-x,z"),
+    ("-x,-y,z", "-x,-y,z"),
+)
+"""Readings of a position, and their axes."""
+LENGTHS = (1.0, 0.01, 0.001)
+"""Metres in what a position may be in."""
+
+
+class Reading(NamedTuple):
+    """One way to read the attitude and the position."""
+
+    quat: str
+    """Steps of `reading.read_as`, "" for as it is."""
+    pos: str
+    length: float
+    steps: int
+    """How many things it changes."""
+    misfit: float
+    """By force and turns together; 0 fits, 1 and more does not."""
+    force: float | None
+    turns: float | None
+    gyro: Match | None
+
+
+class Looked(NamedTuple):
+    """What a log shows of its pose."""
+
+    given: Reading
+    best: Reading
+    second: float
+    """Misfit of the best reading that says another thing."""
+    level: float
+    """Horizontal acceleration or tilt times gravity, root mean square [m/s^2]."""
+    rate: float
+    """Turns by the gyro [its unit]."""
+
+
+def look_at_pose(rows: Rows) -> Looked | None:
+    """Return how well every reading fits; None where the rows hold no attitude."""
+    if "quat" not in rows:
+        return None
+    time_s, quat = rows["time"], _unit(rows["quat"])
+    every = max(1, len(time_s) // POINTS)
+    turned = {steps: _turns(time_s, _as(quat, steps))[::every] for steps in _bases()}
+    gyro = smooth(time_s, rows["rate"], WIDTH_S)[::every] if "rate" in rows else None
+    path = _path(time_s, rows["pos"], every) if "pos" in rows else None
+    found, level = [], 0.0
+    for steps in _attitudes():
+        if len(found) == 1 and _is_right(found[0]):
+            break
+        base = "+".join(step for step in steps.split("+") if step not in ("ned", "frd"))
+        frames = {"ned", "frd"} & set(steps.split("+"))
+        seen = None if gyro is None else _gyro_match(turned[base], gyro, "frd" in frames)
+        turns = None if seen is None else _misfit_of(seen)
+        axes = _axes_of(time_s, _as(quat, steps), every) if path is not None else None
+        # A frame is one mistake, of the attitude alone or of the gyro with it.
+        count = sum(step not in ("", "ned", "frd") for step in steps.split("+")) + bool(frames)
+        apart = 0 if seen is None else int(seen.axes != "x,y,z")
+        apart = 0 if "frd" in frames and seen is not None and seen.axes == "x,-y,-z" else apart
+        for pos, name in POSITIONS if path is not None else POSITIONS[:1]:
+            for length in LENGTHS if path is not None else LENGTHS[:1]:
+                if len(found) == 1 and _is_right(found[0]):
+                    break
+                force = None
+                if path is not None and axes is not None:
+                    force, size = _force_misfit(axes, path, axes_matrix(name) * length)
+                    level = max(level, size) if not steps and not pos and length == 1.0 else level
+                taken = count + apart + (pos != "") + (length != 1.0)
+                if frames == {"ned", "frd"} and pos == "x,-y,-z":
+                    taken -= 1  # one mistake: all of it is north-east-down
+                parts = [part for part in (force, turns) if part is not None]
+                misfit = float(np.sqrt(np.mean(np.square(parts)))) if parts else 0.0
+                found.append(Reading(steps, pos, length, taken, misfit, force, turns, seen))
+    best = min(found, key=lambda one: one.misfit + EACH * one.steps)
+    others = [one for one in found if one is not best and one.steps <= best.steps + 1]
+    second = min((o.misfit + EACH * (o.steps - best.steps) for o in others), default=np.inf)
+    rate = 0.0 if gyro is None else rms(gyro)
+    return Looked(found[0], best, second, level, rate)
+
+
+def _is_right(one: Reading) -> bool:
+    """Return whether the log fits as it is given, so that no other reading need be tried."""
+    turned = one.gyro is not None and one.gyro.is_turned
+    return one.force is not None and one.misfit < RIGHT and not turned
+
+
+def check_pose(rows: Rows, looked: Looked | None) -> list[Finding]:
+    """Return what is wrong with how attitude and position are written."""
+    if looked is None:
+        return []
+    given, best = looked.given, looked.best
+    figures = _figures(given)
+    if not figures:
+        return []
+    calm = looked.level < CALM_ACC and (given.force is None or given.force < BAD)
+    if calm and (given.turns is None or looked.rate < CALM_RATE):
+        text = (
+            f"accelerations of {looked.level:.2g} m/s^2 and turns of {looked.rate:.2g} rad/s are "
+            "too small to check it by"
+        )
+        return [Finding("not identifiable", "attitude", text, "attitude")]
+    if not (best.quat or best.pos or best.length != 1.0):
+        if given.misfit < BAD or (given.gyro is not None and given.gyro.is_turned):
+            return [Finding("ok", "attitude", figures)]
+        text = f"{figures}: no other order, direction, sign or frame of it fits"
+        sure = 0.9 if given.misfit > 1.0 else 0.6
+        return [Finding("doubt", "attitude", text, "attitude", given.misfit, sure, "see --pose")]
+    better = given.misfit / max(best.misfit, 1e-3)
+    clear = looked.second - best.misfit
+    sure = best.misfit < GOOD and better > TIMES_BETTER and clear > 0.5 * EACH
+    readings = _readings(best, rows)
+    text = f"{figures}; {_figures(best)} if {_words(best)}"
+    if given.misfit < BAD and not sure:
+        return [Finding("ok", "attitude", figures)]
+    confidence = 0.99 if sure and clear > 2.0 * EACH else 0.95 if better > TIMES_BETTER else 0.7
+    return [
+        Finding("corrected" if sure else "doubt", signal, text, name, None, confidence,
+                option(*(r for r in readings if r[0] in of)))
+        for name, signal, of in _names(best)
+        if any(r[0] in of for r in readings)
+    ]  # fmt: skip
+
+
+def _names(best: Reading) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """Yield (fault, signal, signals that its fix is of) of a reading that differs."""
+    steps = set(best.quat.split("+")) - {""}
+    pose, world = ("quat", "cmd_quat"), ("pos", "vel")
+    if steps:
+        name = "attitude_sign"
+        if {"ned", "frd"} & steps:
+            name = "body_frame" if "frd" in steps and "ned" not in steps else "world_frame"
+        name = "quaternion_direction" if "inverse" in steps else name
+        name = "quaternion_order" if "xyzw" in steps else name
+        yield name, "attitude", pose
+    if best.length != 1.0:
+        yield "position_unit", "position", world
+    elif best.pos:
+        yield (
+            "world_frame" if best.pos in ("x,-y,-z", "y,x,-z") else "position_axes",
+            "position",
+            world,
+        )
+
+
+def _readings(best: Reading, rows: Rows) -> list[tuple[str, str]]:
+    found = [(name, best.quat) for name in ("quat", "cmd_quat") if best.quat and name in rows]
+    steps = [best.pos] if best.pos else []
+    steps += [f"{best.length:g}"] if best.length != 1.0 else []
+    if steps:
+        found.append(("pos", "+".join(steps)))
+    return found
+
+
+def _words(best: Reading) -> str:
+    words = {
+        "xyzw": "the quaternion is xyzw",
+        "inverse": "it maps world to body",
+        "ned": "its world points down",
+        "frd": "its body is forward-right-down",
+        "-roll": "roll has the other sign",
+        "-pitch": "pitch has the other sign",
+        "-yaw": "yaw has the other sign",
+    }
+    told = [words[step] for step in best.quat.split("+") if step]
+    told += [f"the position's axes are {best.pos}"] if best.pos else []
+    told += [f"it is in {'cm' if best.length == 0.01 else 'mm'}"] if best.length != 1.0 else []
+    return " and ".join(told)
+
+
+def _figures(one: Reading) -> str:
+    told = []
+    if one.force is not None:
+        told.append(f"the force off body z is {100 * one.force:.0f} % of the acceleration")
+    if one.turns is not None:
+        told.append(f"its turns are off the gyro's by {100 * one.turns:.0f} %")
+    return ", ".join(told)
+
+
+def _bases() -> Iterator[str]:
+    yield from ("+".join(s for s in (o, i) if s) for o in _ORDERS for i in _SENSES)
+    yield from _ANGLES
+
+
+def _attitudes() -> Iterator[str]:
+    for base in ("+".join(s for s in (o, i) if s) for o in _ORDERS for i in _SENSES):
+        for frames in _FRAMES:
+            yield "+".join(s for s in (base, frames) if s)
+    yield from _ANGLES
+
+
+def _as(quat: np.ndarray, steps: str) -> np.ndarray:
+    return read_as("quat", quat, steps) if steps else quat
+
+
+def _unit(quat: np.ndarray) -> np.ndarray:
+    norm = np.linalg.norm(quat, axis=1, keepdims=True)
+    return np.where(norm > 0.0, quat / np.where(norm > 0.0, norm, 1.0), np.nan)
+
+
+def turns_of(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Return the body rates (T, 3) by the attitude, over `SPAN_S` around each row [rad/s]."""
+    count = max(1, round(0.5 * SPAN_S / float(np.median(np.diff(time_s)))))
+    out = np.full((len(time_s), 3), np.nan)
+    if len(time_s) > 2 * count:
+        step = (time_s[2 * count :] - time_s[: -2 * count])[:, None]
+        relative = multiply(conjugate(quat[: -2 * count]), quat[2 * count :])
+        whole = step < 1.5 * (2 * count) * float(np.median(np.diff(time_s)))
+        out[count:-count] = np.where(whole, rotation_vector(relative) / step, np.nan)
+    return out
+
+
+def _turns(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    return smooth(time_s, turns_of(time_s, quat), WIDTH_S)
+
+
+def _gyro_match(turns: np.ndarray, gyro: np.ndarray, frd: bool) -> Match:
+    return match(turns * [1.0, -1.0, -1.0] if frd else turns, gyro)
+
+
+def _misfit_of(seen: Match) -> float:
+    """Return what the gyro leaves of the turns in its best axes, as a share of them."""
+    weight = seen.level**2
+    left = weight * (1.0 - np.clip(seen.alike, 0.0, 1.0) ** 2)
+    return float(np.sqrt(left.sum() / max(weight.sum(), 1e-12)))
+
+
+def _axes_of(time_s: np.ndarray, quat: np.ndarray, every: int) -> np.ndarray:
+    """Return the body's axes in the world, averaged, (N, 3, 3): [:, :, k] is axis k."""
+    columns = [turn(quat, np.eye(3)[k]) for k in range(3)]
+    flat = smooth(time_s, np.concatenate(columns, axis=1), WIDTH_S)[::every]
+    return np.moveaxis(flat.reshape(-1, 3, 3), 1, 2)
+
+
+def _path(time_s: np.ndarray, pos: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:
+    vel = velocity_from_position(time_s, pos)
+    acc = velocity_from_position(time_s, vel)
+    return smooth(time_s, vel, WIDTH_S)[::every], smooth(time_s, acc, WIDTH_S)[::every]
+
+
+def _force_misfit(
+    axes: np.ndarray, path: tuple[np.ndarray, np.ndarray], change: np.ndarray
+) -> tuple[float, float]:
+    """Return what of the force is not along body z, but for drag, over what there is of it.
+
+    Args:
+        axes: (N, 3, 3) of the body in the world.
+        path: velocity and acceleration (N, 3) as they are written.
+        change: (3, 3) that takes them to the reading's.
+
+    Returns:
+        The share, and the level that it is a share of [m/s^2].
+    """
+    vel, acc = path[0] @ change.T, path[1] @ change.T
+    good = np.isfinite(axes).all(axis=(1, 2)) & np.isfinite(acc).all(axis=1)
+    if good.sum() < 20:
+        return 0.0, 0.0
+    axes, vel, acc = axes[good], vel[good], acc[good]
+    fast = np.linalg.norm(acc, axis=1)
+    usual = fast <= 4.0 * np.median(fast) + 1.0
+    axes, vel, acc = axes[usual], vel[usual], acc[usual]
+    force = np.einsum("nik,ni->nk", axes, acc + [0.0, 0.0, GRAVITY])
+    wind = np.einsum("nik,ni->nk", axes, vel)
+    left = force.copy()
+    left[:, 2] = np.minimum(force[:, 2], 0.0)  # thrust only pushes
+    for k in range(2):
+        speed = wind[:, k] - wind[:, k].mean()
+        slope = float(speed @ force[:, k]) / max(float(speed @ speed), 1e-9)
+        left[:, k] -= np.clip(slope, -DRAG, 0.0) * speed
+        left[:, k] -= np.clip(left[:, k].mean(), -BIAS, BIAS)
+    tilt = GRAVITY * axes[:, :2, 2]
+    level = float(np.sqrt(max(rms(acc[:, :2]) ** 2, rms(tilt - tilt.mean(axis=0)) ** 2)))
+    return rms(left) / max(level, CALM_ACC), level

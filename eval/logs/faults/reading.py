@@ -1,0 +1,170 @@
+"""Other readings of a signal, written as on the command line: `--read rate=x,-y,-z+0.0610352`.
+
+| step | what it does | signals |
+|---|---|---|
+| `0.01` | times that | all |
+| `x,-y,-z` | these columns with these signs | pos vel rate acc cmd_rate cmd_torque |
+| `2,1,4,3` | motors in this order | motor motor_cmd pwm |
+| `xyzw` | columns were in this order | quat cmd_quat |
+| `inverse` | it maps world to body | quat cmd_quat |
+| `ned`, `frd` | its world points down; its body is forward-right-down | quat cmd_quat |
+| `-roll`, `-pitch`, `-yaw` | the angle's sign | quat cmd_quat |
+| `from-body`, `from-world` | turned by the attitude into our axes | vel rate acc |
+| `plus-gravity` | gravity had been taken out of it | acc |
+| `1000-2000` | pulse widths in us to a share from 0 to 1 | throttle pwm |
+| `ms`, `us`, `ns` | the unit of all times | time |
+| `drop` | left out | all but time |
+
+Steps are joined by `+` and act from left to right.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from eval.importers.frames import conjugate, from_euler, multiply, turn
+
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Seconds in each unit that clocks count in."""
+QUATS = ("quat", "cmd_quat")
+VECTORS = ("pos", "vel", "rate", "acc", "cmd_rate", "cmd_torque")
+MOTORS = ("motor", "motor_cmd", "pwm")
+SCALARS = ("throttle", "cmd_thrust", "voltage")
+_HALF = np.array([0.0, 1.0, 0.0, 0.0])
+"""Half a turn about x."""
+_AXES = re.compile(r"^-?[xyz],-?[xyz],-?[xyz]$")
+_ORDER = re.compile(r"^[1-4](,[1-4]){3}$")
+_ANGLES = ("-roll", "-pitch", "-yaw")
+_QUAT_STEPS = ("xyzw", "inverse", "ned", "frd", *_ANGLES)
+Readings = tuple[tuple[str, str], ...]
+"""(signal, steps) in the order in which they act."""
+
+
+def parse_readings(texts: Sequence[str]) -> Readings:
+    """Return what options as `rate=x,-y,-z` say.
+
+    Raises:
+        ValueError: naming the option, and what is allowed.
+    """
+    found = []
+    for text in texts:
+        signal, equals, steps = text.partition("=")
+        if not equals or signal not in (*QUATS, *VECTORS, *MOTORS, *SCALARS, "time"):
+            names = ", ".join((*QUATS, *VECTORS, *MOTORS, *SCALARS, "time"))
+            raise ValueError(f"--read {text!r}: give SIGNAL=STEPS; signals are {names}")
+        for step in steps.split("+"):
+            if not _allowed(signal, step):
+                raise ValueError(
+                    f"--read {text!r}: {step!r} is no step of {signal}; allowed are a factor, "
+                    "x,-y,-z for vectors, 2,1,4,3 for motors, and what docs/import.md lists"
+                )
+        found.append((signal, steps))
+    return tuple(found)
+
+
+def option(*readings: tuple[str, str]) -> str:
+    """Return readings as options of `suite import`."""
+    return " ".join(f"--read {signal}={steps}" for signal, steps in readings)
+
+
+def readings_in(fix: str) -> Readings:
+    """Return the readings in a finding's fix; () where it is no option `--read`."""
+    words = fix.split()
+    return parse_readings([words[k + 1] for k, w in enumerate(words[:-1]) if w == "--read"])
+
+
+def read_as(
+    signal: str, value: np.ndarray, steps: str, quat: Callable[[], np.ndarray] | None = None
+) -> np.ndarray:
+    """Return samples (N, C) of a signal as another reading has them.
+
+    Args:
+        signal: its name.
+        value: (N, C).
+        steps: see the head of this file.
+        quat: gives the attitude (N, 4) wxyz at the same times; needed by `from-body` and others
+            that turn.
+    """
+    for step in steps.split("+"):
+        if step in ("from-body", "from-world", "plus-gravity"):
+            assert quat is not None
+            value = _turned(value, step, quat())
+        elif step == "1000-2000":
+            value = (value - 1000.0) / 1000.0
+        elif signal in QUATS:
+            value = _quat_as(value, step)
+        elif _AXES.match(step):
+            value = value @ axes_matrix(step).T
+        elif _ORDER.match(step):
+            value = value[:, [int(k) - 1 for k in step.split(",")]]
+        else:
+            value = value * float(step)
+    return value
+
+
+def read_rows(rows: Mapping[str, np.ndarray], readings: Readings) -> dict[str, np.ndarray]:
+    """Return rows (signal to (T, C), `time` to (T,)) with `readings` in place."""
+    found = dict(rows)
+    for signal, steps in readings:
+        if signal == "time":
+            found["time"] = found["time"] * TIMES[steps]
+        elif steps == "drop":
+            found.pop(signal, None)
+        elif signal in found:
+            found[signal] = read_as(signal, found[signal], steps, lambda: found["quat"])
+    return found
+
+
+def axes_matrix(step: str) -> np.ndarray:
+    """Return the matrix (3, 3) that takes columns to `x,-y,-z` of them."""
+    matrix = np.zeros((3, 3))
+    for row, part in enumerate(step.split(",")):
+        matrix[row, "xyz".index(part[-1])] = -1.0 if part[0] == "-" else 1.0
+    return matrix
+
+
+def _allowed(signal: str, step: str) -> bool:
+    if signal == "time" or step == "drop":
+        return step in TIMES or (step == "drop" and signal != "time")
+    if signal in QUATS:
+        return step in _QUAT_STEPS
+    if signal in MOTORS and _ORDER.match(step):
+        return sorted(step.split(",")) == ["1", "2", "3", "4"]
+    if signal in VECTORS and _AXES.match(step):
+        return abs(np.linalg.det(axes_matrix(step))) == 1.0
+    if step in ("from-body", "from-world"):
+        return signal in ("vel", "rate", "acc")
+    if step in ("plus-gravity", "1000-2000"):
+        return signal in (("acc",) if step == "plus-gravity" else ("throttle", "pwm"))
+    try:
+        return np.isfinite(float(step)) and float(step) != 0.0
+    except ValueError:
+        return False
+
+
+def _turned(value: np.ndarray, step: str, quat: np.ndarray) -> np.ndarray:
+    if step == "plus-gravity":
+        return value + turn(conjugate(quat), np.array([0.0, 0.0, GRAVITY]))
+    return turn(quat if step == "from-body" else conjugate(quat), value)
+
+
+def _quat_as(value: np.ndarray, step: str) -> np.ndarray:
+    if step == "xyzw":
+        return value[:, [3, 0, 1, 2]]
+    if step == "inverse":
+        return conjugate(value)
+    if step == "ned":
+        return multiply(np.broadcast_to(_HALF, value.shape), value)
+    if step == "frd":
+        return multiply(value, np.broadcast_to(_HALF, value.shape))
+    from scipy.spatial.transform import Rotation
+
+    known = np.isfinite(value).all(axis=1) & (np.linalg.norm(value, axis=1) > 0.0)
+    angles = np.zeros((len(value), 3))
+    angles[known] = Rotation.from_quat(value[known], scalar_first=True).as_euler("ZYX")[:, ::-1]
+    angles[:, _ANGLES.index(step)] *= -1.0
+    return np.where(known[:, None], from_euler(angles), np.nan)

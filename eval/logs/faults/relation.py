@@ -1,0 +1,116 @@
+"""How two measurements of the same vector differ: axes, signs and scale, whatever the noise."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from typing import NamedTuple
+
+import numpy as np
+
+ALIKE = 0.8
+"""Axes whose correlation is above this are the same."""
+UNLIKE = 0.5
+"""An axis correlates with its own by less than the best other by this: it is another one."""
+SEEN = 0.5
+"""An axis that correlates with none by more than this cannot be identified."""
+
+
+class Match(NamedTuple):
+    """How `wanted` (N, 3) and `given` (N, 3) belong together."""
+
+    axes: str
+    """Which columns of `given`, with which signs, are x, y and z of `wanted`: `x,-y,-z`."""
+    seen: np.ndarray
+    """(3,) bool: axes of `wanted` of which that can be said."""
+    alike: np.ndarray
+    """(3,) correlation in these axes."""
+    as_given: np.ndarray
+    """(3,) correlation with the axes as they are."""
+    scale: np.ndarray
+    """(3,) given over wanted, in these axes."""
+    low: np.ndarray
+    """(3,) smallest and ..."""
+    high: np.ndarray
+    """... largest scale that noise in either of them allows (Frisch 1934)."""
+    level: np.ndarray
+    """(3,) standard deviation of `wanted`."""
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether other axes than the given ones are overwhelmingly right."""
+        worse = self.seen & (self.alike - self.as_given > UNLIKE)
+        return bool(worse.any() and (self.alike[self.seen] > ALIKE).all())
+
+    @property
+    def fits(self) -> bool:
+        """Whether every axis that can be judged fits as it is given."""
+        return bool(self.seen.any() and (self.as_given[self.seen] > SEEN).all())
+
+
+def match(wanted: np.ndarray, given: np.ndarray) -> Match:
+    """Return how (N, 3) `given` belongs to (N, 3) `wanted`; rows with a NaN take no part."""
+    wanted, given = _clear(wanted, given)
+    level, other = wanted.std(axis=0), given.std(axis=0)
+    wanted, given = wanted - wanted.mean(axis=0), given - given.mean(axis=0)
+    size = np.outer(np.maximum(level, 1e-12), np.maximum(other, 1e-12)) * max(len(wanted), 1)
+    corr = (wanted.T @ given) / size
+    order = max(
+        permutations(range(3)),
+        key=lambda p: float(np.sum(corr[range(3), p] ** 2)) + 1e-6 * (p == (0, 1, 2)),
+    )
+    best = corr[range(3), order]
+    seen = np.abs(best) > SEEN
+    if not seen[[k for k in range(3) if order[k] != k]].all():
+        order, best = (0, 1, 2), np.diag(corr).copy()
+        seen = np.abs(best) > SEEN
+    sign = np.where(seen & (best < 0.0), -1.0, 1.0)
+    names = [("-" if s < 0 else "") + "xyz"[k] for k, s in zip(order, sign, strict=True)]
+    ratio = other[list(order)] / np.maximum(level, 1e-12)
+    r = np.clip(np.abs(best), 1e-3, 1.0)
+    alike = best * sign
+    return Match(",".join(names), seen, alike, np.diag(corr), ratio, ratio * r, ratio / r, level)
+
+
+def pooled_scale(found: Match) -> tuple[float, float, float]:
+    """Return the common scale of the axes that are seen, and the least and largest of it."""
+    weight = np.where(found.seen, found.level**2 * found.alike**4, 0.0)
+    if weight.sum() == 0.0:
+        return np.nan, np.nan, np.nan
+    mean = [
+        float(np.exp(np.sum(weight * np.log(value)) / weight.sum()))
+        for value in (found.scale, found.low, found.high)
+    ]
+    return mean[0], mean[1], mean[2]
+
+
+def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:
+    """Return the mean (T, C) of `value` over `width_s` around each time; NaN over holes."""
+    first = np.searchsorted(time_s, time_s - 0.5 * width_s)
+    stop = np.searchsorted(time_s, time_s + 0.5 * width_s, side="right")
+    known = np.isfinite(value).all(axis=1)
+    full = np.concatenate(
+        [np.zeros((1, value.shape[1])), np.cumsum(np.where(known[:, None], value, 0.0), 0)]
+    )
+    count = np.concatenate([[0], np.cumsum(known)])
+    inside = (count[stop] - count[first])[:, None]
+    enough = inside > 0.6 * (stop - first)[:, None]
+    return np.where(enough, (full[stop] - full[first]) / np.maximum(inside, 1), np.nan)
+
+
+def rms(value: np.ndarray) -> float:
+    """Return the root mean square of the lesser nineteen twentieths: glitches must not decide."""
+    squared = np.sum(np.atleast_2d(value.T).T ** 2, axis=1)
+    squared = np.sort(squared[np.isfinite(squared)])
+    squared = squared[: max(1, int(0.95 * len(squared)))]
+    return float(np.sqrt(np.mean(squared))) if len(squared) else 0.0
+
+
+def _clear(wanted: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows in which both are known and neither jumps."""
+    good = np.isfinite(wanted).all(axis=1) & np.isfinite(given).all(axis=1)
+    for value in (wanted, given):
+        size = np.linalg.norm(value, axis=1)
+        known = size[good]
+        if len(known):
+            good = good & (size <= 8.0 * np.quantile(known, 0.9) + 1e-12)
+    return wanted[good], given[good]

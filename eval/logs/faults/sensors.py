@@ -1,0 +1,107 @@
+"""Battery, barometer and the accelerometer under vibration: what a flight contradicts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from eval.importers.frames import turn
+from eval.logs.faults.finding import Finding
+from eval.logs.faults.pose import Rows
+from eval.logs.faults.reading import option
+from eval.logs.velocity import velocity_from_position
+
+LEAST_V, MOST_V = 2.5, 70.0
+"""Batteries of multirotors, from one cell at its end to sixteen full ones [V]."""
+SUNK_M, SUNK_SHARE = 0.5, 0.6
+"""A height that falls by the first as the motors start, and by that share of it stays there."""
+SPAN_S = 0.6
+BIAS, ALIKE = 0.15, 0.6
+"""An accelerometer that owes the first to the throttle half of the flight [m/s^2], and whose error
+correlates with it by the second."""
+
+
+def check_voltage(rows: Rows) -> list[Finding]:
+    """Return whether the battery's voltage is one that a battery has."""
+    value = rows.get("voltage")
+    if value is None or not np.isfinite(value).any():
+        return []
+    middle = float(np.nanmedian(value))
+    if LEAST_V <= middle <= MOST_V:
+        return [Finding("ok", "voltage", f"{middle:.3g} V")]
+    for unit, scale in (("mV", 1e-3), ("hundredths of a volt", 1e-2), ("tenths of a volt", 0.1)):
+        if middle > MOST_V and LEAST_V <= middle * scale <= MOST_V:
+            text = f"{middle:.4g} V in the file: it is in {unit}"
+            fix = option(("voltage", f"{scale:g}"))
+            return [Finding("corrected", "voltage", text, "voltage", middle, 0.95, fix)]
+    text = f"{middle:.3g} V is no battery's: left out, so that no thrust is scaled by it"
+    return [
+        Finding("corrected", "voltage", text, "voltage", middle, 0.97, option(("voltage", "drop")))
+    ]
+
+
+def check_accelerometer_bias(rows: Rows) -> list[Finding]:
+    """Return whether the accelerometer's error along body z grows with the throttle squared.
+
+    Changes of the vertical speed over `SPAN_S` are held against the integrated accelerometer.
+    """
+    drive = next((n for n in ("throttle", "pwm", "motor", "cmd_thrust") if n in rows), None)
+    if not {"acc", "pos", "quat"} <= rows.keys() or drive is None:
+        return []
+    time_s = rows["time"]
+    vel = rows["vel"] if "vel" in rows else velocity_from_position(time_s, rows["pos"])
+    load = np.mean(np.abs(rows[drive]), axis=1)
+    load = load / (1.0 if drive in ("throttle", "pwm") else np.nanquantile(load, 0.99))
+    up = turn(rows["quat"], np.array([0.0, 0.0, 1.0]))[:, 2]
+    felt = turn(rows["quat"], rows["acc"])[:, 2] - GRAVITY
+    both = np.stack([felt, up * load**2], axis=1)
+    count = max(1, round(SPAN_S / float(np.median(np.diff(time_s)))))
+    full = np.cumsum(both, axis=0)
+    felt, power = ((full[count:] - full[:-count]) / count).T
+    off = felt - (vel[count:, 2] - vel[:-count, 2]) / (time_s[count:] - time_s[:-count])
+    good = np.isfinite(off) & np.isfinite(power)
+    if good.sum() < 5 * count or min(np.std(power[good]), np.std(off[good])) < 1e-6:
+        return []
+    slope, _ = np.polyfit(power[good], off[good], 1)
+    alike = float(np.corrcoef(power[good], off[good])[0, 1])
+    middle = float(np.median(off[good]))
+    share = slope * float(np.median(power[good]))
+    if share > -BIAS or middle > 0.5 * share or alike > -ALIKE:
+        return []
+    text = (
+        f"it reads {middle:+.2f} m/s^2 too much along body z and {slope:+.2f} more at full "
+        f"throttle (correlation {alike:+.2f}): vibration biases it"
+    )
+    fix = "soft mounting or a wider range; do not scale thrust by it"
+    about = ("accelerometer_throttle_bias", float(slope), 0.92, fix)
+    return [Finding("doubt", "accelerometer", text, *about)]
+
+
+def check_barometer(rows: Rows) -> list[Finding]:
+    """Return whether a barometer's height falls as the motors spin up."""
+    height = rows.get("baro")
+    drive = next((n for n in ("throttle", "pwm", "motor") if n in rows), None)
+    if height is None or drive is None:
+        return []
+    load = np.nanmean(np.abs(rows[drive]), axis=1)
+    running = load > 0.3 * np.nanquantile(load, 0.9)
+    if running.all() or not running.any():
+        text = "the log has no row before the motors start"
+        return [Finding("not identifiable", "barometer", text, "barometer_spin_up")]
+    start = int(np.argmax(running))
+    time_s, value = rows["time"], height[:, 0]
+    before = value[(time_s < time_s[start]) & (time_s > time_s[start] - 2.0)]
+    after = value[(time_s > time_s[start]) & (time_s < time_s[start] + 1.0)]
+    if not len(before) or not len(after):
+        return []
+    true = 0.0
+    if "pos" in rows:
+        up = rows["pos"][:, 2]
+        true = float(np.nanmedian(up[(time_s > time_s[start]) & (time_s < time_s[start] + 1.0)])
+                     - np.nanmedian(up[time_s < time_s[start]]))  # fmt: skip
+    fall = float(np.nanmin(after) - np.nanmedian(before)) - min(true, 0.0)
+    if fall < -SUNK_M:
+        text = f"its height falls by {-fall:.2g} m in the second in which the motors start"
+        fix = "foam over the barometer, or a height from elsewhere; leave baro out"
+        return [Finding("doubt", "barometer", text, "barometer_spin_up", fall, 0.95, fix)]
+    return [Finding("ok", "barometer", f"it moves by {fall:+.2g} m as the motors start")]

@@ -1,0 +1,253 @@
+"""Gyro, velocity and accelerometer: axes, signs, frames and units, against a pose that is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from eval.importers.frames import conjugate, turn
+from eval.logs.faults.finding import Finding
+from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
+from eval.logs.faults.reading import option, read_as
+from eval.logs.faults.relation import Match, match, pooled_scale, rms, smooth
+from eval.logs.velocity import velocity_from_position
+
+DEG = float(np.pi / 180.0)
+COUNTS = 16.384
+"""Counts per deg/s of a gyro of 2000 deg/s and 16 bits."""
+RATES = {
+    "deg/s": 1.0 / DEG,
+    "raw counts of a gyro, read as deg/s": COUNTS,
+    "raw counts of a gyro": COUNTS / DEG,
+    "ten times too large (blackbox_high_resolution)": 10.0,
+    "rad/s, read as deg/s": DEG,
+    "mrad/s": 1000.0,
+}
+"""Unit -> what it is too large by."""
+SPEEDS = {"cm/s": 100.0, "mm/s": 1000.0, "km/h": 3.6, "knots": 1.0 / 0.514444}
+FORCES = {
+    "g": 1.0 / GRAVITY,
+    "mg": 1000.0 / GRAVITY,
+    "m/s^2, taken for g": GRAVITY,
+    "m/s^2, taken for raw counts of 2048 per g": GRAVITY / 2048.0,
+    "g, taken for raw counts of 2048 per g": 1.0 / 2048.0,
+} | {f"raw counts of {per_g} per g": per_g / GRAVITY for per_g in (512, 2048, 4096, 8192, 16384)}
+NEAR = 1.06
+"""A scale within this factor of a unit's is of that unit."""
+SAME = 1.1
+"""A scale within this factor of 1 is no fault."""
+CALM_SPEED = 0.3
+"""Speeds below this say nothing (root mean square) [m/s]."""
+GOOD, BAD, TIMES_BETTER = 0.35, 0.6, 2.0
+APART = 0.5
+"""Axes that differ by a smaller share of a signal cannot be told apart by it."""
+
+
+def check_gyro(rows: Rows) -> list[Finding]:
+    """Return what is wrong with the gyro's axes, frame and unit, by how the attitude turns."""
+    if not {"quat", "rate"} <= rows.keys():
+        return []
+    time_s = rows["time"]
+    turns = smooth(time_s, turns_of(time_s, rows["quat"]), WIDTH_S)
+    gyro = smooth(time_s, rows["rate"], WIDTH_S)
+    size = rms(turns)
+    if size < CALM_RATE:
+        text = f"turns of {size:.2g} rad/s are too small to check it by"
+        return [Finding("not identifiable", "gyro", text, "gyro_scale")]
+    found = match(turns, gyro)
+    world = match(turn(rows["quat"], turns), gyro)
+    in_world = not found.is_turned and _left(world) < GOOD and _left(found) > max(
+        BAD, TIMES_BETTER * _left(world))  # fmt: skip
+    if in_world:
+        text = (
+            f"its turns are off the attitude's by {100 * _left(found):.0f} % in body axes and by "
+            f"{100 * _left(world):.0f} % in world axes"
+        )
+        fix = option(("rate", "from-world"))
+        return [Finding("corrected", "gyro", text, "gyro_frame", None, 0.98, fix)]
+    findings = []
+    apart = rms(turn(rows["quat"], turns) - turns) / size
+    if apart < APART:
+        text = f"body and world axes are {100 * apart:.0f} % of its turns apart only"
+        findings.append(Finding("not identifiable", "gyro", text, "gyro_frame"))
+    if found.is_turned:
+        findings.append(_turned(found, "rate", "gyro"))
+    elif not found.seen.any():
+        text = "its noise hides how the attitude turns"
+        return [Finding("not identifiable", "gyro", text, "gyro_scale")]
+    findings += _unit(found, RATES, "rate", "gyro", "gyro_scale", "the attitude's turns")
+    return findings
+
+
+def _turned(found: Match, signal: str, subject: str) -> Finding:
+    alike = ", ".join(
+        f"{axis} {value:+.2f}" for axis, value in zip("xyz", found.as_given, strict=True)
+    )
+    frame = {"x,-y,-z": "body_frame"}.get(found.axes, f"{subject}_axes")
+    text = f"correlations with what it should be are {alike}; its axes are {found.axes}"
+    sure = float(np.clip(np.min(found.alike[found.seen]), 0.0, 0.99))
+    fix = option((signal, found.axes))
+    return Finding("corrected", subject, text, frame, None, max(sure, 0.9), fix)
+
+
+def _unit(
+    found: Match, units: Mapping[str, float], signal: str, subject: str, fault: str, of: str
+) -> list[Finding]:
+    """Return what a scale means: a unit, another factor, or nothing."""
+    scale, low, high = pooled_scale(found)
+    figures = f"it is {scale:.3g} times {of} ({low:.3g} to {high:.3g})"
+    if not np.isfinite(scale) or low / SAME < 1.0 < high * SAME:
+        return [Finding("ok", subject, figures)]
+    off = {words: abs(np.log(scale / factor)) for words, factor in units.items()}
+    words, *others = sorted(off, key=lambda name: off[name])
+    if low / NEAR < units[words] < high * NEAR and off[words] < np.log(1.3):
+        clear = off[words] < 0.5 * min((off[name] for name in others), default=np.inf)
+        fix = option((signal, f"{1.0 / units[words]:.10g}"))
+        status, sure = ("corrected", 0.99) if clear else ("doubt", 0.9)
+        return [Finding(status, subject, f"{figures}: {words}", fault, scale, sure, fix)]
+    sure = 0.97 if high / low < 1.15 else 0.9 if high / low < 1.5 else 0.6
+    fix = option((signal, f"{1.0 / scale:.4g}"))
+    text = f"{figures}, which is no unit's doing; check its range and scale"
+    return [Finding("doubt", subject, text, fault, scale, sure, fix)]
+
+
+def check_velocity(rows: Rows) -> list[Finding]:
+    """Return what is wrong with the velocity's frame and unit, by the path's derivative."""
+    if "vel" not in rows or "pos" not in rows:
+        return []
+    time_s = rows["time"]
+    path = smooth(time_s, velocity_from_position(time_s, rows["pos"]), WIDTH_S)
+    speed = rms(path)
+    if speed < CALM_SPEED:
+        text = f"a speed of {speed:.2g} m/s is too little to check the velocity by"
+        return [Finding("not identifiable", "velocity", text, "velocity_frame")]
+    quat = rows.get("quat")
+    ways = ["", "from-body", "x,-y,-z+from-body", "from-world"] if quat is not None else [""]
+    found = {}
+    for way in ways:
+        value = read_as("vel", rows["vel"], way, lambda: quat) if way else rows["vel"]
+        found[way] = match(path, smooth(time_s, value, WIDTH_S))
+    left = {way: _left(one) for way, one in found.items()}
+    best = min(left, key=lambda way: left[way])
+    here = found[""]
+    figures = f"it is off the path's derivative by {100 * left['']:.0f} %, its scale left out"
+    if best and left[best] < GOOD and left[""] > TIMES_BETTER * left[best] and left[""] > 0.3:
+        words = {
+            "from-body": "in body axes",
+            "x,-y,-z+from-body": "in forward-right-down body axes",
+            "from-world": "in world axes already, and was turned by the attitude",
+        }[best]
+        text = f"{figures}, but by {100 * left[best]:.0f} % if it is {words}"
+        findings = [Finding("corrected", "velocity", text, "velocity_frame", None, 0.98,
+                            option(("vel", best)))]  # fmt: skip
+        here = found[best]
+    elif here.is_turned:
+        findings = [_turned(here, "vel", "velocity")._replace(fault="velocity_frame")]
+    elif left[""] > BAD:
+        text = f"{figures}, and no other frame of it fits"
+        sure = 0.9 if left[""] > 0.9 else 0.6
+        return [Finding("doubt", "velocity", text, "velocity_frame", left[""], sure)]
+    else:
+        findings = [Finding("ok", "velocity", figures)]
+        apart = 1.0 if quat is None else rms(turn(quat, path) - path) / speed
+        if apart < APART:
+            text = f"body and world axes are {100 * apart:.0f} % of it apart only"
+            findings.append(Finding("not identifiable", "velocity", text, "velocity_frame"))
+    unit = _unit(here, SPEEDS, "vel", "velocity", "velocity_unit", "the path's derivative")
+    return findings + [one for one in unit if one.status != "ok"]
+
+
+def check_accelerometer(rows: Rows) -> list[Finding]:
+    """Return what is wrong with the accelerometer, by the force that bends the path.
+
+    Without a path its unit shows all the same: in flight it reads about one g.
+    """
+    if "acc" in rows and not {"pos", "quat"} <= rows.keys():
+        return _unit_alone(rows)
+    if "acc" not in rows:
+        return []
+    time_s = rows["time"]
+    acc_w = velocity_from_position(time_s, velocity_from_position(time_s, rows["pos"]))
+    quat, acc = rows["quat"], rows["acc"]
+    down = turn(conjugate(quat), np.array([0.0, 0.0, GRAVITY]))
+    force = smooth(time_s, turn(conjugate(quat), acc_w) + down, WIDTH_S)
+    ratio = _middle(smooth(time_s, acc, WIDTH_S)) / max(_middle(force), 1e-9)
+    unit, factor = _unit_of(ratio, 1.2)
+    readings = {
+        (steps, scale): smooth(time_s, read_as("acc", acc, steps or "1", lambda: quat), WIDTH_S)
+        / scale
+        for steps in ("", "-x,-y,-z", "x,-y,-z", "-x,y,z", "x,-y,z", "from-world", "plus-gravity")
+        for scale in {1.0, factor}
+        if steps != "plus-gravity" or scale == 1.0
+    }
+    size = rms(force)
+    residual = {name: rms(value - force) / size for name, value in readings.items()}
+    given = residual["", 1.0]
+    best = min(residual, key=lambda name: residual[name] + 0.03 * (name[0] != ""))
+    figures = f"it is off the path's acceleration less gravity by {100 * given:.0f} %"
+    lateral = _sideways(readings["", 1.0], force)
+    if best[0] and best[1] == 1.0 and residual[best] > 0.6 * given and given < 0.4:
+        best = ("", 1.0)
+    if best == ("", 1.0) or residual[best] * TIMES_BETTER > given or residual[best] > GOOD:
+        if given < 0.4:
+            beside = match(force, readings["", 1.0])
+            if beside.is_turned:
+                return [_turned(beside, "acc", "accelerometer")]
+            return [Finding("ok", "accelerometer", figures + lateral)]
+        sure = 0.9 if given > 0.8 else 0.6
+        text = f"{figures}, and no unit, sign or frame of it fits"
+        return [Finding("doubt", "accelerometer", text, "accelerometer_unit", ratio, sure)]
+    steps, scale = best
+    words = {"": "", "-x,-y,-z": "of the other sign", "x,-y,-z": "in forward-right-down axes",
+             "from-world": "in world axes", "plus-gravity": "without gravity"}  # fmt: skip
+    told = [unit] if scale != 1.0 else []
+    told += [words.get(steps, f"with axes {steps}")] if steps else []
+    text = f"{figures}, but by {100 * residual[best]:.0f} % if it is {' and '.join(told)}"
+    fault = "accelerometer_unit" if scale != 1.0 else "accelerometer_axes"
+    fault = "accelerometer_gravity" if steps == "plus-gravity" else fault
+    parts = [f"{1.0 / scale:.10g}"] if scale != 1.0 else []
+    fix = option(("acc", "+".join([*parts, *([steps] if steps else [])])))
+    size_ = scale if scale != 1.0 else None
+    return [Finding("corrected", "accelerometer", text, fault, size_, 0.98, fix)]
+
+
+def _unit_of(ratio: float, within: float) -> tuple[str, float]:
+    """Return the unit of an accelerometer that reads `ratio` times the force, and its factor."""
+    units = {"m/s^2": 1.0, **FORCES}
+    unit = min(units, key=lambda name: abs(np.log(max(ratio, 1e-9) / units[name])))
+    near = abs(np.log(max(ratio, 1e-9) / units[unit])) < np.log(within)
+    return (unit, units[unit]) if near else ("m/s^2", 1.0)
+
+
+def _unit_alone(rows: Rows) -> list[Finding]:
+    ratio = _middle(smooth(rows["time"], rows["acc"], WIDTH_S)) / GRAVITY
+    figures = f"half of the flight it reads below {GRAVITY * ratio:.3g} m/s^2"
+    if 0.5 < ratio < 2.0:
+        return [Finding("ok", "accelerometer", figures)]
+    unit, factor = _unit_of(ratio, 1.5)
+    if factor == 1.0:
+        text = f"{figures}: no unit of it is one g"
+        return [Finding("doubt", "accelerometer", text, "accelerometer_unit", ratio, 0.9)]
+    text = f"{figures}: it is in {unit}"
+    fix = option(("acc", f"{1.0 / factor:.10g}"))
+    return [Finding("corrected", "accelerometer", text, "accelerometer_unit", factor, 0.95, fix)]
+
+
+def _sideways(acc: np.ndarray, force: np.ndarray) -> str:
+    off = rms((acc - force)[:, :2])
+    return f" ({off:.2g} m/s^2 sideways)"
+
+
+def _left(found: Match) -> float:
+    """Return what axes as they are given leave, as a share, whatever the scale."""
+    weight = found.level**2
+    left = weight * (1.0 - np.clip(found.as_given, 0.0, 1.0) ** 2)
+    return float(np.sqrt(left.sum() / max(weight.sum(), 1e-12)))
+
+
+def _middle(value: np.ndarray) -> float:
+    size = np.linalg.norm(value, axis=1)
+    known = size[np.isfinite(size)]
+    return float(np.median(known)) if len(known) else 0.0

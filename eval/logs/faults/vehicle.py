@@ -1,0 +1,61 @@
+"""Numbers of a vehicle file that no quadrotor has, and of a policy that another camera flew."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from eval.logs.faults.finding import Finding
+from eval.vehicles.vehicle import Vehicle
+
+ARM_M = (0.012, 1.5)
+"""From the middle to a rotor [m]."""
+LIFT = (1.15, 20.0)
+"""Full thrust over the weight."""
+ROUND = (0.015, 2.5)
+"""Inertia about x and y over mass times arm squared: all mass in the middle, or at the rotors."""
+FOV_DEG = 2.0
+"""Fields of view that differ by more are of another camera [deg]."""
+
+
+def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
+    """Return which numbers of the vehicle file do not belong together."""
+    found = []
+    hubs = np.asarray(vehicle.rotors.position)
+    arm = float(np.mean(np.hypot(hubs[:, 0], hubs[:, 1])))
+    if not ARM_M[0] <= arm <= ARM_M[1]:
+        text = f"rotors are {arm:.3g} m from the middle; usual are {ARM_M[0]:g} to {ARM_M[1]:g}"
+        fix = "rotors.position in m" + (": divide by 1000" if arm / 1000.0 >= ARM_M[0] else "")
+        found.append(Finding("doubt", "vehicle", text, "vehicle_arms", arm, 0.97, fix))
+        arm = arm / 1000.0 if arm > ARM_M[1] else arm
+    lift = vehicle.full_thrust / GRAVITY
+    if not LIFT[0] <= lift <= LIFT[1]:
+        text = f"full thrust is {lift:.3g} times the weight; usual are {LIFT[0]:g} to {LIFT[1]:g}"
+        rpm = lift / (60.0 / (2.0 * np.pi)) ** 2
+        fix = "rotors.speed_max in rad/s" + (", not rpm" if LIFT[0] <= rpm <= LIFT[1] else "")
+        found.append(Finding("doubt", "vehicle", text, "vehicle_thrust", lift, 0.95, fix))
+    gyration = [j / (vehicle.mass * arm**2) for j in vehicle.inertia[:2]]
+    worst = max(gyration, key=lambda r: abs(np.log(r / np.sqrt(ROUND[0] * ROUND[1]))))
+    if not ROUND[0] <= worst <= ROUND[1]:
+        text = (
+            f"inertia about x or y is {worst:.3g} times mass x arm^2; from {ROUND[0]:g} to "
+            f"{ROUND[1]:g} is usual"
+        )
+        fix = "inertia in kg m^2, of this vehicle"
+        found.append(Finding("doubt", "vehicle", text, "vehicle_inertia", worst, 0.93, fix))
+    return found or [Finding("ok", "vehicle", f"full thrust is {lift:.3g} times the weight")]
+
+
+def check_camera(policy_fov: tuple[float, float] | None, vehicle: Vehicle | None) -> list[Finding]:
+    """Return whether a policy's camera is the vehicle's."""
+    if policy_fov is None or vehicle is None:
+        return []
+    here = vehicle.camera.fov_deg
+    figures = (
+        f"the policy saw {policy_fov[0]:g} x {policy_fov[1]:g} deg, the vehicle's camera sees "
+    )
+    figures += f"{here[0]:g} x {here[1]:g} deg"
+    if max(abs(a - b) for a, b in zip(policy_fov, here, strict=True)) <= FOV_DEG:
+        return [Finding("ok", "camera", figures)]
+    fix = "camera.fov_deg of the vehicle file, or crop the image"
+    return [Finding("doubt", "camera", figures, "camera_fov", here[0] / policy_fov[0], 0.97, fix)]

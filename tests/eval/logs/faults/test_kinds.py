@@ -1,0 +1,90 @@
+"""Every kind of fault is named, its fix restores the flight, and good flights stay as they are."""
+
+import numpy as np
+import pytest
+
+from eval.logs.faults.catalogue import FAULTS
+from eval.logs.faults.check import DRIVE, POSE, Against, check_files, run_checks
+from eval.logs.faults.clock import check_clock
+from eval.logs.faults.commands import check_controller_rate
+from eval.logs.faults.reading import read_rows
+from suite.experiments.injected.kinds import KINDS, inject
+from tests.support import known_flight
+from tests.support.vehicles import PLAIN
+
+HZ, POLICY_HZ = 100.0, 30.0
+NOISE = {"pos": 0.002, "vel": 0.02, "rate": 0.03, "quat": 0.001, "acc": 0.3, "motor": 3.0}
+
+
+def good(seed=0, end=16.0):
+    """A flight as a logger has it: noise, commands that hold, and a body that follows in 50 ms."""
+    truth = known_flight.fly(np.arange(0.0, end, 1.0 / HZ))
+    held = (np.floor(truth.time * POLICY_HZ) / POLICY_HZ * HZ).astype(int)
+    wanted = known_flight.fly(truth.time + 0.05).cmd_rate[held]
+    thrust = truth.thrust[held][:, None]
+    parts = {
+        "time": truth.time, "pos": truth.pos, "quat": truth.quat, "vel": truth.vel,
+        "rate": truth.rate, "acc": truth.acc, "motor": truth.motor, "cmd_thrust": thrust,
+        "cmd_rate": wanted, "throttle": thrust / PLAIN.full_thrust,
+        "voltage": truth.voltage[:, None], "baro": truth.pos[:, 2:].copy(),
+    }  # fmt: skip
+    rng = np.random.default_rng(seed)
+    for name, size in NOISE.items():
+        parts[name] = parts[name] + size * rng.normal(size=parts[name].shape)
+    parts["quat"] /= np.linalg.norm(parts["quat"], axis=1, keepdims=True)
+    return parts
+
+
+def checked(parts, vehicle=PLAIN, fov=1.0):
+    against = Against(vehicle, POLICY_HZ, tuple(fov * angle for angle in vehicle.camera.fov_deg))
+    checks = (*POSE, lambda rows, _: check_clock(rows), *DRIVE)
+    findings, readings, _ = run_checks(parts, checks, against, fix=True)
+    commands = {name: value for name, value in parts.items() if name != "throttle"}
+    findings += check_controller_rate(commands, POLICY_HZ, "the policy")
+    return findings + check_files(against), readings
+
+
+def named(findings):
+    return {f.fault for f in findings if f.fault and f.status in ("corrected", "doubt", "note")}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_fault_is_named_and_its_fix_restores_the_flight(name):
+    kind, right = KINDS[name], good()
+    wrong = inject(kind, right, np.random.default_rng(1))
+    vehicle = PLAIN if kind.vehicle is None else kind.vehicle(PLAIN)
+    findings, readings = checked(wrong, vehicle, kind.fov)
+    assert named(findings) & set(kind.names)
+    corrected = [f for f in findings if f.fault in kind.names and f.status == "corrected"]
+    if corrected and kind.change is None and "battery" not in name:
+        fixed = read_rows(wrong, readings)
+        for signal in {text.partition("=")[0] for text in kind.readings}:
+            if signal == "quat":
+                alike = np.abs(np.sum(fixed[signal] * right[signal], axis=1))
+                np.testing.assert_allclose(alike, 1.0, atol=1e-9)
+            else:
+                np.testing.assert_allclose(fixed[signal], right[signal], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_good_flight_has_no_fault(seed):
+    findings, readings = checked(good(seed))
+    assert not named(findings) and not readings
+
+
+def test_a_calm_flight_says_what_it_does_not_show():
+    still = good(end=4.0)
+    for name in ("pos", "quat", "vel", "rate", "acc", "cmd_rate"):
+        still[name] = np.repeat(still[name][:1] * (name != "rate"), len(still["time"]), axis=0)
+    still["quat"] = np.tile([1.0, 0.0, 0.0, 0.0], (len(still["time"]), 1))
+    still["acc"] = np.tile([0.0, 0.0, 9.81], (len(still["time"]), 1))
+    findings, _ = checked(still)
+    unseen = {f.fault for f in findings if f.status == "not identifiable"}
+    assert unseen >= {"attitude", "gyro_scale", "velocity_frame", "motor_order"}
+    assert unseen <= FAULTS.keys()
+    assert not {f.fault for f in findings if f.is_open}
+
+
+def test_every_name_is_in_the_catalogue():
+    assert {name for kind in KINDS.values() for name in kind.names} <= FAULTS.keys()
+    assert sum(kind.race for kind in KINDS.values()) == 10
