@@ -11,8 +11,8 @@ from eval.importers.commands import order_motors, rates_wanted, thrust_command
 from eval.importers.findings import asked_of
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
-from eval.importers.rows import HOLE_S, HOLE_STEPS, NEEDED, own_rows, row_times, rows_at, slowest
-from eval.importers.signals import Recording, median_step, with_readings
+from eval.importers.rows import HOLE_S, HOLE_STEPS, own_rows, row_times, rows_at, slowest
+from eval.importers.signals import NEEDED, Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import DRIVE, POSE, Against, run_checks
 from eval.logs.faults.finding import Finding, said
@@ -47,7 +47,7 @@ def assemble(
         recording, more = with_pose(recording, options)
         findings += more
     recording = with_readings(recording, options.read)
-    _need(recording, options.partial)
+    _need(recording, options.partial, findings)
     against = Against(options.vehicle)
     coarse = row_times(recording, COARSE_HZ, 0.0, None)
     more, readings, _ = run_checks(rows_at(recording, coarse), POSE, against, options.fix)
@@ -99,11 +99,12 @@ def assemble(
     return log, tuple(findings)
 
 
-def _need(recording: Recording, partial: bool) -> None:
+def _need(recording: Recording, partial: bool, findings: list[Finding]) -> None:
     missing = [TEXTS[name] for name in NEEDED if name not in recording.signals]
     if missing and not (partial and len(missing) < len(NEEDED)):
+        why = "".join(f" ({f.evidence})" for f in findings if f.signal in missing)
         hint = "" if missing == ["gyro"] else "; --pose FILE brings position and attitude"
-        reason = f"holds no {' and no '.join(missing)}{hint}; --partial keeps what is there"
+        reason = f"holds no {' and no '.join(missing)}{why}{hint}; --partial keeps what is there"
         raise FlightLogError(recording.name, None, None, reason)
 
 

@@ -13,11 +13,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from eval.importers.frames import turn
-from eval.importers.signals import Recording, Signal, median_step
+from eval.importers.signals import NEEDED, Recording, Signal, median_step
 from eval.logs.columns import FlightLogError
 
-NEEDED = ("pos", "quat", "rate")
-"""The slowest of these that are there sets the rows."""
 LEAST_HZ = 20.0
 """Where that is slower than this, further rows stand between its samples."""
 SMOOTH = ("pos", "quat", "vel")
@@ -65,7 +63,7 @@ def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def slowest(recording: Recording) -> str:
-    """Return which of the needed signals that are there is the slowest."""
+    """Return which of the needed signals that are there is the slowest: it sets the rows."""
     there = [name for name in NEEDED if name in recording.signals]
     return max(there, key=lambda name: median_step(recording.signals[name].time_s))
 

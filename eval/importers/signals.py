@@ -16,8 +16,10 @@ import numpy as np
 
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.reading import TIMES, Readings, read_as
+from eval.logs.faults.reading import TIMES, Readings, option, read_as
 
+NEEDED = ("pos", "quat", "rate")
+"""What a flight cannot do without."""
 BACKWARDS_MAX = 0.05
 """A signal with a larger share of rows whose time does not increase is refused."""
 LARGEST = 1e20
@@ -103,7 +105,15 @@ def collect(
     """Return the signals of `parts` (name to time and values) that hold samples, and findings."""
     signals, findings = {}, []
     for what, (time_s, value) in parts.items():
-        made, finding = signal(time_s, value, name, what)
+        try:
+            made, finding = signal(time_s, value, name, what)
+        except FlightLogError as error:
+            if what in NEEDED:
+                raise
+            # What a flight can do without is left out, and the rest is read.
+            text = f"{what!r} is left out: {error.reason}"
+            about = ("time_stamps", None, 0.95, option((what, "drop")))
+            made, finding = None, Finding("corrected", what, text, *about)
         if made is not None:
             signals[what] = made
         if finding is not None:

@@ -137,7 +137,7 @@ def check_columns(
         _refuse_where(bad, name, column, kept[column], reason, row_number)
     for column in GROUPS["rate"] if "rate" in present else ():
         bad = np.abs(kept[column]) > RATE_MAX
-        reason = "beyond 200 rad/s; rates are in rad/s"
+        reason = "beyond 200 rad/s; rates are in rad/s (suite import corrects deg/s and raw counts)"
         _refuse_where(bad, name, column, kept[column], reason, row_number)
     for column in GROUPS["pwm"] if "pwm" in present else ():
         bad = (kept[column] > PWM_MAX) | (kept[column] < 1.0 - PWM_MAX)

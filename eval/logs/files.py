@@ -28,6 +28,16 @@ MOST_ROWS = 4_000_000
 MOST_CELLS = 100_000_000
 """Of a flight log, rows times columns: all the columns that we know at `MOST_ROWS`."""
 PARQUET_MAGIC = b"PAR1"
+MOST_BEFORE = 500
+"""Lines in which a CSV's header is looked for."""
+OTHERS = {
+    "FMT": "an ArduPilot text log, whose messages have columns of their own; export the messages "
+    "that you need (ATT, IMU, RATE, RCOU, XKF1) as one table with a time, and describe it by --map",
+    "Format Version": "an export of Motive, whose header takes several lines; remove all lines "
+    "above the first row of numbers, name the columns in one line (time, x, y, z, qx, qy, qz, qw), "
+    "and describe it by --pose-map",
+}
+"""First cell of tables of other programs that cannot be read as they are, and what to do."""
 NOT_CSV = "neither a Parquet file nor CSV in UTF-8"
 
 
@@ -132,7 +142,7 @@ def _is_text(kind: pa.DataType) -> bool:
 
 
 def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
-    names = _csv_header(path)
+    names, before = _csv_header(path)
     _check_text(path, len(names))
     bad_rows: list[Any] = []
 
@@ -146,7 +156,7 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
             path,
             # One thread, because only then are bad rows told with their numbers.
             read_options=pyarrow.csv.ReadOptions(
-                column_names=names, skip_rows=1, use_threads=False
+                column_names=names, skip_rows=before + 1, use_threads=False
             ),
             parse_options=pyarrow.csv.ParseOptions(invalid_row_handler=remember),
             convert_options=pyarrow.csv.ConvertOptions(
@@ -165,9 +175,11 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
         first = str(error).splitlines()[0]
         raise FlightLogError(str(path), None, None, f"not readable as CSV ({first})") from None
     warnings = []
+    if before:
+        warnings.append(f"{path}: the {before} lines before the header are left out")
     last = table.num_rows + len(bad_rows)
     for bad in bad_rows:
-        row = bad.number - 1
+        row = bad.number - 1 - before
         reason = f"{bad.actual_columns} values where the header has {bad.expected_columns} columns"
         if row < last:
             raise FlightLogError(str(path), None, row, reason)
@@ -207,16 +219,50 @@ def _check_text(path: Path, columns: int) -> None:
     _check_size(path, lines, columns)
 
 
-def _csv_header(path: Path) -> list[str]:
+def _csv_header(path: Path) -> tuple[list[str], int]:
+    """Return the names of the columns, and how many lines of something else stand before them."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            names = [name.strip() for name in next(csv.reader(file), [])]
+            lines = [row for row, _ in zip(csv.reader(file), range(MOST_BEFORE), strict=False)]
     except (UnicodeDecodeError, csv.Error):
         raise FlightLogError(str(path), None, None, NOT_CSV) from None
+    names = [name.strip() for name in lines[0]] if lines else []
     if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
         reason = "the first line has no commas; separate the columns by commas"
         raise FlightLogError(str(path), None, None, reason)
-    return names
+    for start, advice in OTHERS.items():
+        if names and names[0] == start:
+            raise FlightLogError(str(path), None, None, advice)
+    before = _lines_before(lines)
+    return [name.strip() for name in lines[before]] if lines else [], before
+
+
+def _lines_before(lines: list[list[str]]) -> int:
+    """Return the place of the header: names above two rows of as many cells, most of them numbers.
+
+    0 where the first line may be it, so that its mistakes are reported of it.
+    """
+    if len(lines) < 4 or len(lines[0]) == len(lines[1]) == len(lines[-2]):
+        return 0
+    for k in range(1, len(lines) - 2):
+        width = len(lines[k])
+        alike = width == len(lines[k + 1]) == len(lines[k + 2]) and width > len(lines[0])
+        if alike and not any(map(_is_number, lines[k])) and _numbers(lines[k + 1]) > 0.5:
+            return k
+    return 0
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers(row: list[str]) -> float:
+    """Return the share of a row's cells that are numbers or empty."""
+    return sum(not cell.strip() or _is_number(cell) for cell in row) / max(len(row), 1)
 
 
 def _arrays(table: pa.Table, path: Path) -> dict[str, np.ndarray]:

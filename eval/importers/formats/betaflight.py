@@ -22,6 +22,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
+from eval.logs.faults.motors import check_count
 from eval.logs.files import first_line, read_columns
 
 SUMMARY = "CSV of blackbox_decode; needs --pose"
@@ -36,7 +37,7 @@ _ACCELERATION = {"": GRAVITY / ACC_1G, "g": GRAVITY, "m/s2": 1.0}
 _TIME = {"": 1e-6, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 _VOLT = {"": 0.01, "V": 1.0, "mV": 1e-3}
 """Factors to our units by the unit in the header; raw voltages of Betaflight 4 are in 10 mV."""
-MOST_V = 30.0
+LEAST_V, MOST_V = 2.5, 30.0
 """A higher voltage is ten times too large: `blackbox_decode` divides by ten to make volts, as was
 right before Betaflight 4 (a quadrotor of more than seven cells and older firmware is rarer)."""
 _UNIT = re.compile(r"^(?P<name>.*?)(?: \((?P<unit>[^()]*)\))?$")
@@ -53,8 +54,10 @@ def detect(head: bytes, options: ImportOptions) -> bool:
         raise ValueError(
             "a Blackbox log that is not decoded; run blackbox_decode on it, import the CSV"
         )
+    # Blackbox Explorer writes the log's settings before the header.
+    explorer = head.lstrip(b'\xef\xbb\xbf"').startswith(b'Product","Blackbox')
     line = first_line(head)
-    return b"\0" not in line and (b"loopIteration" in line or b"gyroADC[" in line)
+    return b"\0" not in line and (explorer or b"loopIteration" in line or b"gyroADC[" in line)
 
 
 class Blackbox:
@@ -73,6 +76,10 @@ class Blackbox:
     def has(self, *names: str) -> bool:
         """Return whether all the columns are there."""
         return all(name in self._found for name in names)
+
+    def unit(self, name: str) -> str:
+        """Return the unit in a column's name, "" where there is none."""
+        return self._found[name][1]
 
     def values(self, names: list[str], factor: Mapping[str, float]) -> np.ndarray:
         """Return columns (N, C) in our unit.
@@ -119,24 +126,35 @@ def read(path: Path, options: ImportOptions) -> Recording:
         text = "no setpoint columns: sticks are not rates, so there is no rate command"
         findings.append(Finding("doubt", "command", text))
     if box.has("vbatLatest"):
-        parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), options.fix, findings)
+        told = box.unit("vbatLatest")
+        parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), told, options.fix, findings)
     parts |= _motors(box, options.motor_poles, findings)
     signals, more = collect({name: (time_s, value) for name, value in parts.items()}, box.name)
     return Recording(box.name, signals, (*findings, *more), MOTOR_SIDE)
 
 
-def _volts(voltage: np.ndarray, fix: bool, findings: list[Finding]) -> np.ndarray:
+def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -> np.ndarray:
     middle = float(np.nanmedian(voltage)) if np.isfinite(voltage).any() else 0.0
+    raw = voltage / _VOLT[""]
+    whole = np.all(np.mod(raw[np.isfinite(raw)], 1.0) == 0.0)
+    if not unit and not whole and LEAST_V <= 100.0 * middle <= MOST_V:
+        text = f"numbers around {100.0 * middle:.3g}, not whole and without a unit: they are volts"
+        about = ("voltage", middle, 0.95)
+        findings.append(Finding("corrected" if fix else "doubt", "voltage", text, *about))
+        return 100.0 * voltage if fix else voltage
     if middle <= MOST_V:
         return voltage
     text = f"{middle:.4g} V in the file: ten times too much, as blackbox_decode writes Betaflight 4"
-    findings.append(Finding("corrected" if fix else "doubt", "voltage", text))
+    about = ("voltage", middle, 0.95)
+    findings.append(Finding("corrected" if fix else "doubt", "voltage", text, *about))
     return voltage / 10.0 if fix else voltage
 
 
 def _motors(box: Blackbox, poles: int, findings: list[Finding]) -> dict[str, np.ndarray]:
     """Return rotor speeds [rad/s] from eRPM, which is logged in hundreds."""
     columns = {match[1]: c for c in box.columns if (match := _ERPM.match(c))}
+    turning = [np.nanmax(numbers(box.columns, c, box.name), initial=0.0) for c in columns.values()]
+    findings += check_count(sum(top > 0.0 for top in turning), "of the log")
     if set(columns) < set("0123"):
         return {}
     if poles < 2 or poles % 2:

@@ -44,6 +44,8 @@ CODES = {"b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"} |
 DEFAULT_MAP = Path("crazyflie")
 """The shipped mapping of the firmware's log variables."""
 PACKED = "stateEstimateZ.quat"
+BACK_S, AHEAD_S = 1.0, 10.0
+"""Without a checksum, an event this far from the one before is the card's old content [s]."""
 
 
 class Kind(NamedTuple):
@@ -107,9 +109,10 @@ def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], li
         text = "the checksum is missing or wrong (switched off while logging?); read to the end"
         findings.append(Finding("doubt", "file", text))
     stop = len(data) - 4 if whole else len(data)
+    unit = 1e-3 if version == 1 else 1e-6
     stamp = struct.Struct("<HI" if version == 1 else "<HQ")
     found: dict[int, list[bytes]] = {number: [] for number in kinds}
-    at = start
+    at, last, newest = start, None, 0
     while at + stamp.size <= stop:
         number = int.from_bytes(data[at : at + 2], "little")
         if number not in kinds:
@@ -122,9 +125,15 @@ def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], li
         end = at + stamp.size + kinds[number].layout.itemsize
         if end > stop:
             break
+        when = stamp.unpack_from(data, at)[1] * unit
+        if not whole and last is not None and not -BACK_S < when - last < AHEAD_S:
+            text = f"byte {at} has a time {when - last:+.3g} s from the one before: what follows is"
+            findings.append(Finding("doubt", "file", f"{text} the card's old content, not read"))
+            break
         found[number].append(data[at + 2 : end])
-        at = end
-    unit = 1e-3 if version == 1 else 1e-6
+        at, last, newest = end, when, number
+    if not whole and last is not None:
+        found[newest].pop()  # cut within it, or its end is the card's old content
     events = {}
     for number, kind in kinds.items():
         clock = np.dtype([("timestamp", "<u4" if version == 1 else "<u8")])

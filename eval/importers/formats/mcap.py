@@ -28,6 +28,7 @@ from eval.importers.rows import in_world
 from eval.importers.signals import Recording, Signal, collect
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
+from eval.logs.faults.motors import check_count
 from eval.logs.files import read_head
 from tracks.common.toml_table import read_toml
 
@@ -63,7 +64,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         raise FlightLogError(str(path), None, None, "not an MCAP file (its first bytes differ)")
     told, motor_side = _told(options.map)
     found = _messages(path)
-    messages: dict[str, list[tuple[int, Any]]] = {}
+    chosen: dict[str, list[tuple[int, int, Any]]] = {}
     findings: list[Finding] = []
     for kind in KINDS:
         topics = {topic: held for (k, topic), held in found.items() if k == kind}
@@ -76,11 +77,13 @@ def read(path: Path, options: ImportOptions) -> Recording:
         if len(topics) > 1 and kind not in told:
             text = f"{kind} from {topic}; also there: {', '.join(sorted(topics.keys() - {topic}))}"
             findings.append(Finding("note", "topics", text + ". Choose with [topics] in --map"))
-        messages[kind] = topics[topic]
-    missing = sorted(told.keys() - messages.keys())
+        chosen[kind] = topics[topic]
+    missing = sorted(told.keys() - chosen.keys())
     if missing:
         reason = f"topic {told[missing[0]]!r} of the mapping is not there"
         raise FlightLogError(str(path), None, None, reason)
+    messages = _on_one_clock(chosen, findings)
+    findings += _motor_count(messages)
     signals, more = _signals(messages, str(path))
     return Recording(str(path), signals, (*findings, *more), motor_side)
 
@@ -102,8 +105,8 @@ def _told(map_path: Path | None) -> tuple[dict[str, str], tuple[tuple[float, flo
     return topics, motor_side
 
 
-def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, Any]]]:
-    """Return (kind, topic) -> [(time in ns, message)] of all that is of use."""
+def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, int, Any]]]:
+    """Return (kind, topic) -> [(header's, recorder's time in ns, message)] of all of use."""
     try:
         from mcap.reader import make_reader
         from mcap_ros2.decoder import DecoderFactory
@@ -113,7 +116,7 @@ def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, Any]]]:
         )
         raise FlightLogError(str(path), None, None, reason) from None
     kind_of = {type_: kind for kind, types in KINDS.items() for type_ in types}
-    found: dict[tuple[str, str], list[tuple[int, Any]]] = {}
+    found: dict[tuple[str, str], list[tuple[int, int, Any]]] = {}
     factory = DecoderFactory()
     try:
         with path.open("rb") as file:
@@ -125,8 +128,8 @@ def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, Any]]]:
                 if decode is None:
                     continue
                 decoded = decode(message.data)
-                when = _stamp(decoded) or message.log_time
-                found.setdefault((kind, channel.topic), []).append((when, decoded))
+                stamps = (_stamp(decoded), message.log_time)
+                found.setdefault((kind, channel.topic), []).append((*stamps, decoded))
     except Exception as error:
         reason = f"an MCAP file that cannot be read ({type(error).__name__}: {error})"
         raise FlightLogError(str(path), None, None, reason) from None
@@ -134,6 +137,30 @@ def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, Any]]]:
         types = ", ".join(kind_of)
         raise FlightLogError(str(path), None, None, f"holds no ROS 2 message of {types}")
     return found
+
+
+def _on_one_clock(
+    chosen: dict[str, list[tuple[int, int, Any]]], findings: list[Finding]
+) -> dict[str, list[tuple[int, Any]]]:
+    """Return (time in ns, message) by kind: by the headers, or by the recorder for all of them.
+
+    A header's stamp of 0 was never set; two clocks in one flight would tear it apart.
+    """
+    unset = sorted(k for k, held in chosen.items() if any(header <= 0 for header, _, _ in held))
+    if unset:
+        text = f"headers of {', '.join(unset)} have stamp 0: all times are the recorder's"
+        findings.append(Finding("corrected", "time", text, "time_stamps", None, 0.95))
+    clock = 1 if unset else 0
+    return {kind: [(m[clock], m[2]) for m in held] for kind, held in chosen.items()}
+
+
+def _motor_count(messages: dict[str, list[tuple[int, Any]]]) -> list[Finding]:
+    speeds = [np.abs(np.asarray(_all_speeds(m), float)) for _, m in messages.get("motors", ())]
+    width = max((len(s) for s in speeds), default=0)
+    if width <= 4:
+        return []
+    table = np.array([[*s, *[0.0] * (width - len(s))] for s in speeds])
+    return check_count(int(np.sum(table.max(axis=0) > 0.0)), "of the topic")
 
 
 def _stamp(message: Any) -> int:
@@ -193,7 +220,10 @@ def _unless(message: Any, ignored: int, value: list[float]) -> list[float]:
     return [float("nan")] * len(value) if message.type_mask & ignored else value
 
 
+def _all_speeds(message: Any) -> Any:
+    return message.velocity if hasattr(message, "velocity") else message.angular_velocities
+
+
 def _speeds(message: Any) -> list[float]:
-    speeds = message.velocity if hasattr(message, "velocity") else message.angular_velocities
-    four = [abs(float(speed)) for speed in list(speeds)[:4]]
+    four = [abs(float(speed)) for speed in list(_all_speeds(message))[:4]]
     return four + [float("nan")] * (4 - len(four))

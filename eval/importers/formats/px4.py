@@ -30,6 +30,8 @@ from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
+from eval.logs.faults.motors import check_count
+from eval.logs.faults.sensors import check_voltage_fails
 from eval.logs.files import read_head
 from tracks.input.ranges import is_number
 
@@ -46,9 +48,12 @@ TOPICS = (
     "vehicle_rates_setpoint",
     "esc_status",
     "battery_status",
+    "actuator_motors",
 )
 QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 """PX4's motors 1 to 4 (x forward, y left): front right, rear left, front left, rear right."""
+QUADROTOR = 2
+"""MAV_TYPE of one."""
 FIRST_MOTOR = 101
 """`actuator_function` of Motor1."""
 BODY_FRAME = 3
@@ -89,6 +94,10 @@ def read(path: Path, options: ImportOptions) -> Recording:
             if part is not None:
                 parts[name] = part
                 break
+    findings += _motor_count(log.initial_parameters, topics)
+    batteries = [d.data for d in log.data_list if d.name == "battery_status" and d.multi_id > 0]
+    findings += _other_battery(parts, batteries)
+    findings += _no_position(topics)
     if "vehicle_local_position" in topics:
         findings += _resets(topics["vehicle_local_position"])
     signals, more = collect(parts, str(path))
@@ -251,6 +260,48 @@ _READERS: dict[str, list[tuple[str, Callable[[Topic], Part | None]]]] = {
     "motor": [("esc_status", _motors)],
     "voltage": [("battery_status", _voltage)],
 }
+
+
+def _motor_count(parameters: Mapping[str, Any], topics: Mapping[str, Topic]) -> list[Finding]:
+    """Return a finding where the vehicle is none of four motors: by type, rotors, and what turns.
+
+    `esc_count` alone misleads: it counts what is wired.
+    """
+    kind, rotors = (int(_parameter(parameters, name)) for name in ("MAV_TYPE", "CA_ROTOR_COUNT"))
+    turning = 0
+    for topic, name in (("esc_status", "esc[{}].esc_rpm"), ("actuator_motors", "control[{}]")):
+        values = [np.asarray(topics.get(topic, {}).get(name.format(k), 0.0)) for k in range(12)]
+        moved = sum(bool(np.any(np.nan_to_num(v.astype(np.float64)) > 0.0)) for v in values)
+        turning = max(turning, moved)
+    if rotors not in (0, 4):
+        return check_count(rotors, "by CA_ROTOR_COUNT")
+    if kind not in (0, QUADROTOR):
+        text = f"MAV_TYPE is {kind}, not {QUADROTOR}: no quadrotor; {turning} motors turn"
+        about = ("motor_count", float(turning), 0.95, "none: only quadrotors can be diagnosed")
+        return [Finding("doubt", "motors", text, *about)]
+    return check_count(turning, "of the log") if turning > 4 else []
+
+
+def _other_battery(parts: dict[str, Part], others: Sequence[Topic]) -> list[Finding]:
+    """Take another battery's voltage, in place, where the first one's is impossible."""
+    if "voltage" not in parts or not check_voltage_fails(parts["voltage"][1]):
+        return []
+    for number, topic in enumerate(others, start=1):
+        part = _voltage(topic) if "timestamp" in topic else None
+        if part is not None and not check_voltage_fails(part[1]):
+            middle = float(np.nanmedian(parts["voltage"][1]))
+            parts["voltage"] = part
+            text = f"battery 0 says {middle:.3g} V, which none has; battery {number} is read"
+            return [Finding("corrected", "voltage", text, "voltage", middle, 0.97)]
+    return []
+
+
+def _no_position(topics: Mapping[str, Topic]) -> list[Finding]:
+    """Say why a local position is none: the estimator's own flags."""
+    topic = topics.get("vehicle_local_position", {})
+    never = [f for f in ("xy_valid", "z_valid") if f in topic and not np.any(topic[f])]
+    text = f"{' and '.join(never)} of vehicle_local_position are false throughout"
+    return [Finding("note", "position", text)] if never else []
 
 
 def _parameter(parameters: Mapping[str, Any], name: str) -> float:

@@ -58,6 +58,15 @@ X_SHAPE = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 X_SPIN = (1, -1, 1, -1)
 
 
+def check_count(turning: int, whose: str) -> list[Finding]:
+    """Return a finding where not four motors ever turn: the models here are quadrotors."""
+    if turning == 4 or turning == 0:
+        return []
+    text = f"{turning} motors {whose} turn; four are read, and the models here have four"
+    fix = "none: only quadrotors can be diagnosed"
+    return [Finding("doubt", "motors", text, "motor_count", float(turning), 0.97, fix)]
+
+
 def check_motors(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
     """Return which motors do not turn, and whether their order and spin fit how the body turns."""
     name = next((n for n in ("motor", "pwm", "motor_cmd") if n in rows), None)

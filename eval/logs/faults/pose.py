@@ -150,7 +150,8 @@ def check_pose(rows: Rows, looked: Looked | None) -> list[Finding]:
         return [Finding("not identifiable", "attitude", text, "attitude")]
     if not (best.quat or best.pos or best.length != 1.0):
         if given.misfit < BAD or (given.gyro is not None and given.gyro.is_turned):
-            return [Finding("ok", "attitude", figures)]
+            noisy = given.misfit > GOOD
+            return [Finding("note" if noisy else "ok", "attitude", figures)]
         text = f"{figures}: no other order, direction, sign or frame of it fits"
         sure = 0.9 if given.misfit > 1.0 else 0.6
         return [Finding("doubt", "attitude", text, "attitude", given.misfit, sure, "see --pose")]

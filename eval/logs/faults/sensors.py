@@ -21,6 +21,12 @@ BIAS, ALIKE = 0.15, 0.6
 correlates with it by the second."""
 
 
+def check_voltage_fails(value: np.ndarray) -> bool:
+    """Return whether the middle of a voltage is none that a battery has [V]."""
+    known = value[np.isfinite(value)]
+    return not len(known) or not LEAST_V <= float(np.median(known)) <= MOST_V
+
+
 def check_voltage(rows: Rows) -> list[Finding]:
     """Return whether the battery's voltage is one that a battery has."""
     value = rows.get("voltage")

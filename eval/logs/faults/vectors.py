@@ -41,6 +41,8 @@ SAME = 1.1
 CALM_SPEED = 0.3
 """Speeds below this say nothing (root mean square) [m/s]."""
 GOOD, BAD, TIMES_BETTER = 0.35, 0.6, 2.0
+OK = 0.3
+"""A signal that is off by more than this share of itself is not called right."""
 APART = 0.5
 """Axes that differ by a smaller share of a signal cannot be told apart by it."""
 
@@ -150,7 +152,10 @@ def check_velocity(rows: Rows) -> list[Finding]:
         sure = 0.9 if left[""] > 0.9 else 0.6
         return [Finding("doubt", "velocity", text, "velocity_frame", left[""], sure)]
     else:
-        findings = [Finding("ok", "velocity", figures)]
+        noisy = left[""] > OK
+        status, sure = ("doubt", 0.6) if noisy else ("ok", None)
+        fault = "velocity_frame" if noisy else ""
+        findings = [Finding(status, "velocity", figures, fault, left[""] if noisy else None, sure)]
         apart = 1.0 if quat is None else rms(turn(quat, path) - path) / speed
         if apart < APART:
             text = f"body and world axes are {100 * apart:.0f} % of it apart only"
@@ -188,10 +193,10 @@ def check_accelerometer(rows: Rows) -> list[Finding]:
     best = min(residual, key=lambda name: residual[name] + 0.03 * (name[0] != ""))
     figures = f"it is off the path's acceleration less gravity by {100 * given:.0f} %"
     lateral = _sideways(readings["", 1.0], force)
-    if best[0] and best[1] == 1.0 and residual[best] > 0.6 * given and given < 0.4:
+    if best[0] and best[1] == 1.0 and residual[best] > 0.6 * given and given < OK:
         best = ("", 1.0)
     if best == ("", 1.0) or residual[best] * TIMES_BETTER > given or residual[best] > GOOD:
-        if given < 0.4:
+        if given < OK:
             beside = match(force, readings["", 1.0])
             if beside.is_turned:
                 return [_turned(beside, "acc", "accelerometer")]

@@ -71,7 +71,7 @@ def test_nanobench_has_motor_commands_battery_and_only_the_flight():
     assert np.nanmin(log.pwm) > 0.3
     assert abs(np.nanmean(log.acc_b[:, 2]) - 9.9) < 0.3
     assert log.about["beside"]["crazyflie_id"] == "CF_01"
-    assert levels(findings)["units"] == "ok"
+    assert levels(findings)["gyro"] == "ok"
 
 
 @real
