@@ -14,7 +14,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import HOLE_S, HOLE_STEPS, own_rows, row_times, rows_at, slowest
 from eval.importers.signals import NEEDED, Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
-from eval.logs.faults.check import DRIVE, POSE, Against, run_checks
+from eval.logs.faults.check import CLOCK, DRIVE, POSE, Against, run_checks
 from eval.logs.faults.finding import Finding, said
 from eval.logs.flight_log import FlightLog, log_from_columns
 
@@ -49,6 +49,11 @@ def assemble(
     recording = with_readings(recording, options.read)
     _need(recording, options.partial, findings)
     against = Against(options.vehicle)
+    more, readings, _ = run_checks(
+        {"time": recording.signals[slowest(recording)].time_s}, CLOCK, against, options.fix
+    )
+    findings += more
+    recording = with_readings(recording, readings)  # without seconds there are no rows
     coarse = row_times(recording, COARSE_HZ, 0.0, None)
     more, readings, _ = run_checks(rows_at(recording, coarse), POSE, against, options.fix)
     findings += more

@@ -37,8 +37,9 @@ class Against:
 
 
 Check = Callable[[Rows, Against], list[Finding]]
+CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows),)
+"""In which unit the time is: before there can be rows."""
 POSE: tuple[Check, ...] = (
-    lambda rows, _: check_time(rows),
     lambda rows, _: check_pose(rows, look_at_pose(rows)),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
@@ -89,7 +90,7 @@ def check_log(
 
     What an import found and left open is repeated, where the same check does not come out again.
     """
-    checks = (*POSE, lambda rows, _: check_clock(rows), *DRIVE)
+    checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
     rates = {**_action_rows(log), **rows_of(log)}
     findings += check_controller_rate(rates, against.policy_hz, "the policy")

@@ -20,7 +20,9 @@ USUAL_S = 0.08
 GAIN = (0.8, 1.25)
 """What the body does of a steady rate command, where nothing is wrong."""
 UNITS = {"in degrees per second": 1.0 / DEG, "ten times too large (blackbox_high_resolution)": 10.0}
-OPPOSITE = -0.5
+OPPOSITE, CLOSE, FOLLOWED, BENT = -0.5, 0.9, 0.92, 0.4
+"""Correlations of commands and gyro: of another sign, of small commands that are followed closely,
+of commands whose gain says something for sure; and how much bend is a curve."""
 RANGES = (
     ("0 to 1", 1.0, (0.03, 0.97), ""),
     ("percent", 100.0, (8.0, 90.0), "0.01"),
@@ -94,13 +96,14 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
             return [Finding("corrected", subject, text, "rate_command_unit", factor, 0.98, fix)]
     findings = []
     bend = _bend(command, rate)
-    if np.isfinite(gain) and (high < GAIN[0] or low > GAIN[1] or abs(bend) > 0.35):
+    if np.isfinite(gain) and (high < GAIN[0] or low > GAIN[1] or abs(bend) > BENT):
         shape = f", and {1.0 + bend:.2g} times as much of large ones as of small ones"
         text = f"{figures}, by {gain:.3g} of it ({low:.3g} to {high:.3g}){shape}: a stick map or "
         text += "a rates curve that the log's commands do not have"
         fix = "the firmware's rates curve for the map from sticks, or " + option(
             ("cmd_rate", f"{gain:.4g}"))  # fmt: skip
-        findings.append(Finding("doubt", subject, text, "rate_curve", gain, 0.93, fix))
+        sure = 0.93 if found.alike[found.seen].min() > FOLLOWED else 0.7
+        findings.append(Finding("doubt", subject, text, "rate_curve", gain, sure, fix))
     if delay > LATE_S + (USUAL_S if vehicle is None else _response(vehicle)):
         text = f"{figures}: later than the rate loop, rotors and a link make it"
         fix = "the link's or the logger's clock; a delay in the simulation: effects.command_delay"
@@ -139,19 +142,22 @@ def _delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple
 
 
 def _bend(command: np.ndarray, rate: np.ndarray) -> float:
-    """Return how much more of large commands the body does than of small ones, as a share."""
+    """Return how much more of large commands the body does than of small ones, as a share.
+
+    Of the axes on which small ones are followed closely; 0 where they do not agree.
+    """
     both = np.isfinite(command).all(axis=1) & np.isfinite(rate).all(axis=1)
-    size = np.abs(command[both])
-    limit = np.quantile(size, 0.9, axis=0)
-    k = int(np.argmax(limit))
-    c, r = command[both, k], rate[both, k]
-    large, small = np.abs(c) > 0.6 * limit[k], np.abs(c) < 0.4 * limit[k]
-    if limit[k] < 3.0 * CALM_RATE or min(large.sum(), small.sum()) < 50:
-        return 0.0
-    slopes = [float(c[m] @ r[m]) / max(float(c[m] @ c[m]), 1e-12) for m in (large, small)]
-    if slopes[1] < 0.1 or r[small].std() == 0.0 or np.corrcoef(c[small], r[small])[0, 1] < 0.7:
-        return 0.0
-    return slopes[0] / slopes[1] - 1.0
+    bends = []
+    for c, r in zip(command[both].T, rate[both].T, strict=True):
+        limit = np.quantile(np.abs(c), 0.9)
+        large, small = np.abs(c) > 0.6 * limit, np.abs(c) < 0.4 * limit
+        if limit < 3.0 * CALM_RATE or min(large.sum(), small.sum()) < 50 or not r[small].std():
+            continue
+        if np.corrcoef(c[small], r[small])[0, 1] > CLOSE:
+            slopes = [float(c[m] @ r[m]) / float(c[m] @ c[m]) for m in (large, small)]
+            bends.append(slopes[0] / slopes[1] - 1.0)
+    alike = bends and (min(bends) > 0.0 or max(bends) < 0.0)
+    return float(np.median(bends)) if alike else 0.0
 
 
 def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> list[Finding]:

@@ -22,7 +22,7 @@ from eval.logs.velocity import velocity_from_position
 Rows = Mapping[str, np.ndarray]
 WIDTH_S, SPAN_S = 0.2, 0.06
 """Everything is averaged over the first; the attitude is differenced over the second [s]."""
-POINTS = 1500
+POINTS = 400
 """At most so many rows take part."""
 CALM_RATE, CALM_ACC = 0.15, 0.5
 """Below these, root mean square, turns [rad/s] and accelerations [m/s^2] say nothing."""

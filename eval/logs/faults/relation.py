@@ -11,6 +11,8 @@ ALIKE = 0.8
 """Axes whose correlation is above this are the same."""
 UNLIKE = 0.5
 """An axis correlates with its own by less than the best other by this: it is another one."""
+LEAST = 20
+"""Fewer rows say nothing."""
 SEEN = 0.5
 """An axis that correlates with none by more than this cannot be identified."""
 
@@ -50,6 +52,8 @@ class Match(NamedTuple):
 def match(wanted: np.ndarray, given: np.ndarray) -> Match:
     """Return how (N, 3) `given` belongs to (N, 3) `wanted`; rows with a NaN take no part."""
     wanted, given = _clear(wanted, given)
+    if len(wanted) < LEAST:
+        wanted = given = np.zeros((LEAST, 3))
     level, other = wanted.std(axis=0), given.std(axis=0)
     wanted, given = wanted - wanted.mean(axis=0), given - given.mean(axis=0)
     size = np.outer(np.maximum(level, 1e-12), np.maximum(other, 1e-12)) * max(len(wanted), 1)

@@ -11,7 +11,7 @@ from eval.importers.frames import conjugate, turn
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
 from eval.logs.faults.reading import option, read_as
-from eval.logs.faults.relation import Match, match, pooled_scale, rms, smooth
+from eval.logs.faults.relation import LEAST, Match, match, pooled_scale, rms, smooth
 from eval.logs.velocity import velocity_from_position
 
 DEG = float(np.pi / 180.0)
@@ -188,6 +188,9 @@ def check_accelerometer(rows: Rows) -> list[Finding]:
         if steps != "plus-gravity" or scale == 1.0
     }
     size = rms(force)
+    if not np.isfinite(force).all(axis=1).sum() > LEAST or size < 1.0:
+        text = "there is no path to check it by"
+        return [Finding("not identifiable", "accelerometer", text, "accelerometer_unit")]
     residual = {name: rms(value - force) / size for name, value in readings.items()}
     given = residual["", 1.0]
     best = min(residual, key=lambda name: residual[name] + 0.03 * (name[0] != ""))

@@ -37,6 +37,12 @@ class Kind:
     """The policy's field of view over the vehicle's."""
     race: bool = False
     """One of those that cost teams of a vision race of 2026 their flights."""
+    of: tuple[str, ...] = ()
+    """Signals that `change` is of, and those without which the fault cannot be seen."""
+
+    def needs(self) -> set[str]:
+        """Return the signals that a log must hold for the fault to be put into it."""
+        return {*self.of, *(text.partition("=")[0] for text in self.readings)}
 
 
 def inject(kind: Kind, parts: Mapping[str, np.ndarray], rng: np.random.Generator) -> Parts:
@@ -124,11 +130,18 @@ KINDS: dict[str, Kind] = {
     "accelerometer in g": Kind(("accelerometer_unit",), (f"acc={1.0 / GRAVITY}",)),
     "accelerometer in counts": Kind(("accelerometer_unit",), (f"acc={2048.0 / GRAVITY}",)),
     "accelerometer's sign": Kind(("accelerometer_axes",), ("acc=-x,-y,-z",)),
-    "accelerometer forward-right-down": Kind(("accelerometer_axes", "body_frame"),
-                                             ("acc=x,-y,-z",)),
-    "gravity removed": Kind(("accelerometer_gravity",), change=_without_gravity),
-    "accelerometer's bias with throttle": Kind(("accelerometer_throttle_bias",),
-                                               change=_biased_by_throttle, race=True),
+    "accelerometer forward-right-down": Kind(
+        ("accelerometer_axes", "body_frame"), ("acc=x,-y,-z",)
+    ),
+    "gravity removed": Kind(
+        ("accelerometer_gravity",), change=_without_gravity, of=("acc", "quat")
+    ),
+    "accelerometer's bias with throttle": Kind(
+        ("accelerometer_throttle_bias",),
+        change=_biased_by_throttle,
+        race=True,
+        of=("acc", "throttle", "pos", "quat"),
+    ),
     "position in mm": Kind(("position_unit",), ("pos=1000",)),
     "position in cm": Kind(("position_unit",), ("pos=100",)),
     "position north-east-down": Kind(("world_frame",), ("pos=x,-y,-z",)),
@@ -138,46 +151,66 @@ KINDS: dict[str, Kind] = {
     "velocity turned twice": Kind(("velocity_frame",), ("vel=from-body",)),
     "velocity in cm/s": Kind(("velocity_unit",), ("vel=100",)),
     "all of it north-east-down": Kind(
-        ("world_frame",), ("quat=ned+frd", "pos=x,-y,-z", "vel=x,-y,-z", *ALL_FRD)),
+        ("world_frame",), ("quat=ned+frd", "pos=x,-y,-z", "vel=x,-y,-z", *ALL_FRD)
+    ),
     "body forward-right-down": Kind(("body_frame",), ("quat=frd", *ALL_FRD)),
     "quaternion xyzw": Kind(("quaternion_order",), ("quat=xyzw+xyzw+xyzw",)),
     "quaternion world to body": Kind(("quaternion_direction",), ("quat=inverse",)),
     "attitude's pitch and odometry's roll inverted": Kind(
-        ("attitude_sign",), ("quat=-pitch", "rate=-x,y,z"), race=True),
-    "pose late by 60 ms": Kind(("clock_offset",), change=_late),
+        ("attitude_sign",), ("quat=-pitch", "rate=-x,y,z"), race=True
+    ),
+    "pose late by 60 ms": Kind(("clock_offset",), change=_late, of=("quat", "vel", "rate")),
     "rotor speeds in rpm": Kind(("motor_unit",), (f"motor={RPM}",)),
     "electrical rotor speeds": Kind(("motor_unit",), ("motor=7",)),
     "12 poles declared of 14": Kind(("motor_poles",), (f"motor={14.0 / 12.0}",)),
     "motors in the order 2, 1, 4, 3": Kind(("motor_order",), ("motor=2,1,4,3",)),
     "motors in the order 4, 1, 2, 3": Kind(("motor_order",), ("motor=4,1,2,3",)),
     "motors 3 and 4 swapped": Kind(("motor_order",), ("motor=1,2,4,3",)),
-    "motor 3 never turns": Kind(("motor_dead",), change=_dead),
+    "motor 3 never turns": Kind(("motor_dead",), change=_dead, of=("motor",)),
     "spin of all motors": Kind(
         ("motor_spin",),
-        vehicle=lambda v: _rotors(v, spin=tuple(-s for s in v.rotors.spin))),
+        vehicle=lambda v: _rotors(v, spin=tuple(-s for s in v.rotors.spin)),
+        of=("motor", "rate"),
+    ),
     "throttle from 0 to 1000": Kind(("throttle_range",), ("throttle=1000",)),
     "throttle in percent": Kind(("throttle_range",), ("throttle=100",)),
     "rate command in deg/s": Kind(("rate_command_unit",), (f"cmd_rate={DEG}",)),
     "sign of the yaw command": Kind(("rate_command_sign",), ("cmd_rate=x,y,-z",)),
-    "linear stick map against a rates curve": Kind(("rate_curve",), change=_curved, race=True),
-    "commands act 150 ms later": Kind(("command_delay",), change=_ahead),
+    "linear stick map against a rates curve": Kind(
+        ("rate_curve",), change=_curved, race=True, of=("cmd_rate", "rate")
+    ),
+    "commands act 150 ms later": Kind(
+        ("command_delay",), change=_ahead, of=("cmd_rate", "rate", "throttle")
+    ),
     "loop at two thirds of its rate (40 of 60 Hz)": Kind(
-        ("controller_rate",), change=_held, race=True),
+        ("controller_rate",), change=_held, race=True, of=("cmd_rate", "throttle")
+    ),
     "time in ms": Kind(("time_unit",), change=lambda p, _: {**p, "time": 1e3 * p["time"]}),
     "voltage in mV": Kind(("voltage",), ("voltage=1000",)),
     "battery of 0.1 V": Kind(("voltage",), ("voltage=0.00625",)),
-    "mass on five links": Kind(("vehicle_mass", "vehicle_thrust"),
-                               vehicle=lambda v: replace(v, mass=5.0 * v.mass), race=True),
+    "mass on five links": Kind(
+        ("vehicle_mass", "vehicle_thrust"),
+        vehicle=lambda v: replace(v, mass=5.0 * v.mass),
+        race=True,
+        of=("motor",),
+    ),
     "arms in mm": Kind(("vehicle_arms",), vehicle=_in_mm),
     "speed_max in rpm": Kind(
-        ("vehicle_thrust",), vehicle=lambda v: _rotors(v, speed_max=RPM * v.rotors.speed_max)),
+        ("vehicle_thrust",), vehicle=lambda v: _rotors(v, speed_max=RPM * v.rotors.speed_max)
+    ),
     "inertia x 1000": Kind(
         ("vehicle_inertia",),
-        vehicle=lambda v: replace(v, inertia=tuple(1000.0 * j for j in v.inertia))),
-    "barometer falls on spin-up": Kind(("barometer_spin_up",), change=_sunk, race=True),
+        vehicle=lambda v: replace(v, inertia=tuple(1000.0 * j for j in v.inertia)),
+    ),
+    "barometer falls on spin-up": Kind(
+        ("barometer_spin_up",), change=_sunk, race=True, of=("baro", "motor", "throttle")
+    ),
     "field of view": Kind(("camera_fov",), fov=1.25, race=True),
     "thrust -10 %": Kind(
-        ("thrust_scale",), race=True,
-        vehicle=lambda v: _rotors(v, thrust_coefficient=v.rotors.thrust_coefficient / 0.9)),
-}  # fmt: skip
+        ("thrust_scale",),
+        race=True,
+        vehicle=lambda v: _rotors(v, thrust_coefficient=v.rotors.thrust_coefficient / 0.9),
+        of=("motor", "pos", "quat"),
+    ),
+}
 """Kind -> what it does, and what it must be reported as."""

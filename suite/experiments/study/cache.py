@@ -13,7 +13,7 @@ from tracks.common.files import digest_of
 from tracks.common.names import added_entries
 
 ROOT = Path(__file__).resolve().parents[3]
-NO_RESULT = ("view", "importers", "envs")
+NO_RESULT = ("view", "importers", "faults", "envs")
 """Folders whose code changes no flight."""
 LOOP_ROOMS = (
     "tracks",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.check import DRIVE, POSE, Against, check_files, run_checks
+from eval.logs.faults.check import CLOCK, DRIVE, POSE, Against, check_files, run_checks
 from eval.logs.faults.clock import check_clock
 from eval.logs.faults.commands import check_controller_rate
 from eval.logs.faults.reading import read_rows
@@ -37,7 +37,7 @@ def good(seed=0, end=16.0):
 
 def checked(parts, vehicle=PLAIN, fov=1.0):
     against = Against(vehicle, POLICY_HZ, tuple(fov * angle for angle in vehicle.camera.fov_deg))
-    checks = (*POSE, lambda rows, _: check_clock(rows), *DRIVE)
+    checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(parts, checks, against, fix=True)
     commands = {name: value for name, value in parts.items() if name != "throttle"}
     findings += check_controller_rate(commands, POLICY_HZ, "the policy")

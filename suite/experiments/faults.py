@@ -1,0 +1,279 @@
+"""Faults put into simulated and real logs: how many are named, and how many good logs accused."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+
+from eval.importers import import_log
+from eval.importers.options import ImportOptions
+from eval.logs.faults.check import Against, check_files, check_log, rows_of
+from eval.logs.faults.finding import Finding
+from eval.logs.flight_log import FlightLog, read_flight
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from eval.vehicles.vehicle import Vehicle, with_effects
+from suite.common.console import Console
+from suite.experiments.injected.flights import TRUE_EFFECTS, as_log, flight_parts, real_logs
+from suite.experiments.injected.kinds import KINDS, Kind, inject
+from suite.experiments.injected.writers import WRITERS
+from suite.experiments.pages.document import Made, Place
+from suite.experiments.study.cache import code_digest, digest
+from suite.judging.collect import collect
+from suite.judging.requests import Collection
+from tracks.common.grid import Grid, table
+from tracks.common.provenance import git_commit
+from tracks.common.work import work_off
+from tracks.input.ranges import Range, Seed
+
+OWN = "flight log"
+FORMATS = (*WRITERS, OWN)
+POLICY_HZ = 30.0
+OUTCOMES = ("named", "not identifiable", "refused", "another name", "silent")
+"""What becomes of a faulty log: named as it should be, reported as not identifiable, refused with a
+reason, reported under another name only, imported without a word."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Put every kind of fault into simulated logs of four formats and real ones, and check them."""
+
+    flights: Annotated[int, Range(1, 100)] = 5
+    """Simulated flights a kind; each in another format."""
+    clean: Annotated[int, Range(1, 2000)] = 200
+    """Simulated flights without a fault."""
+    real: Path = Path("../shared/real_logs")
+    """Folder of real logs (nanobench, crazyswarm2, crazypad); left out where it is missing."""
+    vehicle: str = "reference"
+    """A shipped vehicle's name or a vehicle file (.toml): flown with an offset centre of mass."""
+    seed: Seed = 7_000_000
+    """Of the flights, their noise and what is drawn."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One log to check."""
+
+    kind: str
+    """A key of `KINDS`; "" for none."""
+    format: str
+    path: Path
+    """The good flight."""
+    number: int
+    """Of the flight, for its noise."""
+
+
+def document(config: Config, place: Place, console: Console) -> Made:
+    """Return the tables; flights and logs that are missing are made first."""
+    vehicle = load_vehicle(config.vehicle)
+    same = [config.vehicle, config.seed, git_commit(), code_digest("eval")]
+    folder = place.cache / f"faults-{digest(same)}"
+    good = _flights(config, vehicle, folder, console)
+    faulty = list(_faulty(config, good))
+    clean = [
+        Case("", FORMATS[k % len(FORMATS)], path, k) for k, path in enumerate(good[: config.clean])
+    ]
+    real = real_logs(config.real)
+    on_real = [
+        Case(kind, "real", path, k)
+        for kind in KINDS
+        for k, path in enumerate(_share(kind, real, config.flights))
+    ]
+    unhurt = [Case("", "real", path, 0) for path in real]
+    cases = [*faulty, *clean, *on_real, *unhurt]
+    done = _checked(cases, config, folder, console, place)
+    groups = {"simulated": faulty, "real": on_real}
+    parts = {
+        f"Faults in {name} logs": [_kinds_grid([(c, done[c]) for c in held if done[c]])]
+        for name, held in groups.items()
+        if any(done[c] for c in held)
+    }
+    parts["Logs without a fault"] = [_clean_grid([(c, done[c]) for c in (*clean, *unhurt)])]
+    facts = {
+        "flights": f"{len(good)} of the judge on all tracks, levels 0, 3 and 6, vehicle "
+        f"{config.vehicle} with its centre of mass off by 6 and -3 mm, measured with noise; held "
+        f"against {config.vehicle} and a policy of {POLICY_HZ:g} Hz",
+        "formats": ", ".join(FORMATS),
+        "real logs": f"{len(real)} of {config.real.name}" if real else "none here",
+        "kinds": f"{len(KINDS)}, {sum(k.race for k in KINDS.values())} of them (race) cost "
+        "teams of a vision race their flights",
+        "seed": str(config.seed),
+    }
+    numbers = {
+        name: Counter(_outcome(c, done[c]) for c in held if done[c])
+        for name, held in groups.items()
+    }
+    accused = [c for c in clean if _accused(done[c])]
+    return Made(facts, parts, {"outcomes": numbers, "clean": len(clean), "accused": len(accused)})
+
+
+def _flights(config: Config, vehicle: Vehicle, folder: Path, console: Console) -> list[Path]:
+    """Return good flights of four seconds and more, flown where they are not there yet."""
+    count = max(config.clean, config.flights * len(FORMATS))
+    true = with_effects(vehicle, TRUE_EFFECTS)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_vehicle(true, folder / "true.toml", "the nominal vehicle, its centre of mass moved")
+    asked = Collection(
+        difficulty="0,3,6",
+        trials=-(-count * 12 // (9 * 10)),
+        vehicle=str(folder / "true.toml"),
+        seed=config.seed,
+    )
+    flown = collect(asked, folder / "flights", console, None)["flights"]
+    paths = [folder / "flights" / row["file"] for row in flown if row["file"] and row["time_s"] > 4]
+    order = np.random.default_rng(config.seed).permutation(len(paths))
+    return [paths[k] for k in order][:count]
+
+
+def _faulty(config: Config, good: Sequence[Path]) -> Iterator[Case]:
+    for number, (name, kind) in enumerate(KINDS.items()):
+        able = [f for f in FORMATS if kind.needs() <= _holds(f)]
+        for k in range(config.flights):
+            at = (number * config.flights + k) % len(good)
+            yield Case(name, able[k % len(able)], good[at], at)
+
+
+def _holds(format: str) -> set[str]:
+    both = {"time", "pos", "quat", "rate", "acc", "motor", "cmd_rate", "throttle", "voltage"}
+    return both | {"betaflight": set(), OWN: {"vel", "baro"}}.get(format, {"vel"})
+
+
+def _share(kind: str, real: Sequence[Path], count: int) -> list[Path]:
+    """Return the real logs that a kind is put into, spread over all of them."""
+    start = list(KINDS).index(kind) * 3
+    return [real[(start + 7 * k) % len(real)] for k in range(min(count, len(real)))]
+
+
+Answer = list[dict[str, Any]] | str | None
+"""Records of findings; the reason of a refusal; None where a log lacks what the fault is of."""
+
+
+def _checked(
+    cases: Sequence[Case], config: Config, folder: Path, console: Console, place: Place
+) -> dict[Case, Answer]:
+    """Return the findings of every case; those of an interrupted run are kept."""
+    path = folder / f"checked-{code_digest('suite/experiments/injected', 'eval/importers')}.jsonl"
+    keys = {f"{c.kind}|{c.format}|{c.path.name}": c for c in cases}
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    done = {k: a for k, a in map(json.loads, lines) if k in keys}
+    left = [key for key in keys if key not in done]
+    with console.progress("logs", len(cases)) as show, path.open("a", encoding="utf-8") as file:
+
+        def keep(number: int, answer: Answer) -> None:
+            done[left[number]] = answer
+            file.write(json.dumps([left[number], answer]) + "\n")
+            file.flush()
+            show(len(done), left[number])
+
+        check = partial(_check, vehicle_name=config.vehicle, seed=config.seed)
+        work_off(check, [keys[key] for key in left], place.workers or 1, keep)
+    return {c: done[key] for key, c in keys.items()}
+
+
+def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
+    """Yield what is found in one log."""
+    kind = KINDS.get(case.kind, Kind(()))
+    rng = np.random.default_rng([seed, case.number, len(case.kind)])
+    if case.format == "real":
+        log, vehicle = _real(case.path)
+        parts = rows_of(log)
+        lacks = not kind.needs() <= parts.keys() or (kind.fov != 1.0)
+    else:
+        vehicle = load_vehicle(vehicle_name)
+        parts, lacks = flight_parts(read_flight(case.path), vehicle, rng), False
+    if lacks:
+        yield None
+        return
+    wrong = inject(kind, parts, rng) if kind.names else parts
+    vehicle = vehicle if kind.vehicle is None else kind.vehicle(vehicle)
+    fov = tuple(kind.fov * angle for angle in vehicle.camera.fov_deg)
+    hz = POLICY_HZ if case.format != "real" else None
+    against = Against(vehicle, hz, (fov[0], fov[1]))
+    try:
+        found = _findings(case, wrong, vehicle, against)
+    except ValueError as error:
+        yield str(error).splitlines()[0]
+        return
+    yield [f._asdict() for f in found if f.fault and f.status != "ok"]
+
+
+def _findings(case: Case, parts: dict[str, np.ndarray], vehicle: Vehicle, against: Against
+              ) -> list[Finding]:  # fmt: skip
+    if case.format in WRITERS:
+        with tempfile.TemporaryDirectory() as folder:
+            written = WRITERS[case.format](Path(folder), parts, vehicle.full_thrust)
+            options = replace(written.options, vehicle=vehicle)
+            log, found = import_log(written.path, case.format, options)
+        return [*found, *check_log(log, against)[0], *check_files(against)]
+    return [*check_log(as_log(parts, case.path.name), against)[0], *check_files(against)]
+
+
+def _real(path: Path) -> tuple[FlightLog, Vehicle]:
+    """Return a real log as it is imported, and the vehicle file that it is held against."""
+    name = path.parent.name if path.parent.name in ("nanobench", "crazyswarm2") else "crazypad"
+    vehicle = load_vehicle("crazyflie21")
+    options = ImportOptions(map=Path(name), partial=True, vehicle=vehicle)
+    return import_log(path, None, options)[0], vehicle
+
+
+def _outcome(case: Case, answer: Answer) -> str:
+    names = KINDS[case.kind].names
+    if isinstance(answer, str):
+        return "refused"
+    said = {f["fault"] for f in answer or () if f["status"] != "not identifiable"}
+    if said & set(names):
+        return "named"
+    if set(names) & {f["fault"] for f in answer or ()}:
+        return "not identifiable"
+    return "another name" if said else "silent"
+
+
+def _accused(answer: Answer) -> bool:
+    return isinstance(answer, str) or any(f["status"] != "not identifiable" for f in answer or ())
+
+
+def _kinds_grid(done: Iterable[tuple[Case, Answer]]) -> Grid:
+    count: dict[str, Counter[str]] = {}
+    for case, answer in done:
+        count.setdefault(case.kind, Counter())[_outcome(case, answer)] += 1
+    total = Counter[str]()
+    for one in count.values():
+        total += one
+    rows = [
+        [("(race) " if KINDS[kind].race else "") + kind, " or ".join(KINDS[kind].names)]
+        + [str(c[o] or "") for o in OUTCOMES]
+        for kind, c in count.items()
+    ]
+    share = sum(total.values())
+    rows.append(
+        ["all", f"{share} logs", *(f"{total[o]} ({total[o] / share:.1%})" for o in OUTCOMES)]
+    )
+    return table(["fault", "name", *OUTCOMES], rows)
+
+
+def _clean_grid(done: Iterable[tuple[Case, Answer]]) -> Grid:
+    logs, accused, names = Counter[str](), Counter[str](), {}
+    for case, answer in done:
+        logs[case.format] += 1
+        accused[case.format] += _accused(answer)
+        for f in answer if isinstance(answer, list) else ():
+            if f["status"] != "not identifiable":
+                names.setdefault(case.format, Counter())[f["fault"]] += 1
+        if isinstance(answer, str):
+            names.setdefault(case.format, Counter())["refused"] += 1
+    rows = [
+        [format, str(count), str(accused[format]),
+         ", ".join(f"{n} {c}" for n, c in names.get(format, Counter()).items())]
+        for format, count in logs.items()
+    ]  # fmt: skip
+    simulated = [f for f in logs if f != "real"]
+    both = [str(sum(c[f] for f in simulated)) for c in (logs, accused)]
+    rows.append(["all simulated", *both, ""])
+    return table(["format", "logs", "with a finding", "which"], rows)

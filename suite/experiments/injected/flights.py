@@ -1,0 +1,69 @@
+"""Good flights: the judge's as a logger has them, and real ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from eval.effects import EFFECTS
+from eval.effects.interface import GRAVITY
+from eval.importers.frames import conjugate, turn
+from eval.logs.columns import GROUPS
+from eval.logs.flight_log import FlightLog, log_from_columns
+from eval.logs.velocity import velocity_from_position
+from eval.vehicles.vehicle import Vehicle
+
+TRUE_EFFECTS = {"com_offset": EFFECTS["com_offset"].values((0.006, -0.003, 0.0))}
+"""What the flown vehicle has besides the nominal one's effects."""
+NOISE = {"pos": 0.002, "vel": 0.02, "quat": 0.001, "rate": 0.03, "acc": 0.3, "motor": 3.0,
+         "voltage": 0.05, "baro": 0.05}  # fmt: skip
+"""Standard deviation of the white noise of each signal [its unit]."""
+LOGS = ("nanobench/*.csv", "crazyswarm2/log*", "crazypad/*/*log*")
+
+
+def flight_parts(
+    log: FlightLog, vehicle: Vehicle, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Return a judge's flight as signals with noise, and a battery and a barometer besides."""
+    assert log.thrust_cmd is not None and log.rate_cmd_b is not None and log.rotor_speed is not None
+    change = velocity_from_position(log.time_s, log.vel_w)
+    parts = {
+        "time": log.time_s,
+        "pos": log.pos_w,
+        "quat": log.quat_wxyz,
+        "vel": log.vel_w,
+        "rate": log.rate_b,
+        "acc": turn(conjugate(log.quat_wxyz), change + [0.0, 0.0, GRAVITY]),
+        "cmd_thrust": log.thrust_cmd[:, None],
+        "cmd_rate": log.rate_cmd_b,
+        "motor": log.rotor_speed,
+        "throttle": log.thrust_cmd[:, None] / vehicle.full_thrust,
+        "voltage": (16.0 - 0.05 * log.time_s)[:, None],
+        "baro": log.pos_w[:, 2:],
+    }
+    for name, size in NOISE.items():
+        parts[name] = parts[name] + size * rng.normal(size=parts[name].shape)
+    parts["quat"] = parts["quat"] / np.linalg.norm(parts["quat"], axis=1, keepdims=True)
+    return parts
+
+
+def as_log(parts: Mapping[str, np.ndarray], name: str) -> FlightLog:
+    """Return signals as a flight log, `throttle` and `baro` as columns of their own.
+
+    Raises:
+        FlightLogError: where they break a rule of flight logs.
+    """
+    columns = {"time": parts["time"]}
+    for group, names in GROUPS.items():
+        if group != "time" and group in parts:
+            columns |= dict(zip(names, np.asarray(parts[group]).T, strict=True))
+    columns |= {n: parts[n][:, 0] for n in ("throttle", "baro") if n in parts}
+    lacks = [group for group in ("pos", "quat", "rate") if group not in parts]
+    return log_from_columns(columns, {"partial": lacks} if lacks else {}, name)
+
+
+def real_logs(folder: Path) -> list[Path]:
+    """Return the real logs in `folder`, sorted; none where it is not there."""
+    return [path for pattern in LOGS for path in sorted(folder.glob(pattern))]
