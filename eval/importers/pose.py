@@ -102,7 +102,7 @@ def with_pose(
             change = conjugate(rot_to_quat(alignment.turn))
             quat = Signal(quat.time_s, multiply(quat.value, np.broadcast_to(change, (1, 4))))
         level = "corrected" if options.fix else "doubt"
-        findings.append(Finding(level, "pose axes", text))
+        findings.append(Finding(level, "pose axes", text, "body_frame", None, 0.9))
     elif turn_deg > 1.0:
         text = f"its body is turned by {turn_deg:.1f} deg against the gyro; left as it is"
         findings.append(Finding("note", "pose axes", text))
@@ -122,7 +122,7 @@ def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
         return pose, []
     scaled = {n: Signal(s.time_s * TIMES[unit], s.value) for n, s in pose.signals.items()}
     text = f"rows are {step:.4g} apart, so time is in {unit}"
-    return replace(pose, signals=scaled), [Finding("corrected", "pose time", text)]
+    return replace(pose, signals=scaled), [Finding("corrected", "pose time", text, "time_unit")]
 
 
 def _best_reading(
@@ -138,7 +138,10 @@ def _best_reading(
         found = align(other, rate, pose.name)
         if fix and found.correlation > SURE:
             text = f"it turns as the gyro does only if it is {words}"
-            return other, found, [Finding("corrected", "pose attitude", text)]
+            order = "xyzw" in steps
+            fault = "quaternion_order" if order else "quaternion_direction"
+            about = (fault, None, found.correlation)
+            return other, found, [Finding("corrected", "pose attitude", text, *about)]
     if given.correlation < ALIKE or abs(given.drift) > DRIFT_MAX:
         reason = (
             f"its clock cannot be aligned with the log's: at best the body rates correlate by "
@@ -206,7 +209,7 @@ def _refine(
     slope = (later - sooner) / (2.0 * step)
     turn = _kabsch(seen - seen.mean(0), gyro - gyro.mean(0))
     turned = seen @ turn.T
-    # The size is left open: a gyro in other units is for `checks/units.py` to find.
+    # The size is left open: a gyro in other units is for `faults/vectors.py` to find.
     centred = turned - turned.mean(0)
     size = float(np.sum(gyro * centred) / max(np.sum(centred**2), 1e-12))
     rest = gyro - size * turned
