@@ -1,0 +1,77 @@
+"""`suite check` on flights, and what diagnose and identify do of a log with an open fault."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eval.logs.faults.finding import Finding, findings_of
+from eval.logs.flight_log import read_flight, write_flight
+from eval.quadrotor.vehicle_file import save_vehicle
+from suite import cli
+from suite.experiments.injected.flights import as_log
+from tests.eval.logs.faults.test_kinds import good
+from tests.support.vehicles import PLAIN
+
+
+@pytest.fixture
+def flight(tmp_path):
+    """Write a good flight with its rates times a factor, and return its path."""
+
+    def written(factor, **changes):
+        parts = good(end=10.0)
+        log = as_log({**parts, "rate": factor * parts["rate"]}, "flight")
+        return write_flight(tmp_path / "flight.parquet", replace(log, **changes))
+
+    save_vehicle(PLAIN, tmp_path / "plain.toml")
+    return written
+
+
+def checked(tmp_path, capsys, path, *options):
+    line = ["check", str(path), "--vehicle", str(tmp_path / "plain.toml"), "--json", *options]
+    assert cli.main(line) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_fault_is_reported_with_its_fix_and_put_right(tmp_path, capsys, flight):
+    path = flight(1.0 / 0.0174532925)
+    answer = checked(tmp_path, capsys, path)
+    (found,) = (f for f in answer["findings"] if f["fault"] == "gyro_scale")
+    assert found["status"] == "doubt" and found["fix"].startswith("--read rate=0.01745")
+    assert found["flight"] == str(path) and found["confidence"] > 0.9
+    assert abs(found["size"] - 57.3) < 2.0
+    answer = checked(tmp_path, capsys, path, "--fix", "--out", str(tmp_path / "checked"))
+    assert {f["status"] for f in answer["findings"] if f["fault"] == "gyro_scale"} == {"corrected"}
+    fixed = read_flight(answer["written"][0])
+    np.testing.assert_allclose(fixed.rate_b, good(end=10.0)["rate"], rtol=1e-6, atol=1e-9)
+    again = checked(tmp_path, capsys, answer["written"][0])
+    assert not [f for f in again["findings"] if f["status"] == "doubt"]
+
+
+@pytest.mark.parametrize("command", ["diagnose", "identify"])
+def test_nothing_is_concluded_of_a_log_with_an_open_fault(tmp_path, capsys, flight, command):
+    path, out = flight(1.2), tmp_path / "out.toml"
+    line = [command, str(path), "--vehicle", str(tmp_path / "plain.toml"), "--out", str(out)]
+    assert cli.main(line) == 2
+    said = capsys.readouterr().err
+    assert "gyro_scale" in said and "--read rate=0.8" in said and "--accept gyro_scale" in said
+    assert not out.exists()
+    assert cli.main([*line, "--accept", "gyro_scales"]) == 2
+    assert "gyro_scale" in capsys.readouterr().err
+
+
+def test_what_an_import_left_open_is_repeated(tmp_path, capsys, flight):
+    doubt = Finding("doubt", "motors", "6 motors turn", "motor_count", 6.0, 0.97, "none")
+    path = flight(1.0, about={"findings": [doubt._asdict()]})
+    assert findings_of(read_flight(path).about) == (doubt,)
+    answer = checked(tmp_path, capsys, path)
+    assert "motor_count" in {f["fault"] for f in answer["findings"]}
+    line = ["diagnose", str(path), "--vehicle", str(tmp_path / "plain.toml")]
+    assert cli.main([*line, "--out", str(tmp_path / "out")]) == 2
+    assert "6 motors turn" in capsys.readouterr().err
+
+
+def test_findings_of_earlier_versions_are_read():
+    old = {"level": "doubt", "subject": "attitude", "text": "39 % off"}
+    assert findings_of({"findings": [old, "odd"]}) == (Finding("doubt", "attitude", "39 % off"),)

@@ -1,0 +1,50 @@
+"""Injected faults: every format brings a good flight back, and what is found is counted."""
+
+import numpy as np
+import pytest
+
+from eval.importers import import_log
+from eval.logs.flight_log import FlightLog, write_flight
+from suite.experiments import faults
+from suite.experiments.injected.flights import flight_parts
+from suite.experiments.injected.writers import WRITERS
+from tests.support import known_flight
+from tests.support.imported import near
+from tests.support.vehicles import PLAIN
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory):
+    truth = known_flight.fly(np.arange(0.0, 10.0, 0.01))
+    log = FlightLog(
+        "known", truth.time, truth.pos, truth.quat, truth.vel, truth.rate, truth.thrust,
+        known_flight.fly(truth.time + 0.05).cmd_rate, truth.motor,
+    )  # fmt: skip
+    return write_flight(tmp_path_factory.mktemp("judged") / "known.parquet", log), log, truth
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_a_written_flight_comes_back(tmp_path, judged, format):
+    _, log, truth = judged
+    parts = flight_parts(log, PLAIN, np.random.default_rng(0))
+    written = WRITERS[format](tmp_path, parts, PLAIN.full_thrust)
+    back, findings = import_log(written.path, format, written.options)
+    assert not [f for f in findings if f.fault and f.status in ("corrected", "doubt")]
+    rows = known_flight.fly(truth.time[0] + back.time_s)
+    near(back.rate_b, rows.rate, 0.3)
+    near(back.rotor_speed, rows.motor, 40.0)
+
+
+def test_outcomes_are_counted_by_name(judged):
+    path, *_ = judged
+    cases = {
+        "named": faults.Case("quaternion xyzw", "px4", path, 0),
+        "silent": faults.Case("gyro in deg/s", faults.OWN, path, 0),
+    }
+    (answer,) = faults._check(cases["named"], "racer5", 1)
+    assert faults._outcome(cases["named"], answer) == "named"
+    assert faults._outcome(cases["silent"], []) == "silent"
+    assert faults._outcome(cases["silent"], "refused for a reason") == "refused"
+    assert faults._accused(answer) and not faults._accused([])
+    grid = faults._kinds_grid([(cases["named"], answer)])
+    assert "1 (100.0%)" in {cell.text for cell in grid.rows[-1]}
