@@ -97,7 +97,7 @@ def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:
     )
     count = np.concatenate([[0], np.cumsum(known)])
     inside = (count[stop] - count[first])[:, None]
-    enough = inside > 0.6 * (stop - first)[:, None]
+    enough = np.asarray(inside > 0.6 * (stop - first)[:, None])
     return np.where(enough, (full[stop] - full[first]) / np.maximum(inside, 1), np.nan)
 
 

@@ -129,7 +129,7 @@ def check_velocity(rows: Rows) -> list[Finding]:
     ways = ["", "from-body", "x,-y,-z+from-body", "from-world"] if quat is not None else [""]
     found = {}
     for way in ways:
-        value = read_as("vel", rows["vel"], way, lambda: quat) if way else rows["vel"]
+        value = read_as("vel", rows["vel"], way, lambda: rows["quat"]) if way else rows["vel"]
         found[way] = match(path, smooth(time_s, value, WIDTH_S))
     left = {way: _left(one) for way, one in found.items()}
     best = min(left, key=lambda way: left[way])
