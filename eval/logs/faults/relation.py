@@ -91,7 +91,7 @@ def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:
     """Return the mean (T, C) of `value` over `width_s` around each time; NaN over holes."""
     first = np.searchsorted(time_s, time_s - 0.5 * width_s)
     stop = np.searchsorted(time_s, time_s + 0.5 * width_s, side="right")
-    known = np.isfinite(value).all(axis=1)
+    known = np.asarray(np.isfinite(value).all(axis=1))
     full = np.concatenate(
         [np.zeros((1, value.shape[1])), np.cumsum(np.where(known[:, None], value, 0.0), 0)]
     )
