@@ -48,15 +48,15 @@ class Judged(torch.nn.Module):
         return self.policy.action_net(actor), torch.cat([state, image.flatten(1)], -1)
 
 
-def main(out: Path, minutes: float, envs: int = 128, rollout: int = 16) -> Path:
+def main(out: Path, minutes: float, envs: int = 128, rollout: int = 32) -> Path:
     """Train for some minutes and return the file."""
     torch.set_num_threads(1)  # the network is small
     races = RaceVecEnv(envs, **SETTINGS)
-    normalised = VecNormalize(VecMonitor(races), gamma=0.97, norm_obs_keys=["state"])
-    network = {"net_arch": [64, 64], "log_std_init": -2.0}
-    model = PPO("MultiInputPolicy", VecFrameStack(normalised, 2), n_steps=rollout, batch_size=256,
-                n_epochs=10, gamma=0.97, gae_lambda=0.9, learning_rate=1e-3, target_kl=0.05,
-                seed=0, policy_kwargs=network, device="cpu", verbose=1)  # fmt: skip
+    normalised = VecNormalize(VecMonitor(races), gamma=0.98, norm_obs_keys=["state"])
+    network = {"net_arch": [64, 64], "log_std_init": -1.5}
+    stacked = VecFrameStack(normalised, 2)
+    model = PPO("MultiInputPolicy", stacked, n_steps=rollout, batch_size=512, n_epochs=6,
+                gamma=0.98, seed=0, policy_kwargs=network, device="cpu", verbose=1)  # fmt: skip
     end = time.monotonic() + 60.0 * minutes
     model.learn(10**9, lambda *_: time.monotonic() < end, log_interval=10)
     out.mkdir(parents=True, exist_ok=True)

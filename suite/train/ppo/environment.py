@@ -177,7 +177,8 @@ class JaxRace:
         """Fly an action (3,) for a policy period; return (seen, state, reward, done, info).
 
         After an episode's end it starts the next one, and `seen` is what is seen there. `info` has
-        the gates passed, and `collided`, `tipped`, `finished` and `truncated` (the time limit).
+        the `gates` passed, counted from the track's first, and `collided`, `tipped`, `finished`
+        and `truncated` (the time limit).
         """
         air, pick, noise = jax.random.split(key, 3)
         one = _one(worlds, state.world)

@@ -119,7 +119,7 @@ def test_a_crash_costs_and_progress_pays():
     while not over:
         _, reward, over, _, info = env.step(down)
         rewards.append(reward)
-    assert rewards[-1] < -4 and info["ended_by"] in ("collision", "tipped")
+    assert rewards[-1] < rewards[-2] - 0.8 and info["ended_by"] in ("collision", "tipped")
 
     start, _ = env.reset()
     policy, total = Pursuit(), 0.0
@@ -137,7 +137,7 @@ def test_an_action_that_is_not_finite_ends_the_episode_with_a_message(value):
     env.reset()
     seen, reward, terminated, truncated, info = env.step(np.full(3, value, np.float32))
     assert (terminated, truncated, info["ended_by"]) == (True, False, "bad_action")
-    assert "not finite" in info["message"] and reward == -5.0
+    assert "not finite" in info["message"] and reward == -1.0
     assert np.isfinite(seen["state"]).all()
     with pytest.raises(RuntimeError, match="ended by bad_action: call reset"):
         env.step(np.zeros(3, np.float32))

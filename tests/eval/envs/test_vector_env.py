@@ -97,7 +97,7 @@ def test_environments_and_vehicles_travel(copied):
     again = copied(env)
     second, _ = again.reset(seed=3)
     assert np.array_equal(first["image"], second["image"])
-    assert again.render().shape == (192, 256, 3) and again.render().max() > 0
+    assert again.render().shape == (360, 640, 3) and again.render().max() > 0
     assert copied(RaceVectorEnv(2, rules=SHORT)).num_envs == 2
 
 
