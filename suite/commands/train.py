@@ -11,8 +11,8 @@ import tyro
 from suite.common.console import Console
 from suite.common.running.hosts import Joined, join, member
 from suite.common.work import Silent
-from suite.train.config import TrainConfig, check
-from suite.train.overrides import override
+from suite.train.config import TrainConfig
+from suite.train.phases import changed, check_phases
 from suite.train.presets import chosen_model, fresh_start_note, preset, with_iterations
 from tracks.common.files import check_no_input, plain
 from tracks.input.ranges import Iterations, Seed
@@ -68,8 +68,8 @@ def resolve(config: Config) -> TrainConfig:
     run = chosen_model(run, config.model, config.vehicle)
     if config.iterations is not None:
         run = with_iterations(run, config.iterations)
-    run = override(run, config.set)
-    check(run)
+    run = changed(run, config.set)
+    check_phases(run)
     return run
 
 

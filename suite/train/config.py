@@ -191,18 +191,28 @@ class EpisodeConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW with a cosine schedule."""
+    """AdamW with a cosine schedule in each phase."""
 
     iterations: Iterations = 2000
-    """Gradient steps."""
+    """Gradient steps of the whole run."""
     rate: Annotated[float, Range(0.0, 10.0)] = 2e-3
     """Peak learning rate."""
     warmup: Annotated[int, Range(0, 10**9)] = 20
-    """Iterations of linear warm-up; the first of them changes nothing."""
+    """Iterations of linear warm-up of each phase; the first of them changes nothing."""
     memory: Annotated[float, Range(0.0, 1.0, below=True)] = 0.99
     """Adam's beta_2: short, because the first crashes' gradients are ten times all later ones."""
     clip: Annotated[float, Range(0.0, 1e12)] = 1.0
     """Largest global norm of a gradient; 0 does not clip."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A part of a training in which some settings differ from those before."""
+
+    share: Annotated[float, Range(0.0, 1.0, above=True)] = 1.0
+    """Share of the run's gradient steps [1]."""
+    set: tuple[str, ...] = ()
+    """Settings that change as the phase begins and stay so, such as "loss.progress=2.2"."""
 
 
 @dataclass(frozen=True)
@@ -220,7 +230,9 @@ class TrainConfig:
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
     """Worlds and horizon."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-    """Optimiser and its schedule."""
+    """Optimiser and its schedule, which every phase goes through."""
+    phases: tuple[Phase, ...] = ()
+    """What changes on the way; shares add up to 1. None: nothing does."""
     seed: Seed = 0
     """Seed of the parameters, the tracks and the randomisation."""
 

@@ -13,6 +13,7 @@ from suite.train.config import (
     EpisodeConfig,
     LossConfig,
     OptimizerConfig,
+    Phase,
     PointMassConfig,
     QuadrotorConfig,
     TrainConfig,
@@ -125,6 +126,50 @@ def swift_keen() -> TrainConfig:
     base = swift_sure()
     camera = replace(base.spec.camera, rays=2)
     return replace(base, spec=replace(base.spec, camera=camera))
+
+
+def race() -> TrainConfig:
+    """Return the recipe of `race`, the default policy: three phases from random weights.
+
+    First to fly surely; then fast, at a high weight of progress and low costs of acceleration and
+    jerk, where a decision costs half as much; then at 30 Hz, with a price on tipping over, which
+    ends a judged trial, and delays of up to 80 ms.
+    """
+    base = swift_quad()
+    first = replace(base.loss, gradient_decay=1.4, clearance=4.2, collide=0.28)
+    return replace(
+        base,
+        spec=replace(base.spec, second_axis=True, camera=replace(base.spec.camera, rays=2)),
+        loss=first,
+        optimizer=OptimizerConfig(iterations=4500),
+        phases=(
+            Phase(13 / 45),
+            Phase(
+                11 / 45,
+                (
+                    "loss.progress=2.2",
+                    "loss.acceleration=2e-3",
+                    "loss.jerk=1e-4",
+                    "loss.tilt=20.0",
+                    "episode.race_share=0.8",
+                    "optimizer.rate=1e-3",
+                ),
+            ),
+            Phase(
+                21 / 45,
+                (
+                    "spec.rate_hz=30.0",
+                    "episode.steps=180",
+                    "episode.image_stride=6",
+                    "quadrotor.delay_spread_s=0.08",
+                    "loss.progress=1.7",
+                    "loss.tilt=40.0",
+                    "episode.race_share=0.6",
+                    "optimizer.rate=4e-4",
+                ),
+            ),
+        ),
+    )
 
 
 def paper() -> TrainConfig:
@@ -291,6 +336,7 @@ def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) ->
 
 
 PRESETS = {
+    "race": race,
     "racer": racer,
     "swift": swift,
     "swift-quad": swift_quad,

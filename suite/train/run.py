@@ -21,10 +21,11 @@ from policies.spec import PolicySpec
 from suite.common.console import Console
 from suite.common.running import hosts
 from suite.common.stages import Estimate
-from suite.train.config import TrainConfig, check
+from suite.train.config import TrainConfig
+from suite.train.phases import check_phases, phase_configs, phase_ends
 from suite.train.shards import check_processes
 from suite.train.training_loop import Method, Outcome, Run, Watch, flight_note, train_in_folder
-from suite.train.update import make_update, start_state
+from suite.train.update import TrainState, make_update, start_state
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
 from tracks.common.work import usable_cores
@@ -100,21 +101,37 @@ def train(
             configuration, start or delta, and where processes were asked for different ones.
         WorkFailed: where the loss or the parameters stop being finite, or another process is gone.
     """
-    check(config)
+    check_phases(config)
     check_processes(config)
     origin = {"config": plain(config), "from": _digest(params), "delta": _digest(delta)}
     hosts.agree({"the configuration": origin["config"], "--from": origin["from"],
                  "--delta": origin["delta"], "threads": threads() > 1})  # fmt: skip
-    method = Method(
-        iterations=config.optimizer.iterations,
-        frames=config.episode.batch * config.episode.steps,
-        estimate=estimate(config),
-        worlds=lambda iteration: sample_worlds(config, iteration),
-        make_update=lambda: make_update(config, delta),
-        note=functools.partial(flight_note, "loss"),
-    )
-    run = Run(config, config.spec, config.seed, origin, folder)
-    return train_in_folder(method, run, start_state(config, params), console, watch)
+    configs, ends = phase_configs(config), phase_ends(config)
+    begins = (0, *ends[:-1])
+    specs = (configs[0].spec, *(one.spec for one in configs[:-1]))
+    methods = [
+        Method(
+            end=end,
+            spec=one.spec,
+            frames=one.episode.batch * one.episode.steps,
+            worlds=functools.partial(sample_worlds, one),
+            make_update=functools.partial(make_update, one, delta, begin),
+            note=functools.partial(flight_note, "loss"),
+            begin=functools.partial(_refitted, seen=seen, spec=one.spec),
+        )
+        for one, begin, end, seen in zip(configs, begins, ends, specs, strict=True)
+    ]
+    needs = [estimate(one) for one in configs]
+    whole = Estimate(sum(need.seconds for need in needs), max(need.memory_bytes for need in needs))
+    run = Run(config, config.seed, origin, folder, whole)
+    return train_in_folder(methods, run, start_state(configs[0], params), console, watch)
+
+
+def _refitted(state: TrainState, seen: PolicySpec, spec: PolicySpec) -> TrainState:
+    """Return the state of a policy trained with spec `seen` as that of one with `spec`."""
+    if seen == spec:
+        return state
+    return state._replace(params=network.fitted(state.params, seen, spec))
 
 
 def _digest(params: Mapping[str, Any] | None) -> str | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -62,20 +62,25 @@ class Watch(NamedTuple):
 
 
 class Method(NamedTuple):
-    """What is iterated. A state has the policy's `params` and the `iteration` to do next."""
+    """What one phase of a run iterates.
 
-    iterations: int
-    """How often."""
+    A state has the policy's `params` and the `iteration` to do next.
+    """
+
+    end: int
+    """The run's iterations when the phase is over; it begins where the one before it ends."""
+    spec: PolicySpec
+    """Of the policy during the phase."""
     frames: int
     """Steps of worlds in one iteration."""
-    estimate: Estimate
-    """What the whole run will need."""
     worlds: Callable[[int], Worlds]
     """The fresh worlds of an iteration."""
     make_update: Callable[[], Callable[[Any, Worlds], tuple[Any, dict[str, jax.Array]]]]
     """Called once: update(state, worlds) -> (state', numbers of the curve)."""
     note: Callable[[Mapping[str, float]], str]
     """A few words for people about a row of the curve."""
+    begin: Callable[[Any], Any] = lambda state: state
+    """What the phase makes of the state with which the one before it ends."""
 
 
 def flight_note(goal: str, row: Mapping[str, float]) -> str:
@@ -87,24 +92,24 @@ def flight_note(goal: str, row: Mapping[str, float]) -> str:
 
 
 class Run(NamedTuple):
-    """Where a run lives and what tells it from others."""
+    """Where a run lives and what distinguishes it from others."""
 
     config: Any
     """The resolved configuration, a dataclass."""
-    spec: PolicySpec
-    """Of the policy."""
     seed: int
     """Of the run."""
     origin: dict[str, Any]
     """What a folder's run must have been made from for it to be resumed, "config" among it."""
     folder: Path
     """Where it lives."""
+    estimate: Estimate
+    """What the whole run needs."""
 
 
 def train_in_folder(
-    method: Method, run: Run, fresh: Any, console: Console, watch: Watch | None = None
+    phases: Sequence[Method], run: Run, fresh: Any, console: Console, watch: Watch | None = None
 ) -> Outcome:
-    """Iterate a method's update from the folder's state, or the `fresh` one, to its end.
+    """Iterate the phases' updates from the folder's state, or the `fresh` one, to their end.
 
     Of several processes the first reads and writes the folder, and hands the others its state.
 
@@ -118,15 +123,14 @@ def train_in_folder(
         fresh = _resume(run, fresh)
     # Where the update leaves it: placed otherwise, the second step would compile it again.
     state = jax.device_put(hosts.from_the_first(fresh), jax.local_devices()[0])
-    done = int(state.iteration)
+    done, total = int(state.iteration), phases[-1].end
     if not hosts.writes():
-        state = _iterate(method, run, state, console, None) if done < method.iterations else state
-        return Outcome(folder / "policy", int(state.iteration), {})
-    if done < method.iterations or _is_missing(watch, folder, done, method.iterations):
-        announce(console, f"training to {folder}", method.estimate)
-        if done < method.iterations:
+        return Outcome(folder / "policy", int(_iterate(phases, run, state, console).iteration), {})
+    if done < total or _is_missing(watch, folder, done, total):
+        announce(console, f"training to {folder}", run.estimate)
+        if done < total:
             write_run_record(folder, run.config, run.seed, goes_on=done > 0)
-        state = _iterate(method, run, state, console, watch)
+        state = _iterate(phases, run, state, console, watch)
     rows = curve.read(folder)
     if not rows:
         raise ValueError(
@@ -138,59 +142,96 @@ def train_in_folder(
     return Outcome(folder / "policy", int(state.iteration), means)
 
 
-def _iterate(method: Method, run: Run, state: Any, console: Console, watch: Watch | None) -> Any:
-    total, first = method.iterations, int(state.iteration)
-    rows: list[dict[str, Any]] = []
-    watched: list[dict[str, Any]] = []
-    saved_at = time.monotonic()
-    update, worlds = method.make_update(), method.worlds(first)
+def _iterate(
+    phases: Sequence[Method], run: Run, state: Any, console: Console, watch: Watch | None = None
+) -> Any:
+    total, first, beginning = phases[-1].end, int(state.iteration), 0
+    with (
+        console.progress("training", total, begun=first) as show,
+        _Recorder(run, watch, total) as recorder,
+        ThreadPoolExecutor(1) as ahead,
+    ):
+        recorder.last = (next(method for method in phases if first <= method.end), state)
+        if _is_missing(watch, run.folder, first, total):
+            recorder.measure_if_due(state)
+        for method in phases:
+            if int(state.iteration) < method.end:
+                if int(state.iteration) == beginning:
+                    state = method.begin(state)
+                state = _iterate_phase(method, state, recorder, show, ahead)
+            beginning = method.end
+    return state
 
-    def save() -> None:
+
+def _iterate_phase(
+    method: Method,
+    state: Any,
+    recorder: _Recorder,
+    show: Callable[[int, str], None],
+    ahead: ThreadPoolExecutor,
+) -> Any:
+    first = int(state.iteration)
+    update, worlds = method.make_update(), method.worlds(first)
+    for iteration in range(first, method.end):
+        started = time.monotonic()
+        with _others_there(iteration, recorder.run.folder):
+            # The update waits for the devices: prepare the next worlds meanwhile.
+            following = ahead.submit(method.worlds, iteration + 1)
+            state, numbers = update(state, worlds)
+            worlds = following.result()
+            row = {key: float(value) for key, value in numbers.items()}
+        _check_finite(iteration, row, recorder.run.folder)
+        seconds = time.monotonic() - started
+        speed = method.frames / seconds
+        # A cold iteration compiles as well.
+        clock = {"seconds": round(seconds, 4), "cold": iteration == first}
+        row = {"iteration": iteration, **row, "steps_per_s": round(speed), **clock}
+        recorder.add(method, state, row)
+        show(iteration + 1, f"{method.note(row)}, {speed:.0f} steps/s")
+    return state
+
+
+class _Recorder:
+    """Writes a run's curve and checkpoints, from time to time and at the end."""
+
+    def __init__(self, run: Run, watch: Watch | None, total: int) -> None:
+        self.run, self.watch, self.total = run, watch, total
+        self.rows: list[dict[str, Any]] = []
+        self.watched: list[dict[str, Any]] = []
+        self.last: tuple[Method, Any] | None = None
+        self.saved_at = time.monotonic()
+
+    def __enter__(self) -> _Recorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.save()
+
+    def add(self, method: Method, state: Any, row: dict[str, Any]) -> None:
+        """Take a finite iteration's row and the state after it."""
+        # The row comes first: an interrupt between the two leaves one too many, which resuming
+        # cuts, and not one too few.
+        self.rows.append(row)
+        self.last = (method, state)
+        self.measure_if_due(state)
+        if time.monotonic() - self.saved_at > SAVE_PERIOD_S:
+            self.save()
+            self.saved_at = time.monotonic()
+
+    def measure_if_due(self, state: Any) -> None:
+        done = int(state.iteration)
+        if self.watch and _is_due(self.watch, done, self.total):
+            self.watched.append({"iteration": done, **self.watch.measure(state.params)})
+
+    def save(self) -> None:
         if not hosts.writes():
             return
-        curve.append(run.folder, rows)
-        if watched:
-            curve.append(run.folder, watched, curve.WATCHED)
-        rows.clear()
-        watched.clear()
-        _save(run, state)
-
-    def measure_if_due() -> None:
-        done = int(state.iteration)
-        if watch and _is_due(watch, done, total):
-            watched.append({"iteration": done, **watch.measure(state.params)})
-
-    try:
-        with (
-            console.progress("training", total, begun=first) as show,
-            ThreadPoolExecutor(1) as ahead,
-        ):
-            if _is_missing(watch, run.folder, first, total):
-                measure_if_due()
-            for iteration in range(first, total):
-                started = time.monotonic()
-                with _others_there(iteration, run.folder):
-                    # The update waits for the devices: prepare the next worlds meanwhile.
-                    following = ahead.submit(method.worlds, iteration + 1)
-                    after, numbers = update(state, worlds)
-                    worlds = following.result()
-                    row = {key: float(value) for key, value in numbers.items()}
-                _check_finite(iteration, row, run.folder)
-                seconds = time.monotonic() - started
-                speed = method.frames / seconds
-                # The row comes first: an interrupt between the two leaves one too many, which
-                # resuming cuts, and not one too few. A cold iteration compiles as well.
-                clock = {"seconds": round(seconds, 4), "cold": iteration == first}
-                rows.append({"iteration": iteration, **row, "steps_per_s": round(speed), **clock})
-                state = after
-                measure_if_due()
-                show(iteration + 1, f"{method.note(row)}, {speed:.0f} steps/s")
-                if time.monotonic() - saved_at > SAVE_PERIOD_S:
-                    save()
-                    saved_at = time.monotonic()
-    finally:
-        save()
-    return state
+        curve.append(self.run.folder, self.rows)
+        if self.watched:
+            curve.append(self.run.folder, self.watched, curve.WATCHED)
+        self.rows, self.watched = [], []
+        if self.last:
+            _save(self.run, *self.last)
 
 
 @contextmanager
@@ -230,14 +271,14 @@ def _check_finite(iteration: int, row: dict[str, float], folder: Path) -> None:
         )
 
 
-def _save(run: Run, state: Any) -> None:
+def _save(run: Run, method: Method, state: Any) -> None:
     described = {
         **run.origin,
         "iteration": int(state.iteration),
         "threads": threads(),
     }
     policy = run.folder / "policy"
-    save_policy(policy, state.params, run.spec, seed=run.seed, training=described)
+    save_policy(policy, state.params, method.spec, seed=run.seed, training=described)
     # The state comes last: what it says is done has its policy and its curve on the disk.
     save_arrays(
         run.folder / "state",

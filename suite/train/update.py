@@ -31,12 +31,19 @@ class TrainState(NamedTuple):
     """(B, hidden) recurrent states from random steps of the last rollout."""
 
 
-def make_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
-    """Return AdamW with warm-up, cosine decay and optional clipping by global norm."""
+def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTransformation:
+    """Return AdamW with warm-up, cosine decay and optional clipping by global norm.
+
+    Args:
+        config: of the run, or of one of its phases.
+        begin: gradient steps of the run before that phase. AdamW's moments are carried over.
+    """
     rate = optax.warmup_cosine_decay_schedule(
         0.0, config.rate, config.warmup, max(config.iterations, config.warmup + 1), RATE_END
     )
-    adamw = optax.adamw(rate, b2=config.memory, weight_decay=WEIGHT_DECAY)
+    adamw = optax.adamw(
+        lambda step: rate(step - begin), b2=config.memory, weight_decay=WEIGHT_DECAY
+    )
     if config.clip <= 0:
         return adamw
     return optax.chain(optax.clip_by_global_norm(config.clip), adamw)
@@ -56,13 +63,16 @@ def start_state(config: TrainConfig, params: network.Params | None = None) -> Tr
 
 
 def make_update(
-    config: TrainConfig, delta: delta_network.Params | None = None
+    config: TrainConfig, delta: delta_network.Params | None = None, begin: int = 0
 ) -> Callable[[TrainState, Worlds], tuple[TrainState, dict[str, jax.Array]]]:
     """Return update(state, worlds) -> (state', numbers of the curve), compiled on first call.
 
-    `delta` is a frozen Delta Action network whose correction is added to every action.
+    Args:
+        config: of the run, or of one of its phases.
+        delta: a frozen Delta Action network whose correction is added to every action.
+        begin: gradient steps of the run before that phase.
     """
-    optimizer, shards_of = make_optimizer(config.optimizer), make_shards(config, delta)
+    optimizer, shards_of = make_optimizer(config.optimizer, begin), make_shards(config, delta)
 
     @jax.jit
     def step(state: TrainState, shards: list[Shard]) -> tuple[TrainState, dict[str, jax.Array]]:

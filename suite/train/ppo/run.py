@@ -46,13 +46,13 @@ def train_ppo(
     shared = config.shared
     check(shared)
     method = Method(
-        iterations=config.iterations,
+        end=config.iterations,
+        spec=config.spec,
         frames=config.episode.batch * config.episode.steps,
-        estimate=estimate(config),
         worlds=lambda iteration: sample_worlds(shared, iteration),
         make_update=lambda: make_update(config),
         note=functools.partial(flight_note, "reward"),
     )
     origin = {"config": plain(config), "from": None, "delta": None, "method": "ppo"}
-    run = Run(config, config.spec, config.seed, origin, folder)
-    return train_in_folder(method, run, start_state(config), console, watch)
+    run = Run(config, config.seed, origin, folder, estimate(config))
+    return train_in_folder([method], run, start_state(config), console, watch)
