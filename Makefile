@@ -34,7 +34,7 @@ $(STAMP): requirements.lock pyproject.toml setup.py
 	@touch $(STAMP)
 
 race: $(STAMP)
-	$(VENV)/bin/suite loop --world examples/hidden.toml --policy racer --preset small --no-delta --workers $(JOBS) --out $(OUT)
+	$(VENV)/bin/suite loop --world examples/hidden.toml --policy race-paper --recipe quick --no-delta --workers $(JOBS) --out $(OUT)
 
 lint: style types
 

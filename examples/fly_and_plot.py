@@ -26,7 +26,7 @@ def main(folder: Path) -> None:
     trial = TrialSpec(track="zigzag", difficulty=0, seed=1)
     flights = []
     (result,) = fly(
-        load_policy("swift-30"),
+        load_policy("race"),
         [trial],
         load_vehicle("reference"),  # the vehicle of the tables; no training reads it
         options=JudgeOptions(workers=1),

@@ -47,7 +47,7 @@ TETHER = Effect(
 def main() -> None:
     """Register the effect, and fly with tethers of growing stiffness."""
     EFFECTS.register(TETHER.name, TETHER)
-    vehicle, policy = load_vehicle("reference"), load_policy("swift")
+    vehicle, policy = load_vehicle("reference"), load_policy("race")
     for stiffness in (0.0, 0.4):
         (result,) = fly(
             policy,

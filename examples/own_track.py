@@ -58,7 +58,7 @@ def main(folder: Path) -> None:
     write_picture(folder / "course.png", track)
     print(f"written: {path} and {folder / 'course.png'}")
     (result,) = fly(
-        load_policy("swift"),
+        load_policy("race"),
         [TrialSpec(str(path), difficulty=0, seed=0)],
         load_vehicle("reference"),
         options=JudgeOptions(workers=1),

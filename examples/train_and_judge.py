@@ -16,13 +16,13 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
 from policies.policy import load_policy
 from suite.common.console import Console
-from suite.train.presets import preset, with_iterations
+from suite.train.recipes import named_recipe, with_iterations
 from suite.train.run import train
 
 
 def main(folder: Path, iterations: int) -> None:
     """Train for `iterations` gradient steps into `folder`, and fly five tracks."""
-    config = with_iterations(preset("small"), iterations)
+    config = with_iterations(named_recipe("quick"), iterations)
     # Every setting is a field of a frozen dataclass; --set changes the same ones by name.
     config = replace(config, loss=replace(config.loss, progress=1.0), seed=3)
     train(config, folder, Console())

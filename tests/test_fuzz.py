@@ -30,7 +30,7 @@ from suite.judging.replay import read_evaluation
 from suite.judging.requests import Evaluation
 from suite.train.config import check
 from suite.train.overrides import override
-from suite.train.presets import preset, with_quadrotor
+from suite.train.recipes import named_recipe, with_quadrotor
 from tests.support import foreign_logs
 from tests.support.judged_cells import ROWS
 from tests.support.mutations import changes, mutated_bytes, mutated_json, mutated_toml
@@ -130,7 +130,7 @@ def foreign_reader(kind):
 
 def drawn_and_used(kind, folder):
     """Return the strategy of a kind of input, and what uses one."""
-    recipe = with_quadrotor(preset("swift"), load_vehicle("racer5"))
+    recipe = with_quadrotor(named_recipe("race"), load_vehicle("racer5"))
     odd = folder / "odd"
 
     def filed(read, name="odd"):
@@ -157,7 +157,7 @@ def drawn_and_used(kind, folder):
     if kind == "mapping":
         return mutated_toml(MAPPING), filed(read_map, "odd.toml")
     if kind == "checkpoint":
-        source = shipped.folder("racer")
+        source = shipped.folder("race-paper")
         (folder / "weights.safetensors").write_bytes((source / "weights.safetensors").read_bytes())
         config = json.loads((source / "config.json").read_text())
         return mutated_json(config), filed(lambda _: load_policy_checkpoint(folder), "config.json")

@@ -29,7 +29,7 @@ def refused(line, capsys):
 
 def checkpoint(folder):
     """Return a copy of a shipped policy."""
-    return Path(shutil.copytree(shipped.folder("racer"), folder / "policy"))
+    return Path(shutil.copytree(shipped.folder("race-paper"), folder / "policy"))
 
 
 READ = {
@@ -38,7 +38,7 @@ READ = {
     "model": ("it.onnx", "eval --policy it.onnx --trials 1"),
     "program": ("it.pt2", "eval --policy it.pt2 --trust --trials 1"),
     "script": ("it.pt", "eval --policy it.pt --trust --trials 1"),
-    "policy to start from": ("policy/weights.safetensors", "train --from policy"),
+    "policy to start from": ("policy/weights.safetensors", "train --init-from policy"),
     "policy to export": ("policy/config.json", "export policy"),
     "Delta Action Model": ("policy/weights.safetensors", "train --delta policy"),
     "vehicle": ("it.toml", "eval --vehicle it.toml --trials 1"),
@@ -120,10 +120,10 @@ def test_text_that_is_nested_long_or_damaged_is_refused(
 
 WRITERS = {
     "eval": "eval --trials 1",
-    "train": "train --preset small --iterations 1",
+    "train": "train --recipe quick --iterations 1",
     "collect": "collect --trials 1",
     "tracks": "tracks zigzag",
-    "export": "export racer --formats onnx",
+    "export": "export race-paper --formats onnx",
     "delta": f"delta {EXAMPLE}",
     "diagnose": f"diagnose {EXAMPLE} --vehicle reference",
     "loop": "loop",

@@ -1,8 +1,8 @@
 """What is left of a training's speed while another program keeps a core busy.
 
-    python tools/beside.py [ROUNDS] [PRESET]
+    python tools/beside.py [ROUNDS] [RECIPE]
 
-Iterations of a preset alone and beside a loop that does nothing, pinned to the last core, in turn.
+Iterations of a recipe alone and beside a loop that does nothing, pinned to the last core, in turn.
 Prints for every block the steps of worlds a second, the cores that the training got, and the steps
 of each second of a core: where this stays the same, the training lost what others took and no more.
 The column "others" says how much of the machine a third party had; such blocks are worth little.
@@ -37,14 +37,14 @@ def used_s(pid: int | None = None) -> float:
 
 
 def trainer(name: str) -> tuple[Callable[[], None], int]:
-    """Return a function that does one iteration of a preset, and the steps of worlds in it."""
+    """Return a function that does one iteration of a recipe, and the steps of worlds in it."""
     import jax
 
-    from suite.train.presets import preset
+    from suite.train.recipes import named_recipe
     from suite.train.update import make_update, start_state
     from suite.train.worlds import sample_worlds
 
-    config = preset(name)
+    config = named_recipe(name)
     update, number, first = make_update(config), 0, jax.devices()[0]
     state, worlds = jax.device_put(start_state(config), first), sample_worlds(config, 0)
 
@@ -63,7 +63,7 @@ def main() -> int:
     keep_compiled()
     set_threads()
     rounds = int(sys.argv[1]) if len(sys.argv) > 1 else 3
-    iterate, steps = trainer(sys.argv[2] if len(sys.argv) > 2 else "small")
+    iterate, steps = trainer(sys.argv[2] if len(sys.argv) > 2 else "quick")
     iterate()
     iterate()
     print("beside   steps/s   cores   steps a core second   others")

@@ -25,11 +25,9 @@ from typing import Any
 
 import numpy as np
 
-POLICIES = ("racer", "swift", "swift-quad", "swift-30", "swift-ahead", "swift-sure", "swift-keen",
-            "swift-small", "swift-tuned")  # fmt: skip
-RECIPES = ("racer", "swift", "swift-quad", "direct", "swift-30", "swift-ahead", "swift-sure",
-           "swift-keen", "paper")  # fmt: skip
-MJX_POLICIES = ("racer", "swift-keen")
+POLICIES = ("race", "race-small", "race-paper")
+RECIPES = ("race", "race-small", "race-paper", "paper")
+MJX_POLICIES = ("race-paper", "race")
 """MJX takes longer: two of them show that its arithmetic stays."""
 STAMPS = ("version", "commit", "git_commit", "schema", "created", "seconds", "out")
 """Keys that may differ between two versions of the code that compute the same."""
@@ -102,14 +100,14 @@ def training(work: Path) -> dict[str, str]:
     digests = {}
     for recipe in RECIPES:
         out = work / f"train-{recipe}"
-        suite("train", "--preset", recipe, "--iterations", "3", "--out", out,
+        suite("train", "--recipe", recipe, "--iterations", "3", "--out", out,
               "--set", "episode.batch=4")  # fmt: skip
         digests[f"training {recipe}"] = weights_digest(out / "policy")
     for model in ("point", "quad"):
         out = work / f"train-{model}"
         vehicle = ("--vehicle", "racer5") if model == "quad" else ()
         batch = ("--set", "episode.batch=8") if model == "quad" else ()
-        suite("train", "--preset", "small", "--iterations", "20", "--model", model, "--out", out,
+        suite("train", "--recipe", "quick", "--iterations", "20", "--model", model, "--out", out,
               *vehicle, *batch)  # fmt: skip
         digests[f"training {model}"] = weights_digest(out / "policy")
     return digests
@@ -118,12 +116,12 @@ def training(work: Path) -> dict[str, str]:
 def delta(work: Path) -> dict[str, str]:
     """Return digests of flights and of a Delta Action Model in each of the two dynamics."""
     flights = work / "flights"
-    suite("collect", "--policy", "racer", "--trials", "2", "--out", flights)
+    suite("collect", "--policy", "race-paper", "--trials", "2", "--out", flights)
     digests = {"flights": "".join(parquet_digest(f)[:8] for f in sorted(flights.glob("*.parquet")))}
     for model in ("point", "quad"):
         out = work / f"delta-{model}"
         vehicle = ("--vehicle", "racer5") if model == "quad" else ()
-        suite("delta", flights, "--model", model, *vehicle, "--preset", "small",
+        suite("delta", flights, "--model", model, *vehicle, "--recipe", "quick",
               "--iterations", "30", "--out", out)  # fmt: skip
         digests[f"delta {model}"] = weights_digest(out / "delta")
     return digests
@@ -146,7 +144,7 @@ def diagnosis(work: Path) -> dict[str, str]:
 def identified(work: Path) -> dict[str, str]:
     """Return digests of the vehicle that `suite identify` estimates from four flights."""
     flights, out = work / "identify-flights", work / "identified.toml"
-    suite("collect", "--policy", "racer", "--trials", "4", "--vehicle", "reference",
+    suite("collect", "--policy", "race-paper", "--trials", "4", "--vehicle", "reference",
           "--out", flights)  # fmt: skip
     suite("identify", *sorted(flights.glob("*.parquet")), "--vehicle", "racer5", "--out", out)
     lines = [line for line in out.read_text().splitlines() if not line.startswith("#")]

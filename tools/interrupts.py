@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 
-TRAIN = "train --preset small --iterations 203 --set episode.batch=16 episode.steps=30"
+TRAIN = "train --recipe quick --iterations 203 --set episode.batch=16 episode.steps=30"
 WITHIN_S = 5.0
 """A signal is answered in this time."""
 

@@ -24,12 +24,12 @@ from typing import Any
 EASY = "--track zigzag --difficulty 0"
 WORLDS = "episode.batch=8 episode.steps=30"
 COMMANDS = {
-    "train": f"train --preset small --iterations 60 --set {WORLDS}",
-    "eval": f"eval --policy racer --trials 12 {EASY}",
-    "collect": f"collect --policy racer --trials 12 {EASY}",
+    "train": f"train --recipe quick --iterations 60 --set {WORLDS}",
+    "eval": f"eval --policy race-paper --trials 12 {EASY}",
+    "collect": f"collect --policy race-paper --trials 12 {EASY}",
     "delta": "delta FLIGHTS --iterations 60",
     "diagnose": "diagnose suite/diagnose/example --vehicle suite/diagnose/example/vehicle.toml",
-    "loop": f"loop --preset small --iterations 6 --finetune-iterations 3 --fit-iterations 10 "
+    "loop": f"loop --recipe quick --iterations 6 --finetune-iterations 3 --fit-iterations 10 "
     f"--trials 2 --flights 2 {EASY} --set {WORLDS}",
 }
 """What is killed, without its --out; FLIGHTS is a folder of recorded ones."""

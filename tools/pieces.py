@@ -148,7 +148,7 @@ def sweep(count: int, args: argparse.Namespace) -> None:
     judging._fly_piece = piece
     vehicle, trial, clock = load_vehicle("reference"), TrialSpec("zigzag", 0, 0), Clock()
     fliers = (
-        judging.Flier("swift", replace(vehicle, mass=vehicle.mass + 1e-6 * k)) for k in range(count)
+        judging.Flier("race", replace(vehicle, mass=vehicle.mass + 1e-6 * k)) for k in range(count)
     )
     orders = {k: judging.Order(flier, [trial]) for k, flier in enumerate(fliers)}
     with tempfile.TemporaryDirectory() as folder:
@@ -167,10 +167,10 @@ def costs(count: int, args: argparse.Namespace) -> None:
     from suite.blind.cases import DRAWERS
     from suite.blind.run import by_command
     from suite.judging.content import PolicyContent
-    from suite.train.presets import preset, with_iterations
+    from suite.train.recipes import named_recipe, with_iterations
     from suite.train.run import train
 
-    content, clock = PolicyContent.of("swift"), Clock()
+    content, clock = PolicyContent.of("race"), Clock()
     task = Task(content(), load_vehicle("reference"), record=Record())
     list(fly_share(task, [(0, TrialSpec("zigzag", 0, 0))]))
     clock.say("a worker's start: imports, policy, first trial")
@@ -183,12 +183,12 @@ def costs(count: int, args: argparse.Namespace) -> None:
           f"{flight / MB:.3f} MB with its flight")  # fmt: skip
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        config = with_iterations(preset("swift"), 10)
+        config = with_iterations(named_recipe("race"), 10)
         train(config, folder / "run", Silent())
-        clock.say("a training of swift: start and 10 of 2,000 iterations")
+        clock.say("a training of race: start and 10 of 2,000 iterations")
         sizes = [path.stat().st_size for path in (folder / "run").rglob("*") if path.is_file()]
         print(f"  {sum(sizes) / MB:.1f} MB back")
-        train(with_iterations(preset("swift"), 30), folder / "longer", Silent())
+        train(with_iterations(named_recipe("race"), 30), folder / "longer", Silent())
         clock.say("the same with 30 iterations")
         case = next(iter(DRAWERS["mujoco"](0, 12).values()))
         built = build(case)

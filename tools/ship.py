@@ -85,7 +85,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("runs", type=Path, nargs="+", help="folders of suite train, in order")
     parser.add_argument("--eval", type=Path, help="folder of suite eval of the last run's policy")
-    parser.add_argument("--name", default="racer", help="the shipped policy's name")
+    parser.add_argument("--name", default="race-paper", help="the shipped policy's name")
     parser.add_argument("--speed", type=float, help="spec.speed, in the place of the run's own")
     parser.add_argument("--rays", type=int, help="spec.camera.rays, in the place of the run's own")
     options = parser.parse_args()

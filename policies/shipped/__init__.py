@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-DEFAULT = "swift-keen"
+DEFAULT = "race"
 """Name of the policy that is flown when none is given."""
 
 _HERE = Path(__file__).resolve().parent

@@ -20,7 +20,7 @@ class Config:
     """Flight logs, or folders of them, as `suite collect` writes them."""
     out: Path = Path("runs/delta")
     """Folder for the checkpoint delta/, delta.json and table.md."""
-    preset: str = "swift"
+    recipe: str = "race"
     """The training recipe whose point mass is corrected."""
     model: Literal["point", "quad"] = "point"
     """What is corrected: the point mass, or the quadrotor of --vehicle with its effects."""
@@ -45,11 +45,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Fit, and show the errors on held-out flights beside those of the plain point mass.
 
     Raises:
-        ValueError: for an unknown preset or logs that cannot be used.
+        ValueError: for an unknown recipe or logs that cannot be used.
     """
     from suite.delta.fit import FitConfig
     from suite.delta.run import errors, fit_delta, table
-    from suite.train.presets import chosen_model, preset
+    from suite.train.recipes import chosen_model, named_recipe
     from tracks.common.files import plain
 
     fitting = replace(
@@ -58,7 +58,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         iterations=config.iterations,
         seed=config.seed,
     )
-    recipe = chosen_model(preset(config.preset), config.model, config.vehicle)
+    recipe = chosen_model(named_recipe(config.recipe), config.model, config.vehicle)
     dynamics = recipe.quadrotor or recipe.physics
     result = fit_delta(fitting, dynamics, config.flights, config.out, console)
     console.say(table(result, fitting.horizon_s))

@@ -18,10 +18,9 @@ class Config:
     The same command again goes on where it was stopped.
     """
 
-    preset: str | None = None
-    """The recipe: swift, direct, swift-quad, swift-30, swift-ahead, swift-sure or swift-keen
-    (through quadrotors), racer, small, gpu or paper. By default that of the policy to start from,
-    or swift."""
+    recipe: str | None = None
+    """The recipe: race, race-small, race-paper, quick, gpu or paper. By default that of the policy
+    to start from, or race."""
     policy: str | None = None
     """Start from this policy instead of training one: a shipped name or a checkpoint's folder."""
     track: str = "all"
@@ -29,10 +28,10 @@ class Config:
     difficulty: str = "0,3"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials | None = None
-    """Trials of each policy on every track at every level; by default 50, or 20 with small; with
+    """Trials of each policy on every track at every level; by default 50, or 20 with quick; with
     --world 25, or 20."""
     flights: Trials | None = None
-    """Recorded flights on every track at every level; by default 20, or 8 with small; with --world
+    """Recorded flights on every track at every level; by default 20, or 8 with quick; with --world
     3."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
@@ -43,12 +42,12 @@ class Config:
     seed: Annotated[int, Range(0, SEED_MOST - 10**6)] = 0
     """Seed of the training and of the first trial; recorded flights begin 100,000 above."""
     iterations: Iterations | None = None
-    """Gradient steps of the training, instead of the preset's."""
+    """Gradient steps of the training, instead of the recipe's."""
     finetune_iterations: Iterations | None = None
     """Gradient steps of each fine-tuning; by default a quarter of the recipe's; with --world 60,
-    or 100 with small."""
+    or 100 with quick."""
     fit_iterations: Iterations | None = None
-    """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with small; with
+    """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with quick; with
     --world 200."""
     delta: bool = True
     """With --world: Delta Action Models as well, and fine-tunings under them, which take half the
@@ -77,11 +76,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """
     from suite.loop.config import resolve
     from suite.loop.run import run_loop
-    from suite.train.presets import fresh_start_note
 
     workers = asked_workers(config.workers, whole_cores=True)
     resolved = resolve(
-        recipe=config.preset,
+        recipe=config.recipe,
         world=config.world,
         policy=config.policy,
         track=config.track,
@@ -96,8 +94,4 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         delta=config.delta,
         changes=config.set,
     )
-    if resolved.policy is None and config.preset:
-        warning = fresh_start_note(config.preset, "--policy")
-        if warning:
-            console.note(warning)
     return run_loop(resolved, config.out, console, workers)

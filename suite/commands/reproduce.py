@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar, Union
 
@@ -12,7 +12,8 @@ import tyro
 
 from suite.common.console import Console
 from suite.common.work import WorkersOption, asked_workers
-from suite.experiments import EXPERIMENTS
+from suite.experiments import EXPERIMENTS, OVER_ALL
+from tracks.common.grid import rich_table
 
 Experiment = TypeVar("Experiment")
 
@@ -50,13 +51,17 @@ def config_type(args: Sequence[str]) -> Any:
     """
     kinds = [
         _options(name) if name in args else _summary(name, summary)
-        for name, summary in EXPERIMENTS.items()
+        for name, summary in {**EXPERIMENTS, **OVER_ALL}.items()
     ]
     asked = Config[Union[tuple(kinds)]]  # noqa: UP007  (made from the table)
     return Annotated[asked, tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes]
 
 
 def _options(name: str) -> Any:
+    if name in OVER_ALL:
+        from suite.experiments import published
+
+        return Annotated[getattr(published, name.capitalize()), tyro.conf.subcommand(name)]
     config = importlib.import_module(f"suite.experiments.{name}").Config
     return Annotated[config, tyro.conf.subcommand(name)]
 
@@ -76,6 +81,24 @@ def run(config: Config[Any], console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
     """
+    from suite.experiments import published
+
+    if isinstance(config.experiment, published.Status):
+        states = published.page_states(config.out)
+        console.show(rich_table(published.status_grid(states)))
+        return {"pages": states}
+    if isinstance(config.experiment, published.All):
+
+        def make(name: str, options: Sequence[str]) -> dict[str, Any]:
+            return _made(
+                replace(config, experiment=tyro.cli(_options(name), args=options)), console
+            )
+
+        return published.make_all(make, console)
+    return _made(config, console)
+
+
+def _made(config: Config[Any], console: Console) -> dict[str, Any]:
     from suite.experiments.pages.document import Place, check_page, write_document
     from suite.experiments.study.options import check
 

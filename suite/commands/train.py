@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -12,8 +12,8 @@ from suite.common.console import Console
 from suite.common.running.hosts import Joined, join, member
 from suite.common.work import Silent
 from suite.train.config import TrainConfig
-from suite.train.phases import changed, check_phases
-from suite.train.presets import chosen_model, fresh_start_note, preset, with_iterations
+from suite.train.overrides import changed, check_phases
+from suite.train.recipes import chosen_model, named_recipe, with_iterations
 from tracks.common.files import check_no_input, plain
 from tracks.input.ranges import Iterations, Seed
 
@@ -22,30 +22,30 @@ from tracks.input.ranges import Iterations, Seed
 class Config:
     """Train a policy; the same command again resumes where it was stopped."""
 
-    preset: str = "direct"
-    """The recipe: direct (through quadrotors from the first step), racer (through the point mass,
-    with the paper's 12 numbers), swift (with 18), swift-quad (with --from swift), swift-30 (with
-    --from swift-quad), swift-ahead (with --from swift-30), swift-sure or swift-keen (with
-    --from swift-ahead), small, gpu or paper."""
+    recipe: str = "race"
+    """The settings: race (the default policy's, through quadrotors, two hours on one core),
+    race-small (the same for a small network), race-paper (the paper's 12 numbers, through the point
+    mass), quick (minutes), paper (as printed) or gpu."""
     model: Literal["point", "quad"] | None = None
     """What flies in training: the point mass, or the quadrotor of --vehicle with its effects; the
     recipe's own if not given."""
     vehicle: str | None = None
     """What the training's quadrotors are drawn around: a shipped vehicle's name or a vehicle file
-    (.toml); with --model quad, or with a preset that trains through quadrotors."""
+    (.toml); with --model quad, or with a recipe that trains through quadrotors."""
     out: Path = Path("runs/train")
     """Folder of the run; a run that stands there is resumed."""
     seed: Seed = 0
     """Seed of the parameters, the tracks and the randomisation."""
     iterations: Iterations | None = None
-    """Gradient steps, instead of the preset's."""
-    from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Gradient steps, instead of the recipe's."""
+    init_from: str | None = None
     """Start from this policy instead of fresh parameters: a checkpoint's folder or a shipped
     policy's name."""
     delta: Path | None = None
     """Train under this frozen Delta Action Model (a checkpoint of `suite delta`)."""
     set: tuple[str, ...] = ()
-    """Change settings by name, such as loss.progress=0.4 episode.batch=128."""
+    """Change settings by name, in every phase, such as loss.progress=0.4; in the second phase
+    alone: phases.2.loss.progress=0.4."""
     joined: tyro.conf.OmitArgPrefixes[Joined] = Joined()
     """Several processes, for devices of several hosts."""
     json: bool = False
@@ -61,10 +61,10 @@ def resolve(config: Config) -> TrainConfig:
     """Return the run that the options ask for.
 
     Raises:
-        ValueError: for an unknown preset, setting or vehicle, or a vehicle without its model,
+        ValueError: for an unknown recipe, setting or vehicle, or a vehicle without its model,
             naming what is allowed.
     """
-    run = replace(preset(config.preset), seed=config.seed)
+    run = replace(named_recipe(config.recipe), seed=config.seed)
     run = chosen_model(run, config.model, config.vehicle)
     if config.iterations is not None:
         run = with_iterations(run, config.iterations)
@@ -93,14 +93,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.train.run import started_from, train
 
     resolved = resolve(config)
-    if config.from_ is None and (warning := fresh_start_note(config.preset, "--from")):
-        console.note(warning)
     params, delta = None, None
-    if config.from_ is not None:
+    if config.init_from is not None:
         # What is trained is written to out/policy, which nothing there may yet say is another run.
-        start, trained = locate(config.from_) / CONFIG, config.out / "policy" / CONFIG
+        start, trained = locate(config.init_from) / CONFIG, config.out / "policy" / CONFIG
         check_no_input(trained, [start], "--out")
-        params = started_from(config.from_, resolved.spec)
+        params = started_from(config.init_from, resolved.spec)
     if config.delta is not None:
         stored = load_delta(config.delta)
         dynamics = resolved.quadrotor or resolved.physics

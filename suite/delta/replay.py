@@ -160,8 +160,8 @@ def check_corrects(
         )
     raise ValueError(
         f"--delta {where} corrects a point mass with {_words(plant)}, and this run's has "
-        f"{_words(mine['plant'])}; take the --preset it was fitted to, or fit again with suite "
-        "delta --preset"
+        f"{_words(mine['plant'])}; take the --recipe it was fitted to, or fit again with suite "
+        "delta --recipe"
     )
 
 

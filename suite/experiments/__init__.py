@@ -18,3 +18,8 @@ EXPERIMENTS: dict[str, str] = {
     "worlds": "the shipped policies on the same trials in every world",
 }
 """Name -> one-line summary; NAME lives in suite/experiments/NAME.py."""
+OVER_ALL: dict[str, str] = {
+    "all": "every published page, in order; finished parts are not done again",
+    "status": "the published pages, and which policy or code is newer than a page",
+}
+"""What is done with all of them, in suite/experiments/published.py."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from suite.experiments.pages import paper
 from suite.experiments.pages.document import Made, Place
 from suite.experiments.study import options, training
 from suite.experiments.study.summary import Summary, summaries
-from suite.train.overrides import check_owned
+from suite.train.overrides import check_owned, in_every_phase
 from tracks.common.grid import Grid, table
 
 PROGRESS = (0.4, 0.8, 1.6, 3.2)
@@ -95,7 +95,7 @@ def settings(config: Config) -> list[training.Row]:
     """Return the rows that are asked for, in the paper's order.
 
     Raises:
-        ValueError: for a preset, a change or a row that does not exist.
+        ValueError: for a recipe, a change or a row that does not exist.
     """
     fixed = ("progress_norm", "projection")
     check_owned(config.set, {f"loss.{name}": "it is compared" for name in fixed})
@@ -103,9 +103,7 @@ def settings(config: Config) -> list[training.Row]:
 
     def row(key: str, words: str, weight: float, **changes: float) -> training.Row:
         weights = {"progress": weight, "progress_norm": 0.0, **changes}
-        return training.Row(
-            f"{key} {weight:g}", words, replace(base, loss=replace(base.loss, **weights))
-        )
+        return training.Row(f"{key} {weight:g}", words, in_every_phase(base, "loss", **weights))
 
     weights = sorted({float(f"{weight:g}") for weight in (*PROGRESS, base.loss.progress)})
     rows = [row("field", "with the field, L_p", w) for w in weights]

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import tyro
 
 from eval.judging.statistics import Interval, wilson
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -50,14 +49,14 @@ class Config:
     Every training seed flies its share of the trials, the same share in all settings.
     """
 
-    preset: str = "swift-quad"
+    recipe: str = "race"
     """The recipe."""
-    from_: Annotated[str | None, tyro.conf.arg(name="from")] = "swift"
+    init_from: str | None = "race-paper"
     """All are trained on from this shipped name or checkpoint's folder; None: from nothing."""
     set: tuple[str, ...] = ()
     """Change settings of the recipe by name."""
     iterations: Iterations | None = 200
-    """Gradient steps; None: the preset's."""
+    """Gradient steps; None: the recipe's."""
     without: tuple[str, ...] = ()
     """Only these spreads are left out one by one, by name; by default each that the recipe has."""
     training_seeds: tuple[Seed, ...] = (0, 1, 2)
@@ -88,7 +87,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
             f"shared among {len(seeds)} --training-seeds; give more trials or fewer seeds"
         )
     runs = training.trained(
-        training.Study(rows, seeds, may_diverge=False, start=config.from_),
+        training.Study(rows, seeds, may_diverge=False, start=config.init_from),
         place.cache, console, place.workers,
     )  # fmt: skip
     shares = {seed: trials[part :: len(seeds)] for part, seed in enumerate(seeds)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -13,7 +13,7 @@ from suite.common.report import Picture
 from suite.experiments.pages.document import Made, Place
 from suite.experiments.study import options, training
 from suite.experiments.study.summary import METRICS, Summary, summaries
-from suite.train.overrides import check_owned
+from suite.train.overrides import check_owned, in_every_phase
 from suite.train.ppo.config import ppo_like
 from tracks.common.grid import Grid, table
 from tracks.input.ranges import Iterations, Range, Trials
@@ -94,17 +94,16 @@ def schemes(config: Config) -> list[training.Row]:
     """Return the schemes that are asked for, in the paper's order.
 
     Raises:
-        ValueError: for a preset, a change or a scheme that does not exist, and for worlds that PPO
+        ValueError: for a recipe, a change or a scheme that does not exist, and for worlds that PPO
             cannot share among its minibatches.
     """
     compared = ("progress_norm", "projection", "projection_decay")
     owned = {f"loss.{name}": "it is compared" for name in compared}
     check_owned(config.set, {"loss.progress": "give --progress", **owned})
     base = options.four_gate_recipe(config)
-    loss = replace(base.loss, progress=config.progress, progress_norm=0.0, projection=0.0)
-    ours = replace(base, loss=loss)
-    scalar = replace(loss, field_gain=0.0, projection=PROJECTION, projection_decay=PROJECTION_DECAY)
-    bare = replace(base, loss=scalar)
+    ours = in_every_phase(base, "loss", progress=config.progress, progress_norm=0.0, projection=0.0)
+    scalar = {"projection": PROJECTION, "projection_decay": PROJECTION_DECAY}
+    bare = in_every_phase(ours, "loss", field_gain=0.0, **scalar)
     ppo = ppo_like(ours, config.ppo_iterations or ours.optimizer.iterations)
     rows = [
         training.Row("ppo", "PPO", ppo),

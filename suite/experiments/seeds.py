@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import tyro
 
 from eval.judging.tables import Tally
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -37,13 +36,13 @@ class Config:
     policies: tuple[str, ...] = ()
     """Policies of one recipe, one a training seed: run folders of `suite train`, checkpoints'
     folders, or names."""
-    preset: str = "direct"
+    recipe: str = "race"
     """Without --policies: the recipe."""
     set: tuple[str, ...] = ()
     """Without --policies: change settings of the recipe by name."""
     iterations: Iterations | None = None
-    """Without --policies: gradient steps, instead of the preset's."""
-    from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Without --policies: gradient steps, instead of the recipe's."""
+    init_from: str | None = None
     """Without --policies: all are trained on from this shipped name or checkpoint's folder."""
     training_seeds: tuple[Seed, ...] = (0, 1, 2, 3, 4)
     """Without --policies: the seeds that are trained."""
@@ -111,7 +110,9 @@ def _policies(config: Config, place: Place, console: Console) -> dict[str, str]:
     """Return the policies by what the tables call them; missing ones are trained."""
     if not config.policies:
         row = training.Row("recipe", "the recipe", options.asked_recipe(config))
-        study = training.Study([row], config.training_seeds, may_diverge=False, start=config.from_)
+        study = training.Study(
+            [row], config.training_seeds, may_diverge=False, start=config.init_from
+        )
         runs = training.trained(study, place.cache, console, place.workers)
         return {f"seed {run.seed}": run.policy for run in runs}
     inside = [Path(path, "policy") for path in config.policies]

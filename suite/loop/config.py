@@ -11,12 +11,12 @@ from policies import shipped
 from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
 from suite.train.config import TrainConfig, check
-from suite.train.overrides import check_owned, override
-from suite.train.presets import (
-    PRESETS,
+from suite.train.overrides import changed, check_owned, check_phases, override, phase_configs
+from suite.train.recipes import (
+    RECIPES,
     at_rate,
     finetune,
-    preset,
+    named_recipe,
     with_iterations,
     with_quadrotor,
 )
@@ -45,9 +45,9 @@ class LoopSize:
     """Gradient steps of each fine-tuning; None: a share of the training's."""
 
 
-SIZES = {"small": LoopSize(20, 8, 500), "": LoopSize(50, 20, 1500)}
+SIZES = {"quick": LoopSize(20, 8, 500), "": LoopSize(50, 20, 1500)}
 """Sizes by recipe; "" is that of the others."""
-HIDDEN_SIZES = {"small": LoopSize(20, 3, 200, 100), "": LoopSize(25, 3, 200, 60)}
+HIDDEN_SIZES = {"quick": LoopSize(20, 3, 200, 100), "": LoopSize(25, 3, 200, 60)}
 """The same of a loop in a world with a hidden effect, as docs/results/hidden_worlds.md shows it."""
 
 
@@ -148,8 +148,8 @@ def loop_by_content(config: LoopConfig) -> LoopConfig:
 
 
 def recipe_of(policy: str | None) -> str:
-    """Return the recipe that a policy is fine-tuned by: the shipped one's own, else `swift`."""
-    return policy if policy in PRESETS else "swift"
+    """Return the recipe that a policy is fine-tuned by: the shipped one's own, else `race`."""
+    return policy if policy in RECIPES else "race"
 
 
 def resolve(
@@ -187,7 +187,7 @@ def resolve(
     if world is not None and policy is None:
         policy = default_policy()
     recipe = recipe_of(policy) if recipe is None else recipe
-    training, simulator = replace(preset(recipe), seed=seed), OWN[0]
+    training, simulator = replace(named_recipe(recipe), seed=seed), OWN[0]
     sizes = SIZES if world is None else HIDDEN_SIZES
     size = sizes.get(recipe, sizes[""])
     if iterations is not None:
@@ -203,8 +203,8 @@ def resolve(
             "fitted; leave one of the two out"
         )
     if world is None and policy is None:
-        training = override(training, changes)
-        check(training)
+        training = changed(training, changes)
+        check_phases(training)
     if world is not None:
         refuse_own_motion(simulated)
         simulator, world = parse_world(world, vehicle)
@@ -218,7 +218,8 @@ def resolve(
         digests["world"] = digest_of(true)
     if policy is not None:
         given = load_policy_checkpoint(checkpoint_folder(policy))
-        training = replace(at_rate(training, given.spec.rate_hz), spec=given.spec)
+        last = phase_configs(training)[-1]
+        training = replace(at_rate(last, given.spec.rate_hz), spec=given.spec)
         digests["policy"] = policy_digest(policy)
     tuning = finetune(training)
     longer = size.finetune_iterations if finetune_iterations is None else finetune_iterations

@@ -18,7 +18,7 @@ COM_STD_MOST, TRIM_STD_MOST = 0.02, 0.2
 class PointMassConfig:
     """The simulator's dynamics and their randomisation, drawn per world.
 
-    The model is that of Zhang et al. 2025 (the preset `paper` has its numbers), with lag, drag and
+    The model is that of Zhang et al. 2025 (the recipe `paper` has its numbers), with lag, drag and
     delay drawn from wider ranges.
     """
 
@@ -92,7 +92,7 @@ class QuadrotorConfig:
 class LossConfig:
     """Weights of the losses of Su et al. 2026, Sec. III-C3, and the strength of the field.
 
-    The defaults race best on two cores; the preset `paper` has the printed ones.
+    The defaults race best on two cores; the recipe `paper` has the printed ones.
     """
 
     clearance: Annotated[float, Range(0.0, 1e6)] = 3.0

@@ -1,4 +1,9 @@
-"""Settings of a run changed by name: `loss.progress=1.2`."""
+"""Settings of a run changed by name, `loss.progress=1.2`: by a user, and by the run's own phases.
+
+A phase's settings are those of the phase before with its own changes made, so that a schedule reads
+as a list of differences. A user's change holds in every phase; `phases.2.loss.progress=2` begins
+with the second phase.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +11,10 @@ import ast
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping
-from typing import TypeVar, get_args, get_type_hints
+from dataclasses import replace
+from typing import Any, TypeVar, get_args, get_type_hints
 
+from suite.train.config import Phase, TrainConfig, check
 from tracks.common.names import unknown_name
 from tracks.input.ranges import check_ranges, is_finite, shown
 
@@ -22,6 +29,8 @@ NEEDS = {
     "episode.stop_from": "episode.rest_share",
 }
 """Settings that do nothing where another is 0 or False."""
+PREFIX = "phases."
+"""What a change of one phase begins with."""
 
 
 def override(config: T, changes: Iterable[str]) -> T:
@@ -48,7 +57,7 @@ def _check_heard(config: object, path: str, change: str) -> None:
     """Refuse a setting that another one keeps from doing anything."""
     for name, need in NEEDS.items():
         part, _, field = need.partition(".")
-        if _is_within(path, name):
+        if is_within(path, name):
             value = getattr(getattr(config, part, None), field, None)
             if value is not None and not value:
                 raise ValueError(
@@ -57,7 +66,7 @@ def _check_heard(config: object, path: str, change: str) -> None:
                 )
 
 
-def _is_within(path: str, part: str) -> bool:
+def is_within(path: str, part: str) -> bool:
     """Say whether a setting's path is that of `part`, or of something below it."""
     return path == part or path.startswith(f"{part}.")
 
@@ -86,7 +95,7 @@ def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = 
     for change in changes:
         path = change.partition("=")[0].strip()
         for mine, words in owned.items():
-            if _is_within(path, mine):
+            if is_within(path, mine):
                 raise ValueError(f"{option} {shown(change)}: this command sets {path}; {words}")
 
 
@@ -100,7 +109,7 @@ def _changed(config: T, path: list[str], text: str, change: str) -> T:
     old = getattr(config, name)
     if rest and old is None and name == "quadrotor":
         raise ValueError(
-            f"--set {change}: this run has no quadrotor; take a preset that trains through "
+            f"--set {change}: this run has no quadrotor; take a recipe that trains through "
             "quadrotors (suite train: or add --model quad and --vehicle)"
         )
     if rest:
@@ -134,3 +143,109 @@ def _value(old: object, text: str, change: str) -> object:
             f"({type(old).__name__})"
         )
     return value
+
+
+def phase_ends(config: TrainConfig) -> tuple[int, ...]:
+    """Return how many gradient steps of the run are done at the end of each phase."""
+    total, done = config.optimizer.iterations, 0.0
+    ends = []
+    for phase in config.phases or (Phase(),):
+        done += phase.share
+        ends.append(min(total, round(done * total)))
+    return tuple(ends)
+
+
+def phase_configs(config: TrainConfig) -> tuple[TrainConfig, ...]:
+    """Return the settings of each phase, as runs of one phase with as many gradient steps.
+
+    Raises:
+        ValueError: for a change that cannot be made, naming the phase.
+    """
+    now, configs, begun = replace(config, phases=()), [], 0
+    phases = config.phases or (Phase(),)
+    for number, (phase, end) in enumerate(zip(phases, phase_ends(config), strict=True), 1):
+        try:
+            now = override(now, phase.set)
+        except ValueError as error:
+            raise ValueError(f"phase {number}: {error}") from error
+        optimizer = replace(now.optimizer, iterations=max(1, end - begun))
+        configs.append(replace(now, optimizer=optimizer))
+        begun = end
+    return tuple(configs)
+
+
+def check_phases(config: TrainConfig) -> None:
+    """Refuse a run with a phase that cannot be trained, before anything is compiled or written.
+
+    Raises:
+        ValueError: naming the setting, its value and what is allowed.
+    """
+    check(config)
+    total = math.fsum(phase.share for phase in config.phases)
+    if config.phases and not math.isclose(total, 1.0, abs_tol=1e-6):
+        raise ValueError(f"the shares of phases add up to {total:g}, allowed is 1")
+    for number, one in enumerate(phase_configs(config), 1):
+        check(one)
+        for key, value in _in_common(one, config).items():
+            if value != _in_common(config, config)[key]:
+                raise ValueError(
+                    f"phase {number} changes {key}, which a whole run has in common (of spec, "
+                    "rate_hz and speed may change); set it without a phase"
+                )
+
+
+def _in_common(config: TrainConfig, run: TrainConfig) -> dict[str, object]:
+    """Return the settings that must be the same in all phases of a run."""
+    spec = replace(config.spec, rate_hz=run.spec.rate_hz, speed=run.spec.speed)
+    episode = config.episode
+    return {"spec": spec, "episode.batch": episode.batch, "episode.shards": episode.shards,
+            "seed": config.seed}  # fmt: skip
+
+
+def changed(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
+    """Return a run with a user's changes made: SETTING=VALUE in every phase, or in one alone.
+
+    Args:
+        config: the run.
+        changes: such as "loss.progress=0.4", or "phases.2.loss.progress=0.4" for its second phase.
+
+    Raises:
+        ValueError: naming the setting, what is wrong with it and what is allowed.
+    """
+    everywhere, phases = [], list(config.phases)
+    for change in changes:
+        if not change.startswith(PREFIX):
+            everywhere.append(change)
+            continue
+        number, _, rest = change.removeprefix(PREFIX).partition(".")
+        if not (number.isdecimal() and 1 <= int(number) <= len(phases)):
+            raise ValueError(
+                f"--set {shown(change)}: this run has {len(phases)} phases; write phases.N.SETTING="
+                "VALUE with N from 1"
+            )
+        phase = phases[int(number) - 1]
+        phases[int(number) - 1] = replace(phase, set=(*phase.set, rest))
+    paths = {change.partition("=")[0].strip() for change in everywhere}
+    return override(_dropping(replace(config, phases=tuple(phases)), paths), everywhere)
+
+
+def in_every_phase(config: TrainConfig, part: str, **values: Any) -> TrainConfig:
+    """Return a run in which settings of a part, such as "loss", have the same values always."""
+    config = _dropping(config, {f"{part}.{name}" for name in values})
+    return replace(config, **{part: replace(getattr(config, part), **values)})
+
+
+def without_quadrotor(config: TrainConfig) -> TrainConfig:
+    """Return a run through the point mass in the place of quadrotors."""
+    return replace(_dropping(config, {"quadrotor"}), quadrotor=None)
+
+
+def _dropping(config: TrainConfig, paths: Iterable[str]) -> TrainConfig:
+    """Return a run whose phases do not change the settings at or below `paths`."""
+    gone = tuple(paths)
+
+    def stays(change: str) -> bool:
+        return not any(is_within(change.partition("=")[0], path) for path in gone)
+
+    kept = (replace(p, set=tuple(filter(stays, p.set))) for p in config.phases)
+    return replace(config, phases=tuple(kept))

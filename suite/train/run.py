@@ -22,7 +22,7 @@ from suite.common.console import Console
 from suite.common.running import hosts
 from suite.common.stages import Estimate
 from suite.train.config import TrainConfig
-from suite.train.phases import check_phases, phase_configs, phase_ends
+from suite.train.overrides import check_phases, phase_configs, phase_ends
 from suite.train.shards import check_processes
 from suite.train.training_loop import Method, Outcome, Run, Watch, flight_note, train_in_folder
 from suite.train.update import TrainState, make_update, start_state
@@ -53,11 +53,15 @@ def estimate(
         passes: how often an iteration goes through its steps.
         images: how many copies of its images are held at once.
     """
-    frames = config.episode.batch * config.episode.steps
     pixels = config.spec.camera.height * config.spec.camera.width
     cores = usable_cores() if jax.default_backend() == "cpu" else 50
-    seconds = compile_s + config.optimizer.iterations * frames * passes / (steps_per_core_s * cores)
-    floats = frames * (images * pixels + 24 * config.spec.hidden_size)
+    seconds, most = 0.0, 0
+    for phase in phase_configs(config):
+        frames = phase.episode.batch * phase.episode.steps
+        steps = phase.optimizer.iterations * frames * passes
+        seconds += compile_s + steps / (steps_per_core_s * cores)
+        most = max(most, frames)
+    floats = most * (images * pixels + 24 * config.spec.hidden_size)
     return Estimate(seconds, 8e8 + floats * 4.0)
 
 
@@ -74,7 +78,7 @@ def started_from(policy: str, spec: PolicySpec) -> network.Params:
     from policies.formats.policy_file import load_policy_checkpoint
     from suite.judging.flying import checkpoint_folder
 
-    start = load_policy_checkpoint(checkpoint_folder(policy, "--from"))
+    start = load_policy_checkpoint(checkpoint_folder(policy, "--init-from"))
     return network.fitted(jax.tree.map(jnp.asarray, start.params), start.spec, spec)
 
 
@@ -104,7 +108,7 @@ def train(
     check_phases(config)
     check_processes(config)
     origin = {"config": plain(config), "from": _digest(params), "delta": _digest(delta)}
-    hosts.agree({"the configuration": origin["config"], "--from": origin["from"],
+    hosts.agree({"the configuration": origin["config"], "--init-from": origin["from"],
                  "--delta": origin["delta"], "threads": threads() > 1})  # fmt: skip
     configs, ends = phase_configs(config), phase_ends(config)
     begins = (0, *ends[:-1])
@@ -121,9 +125,7 @@ def train(
         )
         for one, begin, end, seen in zip(configs, begins, ends, specs, strict=True)
     ]
-    needs = [estimate(one) for one in configs]
-    whole = Estimate(sum(need.seconds for need in needs), max(need.memory_bytes for need in needs))
-    run = Run(config, config.seed, origin, folder, whole)
+    run = Run(config, config.seed, origin, folder, estimate(config))
     return train_in_folder(methods, run, start_state(configs[0], params), console, watch)
 
 

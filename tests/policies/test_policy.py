@@ -13,21 +13,21 @@ from policies.spec import PolicyError
 
 @pytest.fixture
 def shelf(tmp_path, checkpoint, monkeypatch):
-    """A shelf of shipped policies that holds one, "racer"."""
-    shutil.copytree(checkpoint, tmp_path / "racer")
+    """A shelf of shipped policies that holds one, "race-paper"."""
+    shutil.copytree(checkpoint, tmp_path / "race-paper")
     monkeypatch.setattr(shipped, "_HERE", tmp_path)
 
 
 def test_a_shipped_policy_is_found_by_name(shelf):
-    assert shipped.names() == ["racer"]
-    assert load_policy("racer").name == "racer"
+    assert shipped.names() == ["race-paper"]
+    assert load_policy("race-paper").name == "race-paper"
     with pytest.raises(KeyError):
         shipped.folder("../racer")
 
 
 def test_an_unknown_name_is_told_the_nearest(shelf):
-    with pytest.raises(PolicyError, match="unknown policy 'racr'. Did you mean 'racer'"):
-        load_policy("racr")
+    with pytest.raises(PolicyError, match="unknown policy 'race-papr'. Did you mean 'race-paper'"):
+        load_policy("race-papr")
 
 
 def test_a_missing_file_is_told_the_nearest_beside(exported):

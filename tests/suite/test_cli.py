@@ -183,8 +183,8 @@ def test_a_reader_that_leaves_ends_the_program_quietly(args):
 def test_options_of_one_value_each_may_be_given_again():
     _, config = cli.parse("reproduce", ["worlds", "--world", "mjx", "--world", "rotorpy"])
     assert config.experiment.world == ("mjx", "rotorpy")
-    _, config = cli.parse("eval", ["--policy", "swift", "--policy", "racer"])
-    assert config.flown.policies == ("swift", "racer")
+    _, config = cli.parse("eval", ["--policy", "race", "--policy", "race-paper"])
+    assert config.flown.policies == ("race", "race-paper")
 
 
 def test_info_says_versions_devices_and_machine(capfd):
@@ -211,7 +211,7 @@ HUGE = "9" * 400
         f"eval --seed {HUGE}",
         f"eval --trials {HUGE}",
         "collect --seed 9223372036854775808",
-        "view racer --count 0",
+        "view race-paper --count 0",
         f"tracks zigzag --seed {HUGE}",
         "import nothing.csv --rate nan",
         "tracks zigzag --seed -1",
@@ -223,8 +223,8 @@ HUGE = "9" * 400
         "blind make --count -1",
         "loop --trials 1000000000000000000",
         f"loop --seed {HUGE}",
-        "bench train --policy swift",
-        "bench --policy swift",
+        "bench train --policy race",
+        "bench --policy race",
         "reproduce table2 --trials 0",
         "reproduce schemes --seconds nan",
         f"train --iterations {HUGE}",
@@ -253,7 +253,7 @@ HUGE = "9" * 400
         "train --set episode.shards=0",
         "train --set episode.shards=1 --set seed=2",
         "eval --trials 1 --trials 2",
-        "export --policy swift --policy racer",
+        "export --policy race --policy race-paper",
         "train --set episode.batch=10000000000",
         f"train --set episode.steps={'(' * 300}",
         f"train --set {'x' * 5000}",

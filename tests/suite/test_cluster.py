@@ -29,7 +29,7 @@ FILES = ("table.md", "trials.parquet")
 def flown(tmp_path_factory):
     """The policy by path, and its table as one process makes it."""
     folder = tmp_path_factory.mktemp("flown")
-    shutil.copytree(shipped.folder("racer"), folder / "mine")
+    shutil.copytree(shipped.folder("race-paper"), folder / "mine")
     args = ["eval", "--policy", str(folder / "mine"), *TRIALS]
     assert cli.main([*args, "--workers", "1", "--out", str(folder / "one")]) == 0
     return args, folder / "one"
@@ -118,9 +118,11 @@ def test_trainings_come_back_as_this_machine_would_have_made_them(tmp_path, monk
     from dataclasses import replace
 
     from suite.train.overrides import override
-    from suite.train.presets import preset, with_iterations
+    from suite.train.recipes import named_recipe, with_iterations
 
-    recipe = override(with_iterations(preset("small"), 2), ("episode.batch=4", "episode.steps=4"))
+    recipe = override(
+        with_iterations(named_recipe("quick"), 2), ("episode.batch=4", "episode.steps=4")
+    )
     configs = [replace(recipe, seed=seed) for seed in (0, 1)]
     here = [Job(config, tmp_path / "here" / str(config.seed)) for config in configs]
     there = [Job(config, tmp_path / "there" / str(config.seed)) for config in configs]
@@ -137,9 +139,9 @@ def test_trainings_come_back_as_this_machine_would_have_made_them(tmp_path, monk
 @pytest.mark.parametrize(
     "command",
     [
-        "collect --policy racer --track zigzag --difficulty 0 --trials 6",
-        "reproduce seeds --policies racer swift --trials 2",
-        "loop --preset small --iterations 4 --finetune-iterations 2 --fit-iterations 4 --trials 2 "
+        "collect --policy race-paper --track zigzag --difficulty 0 --trials 6",
+        "reproduce seeds --policies race-paper race --trials 2",
+        "loop --recipe quick --iterations 4 --finetune-iterations 2 --fit-iterations 4 --trials 2 "
         "--flights 2 --track zigzag --difficulty 0 --set episode.batch=4 episode.steps=20",
         "blind make --simulator continuous --seed 5 --count 2",
     ],

@@ -153,7 +153,7 @@ def test_a_platform_that_is_not_there_is_one_line(monkeypatch):
 def test_jax_says_of_a_missing_platform_what_we_expect(root, tmp_path):
     """The words are JAX's own: a new version may choose others."""
     env = {"JAX_PLATFORMS": "rocm", "XDG_CACHE_HOME": str(tmp_path)}
-    done = suite(root, ["train", "--preset", "small", "--iterations", "1", "--out", "out"], env,
+    done = suite(root, ["train", "--recipe", "quick", "--iterations", "1", "--out", "out"], env,
                  cwd=tmp_path)  # fmt: skip
     assert done.returncode == 2 and len(done.stderr.splitlines()) <= 2, done.stderr
     assert b"JAX_PLATFORMS is 'rocm'" in done.stderr

@@ -47,7 +47,7 @@ class Small:
 
         return self._fly(policy, trials, vehicle, world, options, keep, *rest, **more)
 
-    def make_update(self, config, delta=None):
+    def make_update(self, config, delta=None, begin=0):
         numbers = {"loss": 1.0, "gates": 2.0, "collided": 0.5, "speed": 3.0}
 
         def update(state, worlds):

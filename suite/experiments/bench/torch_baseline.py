@@ -1,7 +1,7 @@
 """The trainer's method as a plain torch-eager loop: the baseline of `suite bench train`.
 
-Same network, point mass, losses, field, delays and noise as `suite.train` with the preset `paper`,
-one step after another with the encoder inside the loop, and backward through it. What the preset
+Same network, point mass, losses, field, delays and noise as `suite.train` with the recipe `paper`,
+one step after another with the encoder inside the loop, and backward through it. What the recipe
 does not use is not here.
 """
 
@@ -20,7 +20,7 @@ from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
 from suite.train.dynamics.point_mass import HEADING_RATE, PointMassParams
 from suite.train.losses import BARRIER_HEIGHT, BARRIER_SLOPE, FIELD_DECAY, MAX_PULL, UNIT_FIELD
-from suite.train.presets import paper
+from suite.train.recipes import paper
 from suite.train.step import BEYOND_M, PATH_SAMPLES
 from suite.train.update import WEIGHT_DECAY
 from suite.train.worlds import Worlds
@@ -28,7 +28,7 @@ from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.scene import Gates
 
 SIZES = ("camera", "hidden_size", "channels")
-"""What may differ from the preset: the network's and the image's size."""
+"""What may differ from the recipe: the network's and the image's size."""
 
 
 class TorchState(NamedTuple):
@@ -106,7 +106,7 @@ class Baseline:
         """Take over the parameters of `policies.networks.network`.
 
         Raises:
-            ValueError: for a setting of the loss or the observation that is not the preset's, and
+            ValueError: for a setting of the loss or the observation that is not the recipe's, and
                 for quadrotors.
         """
         if config.quadrotor is not None:
@@ -118,7 +118,7 @@ class Baseline:
                 if value != allowed and field.name not in SIZES:
                     raise ValueError(
                         f"{part}.{field.name} is {value!r}, allowed for the torch baseline is "
-                        f"{allowed!r}, that of the preset paper"
+                        f"{allowed!r}, that of the recipe paper"
                     )
         self.config = config
         self.network = torch_twin(params, config.spec).requires_grad_(True)

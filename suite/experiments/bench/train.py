@@ -1,8 +1,8 @@
 """`suite bench train`: gradient steps a second against a plain torch-eager loop.
 
 Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids at
-the preset `paper`: batch 64, 150 steps, 24x32 images, two threads. Steps through the judge's
-quadrotor, varied as the preset `swift-quad` does, are given as a multiple of the point mass's time.
+the recipe `paper`: batch 64, 150 steps, 24x32 images, two threads. Steps through the judge's
+quadrotor, varied as the recipe `race` does, are given as a multiple of the point mass's time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from suite.experiments.bench.compare import Comparison, Figure
 from suite.train.config import TrainConfig
-from suite.train.presets import preset
+from suite.train.recipes import named_recipe
 from suite.train.worlds import Worlds, sample_worlds
 from tracks.common.work.threads import share_threads
 from tracks.geometry.scene import PARKED_Z, Counts, Gates
@@ -35,8 +35,8 @@ ENOUGH_S = 100.0
 
 
 def bench_config(batch: int = BATCH, steps: int = STEPS) -> TrainConfig:
-    """Return the preset `paper` at the bench's size, on one device."""
-    base = preset("paper")
+    """Return the recipe `paper` at the bench's size, on one device."""
+    base = named_recipe("paper")
     return replace(base, episode=replace(base.episode, batch=batch, steps=steps))
 
 
@@ -131,7 +131,7 @@ def _two_cores() -> Iterator[None]:
 
 def _compare(batch: int, steps: int, rounds: int) -> Comparison:
     point = bench_config(batch, steps)
-    quadrotor = replace(point, quadrotor=preset("swift-quad").quadrotor)
+    quadrotor = replace(point, quadrotor=named_recipe("race").quadrotor)
     worlds = bench_worlds(point)
     sides = {
         OURS: _ours(point, worlds),

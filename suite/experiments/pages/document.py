@@ -17,6 +17,7 @@ from suite.common.console import Console
 from suite.common.provenance import machine, package_versions
 from suite.common.report import Picture
 from suite.experiments import EXPERIMENTS
+from suite.experiments.study.cache import FLIES, code_digest
 from tracks.common.files import plain, replacing_file, write_json, write_text
 from tracks.common.grid import Grid, markdown
 from tracks.common.provenance import stamp
@@ -92,6 +93,7 @@ def write_document(
     facts = {**made.facts, **_provenance(header)}
     old = page.read_text(encoding="utf-8") if page.is_file() else _new_page(name)
     before, after = _around(old, page)
+    header["code_sha256"] = code_digest(*FLIES)
     answer = {**header, "made_by": facts, "config": config, **made.numbers}
     figures: list[str] = []
     blocks = ["\n".join(f"- {key}: {value}" for key, value in facts.items())]

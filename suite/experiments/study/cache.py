@@ -25,6 +25,8 @@ LOOP_ROOMS = (
     "suite/loop",
 )
 """Code that flies, fits and fine-tunes in a `suite loop`, but for a diagnosis."""
+FLIES = ("tracks", "policies", "eval")
+"""The rooms whose code sets how a policy flies."""
 
 
 def digest(value: Any) -> str:

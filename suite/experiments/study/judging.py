@@ -26,7 +26,7 @@ from policies.spec import NeedsTrust, PolicyError
 from suite.common.choices import parse_levels
 from suite.common.console import Console
 from suite.common.stages import announce
-from suite.experiments.study.cache import code_digest, digest, engines
+from suite.experiments.study.cache import FLIES, code_digest, digest, engines
 from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.flying import TRIALS_A_PROCESS, cost_of, flying_needs, labels, trial_list
 from tracks.common.work import Workers, crew, usable_cores, work_off
@@ -173,7 +173,7 @@ def _about(flier: Flier, digests: Mapping[str, str]) -> dict[str, Any]:
         "vehicle": flier.vehicle,
         "noise": flier.noise,
         "world": flier.world,
-        "code": code_digest("tracks", "policies", "eval"),
+        "code": code_digest(*FLIES),
         "engines": engines(),
     }
 

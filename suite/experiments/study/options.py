@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 from suite.common.choices import parse_levels
 from suite.train.config import TrainConfig
-from suite.train.config import check as check_recipe
-from suite.train.overrides import check_owned, override
+from suite.train.overrides import check_owned
 from tracks.input.ranges import Iterations, Range, Seed, Trials, check_ranges
 
 GATES = 4
@@ -19,14 +18,14 @@ GATES = 4
 class FourGates:
     """What the experiments on tracks of four gates have in common; their options derive from it."""
 
-    preset: str = "racer"
+    recipe: str = "race-paper"
     """The recipe that all trainings share, but for its size, its gates and what is compared."""
     set: tuple[str, ...] = ("episode.image_stride=3",)
     """Change settings of the recipe by name."""
     iterations: Iterations = 200
-    """Gradient steps, instead of the preset's."""
+    """Gradient steps, instead of the recipe's."""
     worlds: Annotated[int, Range(1, 10**6)] = 48
-    """Worlds in one gradient step, instead of the preset's."""
+    """Worlds in one gradient step, instead of the recipe's."""
     training_seeds: tuple[Seed, ...] = (0, 1, 2)
     """Seeds that everything is trained from."""
     trials: Trials = 300
@@ -59,17 +58,18 @@ def check(config: Any) -> None:
 
 
 def asked_recipe(config: Any) -> TrainConfig:
-    """Return --preset with --set and, unless it is None, --iterations.
+    """Return --recipe with --set and, unless it is None, --iterations.
 
     Raises:
-        ValueError: for a preset or a change that does not exist.
+        ValueError: for a recipe or a change that does not exist.
     """
-    from suite.train.presets import preset, with_iterations
+    from suite.train.overrides import changed, check_phases
+    from suite.train.recipes import named_recipe, with_iterations
 
-    recipe = override(preset(config.preset), config.set)
+    recipe = changed(named_recipe(config.recipe), config.set)
     if config.iterations is not None:
         recipe = with_iterations(recipe, config.iterations)
-    check_recipe(recipe)
+    check_phases(recipe)
     return recipe
 
 
@@ -77,7 +77,7 @@ def four_gate_recipe(config: FourGates) -> TrainConfig:
     """Return the recipe that `config` asks for on tracks of four gates.
 
     Raises:
-        ValueError: for a preset or a change that does not exist, or no field: that is compared.
+        ValueError: for a recipe or a change that does not exist, or no field: that is compared.
     """
     owned = {"episode.batch": "give --worlds", "optimizer.iterations": "give --iterations"}
     check_owned(config.set, {**owned, "episode.gates": f"all fly {GATES}, as in the paper"})
@@ -88,9 +88,9 @@ def four_gate_recipe(config: FourGates) -> TrainConfig:
 
 
 def recipe_words(config: Any) -> str:
-    """Return --preset, --set and, where there is one, --from as they were asked for."""
-    start = getattr(config, "from_", None)
-    return " ".join([config.preset, *config.set, *([] if start is None else ["from", start])])
+    """Return --recipe, --set and, where there is one, --init-from as they were asked for."""
+    start = getattr(config, "init_from", None)
+    return " ".join([config.recipe, *config.set, *([] if start is None else ["init-from", start])])
 
 
 def judged_seeds(config: Any) -> str:

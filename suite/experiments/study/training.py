@@ -138,7 +138,7 @@ def trained(
     whole = Estimate(sum(need.seconds for need in needs), memory)
     announce(console, f"{len(pieces)} trainings, less those that are there", whole)
     do = functools.partial(train_one, looks=study.looks, may_diverge=study.may_diverge)
-    start = None if study.start is None else checkpoint_folder(study.start, "--from")
+    start = None if study.start is None else checkpoint_folder(study.start, "--init-from")
     jobs = [Job(piece, cache / _place_of(piece, study), start) for piece in pieces]
     ended = all_done(do, jobs, workers, console, "training")
     return [_read(job, *end) for job, end in zip(jobs, ended, strict=True)]
@@ -170,6 +170,7 @@ def train_one(
         WorkFailed: where it diverges and may not.
     """
     from suite.experiments.study.validation import make_validation
+    from suite.train.overrides import phase_configs
     from suite.train.ppo.run import train_ppo
     from suite.train.run import started_from, train
     from suite.train.training_loop import Watch
@@ -177,7 +178,7 @@ def train_one(
     (key, config), folder, watch = job.task, job.folder, None
     is_ppo, diverged = isinstance(config, PpoConfig), ""
     if looks and looks.measurements:
-        shared = config.shared if is_ppo else config
+        shared = config.shared if is_ppo else phase_configs(config)[-1]
         iterations = config.iterations if is_ppo else config.optimizer.iterations
         measure = make_validation(shared, *looks[1:], rewarded(shared))
         watch = Watch(max(1, iterations // looks.measurements), measure)
@@ -193,8 +194,9 @@ def train_one(
         console.note(f"{key}, seed {config.seed}: {diverged}")
     points = []
     if looks and not (watch or diverged):
-        params = started_from(str(folder / "policy"), config.spec)
-        found = make_validation(config, *looks[1:])(params)
+        last = phase_configs(config)[-1]
+        params = started_from(str(folder / "policy"), last.spec)
+        found = make_validation(last, *looks[1:])(params)
         points = [found]
         console.note(
             f"{key}, seed {config.seed}: success cross {found['success_cross']:.0%}, "

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.train.config import PointMassConfig, QuadrotorConfig, TrainConfig
+from suite.train.overrides import in_every_phase, phase_configs
 
 STILL = (0.0, 0.0, 0.0)
 """No wind."""
@@ -38,7 +39,7 @@ def spreads(config: TrainConfig) -> dict[str, TrainConfig]:
     settings = _of_point_mass(config.physics) if config.quadrotor is None else QUADROTOR
     named = [(name, part, changes) for name, changes in settings.items()]
     found = {
-        name: replace(config, **{part: replace(getattr(config, part), **changes)})
+        name: in_every_phase(config, part, **changes)
         for name, part, changes in [*named, ("image", "physics", IMAGE)]
     }
     return {name: without for name, without in found.items() if without != config}
@@ -84,9 +85,10 @@ def race_settings(recipe: str, vehicle: str = "racer5") -> dict[str, Any]:
         ValueError: for an unknown recipe or vehicle.
     """
     from eval.quadrotor.vehicle_file import load_vehicle
-    from suite.train.presets import preset, with_quadrotor
+    from suite.train.recipes import named_recipe, with_quadrotor
 
-    config = with_quadrotor(preset(recipe), load_vehicle(vehicle))
+    last = phase_configs(named_recipe(recipe))[-1]
+    config = with_quadrotor(last, load_vehicle(vehicle))
     assert config.quadrotor is not None
     return {"spec": config.spec, "vehicle": DrawnVehicle(config.quadrotor)}
 

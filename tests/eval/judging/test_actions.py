@@ -79,8 +79,8 @@ def test_a_world_without_other_kinds_refuses_them(monkeypatch):
 
 
 def wrapped(count, rules):
-    """Return the trials of swift-keen and of itself with the attitude loop inside a wrapper."""
-    policy = load_policy("swift-keen")
+    """Return the trials of race and of itself with the attitude loop inside a wrapper."""
+    policy = load_policy("race")
     families = ("zigzag", "circular", "ellipse", "random")
     trials = [TrialSpec(families[k % 4], k % 10, k) for k in range(count)]
     options = JudgeOptions(workers=1, rules=rules, slots=min(64, count))
@@ -139,7 +139,7 @@ def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
 def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
     found = actions_of([flown(Steady((0.0, 0.0, 9.81)))], ActionSpec())
     assert "action_gravity" in [doubt.fault for doubt in found["warnings"]]
-    policy = load_policy("swift-small")
+    policy = load_policy("race-small")
     assert isinstance(policy, BlockPolicy) and doubts(policy) == ()
     changes = {
         "action_gravity": lambda a: a + np.array([0, 0, 9.81], np.float32),

@@ -9,47 +9,29 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from policies import shipped
 from suite import cli
 from suite.commands.train import Config, resolve
-from suite.common.errors import WorkFailed
 from suite.judging.flying import checkpoint_folder
 from suite.train import run
 
 
 def test_options_become_settings():
-    config = resolve(Config(preset="small", seed=4, iterations=7, set=("optimizer.rate=1",)))
+    config = resolve(Config(recipe="quick", seed=4, iterations=7, set=("optimizer.rate=1",)))
     assert (config.seed, config.optimizer.iterations, config.optimizer.rate) == (4, 7, 1.0)
-    with pytest.raises(ValueError, match="Did you mean 'racer'"):
-        resolve(Config(preset="rcaer"))
-
-
-@pytest.mark.parametrize(
-    ("preset", "said", "start"), [("swift-30", True, "swift-30"), ("direct", False, "swift-quad")]
-)
-def test_a_recipe_that_trains_on_says_where_nothing_is_trained_on(
-    preset, said, start, tmp_path, monkeypatch, capsys
-):
-    def stop(*args):
-        raise WorkFailed("no training here")
-
-    monkeypatch.setattr(run, "train", stop)
-    assert cli.main(["train", "--preset", preset, "--out", str(tmp_path)]) == 1
-    alone = capsys.readouterr().err
-    assert ("without --from it begins with fresh weights" in alone) == said
-    assert cli.main(["train", "--preset", preset, "--out", str(tmp_path), "--from", start]) == 1
-    assert "without --from" not in capsys.readouterr().err
+    with pytest.raises(ValueError, match="Did you mean 'race'"):
+        resolve(Config(recipe="rcaer"))
 
 
 def test_training_goes_on_from_a_shipped_policy_by_its_name(tmp_path, capsys):
-    assert checkpoint_folder("racer", "--from") == shipped.folder("racer")
-    assert cli.main(["train", "--from", "racr", "--out", str(tmp_path / "run")]) == 2
+    assert checkpoint_folder("race-paper", "--init-from") == shipped.folder("race-paper")
+    assert cli.main(["train", "--init-from", "rac", "--out", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
-    assert "--from racr: " in said and "a shipped policy's name (racer, swift" in said
+    assert "--init-from rac: " in said and "a shipped policy's name (race, race-paper" in said
     assert not (tmp_path / "run").exists()
 
 
 def test_the_policy_that_is_trained_on_is_not_written_over(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run, "train", None)
-    own = shutil.copytree(shipped.folder("racer"), tmp_path / "policy")
-    assert cli.main(["train", "--from", str(own), "--out", str(tmp_path)]) == 2
+    own = shutil.copytree(shipped.folder("race-paper"), tmp_path / "policy")
+    assert cli.main(["train", "--init-from", str(own), "--out", str(tmp_path)]) == 2
     assert "config.json is read, too, and would be written over" in capsys.readouterr().err
 
 
@@ -61,12 +43,12 @@ def test_the_command_line_asks_for_model_and_vehicle_together():
     assert changed.quadrotor is not None and changed.quadrotor.physics_hz == 500.0
     own = resolve(Config()).quadrotor
     assert own is not None and own.vehicle != reference, "by default it has not seen the tables'"
-    assert resolve(Config(preset="racer")).quadrotor is None
+    assert resolve(Config(recipe="race-paper")).quadrotor is None
     with pytest.raises(ValueError, match="--model quad needs --vehicle.*reference"):
         resolve(Config(model="quad"))
     around = resolve(Config(vehicle="reference")).quadrotor
     assert around == replace(own, vehicle=reference), "the recipe's own spreads"
     with pytest.raises(ValueError, match="--vehicle is racer5.*point mass has none.*--model quad"):
-        resolve(Config(preset="swift", vehicle="racer5"))
+        resolve(Config(recipe="race-paper", vehicle="racer5"))
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
         resolve(Config(model="quad", vehicle="racer6"))

@@ -14,7 +14,7 @@ from suite.delta.fit import FitConfig
 from suite.delta.replay import check_corrects, corrected, nominal_model
 from suite.delta.run import fit_delta, flight_files, long_enough, split, table
 from suite.train.config import PointMassConfig, QuadrotorConfig
-from suite.train.presets import racer, swift
+from suite.train.recipes import race, race_paper
 from tests.support.point_mass_flights import fly
 from tests.support.vehicles import with_lag
 from tracks.common.files import plain
@@ -85,13 +85,13 @@ def kept(dynamics):
 
 
 def test_the_middle_of_the_ranges_is_what_counts():
-    physics = swift().physics
+    physics = race().physics
     check_corrects(kept(physics), physics, 15.0, WHERE)
     check_corrects(kept(physics), replace(physics, drag=(0.0, 0.9), lag_std=0.0), 15.0, WHERE)
     check_corrects({}, physics, 15.0, WHERE)
-    words = "drag 0.45 0.45 1.1 1/s.* this run's has .*drag 0.45 0.45 0.45 1/s.*--preset"
+    words = "drag 0.45 0.45 1.1 1/s.* this run's has .*drag 0.45 0.45 0.45 1/s.*--recipe"
     with pytest.raises(ValueError, match=words):
-        check_corrects(kept(physics), racer().physics, 15.0, WHERE)
+        check_corrects(kept(physics), race_paper().physics, 15.0, WHERE)
     with pytest.raises(ValueError, match="delay 1 decisions; take"):
         check_corrects(kept(physics), replace(physics, action_delay=(0.5, 1.5)), 15.0, WHERE)
 
@@ -112,7 +112,7 @@ def test_of_a_vehicle_all_but_its_name_counts():
 
 
 def test_a_network_that_steps_at_another_rate_is_refused():
-    physics = swift().physics
+    physics = race().physics
     fit = {**kept(physics), "rate_hz": 15.03}
     check_corrects(fit, physics, 15.0, WHERE)
     with pytest.raises(ValueError, match="of 15 decisions a second, and this run has 30: .*=15"):

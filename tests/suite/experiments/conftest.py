@@ -37,7 +37,7 @@ def sky(monkeypatch):
 
 @pytest.fixture
 def made(monkeypatch):
-    """Return the configurations that were trained; each gives racer, with another digest."""
+    """Return the configurations that were trained; each gives race-paper, with another digest."""
     configs = []
 
     def stand_in(config, folder, console, params=None, watch=None):

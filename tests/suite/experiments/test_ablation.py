@@ -30,10 +30,10 @@ def test_settings_differ_in_field_and_progress_alone():
         assert rows[key].recipe.episode.gates == 4 and loss.projection == 0
     others = {str(row.recipe).replace(str(row.recipe.loss), "") for row in settings(Config())}
     assert len(others) == 1
-    assert "field 0.4" in {row.key for row in settings(Config(preset="paper"))}
+    assert "field 0.4" in {row.key for row in settings(Config(recipe="paper"))}
     nearly = settings(Config(set=("loss.progress=0.4000001",)))
     assert [row.key for row in nearly].count("field 0.4") == 1
-    assert len(settings(Config(preset="paper"))) == 11, "its own weight is one of the paper's"
+    assert len(settings(Config(recipe="paper"))) == 11, "its own weight is one of the paper's"
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from tests.support.loops import trial_result
 
 def test_robustness(sky, tmp_path, capfd):
     only = ["--only", "wind", "mass_offset", "gate-pose error"]
-    args = [*only, "--trials", "1", "--difficulty", "0", "--policy", "racer"]
+    args = [*only, "--trials", "1", "--difficulty", "0", "--policy", "race-paper"]
     sky.stop_after = 5
     assert reproduce(tmp_path, "robustness", *args) == 130
     assert reproduce(tmp_path, "robustness", *args) == 0
@@ -46,7 +46,7 @@ def test_the_median_policy_and_the_repeats():
 
 
 def test_seeds_are_trained_once_and_compared(sky, made, tmp_path):
-    recipe = ["--preset", "small", "--iterations", "3", "--set", "episode.batch=2"]
+    recipe = ["--recipe", "quick", "--iterations", "3", "--set", "episode.batch=2"]
     args = [*recipe, "--training-seeds", "0", "4", "--trials", "1"]
     assert reproduce(tmp_path, "seeds", *args) == 0
     assert [(c.seed, c.optimizer.iterations, c.episode.batch) for c in made] == [
@@ -109,7 +109,7 @@ def test_table2_with_policies_tuned_under_the_delta_model(sky, tmp_path):
     assert "Goals by cell: ours, with Delta Action Model" in text
     assert not numbers["with_against_without"], "without its control nobody knows its merit"
     another_racer(tuned, 1002)
-    args = [*args, "--control-policy", "racer"]
+    args = [*args, "--control-policy", "race-paper"]
     assert reproduce(tmp_path, "table2", *args) == 0
     text, numbers = page(tmp_path, "table2")
     overall = numbers["with_against_without"][-1]
@@ -123,7 +123,7 @@ def rotorpy(monkeypatch):
 
 
 def test_a_policy_in_two_worlds_and_a_control(sky, rotorpy, tmp_path):
-    args = ["--policy", "racer", "--world", "rotorpy", "--trials", "1", "--difficulty", "0"]
+    args = ["--policy", "race-paper", "--world", "rotorpy", "--trials", "1", "--difficulty", "0"]
     sky.stop_after = 4
     assert reproduce(tmp_path, "worlds", *args) == 130
     assert reproduce(tmp_path, "worlds", *args) == 0

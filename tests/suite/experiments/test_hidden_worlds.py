@@ -55,7 +55,7 @@ def loops(monkeypatch):
 
 
 def test_every_world_from_every_seed_once_and_found_again(loops, tmp_path):
-    args = ["--policy", "racer", "--only", "weak rotor", "long delay", "--trials", "4"]
+    args = ["--policy", "race-paper", "--only", "weak rotor", "long delay", "--trials", "4"]
     args += ["--training-seeds", "0", "1", "2", "--seed", "7", "--difficulty", "3"]
     assert reproduce(tmp_path, "hidden_worlds", *args) == 0
     assert [config.seed for config in loops] == [7, 7, 1007, 1007, 2007, 2007]
@@ -77,7 +77,7 @@ def test_every_world_from_every_seed_once_and_found_again(loops, tmp_path):
 def test_a_loop_needs_none_of_our_files_where_it_runs(tmp_path):
     """A policy and a vehicle of one's own go along by content, and make the same loop anywhere."""
     mine, vehicle = tmp_path / "mine", tmp_path / "mine.toml"
-    shutil.copytree(shipped.locate("racer"), mine)
+    shutil.copytree(shipped.locate("race-paper"), mine)
     save_vehicle(load_vehicle("racer5"), vehicle)
     config = Config(policy=str(mine), vehicle=str(vehicle))
     asked = Asked(config, "weak rotor", 0, load_vehicle(str(vehicle)))

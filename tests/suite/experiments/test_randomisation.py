@@ -40,11 +40,11 @@ def test_all_settings_of_every_seed_fly_the_same_share(sky, made, tmp_path):
         "its own",
         "all disturbances",
     ]
-    assert "- recipe: swift-quad from swift, 7 gradient steps" in text
+    assert "- recipe: race init-from race-paper, 7 gradient steps" in text
     assert "| thrust | thrust_scale | +0 [+0, +0] (+0 +0) | +0" in text
     assert reproduce(tmp_path, *args) == 0
     assert len(made) == 6 and len(sky.flown) == 54, "the second time all is there"
-    assert reproduce(tmp_path, *args, "--from", "swift-quad") == 0
+    assert reproduce(tmp_path, *args, "--init-from", "race") == 0
     assert len(made) == 12, "from another policy all is trained anew"
 
 

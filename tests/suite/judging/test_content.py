@@ -21,7 +21,7 @@ def test_a_policy_that_came_as_content_is_the_same_without_its_files(tmp_path):
     folder = tmp_path / "my.policy"
     folder.mkdir()
     for name in ("config.json", "weights.safetensors", "card.md"):
-        (folder / name).write_bytes((shipped.folder("racer") / name).read_bytes())
+        (folder / name).write_bytes((shipped.folder("race-paper") / name).read_bytes())
     content = PolicyContent.of(folder)
     assert [name for name, _ in content.files] == ["config.json", "weights.safetensors"]
     packed, expected = pack(content), answers(load_policy(folder))

@@ -73,11 +73,11 @@ def test_trials_and_slow_worlds_take_more_processes_and_seconds(monkeypatch):
 
 
 def test_a_cluster_is_given_the_policy_and_this_machines_processes_its_name():
-    policy = load_flier("racer", False)
-    assert who_flies(policy, "racer", False, 1) is policy
+    policy = load_flier("race-paper", False)
+    assert who_flies(policy, "race-paper", False, 1) is policy
     here, there = (
-        who_flies(policy, "racer", False, 2),
-        who_flies(policy, "racer", False, "tcp://a:1"),
+        who_flies(policy, "race-paper", False, 2),
+        who_flies(policy, "race-paper", False, "tcp://a:1"),
     )
     assert len(pack(here)) < 1000 < 100_000 < len(pack(there))
 
@@ -99,7 +99,7 @@ def test_what_a_world_flies_otherwise_is_said_once_and_written(
 
 @pytest.fixture(scope="module")
 def policy():
-    return load_policy("racer")
+    return load_policy("race-paper")
 
 
 def test_every_speed_is_flown_and_again_with_the_monitor():
@@ -118,9 +118,11 @@ def test_a_speed_goes_into_the_spec_that_is_observed_by(policy):
 
 
 def test_a_policy_without_that_input_is_one_line(policy, tmp_path, capsys):
-    with pytest.raises(PolicyError, match="racer takes no speed"):
+    with pytest.raises(PolicyError, match="race-paper takes no speed"):
         Manner(speed=0.5)(policy)
-    assert cli.main(["eval", "--policy", "racer", "--speed", "0.5", "--out", str(tmp_path)]) == 2
+    assert (
+        cli.main(["eval", "--policy", "race-paper", "--speed", "0.5", "--out", str(tmp_path)]) == 2
+    )
     said = capsys.readouterr().err
     assert "spec.speed_input=True" in said and len(said.strip().splitlines()) == 1
 
@@ -132,6 +134,6 @@ def asked(command: str, *args: str) -> Any:
 
 
 def test_options_become_the_request_and_recorded_seeds_are_far_from_judged_ones():
-    given = asked("eval", "--policy", "racer", "--policy", "a.onnx", "--trials", "2")
-    assert (given.policies, given.trials) == (("racer", "a.onnx"), 2)
+    given = asked("eval", "--policy", "race-paper", "--policy", "a.onnx", "--trials", "2")
+    assert (given.policies, given.trials) == (("race-paper", "a.onnx"), 2)
     assert asked("collect").seed - asked("eval").seed >= 100_000

@@ -44,7 +44,7 @@ def test_an_eval_py_in_the_working_folder_does_not_stand_for_ours(tmp_path, root
 
 
 def test_check_reports_the_contract_and_what_looks_wrong(tmp_path):
-    answer = check.run(check.Config(policy="swift-small", trials=1), Quiet())
+    answer = check.run(check.Config(policy="race-small", trials=1), Quiet())
     assert answer["findings"] == [] and answer["contract"]["digest"]
     with pytest.raises(ValueError, match="nothing to check"):
         check.run(check.Config(), Quiet())

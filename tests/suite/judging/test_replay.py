@@ -129,9 +129,9 @@ def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp
         ("{run} --seed 3", "--seed is 3, but"),
         ("{run} --speed 0.5", "--speed is 0.5, but"),
         ("{run} --track zigzag", "flown again as they were"),
-        ("swift-30 --pick failed", "--pick is failed, but swift-30 is no run"),
-        ("swift --difficulty 0 --speed 0.4", "--speed 0.4: swift takes no speed"),
-        ("swift-30 --difficulty 0 --speed 1.4", "--speed is 1.4"),
+        ("race --pick failed", "--pick is failed, but race is no run"),
+        ("race-paper --difficulty 0 --speed 0.4", "--speed 0.4: race-paper takes no speed"),
+        ("race --difficulty 0 --speed 1.4", "--speed is 1.4"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(line, words, tmp_path, capsys):
@@ -150,7 +150,7 @@ def test_a_recording_shows_who_flew_and_asks_for_a_speed(pilots, tmp_path):
     assert found[eye, "Pinhole:resolution"][1] == [[[36.0, 20.0]]]
     layout = found[f"{eye}/depth", "DepthImage:format"][1][0][0]
     assert (layout["width"], layout["height"]) == (36, 20)
-    evaluation, *_ = view._chosen(view.Config(run="swift-30", speed=0.4))
+    evaluation, *_ = view._chosen(view.Config(run="race", speed=0.4))
     assert manners(evaluation.speed, monitor=False) == [Manner(speed=0.4)]
 
 

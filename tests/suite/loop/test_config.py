@@ -32,7 +32,7 @@ EXAMPLE = "examples/hidden.toml"
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["--preset", "smal"], "Did you mean 'small'?"),
+        (["--recipe", "quik"], "Did you mean 'quick'?"),
         (["--policy", "nobody.onnx"], "needs a checkpoint's folder"),
         (["--track", "my.toml"], "cannot be held apart"),
         (["--track", "zigzg"], "Did you mean 'zigzag'?"),
@@ -48,9 +48,18 @@ EXAMPLE = "examples/hidden.toml"
         (["--no-delta"], "--no-delta: the loop is about the Delta Action Model"),
         (["--set", "seed=5"], "this command sets seed; give --seed"),
         (["--set", "optimizer.iterations=5"], "give --iterations"),
-        (["--policy", "racer", "--set", "optimizer.iterations=5"], "give --finetune-iterations"),
-        (["--policy", "racer", "--set", "spec.rate_hz=30"], "sets spec.rate_hz; a policy keeps"),
-        (["--policy", "racer", "--iterations", "5"], "--iterations is 5, but with --policy or"),
+        (
+            ["--policy", "race-paper", "--set", "optimizer.iterations=5"],
+            "give --finetune-iterations",
+        ),
+        (
+            ["--policy", "race-paper", "--set", "spec.rate_hz=30"],
+            "sets spec.rate_hz; a policy keeps",
+        ),
+        (
+            ["--policy", "race-paper", "--iterations", "5"],
+            "--iterations is 5, but with --policy or",
+        ),
         (["--world", "reference"], "nothing is hidden"),
         (["--world", "mjx"], "nothing is hidden"),
         (["--world", "nowhere.toml"], "nowhere.toml: no such file"),
@@ -80,7 +89,7 @@ def test_a_copy_under_another_name_hides_nothing(tmp_path, root):
     copy.write_text(text.replace('name = "racer5"', 'name = "another"'), encoding="utf-8")
     assert load_vehicle(copy) != load_vehicle("racer5")
     with pytest.raises(ValueError, match="nothing is hidden"):
-        resolve(recipe="small", vehicle="racer5", world=str(copy))
+        resolve(recipe="quick", vehicle="racer5", world=str(copy))
 
 
 def test_a_load_on_a_line_may_be_hidden_but_not_known(tmp_path, monkeypatch, root):
@@ -88,21 +97,21 @@ def test_a_load_on_a_line_may_be_hidden_but_not_known(tmp_path, monkeypatch, roo
     monkeypatch.chdir(root)
     loaded = str(tmp_path / "loaded.toml")
     save_vehicle(with_effects(slung_load=(0.05, 0.5)), loaded)
-    assert resolve(recipe="small", vehicle="reference", world=loaded).true_vehicle == loaded
+    assert resolve(recipe="quick", vehicle="reference", world=loaded).true_vehicle == loaded
     with pytest.raises(ValueError, match="effects.slung_load has a motion of its own"):
-        resolve(recipe="small", vehicle=loaded, world="reference")
+        resolve(recipe="quick", vehicle=loaded, world="reference")
 
 
 def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
     monkeypatch.chdir(root)
-    loop = resolve(recipe="small", seed=3, flights=4)
+    loop = resolve(recipe="quick", seed=3, flights=4)
     assert isinstance(loop, DeltaLoopConfig)
     assert (loop.trials, loop.flights, loop.fit.iterations) == (20, 4, 500)
     assert loop.tuning.optimizer.iterations == round(0.25 * loop.training.optimizer.iterations)
     assert loop.tuning.optimizer.rate < loop.training.optimizer.rate
     assert loop.tuning.seed != loop.training.seed and loop.true_simulator == "mujoco"
     assert (loop.recorded_from, loop.cells, loop.true_vehicle) == (100_003, 6, "reference")
-    hidden = resolve(recipe="swift", world=EXAMPLE)
+    hidden = resolve(recipe="race", world=EXAMPLE)
     assert isinstance(hidden, HiddenLoopConfig)
     assert (hidden.trials, hidden.flights, hidden.fit.iterations) == (25, 3, 200)
     assert hidden.tuning.optimizer.iterations == 60 and hidden.tuning.quadrotor is not None
@@ -112,7 +121,7 @@ def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
 
 @pytest.mark.parametrize(
     ("policy", "recipe"),
-    [("racer", "racer"), ("swift-30", "swift-30"), ("swift-small", "swift"), (None, "swift")],
+    [("race-paper", "race-paper"), ("race", "race"), ("race-small", "race-small"), (None, "race")],
 )
 def test_a_policy_is_fine_tuned_by_its_own_recipe(policy, recipe, root, monkeypatch):
     monkeypatch.chdir(root)
@@ -126,29 +135,30 @@ def test_a_policy_is_fine_tuned_by_its_own_recipe(policy, recipe, root, monkeypa
 def test_settings_are_of_the_fine_tuning_where_a_policy_is_given():
     """Else of the recipe, which the fine-tuning follows at its share of the rate."""
     changes = ("optimizer.rate=1e-4", "episode.rest_share=0.2")
-    given = resolve(policy="racer", changes=changes).tuning
+    given = resolve(policy="race-paper", changes=changes).tuning
     assert (given.optimizer.rate, given.episode.rest_share) == (1e-4, 0.2)
-    trained = resolve(recipe="small", changes=changes).tuning
+    trained = resolve(recipe="quick", changes=changes).tuning
     assert (trained.optimizer.rate, trained.episode.rest_share) == (pytest.approx(3e-5), 0.2)
 
 
 def test_settings_are_checked_at_the_rate_that_is_fine_tuned():
     """A policy of 30 Hz has 180 steps where the recipe has 90, which 4 does not divide."""
     changes = ("episode.image_stride=4",)
-    assert resolve(policy="swift-30", recipe="swift", changes=changes).tuning.episode.steps == 180
+    found = resolve(policy="race", recipe="race-paper", changes=changes)
+    assert found.tuning.episode.steps == 180
     with pytest.raises(ValueError, match=r"divisors of episode.steps \(90\)"):
-        resolve(recipe="swift", changes=changes)
+        resolve(recipe="race-paper", changes=changes)
 
 
 def test_where_files_lie_makes_no_other_loop(root, monkeypatch, tmp_path):
     monkeypatch.chdir(root)
     moved = tmp_path / "hidden.toml"
     moved.write_bytes((root / EXAMPLE).read_bytes())
-    here, there = (resolve(recipe="small", world=str(path)) for path in (EXAMPLE, moved))
+    here, there = (resolve(recipe="quick", world=str(path)) for path in (EXAMPLE, moved))
     assert here != there and loop_by_content(here) == loop_by_content(there)
     other = tmp_path / "other" / "hidden.toml"
     save_vehicle(with_effects(com_offset=((0.005, 0.0, 0.0),)), other)
-    assert loop_by_content(resolve(recipe="small", world=str(other))) != loop_by_content(here)
+    assert loop_by_content(resolve(recipe="quick", world=str(other))) != loop_by_content(here)
 
 
 def test_a_folder_called_like_something_shipped_makes_no_other_loop(tmp_path, monkeypatch):
@@ -156,17 +166,17 @@ def test_a_folder_called_like_something_shipped_makes_no_other_loop(tmp_path, mo
     monkeypatch.chdir(tmp_path)
 
     def asked():
-        return loop_by_content(resolve(recipe="small", policy="racer", world="racer5"))
+        return loop_by_content(resolve(recipe="quick", policy="race-paper", world="racer5"))
 
     begun = asked()
-    for name in ("racer", "racer5", "reference"):
+    for name in ("race-paper", "racer5", "reference"):
         (tmp_path / name).mkdir()
     assert asked() == begun
-    for name in ("racer", "racer5"):
+    for name in ("race-paper", "racer5"):
         (tmp_path / name).rmdir()
-    shutil.copytree(shipped.folder("racer"), tmp_path / "mine")
+    shutil.copytree(shipped.folder("race-paper"), tmp_path / "mine")
     save_vehicle(load_vehicle("racer5"), tmp_path / "racer5")
-    own = loop_by_content(resolve(recipe="small", policy="mine", world="racer5"))
+    own = loop_by_content(resolve(recipe="quick", policy="mine", world="racer5"))
     assert isinstance(own, HiddenLoopConfig) and own.digests == begun.digests
     assert (own.policy, own.world, own.vehicle) == ("a file", "a file", "reference")
 
@@ -190,7 +200,7 @@ def rotorpy(monkeypatch):
 def test_a_world_is_a_vehicle_a_simulator_or_both(text, meant, rotorpy):
     assert parse_world(text, "racer5") == meant
     if text == "rotorpy":
-        config = resolve(recipe="small", world=text)
+        config = resolve(recipe="quick", world=text)
         assert isinstance(config, HiddenLoopConfig)
         assert (config.true_vehicle, config.true_simulator) == ("reference", "rotorpy")
 
@@ -221,15 +231,15 @@ def test_another_variant_is_another_two_stages():
         variants=(*delta_action.LOOP.variants, longer),
         models=(*delta_action.LOOP.models, DeltaModel("other", "fitting another")),
     )
-    run = LoopRun(loop, resolve(recipe="small"), Path("out"), Quiet())
+    run = LoopRun(loop, resolve(recipe="quick"), Path("out"), Quiet())
     names = [stage.name for stage in plan(run)]
     assert names.index("other") < names.index("tuned-longer") < names.index("eval-longer")
     assert len(names) == 9 + 3
 
 
 def test_the_first_policy_is_trained_or_taken():
-    for policy, first in ((None, "train"), ("racer", "given")):
-        config = resolve(recipe="small", policy=policy)
+    for policy, first in ((None, "train"), ("race-paper", "given")):
+        config = resolve(recipe="quick", policy=policy)
         run = LoopRun(delta_action.LOOP, config, Path("out"), Quiet())
         stages = plan(run)
         assert stages[0].name == first and len(stages) == 9
@@ -243,7 +253,7 @@ def test_flights_that_cannot_be_fitted_end_the_loop_with_advice(tmp_path, monkey
         raise ValueError("no window of 1.0 s in 3 flights")
 
     monkeypatch.setattr(work, "fit_delta", none)
-    config = resolve(recipe="small", trials=3)
+    config = resolve(recipe="quick", trials=3)
     run = LoopRun(delta_action.LOOP, config, tmp_path, Quiet())
     stage = next(stage for stage in plan(run) if stage.name == "delta")
     with pytest.raises(WorkFailed, match="no window.*--iterations"):

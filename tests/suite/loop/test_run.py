@@ -16,7 +16,7 @@ from suite import cli
 from suite.loop.compare import CAVEAT, VARIANTS
 from tests.support.loops import Small
 
-TUNED = ["--preset", "small", "--track", "zigzag", "--difficulty", "0", "--trials", "3"]
+TUNED = ["--recipe", "quick", "--track", "zigzag", "--difficulty", "0", "--trials", "3"]
 TUNED += ["--flights", "3", "--finetune-iterations", "2", "--fit-iterations", "3"]
 TUNED += ["--seed", "4", "--set", "episode.batch=2"]
 ARGS = [*TUNED, "--iterations", "3"]

@@ -8,8 +8,8 @@ import pytest
 from suite.common.console import Console
 from suite.train import losses
 from suite.train.config import TrainConfig, check
-from suite.train.overrides import check_owned, override
-from suite.train.presets import PRESETS, at_rate, chosen_model, preset
+from suite.train.overrides import check_owned, check_phases, override, phase_configs
+from suite.train.recipes import RECIPES, at_rate, chosen_model, named_recipe
 from suite.train.run import train
 from tests.support.training import small_config
 
@@ -38,9 +38,9 @@ def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_is_within_the_limits(name):
-    check(preset(name))
+@pytest.mark.parametrize("name", RECIPES)
+def test_every_recipe_is_within_the_limits(name):
+    check_phases(named_recipe(name))
 
 
 def test_settings_are_changed_by_name():
@@ -56,7 +56,7 @@ def test_settings_are_changed_by_name():
 
 
 def test_what_only_the_point_mass_reads_is_refused_through_quadrotors():
-    run = preset("direct")
+    run = named_recipe("race")
     for change in ("physics.wind_std=(3,3,1)", "physics.action_delay=(0,2)"):
         with pytest.raises(ValueError, match=r"is of the point mass.*set one of quadrotor\."):
             override(run, [change])
@@ -72,7 +72,7 @@ def test_what_only_the_point_mass_reads_is_refused_through_quadrotors():
     ],
 )
 def test_what_would_do_nothing_is_refused(change, need, given):
-    run = preset("racer")
+    run = named_recipe("race-paper")
     with pytest.raises(ValueError, match=rf"does nothing where {need} is (0|False)"):
         override(run, [change])
     # In whatever order they are given.
@@ -92,7 +92,7 @@ def test_what_a_command_sets_itself_is_refused_with_what_to_do_instead():
         ("los.progress=1", "Did you mean 'loss'"),
         ("loss=1", "has parts, set one of clearance"),
         ("loss.progress.more=1", "'more' is below a setting that has no parts"),
-        ("quadrotor.mass_std=0.1", "this run has no quadrotor; take a preset"),
+        ("quadrotor.mass_std=0.1", "this run has no quadrotor; take a recipe"),
         ("loss.progress=inf", "loss.progress is inf, allowed is"),
         ("loss.progress", "write FIELD=VALUE"),
         ("loss.progress=fast", "'fast' does not fit, the setting is like"),
@@ -108,16 +108,16 @@ def test_wrong_settings_are_refused_by_name(change, words):
 
 
 def test_a_model_is_asked_for_by_name_or_the_recipes_own():
-    swift = preset("swift")
-    quad = chosen_model(swift, "quad", "racer5")
+    own = named_recipe("race-paper")
+    quad = chosen_model(own, "quad", "racer5")
     assert quad.quadrotor is not None and quad.quadrotor.vehicle.name == "racer5"
-    assert chosen_model(quad, "point", None) == swift == chosen_model(swift, None, None)
+    assert chosen_model(quad, "point", None) == own == chosen_model(own, None, None)
     with pytest.raises(ValueError, match="the point mass has none: add --model quad"):
-        chosen_model(swift, None, "reference")
+        chosen_model(own, None, "reference")
 
 
-def test_swift_quad_varies_its_quadrotors_widely_around_any_vehicle_that_is_asked_for():
-    own = preset("swift-quad")
+def test_the_default_recipe_varies_its_quadrotors_widely_around_any_vehicle_that_is_asked_for():
+    own = named_recipe("race")
     check(own)
     assert own.quadrotor is not None and own.quadrotor.vehicle.name == "racer5"
     other = chosen_model(own, "quad", "crazyflie21").quadrotor
@@ -132,24 +132,11 @@ def test_swift_quad_varies_its_quadrotors_widely_around_any_vehicle_that_is_aske
     again = chosen_model(own, "quad", "racer5")
     assert again == own, "to the bit"
     assert chosen_model(own, "point", None).quadrotor is None
-
-
-def test_each_swift_recipe_changes_what_it_says_of_the_one_before():
-    names = ("swift-quad", "swift-30", "swift-ahead", "swift-sure", "swift-keen")
-    slow, fast, ahead, sure, keen = map(preset, names)
-    assert fast.spec == replace(slow.spec, rate_hz=30.0)
-    assert slow.episode.steps / 15.0 == fast.episode.steps / 30.0
-    optimizer = replace(fast.optimizer, iterations=ahead.optimizer.iterations)
-    spec = replace(fast.spec, second_axis=True)
-    assert ahead == replace(fast, spec=spec, optimizer=optimizer)
-    assert (sure.spec, sure.quadrotor) == (ahead.spec, ahead.quadrotor)
-    assert sure.loss.gradient_decay > ahead.loss.gradient_decay
-    camera = replace(sure.spec.camera, rays=2)
-    assert keen == replace(sure, spec=replace(sure.spec, camera=camera))
+    check_phases(chosen_model(own, "point", None))
 
 
 def test_another_rate_keeps_rollouts_and_delays_in_seconds():
-    slow = preset("swift-quad")
+    slow = phase_configs(named_recipe("race"))[0]
     fast = at_rate(slow, 30.0)
     check(fast)
     assert (fast.episode.steps, fast.episode.image_stride) == (180, 6)
@@ -158,12 +145,12 @@ def test_another_rate_keeps_rollouts_and_delays_in_seconds():
     odd = at_rate(slow, 20.0)
     check(odd)
     assert (odd.episode.steps, odd.episode.image_stride) == (120, 4)
-    late = at_rate(preset("paper"), 30.0).physics
+    late = at_rate(named_recipe("paper"), 30.0).physics
     assert (late.state_delay, late.image_delay) == (2, 4)
 
 
-def test_the_papers_preset_has_the_papers_weights():
-    loss = preset("paper").loss
+def test_the_papers_recipe_has_the_papers_weights():
+    loss = named_recipe("paper").loss
     assert (loss.clearance, loss.collide) == (3.0, 3.0)
     assert (loss.acceleration, loss.jerk, loss.progress) == (1e-2, 1e-3, 0.4)
     assert loss.progress_norm == loss.projection == 0.0

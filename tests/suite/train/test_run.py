@@ -27,9 +27,9 @@ def compiled_update(config):
     return make_update(config)
 
 
-def update_of(config, delta=None):
+def update_of(config, delta=None, begin=0):
     """Return the trainer's update, compiled once for all tests."""
-    return compiled_update(config) if delta is None else make_update(config, delta)
+    return compiled_update(config) if delta is None else make_update(config, delta, begin)
 
 
 @pytest.fixture(autouse=True)

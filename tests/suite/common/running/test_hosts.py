@@ -113,7 +113,7 @@ class Trainings:
             "training_loop.SAVE_PERIOD_S = 0.2\n"
             "entry()\n"
         )
-        args = ["train", "--preset", "small", "--iterations", "120", "--seed", str(seed)]
+        args = ["train", "--recipe", "quick", "--iterations", "120", "--seed", str(seed)]
         args += ["--set", "episode.batch=4", "episode.steps=4", "--out", str(self.folder / out)]
         environment = {
             **os.environ, "PYTHONPATH": str(self.root), "JAX_PLATFORMS": "cpu", "NPROC": "2",

@@ -135,11 +135,11 @@ def test_a_kill_frees_the_folder_and_what_it_left_is_swept(tmp_path):
 @pytest.mark.parametrize(
     "line",
     [
-        "train --preset small",
+        "train --recipe quick",
         "eval --trials 1",
         "collect",
         "delta nothing",
-        "loop --preset small",
+        "loop --recipe quick",
         "diagnose nothing --vehicle reference",
         "blind make --count 1",
         "blind run",

@@ -38,7 +38,7 @@ class Config:
 def made(number="1"):
     picture = Picture(PNG, "A figure.")
     grid = table(["a", "b"], [[number, Cell("2", "good")]], note="Below.")
-    return Made({"recipe": "small"}, {"Part": [grid, picture, picture]}, {"x": 1})
+    return Made({"recipe": "quick"}, {"Part": [grid, picture, picture]}, {"x": 1})
 
 
 def test_a_page_has_its_facts_its_tables_and_numbered_figures(tmp_path):

@@ -16,11 +16,11 @@ from suite.experiments.study.conditions import Condition
 from suite.experiments.study.intervals import nested
 from suite.experiments.study.judging import Flier, Order, flown
 from suite.experiments.study.training import Row, Study, curve_of
-from suite.train.presets import preset
+from suite.train.recipes import named_recipe
 from tracks.common import names as registry
 
 VEHICLE = load_vehicle("reference")
-RECIPE = preset("racer")
+RECIPE = named_recipe("race-paper")
 
 
 def test_rows_take_turns_where_they_are_to_meet_the_same_load():
@@ -32,7 +32,7 @@ def test_rows_take_turns_where_they_are_to_meet_the_same_load():
 
 def test_the_same_flier_in_two_orders_flies_a_trial_once(sky, tmp_path):
     one, two = TrialSpec("zigzag", 0, 1), TrialSpec("zigzag", 0, 2)
-    flier = Flier("racer", VEHICLE)
+    flier = Flier("race-paper", VEHICLE)
     orders = {"a": Order(flier, [one, two]), "b": Order(flier, [two])}
     found = flown(orders, tmp_path, Console(), "flying")
     assert len(sky.flown) == 2 and found["b"] == found["a"][1:]
@@ -45,7 +45,7 @@ def test_several_policies_under_one_name_fly_one_after_the_other(sky, tmp_path):
     assert [c.name for c in alone] == ["mass_offset"] * 2
     (wind,) = grown
     base = Condition("undisturbed", 0.0, "", VEHICLE)
-    fliers = {"both": [("racer", trials[:1]), ("swift", trials[1:])]}
+    fliers = {"both": [("race-paper", trials[:1]), ("race", trials[1:])]}
     (tested,), points = disturbed.flown_under(
         [base], {wind: grown[wind][:2]}, fliers, tmp_path, Console()
     )

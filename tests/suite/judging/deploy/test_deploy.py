@@ -60,7 +60,7 @@ def test_what_cannot_be_exported_is_refused(folder, tmp_path, capsys):
     for args, message in (
         (["--format", "tflite"], "unknown format 'tflite'"),
         (["--format", "onnx", "--dtype", "int8"], "float32 alone"),
-        (["--policy", "racer"], "give one"),
+        (["--policy", "race-paper"], "give one"),
     ):
         assert cli.main(["export", str(folder), "--out", str(tmp_path), *args]) == 2
         assert message in capsys.readouterr().err
@@ -105,10 +105,10 @@ def test_an_export_of_another_policy_is_not_written_over(
 def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
     found, stored = parity.Parity(0, "", np.nan, np.nan, None), load_policy_checkpoint(folder)
     text, asked = (
-        exporting.card_text(name, name, stored, "float32", found) for name in ("racer", "swift-30")
+        exporting.card_text(name, name, stored, "float32", found) for name in ("race-paper", "race")
     )
     assert "95 % intervals" in text and "95 % intervals" not in asked
-    assert "| racer | zigzag | 0 | 100 | 98 % [93, 99]" in text
+    assert "| race-paper | zigzag | 0 | 100 | 98 % [93, 99]" in text
     assert "no C compiler" in text and "not measured" in text
     config = {key: value for key, value in stored.config.items() if key != "seed"}
     text = exporting.card_text("tiny", "tiny", replace(stored, config=config), "float32", found)

@@ -307,15 +307,15 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
         raise KeyboardInterrupt
 
     monkeypatch.setattr(commanded, "fly_simulated", interrupted)
-    asked = ["fly", "--policy", "swift", "--trials", "2", "--time-limit-s", "0.2"]
+    asked = ["fly", "--policy", "race", "--trials", "2", "--time-limit-s", "0.2"]
     assert cli.main([*asked, "--out", str(tmp_path / "a")]) == 130
     answer = json.loads((tmp_path / "a" / "fly.json").read_text())
     assert (answer["trials"], answer["successes"], answer["judge_successes"]) == (1, 1, 0)
     config = json.loads((tmp_path / "a" / "run.json").read_text())["config"]
-    assert config["policy"]["name"] == "swift" and config["limits"]["silence_s"] == 0.1
+    assert config["policy"]["name"] == "race" and config["limits"]["silence_s"] == 0.1
     assert config["link"] == "simulated" and config["evaluation"]["time_limit_s"] == 0.2
     capsys.readouterr()
-    fast = load_policy("swift")
+    fast = load_policy("race")
     assert isinstance(fast, BlockPolicy)
     fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0))
     monkeypatch.setattr(commanded, "load_flier", lambda *_: fast)
@@ -347,17 +347,17 @@ def test_a_flight_in_real_time_over_the_loopback(tmp_path, capsys):
 
 def test_a_speed_and_the_judges_monitor_fly_in_real_time_too(capsys, tmp_path, monkeypatch):
     asked, flown = ["fly", "--out", str(tmp_path), "--policy"], []
-    assert cli.main([*asked, "swift", "--speed", "0.3"]) == 2
-    assert "--speed 0.3: swift takes no speed" in capsys.readouterr().err
+    assert cli.main([*asked, "race-paper", "--speed", "0.3"]) == 2
+    assert "--speed 0.3: race-paper takes no speed" in capsys.readouterr().err
     monkeypatch.setattr(commanded, "_real", lambda policy, *_: flown.append(policy) or {})
     link = ["--link", "udpin:127.0.0.1:0", "--confirm"]
-    assert cli.main([*asked, "swift-30", "--speed", "0.3", *link]) == 0
-    assert cli.main([*asked, "swift-30", *link]) == 0
-    assert [policy.spec.speed for policy in flown] == [0.3, load_policy("swift-30").spec.speed]
+    assert cli.main([*asked, "race", "--speed", "0.3", *link]) == 0
+    assert cli.main([*asked, "race", *link]) == 0
+    assert [policy.spec.speed for policy in flown] == [0.3, load_policy("race").spec.speed]
     capsys.readouterr()
-    assert cli.main([*asked, "swift", *link, "--monitor", "--json"]) == 0
+    assert cli.main([*asked, "race", *link, "--monitor", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     policy = flown[-1]
     assert isinstance(policy, Monitored) and isinstance(policy.policy, BlockPolicy)
     assert policy.policy.block == 1
-    assert (answer["policy"]["name"], answer["interventions"]) == ("swift+monitor", 0)
+    assert (answer["policy"]["name"], answer["interventions"]) == ("race+monitor", 0)

@@ -19,7 +19,7 @@ from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
 from suite.train.dynamics.quadrotor import QuadrotorParams, quadrotor_dynamics, substeps
 from suite.train.gradient import make_gradient
-from suite.train.presets import preset, with_quadrotor
+from suite.train.recipes import named_recipe, with_quadrotor
 from suite.train.rollout import make_rollout
 from suite.train.worlds import sample_worlds
 from tests.support.courses import straight
@@ -123,7 +123,7 @@ def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(floa
 @pytest.mark.parametrize(
     ("rates", "steps", "off_m"),
     [((100.0, 250.0), (7, 2), 0.02), ((60.0, 120.0), (4, 2), 0.03)],
-    ids=["default", "swift-quad"],
+    ids=["default", "race"],
 )
 def test_training_steps_stay_near_the_judges(float64, rates, steps, off_m):
     """At 15 Hz: 7 or 4 steps for the judge's 6 or 7 of 10 ms."""
@@ -138,7 +138,7 @@ def test_training_steps_stay_near_the_judges(float64, rates, steps, off_m):
 
 
 def test_long_steps_change_a_flight_by_far_less_than_what_is_drawn(float64):
-    config = preset("swift-30").quadrotor
+    config = named_recipe("race").quadrotor
     assert config is not None
     # The same actions for all, so that only the vehicles differ.
     actions = np.repeat(lively_actions(30, batch=1), 32, axis=1)
@@ -156,7 +156,7 @@ def test_long_steps_change_a_flight_by_far_less_than_what_is_drawn(float64):
 @pytest.mark.parametrize("name", shipped_vehicles())
 def test_the_default_recipe_draws_vehicles_that_fly(name):
     """Around any shipped vehicle: a second of mild actions tips none over."""
-    config = with_quadrotor(preset("direct"), load_vehicle(name)).quadrotor
+    config = with_quadrotor(named_recipe("race"), load_vehicle(name)).quadrotor
     assert config is not None
     actions = 0.5 * lively_actions(15, batch=64)
     pos_w, rot_w, _ = fly_trainer(config, actions, 15.0)

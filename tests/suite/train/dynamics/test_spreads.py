@@ -10,13 +10,15 @@ import pytest
 from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules
+from suite.train.config import PointMassConfig
 from suite.train.dynamics.quadrotor import draw_effects
 from suite.train.dynamics.spreads import fixed, race_settings, spreads
-from suite.train.presets import preset
+from suite.train.overrides import phase_configs
+from suite.train.recipes import named_recipe
 
 
 def test_each_spread_of_a_quadrotor_is_left_out_alone():
-    recipe = preset("swift-quad")
+    recipe = named_recipe("race")
     assert recipe.quadrotor is not None
     found = spreads(recipe)
     assert list(found) == [
@@ -25,13 +27,15 @@ def test_each_spread_of_a_quadrotor_is_left_out_alone():
     ]  # fmt: skip
     assert found["delay"].quadrotor == replace(recipe.quadrotor, delay_spread_s=0.0)
     assert found["image"].quadrotor == recipe.quadrotor
-    assert all(replace(each, quadrotor=None, physics=recipe.physics) ==
-               replace(recipe, quadrotor=None) for each in found.values())  # fmt: skip
+    alike = {"quadrotor": None, "physics": recipe.physics, "phases": ()}
+    assert all(replace(each, **alike) == replace(recipe, **alike) for each in found.values())
+    last = phase_configs(found["delay"])[-1].quadrotor
+    assert last is not None and last.delay_spread_s == 0.0, "no phase brings it back"
     assert "delay" not in spreads(found["delay"])
 
 
 def test_quadrotors_without_spreads_are_all_alike():
-    recipe = fixed(preset("swift-quad"))
+    recipe = fixed(named_recipe("race"))
     assert recipe.quadrotor is not None
     assert spreads(recipe) == {}
     drawn = draw_effects(recipe.quadrotor, 4, np.random.default_rng(0))
@@ -41,7 +45,7 @@ def test_quadrotors_without_spreads_are_all_alike():
 
 
 def test_point_masses_without_spreads_have_the_middle_of_their_ranges():
-    recipe = preset("swift")
+    recipe = replace(named_recipe("race-paper"), physics=PointMassConfig(drag_up=(0.2, 2.0)))
     still = fixed(recipe)
     assert replace(still, physics=recipe.physics) == recipe
     physics = still.physics
@@ -53,7 +57,7 @@ def test_point_masses_without_spreads_have_the_middle_of_their_ranges():
 
 
 def test_environments_draw_their_vehicles_as_the_trainer_does():
-    settings = race_settings("swift-quad")
+    settings = race_settings("race")
     drawn, config = settings["vehicle"], settings["vehicle"].config
     rng = np.random.default_rng(0)
     many = [drawn(rng) for _ in range(60)]
@@ -65,7 +69,7 @@ def test_environments_draw_their_vehicles_as_the_trainer_does():
 
 
 def test_vehicles_of_their_own_fly_at_once_as_they_fly_alone():
-    settings = {**race_settings("swift-quad"), "track": "circular", "rules": Rules(0.3)}
+    settings = {**race_settings("race"), "track": "circular", "rules": Rules(0.3)}
     many = RaceVectorEnv(3, **settings)
     alone = [RaceEnv(**settings) for _ in range(3)]
     seen, _ = many.reset(seed=5)

@@ -92,7 +92,7 @@ def test_a_machine_that_would_come_to_other_numbers_is_refused(two_nodes, monkey
     wanted = {**software(), "mujoco": "2.0"}
     monkeypatch.setattr("tracks.common.work.cluster.software", lambda: wanted)
     with pytest.raises(UnusableCluster, match=r"mujoco 3\S+ there, 2\.0 here.*same versions"):
-        work_off(load, ["swift"], two_nodes.address, lambda *_: None)
+        work_off(load, ["race"], two_nodes.address, lambda *_: None)
 
 
 def test_an_address_that_does_not_answer_says_what_to_do(two_nodes, monkeypatch):

@@ -1,4 +1,4 @@
-"""Training runs by name; `suite train --preset NAME`."""
+"""Settings of trainings by name; `suite train --recipe NAME`."""
 
 from __future__ import annotations
 
@@ -19,49 +19,54 @@ from suite.train.config import (
     TrainConfig,
     check_decides_in_time,
 )
+from suite.train.overrides import phase_configs, without_quadrotor
 from tracks.common.names import unknown_name
+from tracks.geometry.camera import Camera
 
 
-def racer() -> TrainConfig:
-    """Return the recipe of `racer`: the paper's 12 numbers, slow and careful on easy tracks."""
+def race_paper() -> TrainConfig:
+    """Return the recipe of `race-paper`: the paper's 12 numbers, through the point mass alone."""
     return TrainConfig()
 
 
-def swift() -> TrainConfig:
-    """Return the recipe of `swift`: faster, surer than `racer`, with 18 numbers instead of 12."""
-    base = racer()
-    return replace(
-        base,
-        spec=replace(base.spec, second_gate=True, gate_axis=True),
-        physics=replace(base.physics, drag_up=(0.2, 2.0)),
-        loss=replace(base.loss, progress=1.6, pass_first=True, approach_m=1.5, safety_radius_m=0.3),
-        episode=replace(
-            base.episode,
-            missed_share=0.3,
-            density=(0.3, 1.5),
-            bare_share=0.1,
-            sharp_share=0.7,
-            hairpin_share=0.35,
-            height_spread=2.0,
-            finish=True,
-            image_stride=3,
-        ),
-    )
+def race() -> TrainConfig:
+    """Return the recipe of `race`, the default policy: three phases from random weights.
 
-
-def swift_quad() -> TrainConfig:
-    """Return how `swift` is trained on to `swift-quad`: through quadrotors that vary widely.
-
-    They are drawn around `racer5`, which is not the vehicle of the tables. How fast to fly is an
-    input, and changes of acceleration cost less: through the point mass that had to keep actions
-    to what a quadrotor follows.
+    First it learns to fly safely at 15 decisions a second, where a gradient step costs least. Then
+    to fly fast: progress has a higher weight, acceleration and jerk cost less. Then at 30 decisions
+    a second, with a higher price on tipping over, which ends a judged trial, and with delays of up
+    to 80 ms. Its quadrotors vary widely around `racer5`, which is not the vehicle of the tables.
     """
     from eval.quadrotor.vehicle_file import load_vehicle
 
-    base = swift()
-    return replace(
-        base,
-        spec=replace(base.spec, speed_input=True),
+    fast = (
+        "loss.progress=2.2",
+        "loss.acceleration=2e-3",
+        "loss.jerk=1e-4",
+        "loss.tilt=20.0",
+        "episode.race_share=0.8",
+        "optimizer.rate=1e-3",
+    )
+    often = (
+        "spec.rate_hz=30.0",
+        "episode.steps=180",
+        "episode.image_stride=6",
+        "quadrotor.delay_spread_s=0.08",
+        "loss.progress=1.7",
+        "loss.tilt=40.0",
+        "episode.race_share=0.6",
+        "optimizer.rate=4e-4",
+    )
+    return TrainConfig(
+        spec=PolicySpec(
+            rate_hz=15.0,
+            camera=Camera(rays=2),
+            second_gate=True,
+            gate_axis=True,
+            second_axis=True,
+            speed_input=True,
+        ),
+        physics=PointMassConfig(drag_up=(0.2, 2.0)),
         quadrotor=QuadrotorConfig(
             load_vehicle("racer5"),
             attitude_hz=60.0,
@@ -75,101 +80,36 @@ def swift_quad() -> TrainConfig:
             com_std_m=0.003,
             trim_std=0.01,
         ),
-        loss=replace(base.loss, acceleration=5e-3, jerk=4e-4),
-        optimizer=replace(base.optimizer, iterations=1500, rate=6e-4),
-    )
-
-
-def direct() -> TrainConfig:
-    """Return the shortest way to a policy: through those quadrotors from the first step on."""
-    return replace(swift_quad(), optimizer=OptimizerConfig(iterations=1600))
-
-
-def swift_30() -> TrainConfig:
-    """Return how `swift-quad` is trained on to `swift-30`: twice the decisions, and faster.
-
-    Changes of acceleration cost a quarter of that, and tipping over, which ends a judged trial, has
-    a price: at this speed it is what most failed trials would end by.
-    """
-    base = at_rate(swift_quad(), 30.0)
-    assert base.quadrotor is not None
-    return replace(
-        base,
-        quadrotor=replace(base.quadrotor, delay_spread_s=0.08),
-        loss=replace(base.loss, acceleration=2e-3, jerk=1e-4, progress=1.7, tilt=40.0),
-        episode=replace(base.episode, race_share=0.6),
-        optimizer=replace(base.optimizer, iterations=2000, rate=4e-4),
-    )
-
-
-def swift_ahead() -> TrainConfig:
-    """Return how `swift-30` is trained on to `swift-ahead`: it sees how a second gate faces."""
-    base = swift_30()
-    return with_iterations(replace(base, spec=replace(base.spec, second_axis=True)), 1600)
-
-
-def swift_sure() -> TrainConfig:
-    """Return how `swift-ahead` is trained on to `swift-sure`: faster, and as sure.
-
-    Gradients decay 1.5 times as fast, and solids cost 1.4 times as much to be avoided as early.
-    """
-    base = swift_ahead()
-    loss = replace(base.loss, gradient_decay=1.4, clearance=4.2, collide=0.28)
-    return with_iterations(replace(base, loss=loss), 1000)
-
-
-def swift_keen() -> TrainConfig:
-    """Return how `swift-keen` is made: as `swift-sure`, and flown with 2 x 2 rays a pixel.
-
-    A pixel is the nearest of them, so that fewer thin edges are missed than with one ray.
-    """
-    base = swift_sure()
-    camera = replace(base.spec.camera, rays=2)
-    return replace(base, spec=replace(base.spec, camera=camera))
-
-
-def race() -> TrainConfig:
-    """Return the recipe of `race`, the default policy: three phases from random weights.
-
-    First to fly surely; then fast, at a high weight of progress and low costs of acceleration and
-    jerk, where a decision costs half as much; then at 30 Hz, with a price on tipping over, which
-    ends a judged trial, and delays of up to 80 ms.
-    """
-    base = swift_quad()
-    first = replace(base.loss, gradient_decay=1.4, clearance=4.2, collide=0.28)
-    return replace(
-        base,
-        spec=replace(base.spec, second_axis=True, camera=replace(base.spec.camera, rays=2)),
-        loss=first,
-        optimizer=OptimizerConfig(iterations=4500),
-        phases=(
-            Phase(13 / 45),
-            Phase(
-                11 / 45,
-                (
-                    "loss.progress=2.2",
-                    "loss.acceleration=2e-3",
-                    "loss.jerk=1e-4",
-                    "loss.tilt=20.0",
-                    "episode.race_share=0.8",
-                    "optimizer.rate=1e-3",
-                ),
-            ),
-            Phase(
-                21 / 45,
-                (
-                    "spec.rate_hz=30.0",
-                    "episode.steps=180",
-                    "episode.image_stride=6",
-                    "quadrotor.delay_spread_s=0.08",
-                    "loss.progress=1.7",
-                    "loss.tilt=40.0",
-                    "episode.race_share=0.6",
-                    "optimizer.rate=4e-4",
-                ),
-            ),
+        loss=LossConfig(
+            clearance=4.2,
+            collide=0.28,
+            acceleration=5e-3,
+            jerk=4e-4,
+            progress=1.6,
+            approach_m=1.5,
+            pass_first=True,
+            safety_radius_m=0.3,
+            gradient_decay=1.4,
         ),
+        episode=EpisodeConfig(
+            missed_share=0.3,
+            density=(0.3, 1.5),
+            bare_share=0.1,
+            sharp_share=0.7,
+            hairpin_share=0.35,
+            height_spread=2.0,
+            finish=True,
+            image_stride=3,
+        ),
+        optimizer=OptimizerConfig(iterations=4500),
+        phases=(Phase(13 / 45), Phase(11 / 45, fast), Phase(21 / 45, often)),
     )
+
+
+def race_small() -> TrainConfig:
+    """Return the recipe of `race-small`: that of `race` for a network of under 100,000 weights."""
+    base = race()
+    return replace(base, spec=replace(base.spec, channels=(16, 32, 32), hidden_size=96))
 
 
 def paper() -> TrainConfig:
@@ -203,9 +143,9 @@ def paper() -> TrainConfig:
     )
 
 
-def small() -> TrainConfig:
-    """Return a run of minutes on two cores: it flies, it does not win."""
-    base = racer()
+def quick() -> TrainConfig:
+    """Return a run of minutes on two cores, through the point mass: it flies, it does not win."""
+    base = race_paper()
     return replace(
         base,
         episode=replace(base.episode, batch=48),
@@ -214,11 +154,11 @@ def small() -> TrainConfig:
 
 
 def gpu() -> TrainConfig:
-    """Return the racer's recipe with thousands of worlds at once, for one accelerator.
+    """Return the recipe of `race` with thousands of worlds at once, for one accelerator.
 
     In one shard, because a small batch takes an accelerator as long as a large one.
     """
-    base = racer()
+    base = race()
     return replace(base, episode=replace(base.episode, batch=2048, shards=1))
 
 
@@ -255,15 +195,17 @@ def at_rate(config: TrainConfig, rate_hz: float) -> TrainConfig:
 def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
     """Return how a policy that `config` trained is fine-tuned, under a Delta Action Model or not.
 
-    The steps are smaller, since the policy flies already, and the tracks are new ones.
+    The settings are those of its last phase. The steps are smaller, since the policy flies already,
+    and the tracks are new ones.
 
     Args:
         config: how the policy was trained.
-        share: gradient steps, as a share of that training's.
+        share: gradient steps, as a share of that phase's.
     """
-    optimizer = config.optimizer
+    last = phase_configs(config)[-1]
+    optimizer = last.optimizer
     return replace(
-        config,
+        last,
         optimizer=replace(
             optimizer,
             iterations=max(1, round(share * optimizer.iterations)),
@@ -324,7 +266,7 @@ def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) ->
             raise ValueError(
                 f"--vehicle is {vehicle}, but the point mass has none: add --model quad"
             )
-        return replace(config, quadrotor=None)
+        return without_quadrotor(config)
     if vehicle is not None:
         return with_quadrotor(config, load_vehicle(vehicle))
     if model is None:
@@ -335,45 +277,23 @@ def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) ->
     )
 
 
-PRESETS = {
+RECIPES = {
     "race": race,
-    "racer": racer,
-    "swift": swift,
-    "swift-quad": swift_quad,
-    "direct": direct,
-    "swift-30": swift_30,
-    "swift-ahead": swift_ahead,
-    "swift-sure": swift_sure,
-    "swift-keen": swift_keen,
+    "race-small": race_small,
+    "race-paper": race_paper,
+    "quick": quick,
     "paper": paper,
-    "small": small,
     "gpu": gpu,
 }
-"""Name -> function that returns the configuration; the docstring is its description."""
-
-TRAIN_ON = ("swift-quad", "swift-30", "swift-ahead", "swift-sure", "swift-keen")
-"""Recipes for a policy that flies already: their steps are small."""
+"""Name -> function that returns the settings; its docstring is the description."""
 
 
-def fresh_start_note(name: str, start: str) -> str | None:
-    """Return what to say of a training by recipe `name` that begins with fresh weights, if any.
-
-    `start` is the option that would name a policy to start from.
-    """
-    if name not in TRAIN_ON:
-        return None
-    return (
-        f"{name} is made to train on a policy that flies: without {start} it begins with fresh "
-        "weights, in small steps"
-    )
-
-
-def preset(name: str) -> TrainConfig:
+def named_recipe(name: str) -> TrainConfig:
     """Return the recipe called `name`.
 
     Raises:
         ValueError: where there is none, with the names there are.
     """
-    if name not in PRESETS:
-        raise unknown_name("preset", name, PRESETS)
-    return PRESETS[name]()
+    if name not in RECIPES:
+        raise unknown_name("recipe", name, RECIPES)
+    return RECIPES[name]()

@@ -1,0 +1,84 @@
+"""The published pages: how each is made, all of them in order, and which are out of date."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from policies import shipped
+from suite.common.console import Console, duration
+from suite.experiments.study.cache import FLIES, code_digest
+from suite.judging.content import policy_digest
+from tracks.common.grid import Grid, table
+
+PUBLISHED: dict[str, tuple[str, ...]] = {
+    "table2": ("--seed", "9600000"),
+    "robustness": ("--seed", "9700000", "--trials", "16"),
+    "worlds": ("--seed", "9750000"),
+    "ablation": (),
+    "schemes": (
+        "--measurements",
+        "10",
+        "--set",
+        "episode.start_speed=3.0",
+        "episode.image_stride=3",
+    ),
+}
+"""Page -> its options, in the order in which `suite reproduce all` makes them."""
+
+
+@dataclass(frozen=True)
+class All:
+    """Make every published page, in order; what is finished is not done again."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """List the published pages in --out, and which policy or code is newer than a page."""
+
+
+def make_all(make: Callable[[str, tuple[str, ...]], Any], console: Console) -> dict[str, Any]:
+    """Make each published page by make(name, options), and print how long each took."""
+    seconds: dict[str, float] = {}
+    for name, options in PUBLISHED.items():
+        console.say(f"{len(seconds) + 1} of {len(PUBLISHED)}: {name}")
+        began = time.monotonic()
+        make(name, options)
+        seconds[name] = round(time.monotonic() - began, 1)
+        console.say(f"{name}: {duration(seconds[name])}")
+    return {"seconds": seconds}
+
+
+def page_states(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return of every published page in `folder` what made it, and what is newer than it.
+
+    `newer` has "policy" where a shipped policy has other weights than those that flew, and "code"
+    where the code that flies (tracks, policies, eval) is another; None where there is no page.
+    """
+    return {name: _state(folder / f"{name}.json") for name in PUBLISHED}
+
+
+def _state(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {"commit": "", "newer": None}
+    page = json.loads(path.read_text(encoding="utf-8"))
+    flown = re.findall(r"([\w-]+), SHA-256 ([0-9a-f]{16})", json.dumps(page["made_by"]))
+    current = {name: policy_digest(name)[:16] for name in shipped.names()}
+    newer = ["policy"] if any(current.get(name) != digest for name, digest in flown) else []
+    newer += ["code"] if page.get("code_sha256") != code_digest(*FLIES) else []
+    return {"commit": page["git_commit"] or "", "newer": newer}
+
+
+def status_grid(states: dict[str, dict[str, Any]]) -> Grid:
+    """Return the states of the published pages as a table."""
+
+    def words(newer: list[str] | None) -> str:
+        return "not made" if newer is None else ", ".join(newer) or "-"
+
+    lines = [[name, s["commit"][:10] or "-", words(s["newer"])] for name, s in states.items()]
+    return table(["page", "made at commit", "newer than the page"], lines)

@@ -1,0 +1,44 @@
+"""The published pages: all of them made in order, and what is newer than a page."""
+
+import json
+from dataclasses import replace
+
+from policies import shipped
+from suite.commands import reproduce as command
+from suite.commands.reproduce import Config
+from suite.common.console import Console
+from suite.experiments import EXPERIMENTS, published
+from suite.experiments.study.cache import FLIES, code_digest
+from suite.judging.content import policy_digest
+
+
+def write_page(folder, name, flown, code):
+    made_by = {"ours": f"{flown[0]}, SHA-256 {flown[1][:16]}", "vehicle": "reference"}
+    page = {"git_commit": "f8502435b6b42b44", "made_by": made_by, "code_sha256": code}
+    (folder / f"{name}.json").write_text(json.dumps(page))
+
+
+def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
+    code, current = code_digest(*FLIES), policy_digest(shipped.DEFAULT)
+    write_page(tmp_path, "table2", (shipped.DEFAULT, current), code)
+    write_page(tmp_path, "worlds", (shipped.DEFAULT, "0" * 16), code)
+    write_page(tmp_path, "robustness", ("gone-policy", current), "another")
+    config = Config(published.Status(), out=tmp_path)
+    pages = command.run(config, Console())["pages"]
+    assert pages["table2"] == {"commit": "f8502435b6b42b44", "newer": []}
+    assert pages["worlds"]["newer"] == ["policy"]
+    assert pages["robustness"]["newer"] == ["policy", "code"]
+    assert pages["ablation"]["newer"] is None
+    assert "not made" in capsys.readouterr().out
+
+
+def test_all_makes_every_page_with_its_own_options(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(command, "_made", lambda config, console: asked.append(config) or {})
+    config = Config(published.All(), out=tmp_path)
+    assert list(command.run(config, Console())["seconds"]) == list(published.PUBLISHED)
+    assert [type(c.experiment).__module__.rpartition(".")[2] for c in asked] == list(
+        published.PUBLISHED
+    )
+    assert set(published.PUBLISHED) <= set(EXPERIMENTS)
+    assert all(replace(c, experiment=None) == replace(config, experiment=None) for c in asked)
