@@ -13,20 +13,15 @@ from __future__ import annotations
 
 import argparse
 import ast
-import contextlib
 import json
-import os
 import random
 import re
-import runpy
-import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from plant_faults import ROOT, copied
+from plant_faults import ROOT, copied, load_libraries, run_tests
 
 IMPORTERS = (
     "importers/test_frames importers/test_mapping importers/formats importers/test_importers"
@@ -52,8 +47,6 @@ AREAS = (
 PAIRS = "+ - * / < <= > >= == != and or & |".split()
 OTHER = {one: PAIRS[k ^ 1] for k, one in enumerate(PAIRS)} | {"**": "*"}
 C_TOKEN = re.compile(r"(?<= )(\+|-|\*|/|<|<=|>|>=|==|!=|&&)(?= )|(?<![\w.])\d+\.\d*f?\b")
-LONGEST_S = 300
-"""A mutant whose tests run for longer is noticed: they hang."""
 
 
 class Mutant(NamedTuple):
@@ -128,7 +121,7 @@ def mutants(copy: Path) -> list[list[Mutant]]:
 
 
 def fail(copy: Path, tests: str) -> bool:
-    """Say whether tests fail; they run in a child of this process.
+    """Say whether tests fail.
 
     Raises:
         SystemExit: where they did not run.
@@ -137,32 +130,9 @@ def fail(copy: Path, tests: str) -> bool:
              for part in tests.split()]  # fmt: skip
     paths = [f"tests/{name}" if (copy / "tests" / name).is_dir() else f"tests/{name}.py"
              for name in names]  # fmt: skip
-    child = os.fork()
-    if child == 0:
-        code = 3
-        try:
-            import pytest
-
-            os.chdir(copy)
-            sys.path[0] = str(copy)
-            with open(os.devnull, "w") as nowhere:
-                os.dup2(nowhere.fileno(), 1)
-                os.dup2(nowhere.fileno(), 2)
-                code = pytest.main(
-                    ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--assert=plain", *paths]
-                )
-        finally:
-            os._exit(code)
-    end = time.monotonic() + LONGEST_S
-    while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
-        if time.monotonic() > end:
-            os.kill(child, 9)
-            os.waitpid(child, 0)
-            return True
-        time.sleep(0.1)
-    code = os.waitstatus_to_exitcode(ended[1])
+    code, said = run_tests(copy, paths)
     if code > 2:
-        raise SystemExit(f"{tests}: pytest ended with {code}")
+        raise SystemExit(f"{tests}: pytest ended with {code} ({said})")
     return code != 0  # 2: with this mutant nothing can be imported
 
 
@@ -173,11 +143,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/mutants.json"))
     asked = parser.parse_args()
-    runpy.run_path(str(ROOT / "tests" / "conftest.py"))  # its settings of JAX
-    sys.dont_write_bytecode = True
-    for name in ("jax", "optax", "scipy.optimize", "mujoco", "pyarrow.parquet", "matplotlib"):
-        with contextlib.suppress(ImportError):
-            __import__(name)
+    load_libraries()
     done = json.loads(asked.out.read_text("utf-8")) if asked.out.is_file() else {}
     asked.out.parent.mkdir(parents=True, exist_ok=True)
     draw, survive = random.Random(asked.seed), []
