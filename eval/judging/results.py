@@ -23,6 +23,8 @@ SCHEMA = 1
 """Version of the result files."""
 MOST_TRIALS = 1_000_000
 """Of a trials.parquet: some gigabyte in memory."""
+MOST_TEXT = 1000
+"""Characters of a name in a trials.parquet."""
 JOURNAL = "trials.journal.jsonl"
 """Name of the journal in the output folder."""
 
@@ -102,10 +104,16 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
     try:
         check_file(path, LOG_BYTES)
         with pq.ParquetFile(path) as file:
-            names, rows = file.schema_arrow.names, file.metadata.num_rows
-            missing = sorted(kinds.keys() - TrialResult._field_defaults.keys() - set(names))
-            there = [name for name in kinds if name in names]
-            table = file.read([] if missing or rows > MOST_TRIALS else there)
+            schema, rows = file.schema_arrow, file.metadata.num_rows
+        if rows > MOST_TRIALS:
+            raise ValueError(f"{path}: {rows:,} trials, allowed are up to {MOST_TRIALS:,}")
+        there = [name for name in kinds if name in schema.names]
+        _check_columns(path, schema, there)
+        # A text stays coded as in the file: a long one of every row fits there, not in memory.
+        texts = [name for name in there if kinds[name].startswith("str")]
+        with pq.ParquetFile(path, read_dictionary=texts) as file:
+            table = file.read(there)
+        columns = [_cells(path, name, table[name], kinds[name]) for name in there]
     except MemoryError:  # Arrow's own is one as well
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
@@ -113,35 +121,63 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
         raise ValueError(
             f"{path}: not a readable Parquet file ({first}); run suite eval again"
         ) from error
-    if missing:
-        raise ValueError(f"{path}: no column {missing[0]!r}; is it a trials.parquet of this suite?")
-    if twice := [name for name in there if names.count(name) > 1]:
-        raise ValueError(f"{path}: column {twice[0]!r} is there twice; run suite eval again")
-    if rows > MOST_TRIALS:
-        raise ValueError(f"{path}: {rows:,} trials, allowed are up to {MOST_TRIALS:,}")
-    columns = [_cells(path, name, table[name], kinds[name]) for name in there]
     return [TrialResult(**dict(zip(there, row, strict=True))) for row in zip(*columns, strict=True)]
+
+
+def _check_columns(path: str | os.PathLike[str], schema: Any, there: list[str]) -> None:
+    """Refuse columns that no trial has, before they are read.
+
+    Raises:
+        ValueError: where one is missing, is there twice or is of another type.
+    """
+    from pyarrow import types
+
+    kinds = _kinds()
+    for name in sorted(kinds.keys() - TrialResult._field_defaults.keys() - set(there)):
+        raise ValueError(f"{path}: no column {name!r}; is it a trials.parquet of this suite?")
+    fits = {
+        "int": types.is_integer,
+        "float": lambda kind: types.is_floating(kind) or types.is_integer(kind),
+        "bool": types.is_boolean,
+        "str": lambda kind: types.is_string(kind) or types.is_large_string(kind),
+    }
+    for name in there:
+        if schema.names.count(name) > 1:
+            raise ValueError(f"{path}: column {name!r} is there twice; run suite eval again")
+        found = kind = schema.field(name).type
+        if types.is_dictionary(found):
+            kind = found.value_type
+        wanted, *none = kinds[name].split(" | ")
+        if not fits[wanted](kind) and not (none and types.is_null(kind)):
+            raise _other_type(path, name, found)
+
+
+def _other_type(path: str | os.PathLike[str], name: str, found: Any) -> ValueError:
+    return ValueError(
+        f"{path}: column {name!r} holds {found}, cells without a value or texts of more than "
+        f"{MOST_TEXT:,} characters, where a trial has {_kinds()[name]}; is it a trials.parquet "
+        "of this suite?"
+    )
 
 
 def _cells(path: str | os.PathLike[str], name: str, column: Any, kind: str) -> list[Any]:
     """Return a column as Python's own values.
 
     Raises:
-        ValueError: where they are of another kind than a trial's, or missing.
+        ValueError: where some are missing, or texts too long.
     """
-    allowed = {"str": (str,), "int": (int,), "float": (float, int), "bool": (bool,)}
-    types = {*allowed[kind.split()[0]], *((type(None),) if "None" in kind else ())}
-    try:
-        cells = column.to_pylist()
-    except UnicodeDecodeError:
-        cells = [b""]
-    if not {type(cell) for cell in cells} <= types:
-        raise ValueError(
-            f"{path}: column {name!r} holds {column.type}, or cells without a value, where a "
-            f"trial has {kind}; is it a trials.parquet of this suite?"
-        )
-    # One NaN for all, so that equal trials are equal.
-    return [math.nan if cell != cell else cell for cell in cells]
+    from pyarrow import types
+
+    if column.null_count and "None" not in kind:
+        raise _other_type(path, name, column.type)
+    if not types.is_dictionary(column.type):
+        # One NaN for all, so that equal trials are equal.
+        return [math.nan if cell != cell else cell for cell in column.to_pylist()]
+    coded = column.unify_dictionaries().combine_chunks()
+    texts = [*coded.dictionary.to_pylist(), None]
+    if any(len(text or "") > MOST_TEXT for text in texts):
+        raise _other_type(path, name, column.type)
+    return [texts[number] for number in coded.indices.fill_null(len(texts) - 1).to_pylist()]
 
 
 class Journal:

@@ -96,6 +96,8 @@ def test_journal_of_something_else_is_refused(tmp_path):
         ("time_s", pa.array([[1.0], [2.0]]), "'time_s' holds list"),
         ("gates_passed", pa.array([1, None]), "cells without a value"),
         ("policy", pa.array([b"\xff", b"a"]), "'policy' holds binary"),
+        ("policy", pa.array(["a", "b" * 1001]), "'policy' holds .* texts of more than 1,000"),
+        ("policy", pa.array(["a", None]), "'policy' holds .* without a value"),
         ("policy", None, "no column 'policy'"),
     ],
 )
