@@ -6,11 +6,13 @@ that takes the number of a closed stream would get what is printed.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import sys
 import warnings
 from collections.abc import Iterable, MutableMapping
+from pathlib import Path
 
 from tracks.common.files import user_cache
 
@@ -85,6 +87,16 @@ def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
         # A home that machines share must not hand one's instructions to another.
         folder = user_cache(values) / "jax" / (platform.node() or "here")
         values["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    if values["JAX_COMPILATION_CACHE_DIR"]:
+        drop_cut_entries(Path(values["JAX_COMPILATION_CACHE_DIR"]))
     # XLA complains of its own tuning hints, which are no processor feature, at every program that
     # it loads; what goes wrong in earnest is raised as an exception.
     values.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+def drop_cut_entries(folder: Path) -> None:
+    """Remove compiled programs of which a kill left no more than the name: JAX keeps such a one."""
+    for entry in folder.glob("*-cache"):
+        with contextlib.suppress(OSError):
+            if not entry.stat().st_size:
+                entry.unlink()

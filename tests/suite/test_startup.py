@@ -143,6 +143,14 @@ def test_variables_that_change_results_are_set_aside(monkeypatch, capsys):
     assert "JAX_ENABLE_X64 of the environment is set aside" in capsys.readouterr().err
 
 
+def test_a_compiled_program_that_a_kill_cut_is_compiled_again(tmp_path):
+    (tmp_path / "jit_a-1-cache").touch()
+    (tmp_path / "jit_b-2-cache").write_bytes(b"whole")
+    startup.keep_compiled({"JAX_COMPILATION_CACHE_DIR": str(tmp_path)})
+    assert [path.name for path in tmp_path.iterdir()] == ["jit_b-2-cache"]
+    startup.keep_compiled({"JAX_COMPILATION_CACHE_DIR": ""})
+
+
 def test_a_platform_that_is_not_there_is_one_line(monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
     error = RuntimeError("Unable to initialize backend 'cuda': no device\nmore\nlines")
