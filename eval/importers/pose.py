@@ -133,15 +133,16 @@ def _best_reading(
     given = align(quat, rate, pose.name)
     if given.correlation > SURE:
         return quat, given, []
-    for words, steps in READINGS:
-        other = Signal(quat.time_s, read_as("quat", quat.value, steps))
-        found = align(other, rate, pose.name)
-        if fix and found.correlation > SURE:
-            text = f"it turns as the gyro does only if it is {words}"
-            order = "xyzw" in steps
-            fault = "quaternion_order" if order else "quaternion_direction"
-            about = (fault, None, found.correlation)
-            return other, found, [Finding("corrected", "pose attitude", text, *about)]
+    others = [Signal(quat.time_s, read_as("quat", quat.value, steps)) for _, steps in READINGS]
+    found = [align(other, rate, pose.name) for other in others]
+    # Of readings that turn alike, the one whose body is the gyro's.
+    best = max(range(len(found)), key=lambda k: found[k].correlation + 0.1 * found[k].turn.trace())
+    if fix and found[best].correlation > SURE:
+        words, steps = READINGS[best]
+        fault = "quaternion_order" if "xyzw" in steps else "quaternion_direction"
+        text = f"it turns as the gyro does only if it is {words}"
+        about = (fault, None, found[best].correlation)
+        return others[best], found[best], [Finding("corrected", "pose attitude", text, *about)]
     if given.correlation < ALIKE or abs(given.drift) > DRIFT_MAX:
         reason = (
             f"its clock cannot be aligned with the log's: at best the body rates correlate by "

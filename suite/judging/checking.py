@@ -49,7 +49,7 @@ def check_flight_files(
     from dataclasses import replace
 
     from eval.logs.faults.check import Against, check_files, check_log, not_identifiable, with_fixes
-    from eval.logs.faults.finding import Finding, line
+    from eval.logs.faults.finding import Finding, said
     from eval.logs.flight_log import read_flights, write_flight
     from eval.quadrotor.vehicle_file import load_vehicle
     from suite.delta.run import flight_files
@@ -75,10 +75,10 @@ def check_flight_files(
             fixed = with_fixes(log, readings)
             write_flight(path, replace(fixed, about={**fixed.about, "findings": records}))
             written.append(str(path))
-    several = len(logs) > 1
-    for finding, flight in found:
-        if finding.status != "ok":
-            console.say((f"{Path(flight).name}: " if several and flight else "") + line(finding))
+    for name in (None, *(log.name for log in logs)):
+        told = [finding for finding, flight in found if flight == name and finding.status != "ok"]
+        for text in said(told):
+            console.say((f"{Path(name).name}: " if len(logs) > 1 and name else "") + text)
     if written:
         console.say(f"written: {', '.join(written)}")
     return {

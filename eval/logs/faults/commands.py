@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from eval.logs.faults.finding import Finding
+from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import match, pooled_scale, rms, smooth
@@ -171,7 +171,7 @@ def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> li
     row_hz = 1.0 / float(np.median(np.diff(time_s)))
     if len(change) < 20:
         text = "its commands hardly change"
-        return [Finding("not identifiable", "controller", text, "controller_rate")]
+        return unseen("controller", text, "controller_rate")
     span = time_s[change[-1]] - time_s[change[0]]
     steps = np.diff(time_s[change])
     hz = (len(change) - 1) / float(span)
@@ -179,7 +179,7 @@ def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> li
     figures = f"commands change {hz:.3g} times a second (each {1e3 * holds:.0f} ms)"
     if hz > 0.9 * row_hz:
         text = f"{figures}, with every row: log faster than the controller runs"
-        return [Finding("not identifiable", "controller", text, "controller_rate")]
+        return unseen("controller", text, "controller_rate")
     if abs(hz / wanted_hz - 1.0) < RATE_OFF:
         return [Finding("ok", "controller", figures)]
     text = f"{figures}, and {whose} says {wanted_hz:g} Hz"

@@ -36,10 +36,21 @@ class Finding(NamedTuple):
         return self.status == "doubt" and (self.confidence or 0.0) >= SURE and bool(self.fault)
 
 
+def unseen(signal: str, evidence: str, *faults: str) -> list[Finding]:
+    """Return that a flight shows none of `faults`, for the reason in `evidence`."""
+    return [Finding("not identifiable", signal, evidence, fault) for fault in faults]
+
+
 def said(findings: Iterable[Finding]) -> list[str]:
     """Return the findings as lines for people, the serious ones first."""
     ranked = sorted(findings, key=lambda finding: STATUSES.index(finding.status))
-    return [line(finding) for finding in ranked]
+    together: dict[tuple[str, str, str], list[Finding]] = {}
+    for finding in ranked:
+        together.setdefault((finding.status, finding.signal, finding.evidence), []).append(finding)
+    return [
+        line(same[0]._replace(fault=", ".join(dict.fromkeys(f.fault for f in same if f.fault))))
+        for same in together.values()
+    ]
 
 
 def line(finding: Finding) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, turn
-from eval.logs.faults.finding import Finding
+from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S, Rows
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import rms, smooth
@@ -102,7 +102,7 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
     size = rms(turning / inertia)
     if size < CALM_TURN:
         text = f"turns change by {size:.2g} rad/s^2 only, too little to check their order by"
-        return [Finding("not identifiable", "motors", text, "motor_order")]
+        return unseen("motors", text, "motor_order", "motor_spin")
     full = np.concatenate([np.zeros((1, 4)), np.cumsum(thrust, axis=0)])
     mean = (full[count:-1] - full[: -1 - count]) / count
     step = float(np.median(np.diff(time_s)))
@@ -133,7 +133,7 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
         return [Finding("doubt", "motors", text, "motor_order", None, sure, fix)]
     if given[:2].min() < RIGHT:
         text = f"{figures}, too little to check their order by"
-        return [Finding("not identifiable", "motors", text, "motor_order")]
+        return unseen("motors", text, "motor_order", "motor_spin")
     if given[2] < WRONG and all(h[AS_GIVEN][2] < WRONG for h in halves):
         text = f"{figures}: all of them turn the other way round"
         fix = "rotors.spin of the vehicle file, with the other signs"

@@ -14,7 +14,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, multiply, rotation_vector, turn
-from eval.logs.faults.finding import Finding
+from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.reading import axes_matrix, option, read_as
 from eval.logs.faults.relation import Match, match, rms, smooth
 from eval.logs.velocity import velocity_from_position
@@ -39,6 +39,11 @@ _ORDERS = ("", "xyzw")
 _SENSES = ("", "inverse")
 _FRAMES = ("", "ned", "frd", "ned+frd")
 _ANGLES = ("-roll", "-pitch", "-yaw")
+SHOWN = (
+    *("attitude", "attitude_sign", "quaternion_order", "quaternion_direction", "world_frame"),
+    *("body_frame", "position_axes", "position_unit"),
+)
+"""Faults that only the attitude shows."""
 POSITIONS = (
     ("", "x,y,z"),
     ("x,-y,-z", "x,-y,-z"),
@@ -136,7 +141,7 @@ def _is_right(one: Reading) -> bool:
 def check_pose(rows: Rows, looked: Looked | None) -> list[Finding]:
     """Return what is wrong with how attitude and position are written."""
     if looked is None:
-        return []
+        return unseen("attitude", "the log has no attitude", *SHOWN) if "pos" in rows else []
     given, best = looked.given, looked.best
     figures = _figures(given)
     if not figures:
@@ -147,7 +152,7 @@ def check_pose(rows: Rows, looked: Looked | None) -> list[Finding]:
             f"accelerations of {looked.level:.2g} m/s^2 and turns of {looked.rate:.2g} rad/s are "
             "too small to check it by"
         )
-        return [Finding("not identifiable", "attitude", text, "attitude")]
+        return unseen("attitude", text, *SHOWN)
     if not (best.quat or best.pos or best.length != 1.0):
         if given.misfit < BAD or (given.gyro is not None and given.gyro.is_turned):
             noisy = given.misfit > GOOD

@@ -6,7 +6,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import turn
-from eval.logs.faults.finding import Finding
+from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import Rows
 from eval.logs.faults.reading import option
 from eval.logs.velocity import velocity_from_position
@@ -68,10 +68,17 @@ def check_accelerometer_bias(rows: Rows) -> list[Finding]:
     good = np.isfinite(off) & np.isfinite(power)
     if good.sum() < 5 * count or min(np.std(power[good]), np.std(off[good])) < 1e-6:
         return []
-    slope, _ = np.polyfit(power[good], off[good], 1)
+    slope, level = np.polyfit(power[good], off[good], 1)
     alike = float(np.corrcoef(power[good], off[good])[0, 1])
     middle = float(np.median(off[good]))
-    share = slope * float(np.median(power[good]))
+    usual = float(np.median(power[good]))
+    left = off[good] - np.polyval((slope, level), power[good])
+    independent = max((time_s[-1] - time_s[0]) / SPAN_S, 3.0)
+    error = float(left.std() / (power[good].std() * np.sqrt(independent)))
+    if 2.0 * error * usual > 2.0 * BIAS:
+        text = f"its bias at full throttle is {slope:+.1f} m/s^2 with an error of {error:.1f}"
+        return unseen("accelerometer", text, "accelerometer_throttle_bias")
+    share = slope * usual
     if share > -BIAS or middle > 0.5 * share or alike > -ALIKE:
         return []
     text = (
@@ -93,7 +100,7 @@ def check_barometer(rows: Rows) -> list[Finding]:
     running = load > 0.3 * np.nanquantile(load, 0.9)
     if running.all() or not running.any():
         text = "the log has no row before the motors start"
-        return [Finding("not identifiable", "barometer", text, "barometer_spin_up")]
+        return unseen("barometer", text, "barometer_spin_up")
     start = int(np.argmax(running))
     time_s, value = rows["time"], height[:, 0]
     before = value[(time_s < time_s[start]) & (time_s > time_s[start] - 2.0)]

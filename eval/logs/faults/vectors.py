@@ -8,7 +8,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, turn
-from eval.logs.faults.finding import Finding
+from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
 from eval.logs.faults.reading import option, read_as
 from eval.logs.faults.relation import LEAST, Match, match, pooled_scale, rms, smooth
@@ -38,6 +38,8 @@ NEAR = 1.06
 """A scale within this factor of a unit's is of that unit."""
 SAME = 1.1
 """A scale within this factor of 1 is no fault."""
+SLOW = 1.25
+"""The same of a velocity, which filters make smaller or larger."""
 CALM_SPEED = 0.3
 """Speeds below this say nothing (root mean square) [m/s]."""
 GOOD, BAD, TIMES_BETTER = 0.35, 0.6, 2.0
@@ -57,7 +59,7 @@ def check_gyro(rows: Rows) -> list[Finding]:
     size = rms(turns)
     if size < CALM_RATE:
         text = f"turns of {size:.2g} rad/s are too small to check it by"
-        return [Finding("not identifiable", "gyro", text, "gyro_scale")]
+        return unseen("gyro", text, "gyro_scale", "gyro_axes", "gyro_frame", "body_frame")
     found = match(turns, gyro)
     world = match(turn(rows["quat"], turns), gyro)
     in_world = not found.is_turned and _left(world) < GOOD and _left(found) > max(
@@ -78,7 +80,7 @@ def check_gyro(rows: Rows) -> list[Finding]:
         findings.append(_turned(found, "rate", "gyro"))
     elif not found.seen.any():
         text = "its noise hides how the attitude turns"
-        return [Finding("not identifiable", "gyro", text, "gyro_scale")]
+        return unseen("gyro", text, "gyro_scale", "gyro_axes", "gyro_frame", "body_frame")
     findings += _unit(found, RATES, "rate", "gyro", "gyro_scale", "the attitude's turns")
     return findings
 
@@ -95,12 +97,18 @@ def _turned(found: Match, signal: str, subject: str) -> Finding:
 
 
 def _unit(
-    found: Match, units: Mapping[str, float], signal: str, subject: str, fault: str, of: str
+    found: Match,
+    units: Mapping[str, float],
+    signal: str,
+    subject: str,
+    fault: str,
+    of: str,
+    same: float = SAME,
 ) -> list[Finding]:
     """Return what a scale means: a unit, another factor, or nothing."""
     scale, low, high = pooled_scale(found)
     figures = f"it is {scale:.3g} times {of} ({low:.3g} to {high:.3g})"
-    if not np.isfinite(scale) or low / SAME < 1.0 < high * SAME:
+    if not np.isfinite(scale) or low / same < 1.0 < high * same:
         return [Finding("ok", subject, figures)]
     off = {words: abs(np.log(scale / factor)) for words, factor in units.items()}
     words, *others = sorted(off, key=lambda name: off[name])
@@ -124,7 +132,7 @@ def check_velocity(rows: Rows) -> list[Finding]:
     speed = rms(path)
     if speed < CALM_SPEED:
         text = f"a speed of {speed:.2g} m/s is too little to check the velocity by"
-        return [Finding("not identifiable", "velocity", text, "velocity_frame")]
+        return unseen("velocity", text, "velocity_frame", "velocity_unit")
     quat = rows.get("quat")
     ways = ["", "from-body", "x,-y,-z+from-body", "from-world"] if quat is not None else [""]
     found = {}
@@ -152,15 +160,12 @@ def check_velocity(rows: Rows) -> list[Finding]:
         sure = 0.9 if left[""] > 0.9 else 0.6
         return [Finding("doubt", "velocity", text, "velocity_frame", left[""], sure)]
     else:
-        noisy = left[""] > OK
-        status, sure = ("doubt", 0.6) if noisy else ("ok", None)
-        fault = "velocity_frame" if noisy else ""
-        findings = [Finding(status, "velocity", figures, fault, left[""] if noisy else None, sure)]
+        findings = [Finding("note" if left[""] > OK else "ok", "velocity", figures)]
         apart = 1.0 if quat is None else rms(turn(quat, path) - path) / speed
         if apart < APART:
             text = f"body and world axes are {100 * apart:.0f} % of it apart only"
             findings.append(Finding("not identifiable", "velocity", text, "velocity_frame"))
-    unit = _unit(here, SPEEDS, "vel", "velocity", "velocity_unit", "the path's derivative")
+    unit = _unit(here, SPEEDS, "vel", "velocity", "velocity_unit", "the path's derivative", SLOW)
     return findings + [one for one in unit if one.status != "ok"]
 
 
@@ -190,7 +195,13 @@ def check_accelerometer(rows: Rows) -> list[Finding]:
     size = rms(force)
     if not np.isfinite(force).all(axis=1).sum() > LEAST or size < 1.0:
         text = "there is no path to check it by"
-        return [Finding("not identifiable", "accelerometer", text, "accelerometer_unit")]
+        return unseen(
+            "accelerometer",
+            text,
+            "accelerometer_unit",
+            "accelerometer_axes",
+            "accelerometer_gravity",
+        )
     residual = {name: rms(value - force) / size for name, value in readings.items()}
     given = residual["", 1.0]
     best = min(residual, key=lambda name: residual[name] + 0.03 * (name[0] != ""))

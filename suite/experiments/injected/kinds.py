@@ -42,7 +42,8 @@ class Kind:
 
     def needs(self) -> set[str]:
         """Return the signals that a log must hold for the fault to be put into it."""
-        return {*self.of, *(text.partition("=")[0] for text in self.readings)}
+        turned = {"quat"} if any("from-" in text for text in self.readings) else set()
+        return {*self.of, *turned, *(text.partition("=")[0] for text in self.readings)}
 
 
 def inject(kind: Kind, parts: Mapping[str, np.ndarray], rng: np.random.Generator) -> Parts:
