@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from eval.logs.faults.check import Against, first_stage, lines_of
+from eval.logs.faults.check import Against, first_stage, lines_of, not_examined
 from eval.logs.flight_log import FlightLog, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle
@@ -99,7 +99,9 @@ def diagnose_files(
     def noted(found: dict[str, Any]) -> dict[str, Any]:
         for warning in found["warnings"][len(warnings) :]:
             console.note(f"warning: {warning}")
-        found["findings"] = findings
+        found["findings"], found["not_examined"] = findings, not_examined(logs)
+        if found["verdict"] == "no_gap" and found["not_examined"]:
+            console.note(f"not examined: {', '.join(found['not_examined'])}")
         write_json(out / "diagnosis.json", found)
         return found
 

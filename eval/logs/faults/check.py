@@ -149,6 +149,22 @@ def first_stage(
     return [{**f._asdict(), "flight": name} for f, name in found if f.status != "ok"]
 
 
+def not_examined(logs: Sequence[FlightLog]) -> list[str]:
+    """Return what of the motion no log allows to examine, in words: force, torque."""
+    drives = ("rotor_speed", "pwm")
+    force = any(
+        not {"pos", "quat"} & set(log.partial)
+        and any(getattr(log, name) is not None for name in (*drives, "thrust_cmd"))
+        for log in logs
+    )
+    torque = any(
+        "rate" not in log.partial
+        and any(getattr(log, n) is not None for n in (*drives, "torque_cmd_b", "rate_cmd_b"))
+        for log in logs
+    )
+    return [name for name, seen in (("force", force), ("torque", torque)) if not seen]
+
+
 def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the records of doubts and notes with a name as warnings of a report."""
     return [
