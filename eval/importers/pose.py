@@ -22,6 +22,7 @@ from eval.importers.signals import Recording, Signal, median_step
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.reading import TIMES, read_as
+from eval.logs.files import MOST_ROWS
 from tracks.geometry.rotation import rot_to_quat
 
 FIRST_REACH_S = 15.0
@@ -242,10 +243,24 @@ def _pose_rates(quat: Signal) -> tuple[np.ndarray, np.ndarray]:
     return (0.5 * (quat.time_s[count:] + quat.time_s[:-count]))[good], rates[good]
 
 
+def grid(time_s: np.ndarray, name: str) -> np.ndarray:
+    """Return the grid of the cross-correlation from the first to the last time [s].
+
+    Raises:
+        FlightLogError: where it would be longer than any flight.
+    """
+    span, most = time_s[-1] - time_s[0], MOST_ROWS * GRID_S
+    if span > most:
+        reason = (
+            f"lasts {span:.4g} s, allowed are {most:g} s to align clocks by: is its clock damaged?"
+        )
+        raise FlightLogError(name, "time", None, reason)
+    return np.arange(time_s[0], time_s[-1], GRID_S)
+
+
 def _coarse(centre_s: np.ndarray, by_pose: np.ndarray, rate: Signal, name: str) -> float:
     """Return log time less pose time by the cross-correlation of the rates' magnitudes [s]."""
-    pose_grid = np.arange(centre_s[0], centre_s[-1], GRID_S)
-    log_grid = np.arange(rate.time_s[0], rate.time_s[-1], GRID_S)
+    pose_grid, log_grid = grid(centre_s, name), grid(rate.time_s, name)
     least = int(OVERLAP_S / GRID_S)
     if min(len(pose_grid), len(log_grid)) < least:
         raise FlightLogError(name, None, None, f"less than {OVERLAP_S:g} s to align clocks by")

@@ -15,6 +15,7 @@ import numpy as np
 from eval.importers.frames import turn
 from eval.importers.signals import NEEDED, Recording, Signal, median_step
 from eval.logs.columns import FlightLogError
+from eval.logs.files import MOST_ROWS
 
 LEAST_HZ = 20.0
 """Where that is slower than this, further rows stand between its samples."""
@@ -97,6 +98,12 @@ def row_times(
     step = median_step(base)
     if step > 1.0 / LEAST_HZ and len(base) > 1:
         parts = int(np.ceil(step * LEAST_HZ - 1e-9))
+        if (rows := (len(base) - 1) * parts) > MOST_ROWS:
+            reason = (
+                f"{' and '.join(there)} are {step:.3g} s apart, which makes {rows:,} rows; "
+                f"at most {MOST_ROWS:,}: is its clock damaged, or its unit another one?"
+            )
+            raise FlightLogError(recording.name, "time", None, reason)
         share = np.arange(parts) / parts
         between = base[:-1, None] + share * np.diff(base)[:, None]
         # A hole stays one: rows across it would hold nothing.

@@ -5,8 +5,9 @@ import pytest
 
 from eval.importers import import_log
 from eval.importers.options import ImportOptions
-from eval.importers.rows import averaged, smoothed
-from eval.importers.signals import median_step, signal
+from eval.importers.pose import grid
+from eval.importers.rows import averaged, row_times, smoothed
+from eval.importers.signals import Recording, median_step, signal
 from eval.logs.columns import FlightLogError
 from tests.support import known_flight
 from tests.support.imported import flight, of, write
@@ -86,6 +87,17 @@ def test_a_command_that_stops_is_not_held_for_long(tmp_path):
     log, _ = import_log(path)
     missing = np.isnan(np.asarray(log.thrust_cmd))
     assert missing[log.time_s > 5.6].all() and not missing[log.time_s < 5.4].any()
+
+
+def test_samples_that_are_ages_apart_are_no_rows():
+    """Of a damaged clock: rows between them would fill any memory."""
+    time = 1e7 * np.arange(200.0)
+    pose, _ = signal(time, np.zeros((200, 3)), "log", "position")
+    assert pose is not None
+    with pytest.raises(FlightLogError, match=r"1e\+07 s apart.* at most 4,000,000: is its clock"):
+        row_times(Recording("log", {"pos": pose}), 100.0, 0.0, None)
+    with pytest.raises(FlightLogError, match=r"1\.99e\+09 s, allowed are .* to align clocks by"):
+        grid(time, "log")
 
 
 def test_two_flights_in_one_file_are_refused(tmp_path):
