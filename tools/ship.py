@@ -1,6 +1,6 @@
 """Make the training runs behind a policy and its judgement a shipped policy with its card.
 
-    python tools/ship.py RUN [RUN ...] --eval EVAL [--name racer] [--speed 0.8] [--rays 2]
+    python tools/ship.py RUN [RUN ...] --eval EVAL [--name race] [--speed 0.8] [--rays 2]
 
 Each RUN is a folder of `suite train` that started from the one before it; the last one's policy is
 shipped. EVAL is a folder of `suite eval`; without it the card has no table yet. A policy that takes
@@ -35,8 +35,7 @@ def card(name: str, runs: Sequence[Path], judged: Path | None) -> str:
     lines = []
     for run, facts in zip(runs, made, strict=True):
         rows = curve.read(run)
-        episode = facts["config"]["episode"]
-        seconds = sum(episode["batch"] * episode["steps"] / row["steps_per_s"] for row in rows)
+        seconds = sum(row["seconds"] for row in rows)
         lines.append(
             f"| `{shlex.join(facts['command'])}` | {facts['seed']} | {facts['git_commit']} "
             f"| {len(rows)} | {duration(seconds)} |"
@@ -85,7 +84,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("runs", type=Path, nargs="+", help="folders of suite train, in order")
     parser.add_argument("--eval", type=Path, help="folder of suite eval of the last run's policy")
-    parser.add_argument("--name", default="race-paper", help="the shipped policy's name")
+    parser.add_argument("--name", default="race", help="the shipped policy's name")
     parser.add_argument("--speed", type=float, help="spec.speed, in the place of the run's own")
     parser.add_argument("--rays", type=int, help="spec.camera.rays, in the place of the run's own")
     options = parser.parse_args()
