@@ -15,6 +15,8 @@ REACH_S, STEP_S = 0.3, 0.01
 """Delays that are tried, and their distance [s]."""
 LATE_S = 0.06
 """A response later than the loop, the rotors and the usual link make it by more than this [s]."""
+STEADY_S = 0.1
+"""Within so long before and after, a steady command changes little [s]."""
 USUAL_S = 0.08
 """What these make together where no vehicle file says it [s]."""
 GAIN = (0.8, 1.25)
@@ -95,8 +97,8 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
             fix = option(("cmd_rate", f"{1.0 / factor:.10g}"))
             return [Finding("corrected", subject, text, "rate_command_unit", factor, 0.98, fix)]
     findings = []
-    bend = _bend(command, rate)
-    if np.isfinite(gain) and (high < GAIN[0] or low > GAIN[1] or abs(bend) > BENT):
+    bend = _bend(time_s, command, rate)
+    if np.isfinite(gain) and (high < GAIN[0] or low > GAIN[1] or bend > BENT):
         shape = f", and {1.0 + bend:.2g} times as much of large ones as of small ones"
         text = f"{figures}, by {gain:.3g} of it ({low:.3g} to {high:.3g}){shape}: a stick map or "
         text += "a rates curve that the log's commands do not have"
@@ -141,23 +143,28 @@ def _delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple
     return delay, kept
 
 
-def _bend(command: np.ndarray, rate: np.ndarray) -> float:
+def _bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
     """Return how much more of large commands the body does than of small ones, as a share.
 
-    Of the axes on which small ones are followed closely; 0 where they do not agree.
+    Of commands that hardly change within the loop's response: the body never reaches a short large
+    one. Of the axes on which small ones are followed closely; 0 where they do not agree, or where
+    large commands are followed less.
     """
     both = np.isfinite(command).all(axis=1) & np.isfinite(rate).all(axis=1)
-    bends = []
+    time_s, bends = time_s[both], []
     for c, r in zip(command[both].T, rate[both].T, strict=True):
         limit = np.quantile(np.abs(c), 0.9)
-        large, small = np.abs(c) > 0.6 * limit, np.abs(c) < 0.4 * limit
-        if limit < 3.0 * CALM_RATE or min(large.sum(), small.sum()) < 50 or not r[small].std():
+        change = np.interp(time_s + STEADY_S, time_s, c) - np.interp(time_s - STEADY_S, time_s, c)
+        steady = np.abs(change) < 0.3 * np.abs(c)
+        large = steady & (np.abs(c) > 0.6 * limit)
+        small = steady & (np.abs(c) < 0.4 * limit)
+        if limit < 3.0 * CALM_RATE or min(large.sum(), small.sum()) < 30 or not r[small].std():
             continue
         if np.corrcoef(c[small], r[small])[0, 1] > CLOSE:
-            slopes = [float(c[m] @ r[m]) / float(c[m] @ c[m]) for m in (large, small)]
+            slopes = [float(np.median(r[m] / c[m])) for m in (large, small)]
             bends.append(slopes[0] / slopes[1] - 1.0)
-    alike = bends and (min(bends) > 0.0 or max(bends) < 0.0)
-    return float(np.median(bends)) if alike else 0.0
+    # Less of large commands than of small ones is no curve: motors reach their limits.
+    return float(np.median(bends)) if bends and min(bends) > 0.0 else 0.0
 
 
 def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> list[Finding]:
