@@ -1,7 +1,7 @@
 """Train PPO of Stable-Baselines3 on races, frames stacked in twos, and export it for the judge.
 
 Run: pip install 'diffracing-suite[sb3]'; python examples/sb3_race.py runs/sb3 [MINUTES]; then
-suite eval --policy runs/sb3/policy.onnx --track random --trials 100
+suite eval --policy runs/sb3/policy.onnx --track random --vehicle racer5 --trials 100
 """
 
 # pyright: reportMissingImports=false
