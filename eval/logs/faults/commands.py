@@ -97,9 +97,9 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
             fix = option(("cmd_rate", f"{1.0 / factor:.10g}"))
             return [Finding("corrected", subject, text, "rate_command_unit", factor, 0.98, fix)]
     findings = []
-    bend = _bend(time_s, command, rate)
-    if np.isfinite(gain) and (high < GAIN[0] or low > GAIN[1] or bend > BENT):
-        shape = f", and {1.0 + bend:.2g} times as much of large ones as of small ones"
+    bent = bend(time_s, command, rate)
+    if np.isfinite(gain) and (high < GAIN[0] or low > GAIN[1] or bent > BENT):
+        shape = f", and {1.0 + bent:.2g} times as much of large ones as of small ones"
         text = f"{figures}, by {gain:.3g} of it ({low:.3g} to {high:.3g}){shape}: a stick map or "
         text += "a rates curve that the log's commands do not have"
         fix = "the firmware's rates curve for the map from sticks, or " + option(
@@ -143,7 +143,7 @@ def _delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple
     return delay, kept
 
 
-def _bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
+def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
     """Return how much more of large commands the body does than of small ones, as a share.
 
     Of commands that hardly change within the loop's response: the body never reaches a short large

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from eval.logs.faults import commands
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import CLOCK, DRIVE, POSE, Against, check_files, run_checks
 from eval.logs.faults.clock import check_clock
-from eval.logs.faults.commands import check_controller_rate, check_rate_command
+from eval.logs.faults.commands import check_controller_rate
 from eval.logs.faults.reading import read_rows
 from suite.experiments.injected.kinds import KINDS, inject
 from tests.support import known_flight
@@ -90,15 +91,11 @@ def test_every_name_is_in_the_catalogue():
     assert sum(kind.race for kind in KINDS.values()) == 10
 
 
-def test_a_command_that_ends_before_the_body_follows_is_no_rates_curve():
-    """Short large commands, such as a policy's at the start, are never reached by a loop's lag."""
+def test_a_rates_curve_gives_more_of_large_commands_and_motors_limits_give_less():
     rng = np.random.default_rng(3)
-    time_s = np.arange(0.0, 8.0, 0.01)
-    command = np.repeat(rng.normal(0.0, 0.5, (16, 3)), 50, axis=0)
-    for start in range(25, len(time_s), 100):
-        command[start : start + 6] *= 6.0
-    rate = np.zeros_like(command)
-    for k in range(1, len(time_s)):
-        rate[k] = rate[k - 1] + 0.01 / 0.08 * (command[k - 1] - rate[k - 1])
-    found = check_rate_command({"time": time_s, "cmd_rate": command, "rate": rate})
-    assert "rate_curve" not in [one.fault for one in found]
+    time_s = np.arange(0.0, 40.0, 0.01)
+    command = np.repeat(rng.normal(0.0, 1.0, (80, 3)), 50, axis=0)
+    curved = command * (0.5 + np.abs(command))
+    assert commands.bend(time_s, command, curved) > commands.BENT
+    assert commands.bend(time_s, command, np.clip(command, -0.8, 0.8)) == 0.0
+    assert abs(commands.bend(time_s, command, 0.9 * command)) < 1e-6
