@@ -51,8 +51,10 @@ APART = 0.5
 
 def check_gyro(rows: Rows) -> list[Finding]:
     """Return what is wrong with the gyro's axes, frame and unit, by how the attitude turns."""
-    if not {"quat", "rate"} <= rows.keys():
+    if "rate" not in rows:
         return []
+    if "quat" not in rows:
+        return unseen("gyro", "the log has no attitude", "gyro_scale", "gyro_axes", "gyro_frame")
     time_s = rows["time"]
     turns = smooth(time_s, turns_of(time_s, rows["quat"]), WIDTH_S)
     gyro = smooth(time_s, rows["rate"], WIDTH_S)
