@@ -29,8 +29,8 @@ from suite.diagnose.data.colour import Noise, measured_noise
 from suite.diagnose.data.windows import cut
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.rollout_fit import start_estimate
 from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.evidence.rollouts import start_estimate
 from suite.diagnose.plans.follow import FlightFailed
 from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json
@@ -75,7 +75,7 @@ def gap_with(
     assert windows is not None
     model = RolloutModel(vehicle, make_space(vehicle), rotor_input=False, voltage=False)
     begin = start_estimate(model, windows)
-    linear = model.linearise(begin.theta, begin.offset, windows, model.starts)
+    linear = model.linearise(begin.theta, begin.free, windows, model.starts)
     noise = noise or measured_noise(linear.residual, linear.start_slope, windows)
     return gap_of(linear, windows, noise).rms, noise
 

@@ -17,19 +17,18 @@ from suite.diagnose.change.reference import changed_task, search_change
 from suite.diagnose.data.flights import ViewFlights, parted, ready
 from suite.diagnose.data.hold_out import choose_held_out
 from suite.diagnose.data.view import FORCE, View
+from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import (
     ParameterSpace,
     candidates,
-    indices_of,
+    implausible,
     make_space,
     with_fitted,
 )
 from suite.diagnose.evidence.force_torque import ForceModel
-from suite.diagnose.evidence.view_equations import ViewTask, fitted, half_widths, left_of, look
-from suite.diagnose.evidence.weigh import weights_of
-from suite.diagnose.search.composites import composites
-from suite.diagnose.search.plausible import implausible
-from suite.diagnose.search.view_search import ViewName, ViewSearch, search_view
+from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidates
+from suite.diagnose.search.look import NamedEffect, SearchResult
+from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.relevance import EffectSize, Negligible, view_size
 from suite.diagnose.verdict.rotor_lag import LAG, RotorLag, another_lag
@@ -42,11 +41,11 @@ class ViewResult:
     """What one view found."""
 
     view: View
-    search: ViewSearch
-    held: ViewTask
+    search: SearchResult
+    held: ViewEvidence
     """The flights that took no part in it."""
     gap: ViewGap
-    names: tuple[ViewName, ...]
+    names: tuple[NamedEffect, ...]
     """What of the search's names stands, beside the other views'."""
     half_width: dict[int, float]
     """Of the 95 % interval, by the place of each named number."""
@@ -60,11 +59,13 @@ class ViewResult:
         size = EffectSize(rms, 0.0, None) if self.view.in_world else EffectSize(0.0, rms, None)
         return share if size.relevant(limits) else 0.0
 
-    def size(self, names: Sequence[ViewName]) -> tuple[EffectSize, EffectSize]:
+    def size(self, names: Sequence[NamedEffect]) -> tuple[EffectSize, EffectSize]:
         """Return what `names` do together in this view, and the upper end of its interval."""
         at = sorted({i for name in names for i in name.candidate.indices})
         last = self.search.last
-        slope, away = last.data.slope[..., at], (last.theta - self.search.first.theta)[at]
+        assert isinstance(last.block, ViewBlock)
+        slope = last.block.data.slope[..., [last.block.along.index(i) for i in at]]
+        away = (last.at.theta - self.search.start.theta)[at]
         wide = np.array([self.half_width[i] for i in at])
         doubt = np.sqrt(((slope * wide) ** 2).sum(axis=-1))
         inside = self.view.in_world
@@ -106,7 +107,7 @@ class ViewsDiagnosis:
         )
 
     @property
-    def named(self) -> list[tuple[ViewResult, ViewName]]:
+    def named(self) -> list[tuple[ViewResult, NamedEffect]]:
         """Every name that stands, with its view."""
         return [(result, name) for result in self.results for name in result.names]
 
@@ -147,20 +148,22 @@ def diagnose_by_views(
     inside, held = parted(flights, held_numbers, limits)
     results = []
     for view in flights.views:
-        task = ViewTask(view, model, inside[view.name], limits)
+        task = ViewEvidence(view, model, inside[view.name], limits)
         if known and spread:
             found = search_change(known[view.name], task.flights, spread, among, seed)
-            apart = changed_task(known[view.name], found.first.theta, held[view.name])
-            apart = apart._replace(means=True)
+            apart = changed_task(known[view.name], found.start.theta, held[view.name])
+            apart = replace(apart, means=True)
             if whole and not found.named:
                 moved = search_motion_change(known[view.name], task, among)
                 if moved:
-                    found, apart = moved, task._replace(flights=held[view.name])
+                    found, apart = moved, replace(task, flights=held[view.name])
         else:
-            found = search_view(task, [*among, *composites(among)], seed)
-            apart = task._replace(flights=held[view.name])
+            begun = task.weighed(task.start)
+            seen = view_candidates([*among, *composites(among)], begun[1])
+            found = search(begun[0], task.start, seen, say, seed, begun)
+            apart = replace(task, flights=held[view.name])
         gap = judge(found, apart, flights.floor[view.name])
-        widths = half_widths(found.last, found.indices) if found.named else []
+        widths = found.half_widths()
         width = dict(zip(found.indices, map(float, widths), strict=True))
         result = ViewResult(view, found, apart, gap, found.named, width)
         results.append(result if known else _relevant(result, limits))
@@ -177,13 +180,13 @@ def diagnose_by_views(
     ]
     for result in results:
         for name in result.names:
-            far = implausible(space, result.search.last.theta, name.candidate, limits)
+            far = implausible(space, result.search.estimate.theta, name.candidate, limits)
             warnings += [f"implausible: {one}, beyond three times what is usual" for one in far]
     swing = None
     for result in results:
         if result.view.name == FORCE.name and not references:
-            every = ViewTask(result.view, model, flights.smoothed[FORCE.name], limits)
-            swing = swing_left(every, result.search.last.theta)
+            every = ViewEvidence(result.view, model, flights.smoothed[FORCE.name], limits)
+            swing = swing_left(every, result.search.estimate.theta)
     lag = None if references else another_lag(logs, vehicle, limits)
     if lag:
         say(f"commands and rotor speeds: {LAG}, {lag.time_constant:.3g} s")
@@ -209,7 +212,7 @@ def _reference_tasks(
     vehicle: Vehicle,
     references: Sequence[FlightLog],
     limits: Thresholds,
-) -> tuple[dict[str, ViewTask], RotorSpread | None, tuple[str, ...]]:
+) -> tuple[dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
     """Return the reference flights' task by view, how they differ, and which were left out."""
     if not references:
         return {}, None, ()
@@ -231,10 +234,10 @@ def _reference_tasks(
             f"{', '.join(view.name for view in flights.views)}: log both alike"
         )
     tasks = {
-        view.name: ViewTask(view, model, before.smoothed[view.name], limits)
+        view.name: ViewEvidence(view, model, before.smoothed[view.name], limits)
         for view in flights.views
     }
-    after = [task._replace(flights=flights.smoothed[name]) for name, task in tasks.items()]
+    after = [replace(task, flights=flights.smoothed[name]) for name, task in tasks.items()]
     return tasks, rotor_spread([*tasks.values(), *after]), before.notes
 
 
@@ -243,11 +246,10 @@ def _held(
 ) -> tuple[list[int], list[str]]:
     """Return the numbers and the names of the flights that are held out."""
     view = flights.views[0]
-    task = ViewTask(view, model, flights.smoothed[view.name], limits)
-    start = model.space.array("start")
-    first = look(task, start, weights_of(left_of(task, start), limits))
-    told = np.einsum("bkk->bk", first.block.hessian)
-    _, names = choose_held_out(logs, first.flight, np.zeros(len(told)), told, limits)
+    task = ViewEvidence(view, model, flights.smoothed[view.name], limits)
+    block = task.weighed(task.start)[1]
+    told = (block.slope**2).sum(axis=1)
+    _, names = choose_held_out(logs, block.flight, np.zeros(len(told)), told, limits)
     return [k for k, log in enumerate(logs) if log.name in names], names
 
 
@@ -264,7 +266,7 @@ def _confirmed(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...],
             warnings.append(
                 f"{one.view.name}: {labels}: withdrawn, held-out flights are no better for it"
             )
-            nothing = replace(one.search, named=(), last=one.search.first)
+            nothing = one.search.refitted(())
             gap = judge(nothing, one.held, gap.floor)
             one = replace(one, search=nothing, gap=gap, names=(), half_width={})
         kept.append(one)
@@ -273,7 +275,7 @@ def _confirmed(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...],
 
 def _relevant(result: ViewResult, limits: Thresholds) -> ViewResult:
     """Return the result without names that do too little to matter on these flights."""
-    by_effect: dict[str, list[ViewName]] = {}
+    by_effect: dict[str, list[NamedEffect]] = {}
     for name in result.names:
         by_effect.setdefault(name.candidate.name, []).append(name)
     sizes = {effect: result.size(names) for effect, names in by_effect.items()}
@@ -281,12 +283,7 @@ def _relevant(result: ViewResult, limits: Thresholds) -> ViewResult:
     if not small:
         return result
     kept = tuple(name for name in result.names if name.candidate.name not in small)
-    task, theta = result.search.task, result.search.last.theta.copy()
-    gone = [i for n in result.names if n not in kept for i in n.candidate.indices]
-    theta[gone] = result.search.first.theta[gone]
-    last = look(task, theta, result.search.last.weights)
-    last = fitted(task, last, indices_of([name.candidate for name in kept]))
-    search = replace(result.search, named=kept, last=last)
+    search = result.search.refitted(kept)
     return replace(
         result,
         search=search,
@@ -324,10 +321,10 @@ def _one_cause(results: tuple[ViewResult, ...]) -> tuple[tuple[ViewResult, ...],
     return tuple(kept), told
 
 
-def _relative(result: ViewResult, name: ViewName) -> float:
+def _relative(result: ViewResult, name: NamedEffect) -> float:
     """Return the width of a name's numbers over their size."""
     at = list(name.candidate.indices)
-    away = np.abs(result.search.last.theta[at] - result.search.first.theta[at])
+    away = np.abs(result.search.estimate.theta[at] - result.search.start.theta[at])
     return float(np.mean([result.half_width[i] for i in at]) / max(away.mean(), 1e-12))
 
 
@@ -362,7 +359,7 @@ def _with_names(
     for one in results:
         for name in one.names:
             at = list(name.candidate.indices)
-            theta[at] = one.search.last.theta[at]
+            theta[at] = one.search.estimate.theta[at]
             names.append(name.candidate.name)
     besides = {LAG: EFFECTS[LAG].values(lag.time_constant)} if lag else None
     return with_fitted(vehicle, space, theta, names, besides)

@@ -18,18 +18,22 @@ from suite.diagnose.data.hold_out import choose_held_out
 from suite.diagnose.data.view import FORCE
 from suite.diagnose.data.whitening import Linearisation
 from suite.diagnose.data.windows import LENGTH_S, FlightWindows, cut, take
-from suite.diagnose.estimate.intervals import half_widths95
+from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates, make_space, with_fitted
 from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.force_torque import ForceModel
-from suite.diagnose.evidence.rollout_fit import information, start_estimate
 from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.evidence.view_equations import ViewTask
-from suite.diagnose.search.composites import composites
-from suite.diagnose.search.look import least_left
-from suite.diagnose.search.search import SearchResult, search
+from suite.diagnose.evidence.rollouts import (
+    information,
+    least_left,
+    start_estimate,
+    weighed_by,
+)
+from suite.diagnose.evidence.views import ViewEvidence
+from suite.diagnose.search.look import SearchResult, rollouts_of
+from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.confirmation import confirmed, control, without_names
+from suite.diagnose.verdict.confirmation import confirmed, control
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap, measure, worse
 from suite.diagnose.verdict.model_error import with_model_error
@@ -121,7 +125,7 @@ def _diagnose(
     _enough(len(whole.flight), limits)  # before anything is compiled
     say("flying the model from every stretch; its first time on a machine takes half a minute")
     begin = start_estimate(model, whole)
-    linear = model.linearise(begin.theta, begin.offset, whole, None)
+    linear = model.linearise(begin.theta, begin.free, whole, None)
     good = _sound(linear, limits)
     if not good.all():
         broken = int((~good).sum())
@@ -146,16 +150,19 @@ def _diagnose(
     among = candidates(space, voltage, has if rotor_input else has | {"command"})
     among += composites(among)
     say(f"{len(windows.flight)} stretches of 1 s to fit, {len(apart.flight)} held out")
-    found = search(model, windows, among, say, _take(linear, inside), seed, limits)
+    start = start_estimate(model, windows)
+    known = weighed_by(model, windows, _take(linear, inside), limits)
+    found = search(known[0], start, among, say, seed, known)
+    noise = rollouts_of(found.last).noise
 
     held = _held_out(logs, vehicle, rotor_input, apart, limits, integrator)
-    before = measure(model, begin.theta, held, found.noise, limits)
+    before = measure(model, begin.theta, held, noise, limits)
     after = before
     if found.named:
-        after = measure(model, found.estimate.theta, held, found.noise, limits)
+        after = measure(model, found.estimate.theta, held, noise, limits)
         if worse(before, after, limits=limits):
             warnings.append("what was found on the fitted flights does not hold on held-out ones")
-            found, after = without_names(model, found, limits), before
+            found, after = found.refitted(()), before
     found, after, without, gone = confirmed(model, found, held, (before, after), limits)
     warnings += [f"{label}: withdrawn, held-out flights are no better for it" for label in gone]
     found, after, sizes, small = relevant_part(model, found, held, (before, after), limits)
@@ -169,7 +176,9 @@ def _diagnose(
         if not gap_matters(gaps[1], len(held.flight), limits):
             label = "named" if found.named else "no_gap"
             return residual, None, Verdict(label, share_left(*gaps) if found.named else 0.0)
-        return residual, turbulence, verdict_on(found, residual, gaps, rotor_input, limits)
+        slow = rollouts_of(found.last).slow_errors(found.last.block)
+        verdict = verdict_on(bool(found.named), slow, residual, gaps, rotor_input, limits)
+        return residual, turbulence, verdict
 
     (residual, turbulence, verdict), swing = leaves(found, (before, after)), None
     if turbulence or verdict.where:
@@ -178,14 +187,14 @@ def _diagnose(
         verdict, turbulence = with_swing(verdict, swing.words, bool(found.named)), None
     if turbulence and found.named and not worse(after, before, limits=limits):
         # Wind that lasts from one stretch to the next looks like many a steady number.
-        found, after = without_names(model, found, limits), before
+        found, after = found.refitted(()), before
         residual, turbulence, verdict = leaves(found, (before, after))
     if turbulence:
         verdict = Verdict("named", share_left(before, after))
     if verdict.label == "unknown" and found.named:
         labels = ", ".join(candidate.label for candidate in found.candidates)
         warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
-        found, after = without_names(model, found, limits), before
+        found, after = found.refitted(()), before
         residual, _, bare = leaves(found, (before, after))
         verdict = Verdict("unknown", 1.0, bare.where or verdict.where)
         swing = _swing(logs, vehicle, voltage, found, limits) if swing else None
@@ -194,7 +203,7 @@ def _diagnose(
     return Diagnosis(
         verdict=verdict,
         search=found,
-        half_widths=half_widths95(found.judged, found.windows.flight if found.off else None),
+        half_widths=found.half_widths(),
         vehicle=_with_effects(vehicle, model, found, turbulence),
         before=before,
         after=after,
@@ -256,8 +265,9 @@ def _left_over(
     model: RolloutModel, found: SearchResult, seed: int, limits: Thresholds
 ) -> tuple[ResidualStructure, Turbulence | None]:
     """Return the structure in what `found` leaves over, and the wind that may have made it."""
-    windows = found.windows
-    equations = disturbance_equations(model, windows, found.whitening, found.estimate, limits)
+    evidence = rollouts_of(found.last)
+    windows, whitening = evidence.trusted, evidence.whitening
+    equations = disturbance_equations(model, windows, whitening, found.estimate, limits)
     fold = folds_of(windows.flight, windows.start_s, limits.folds)
     residual = residual_structure(equations, fold, seed, limits)
     forces = [p for axis, p in residual.coloured.items() if axis.startswith("force")]
@@ -284,7 +294,7 @@ def _swing(
     except ValueError:  # rollouts need other stretches than this look, which is one more
         return None
     model = ForceModel(vehicle, make_space(vehicle), voltage)
-    return swing_left(ViewTask(FORCE, model, flights, limits), found.estimate.theta)
+    return swing_left(ViewEvidence(FORCE, model, flights, limits), found.estimate.theta)
 
 
 def _late(found: Diagnosis) -> dict[str, float]:

@@ -130,7 +130,7 @@ def diagnose_files(
         found["unexplained"]["where"] += f"; most in {told}"
     out.mkdir(parents=True, exist_ok=True)
     if plan or truth is not None:
-        folder, sigma = out / "plan", result.search.sigma
+        folder, sigma = out / "plan", result.sigma
         found["plan"] = write_plan_of(found, folder)
         if truth is not None:
             found["plan"] = fly_plan(found["plan"], sigma, vehicle, truth, folder, seed)

@@ -80,6 +80,8 @@ class Thresholds:
     """Errors of rotor speeds may be this much larger, for what happens between the knots [1]."""
     singular: float = 1e-5
     """A column with less than this of its own beside the others needs Householder's way [1]."""
+    fit_rounds: int = 3
+    """Gauss-Newton steps of a fit, where no other number of them is given."""
     converged: float = 0.05
     """A fit is done where another round would lower chi-square by less than this [1]."""
     sign_draws: int = 1999
@@ -144,8 +146,6 @@ class Thresholds:
     """Flights from which their means tell how trims differ between flights."""
     longest_memory: int = 40
     """Neighbouring moments of a view up to which errors may hang together."""
-    view_rounds: int = 4
-    """Gauss-Newton steps of a view's fits, which are nearly linear."""
     least_fast_share: float = 0.5
     """Fast changes that surely ask for less than this share of a name speak against it [1]."""
     least_view_share: float = 0.03

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from suite.diagnose.evidence.moments import means_of
-from suite.diagnose.evidence.view_equations import ViewTask, left_of
+from suite.diagnose.evidence.views import ViewEvidence
 
 
 def chance_of(
@@ -99,20 +99,20 @@ def _moderated(
     return (prior * pooled + square) / (prior + freedom)
 
 
-def rotor_gain(task: ViewTask) -> np.ndarray:
+def rotor_gain(task: ViewEvidence) -> np.ndarray:
     """Return what a rotor's own change of thrust does along each axis (3,), all four together."""
     space = task.model.space
     at = [i for i, entry in enumerate(space.entries) if entry.effect == "weak_motor"]
-    slope = left_of(task, space.array("start")).slope[..., at].mean(axis=0)
+    slope = task.left(space.array("start"), at).slope.mean(axis=0)
     return np.sqrt((slope**2).sum(axis=1))
 
 
-def rotor_spread(sets: Sequence[ViewTask]) -> RotorSpread:
+def rotor_spread(sets: Sequence[ViewEvidence]) -> RotorSpread:
     """Return how flights differ within each of `sets`: the reference's and the others', by view."""
     square: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3))
     freedom: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3, int))
     for task in sets:
-        data, gain = left_of(task, task.model.space.array("start")), rotor_gain(task)
+        data, gain = task.left(task.start.theta), rotor_gain(task)
         means = means_of(data.residual, data.flight)
         axes = gain > task.limits.least_rotor_gain * gain.max()
         if task.view.in_world:

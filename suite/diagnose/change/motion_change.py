@@ -15,13 +15,11 @@ import numpy as np
 from scipy.stats import ttest_ind
 
 from suite.diagnose.change.reference import in_balance
-from suite.diagnose.estimate.parameters import Candidate
-from suite.diagnose.evidence.moments import ViewData, centred
-from suite.diagnose.evidence.view_equations import ViewTask, left_of, look
-from suite.diagnose.evidence.weigh import weights_of
-from suite.diagnose.search.plausible import at_bound, usual_first
-from suite.diagnose.search.rivals import flights_agree
-from suite.diagnose.search.view_search import ViewName, ViewSearch, view_candidates
+from suite.diagnose.estimate.parameters import Candidate, at_bound, usual_first
+from suite.diagnose.evidence.evidence import flights_agree
+from suite.diagnose.evidence.moments import ViewData, centred, weights_of
+from suite.diagnose.evidence.views import ViewEvidence, view_candidates
+from suite.diagnose.search.look import Look, NamedEffect, SearchResult
 
 SLIGHT = 0.1
 """Share of a change by which its numbers may lie beyond what is physical; noise does that."""
@@ -54,18 +52,19 @@ def own_changes(inside: ViewData, indices: Sequence[int], scatter: np.ndarray) -
 
 
 def search_motion_change(
-    reference: ViewTask, task: ViewTask, among: Sequence[Candidate]
-) -> ViewSearch | None:
+    reference: ViewEvidence, task: ViewEvidence, among: Sequence[Candidate]
+) -> SearchResult | None:
     """Return the one of `among` that has changed since `reference`, None where none stands out.
 
     Its numbers are totals. Both sets need two flights at least.
     """
     start, limits = in_balance(reference), task.limits
-    sets = [within_flights(left_of(one, start)) for one in (reference, task)]
+    sets = [within_flights(one.left(start, None)) for one in (reference, task)]
     if min(len(np.unique(one.flight)) for one in sets) < 2:
         return None
-    weights = weights_of(sets[1], limits)
-    left, space = view_candidates(among, look(task, start, weights)), task.model.space
+    weights, space = weights_of(sets[1], limits), task.space
+    evidence = replace(task, weights=weights)
+    left = view_candidates(among, evidence.linearise(evidence.at(start)))
     tests = sum(len(one.indices) for one in left)
     tried = []
     for candidate in left:
@@ -85,7 +84,8 @@ def search_motion_change(
         if beyond > SLIGHT * np.linalg.norm(wanted - since) or at_bound(space, possible, candidate):
             continue  # that is no fit
         if flights_agree(gains) and share >= limits.least_view_share:
-            name = ViewName(candidate, p_value, tuple(gains.tolist()), share)
+            told = tuple(gains.tolist())
+            name = NamedEffect(candidate, p_value, sum(told), gains=told, share=share)
             tried.append((name, since, possible))
     if not tried:
         return None
@@ -96,8 +96,11 @@ def search_motion_change(
     begun = start.copy()
     begun[list(name.candidate.indices)] += since
     rivals = tuple(dict.fromkeys(other.candidate.name for other, *_ in others))
+    at = evidence.at(theta)
+    block = evidence.linearise(at, sorted(name.candidate.indices))
+    last = Look(evidence, at, block, block.equations())
     named = (replace(name, rivals=rivals),)
-    return ViewSearch(task, named, look(task, begun, weights), look(task, theta, weights))
+    return SearchResult(named, evidence.at(begun), last, last, [], 0.0)
 
 
 def _gains(

@@ -11,9 +11,10 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from suite.diagnose.checks.delta_model import BlackBoxConfig, black_box_gap, fit_black_box
-from suite.diagnose.data.whitening import make_whitening
 from suite.diagnose.data.windows import LENGTH_S, FlightWindows, take
-from suite.diagnose.evidence.rollout_fit import fit, start_estimate
+from suite.diagnose.estimate.gauss_newton import fit
+from suite.diagnose.evidence.rollouts import start_estimate, weighed_by
+from suite.diagnose.search.look import rollouts_of
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap, measure
 
@@ -58,7 +59,8 @@ def compare_black_box(
     """
     began = time.monotonic()
     limits, search = diagnosis.limits, diagnosis.search
-    model, noise, held = diagnosis.model, search.noise, diagnosis.held_windows
+    model, held = diagnosis.model, diagnosis.held_windows
+    noise = rollouts_of(search.last).noise
 
     def show(part: int) -> Callable[[int, str], None]:
         return lambda step, words: progress(0.5 * (part + step / config.iterations), words)
@@ -83,9 +85,9 @@ def compare_black_box(
         named = None
         if search.named:
             start = start_estimate(model, slow)
-            linear = model.linearise(start.theta, start.offset, slow, model.starts)
-            whitening = make_whitening(linear, noise, slow, limits)
-            best, _ = fit(model, slow, whitening, start, search.indices, limits=limits)
+            linear = model.linearise(start.theta, start.free, slow, None)
+            evidence, block = weighed_by(model, slow, linear, limits, noise)
+            best, _ = fit(evidence, start, search.indices, known=block, limits=limits)
             named = measure(model, best.theta, fast, noise, limits)
         outside = BlackBoxComparison(
             judged_on=f"speeds above {split:.1f} m/s, fitted below",

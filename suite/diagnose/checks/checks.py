@@ -46,7 +46,7 @@ def run_checks(diagnosis: Diagnosis) -> Checks:
         diagnosis.start,
         diagnosis.fitted,
         windows,
-        diagnosis.search.sigma,
+        diagnosis.sigma,
         _measured_start_noise(diagnosis, windows),
         limits,
     )
@@ -63,7 +63,7 @@ def _measured_start_noise(diagnosis: Diagnosis, windows: FlightWindows) -> np.nd
 
     A velocity that was derived from positions is as noisy as the derivation makes it.
     """
-    sigma = diagnosis.search.sigma.copy()
+    sigma = diagnosis.sigma.copy()
     if not np.isfinite(sigma[6:9]).all():
         sigma[6:9] = _derived_velocity_noise(diagnosis.logs) * sigma[:3]
     return start_noise(sigma, windows, diagnosis.model.free, diagnosis.limits)

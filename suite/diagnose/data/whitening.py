@@ -152,6 +152,16 @@ def project_out_start(whitening: Whitening, white: np.ndarray) -> np.ndarray:
     return white - whitening.start @ (np.swapaxes(whitening.start, 1, 2) @ white)
 
 
+def slow_energy(whitening: Whitening, residual: np.ndarray) -> np.ndarray:
+    """Return the energy of slow errors (W, 12) in a block's `residual` (W, M), by channel.
+
+    What the start explains is out of the residual, so the slow errors need not be freed of it.
+    """
+    rows = residual[:, : whitening.weight[0].size].reshape(whitening.weight.shape)[..., :STATE]
+    along = (np.swapaxes(rows, 1, 2)[:, :, None] @ whitening.slow)[:, :, 0]
+    return (along**2).sum(axis=2)
+
+
 def whitened_residual(whitening: Whitening, linear: Linearisation) -> np.ndarray:
     """Return the residuals of `linear` over their noise, (W, M, 1)."""
     white = whiten(whitening, linear.residual[..., None])

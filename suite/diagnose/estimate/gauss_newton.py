@@ -1,53 +1,15 @@
-"""Gauss-Newton: normal equations of blocks of evidence, and the step that solves them in bounds.
-
-All that a search needs of a block is a few sums: J'J, J'r and r'r of what is left when its nuisance
-parameters are projected out.
-"""
+"""The one fit: Gauss-Newton with bounds, halved where a step fails, on whatever makes blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
-
-
-class NormalEquations(NamedTuple):
-    """Gauss-Newton's sums of each of W windows along K numbers, J and r whitened."""
-
-    hessian: np.ndarray
-    """(W, K, K) J'J."""
-    gradient: np.ndarray
-    """(W, K) J'r."""
-    chi2: np.ndarray
-    """(W,) r'r."""
-    slow_energy: np.ndarray
-    """(W, 12) energy of slow errors, by channel of pose, velocity and rates."""
-    lent: tuple[int, ...] = ()
-    """Numbers whose columns come once more, last: as they are where what they act through is there
-    (`composites.Lent`)."""
-
-    def columns_of(self, candidate: Candidate) -> tuple[int, ...]:
-        """Return the columns of `candidate` where the first are along all numbers, in order."""
-        if not candidate.parts:
-            return candidate.indices
-        first = self.gradient.shape[1] - len(self.lent)
-        again = {number: first + k for k, number in enumerate(self.lent)}
-        return tuple(again.get(number, number) for number in candidate.indices)
-
-    def numbers_of(self, columns: Sequence[int]) -> list[int]:
-        """Return the place in the vector of what each of `columns` is along."""
-        first = self.gradient.shape[1] - len(self.lent)
-        return [c if c < first else self.lent[c - first] for c in columns]
-
-
-def products(slope: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return J'J (W, K, K) and J'r (W, K) of `slope` (W, M, K) and `residual` (W, M, 1)."""
-    turned = np.swapaxes(slope, 1, 2)
-    return turned @ slope, (turned @ residual)[..., 0]
+from suite.diagnose.estimate.block import Block, Estimate, Linearised, NormalEquations
+from suite.diagnose.estimate.parameters import ParameterSpace
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 def solve(
@@ -80,33 +42,92 @@ def solve(
 
 
 def gauss_newton_step(
-    hessian: np.ndarray,
-    gradient: np.ndarray,
+    equations: NormalEquations,
     theta: np.ndarray,
     space: ParameterSpace,
-    indices: Sequence[int],
+    inside: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
-    """Return the best change of the numbers at `indices` and the fall of chi-square it promises.
+    """Return the best change of the equations' numbers and the fall of chi-square it promises.
 
-    `hessian` (K, K) and `gradient` (K,) are along them alone, taken at `theta` (P,).
+    Args:
+        equations: along numbers that are fitted together, taken at `theta`.
+        theta: (P,) all numbers.
+        space: their bounds.
+        inside: (B,) bool: the stretches that count; all if not given.
     """
-    at = np.array(indices, dtype=int)
+    hessian, gradient = equations.sums(inside)
+    at = np.array(equations.numbers, dtype=int)
     low, high, scale = (space.array(name)[at] for name in ("low", "high", "step"))
     change = solve(hessian, gradient, low - theta[at], high - theta[at], scale)
     return change, float(2 * gradient @ change - change @ hessian @ change)
 
 
-def along_numbers(
+def chi2_fall(
     equations: NormalEquations, theta: np.ndarray, space: ParameterSpace, columns: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the change (P,) of all numbers that `columns` ask for, and what is told of each (P,).
+) -> float:
+    """Return the fall of chi-square to first order where the numbers at `columns` are fitted."""
+    some = equations.take(sorted(set(columns)))
+    if not some.gradient.shape[1] or np.einsum("bkk->", some.hessian) < 1e-12:
+        return 0.0
+    return gauss_newton_step(some, theta, space)[1]
 
-    `equations` were taken at `theta` (P,); numbers that no column is along are not changed.
+
+def chi2_by_part(
+    equations: NormalEquations, theta: np.ndarray, space: ParameterSpace, part: np.ndarray
+) -> np.ndarray:
+    """Return the squared error (G,) of each part under what the others fit of the numbers.
+
+    To first order about `theta` (P,), where the equations were taken; `part` (B,) is the number of
+    each stretch's part.
     """
-    at, numbers = list(columns), equations.numbers_of(columns)
-    hessian = equations.hessian.sum(axis=0)[np.ix_(at, at)]
-    gradient = equations.gradient.sum(axis=0)[at]
-    moved, _ = gauss_newton_step(hessian, gradient, theta, space, numbers)
-    change, told = np.zeros_like(theta), np.zeros_like(theta)
-    change[numbers], told[numbers] = moved, np.diag(hessian)
-    return change, told
+    found = []
+    for number in np.unique(part):
+        inside = part == number
+        moved, _ = gauss_newton_step(equations, theta, space, ~inside)
+        own, pull = equations.sums(inside)
+        found.append(equations.chi2[inside].sum() - 2.0 * pull @ moved + moved @ own @ moved)
+    return np.array(found, dtype=float)
+
+
+def fit(
+    evidence: Linearised,
+    start: Estimate,
+    indices: Sequence[int],
+    rounds: int | None = None,
+    known: Block | None = None,
+    limits: Thresholds = THRESHOLDS,
+) -> tuple[Estimate, Block]:
+    """Fit the numbers at `indices` and what is free in every stretch.
+
+    At most `rounds` steps are taken, those of the limits if not given; `known` is what the evidence
+    says at `start`, to save its calculation.
+
+    Returns:
+        The best estimate, and what the evidence says there.
+    """
+    at, space = np.array(indices, dtype=int), evidence.space
+    low, high = space.array("low")[at], space.array("high")[at]
+    best, block = start, known or evidence.linearise(start, indices)
+    for done in range(limits.fit_rounds if rounds is None else rounds):
+        equations = block.equations().along_numbers(indices)
+        change, promised = gauss_newton_step(equations, best.theta, space)
+        # What is free moves as well, at least once.
+        if promised < limits.converged and (done or not block.free.shape[1]):
+            break
+        columns = [block.along.index(number) for number in indices]
+        moved = block.free - block.free_slope[..., columns] @ change
+        share, total = 1.0, float(equations.chi2.sum())
+        while share > 0.1:
+            theta = best.theta.copy()
+            theta[at] = np.clip(theta[at] + share * change, low, high)
+            free = best.free + share * moved if moved.size else best.free
+            trial = Estimate(theta, free)
+            there = evidence.linearise(trial, indices)
+            chi2 = float((there.residual**2).sum())
+            if np.isfinite(chi2) and chi2 <= total + 1e-6:
+                break
+            share /= 2.0
+        else:
+            break
+        best, block = trial, there
+    return best, block

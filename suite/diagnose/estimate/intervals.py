@@ -1,64 +1,94 @@
-"""95 % intervals of fitted numbers: by the noise, by blocks, by flights, by leaving flights out."""
+"""The one interval of fitted numbers: by curvature, by stretches of flights and by flights."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from scipy.stats import chi2
 from scipy.stats import t as student
 
-from suite.diagnose.estimate.gauss_newton import NormalEquations
+from suite.diagnose.estimate.block import NormalEquations
+
+Z95 = 1.96
+TINY = 1e-12
+"""Information below this is none."""
+RIDGE = 1e-9
+"""Makes what cannot be told apart wide, where a pseudo-inverse would hide it."""
+FEWEST = 3
+"""Flights from which how they differ says something."""
 
 
-def half_widths95(
-    equations: NormalEquations, flight: np.ndarray | None = None, noise_freedom: int | None = None
-) -> np.ndarray:
-    """Return half-widths (K,) of 95 % intervals at the fit whose normal equations these are.
+class Intervals(NamedTuple):
+    """How far K fitted numbers may be off."""
 
-    The largest of these counts: by the covariance of the noise (Gauss-Newton), and by the one in
-    which each window's slope is one draw (the block sandwich; Liang and Zeger 1986), which holds
-    where errors within a window are not independent. With `flight` (W,), the number of each
-    window's flight, one in which each flight is one draw: a model's error comes back in every
-    window of a flight. The noise is known with `noise_freedom` degrees of freedom, that of the
-    windows if not given.
+    half_width: np.ndarray
+    """(K,) of the 95 % intervals."""
+    by_stretch: np.ndarray
+    """(K, K) covariance by how stretches disagree."""
+    inverse: np.ndarray
+    """(K, K) of the information, which is the covariance by independent noise."""
 
-    Few flights pull a fit of several numbers towards what they themselves want, so that by their
-    slopes it is surer than it is: each flight is left out in turn as well (jackknife).
+
+def intervals95(
+    equations: NormalEquations,
+    differ_p: float = 0.0,
+    leave_out: bool = False,
+    noise_share: float = 1.0,
+    prior: np.ndarray | None = None,
+) -> Intervals:
+    """Return the intervals at the fit whose normal equations these are.
+
+    The largest of these counts: by curvature, the covariance of the noise; by stretches, each of
+    which is one draw (the sandwich; Liang and Zeger 1986), which holds where errors within one are
+    not independent; and by flights, each left out in turn (jackknife), where they differ by more
+    than their stretches explain (Cochran's Q): a model's error comes back in all of a flight.
+
+    Args:
+        equations: along the fitted numbers.
+        differ_p: flights differ where chance makes them do so more rarely than this: 0 never, 1
+            always.
+        leave_out: stretches are left out in turn, too (CR3): a stretch with much to say fits
+            itself. With few of them their spread is itself not well known (Bell & McCaffrey 2002).
+        noise_share: share of the interval by curvature below which no interval is.
+        prior: (K,) information on each number beside the flights', as of one that was held.
     """
     count, size = equations.gradient.shape
     if not size:
-        return np.zeros(0)
-    hessian = equations.hessian.sum(axis=0)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    inverse = np.linalg.pinv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
+        none = np.zeros((0, 0))
+        return Intervals(np.zeros(0), none, none)
+    given = np.zeros(size) if prior is None else prior
+    hessian = equations.hessian.sum(axis=0) + np.diag(given)
+    gradient = equations.gradient - equations.gradient.mean(axis=0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), TINY))
+    both = np.outer(scale, scale)
 
-    def by_draws(gradient: np.ndarray, freedom: int) -> np.ndarray:
-        centred = gradient - gradient.mean(axis=0)
-        blocks = inverse @ (centred.T @ centred * len(gradient) / freedom) @ inverse
-        return np.sqrt(np.maximum(np.diag(blocks), 0.0)) * float(student.ppf(0.975, freedom))
+    def inverted(matrix: np.ndarray) -> np.ndarray:
+        return np.linalg.inv(matrix * both + RIDGE * np.eye(size)) * both
 
-    freedom = max(count - size, 2)
-    known = float(student.ppf(0.975, noise_freedom or freedom))
-    widths = np.sqrt(np.maximum(np.diag(inverse), 0.0)) * known
-    widths = np.maximum(widths, by_draws(equations.gradient, freedom))
-    numbers = [] if flight is None else np.unique(flight)
-    if len(numbers) > 2:
-        flights = np.array([equations.gradient[flight == one].sum(axis=0) for one in numbers])
-        told = np.array([equations.hessian[flight == one].sum(axis=0) for one in numbers])
-        widths = np.maximum(widths, by_draws(flights, len(flights) - 1))
-        widths = np.maximum(widths, _by_leaving_out(told, flights, scale))
-    return widths
+    def moves(own: np.ndarray, pulls: np.ndarray) -> np.ndarray:
+        """Return by how much draws (N, K) move the numbers, by what all others say of these."""
+        return np.einsum("nij,nj->ni", inverted(hessian - own), pulls)
 
-
-def _by_leaving_out(hessian: np.ndarray, gradient: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return half-widths (K,) from the solutions without each of F flights.
-
-    Args:
-        hessian: (F, K, K) of each flight.
-        gradient: (F, K), likewise.
-        scale: (K,) of the numbers.
-    """
-    count = len(gradient)
-    rest = (hessian.sum(axis=0) - hessian) * np.outer(scale, scale)
-    slopes = (gradient.sum(axis=0) - gradient) * scale
-    found = scale * np.einsum("fij,fj->fi", np.linalg.pinv(rest, hermitian=True), slopes)
-    spread = (count - 1) / count * np.sum((found - found.mean(axis=0)) ** 2, axis=0)
-    return np.sqrt(spread) * float(student.ppf(0.975, count - 1))
+    inverse = inverted(hessian)
+    widths = noise_share * Z95 * np.sqrt(np.diag(inverse))
+    freedom = max(count - 1 if leave_out else count - size, 1 if leave_out else 2)
+    if leave_out:
+        moved = moves(equations.hessian, gradient)
+    else:
+        moved = gradient @ inverse * np.sqrt(count / freedom)
+    by_stretch = moved.T @ moved + inverse @ np.diag(given) @ inverse
+    spread = np.sqrt(np.diag(by_stretch)) * float(student.ppf(0.975, freedom))
+    widths = np.maximum(widths, spread)
+    flight = equations.flight
+    numbers = [] if flight is None or not differ_p else np.unique(flight)
+    if len(numbers) >= FEWEST:
+        inside = np.array([flight == number for number in numbers], dtype=float)
+        q = (inside @ moved) ** 2 / np.maximum(inside @ moved**2, 1e-300)
+        differ = chi2.sf(q.sum(axis=0), len(numbers) - 1) < differ_p
+        own = np.einsum("fb,bij->fij", inside, equations.hessian)
+        away = moves(own, inside @ gradient)
+        among = (len(numbers) - 1) / len(numbers) * ((away - away.mean(axis=0)) ** 2).sum(axis=0)
+        wide = np.sqrt(among) * float(student.ppf(0.975, len(numbers) - 1))
+        widths = np.where(differ, np.maximum(widths, wide), widths)
+    return Intervals(widths, by_stretch, inverse)

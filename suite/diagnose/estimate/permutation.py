@@ -51,7 +51,7 @@ def score_candidates(
     `equations` are along all numbers, taken at `theta` (P,); windows of one `fold` (W,) are left
     out together; `seed` is of the null's draws.
     """
-    along = equations.numbers_of(range(equations.gradient.shape[1]))
+    along = list(equations.numbers)
     scale = space.array("step")[along]
     low, high = ((space.array(end) - theta)[along] / scale for end in ("low", "high"))
     hessian, gradient = equations.hessian * np.outer(scale, scale), equations.gradient * scale

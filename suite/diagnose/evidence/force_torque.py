@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.view import FlightRows
 from suite.diagnose.estimate.parameters import ParameterLayout, ParameterSpace, effects_at
-from suite.diagnose.evidence.rollout_model import VehicleArrays
+from suite.diagnose.evidence.rollout_model import VehicleArrays, grouped
 
 CHUNK = 1024
 """Rows a call: one shape, compiled once."""
@@ -32,7 +32,7 @@ class RowForces(NamedTuple):
     value: np.ndarray
     """(N, 6) dv/dt in the world [m/s^2] and dw/dt in body axes [rad/s^2]."""
     slope: np.ndarray
-    """(N, 6, P) along every number."""
+    """(N, 6, K) along numbers."""
 
 
 class ForceModel:
@@ -45,17 +45,25 @@ class ForceModel:
         self._given = VehicleArrays(*nominal_quadrotor(vehicle), base)
         self._compiled = _forces(space.layout, voltage)
 
-    def at(self, theta: np.ndarray, rows: FlightRows) -> RowForces:
-        """Return what acts at the numbers `theta` (P,), and how it changes along each."""
+    def at(
+        self, theta: np.ndarray, rows: FlightRows, indices: Sequence[int] | None = None
+    ) -> RowForces:
+        """Return what acts at the numbers `theta` (P,), and how it changes along each of `indices`.
+
+        Along all numbers if not given.
+        """
+        count, everything = len(rows.time_s), np.eye(len(theta))
+        directions = [everything] if indices is None else grouped(everything, indices)
+        asked = len(theta) if indices is None else len(indices)
         values, slopes = [], []
-        count = len(rows.time_s)
         with jax.enable_x64(True):
             for first in range(0, count, CHUNK):
                 at = np.minimum(np.arange(first, first + CHUNK), count - 1)
                 part = FlightRows(*(np.asarray(field)[at] for field in rows))
-                value, slope = self._compiled(self._given, theta, part)
-                values.append(np.asarray(value)[: count - first])
-                slopes.append(np.asarray(slope)[: count - first])
+                said = [self._compiled(self._given, theta, part, group) for group in directions]
+                values.append(np.asarray(said[0][0])[: count - first])
+                slope = np.concatenate([np.asarray(each) for _, each in said], axis=-1)
+                slopes.append(slope[: count - first, :, :asked])
         return RowForces(np.concatenate(values), np.concatenate(slopes))
 
 
@@ -74,11 +82,10 @@ def _forces(layout: ParameterLayout, voltage: bool) -> Callable[..., Any]:
         acc_w, turn_b = accelerations(plant, motion, wrench_on(plant, rotors, flow))
         return jnp.concatenate([acc_w, turn_b], axis=-1)
 
-    def both(given: VehicleArrays, theta: Any, rows: FlightRows) -> Any:
+    def both(given: VehicleArrays, theta: Any, rows: FlightRows, directions: Any) -> Any:
         def along(direction: Any) -> Any:
             return jax.jvp(lambda t: act(given, t, rows), (theta,), (direction,))
 
-        value, slope = jax.vmap(along, out_axes=(None, -1))(jnp.eye(len(layout)))
-        return value, slope
+        return jax.vmap(along, out_axes=(None, -1))(directions)
 
     return jax.jit(both)

@@ -1,4 +1,11 @@
-"""How flights differ from the model at one set of numbers, moment by moment."""
+"""Moments of force and torque: what flights and model differ by, moment by moment.
+
+What is left is the noise, and flights have trims of their own: an unchanged vehicle flies each time
+with a slightly other trim, so that each flight's mean of each axis is a draw of its own, a random
+effect (Laird and Ware 1982). Rows are made independent of it by taking off a share of their
+flight's mean (quasi-demeaning; Fuller and Battese 1973). What all flights are judged from is off by
+a draw, too, which is the same for all: there a share of the mean of all goes.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.data.view import SmoothedFlight, View
-from suite.diagnose.evidence.force_torque import ForceModel, RowForces
+from suite.diagnose.estimate.block import Block, without_nuisance
+from suite.diagnose.estimate.intervals import intervals95
+from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 class ViewData(NamedTuple):
@@ -23,16 +33,34 @@ class ViewData(NamedTuple):
     residual: np.ndarray
     """(M, 3) measured - model, body axes."""
     slope: np.ndarray
-    """(M, 3, P) of the model along every number."""
+    """(M, 3, K) of the model along numbers."""
+
+
+class Weights(NamedTuple):
+    """What a view's numbers are judged by."""
+
+    scatter: np.ndarray
+    """(3,) RMS of what is left within flights, by axis."""
+    memory: np.ndarray
+    """(3,) how many neighbouring moments tell as much as one that is independent."""
+    trim: np.ndarray
+    """(3,) standard deviation of flights' means; infinite where too few flights can tell."""
+    base: np.ndarray | None = None
+    """(3,) standard deviation of what all flights are judged from, where only their means count;
+    None where that is known."""
 
 
 def compare(
-    view: View, model: ForceModel, theta: np.ndarray, flights: Sequence[SmoothedFlight]
+    view: View,
+    model: ForceModel,
+    theta: np.ndarray,
+    flights: Sequence[SmoothedFlight],
+    indices: Sequence[int] | None = None,
 ) -> ViewData:
-    """Return how `flights` differ from `model` at the numbers `theta` (P,)."""
+    """Return how `flights` differ from `model` at `theta` (P,), slopes along `indices` or all."""
     parts = []
     for number, flight in enumerate(flights):
-        forces: RowForces = model.at(theta, flight.rows)
+        forces = model.at(theta, flight.rows, indices)
         mean, count = flight.form.mean, len(flight.form.middle_s)
         value = mean @ forces.value[:, view.columns]
         slope = forces.slope[:, view.columns]
@@ -73,3 +101,118 @@ def units_of(flight: np.ndarray) -> np.ndarray:
     if len(np.unique(flight)) > 1:
         return flight
     return np.arange(len(flight)) * 3 // len(flight)
+
+
+def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
+    """Return the weights that `data`, the best model's, ask for."""
+    flights = [data.residual[data.flight == n] for n in np.unique(data.flight)]
+    inside = [f - f.mean(axis=0) for f in flights]
+    count = sum(len(f) for f in inside)
+    power = np.sum([(f**2).sum(axis=0) for f in inside], axis=0)
+    scatter = np.sqrt(power / max(count - len(inside), 1))
+    scatter = np.maximum(scatter, 1e-6)
+    memory = np.maximum(1.0, _memory(inside, limits))
+    trim = np.full(3, np.inf)
+    if len(flights) >= limits.least_flights:
+        means = means_of(data.residual, data.flight)
+        own = np.mean([scatter**2 * memory / len(f) for f in flights], axis=0)
+        trim = np.sqrt(np.maximum(means.var(axis=0, ddof=1) - own, 0.0))
+    return Weights(scatter, memory, trim)
+
+
+def _memory(inside: list[np.ndarray], limits: Thresholds) -> np.ndarray:
+    """Return the sum of the autocorrelation (3,), up to where it has fallen to nothing."""
+    power = np.sum([(f**2).sum(axis=0) for f in inside], axis=0)
+    total, alive = np.ones(3), np.ones(3, bool)
+    for lag in range(1, limits.longest_memory):
+        product = np.sum([(f[lag:] * f[:-lag]).sum(axis=0) for f in inside], axis=0)
+        share = product / np.maximum(power, 1e-300)
+        alive &= share > 0.05
+        total += np.where(alive, 2.0 * share, 0.0)
+        if not alive.any():
+            break
+    return total
+
+
+def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
+    """Return residual (M, 3) and slope (M, 3, P) of `data` in units of independent noise."""
+    residual, slope = data.residual.copy(), data.slope.copy()
+    for number in np.unique(data.flight):
+        rows = data.flight == number
+        own = weights.scatter**2 * weights.memory / rows.sum()
+        share = 1.0 - np.sqrt(own / (own + weights.trim**2))
+        residual[rows] -= share * residual[rows].mean(axis=0)
+        slope[rows] -= share[:, None] * slope[rows].mean(axis=0)
+    if weights.base is not None:
+        # Where flights' means tell nothing this is 0.
+        own = weights.scatter**2 * weights.memory + weights.trim**2
+        share = 1.0 - 1.0 / np.sqrt(1.0 + len(residual) * weights.base**2 / own)
+        residual -= share * residual.mean(axis=0)
+        slope -= share[:, None] * slope.mean(axis=0)
+    unit = weights.scatter * np.sqrt(weights.memory)
+    return residual / unit, slope / unit[:, None]
+
+
+def stretch_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> np.ndarray:
+    """Return the number of each moment's stretch (M,): parts of a flight that stand apart."""
+    inside = (data.middle_s / limits.view_block_s).astype(int)
+    _, stretch = np.unique(np.stack([data.flight, inside]), axis=1, return_inverse=True)
+    return stretch.ravel()
+
+
+def block_of(data: ViewData, weights: Weights, stretch: np.ndarray, along: Sequence[int]) -> Block:
+    """Return the block of `data`, slopes `along` these; `stretch` (M,) is each moment's number."""
+    residual, slope = whitened(data, weights)
+    first = np.unique(stretch, return_index=True)[1]
+    return without_nuisance(
+        residual, slope, along, stretch, data.flight[first], data.middle_s[first]
+    )
+
+
+def share_taken(now: ViewData, then: ViewData, limits: Thresholds) -> float:
+    """Return the share of the squared error of `now` that `then` takes away.
+
+    Weighed by the noise that `then` leaves: by that of `now` a slow effect is noise with a memory.
+    """
+    noise = weights_of(then, limits)
+    left, had = (float((whitened(one, noise)[0] ** 2).sum()) for one in (then, now))
+    return 1.0 - left / had
+
+
+def changes_of(data: ViewData) -> ViewData:
+    """Return what changes in `data` from each moment to the next one of its flight."""
+    step = np.diff(data.middle_s)
+    usual = np.median(step[step > 0.0])
+    near = (np.diff(data.flight) == 0) & (step < 1.5 * usual)
+    flight, middle_s, *series = data
+    return ViewData(
+        flight[1:][near], middle_s[1:][near], *(np.diff(one, axis=0)[near] for one in series)
+    )
+
+
+def fast_share(
+    data: ViewData, columns: Sequence[int], away: np.ndarray, limits: Thresholds
+) -> tuple[float, float]:
+    """Return which share of a name's numbers fast changes ask for, and how surely.
+
+    Motors answer what disturbs the body. A controller that holds it still against a slow torque
+    makes the motors' torque look like one that turns nothing, as if inertia were larger or thrust
+    less. Where the equations are right, what changes from one moment to the next asks for the same
+    numbers as the whole does (a specification test; Hausman 1978, doi 10.2307/1913827).
+
+    Args:
+        data: with the name in the model.
+        columns: of its K numbers.
+        away: (K,) how far they are from the vehicle file's.
+        limits: of independent stretches.
+
+    Returns:
+        1 where fast changes ask for the same, 0 where they ask for none of it, to first order; and
+        half of its 95 % interval.
+    """
+    fast = changes_of(data)
+    fast = fast._replace(slope=(fast.slope[..., list(columns)] @ away)[..., None])
+    block = block_of(fast, weights_of(fast, limits), stretch_of(fast, limits), [0]).equations()
+    hessian, gradient = block.sums()
+    share = 1.0 + float(gradient[0]) / max(float(hessian[0, 0]), 1e-300)
+    return share, float(intervals95(block).half_width[0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -106,7 +106,7 @@ class RolloutModel:
         theta: np.ndarray,
         offset: np.ndarray,
         windows: FlightWindows,
-        indices: list[int] | None,
+        indices: Sequence[int] | None,
     ) -> Linearisation:
         """Return residuals and slopes along the numbers at `indices`.
 
@@ -114,19 +114,25 @@ class RolloutModel:
         `starts`.
         """
         everything = np.eye(self.size + self.free)
-        asked = everything if indices is None else everything[indices]
-        groups = []
-        for first in range(0, max(len(asked), 1), DIRECTIONS):
-            part = asked[first : first + DIRECTIONS]
-            groups.append(np.pad(part, ((0, DIRECTIONS - len(part)), (0, 0))))
+        asked, groups = (
+            len(everything if indices is None else indices),
+            grouped(everything, indices),
+        )
         values, slopes = [], []
         with jax.enable_x64(True):
             for x, w, count in batches(offset, windows):
                 answers = [self._linear(self.given, theta, x, w, group) for group in groups]
                 values.append(np.asarray(answers[0][0])[:count])
                 slopes.append(np.concatenate([np.asarray(a[1])[:count] for a in answers], axis=-1))
-        slope = np.concatenate(slopes)[..., : len(asked)]
+        slope = np.concatenate(slopes)[..., :asked]
         return Linearisation(-np.concatenate(values), slope, offset)
+
+
+def grouped(everything: np.ndarray, indices: Sequence[int] | None) -> list[np.ndarray]:
+    """Return `DIRECTIONS` rows at a time, at least once, of `everything` or those at `indices`."""
+    asked = everything if indices is None else everything[list(indices)]
+    parts = [asked[k : k + DIRECTIONS] for k in range(0, max(len(asked), 1), DIRECTIONS)]
+    return [np.pad(part, ((0, DIRECTIONS - len(part)), (0, 0))) for part in parts]
 
 
 def batches(

@@ -1,35 +1,33 @@
-"""Least squares with intervals from how parts of flights, and flights, disagree.
+"""Least squares on misses of flights, with what flights cannot tell left as it was.
 
-Gauss and Newton with Huber's weights. A number's error is the jackknife of blocks of a flight (the
-sandwich CR3; neighbouring windows are not independent), with Student's t of so many blocks. What
-another fit gave is known no better than that fit says (Murphy and Topel 1985). Where the flights
-differ by more than their blocks explain (Cochran's Q), the flights are the units and Student's t
-their quantile. A number that the flights cannot tell is left as it was, the worst first, and the
-others are fitted again.
+Misses are evidence: Gauss and Newton with Huber's weights, intervals by stretches and flights.
+What another fit gave is known no better than that fit says (Murphy and Topel 1985). A number that
+the flights cannot tell is left as it was, the worst first, and the others are fitted again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
-Z95 = 1.96
+from suite.diagnose.estimate.block import Block, Estimate, without_nuisance
+from suite.diagnose.estimate.gauss_newton import fit as fit_numbers
+from suite.diagnose.estimate.intervals import Z95, intervals95
+from suite.diagnose.estimate.parameters import FittedNumber, ParameterSpace
+from suite.diagnose.thresholds import THRESHOLDS
+
 HUBER = 2.5
 BLIND = 0.3
 """No interval is narrower than this share of what independent windows would make of it."""
-TINY = 1e-12
-"""Information below this is none."""
-RIDGE = 1e-9
-SMALL = 0.03
-"""A step below this many standard deviations of every number is the last."""
-ROUNDS = 12
+LIMITS = replace(THRESHOLDS, converged=1e-3)
+"""A step below 0.03 standard deviations is the last."""
+ROUNDS = 6
+"""Of weights, each for some steps."""
 DIFFER_P = 0.05
 """Flights differ where chance would make them do so more rarely than this."""
-FEWEST = 3
-"""Flights, to say that they differ."""
 
 
 class NothingWhole(ValueError):
@@ -109,6 +107,60 @@ class Fitted:
         return [u.name for u in self.unknowns].index(name)
 
 
+@dataclass(frozen=True)
+class MissEvidence:
+    """Misses of flights as evidence on the numbers that are looked for."""
+
+    misses: Misses
+    unknowns: tuple[Unknown, ...]
+    weights: tuple[np.ndarray, ...] = ()
+    """By flight, (N, C)."""
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The numbers."""
+        entries = (
+            FittedNumber("", u.name, None, u.low, u.high, u.start, u.step) for u in self.unknowns
+        )
+        return ParameterSpace(tuple(entries), {})
+
+    def at(self, value: np.ndarray) -> Estimate:
+        """Return the estimate with the numbers `value` (P,): nothing else is free."""
+        return Estimate(value, np.zeros((0, 0)))
+
+    def weighed(self, at: Estimate) -> MissEvidence:
+        """Return this weighed by a channel's noise, and less for what is wild (Huber)."""
+        rows = self.misses(at.theta)
+        off = np.concatenate([np.abs(_levelled(row)) for row in rows])
+        sigma = np.maximum(1.4826 * np.median(off, axis=0), 1e-9)
+        far = (np.maximum(np.abs(_levelled(row)) / sigma, 1e-9) for row in rows)
+        weights = tuple(np.minimum(1.0, HUBER / one) / sigma**2 for one in far)
+        return replace(self, weights=weights)
+
+    def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
+        """Return the misses and their slopes, by finite differences away from the nearer limit."""
+        along = range(len(self.unknowns)) if indices is None else indices
+        here, columns = self.misses(at.theta), []
+        for k in along:
+            near_top = self.unknowns[k].high - at.theta[k] < self.unknowns[k].step
+            step = -self.unknowns[k].step if near_top else self.unknowns[k].step
+            there = at.theta.copy()
+            there[k] += step
+            pairs = zip(self.misses(there), here, strict=True)
+            columns.append([(a.value - b.value) / step for a, b in pairs])
+        values, slopes, numbers = [], [], []
+        for flight, (row, weight) in enumerate(zip(here, self.weights, strict=True)):
+            every = [row.value, *(-column[flight] for column in columns)]
+            freed = _freed(np.stack(every, axis=-1), weight, row.level)
+            white = np.sqrt(weight)[..., None] * freed
+            values.append(white[..., 0])
+            slopes.append(white[..., 1:])
+            numbers.append(np.stack([np.full(len(row.block), flight), row.block]))
+        places, stretch = np.unique(np.concatenate(numbers, axis=1), axis=1, return_inverse=True)
+        rows = np.concatenate(values), np.concatenate(slopes)
+        return without_nuisance(*rows, along, stretch.ravel(), places[0], places[1].astype(float))
+
+
 def fit(
     misses: Misses,
     unknowns: Sequence[Unknown],
@@ -128,23 +180,29 @@ def fit(
     Raises:
         NothingWhole: where there is not one window.
     """
-    unknowns, untold, given = tuple(unknowns), list(held), given or Given()
-    value = np.array([unknown.start for unknown in unknowns])
-    if not sum(len(rows.value) for rows in misses(value)):
+    untold, given = list(held), given or Given()
+    evidence = MissEvidence(misses, tuple(unknowns))
+    at = evidence.at(np.array([unknown.start for unknown in unknowns]))
+    if not sum(len(rows.value) for rows in misses(at.theta)):
         raise NothingWhole("no stretch of these flights is whole enough to compare anything in")
     while True:
         left = (*untold, *given.names)
         free = [k for k, unknown in enumerate(unknowns) if unknown.name not in left]
-        value = _least(misses, unknowns, value, free)
-        covariance, half = _errors(misses, unknowns, value, free, given)
+        for _ in range(ROUNDS if free else 0):
+            before, evidence = at, evidence.weighed(at)
+            at, _ = fit_numbers(evidence, at, free, limits=LIMITS)
+            if (at.theta == before.theta).all():
+                break
+        covariance, half = _errors(evidence.weighed(at), at, free, given)
         ratio = [half[k] / unknowns[k].room for k in free]
         if not free or max(ratio) <= 1.0:
             break
         worst = free[int(np.argmax(ratio))]
         untold.append(unknowns[worst].name)
-        value[worst] = unknowns[worst].start
-    misfit = _left(misses, unknowns, value)
-    return Fitted(unknowns, value, half, covariance, tuple(untold), misfit, given.names)
+        at.theta[worst] = unknowns[worst].start
+    misfit = np.concatenate([_levelled(row) for row in misses(at.theta)])
+    rms = np.sqrt(np.mean(misfit**2, axis=0))
+    return Fitted(evidence.unknowns, at.theta, half, covariance, tuple(untold), rms, given.names)
 
 
 def _levelled(rows: Rows) -> np.ndarray:
@@ -152,171 +210,40 @@ def _levelled(rows: Rows) -> np.ndarray:
     return rows.value - np.where(rows.level, mean, 0.0)
 
 
-def _weights(misses: Sequence[Rows]) -> list[np.ndarray]:
-    """Return the weights (N, C) of every flight: over a channel's noise, less for what is wild."""
-    off = np.concatenate([np.abs(_levelled(rows)) for rows in misses])
-    sigma = np.maximum(1.4826 * np.median(off, axis=0), 1e-9)
-    weights = []
-    for rows in misses:
-        far = np.abs(_levelled(rows)) / sigma
-        weights.append(np.minimum(1.0, HUBER / np.maximum(far, 1e-9)) / sigma**2)
-    return weights
-
-
 def _freed(values: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Return values (N, C, ...) less their weighted mean in channels with a free constant."""
-    weight = weight.reshape(weight.shape + (1,) * (values.ndim - 2))
-    total = np.maximum(weight.sum(axis=0), 1e-12)
-    mean = (weight * values).sum(axis=0) / total
-    level = level.reshape(level.shape + (1,) * (values.ndim - 2))
-    return values - np.where(level, mean, 0.0)
-
-
-def _slopes(
-    misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray, free: Sequence[int]
-) -> list[np.ndarray]:
-    """Return the slopes (N, C, F) of every flight's residuals along the free numbers."""
-    columns: list[list[np.ndarray]] = []
-    here = misses(value)
-    for k in free:
-        # Away from the nearer limit.
-        near_top = unknowns[k].high - value[k] < unknowns[k].step
-        step = -unknowns[k].step if near_top else unknowns[k].step
-        there = value.copy()
-        there[k] += step
-        both = zip(misses(there), here, strict=True)
-        columns.append([(a.value - b.value) / step for a, b in both])
-    return [np.stack([column[f] for column in columns], axis=-1) for f in range(len(here))]
-
-
-def _least(
-    misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray, free: Sequence[int]
-) -> np.ndarray:
-    if not free:
-        return value
-    low = np.array([unknowns[k].low for k in free])
-    high = np.array([unknowns[k].high for k in free])
-    value = value.copy()
-    for _ in range(ROUNDS):
-        rows = misses(value)
-        weights = _weights(rows)
-        slopes = _slopes(misses, unknowns, value, free)
-        square, pull = _normal(rows, weights, slopes)
-        scale = np.sqrt(np.maximum(np.diag(square), TINY))
-        change = -np.linalg.lstsq(square / np.outer(scale, scale), pull / scale, rcond=1e-9)[0]
-        change = change / scale
-        before = _cost(rows, weights)
-        for _ in range(8):
-            trial = value.copy()
-            trial[list(free)] = np.clip(value[list(free)] + change, low, high)
-            if _cost(misses(trial), weights) <= before * (1.0 + 1e-12):
-                break
-            change = 0.5 * change
-        else:
-            break
-        moved = np.abs(trial - value)[list(free)] * scale
-        value = trial
-        if moved.max() < SMALL:
-            break
-    return value
-
-
-def _cost(rows: Sequence[Rows], weights: Sequence[np.ndarray]) -> float:
-    return float(
-        sum(
-            (w * _freed(r.value, w, r.level) ** 2).sum() for r, w in zip(rows, weights, strict=True)
-        )
-    )
-
-
-def _normal(
-    rows: Sequence[Rows], weights: Sequence[np.ndarray], slopes: Sequence[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    count = slopes[0].shape[-1]
-    square, pull = np.zeros((count, count)), np.zeros(count)
-    for row, weight, slope in zip(rows, weights, slopes, strict=True):
-        off, along = _freed(row.value, weight, row.level), _freed(slope, weight, row.level)
-        square += np.einsum("nc,nci,ncj->ij", weight, along, along)
-        pull += np.einsum("nc,nci,nc->i", weight, along, off)
-    return square, pull
+    """Return values (N, C, K) less their weighted mean in channels with a free constant."""
+    total = np.maximum(weight.sum(axis=0), 1e-12)[:, None]
+    mean = (weight[..., None] * values).sum(axis=0) / total
+    return values - np.where(level[:, None], mean, 0.0)
 
 
 def _errors(
-    misses: Misses,
-    unknowns: Sequence[Unknown],
-    value: np.ndarray,
-    free: Sequence[int],
-    given: Given,
+    evidence: MissEvidence, at: Estimate, told: Sequence[int], given: Given
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance (P, P) and the half-widths (P,)."""
-    from scipy.stats import chi2, t
-
-    total = len(unknowns)
+    """Return the covariance (P, P) and the half-widths (P,) of what is `told`."""
+    unknowns = evidence.unknowns
+    total, names = len(unknowns), [unknown.name for unknown in unknowns]
     half = np.full(total, np.nan)
-    if not free:
+    if not told:
         return np.diag([unknown.room**2 for unknown in unknowns]), half
-    names = [unknown.name for unknown in unknowns]
-    told, taken = list(free), [names.index(name) for name in given.names]
+    taken = [names.index(name) for name in given.names]
     free = [k for k in range(total) if k not in taken]
-    rows, slopes = misses(value), _slopes(misses, unknowns, value, range(total))
-    weights = _weights(rows)
-    whole, _ = _normal(rows, weights, slopes)
-    square = whole[np.ix_(free, free)]
-    slopes = [slope[..., free] for slope in slopes]
+    equations = evidence.linearise(at).equations()
     doubt = np.array([0.0 if k in told else 1.0 / unknowns[k].room ** 2 for k in free])
-    square = square + np.diag(doubt)
-    scale = np.sqrt(np.maximum(np.diag(square), TINY))
-    # The ridge makes what cannot be told apart wide, where a pseudo-inverse would hide it.
-    ridge = RIDGE * np.eye(len(free))
-    inverse = np.linalg.inv(square / np.outer(scale, scale) + ridge) / np.outer(scale, scale)
-    by_flight = []
-    for row, weight, slope in zip(rows, weights, slopes, strict=True):
-        off, along = _freed(row.value, weight, row.level), _freed(slope, weight, row.level)
-        each = []
-        for number in np.unique(row.block):
-            w, a, o = (part[row.block == number] for part in (weight, along, off))
-            # What all others say of the numbers: a block with much to say fits itself.
-            others = square - np.einsum("nc,nci,ncj->ij", w, a, a)
-            others = np.linalg.inv(others / np.outer(scale, scale) + ridge)
-            others = others / np.outer(scale, scale)
-            each.append(others @ np.einsum("nc,nci,nc->i", w, a, o))
-        by_flight.append(np.array(each).reshape(-1, len(free)))
-    influence = np.concatenate(by_flight)
-    blocks = influence.T @ influence + inverse @ np.diag(doubt) @ inverse
-    sums = np.array([each.sum(axis=0) for each in by_flight])
-    flights = [k for k, each in enumerate(by_flight) if len(each)]
-    # With few blocks their spread is itself not well known (Bell and McCaffrey 2002).
-    quantile = float(t.ppf(0.975, max(len(influence) - 1, 1)))
-    widest = quantile * np.sqrt(np.maximum(np.diag(blocks), 0.0))
-    if len(flights) >= FEWEST:
-        spread = np.array([(each**2).sum(axis=0) for each in by_flight])[flights]
-        q = (sums[flights] ** 2 / np.maximum(spread, 1e-300)).sum(axis=0)
-        between = len(flights) / (len(flights) - 1) * (sums[flights] ** 2).sum(axis=0)
-        wide = float(t.ppf(0.975, len(flights) - 1)) * np.sqrt(between)
-        differ = chi2.sf(q, len(flights) - 1) < DIFFER_P
-        widest = np.where(differ, np.maximum(widest, wide), widest)
-    # What white noise of this size makes of it: where that is far more, the equations are blind.
-    widest = np.maximum(widest, BLIND * Z95 * np.sqrt(np.diag(inverse)))
+    found = intervals95(equations.take(free), DIFFER_P, True, BLIND, doubt)
     most = np.array([np.inf if k in told else Z95 * unknowns[k].room for k in free])
-    widest = np.minimum(widest, most)
+    widest = np.minimum(found.half_width, most)
     # The method's own errors are no part of what the noise makes alike in two numbers.
     floor = np.array([unknowns[k].floor for k in free])
     floor = np.minimum(floor, np.sqrt(most**2 - widest**2))
-    sd = np.sqrt(np.diag(blocks))
-    alike = blocks / np.maximum(np.outer(sd, sd), 1e-30)
+    sd = np.sqrt(np.diag(found.by_stretch))
+    alike = found.by_stretch / np.maximum(np.outer(sd, sd), 1e-30)
     np.fill_diagonal(alike, 1.0)
     # What was given moves the numbers by so much.
-    follow = inverse @ whole[np.ix_(free, taken)]
+    follow = found.inverse @ equations.sums()[0][np.ix_(free, taken)]
     noise = (alike * np.outer(widest, widest) + np.diag(floor**2)) / Z95**2
-    found = noise + follow @ given.covariance @ follow.T
     covariance = np.zeros((total, total))
-    covariance[np.ix_(free, free)] = found
+    covariance[np.ix_(free, free)] = noise + follow @ given.covariance @ follow.T
     covariance[np.ix_(taken, taken)] = given.covariance
-    half[told] = Z95 * np.sqrt(np.diag(covariance)[told])
+    half[list(told)] = Z95 * np.sqrt(np.diag(covariance)[list(told)])
     return covariance, half
-
-
-def _left(misses: Misses, unknowns: Sequence[Unknown], value: np.ndarray) -> np.ndarray:
-    rows = misses(value)
-    left = np.concatenate([_levelled(row) for row in rows])
-    return np.sqrt(np.mean(left**2, axis=0))

@@ -7,6 +7,7 @@ body slowly. What they answer is what flapping is told by, once all else is know
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,10 +17,11 @@ from suite.diagnose.data.flights import ViewFlights, ready
 from suite.diagnose.data.view import TORQUE
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.force_torque import ForceModel
-from suite.diagnose.evidence.view_equations import ViewTask, half_widths, look
+from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.identify.fit import Z95
 from suite.diagnose.identify.numbers import Number
-from suite.diagnose.search.view_search import ViewSearch, search_view
+from suite.diagnose.search.look import SearchResult
+from suite.diagnose.search.search import search
 
 EFFECT, KEY = "blade_flapping", "coefficient"
 UNIT = "N s^2/rad"
@@ -43,25 +45,30 @@ def flapping_of(
     voltage = all(log.voltage is not None for log in whole)
     task = _task(flights, vehicle, voltage)
     among = [one for one in candidates(task.model.space, voltage, ()) if one.name == EFFECT]
-    found = search_view(task, among)
+    begun = task.weighed(task.start)
+    among = view_candidates(among, begun[1])
+    found = search(begun[0], task.start, among, known=begun)
     if not found.named:
         return None
-    value = float(found.last.theta[found.indices[0]])
-    half = float(half_widths(found.last, found.indices)[0])
+    value = float(found.estimate.theta[found.indices[0]])
+    half = float(found.half_widths()[0])
     tasks = (_task(ready(whole, other), other, voltage) for other in doubted)
     moved = [_step(other, found) for other in tasks]
     half = float(np.hypot(half, Z95 * np.linalg.norm(moved)))
     return Number(f"effects.{EFFECT}.{KEY}", UNIT, [value], [(value - half, value + half)])
 
 
-def _task(flights: ViewFlights, vehicle: Vehicle, voltage: bool) -> ViewTask:
+def _task(flights: ViewFlights, vehicle: Vehicle, voltage: bool) -> ViewEvidence:
     model = ForceModel(vehicle, make_space(vehicle), voltage)
-    return ViewTask(TORQUE, model, flights.smoothed[TORQUE.name])
+    return ViewEvidence(TORQUE, model, flights.smoothed[TORQUE.name])
 
 
-def _step(task: ViewTask, found: ViewSearch) -> float:
+def _step(task: ViewEvidence, found: SearchResult) -> float:
     """Return by how much the coefficient of `found` moves where the vehicle is that of `task`."""
     theta, (at,) = task.model.space.array("start"), found.indices
-    theta[at] = found.last.theta[at]
-    then = look(task, theta, found.last.weights)
-    return float(then.block.gradient[:, at].sum() / then.block.hessian[:, at, at].sum())
+    theta[at] = found.estimate.theta[at]
+    last = found.last.evidence
+    assert isinstance(last, ViewEvidence)
+    then = replace(task, weights=last.weights)
+    hessian, gradient = then.linearise(then.at(theta), [at]).equations().sums()
+    return float(gradient[0] / hessian[0, 0])

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.estimate.intervals import TINY
 from suite.diagnose.identify.data.drive import delayed, lagged, torque_of
 from suite.diagnose.identify.data.grid import (
     ROTOR_NOISE,
@@ -17,7 +18,7 @@ from suite.diagnose.identify.data.grid import (
     over,
     windows_of,
 )
-from suite.diagnose.identify.fit import TINY, Z95, Fitted, Given, Rows, Unknown, fit
+from suite.diagnose.identify.fit import Z95, Fitted, Given, Rows, Unknown, fit
 from suite.diagnose.identify.force import BLOCK_S
 
 WIDTH_S = 0.2

@@ -14,7 +14,7 @@ from suite.diagnose.checks.kinematics import Kinematics
 from suite.diagnose.data.windows import STATE_GROUPS
 from suite.diagnose.plans.separating import advice
 from suite.diagnose.report.parameters_json import parameters_json, short_name
-from suite.diagnose.search.rivals import NamedEffect
+from suite.diagnose.search.look import NamedEffect
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import HEADLINE_S, HORIZONS_S, MEASURE, Gap
@@ -135,7 +135,7 @@ def model_error(diagnosis: Diagnosis) -> float:
 
     It is that of the group of channels in which it is largest.
     """
-    limits, sigma = diagnosis.limits, diagnosis.search.sigma
+    limits, sigma = diagnosis.limits, diagnosis.sigma
     least = np.array(limits.least_noise)[: len(STATE_GROUPS)]
     raised = least > np.array(THRESHOLDS.least_noise)[: len(STATE_GROUPS)]
     whole = np.sqrt(np.nan_to_num(sigma[:12].reshape(-1, 3) ** 2).mean(axis=1))

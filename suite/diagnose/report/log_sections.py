@@ -88,7 +88,7 @@ def noise_section(diagnosis: Diagnosis) -> Section:
     rows = [
         (f"{name} [{UNITS[name]}]", ", ".join(f"{v:.3g}" for v in values))
         for name, place in SLICES.items()
-        if np.isfinite(values := diagnosis.search.sigma[place]).any()
+        if np.isfinite(values := diagnosis.sigma[place]).any()
     ]
     words = (
         "Standard deviation by axis, from the data: what is left of measured minus simulated when "

@@ -9,11 +9,11 @@ from eval.effects import EFFECTS
 from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.checks.checks import Checks
 from suite.diagnose.data.windows import UNITS
+from suite.diagnose.estimate.composites import in_words
 from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
 from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
 from suite.diagnose.report.parameters_json import cells, components, grid, short_name, size_words
 from suite.diagnose.report.result_sections import held_out_section, residual_section
-from suite.diagnose.search.composites import in_words
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from tracks.common.grid import Cell, Grid
 

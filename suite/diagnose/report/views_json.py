@@ -10,7 +10,7 @@ import numpy as np
 from suite.diagnose.by_views import ViewResult, ViewsDiagnosis
 from suite.diagnose.plans.separating import advice
 from suite.diagnose.report.parameters_json import parameters_json, short_name
-from suite.diagnose.search.view_search import ViewName
+from suite.diagnose.search.look import NamedEffect
 from suite.diagnose.verdict.rotor_lag import LAG, RotorLag
 from suite.diagnose.verdict.view_gap import gap_without
 
@@ -123,14 +123,16 @@ def _lag_effect(found: ViewsDiagnosis, lag: RotorLag) -> dict[str, Any]:
     }
 
 
-def _effect(found: ViewsDiagnosis, result: ViewResult, names: Sequence[ViewName]) -> dict[str, Any]:
+def _effect(
+    found: ViewsDiagnosis, result: ViewResult, names: Sequence[NamedEffect]
+) -> dict[str, Any]:
     indices = sorted(i for name in names for i in name.candidate.indices)
     gap = result.gap
     without = gap.rms(gap_without(result.search, result.held, indices))
     whole = gap.rms(gap.before) - gap.rms(gap.floor)
     removed = (without - gap.rms(gap.after)) / max(whole, 1e-9)
     effect = names[0].candidate.name
-    theta, width = result.search.last.theta, result.half_width
+    theta, width = result.search.estimate.theta, result.half_width
     return {
         "name": effect,
         "alternatives": sorted({rival for name in names for rival in name.rivals} - {effect}),

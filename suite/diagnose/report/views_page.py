@@ -12,10 +12,9 @@ from eval.effects import EFFECTS
 from suite.common.charts import png, titled
 from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.by_views import ViewsDiagnosis
-from suite.diagnose.evidence.view_equations import left_of
+from suite.diagnose.estimate.composites import in_words
 from suite.diagnose.report.charts import AFTER, BEFORE, FLOOR
 from suite.diagnose.report.parameters_json import components, grid, size_words
-from suite.diagnose.search.composites import in_words
 from tracks.common.grid import Grid
 
 STRETCH_S = 10.0
@@ -71,8 +70,8 @@ def views_page(found: ViewsDiagnosis, told: Mapping[str, Any], toml: str) -> Rep
 def _picture(found: ViewsDiagnosis, told: Mapping[str, Any]) -> list[Part]:
     """Return measured, simulated, and simulated with what was named, over a held-out stretch."""
     one = found.main
-    before = left_of(one.held, one.search.first.theta)
-    after = left_of(one.held, one.search.last.theta)
+    before = one.held.left(one.search.start.theta)
+    after = one.held.left(one.search.estimate.theta)
     axis = max(one.view.axes, key=lambda k: float(one.gap.closed[k] * one.gap.variance[k]))
     rows = before.flight == before.flight[0]
     middle = before.middle_s[rows]

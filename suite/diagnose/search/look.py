@@ -1,173 +1,167 @@
-"""What the search sees at one estimate: slopes along all numbers, and how to weigh them."""
+"""What a search sees of its evidence at one estimate, and how candidates are fitted there."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.colour import Noise, left_as_noise, measured_noise
-from suite.diagnose.data.whitening import Linearisation, Whitening, make_whitening
-from suite.diagnose.data.windows import SLICES, FlightWindows
-from suite.diagnose.estimate.gauss_newton import NormalEquations, along_numbers, gauss_newton_step
-from suite.diagnose.estimate.parameters import Candidate
-from suite.diagnose.estimate.permutation import CandidateScore, score_candidates
-from suite.diagnose.evidence.rollout_fit import Estimate, fit, normal_equations_of
-from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.search.composites import begin_of, lent_at
-from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
+from suite.diagnose.estimate.composites import acts_through, begin_of, lent_at
+from suite.diagnose.estimate.gauss_newton import chi2_by_part, fit, gauss_newton_step
+from suite.diagnose.estimate.intervals import intervals95
+from suite.diagnose.estimate.parameters import Candidate, indices_of
+from suite.diagnose.estimate.permutation import CandidateScore
+from suite.diagnose.evidence.evidence import Evidence
+from suite.diagnose.evidence.rollouts import RolloutEvidence
 
 
-class SearchTask(NamedTuple):
-    """What a search is given."""
+@dataclass(frozen=True)
+class NamedEffect:
+    """One effect that was named."""
 
-    model: RolloutModel
-    windows: FlightWindows
-    """At full length."""
-    among: Sequence[Candidate]
-    fold: np.ndarray
-    """(W,) windows of one number are left out together."""
-    say: Callable[[str], None]
-    seed: int
-    limits: Thresholds
-
-    def score(
-        self, equations: NormalEquations, theta: np.ndarray, named: Sequence[int]
-    ) -> list[CandidateScore]:
-        """Return the scores of what is not among the numbers `named`, best first."""
-        left = [c for c in self.among if not set(c.indices) & set(named)]
-        return score_candidates(
-            equations, theta, self.model.space, named, left, self.fold, self.seed, self.limits
-        )
-
-    def fit(
-        self,
-        look: Look,
-        start: Estimate,
-        indices: list[int],
-        known: Linearisation | None = None,
-        rounds: int = 3,
-    ) -> tuple[Estimate, NormalEquations]:
-        """Fit the numbers at `indices` to what can be trusted, in at most `rounds` steps."""
-        weighed = look.windows, look.whitening
-        return fit(self.model, *weighed, start, indices, rounds, known, self.limits)
-
-    def fit_beside(
-        self, look: Look, start: Estimate, beside: Sequence[int], candidate: Candidate
-    ) -> tuple[Estimate, NormalEquations]:
-        """Fit `candidate` and the numbers at `beside`; `look` was taken at `start`."""
-        at, space = sorted({*beside, *candidate.indices}), self.model.space
-        lent = [number for number in look.equations.lent if number in candidate.indices]
-        if not candidate.parts or not lent:
-            return self.fit(look, start, at, look.linear)
-        columns = sorted({*beside, *look.equations.columns_of(candidate)})
-        change, told = along_numbers(look.equations, start.theta, space, columns)
-        begin = begin_of(space, start.theta, candidate, lent, change, told)
-        return self.fit(look, Estimate(begin, start.offset), at, rounds=self.limits.bilinear_rounds)
+    candidate: Candidate
+    p_value: float
+    gain: float
+    """Fall of chi-square on stretches left out when it is added last."""
+    rivals: tuple[str, ...] = ()
+    """Names that explain the same."""
+    worse_by: dict[str, float] = field(default_factory=dict)
+    """By label of what was fitted in its place: rise of chi-square, with one for each number."""
+    gains: tuple[float, ...] = ()
+    """Fall of the squared error of each flight that the others' fit brings."""
+    share: float = 0.0
+    """Of the squared error that was to be explained [1]."""
 
 
 class Look(NamedTuple):
-    """The slopes along everything at one estimate, and how to weigh them."""
+    """What the evidence says at one estimate."""
 
-    linear: Linearisation
-    windows: FlightWindows
-    """As long as these slopes can be trusted."""
-    whitening: Whitening
+    evidence: Evidence
+    at: Estimate
+    block: Block
     equations: NormalEquations
-    noise: Noise
-    off: bool = False
-    """Whether all that the model leaves is taken for noise."""
 
 
-def look_at(
-    task: SearchTask,
-    estimate: Estimate,
-    known: Linearisation | None = None,
-    noise: Noise | None = None,
-) -> Look:
-    """Return the slopes of all windows at `estimate`, which `known` saves, as `noise` does its own.
+def rollouts_of(look: Look) -> RolloutEvidence:
+    """Return the evidence of `look`, which is one of rollouts."""
+    assert isinstance(look.evidence, RolloutEvidence)
+    return look.evidence
 
-    Noise is measured best where the model fits best.
+
+def look_at(found: tuple[Evidence, Block], at: Estimate, among: Sequence[Candidate] = ()) -> Look:
+    """Return the look at an estimate, with columns of what acts through composites `among`."""
+    evidence, block = found
+    lent = lent_at(evidence.space, at.theta, among, block.acts())
+    if lent is not None:
+        numbers = lent.numbers
+        there = evidence.linearise(Estimate(lent.theta, at.free), numbers)
+        columns = [there.along.index(number) for number in numbers]
+        block = replace(
+            block,
+            slope=np.concatenate([block.slope, there.slope[..., columns]], axis=-1),
+            free_slope=np.concatenate([block.free_slope, there.free_slope[..., columns]], axis=-1),
+            along=(*block.along, *numbers),
+        )
+    return Look(evidence, at, block, block.equations())
+
+
+def fit_beside(look: Look, beside: Sequence[int], candidate: Candidate) -> tuple[Estimate, Block]:
+    """Fit `candidate` and the numbers at `beside`, from where `look` was taken."""
+    evidence, equations, limits = look.evidence, look.equations, look.evidence.limits
+    at, space, theta = sorted({*beside, *candidate.indices}), evidence.space, look.at.theta
+    lent = [number for number in equations.lent() if number in candidate.indices]
+    if not candidate.parts or not lent:
+        rounds = limits.bilinear_rounds if acts_through(candidate) else None
+        return fit(evidence, look.at, at, rounds, look.block, limits)
+    change, told = asked_for(look, beside, candidate)
+    begin = begin_of(space, theta, candidate, lent, change, told)
+    return fit(evidence, Estimate(begin, look.at.free), at, limits.bilinear_rounds, None, limits)
+
+
+def asked_for(
+    look: Look, beside: Sequence[int], candidate: Candidate
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the change (P,) of all numbers that slopes ask for, and what is told of each (P,).
+
+    Those of `candidate` and at `beside` are changed.
     """
-    model, limits = task.model, task.limits
-    linear = known
-    if linear is None:
-        linear = model.linearise(estimate.theta, estimate.offset, task.windows, None)
-    view = trusted(task.windows, linear.residual, limits)
-    noise = noise or measured_noise(linear.residual, linear.start_slope, view, limits)
-    whitening = make_whitening(linear, noise, view, limits)
-    equations = _equations(task, estimate, linear, whitening)
-    return Look(linear, view, whitening, equations, noise)
+    equations = look.equations
+    some = equations.take(sorted({*beside, *equations.columns_of(candidate)}))
+    moved, _ = gauss_newton_step(some, look.at.theta, look.evidence.space)
+    change, told = np.zeros_like(look.at.theta), np.zeros_like(look.at.theta)
+    numbers = list(some.numbers)
+    change[numbers], told[numbers] = moved, np.diag(some.sums()[0])
+    return change, told
 
 
-def _equations(
-    task: SearchTask, estimate: Estimate, linear: Linearisation, whitening: Whitening
-) -> NormalEquations:
-    """Return the normal equations along all numbers, and along those that are lent."""
-    model, size = task.model, task.model.size
-    acts = np.abs(linear.slope[..., :size]).max(axis=(0, 1, 2)) > 0.0
-    lent = lent_at(model.space, estimate.theta, task.among, acts)
-    if lent is None:
-        return normal_equations_of(whitening, linear, size)
-    numbers = list(lent.numbers)
-    there = model.linearise(lent.theta, estimate.offset, task.windows, numbers).slope
-    slope = np.concatenate([linear.slope[..., :size], there], axis=-1)
-    equations = normal_equations_of(whitening, linear._replace(slope=slope), size + len(numbers))
-    return equations._replace(lent=lent.numbers)
+def chi2_of(look: Look, block: Block, at: Estimate, indices: Sequence[int]) -> np.ndarray:
+    """Return the squared error (G,) of each part of the flights under the others' fit."""
+    equations = block.equations().along_numbers(sorted(indices))
+    return chi2_by_part(equations, at.theta, look.evidence.space, look.evidence.parts(block))
 
 
-def least_left(
-    model: RolloutModel, windows: FlightWindows, linear: Linearisation, limits: Thresholds
-) -> float:
-    """Return the squared error a value, 1 of noise, that all numbers of the catalogue leave.
+@dataclass(frozen=True)
+class SearchResult:
+    """What a search found."""
 
-    To first order about `linear`, the slopes of `windows` along all numbers.
-    """
-    view = trusted(windows, linear.residual, limits)
-    noise = measured_noise(linear.residual, linear.start_slope, view, limits)
-    equations = normal_equations_of(make_whitening(linear, noise, view, limits), linear, model.size)
-    hessian, gradient = equations.hessian.sum(axis=0), equations.gradient.sum(axis=0)
-    at = np.flatnonzero(np.diag(hessian) > 1e-9)
-    start, square = model.space.array("start"), hessian[np.ix_(at, at)]
-    _, fall = gauss_newton_step(square, gradient[at], start, model.space, at.tolist())
-    return (float(equations.chi2.sum()) - fall) / max(int(np.asarray(view.seen).sum()), 1)
+    named: tuple[NamedEffect, ...]
+    start: Estimate
+    """Where it began."""
+    last: Look
+    """At the fit of all names, weighed by the noise that was measured beside them."""
+    judged: Look
+    """The same, by which names, rivals and intervals were judged: where the model leaves more than
+    noise, the noise is what it leaves."""
+    first: list[CandidateScore]
+    """Scores of all candidates before anything was named, best first."""
+    explained: float
+    """Fall of chi-square that the named effects bring."""
 
+    @property
+    def estimate(self) -> Estimate:
+        """Where the numbers stand with all names."""
+        return self.last.at
 
-def is_off(look: Look, equations: NormalEquations, limits: Thresholds) -> bool:
-    """Return whether a fit, with these `equations`, leaves more than noise in `look`'s windows."""
-    expected = look.whitening.slow_freedom.sum()
-    return bool(equations.slow_energy.sum() > limits.structure_rotor_input * expected)
+    @property
+    def candidates(self) -> list[Candidate]:
+        """What was named, without the reasons."""
+        return [one.candidate for one in self.named]
 
+    @property
+    def indices(self) -> list[int]:
+        """Places in the vector of the named numbers."""
+        return indices_of(self.candidates)
 
-def look_at_misfit(task: SearchTask, look: Look, estimate: Estimate) -> Look:
-    """Return the slopes at `estimate`, the best fit, weighed by what that leaves."""
-    linear = task.model.linearise(estimate.theta, estimate.offset, task.windows, None)
-    noise = left_as_noise(linear.residual, linear.start_slope, look.windows, task.limits)
-    whitening = make_whitening(linear, noise, look.windows, task.limits)
-    equations = _equations(task, estimate, linear, whitening)
-    return Look(linear, look.windows, whitening, equations, noise, off=True)
+    @property
+    def moved(self) -> np.ndarray:
+        """(K,) how far the named numbers are from where they began."""
+        return (self.estimate.theta - self.start.theta)[self.indices]
 
+    def half_widths(self) -> np.ndarray:
+        """Return half-widths (K,) of the 95 % intervals of the named numbers."""
+        equations = self.judged.equations.along_numbers(self.indices)
+        return intervals95(equations, self.judged.evidence.draws).half_width
 
-def trusted(
-    windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
-) -> FlightWindows:
-    """Return `windows`, each up to where the model has not left the flight by too much.
+    def refitted(self, named: Sequence[NamedEffect]) -> SearchResult:
+        """Return this with those of its names alone that are in `named`."""
+        indices = indices_of([one.candidate for one in named])
+        theta = self.start.theta.copy()
+        theta[indices] = self.estimate.theta[indices]
+        begin = Estimate(theta, self.estimate.free) if named else self.start
+        at, judged = self.judged, self.judged.evidence
+        best, block = fit(judged, begin, indices, limits=judged.limits)
+        last = at = Look(judged, best, block, block.equations())
+        if self.judged is not self.last:
+            block = self.last.evidence.linearise(best, indices)
+            last = Look(self.last.evidence, best, block, block.equations())
+        nothing = self.explained + float(self.last.equations.chi2.sum())
+        explained = nothing - float(last.equations.chi2.sum()) if named else 0.0
+        return replace(self, named=tuple(named), last=last, judged=at, explained=explained)
 
-    Beyond, slopes taken where the model is say nothing of where the flight was: it may have turned
-    over, or sunk below the ground. What is named brings the model back, and the next look is
-    longer. `residual` is (W, N, 19).
-    """
-    error = np.abs(residual)
-    height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
-    lost = (error[..., SLICES["position"]].max(axis=-1) > limits.trusted_m) | (
-        error[..., SLICES["attitude"]].max(axis=-1) > limits.trusted_rad
-    )
-    lost |= (error[..., 2] > limits.trusted_height_share * height) & (height > 0.0)
-    row_s = np.asarray(windows.row_s)
-    until_s = np.full(len(row_s), limits.trusted_horizons_s[-1])
-    for horizon in reversed(limits.trusted_horizons_s):
-        there = ~(lost & (row_s <= horizon)).any(axis=1)
-        until_s = np.where(there, horizon, until_s)
-    seen = np.asarray(windows.seen) & (row_s <= until_s[:, None] + 1e-9)[..., None]
-    return windows._replace(seen=seen)
+    def fitted_anew(self, begin: Estimate, indices: Sequence[int]) -> Estimate:
+        """Return the estimate where the numbers at `indices` alone are fitted from `begin`."""
+        judged = self.judged.evidence
+        return fit(judged, begin, indices, limits=judged.limits)[0]

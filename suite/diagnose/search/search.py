@@ -1,179 +1,246 @@
 """The search: one effect after another, each against the null, then every name against its rivals.
 
-What is named must lower the error on windows left out by more than the best of all candidates does
-on data with shuffled signs. A rival that explains the same windows as well is an alternative.
+What is named must lower the error on stretches left out by more than the best of all candidates
+does by chance, and pass what its evidence asks for besides. A rival that explains the same is an
+alternative. The search is the same for every kind of evidence.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.whitening import Linearisation, Whitening
-from suite.diagnose.data.windows import FlightWindows
-from suite.diagnose.estimate.gauss_newton import NormalEquations
+from suite.diagnose.estimate.block import Block, Estimate
+from suite.diagnose.estimate.gauss_newton import chi2_fall, fit
 from suite.diagnose.estimate.parameters import Candidate, indices_of
-from suite.diagnose.estimate.permutation import CandidateScore, folds_of
-from suite.diagnose.evidence.rollout_fit import Estimate, fit, start_estimate
-from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.search.look import Look, SearchTask, is_off, look_at, look_at_misfit
-from suite.diagnose.search.rivals import NamedEffect, chi2_fall, could_be_best, settle, without_idle
-from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.evidence.evidence import Evidence
+from suite.diagnose.search.look import Look, NamedEffect, SearchResult, chi2_of, fit_beside, look_at
+from suite.diagnose.thresholds import Thresholds
+
+T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class SearchResult:
-    """What a search found."""
+class SearchTask(NamedTuple):
+    """What a search is given."""
 
-    named: tuple[NamedEffect, ...]
-    windows: FlightWindows
-    """What was fitted, as long as the model could be trusted."""
-    estimate: Estimate
-    equations: NormalEquations
-    """Along the named numbers, at the end of the search."""
-    noise: Noise
-    """Measured beside what was found."""
-    whitening: Whitening
-    judging: Whitening
-    """By which names, rivals and intervals were judged: where the model leaves more than noise, the
-    noise is what it leaves."""
-    judged: NormalEquations
-    """As `equations`, by `judging`."""
-    first: list[CandidateScore]
-    """Scores of all candidates before anything was named, best first."""
-    explained: float
-    """Fall of chi-square that the named effects bring."""
-
-    @property
-    def off(self) -> bool:
-        """Whether the model leaves more than noise, by which then everything is judged."""
-        return self.judging is not self.whitening
-
-    @property
-    def sigma(self) -> np.ndarray:
-        """(19,) measurement noise of each channel in its unit; NaN where nothing was measured."""
-        return self.noise.sigma
-
-    @property
-    def candidates(self) -> list[Candidate]:
-        """What was named, without the reasons."""
-        return [one.candidate for one in self.named]
-
-    @property
-    def indices(self) -> list[int]:
-        """Places in the vector of the named numbers."""
-        return indices_of(self.candidates)
+    among: Sequence[Candidate]
+    say: Callable[[str], None]
+    seed: int
+    limits: Thresholds
 
 
 def search(
-    model: RolloutModel,
-    windows: FlightWindows,
+    evidence: Evidence,
+    start: Estimate,
     among: Sequence[Candidate],
-    say: Callable[[str], None],
-    known: Linearisation | None = None,
+    say: Callable[[str], None] = lambda _: None,
     seed: int = 0,
-    limits: Thresholds = THRESHOLDS,
+    known: tuple[Evidence, Block] | None = None,
 ) -> SearchResult:
-    """Return which of `among` explain the gap between `model` and `windows`.
+    """Return which of `among` explain what the model leaves of the evidence at `start`.
 
-    `say` is told of each step in a line for people; `known` are the slopes along everything at the
-    vehicle file's numbers, to save their calculation; `seed` is of the null's draws.
+    `say` is told of each step in a line for people; `known` is the evidence weighed at `start`, to
+    save its calculation; `seed` is of the null's draws.
     """
-    fold = folds_of(np.asarray(windows.flight), np.asarray(windows.start_s), limits.folds)
-    task = SearchTask(model, windows, among, fold, say, seed, limits)
-    estimate = start_estimate(model, windows)
+    limits = evidence.limits
+    task = SearchTask(among, say, seed, limits)
+    look = look_at(known or evidence.weighed(start), start, among)
+    first = _scores(task, look, [], among)
     named: list[NamedEffect] = []
-    first: list[CandidateScore] = []
-    while True:
-        look = look_at(task, estimate, None if named else known)
-        chosen = [n.candidate for n in named]
-        scores = task.score(look.equations, estimate.theta, indices_of(chosen))
-        first = first or scores
-        best = scores[0] if scores else None
-        if best is None or len(named) >= limits.most_names or best.p_value > limits.name_p_value:
+    for _ in range(2 * limits.most_names):  # a name that went may come again
+        found = None
+        if len(named) < limits.most_names:
+            found = _next_name(task, look, named, among)
+        if found is None or (named and found[0].gain <= limits.least_name_share * first[0].gain):
             break
-        if best.gain <= limits.least_name_share * first[0].gain:
-            break
-        item, estimate = _best_of_short_list(task, look, estimate, chosen, scores)
-        singles = item.candidate.singles
-        named += [NamedEffect(single, item.p_value, item.gain) for single in singles]
-    named, estimate = settle(task, look, named, estimate)
-    estimate, last = _last_fit(task, look, named, estimate)
-    judge, judged = look, last
-    if is_off(look, last, limits):
+        one, at = found
+        new = [replace(one, candidate=single) for single in one.candidate.singles]
+        known = look.evidence.weighed(at)
+        named, at = _without_idle_names(task, known[0], at, [*named, *new], len(new) == 1)
+        look = look_at(known if at is found[1] else known[0].again(at), at, among)
+    named, at = _settled(task, look.evidence, look.at, named)
+    last = judged = _last_fit(look.evidence, at, named)
+    misfit = last.evidence.misfit(last.at, last.block)
+    if misfit is not None:
         say("the model leaves more than noise: names are judged by what it leaves")
-        judge = look_at_misfit(task, look, estimate)
-        named, estimate = settle(task, judge, named, estimate)
-        estimate, judged = _last_fit(task, judge, named, estimate)
-        indices = indices_of([n.candidate for n in named])
-        estimate, last = fit(model, look.windows, look.whitening, estimate, indices, 0)
-    nothing = last
+        named, at = _settled(task, misfit[0], last.at, named)
+        judged = _last_fit(misfit[0], at, named)
+        last = _seen_by(last.evidence, judged.at, named)
+    explained = 0.0
     if named:
-        _, nothing = task.fit(look, start_estimate(model, look.windows), [])
-    explained = float(nothing.chi2.sum() - last.chi2.sum())
-    return SearchResult(
-        tuple(named), look.windows, estimate, last, look.noise, look.whitening, judge.whitening,
-        judged, first, explained,
-    )  # fmt: skip
+        _, nothing = fit(last.evidence, start, [], limits=limits)
+        explained = float((nothing.residual**2).sum() - last.equations.chi2.sum())
+    return SearchResult(tuple(named), start, last, judged, first, explained)
 
 
-def refitted(
-    model: RolloutModel,
-    found: SearchResult,
-    named: tuple[NamedEffect, ...],
-    limits: Thresholds = THRESHOLDS,
-) -> SearchResult:
-    """Return `found` with those of its names alone that are in `named`, at least one."""
-    indices = indices_of([one.candidate for one in named])
-    theta = model.space.array("start")
-    theta[indices] = found.estimate.theta[indices]
-    start, windows = Estimate(theta, found.estimate.offset), found.windows
-    best, judged = fit(model, windows, found.judging, start, indices, limits=limits)
-    _, last = fit(model, windows, found.whitening, best, indices, 0)
-    nothing = found.explained + float(found.equations.chi2.sum())
-    return replace(
-        found, named=named, estimate=best, equations=last, judged=judged,
-        explained=nothing - float(last.chi2.sum()),
-    )  # fmt: skip
+def _scores(
+    task: SearchTask, look: Look, beside: Sequence[int], among: Sequence[Candidate]
+) -> list:
+    return look.evidence.scores(look.block, look.equations, look.at.theta, beside, among, task.seed)
 
 
-def _last_fit(
-    task: SearchTask, look: Look, named: Sequence[NamedEffect], estimate: Estimate
-) -> tuple[Estimate, NormalEquations]:
-    """Fit all names to the end; where there is none nothing is moved."""
-    indices = indices_of([n.candidate for n in named])
-    rounds = task.limits.last_rounds if indices else 0
-    weighed = look.windows, look.whitening
-    return fit(task.model, *weighed, estimate, indices, rounds, limits=task.limits)
+def _seen_by(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Look:
+    block = evidence.linearise(at, indices_of([n.candidate for n in named]))
+    return Look(evidence, at, block, block.equations())
 
 
-def _best_of_short_list(
+def _last_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Look:
+    """Fit all names to the end, as some effects saturate; where there is none nothing is moved."""
+    indices, limits = indices_of([n.candidate for n in named]), evidence.limits
+    at, block = fit(evidence, at, indices, limits.last_rounds if indices else 0, None, limits)
+    return Look(evidence, at, block, block.equations())
+
+
+def _next_name(
     task: SearchTask,
     look: Look,
-    estimate: Estimate,
-    chosen: list[Candidate],
-    scores: list[CandidateScore],
-) -> tuple[CandidateScore, Estimate]:
-    """Return which of the best `scores` fits best through the whole model beside `chosen`."""
-    limits, space, tried = task.limits, task.model.space, []
-    indices, chi2 = indices_of(chosen), float(look.equations.chi2.sum())
-    columns = look.equations.columns_of
-    fallen = {
-        s.candidate: chi2_fall(
-            look.equations, estimate.theta, space, [*indices, *columns(s.candidate)]
-        )
-        for s in scores
-        if s.gain >= limits.near_share * scores[0].gain
-    }
-    near = [s for s in scores if could_be_best(fallen, s.candidate, limits)]
-    single = [s for s in near if not s.candidate.parts][: limits.short_list]
-    for item in [s for s in near if s.candidate.parts or s in single]:
-        after, equations = task.fit_beside(look, estimate, indices, item.candidate)
-        cost = float(equations.chi2.sum()) + 2 * len(item.candidate.indices)
-        tried.append((cost, item.candidate, (item, after)))
-        task.say(f"{item.candidate.label}: {chi2 - equations.chi2.sum():.0f}")
-    _, _, (item, after) = min(without_idle(tried, limits), key=lambda t: t[0])
-    return item, after
+    named: Sequence[NamedEffect],
+    among: Sequence[Candidate],
+    now: Candidate | None = None,
+) -> tuple[NamedEffect, Estimate] | None:
+    """Return the best name beside `named`, and the fit with it; None where there is none.
+
+    With `now`, a name that `look` is taken without, all that may stand in its place is tried.
+    """
+    limits, evidence, space = task.limits, look.evidence, look.evidence.space
+    beside = indices_of([n.candidate for n in named])
+    left = [c for c in among if not set(c.indices) & set(beside)]
+    scores = {s.candidate: s for s in _scores(task, look, beside, left)}
+    near = list(scores)
+    if now is None:
+        most = limits.near_share * max((s.gain for s in scores.values()), default=0.0)
+        near = [
+            c
+            for c, score in scores.items()
+            if score.p_value <= evidence.name_p_value and score.gain >= most
+        ]
+    columns, theta = look.equations.columns_of, look.at.theta
+    fallen = {c: chi2_fall(look.equations, theta, space, [*beside, *columns(c)]) for c in near}
+    near = [c for c in near if c == now or could_be_best(fallen, c, limits)]
+    if now is None:
+        single = [c for c in near if not c.parts][: limits.short_list]
+        near = [c for c in near if c.parts or c in single]
+    begin, judge = look, evidence.compared()
+    if judge is not evidence and near:
+        begin = look_at(judge.again(look.at), look.at, among)
+    before, tried = chi2_of(begin, begin.block, begin.at, beside), []
+    for candidate in near:
+        at, block = fit_beside(begin, beside, candidate)
+        gains = before - chi2_of(begin, block, at, [*beside, *candidate.indices])
+        share = judge.share(begin.block, at, block, candidate, gains)
+        chi2 = float((block.residual**2).sum())
+        told = "refused" if share is None else f"{begin.equations.chi2.sum() - chi2:.0f}"
+        task.say(f"{candidate.label}: {told}")
+        if share is not None:
+            one = NamedEffect(
+                candidate, scores[candidate].p_value, scores[candidate].gain,
+                gains=tuple(gains.tolist()), share=share,
+            )  # fmt: skip
+            tried.append((chi2 + len(candidate.indices), candidate, (one, at)))
+    tried = without_idle(tried, limits)
+    if not tried:
+        return None
+    least = min(cost for cost, *_ in tried)
+    total = float(begin.equations.chi2.sum())
+    explained = total - chi2_fall(begin.equations, theta, space, beside) - least
+    slack = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
+    alike = [one for one in tried if one[0] - least <= slack]
+    cost, best, (one, at) = min(alike, key=lambda t: (*judge.order(t[2][1], t[1]), t[0]))
+    if one.p_value > evidence.name_p_value:
+        return None
+    rivals = dict.fromkeys(c.name for _, c, _ in alike if c.name != best.name)
+    worse_by = {c.label: other - cost for other, c, _ in tried if c != best}
+    return replace(one, rivals=tuple(rivals), worse_by=worse_by), at
+
+
+def _judged(
+    task: SearchTask,
+    evidence: Evidence,
+    at: Estimate,
+    named: list[NamedEffect],
+    place: int,
+    among: Sequence[Candidate] | None = None,
+) -> tuple[list[NamedEffect], Estimate]:
+    """Weigh the name at `place` when added last: a better rival takes its place, or it goes.
+
+    It is weighed against `among`, all candidates if not given.
+    """
+    one, theta = named[place].candidate, at.theta.copy()
+    theta[list(one.indices)] = evidence.space.array("start")[list(one.indices)]
+    without = Estimate(theta, at.free)
+    others = [*named[:place], *named[place + 1 :]]
+    left = [c for c in (task.among if among is None else among) if one not in c.parts]
+    look = look_at(evidence.again(without), without, left)
+    found = _next_name(task, look, others, left, one)
+    if found is None:
+        return others, without
+    new = [replace(found[0], candidate=single) for single in found[0].candidate.singles]
+    return [*named[:place], *new, *named[place + 1 :]], found[1]
+
+
+def _without_idle_names(
+    task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect], newest: bool
+) -> tuple[list[NamedEffect], Estimate]:
+    """Return the names that are needed beside all others, each weighed against nothing.
+
+    With `newest` the last one has just been weighed.
+    """
+    place = 0
+    while place < len(named) - newest:
+        kept, after = _judged(task, evidence, at, named, place, [named[place].candidate])
+        if len(kept) < len(named):
+            named, at = kept, after
+        else:
+            place += 1
+    return named, at
+
+
+def _settled(
+    task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect]
+) -> tuple[list[NamedEffect], Estimate]:
+    """Refit all names jointly and judge each against its rivals, until no name changes."""
+    for _ in range(task.limits.settle_rounds):
+        before = [n.candidate for n in named]
+        if not before:
+            break
+        at, _ = fit(evidence, at, indices_of(before), limits=task.limits)
+        place = 0
+        while place < len(named):
+            count = len(named)
+            named, at = _judged(task, evidence, at, named, place)
+            place += len(named) >= count
+        if [n.candidate for n in named] == before:
+            break
+    return named, at
+
+
+def could_be_best(
+    fallen: Mapping[Candidate, float], candidate: Candidate, limits: Thresholds
+) -> bool:
+    """Return whether `candidate` could be the best: slopes alone say too little of large effects.
+
+    `fallen` holds the fall of chi-square to first order, by candidate. Several effects together
+    have to explain more than each of them alone.
+    """
+    own, most = fallen.get(candidate, -np.inf), max(fallen.values())
+    alone = max((fallen.get(part, 0.0) for part in candidate.parts), default=-np.inf)
+    slack = limits.first_order_chi2 + limits.first_order_share * abs(most)
+    return own >= most - slack and own > alone + limits.rival_chi2
+
+
+def without_idle(
+    tried: Sequence[tuple[float, Candidate, T]], limits: Thresholds
+) -> list[tuple[float, Candidate, T]]:
+    """Return what was `tried`, without composites of which one part alone explains as much.
+
+    Each comes with its squared error, to which its numbers were added.
+    """
+    cost = {candidate: chi2 for chi2, candidate, _ in tried}
+    return [
+        (chi2, candidate, more)
+        for chi2, candidate, more in tried
+        if all(chi2 + limits.rival_chi2 < cost.get(part, np.inf) for part in candidate.parts)
+    ]

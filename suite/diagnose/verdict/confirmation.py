@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from suite.diagnose.data.whitening import make_whitening
 from suite.diagnose.data.windows import FlightWindows
+from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
-from suite.diagnose.evidence.rollout_fit import Estimate, fit, normal_equations_of, start_estimate
 from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.search.rivals import NamedEffect
-from suite.diagnose.search.search import SearchResult, refitted
-from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.evidence.rollouts import block_of
+from suite.diagnose.search.look import NamedEffect, SearchResult, rollouts_of
+from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.gap import HEADLINE_S, Gap, measure, true_starts
 
 
@@ -38,7 +36,7 @@ def confirmed(
     while found.named:
         without = _without_each(model, found, held, limits)
         # Of the mean score, 1 is noise and all else what no name explains.
-        rest = max(0.0, 1.0 - 1.0 / after.score.mean()) if found.off else 0.0
+        rest = max(0.0, 1.0 - 1.0 / after.score.mean()) if rollouts_of(found.judged).off else 0.0
         doubted = [
             one
             for one in found.candidates
@@ -52,30 +50,15 @@ def confirmed(
         gone.append(label)
         kept = tuple(one for one in found.named if one.candidate.label != label)
         if kept:
-            found = refitted(model, found, kept, limits)
+            found = found.refitted(kept)
             kept = _acting(found)
         if not kept:
-            return without_names(model, found, limits), before, {}, gone
+            return found.refitted(()), before, {}, gone
         if len(kept) < len(found.named):
             gone += [one.candidate.label for one in found.named if one not in kept]
-            found = refitted(model, found, kept, limits)
-        after = measure(model, found.estimate.theta, held, found.noise, limits)
+            found = found.refitted(kept)
+        after = measure(model, found.estimate.theta, held, rollouts_of(found.last).noise, limits)
     return found, after, {}, gone
-
-
-def without_names(
-    model: RolloutModel, found: SearchResult, limits: Thresholds = THRESHOLDS
-) -> SearchResult:
-    """Return `found` with nothing named, at the numbers of the vehicle file.
-
-    What is left over is that of these numbers, and not of those that explained a part of it.
-    """
-    begin = start_estimate(model, found.windows)
-    estimate, left = fit(model, found.windows, found.whitening, begin, [], limits=limits)
-    judged = left
-    if found.off:
-        _, judged = fit(model, found.windows, found.judging, estimate, [], limits=limits)
-    return replace(found, named=(), estimate=estimate, equations=left, judged=judged, explained=0.0)
 
 
 def control(
@@ -88,14 +71,13 @@ def control(
     wrong = next((one for one in among if one.name not in taken), None)
     if wrong is None:
         return None
-    start = start_estimate(model, found.windows)
-    theta = _refit(model, found, start, list(wrong.indices), limits)
-    return wrong.label, measure(model, theta, held, found.noise, limits)
+    theta = found.fitted_anew(found.start, list(wrong.indices)).theta
+    return wrong.label, measure(model, theta, held, rollouts_of(found.last).noise, limits)
 
 
 def _acting(found: SearchResult) -> tuple[NamedEffect, ...]:
     """Return the names of `found` that do something: a wind without its drag does not."""
-    told = np.einsum("wkk->k", found.judged.hessian)
+    told = np.einsum("wkk->k", found.judged.equations.along_numbers(found.indices).hessian)
     at = {index: told[k] for k, index in enumerate(found.indices)}
     return tuple(
         one for one in found.named if any(at[index] > 0.0 for index in one.candidate.indices)
@@ -113,11 +95,11 @@ def _shown(
     theta, own = found.estimate.theta, list(one.indices)
     offset = true_starts(model, theta, held)
     linear = model.linearise(theta, offset, held, [*own, *model.starts])
-    whitening = make_whitening(linear, found.noise, held, limits)
-    hessian = normal_equations_of(whitening, linear, len(own)).hessian.sum(axis=0)
+    whitening = make_whitening(linear, rollouts_of(found.last).noise, held, limits)
+    slope = block_of(whitening, linear, own, held).slope
     moved = theta[own] - model.space.array("start")[own]
     # Windows overlap: each row of the log counts this often.
-    expected = moved @ hessian @ moved * limits.gap_stride_s / HEADLINE_S
+    expected = float(((slope @ moved) ** 2).sum()) * limits.gap_stride_s / HEADLINE_S
     return bool(expected > limits.shown_chi2)
 
 
@@ -132,19 +114,7 @@ def _without_each(
         if others:
             theta = found.estimate.theta.copy()
             theta[list(one.indices)] = start[list(one.indices)]
-            without = Estimate(theta, found.estimate.offset)
-            theta = _refit(model, found, without, indices_of(others), limits)
-        gaps[one.label] = measure(model, theta, held, found.noise, limits)
+            without = Estimate(theta, found.estimate.free)
+            theta = found.fitted_anew(without, indices_of(others)).theta
+        gaps[one.label] = measure(model, theta, held, rollouts_of(found.last).noise, limits)
     return gaps
-
-
-def _refit(
-    model: RolloutModel,
-    found: SearchResult,
-    start: Estimate,
-    indices: list[int],
-    limits: Thresholds,
-) -> np.ndarray:
-    """Return the numbers (P,) where those at `indices` are fitted to what was searched."""
-    best, _ = fit(model, found.windows, found.judging, start, indices, limits=limits)
-    return best.theta

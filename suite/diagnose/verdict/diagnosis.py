@@ -11,7 +11,7 @@ from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.windows import FlightWindows, cut
 from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.search.search import SearchResult
+from suite.diagnose.search.look import SearchResult, rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.gap import Gap
 from suite.diagnose.verdict.relevance import EffectSize, Negligible
@@ -59,6 +59,11 @@ class Diagnosis:
     seed: int
     """Of all draws."""
     limits: Thresholds = THRESHOLDS
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(19,) measurement noise of each channel in its unit; NaN where nothing was measured."""
+        return rollouts_of(self.search.last).noise.sigma
 
     @property
     def input_source(self) -> str:

@@ -14,10 +14,10 @@ import numpy as np
 
 from eval.effects.log_faults import lateness
 from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.whitening import Linearisation, make_whitening, rotor_spread
+from suite.diagnose.data.whitening import Linearisation, make_whitening, rotor_spread, slow_energy
 from suite.diagnose.data.windows import SLICES, STATE, STATE_GROUPS, FlightWindows
-from suite.diagnose.evidence.rollout_fit import normal_equations_of
 from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.evidence.rollouts import block_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 HORIZONS_S = (0.1, 0.5, 1.0)
@@ -73,7 +73,8 @@ def gap_of(
 ) -> Gap:
     """Return the gap of residuals; the slopes in `linear` are those along what is free."""
     whitening = make_whitening(linear, noise, windows, limits)
-    slow = normal_equations_of(whitening, linear, 0).slow_energy
+    residual = block_of(whitening, linear, (), windows).residual
+    slow = slow_energy(whitening, residual)
     score = slow.sum(axis=1) / whitening.slow_freedom.sum(axis=1)
     free = start_noise(noise.sigma, windows, linear.offset.shape[1], limits)
     table = {}

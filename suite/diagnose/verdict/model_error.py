@@ -15,7 +15,7 @@ import numpy as np
 from suite.diagnose.data.colour import measured_noise
 from suite.diagnose.data.whitening import Linearisation, make_whitening, project_out_start, whiten
 from suite.diagnose.data.windows import SLICES, FlightWindows
-from suite.diagnose.evidence.rollout_fit import Estimate
+from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.thresholds import Thresholds
 
@@ -40,7 +40,7 @@ def with_model_error(
     """
     noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
-    apart = model.residual(at.theta, at.offset, coarser) - linear.residual
+    apart = model.residual(at.theta, at.free, coarser) - linear.residual
     good = np.isfinite(apart).all(axis=(1, 2), keepdims=True)
     apart = np.where(good, apart, 0.0)
     left = project_out_start(whitening, whiten(whitening, apart[..., None]))[..., 0]

@@ -13,11 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.data.windows import SLICES, FlightWindows
-from suite.diagnose.estimate.intervals import half_widths95
 from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.search.search import SearchResult, refitted
+from suite.diagnose.search.look import SearchResult, rollouts_of
 from suite.diagnose.thresholds import Thresholds
-from suite.diagnose.verdict.confirmation import without_names
 from suite.diagnose.verdict.gap import Gap, measure
 
 FORCE_S, TORQUE_S = 0.5, 0.1
@@ -153,9 +151,9 @@ def relevant_part(
         out += [Negligible(name, sizes[name]) for name in small]
         kept = tuple(one for one in found.named if one.candidate.name not in small)
         if not kept:
-            return without_names(model, found, limits), before, {}, out
-        found = refitted(model, found, kept, limits)
-        after = measure(model, found.estimate.theta, held, found.noise, limits)
+            return found.refitted(()), before, {}, out
+        found = found.refitted(kept)
+        after = measure(model, found.estimate.theta, held, rollouts_of(found.last).noise, limits)
     return found, after, {}, out
 
 
@@ -163,10 +161,9 @@ def _sizes(
     model: RolloutModel, found: SearchResult
 ) -> tuple[dict[str, EffectSize], dict[str, EffectSize]]:
     """Return the sizes of the named effects, and the upper ends of their intervals."""
-    estimate, windows, indices = found.estimate, found.windows, found.indices
-    slope = model.linearise(estimate.theta, estimate.offset, windows, indices).slope
-    width = half_widths95(found.judged, windows.flight if found.off else None)
-    away = (estimate.theta - model.space.array("start"))[indices]
+    estimate, windows, indices = found.estimate, rollouts_of(found.last).trusted, found.indices
+    slope = model.linearise(estimate.theta, estimate.free, windows, indices).slope
+    width, away = found.half_widths(), found.moved
     sizes, upper = {}, {}
     for name in dict.fromkeys(one.candidate.name for one in found.named):
         at = [k for k, i in enumerate(indices) if model.space.entries[i].effect == name]

@@ -17,10 +17,9 @@ from scipy.stats import gamma
 from eval.effects.interface import GRAVITY
 from suite.diagnose.data.whitening import Whitening, project_out_start, whiten, whitened_residual
 from suite.diagnose.data.windows import KNOTS, FlightWindows
-from suite.diagnose.estimate.gauss_newton import products
+from suite.diagnose.estimate.block import Estimate, products
 from suite.diagnose.estimate.permutation import permutation_test
 from suite.diagnose.evidence.rollout import Flown
-from suite.diagnose.evidence.rollout_fit import Estimate
 from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -65,8 +64,8 @@ def disturbance_equations(
     limits: Thresholds = THRESHOLDS,
 ) -> DisturbanceEquations:
     """Return the normal equations of a disturbance on what `estimate` leaves over."""
-    response = model.respond(estimate.theta, estimate.offset, windows)
-    linear = model.linearise(estimate.theta, estimate.offset, windows, [])
+    response = model.respond(estimate.theta, estimate.free, windows)
+    linear = model.linearise(estimate.theta, estimate.free, windows, [])
     residual = project_out_start(whitening, whitened_residual(whitening, linear))
     slope = project_out_start(whitening, whiten(whitening, response.slope))
     shapes = shape_library(response.knot, np.asarray(windows.start_s), limits)

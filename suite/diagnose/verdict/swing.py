@@ -17,8 +17,8 @@ from scipy.stats import chi2
 
 from eval.effects.interface import GRAVITY
 from suite.diagnose.data.view import SmoothedFlight
-from suite.diagnose.evidence.view_equations import ViewTask, left_of
-from suite.diagnose.search.rivals import flights_agree
+from suite.diagnose.evidence.evidence import flights_agree
+from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 STEP_HZ = 0.01
@@ -75,11 +75,11 @@ class Spectrum(NamedTuple):
     """Of a line."""
 
 
-def swing_left(task: ViewTask, theta: np.ndarray) -> Swing | None:
+def swing_left(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     """Return the swing in what `task`, of the force view, leaves at the numbers `theta` (P,)."""
     if not {0, 1} <= set(task.view.axes):
         return None
-    data = left_of(task, theta)
+    data = task.left(theta)
     left_b = [data.residual[data.flight == number] for number in range(len(task.flights))]
     return find_swing(task.flights, left_b, task.limits)
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.data.windows import STATE_GROUPS
-from suite.diagnose.search.search import SearchResult
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.gap import Gap
 from suite.diagnose.verdict.residual_structure import ResidualStructure
@@ -26,7 +25,8 @@ class Verdict(NamedTuple):
 
 
 def verdict_on(
-    found: SearchResult,
+    named: bool,
+    slow_errors: tuple[np.ndarray, np.ndarray],
     residual: ResidualStructure,
     gaps: tuple[Gap, Gap],
     rotor_input: bool,
@@ -34,9 +34,15 @@ def verdict_on(
 ) -> Verdict:
     """Return the verdict on what was found and on the structure in what it leaves over.
 
-    `gaps` are those before and after it was found.
+    Args:
+        named: whether something was named.
+        slow_errors: as `RolloutEvidence.slow_errors` has them.
+        residual: the structure.
+        gaps: those before and after it was found.
+        rotor_input: whether measured rotor speeds drive.
+        limits: from where on structure is none of noise.
     """
-    slow, expected = found.equations.slow_energy, found.whitening.slow_freedom
+    slow, expected = slow_errors
     shape = residual.shapes[0] if residual.shapes else None
     if shape is not None and shape.p_value > limits.shape_p_value:
         shape = None
@@ -47,12 +53,12 @@ def verdict_on(
     ]
     loud = limits.structure_rotor_input if rotor_input else limits.structure
     if not (shape or coloured or slow.sum() / expected.sum() > loud):
-        return Verdict("named", share_left(*gaps)) if found.named else Verdict("no_gap")
-    share = share_left(*gaps) if found.named else 1.0
+        return Verdict("named", share_left(*gaps)) if named else Verdict("no_gap")
+    share = share_left(*gaps) if named else 1.0
     where = [shape.label] if shape else []
     if coloured:
         where.append("a changing " + ", ".join(coloured))
-    partly = found.named and share <= limits.unexplained_share
+    partly = named and share <= limits.unexplained_share
     where = "; ".join(where) or _loudest(slow.sum(axis=0), expected.sum(axis=0))
     return Verdict("partly" if partly else "unknown", share, where)
 

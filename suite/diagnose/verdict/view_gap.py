@@ -9,8 +9,8 @@ import numpy as np
 
 from suite.diagnose.data.view import FlightRows, SmoothedFlight
 from suite.diagnose.evidence.moments import ViewData, centred, units_of
-from suite.diagnose.evidence.view_equations import ViewTask, left_of
-from suite.diagnose.search.view_search import ViewSearch
+from suite.diagnose.evidence.views import ViewEvidence
+from suite.diagnose.search.look import SearchResult
 
 
 class ViewGap(NamedTuple):
@@ -42,13 +42,15 @@ class ViewGap(NamedTuple):
         return float(np.sqrt((by_axis**2).sum()))
 
 
-def judge(found: ViewSearch, held: ViewTask, floor: np.ndarray) -> ViewGap:
+def judge(found: SearchResult, held: ViewEvidence, floor: np.ndarray) -> ViewGap:
     """Return what `found` is worth on the flights of `held`; `floor` (3,) is the noise's."""
-    before, after = left_of(held, found.first.theta), left_of(held, found.last.theta)
+    before, after = held.left(found.start.theta), held.left(found.estimate.theta)
+    evidence = found.last.evidence
+    assert isinstance(evidence, ViewEvidence) and evidence.weights
     if held.means:
-        return _judge_change(found, before, after, floor)
-    start, fitted = found.first.data, found.last.data
-    inside = np.concatenate([inputs_of(flight) for flight in found.task.flights])
+        return _judge_change(before, after, floor, evidence.weights.trim)
+    start, fitted = evidence.left(found.start.theta), evidence.left(found.estimate.theta)
+    inside = np.concatenate([inputs_of(flight) for flight in evidence.flights])
     outside = np.concatenate([inputs_of(flight) for flight in held.flights])
     numbers = before.flight
     whole = fit_black_box(inside, start.residual, start.flight)
@@ -66,7 +68,7 @@ def judge(found: ViewSearch, held: ViewTask, floor: np.ndarray) -> ViewGap:
         before=_rms(before.residual),
         after=_rms(after.residual),
         floor=floor,
-        repeatability=_finite(found.last.weights.trim),
+        repeatability=_finite(evidence.weights.trim),
         closed=closed,
         explainable=np.maximum(explainable, closed),
         left=both - closed,
@@ -75,7 +77,7 @@ def judge(found: ViewSearch, held: ViewTask, floor: np.ndarray) -> ViewGap:
 
 
 def _judge_change(
-    found: ViewSearch, before: ViewData, after: ViewData, floor: np.ndarray
+    before: ViewData, after: ViewData, floor: np.ndarray, trim: np.ndarray
 ) -> ViewGap:
     """Return what the names of a change are worth: means alone count."""
     power = (before.residual**2).mean(axis=0)
@@ -84,7 +86,7 @@ def _judge_change(
         before=_rms(before.residual),
         after=_rms(after.residual),
         floor=floor,
-        repeatability=_finite(found.first.weights.trim),
+        repeatability=_finite(trim),
         closed=closed,
         explainable=np.maximum(closed, 0.0),
         left=np.zeros(3),
@@ -92,11 +94,11 @@ def _judge_change(
     )
 
 
-def gap_without(found: ViewSearch, held: ViewTask, indices: Sequence[int]) -> np.ndarray:
+def gap_without(found: SearchResult, held: ViewEvidence, indices: Sequence[int]) -> np.ndarray:
     """Return the RMS (3,) on held-out flights where the numbers at `indices` are as given."""
-    theta = found.last.theta.copy()
-    theta[list(indices)] = found.first.theta[list(indices)]
-    return _rms(left_of(held, theta).residual)
+    theta = found.estimate.theta.copy()
+    theta[list(indices)] = found.start.theta[list(indices)]
+    return _rms(held.left(theta).residual)
 
 
 def _rms(residual: np.ndarray) -> np.ndarray:

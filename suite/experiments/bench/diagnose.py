@@ -13,14 +13,12 @@ from typing import Any
 import numpy as np
 
 from suite.common.errors import WorkFailed
-from suite.diagnose.data.colour import measured_noise
 from suite.diagnose.data.noise import noise_of
-from suite.diagnose.data.whitening import make_whitening
-from suite.diagnose.estimate.gauss_newton import NormalEquations
-from suite.diagnose.estimate.intervals import half_widths95
-from suite.diagnose.evidence.rollout_fit import fit, start_estimate
+from suite.diagnose.estimate.block import NormalEquations
+from suite.diagnose.estimate.gauss_newton import fit
+from suite.diagnose.estimate.intervals import intervals95
 from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.search.look import trusted
+from suite.diagnose.evidence.rollouts import start_estimate, weighed_by
 from suite.experiments.bench.compare import Comparison, Figure, in_turn
 from suite.experiments.bench.rigid_body import Task, make_task
 
@@ -49,7 +47,7 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
         task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
     )
     begin = start_estimate(model, task.windows)
-    residual = model.residual(begin.theta, begin.offset, task.windows)
+    residual = model.residual(begin.theta, begin.free, task.windows)
     problem = sysid_baseline.prepare(task, noise_of(residual, task.windows))
     answers: dict[str, tuple[np.ndarray, NormalEquations]] = {}
 
@@ -79,14 +77,13 @@ def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]
     indices, state = list(task.indices), start_estimate(model, task.windows)
     seen = 0
     while True:
-        linear = model.linearise(state.theta, state.offset, task.windows, [*indices, *model.starts])
-        view = trusted(task.windows, linear.residual)
-        noise = measured_noise(linear.residual, linear.start_slope, view)
-        whitening = make_whitening(linear, noise, view)
-        state, equations = fit(model, view, whitening, state, indices)
-        if view.seen.sum() <= seen:
-            return state.theta[indices], equations
-        seen = view.seen.sum()
+        directions = [*indices, *model.starts]
+        linear = model.linearise(state.theta, state.free, task.windows, directions)
+        evidence, known = weighed_by(model, task.windows, linear, along=indices)
+        state, block = fit(evidence, state, indices, known=known)
+        if evidence.trusted.seen.sum() <= seen:
+            return state.theta[indices], block.equations()
+        seen = evidence.trusted.seen.sum()
 
 
 def _agreement(
@@ -97,7 +94,7 @@ def _agreement(
     The half-widths are worked out in the same way for both, from how stretches disagree; the joint
     one is their root sum of squares.
     """
-    widths = {side: half_widths95(equations) for side, (_, equations) in answers.items()}
+    widths = {side: intervals95(equations).half_width for side, (_, equations) in answers.items()}
     first, second = (values for values, _ in answers.values())
     apart = np.abs(first - second) / np.hypot(*widths.values())
     rows = {}

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from eval.quadrotor.model import BODY, add_quadrotor, rotor_name
 from eval.quadrotor.plant import make_plant
 from suite.diagnose.data.windows import SLICES, step_s
-from suite.diagnose.estimate.gauss_newton import NormalEquations
+from suite.diagnose.estimate.block import NormalEquations
 from suite.experiments.bench.rigid_body import Task
 
 POSE = 13
@@ -120,10 +120,8 @@ def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
     slope = np.asarray(result.jac).reshape(count, -1, len(values))
     apart = residual.reshape(count, -1)
     turned = np.swapaxes(slope, 1, 2)
-    error = (apart**2).sum(1)
-    return values, NormalEquations(
-        turned @ slope, -(turned @ apart[..., None])[..., 0], error, np.zeros((count, 12))
-    )
+    pull = -(turned @ apart[..., None])[..., 0]
+    return values, NormalEquations(turned @ slope, pull, (apart**2).sum(1))
 
 
 def _built(base: Any, task: Task, values: np.ndarray) -> Any:

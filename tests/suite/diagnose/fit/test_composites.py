@@ -1,11 +1,13 @@
 """Effects that are one hypothesis: what they are made of, and how a fit of them begins."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from suite.diagnose.estimate.gauss_newton import NormalEquations, along_numbers
-from suite.diagnose.estimate.parameters import candidates, effects_in, make_space
-from suite.diagnose.search.composites import (
+from suite.diagnose.estimate.block import NormalEquations
+from suite.diagnose.estimate.composites import (
     COMPOSITES,
     acts_through,
     begin_of,
@@ -15,6 +17,8 @@ from suite.diagnose.search.composites import (
     lent_at,
     usual_size,
 )
+from suite.diagnose.estimate.parameters import candidates, effects_in, make_space
+from suite.diagnose.search.look import Look, asked_for
 from tests.support.vehicles import PLAIN
 
 SPACE = make_space(PLAIN)
@@ -70,12 +74,22 @@ def test_lent_columns_come_last_and_are_a_composites_alone():
     moved = slope[..., size:] @ [1.0, -2.0, 0.5]
     turned = np.swapaxes(slope, 1, 2)
     made = NormalEquations(
-        turned @ slope, (turned @ moved[..., None])[..., 0], (moved**2).sum(1), np.zeros(0), lent
+        turned @ slope,
+        (turned @ moved[..., None])[..., 0],
+        (moved**2).sum(1),
+        along=(*range(size), *lent),
     )
     columns = made.columns_of(WIND)
-    assert made.columns_of(WIND.parts[0]) == lent and set(columns) >= {size, size + 1, size + 2}
-    assert sorted(made.numbers_of(columns)) == list(WIND.indices)
-    change, told = along_numbers(made, SPACE.array("start"), SPACE, columns)
+    assert tuple(made.columns_of(WIND.parts[0])) == lent and set(columns) >= {
+        size,
+        size + 1,
+        size + 2,
+    }
+    assert sorted(made.numbers[c] for c in columns) == list(WIND.indices)
+    evidence: Any = SimpleNamespace(space=SPACE)
+    at: Any = SimpleNamespace(theta=SPACE.array("start"))
+    block: Any = None
+    change, told = asked_for(Look(evidence, at, block, made), [], WIND)
     np.testing.assert_allclose(change[list(lent)], [1.0, -2.0, 0.5], atol=1e-3)
     assert (told[list(lent)] > 0.0).all() and told[places("frame_tilt")].max() == 0.0
 

@@ -9,15 +9,15 @@ from suite.diagnose.data.whitening import (
     make_whitening,
     orthonormal,
     project_out_start,
+    slow_energy,
     whiten,
     whitened_residual,
 )
 from suite.diagnose.data.windows import KNOTS, STATE
 from suite.diagnose.estimate.parameters import candidates, effects_at, indices_of, make_space
-from suite.diagnose.evidence.rollout_fit import normal_equations_of, start_estimate
 from suite.diagnose.evidence.rollout_model import BATCH, DIRECTIONS, batches
-from suite.diagnose.search.look import trusted
-from suite.diagnose.search.rivals import NamedEffect
+from suite.diagnose.evidence.rollouts import block_of, start_estimate, trusted, weighed_by
+from suite.diagnose.search.look import NamedEffect
 from suite.diagnose.search.search import search
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -34,7 +34,7 @@ def flown(drag):
     """
     model, windows = drag.model, drag.cut(1.0)
     begin = start_estimate(model, windows)
-    return model, windows, model.linearise(begin.theta, begin.offset, windows, None)
+    return model, windows, model.linearise(begin.theta, begin.free, windows, None)
 
 
 def test_a_vector_of_numbers_is_the_vehicles_effects_and_back():
@@ -65,17 +65,17 @@ def test_slopes_are_those_of_small_changes(flown):
     index = SPACE.layout.index(name)
     step = np.zeros(model.size)
     step[index] = 1e-4
-    ends = [model.residual(begin.theta + s * step, begin.offset, windows) for s in (-1, 1)]
+    ends = [model.residual(begin.theta + s * step, begin.free, windows) for s in (-1, 1)]
     slope = (ends[0] - ends[1]) / 2e-4
     np.testing.assert_allclose(linear.slope[..., index], slope, atol=1e-4)
-    few = model.linearise(begin.theta, begin.offset, windows, [index])
+    few = model.linearise(begin.theta, begin.free, windows, [index])
     np.testing.assert_allclose(few.slope[..., 0], linear.slope[..., index], atol=1e-9)
 
 
 def test_a_disturbance_pushes_the_windows(flown):
     model, windows, _ = flown
     begin = start_estimate(model, windows)
-    response = model.respond(begin.theta, begin.offset, windows)
+    response = model.respond(begin.theta, begin.free, windows)
     assert response.slope.shape[-1] == KNOTS * 6
     assert response.knot.rotor_speed.shape == (len(windows.flight), KNOTS, 4)
     up = response.slope[..., 2::6].sum(axis=-1)[:, :, 2]
@@ -86,7 +86,7 @@ def test_a_disturbance_pushes_the_windows(flown):
 
 def test_batches_are_of_one_size_and_whole(flown):
     model, windows, _ = flown
-    offset = start_estimate(model, windows).offset
+    offset = start_estimate(model, windows).free
     parts = list(batches(offset, windows))
     assert all(len(x) == len(w.flight) == BATCH for x, w, _ in parts)
     assert sum(count for *_, count in parts) == len(windows.flight) and DIRECTIONS <= model.size
@@ -101,15 +101,16 @@ def test_what_the_start_explains_is_projected_out(flown):
     by_start = np.einsum("wnck,wk->wnc", slope, moved)[..., None]
     left = project_out_start(whitening, whiten(whitening, by_start))
     assert np.abs(left).max() < 1e-6 * np.abs(whiten(whitening, by_start)).max()
-    equations = normal_equations_of(whitening, linear, 3)
+    block = block_of(whitening, linear, range(3), windows)
     residual = project_out_start(whitening, whitened_residual(whitening, linear))
-    np.testing.assert_allclose(equations.chi2, (residual**2).sum(axis=(1, 2)))
+    np.testing.assert_allclose(block.residual, residual[..., 0])
     assert (whitening.slow_freedom >= -1e-9).all()
     energy = []
     for seed in range(10):
         noise = np.random.default_rng(seed).standard_normal(linear.residual.shape)
         white = linear._replace(residual=np.nan_to_num(sigma) * noise)
-        energy.append(normal_equations_of(whitening, white, 0).slow_energy.sum())
+        rest = block_of(whitening, white, (), windows).residual
+        energy.append(slow_energy(whitening, rest).sum())
     # Noise alone gives one for each degree of freedom that the start leaves.
     assert np.mean(energy) == pytest.approx(whitening.slow_freedom.sum(), rel=0.05)
 
@@ -140,7 +141,9 @@ def test_a_search_names_the_drag_and_leaves_its_result_alone(flown):
         c for c in candidates(SPACE, False, NEEDED[1:]) if c.name in ("linear_drag", "gyro_bias")
     ]
     said = []
-    found = search(model, windows, among, said.append, linear)
+    known = weighed_by(model, windows, linear)
+    begin = start_estimate(model, windows)
+    found = search(known[0], begin, among, said.append, known=known)
     assert [candidate.name for candidate in found.candidates] == ["linear_drag"]
     one = found.named[0]
     assert one.p_value <= 1e-3 and one.gain > 0.0 and found.explained > 100.0 and said

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from suite.diagnose.estimate.gauss_newton import NormalEquations, products, solve
-from suite.diagnose.estimate.intervals import half_widths95
+from suite.diagnose.estimate.block import NormalEquations, products
+from suite.diagnose.estimate.gauss_newton import solve
+from suite.diagnose.estimate.intervals import intervals95
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.estimate.permutation import folds_of, score_candidates
 from tests.support.vehicles import PLAIN
@@ -17,7 +18,7 @@ def made_equations(rng, space, true_size, windows=24, rows=40):
     residual += true_size * slope[..., 0] * space.array("step")[0]
     turned = np.swapaxes(slope, 1, 2)
     return NormalEquations(
-        turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1), np.zeros(0)
+        turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1)
     )
 
 
@@ -58,7 +59,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
         hessian, gradient = products(slope, residual)
         best = np.linalg.solve(hessian.sum(0), gradient.sum(0))
         left = gradient - hessian @ best
-        half = half_widths95(NormalEquations(hessian, left, np.zeros(30), np.zeros(0)))
+        half = intervals95(NormalEquations(hessian, left, np.zeros(30))).half_width
         inside.extend(np.abs(best - [0.3, -0.2]) < half)
     # Of 200, 190 are expected inside; fewer than 180 come with a chance of 0.1 %.
     assert sum(inside) >= 180
@@ -72,9 +73,9 @@ def test_intervals_know_that_an_error_comes_back_in_every_window_of_a_flight():
         residual = rng.standard_normal((6, 1, 20, 1)) + 0.1 * rng.standard_normal((6, 8, 20, 1))
         hessian, gradient = products(slope.reshape(48, 20, 2), residual.reshape(48, 20, 1))
         best = np.linalg.solve(hessian.sum(0), gradient.sum(0))
-        left = NormalEquations(hessian, gradient - hessian @ best, np.zeros(48), np.zeros(0))
-        inside["windows"].extend(np.abs(best) < half_widths95(left))
-        inside["flights"].extend(np.abs(best) < half_widths95(left, flight))
+        left = NormalEquations(hessian, gradient - hessian @ best, np.zeros(48), flight)
+        inside["windows"].extend(np.abs(best) < intervals95(left).half_width)
+        inside["flights"].extend(np.abs(best) < intervals95(left, 1.0).half_width)
     assert np.mean(inside["windows"]) < 0.7
     assert np.mean(inside["flights"]) > 0.88
 
@@ -91,6 +92,6 @@ def test_intervals_by_flights_hold_the_truth_however_many_numbers_are_fitted():
         residual = rng.standard_normal((20, 40, 1)) + rng.standard_normal((4, 1, 1))[flight]
         hessian, gradient = products(slope, residual)
         best = np.linalg.solve(hessian.sum(0), gradient.sum(0))
-        left = NormalEquations(hessian, gradient - hessian @ best, np.zeros(20), np.zeros(0))
-        inside.append(np.abs(best) <= half_widths95(left, flight))
+        left = NormalEquations(hessian, gradient - hessian @ best, np.zeros(20), flight)
+        inside.append(np.abs(best) <= intervals95(left, 1.0).half_width)
     assert 0.93 < np.mean(inside) < 0.99

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from suite.diagnose.estimate.gauss_newton import NormalEquations
+from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.estimate.permutation import folds_of, score_candidates
 from suite.diagnose.thresholds import THRESHOLDS
@@ -43,7 +43,7 @@ def equations(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
     slope = slope / SPACE.array("step")
     turned = np.swapaxes(slope, 1, 2)
     cross = (turned @ noise[..., None])[..., 0]
-    return NormalEquations(turned @ slope, cross, (noise**2).sum(axis=1), np.zeros(0))
+    return NormalEquations(turned @ slope, cross, (noise**2).sum(axis=1))
 
 
 @cache

@@ -2,16 +2,12 @@
 
 import numpy as np
 
-from suite.diagnose.estimate.gauss_newton import NormalEquations
+from suite.diagnose.estimate.block import NormalEquations
+from suite.diagnose.estimate.composites import composites
+from suite.diagnose.estimate.gauss_newton import chi2_by_part, chi2_fall
 from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.search.composites import composites
-from suite.diagnose.search.rivals import (
-    chi2_fall,
-    could_be_best,
-    flights_agree,
-    gains_by_flight,
-    without_idle,
-)
+from suite.diagnose.evidence.evidence import flights_agree
+from suite.diagnose.search.search import could_be_best, without_idle
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.vehicles import PLAIN
 
@@ -26,7 +22,7 @@ def made_equations(space, sizes, rng):
     residual += np.array(sizes)[FLIGHT][:, None] * slope[..., 0] * step[0]
     turned = np.swapaxes(slope, 1, 2)
     return NormalEquations(
-        turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1), np.zeros(0)
+        turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1)
     )
 
 
@@ -36,7 +32,10 @@ def gains_of(sizes):
     made = made_equations(space, sizes, np.random.default_rng(0))
     assert chi2_fall(made, theta, space, [0]) > 10.0
     assert chi2_fall(made, theta, space, []) == 0.0
-    return gains_by_flight(made, theta, space, [1], [0], FLIGHT)
+    without, with_it = (
+        chi2_by_part(made.along_numbers(at), theta, space, FLIGHT) for at in ([1], [0, 1])
+    )
+    return without - with_it
 
 
 def test_what_all_flights_have_is_agreed_on():

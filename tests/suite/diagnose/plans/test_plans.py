@@ -114,7 +114,7 @@ def test_flying_the_plan_turns_the_set_into_a_name(tmp_path):
     (effect,) = found["effects"]
     assert {effect["name"], *effect["alternatives"]} >= {"rotor_drag", "linear_drag"}
     plan = write_plan_of(found, tmp_path / "plan")
-    plan = fly_plan(plan, first.search.sigma, LAGGED, truth, tmp_path / "plan", 1)
+    plan = fly_plan(plan, first.sigma, LAGGED, truth, tmp_path / "plan", 1)
     new = [read_flight(tmp_path / "plan" / flight["flown"]) for flight in plan["flights"]]
     again = diagnosis_json(diagnose([*logs, *(replace(log, about={}) for log in new)], LAGGED))
     (effect,) = again["effects"]

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from suite.diagnose.search.rivals import NamedEffect
-from suite.diagnose.verdict.confirmation import confirmed, without_names
+from suite.diagnose.search.look import NamedEffect, rollouts_of
+from suite.diagnose.verdict.confirmation import confirmed
 from suite.diagnose.verdict.gap import measure
 from suite.diagnose.verdict.verdict import verdict_on
 
@@ -17,12 +17,13 @@ def spoilt(drag, steps):
     theta, at = found.estimate.theta.copy(), list(other.indices)
     theta[at] += steps * space.array("step")[at]
     named = (*found.named, NamedEffect(other, 0.001, 20.0))
-    return replace(found, named=named, estimate=replace(found.estimate, theta=theta))
+    last = found.last._replace(at=found.estimate._replace(theta=theta))
+    return replace(found, named=named, last=last, judged=last)
 
 
 def judged(drag, found):
     held, limits = drag.held_windows, drag.limits
-    after = measure(drag.model, found.estimate.theta, held, found.noise, limits)
+    after = measure(drag.model, found.estimate.theta, held, rollouts_of(found.last).noise, limits)
     return after, confirmed(drag.model, found, held, (drag.before, after), limits)
 
 
@@ -41,10 +42,12 @@ def test_where_the_model_lacks_something_a_name_must_take_away_a_share_of_the_re
     # As if the rest were so large that the gap without the drag is a fifth larger only.
     raised = drag.without["linear_drag"].energy.sum() / 1.2 / drag.after.energy.sum()
     after = drag.after._replace(score=raised * drag.after.score, energy=raised * drag.after.energy)
-    off = replace(found, judging=found.judging._replace())
-    assert off.off and not found.off
+    misfit = replace(rollouts_of(found.judged), off=True)
+    off = replace(found, judged=found.judged._replace(evidence=misfit))
     gone = {
-        one.off: confirmed(drag.model, one, held, (drag.before, after), limits)[3]
+        rollouts_of(one.judged).off: confirmed(drag.model, one, held, (drag.before, after), limits)[
+            3
+        ]
         for one in (found, off)
     }
     assert gone == {False: [], True: ["linear_drag"]}
@@ -59,11 +62,14 @@ def test_what_was_withdrawn_has_explained_nothing(drag):
     """A gap that a withdrawn name had closed is there again: `unknown`, not `no_gap`."""
 
     def loudness(found):
-        return found.equations.slow_energy.sum() / found.whitening.slow_freedom.sum()
+        slow, expected = rollouts_of(found.last).slow_errors(found.last.block)
+        return slow.sum() / expected.sum()
 
-    bare = without_names(drag.model, drag.search, drag.limits)
+    bare = drag.search.refitted(())
     assert bare.named == () and bare.explained == 0.0
     assert loudness(drag.search) < 1.5 and loudness(bare) > 3.0
     quiet = drag.residual._replace(shapes=[], coloured={})
     gaps = (drag.before, drag.before)
-    assert verdict_on(bare, quiet, gaps, rotor_input=True, limits=drag.limits).label == "unknown"
+    slow = rollouts_of(bare.last).slow_errors(bare.last.block)
+    verdict = verdict_on(False, slow, quiet, gaps, rotor_input=True, limits=drag.limits)
+    assert verdict.label == "unknown"

@@ -1,14 +1,13 @@
 """What the numbers allow to be said: gaps, structure in what is left, wind, and the verdict."""
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from suite.diagnose.checks import black_box, checks
 from suite.diagnose.data.windows import KNOTS, STATE
+from suite.diagnose.search.look import rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict import diagnosis
 from suite.diagnose.verdict.gap import Gap, measure, noise_floor, start_noise, worse
@@ -29,13 +28,14 @@ def gap(energy):
     return Gap(np.asarray(energy) / 10.0, np.asarray(energy), {})
 
 
-def searched(slow=1.0, named=()) -> Any:
-    """As much of a search's result as a verdict needs: 10 windows of slow errors."""
-    whitening = SimpleNamespace(slow_freedom=np.full((10, STATE), 5.0))
+def slow_errors(size=1.0):
+    """Slow errors of 10 windows, and what is expected."""
     energy = np.full((10, STATE), 5.0)
-    energy[:, 6] *= slow
-    equations = SimpleNamespace(slow_energy=energy)
-    return SimpleNamespace(named=named, whitening=whitening, equations=equations)
+    energy[:, 6] *= size
+    return energy, np.full((10, STATE), 5.0)
+
+
+QUIET = slow_errors()
 
 
 def scores(before, after):
@@ -53,26 +53,26 @@ def left(p_value=0.5, coloured=0.5, gain=1.0):
 
 
 def test_noise_alone_is_no_gap_and_a_name_without_structure_is_named():
-    assert verdict_on(searched(), left(), SAME, False) == Verdict("no_gap")
-    assert verdict_on(searched(named=("drag",)), left(), SAME, False) == Verdict("named")
+    assert verdict_on(False, QUIET, left(), SAME, False) == Verdict("no_gap")
+    assert verdict_on(True, QUIET, left(), SAME, False) == Verdict("named")
 
 
 def test_structure_is_told_by_what_it_goes_with():
-    shaped = verdict_on(searched(), left(p_value=1e-4), SAME, False)
+    shaped = verdict_on(False, QUIET, left(p_value=1e-4), SAME, False)
     assert shaped == Verdict("unknown", 1.0, "force with the speed")
-    coloured = verdict_on(searched(), left(coloured=1e-6), SAME, False)
+    coloured = verdict_on(False, QUIET, left(coloured=1e-6), SAME, False)
     assert coloured.where == "a changing " + ", ".join(AXES)
-    loud = verdict_on(searched(slow=10.0), left(), SAME, False)
+    loud = verdict_on(False, slow_errors(10.0), left(), SAME, False)
     assert loud.label == "unknown" and loud.where == "errors of velocity x"
 
 
 def test_what_explains_most_is_named_in_part():
-    found, seen = searched(named=("drag",)), left(p_value=1e-4)
-    verdict = verdict_on(found, seen, scores(11.0, 1.0), False)
+    seen = left(p_value=1e-4)
+    verdict = verdict_on(True, QUIET, seen, scores(11.0, 1.0), False)
     assert verdict.label == "partly" and verdict.share_left == pytest.approx(
         (2**0.5 - 1.0) / (12**0.5 - 1.0)
     )
-    assert verdict_on(found, seen, scores(11.0, 9.0), False).label == "unknown"
+    assert verdict_on(True, QUIET, seen, scores(11.0, 9.0), False).label == "unknown"
 
 
 def test_the_share_that_is_left_is_that_of_the_gaps():
@@ -83,11 +83,11 @@ def test_the_share_that_is_left_is_that_of_the_gaps():
 
 
 def test_rotor_speeds_as_input_may_be_noisier():
-    quiet = searched(slow=3.0)
-    assert verdict_on(quiet, left(coloured=1e-6), SAME, True) == Verdict("no_gap")
-    assert verdict_on(quiet, left(), SAME, False).label == "unknown"
+    quiet = slow_errors(3.0)
+    assert verdict_on(False, quiet, left(coloured=1e-6), SAME, True) == Verdict("no_gap")
+    assert verdict_on(False, quiet, left(), SAME, False).label == "unknown"
     strict = replace(THRESHOLDS, structure_rotor_input=1.1)
-    assert verdict_on(quiet, left(), SAME, True, strict).label == "unknown"
+    assert verdict_on(False, quiet, left(), SAME, True, strict).label == "unknown"
 
 
 def test_a_gaps_interval_holds_it_and_a_rise_is_seen():
@@ -112,8 +112,8 @@ def test_the_noise_floor_is_what_start_and_row_make():
 def test_a_diagnosis_is_measured_on_what_was_held_out(drag):
     assert isinstance(drag, diagnosis.Diagnosis) and drag.verdict.label == "named"
     assert drag.input_source == "commands" and drag.fitted is not None
-    sigma, held = drag.search.sigma, drag.held_windows
-    again = measure(drag.model, drag.fitted, held, drag.search.noise)
+    sigma, held = drag.sigma, drag.held_windows
+    again = measure(drag.model, drag.fitted, held, rollouts_of(drag.search.last).noise)
     np.testing.assert_array_equal(again.score, drag.after.score)
     assert drag.after.rms < 1.3 < drag.before.rms
     noise = start_noise(sigma, held, drag.model.free)
@@ -124,9 +124,10 @@ def test_a_diagnosis_is_measured_on_what_was_held_out(drag):
 
 def test_without_the_name_its_shape_is_left(drag):
     found = drag.search
-    bare = replace(found.estimate, theta=drag.start)
-    equations = disturbance_equations(drag.model, found.windows, found.whitening, bare)
-    fold = np.arange(len(found.windows.flight)) % 5
+    evidence, bare = rollouts_of(found.last), found.estimate._replace(theta=drag.start)
+    windows = evidence.trusted
+    equations = disturbance_equations(drag.model, windows, evidence.whitening, bare)
+    fold = np.arange(len(windows.flight)) % 5
     with_gap = residual_structure(equations, fold)
     assert with_gap.shapes[0].gain > 10.0 * max(drag.residual.shapes[0].gain, 1.0)
     assert min(with_gap.coloured.values()) < 1e-6 <= min(drag.residual.coloured.values())
@@ -134,12 +135,13 @@ def test_without_the_name_its_shape_is_left(drag):
 
 def test_shapes_are_columns_that_their_groups_share_out(drag):
     found = drag.search
-    response = drag.model.respond(found.estimate.theta, found.estimate.offset, found.windows)
-    library = shape_library(response.knot, np.asarray(found.windows.start_s))
+    windows = rollouts_of(found.last).trusted
+    response = drag.model.respond(found.estimate.theta, found.estimate.free, windows)
+    library = shape_library(response.knot, np.asarray(windows.start_s))
     columns = [column for group in library.groups for column in group.columns]
     assert columns == list(range(library.unit.shape[-1]))
     assert library.unit.shape[1] == KNOTS * 6 and np.isfinite(library.unit).all()
-    fewer = shape_library(response.knot, np.asarray(found.windows.start_s), Thresholds(cells=2))
+    fewer = shape_library(response.knot, np.asarray(windows.start_s), Thresholds(cells=2))
     assert fewer.unit.shape[-1] < library.unit.shape[-1]
 
 
@@ -157,7 +159,9 @@ def test_the_likelihood_of_a_random_disturbance_peaks_at_its_size():
 
 def test_a_drag_is_not_taken_for_wind(drag):
     found = drag.search
-    equations = disturbance_equations(drag.model, found.windows, found.whitening, found.estimate)
+    evidence = rollouts_of(found.last)
+    with_it = (evidence.trusted, evidence.whitening, found.estimate)
+    equations = disturbance_equations(drag.model, *with_it)
     assert find_turbulence(drag.model, found.estimate.theta, equations) is None
 
 

@@ -99,9 +99,9 @@ def test_the_vehicle_itself_has_no_gap():
 
 
 def test_a_black_box_closes_what_goes_with_what_was_flown_and_no_noise(found):
-    fitted = found.main.search.task.flights
+    fitted = found.main.search.last.evidence.flights
     inputs = np.concatenate([inputs_of(flight) for flight in fitted])
-    flight = found.main.search.first.data.flight
+    flight = found.main.search.last.block.data.flight
     noise = np.random.default_rng(0).standard_normal((len(flight), 3))
     said = fit_black_box(inputs, noise, flight).predict(inputs)
     assert closed_share(noise, noise - said, flight).max() < 0.2

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.noise import noise_of
-from suite.diagnose.estimate.intervals import half_widths95
-from suite.diagnose.evidence.rollout_fit import start_estimate
+from suite.diagnose.estimate.intervals import intervals95
 from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.evidence.rollouts import start_estimate
 from suite.experiments.bench import diagnose, sysid_baseline
 from suite.experiments.bench.rigid_body import REFITTED, make_task
 
@@ -42,7 +42,7 @@ def test_both_sides_have_the_same_residuals(both):
 def test_both_sides_find_what_was_flown(both):
     task, model, problem, _ = both
     answers = [diagnose.refit(model, task), sysid_baseline.refit(problem)]
-    widths = [half_widths95(equations) for _, equations in answers]
+    widths = [intervals95(equations).half_width for _, equations in answers]
     for (values, _), width in zip(answers, widths, strict=True):
         assert np.all(np.abs(values - task.truth) < 2.0 * width)
         assert np.all(width < task.array("step"))

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from suite.diagnose.change.chance import chance_of
-from suite.diagnose.evidence.moments import ViewData
-from suite.diagnose.evidence.weigh import Weights, weighed
+from suite.diagnose.evidence.moments import ViewData, Weights, whitened
 
 FREEDOM = 12
 SIZES = np.random.default_rng(0).chisquare(FREEDOM, (999, 3)) / FREEDOM
@@ -71,8 +70,8 @@ def test_what_all_flights_are_judged_from_is_off_for_all_alike():
         residual = rng.standard_normal((many, 3)) - base
         data = ViewData(np.arange(many), np.zeros(many), residual, residual, np.ones((many, 3, 1)))
         for key, told_by in (("told", weights), ("taken as known", weights._replace(base=None))):
-            white, slope = weighed(data, told_by)
+            white, slope = whitened(data, told_by)
             sums[key].append((white * slope[..., 0]).sum(axis=0) / np.sqrt((slope**2).sum((0, 2))))
-        assert np.all(weighed(data, unknown)[0][:, 1] == 0.0)
+        assert np.all(whitened(data, unknown)[0][:, 1] == 0.0)
     assert np.std(sums["told"], axis=0) == pytest.approx(np.ones(3), rel=0.06)
     assert np.std(sums["taken as known"], axis=0).min() > 2.0  # the square root of 1 + 8 / 2

@@ -1,5 +1,7 @@
 """What has changed since reference flights, and how far flights of one vehicle are apart."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE, TORQUE
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.force_torque import ForceModel
-from suite.diagnose.evidence.view_equations import ViewTask
+from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
 
@@ -19,7 +21,7 @@ DRAG = (0.4, 0.3, 0.2)
 
 def task_of(logs, view=FORCE):
     smoothed = ready(logs, VEHICLE).smoothed[view.name]
-    return ViewTask(view, ForceModel(VEHICLE, SPACE, False), smoothed)
+    return ViewEvidence(view, ForceModel(VEHICLE, SPACE, False), smoothed)
 
 
 def changes(logs, references):
@@ -51,7 +53,7 @@ def test_an_axis_along_which_flights_are_alike_counts_for_itself_beside_the_othe
         flight._replace(measured=flight.measured + push * np.array([1.0, 1.0, 0.1]))
         for flight, push in zip(torque.flights, (-2.0, 0.0, 2.0), strict=True)
     ]
-    spread = rotor_spread([force, torque._replace(flights=apart)])
+    spread = rotor_spread([force, replace(torque, flights=apart)])
     prior, own = THRESHOLDS.spread_freedom, 2
     assert spread.freedom == 4 * own
     assert {view: list(one) for view, one in spread.freedom_along.items()} == {

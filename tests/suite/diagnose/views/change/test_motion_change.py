@@ -9,7 +9,7 @@ from suite.diagnose.data.view import FORCE
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.force_torque import ForceModel
 from suite.diagnose.evidence.moments import ViewData
-from suite.diagnose.evidence.view_equations import ViewTask
+from suite.diagnose.evidence.views import ViewEvidence
 from tests.support.real_flights import VEHICLE, flights
 
 SPACE = make_space(VEHICLE)
@@ -19,7 +19,7 @@ DRAG, MORE = (0.4, 0.3, 0.2), (0.6, 0.5, 0.2)
 
 def task_of(logs):
     model = ForceModel(VEHICLE, SPACE, False)
-    return ViewTask(FORCE, model, ready(logs, VEHICLE).smoothed[FORCE.name])
+    return ViewEvidence(FORCE, model, ready(logs, VEHICLE).smoothed[FORCE.name])
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,8 @@ def test_more_drag_is_told_with_its_whole_size(before):
     assert found is not None
     (name,) = found.named
     assert name.candidate.name == "linear_drag"
-    np.testing.assert_allclose(found.last.theta[found.indices], MORE, atol=0.06)
-    np.testing.assert_allclose(found.first.theta[found.indices], DRAG, atol=0.06)
+    np.testing.assert_allclose(found.estimate.theta[found.indices], MORE, atol=0.06)
+    np.testing.assert_allclose(found.start.theta[found.indices], DRAG, atol=0.06)
 
 
 def test_other_speeds_of_the_same_vehicle_are_no_change(before):

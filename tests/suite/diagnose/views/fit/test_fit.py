@@ -5,20 +5,31 @@ import pytest
 
 from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE, TORQUE
-from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
-from suite.diagnose.evidence.force_torque import ForceModel
-from suite.diagnose.evidence.moments import ViewData, centred, compare, means_of, units_of
-from suite.diagnose.evidence.view_equations import (
-    ViewTask,
-    chi2_by_flight,
-    half_widths,
-    in_means,
-    look,
+from suite.diagnose.estimate.composites import composites
+from suite.diagnose.estimate.gauss_newton import chi2_by_part
+from suite.diagnose.estimate.parameters import (
+    Candidate,
+    at_bound,
+    candidates,
+    implausible,
+    make_space,
+    usual_first,
 )
-from suite.diagnose.evidence.weigh import Weights, blocks_of, equations_of, weighed, weights_of
-from suite.diagnose.search.composites import composites
-from suite.diagnose.search.plausible import at_bound, implausible, usual_first
-from suite.diagnose.search.view_search import search_view
+from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.moments import (
+    ViewData,
+    Weights,
+    block_of,
+    centred,
+    compare,
+    means_of,
+    stretch_of,
+    units_of,
+    weights_of,
+    whitened,
+)
+from suite.diagnose.evidence.views import ViewEvidence, view_candidates
+from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
@@ -29,12 +40,18 @@ DRAG = (0.4, 0.3, 0.2)
 
 def task_of(logs, view=FORCE, vehicle=VEHICLE):
     model = ForceModel(vehicle, make_space(vehicle), False)
-    return ViewTask(view, model, ready(logs, vehicle).smoothed[view.name])
+    return ViewEvidence(view, model, ready(logs, vehicle).smoothed[view.name])
 
 
 @pytest.fixture(scope="module")
 def dragged():
     return flights(4, linear_drag=(DRAG,))
+
+
+def names_of(task):
+    known = task.weighed(task.start)
+    among = view_candidates(candidates(SPACE, False, ()), known[1])
+    return search(known[0], task.start, among, known=known)
 
 
 def made(rng, count=6, moments=200, trim=(0.5, 0.0, 2.0), scatter=0.3):
@@ -81,7 +98,7 @@ def test_weighed_moments_of_flights_with_trims_are_independent_units():
     means, within = [], []
     for _ in range(200):
         data = made(rng, count=1, moments=50)
-        residual, _ = weighed(data, weights)
+        residual, _ = whitened(data, weights)
         means.append(residual.sum(axis=0) / np.sqrt(50))
         within.append(residual.std(axis=0))
     assert np.std(means, axis=0) == pytest.approx([1.0, 1.0, 1.0], rel=0.2)
@@ -90,13 +107,10 @@ def test_weighed_moments_of_flights_with_trims_are_independent_units():
 
 def test_blocks_stand_apart_and_a_flight_has_one_mean():
     data = made(np.random.default_rng(3), count=2, moments=60)
-    block = blocks_of(data)
-    assert block.max() + 1 == 2 * 3  # 6 s in blocks of 2 s
+    stretch = stretch_of(data)
+    assert stretch.max() + 1 == 2 * 3  # 6 s in blocks of 2 s
     weights = weights_of(data)
-    assert equations_of(data, weights, block).hessian.shape == (6, 1, 1)
-    means = in_means(data)
-    assert len(means.flight) == 2
-    assert np.allclose(means.residual[0], data.residual[:60].mean(axis=0))
+    assert block_of(data, weights, stretch, [0]).slope.shape == (6, 60, 1)
 
 
 def test_flights_have_means_and_a_lone_one_has_thirds():
@@ -108,28 +122,30 @@ def test_flights_have_means_and_a_lone_one_has_thirds():
 
 
 def test_a_drag_is_named_with_its_numbers_by_flights_that_agree(dragged):
-    found = search_view(task_of(dragged), candidates(SPACE, False, ()))
+    found = names_of(task_of(dragged))
     (name,) = found.named
     assert name.candidate.name == "linear_drag" and (np.array(name.gains) > 0.0).all()
     at = list(name.candidate.indices)
-    width = half_widths(found.last, at)
-    assert (np.abs(found.last.theta[at] - DRAG) < 2.0 * width + 0.02).all()
+    width = found.half_widths()
+    assert (np.abs(found.estimate.theta[at] - DRAG) < 2.0 * width + 0.02).all()
     assert width[:2].max() < 0.1
 
 
 def test_trims_that_differ_from_flight_to_flight_are_no_effect():
     logs = flights(4, seed=3)
     for view in (FORCE, TORQUE):
-        assert search_view(task_of(logs, view), candidates(SPACE, False, ())).named == ()
+        assert names_of(task_of(logs, view)).named == ()
 
 
 def test_a_flight_is_judged_by_what_the_others_say(dragged):
     task = task_of(dragged)
     drag = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "linear_drag"]
-    start = SPACE.array("start")
-    data = compare(FORCE, task.model, start, task.flights)
-    first = look(task, start, weights_of(data))
-    gains = chi2_by_flight(task, first, []) - chi2_by_flight(task, first, drag)
+    evidence, block = task.weighed(task.start)
+    equations, theta, part = block.equations(), task.start.theta, evidence.parts(block)
+    without, with_it = (
+        chi2_by_part(equations.along_numbers(at), theta, SPACE, part) for at in ([], drag)
+    )
+    gains = without - with_it
     assert gains.shape == (4,) and (gains > 0.0).all()
 
 

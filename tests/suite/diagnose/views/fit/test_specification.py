@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from suite.diagnose.evidence.moments import ViewData
-from suite.diagnose.search.specification import changes_of, fast_share, holds_at_any_speed
+from suite.diagnose.evidence.moments import ViewData, changes_of, fast_share
+from suite.diagnose.evidence.views import holds_at_any_speed
 from suite.diagnose.thresholds import THRESHOLDS
 
 ROWS, STEP_S = 1200, 0.05
@@ -21,7 +21,7 @@ def data_of(residual, slope):
     return ViewData(flight, middle_s, slope, residual, slope[..., None])
 
 
-def fitted(slow, *, closed_loop, seed=0) -> tuple[Any, Any, np.ndarray]:
+def fitted(slow, *, closed_loop, seed=0) -> tuple[Any, np.ndarray]:
     """A thrust scale fitted under motors that answer a slow torque, or to less thrust."""
     rng = np.random.default_rng(seed)
     slow = slow * gaussian_filter1d(rng.standard_normal((ROWS, 3)), 20.0, axis=0) * 8.0
@@ -31,26 +31,24 @@ def fitted(slow, *, closed_loop, seed=0) -> tuple[Any, Any, np.ndarray]:
     lacks = measured + 0.1 * noise - motors
     away = float((lacks * motors).sum() / (motors**2).sum())
     data = data_of(lacks - away * motors, motors)
-    space = SimpleNamespace(array=lambda _: np.ones(1))
-    task = SimpleNamespace(means=False, limits=THRESHOLDS, model=SimpleNamespace(space=space))
-    return task, SimpleNamespace(theta=np.array([1.0 + away]), data=data), np.array([away])
+    return SimpleNamespace(along=(0,), data=data), np.array([away])
 
 
 @pytest.mark.parametrize("slow", [1.0, 3.0])
 def test_what_motors_answer_is_no_weak_thrust(slow):
-    task, found, away = fitted(slow, closed_loop=True)
+    found, away = fitted(slow, closed_loop=True)
     assert away[0] < -0.3, "it does look like less thrust"
     share, half_width = fast_share(found.data, [0], away, THRESHOLDS)
     assert share + half_width < 0.3
-    assert not holds_at_any_speed(task, found, [0])
+    assert not holds_at_any_speed(found, [0], away, THRESHOLDS)
 
 
 def test_less_thrust_is_so_for_slow_and_fast_changes():
-    task, found, away = fitted(1.0, closed_loop=False)
+    found, away = fitted(1.0, closed_loop=False)
     assert away[0] == pytest.approx(-0.4, abs=0.02)
     share, half_width = fast_share(found.data, [0], away, THRESHOLDS)
     assert share == pytest.approx(1.0, abs=3.0 * half_width) and half_width < 0.1
-    assert holds_at_any_speed(task, found, [0])
+    assert holds_at_any_speed(found, [0], away, THRESHOLDS)
 
 
 def test_changes_reach_across_no_hole_and_no_two_flights():
@@ -64,6 +62,7 @@ def test_changes_reach_across_no_hole_and_no_two_flights():
 
 
 def test_means_of_flights_have_no_changes():
-    _, found, _ = fitted(1.0, closed_loop=True)
-    task: Any = SimpleNamespace(means=True)
-    assert holds_at_any_speed(task, found, [0])
+    found, away = fitted(1.0, closed_loop=True)
+    few = ViewData(*(field[[0, -1]] for field in found.data))
+    found: Any = SimpleNamespace(along=(0,), data=few)
+    assert holds_at_any_speed(found, [0], away, THRESHOLDS)

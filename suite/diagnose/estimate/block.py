@@ -1,0 +1,172 @@
+"""Evidence: what a source of information says of the numbers of a space, in blocks of its noise.
+
+Everything that is done with numbers (fit, intervals, search, hold-out) is done with blocks, so that
+a new source of information is one class that makes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
+
+
+class Estimate(NamedTuple):
+    """Where the numbers stand."""
+
+    theta: np.ndarray
+    """(P,) the vector of all numbers."""
+    free: np.ndarray
+    """(B, F) nuisance numbers of each of B stretches, as a rollout's start; (B, 0) for none."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """B stretches of M rows at one estimate, in units of independent noise.
+
+    What the nuisance numbers of a stretch explain is projected out of its rows. Stretches with
+    fewer rows have zeros in the place of the others.
+    """
+
+    residual: np.ndarray
+    """(B, M) measured - model."""
+    slope: np.ndarray
+    """(B, M, K) of the model."""
+    along: tuple[int, ...]
+    """Place in the vector of each column's number; lent columns come once more, last."""
+    flight: np.ndarray
+    """(B,) number of each stretch's flight."""
+    start_s: np.ndarray
+    """(B,) since the first row of the flight [s]."""
+    free: np.ndarray
+    """(B, F) change of the nuisance numbers that fits best, with the numbers as they are."""
+    free_slope: np.ndarray
+    """(B, F, K) by how much less of it is wanted for a change of each number."""
+
+    def equations(self) -> NormalEquations:
+        """Return the sums that a fit needs."""
+        return NormalEquations(
+            *products(self.slope, self.residual[..., None]),
+            (self.residual**2).sum(axis=1),
+            self.flight,
+            self.along,
+        )
+
+    def acts(self) -> np.ndarray:
+        """Return which columns (K,) do something."""
+        return np.abs(self.slope).max(axis=(0, 1), initial=0.0) > 0.0
+
+
+class Linearised(Protocol):
+    """A source of information on the numbers of a space, with its noise known."""
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The numbers."""
+        ...
+
+    def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
+        """Return what it says at an estimate, along the numbers at `indices` or along all.
+
+        A source that has all slopes at once may return more than it is asked for.
+        """
+        ...
+
+
+class NormalEquations(NamedTuple):
+    """Gauss-Newton's sums of each of B stretches along K numbers."""
+
+    hessian: np.ndarray
+    """(B, K, K) J'J."""
+    gradient: np.ndarray
+    """(B, K) J'r."""
+    chi2: np.ndarray
+    """(B,) r'r."""
+    flight: np.ndarray | None = None
+    """(B,) and `along`, as a block has them; None where each column is along the number of its
+    place."""
+    along: tuple[int, ...] | None = None
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Place in the vector of each column's number."""
+        return tuple(range(self.gradient.shape[1])) if self.along is None else self.along
+
+    def columns_of(self, candidate: Candidate) -> list[int]:
+        """Return the columns of `candidate`; of a composite the lent ones."""
+        numbers = self.numbers
+        place = {number: column for column, number in enumerate(numbers)}
+        if not candidate.parts:
+            place |= {n: numbers.index(n) for n in candidate.indices}
+        return [place[number] for number in candidate.indices]
+
+    def lent(self) -> tuple[int, ...]:
+        """Return the numbers whose columns come twice."""
+        return tuple(n for k, n in enumerate(self.numbers) if n in self.numbers[:k])
+
+    def take(self, columns: Sequence[int]) -> NormalEquations:
+        """Return the equations along `columns` alone."""
+        at = np.array(columns, dtype=int)
+        return self._replace(
+            hessian=self.hessian[:, at][:, :, at],
+            gradient=self.gradient[:, at],
+            along=tuple(self.numbers[k] for k in at),
+        )
+
+    def along_numbers(self, indices: Sequence[int]) -> NormalEquations:
+        """Return the equations along the numbers at `indices` of the vector, in that order."""
+        return self.take([self.numbers.index(number) for number in indices])
+
+    def sums(self, inside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return J'J (K, K) and J'r (K,) over all stretches, or those `inside` (B,) bool."""
+        rows = slice(None) if inside is None else inside
+        return self.hessian[rows].sum(axis=0), self.gradient[rows].sum(axis=0)
+
+
+def products(slope: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return J'J (B, K, K) and J'r (B, K) of `slope` (B, M, K) and `residual` (B, M, 1)."""
+    turned = np.swapaxes(slope, 1, 2)
+    return turned @ slope, (turned @ residual)[..., 0]
+
+
+def stacked(rows: np.ndarray, stretch: np.ndarray) -> np.ndarray:
+    """Return `rows` (R, ...) by stretch (B, M, ...), zeros where one has fewer than another.
+
+    `stretch` (R,) is the number of each row's, from 0 on without a gap.
+    """
+    count = np.bincount(stretch) if len(stretch) else np.zeros(0, int)
+    order = np.argsort(stretch, kind="stable")
+    first = np.cumsum(count) - count
+    place = np.arange(len(rows)) - np.repeat(first, count)
+    out = np.zeros((len(count), count.max(initial=0), *rows.shape[1:]))
+    out[stretch[order], place] = rows[order]
+    return out
+
+
+def without_nuisance(
+    residual: np.ndarray,
+    slope: np.ndarray,
+    along: Sequence[int],
+    stretch: np.ndarray,
+    flight: np.ndarray,
+    start_s: np.ndarray,
+) -> Block:
+    """Return the block of rows in which nothing is free.
+
+    Args:
+        residual: (R, C) over its noise.
+        slope: (R, C, K) over the noise.
+        along: place in the vector of each column's number.
+        stretch: (R,) number of each row's stretch, from 0 on without a gap.
+        flight: (B,) and `start_s`, as a block has them.
+        start_s: (B,) [s].
+    """
+    count, size = len(flight), slope.shape[2]
+    residual = stacked(residual, stretch).reshape(count, -1)
+    slope = stacked(slope, stretch).reshape(count, residual.shape[1], size)
+    none = np.zeros((count, 0))
+    return Block(residual, slope, tuple(along), flight, start_s, none, np.zeros((count, 0, size)))
