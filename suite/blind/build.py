@@ -39,9 +39,8 @@ from suite.blind.outside import KINDS, changed_values, draw_change, make_outside
 from suite.blind.simulators import Flights, Simulator, simulator_for
 from suite.common.errors import WorkFailed
 from suite.diagnose.plans.follow import FlightFailed, Recording
-from suite.diagnose.plans.sensors import SENSORS, Sensors
-from suite.diagnose.plans.separating import SEPARATIONS
-from suite.diagnose.plans.simulate import FALL_V_PER_S, fly
+from suite.diagnose.plans.plan import SEPARATIONS
+from suite.diagnose.plans.simulate import FALL_V_PER_S, SENSORS, Sensors, fly
 from suite.diagnose.plans.trajectory import Trajectory, long_flights, ordinary_flights
 
 TRIES = 6

@@ -18,10 +18,8 @@ from suite.blind.continuous.engine import Flown, Rows, fly
 from suite.blind.continuous.log import Noise, log_of_flight, state_at
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import STEP_S, Conditions, jittered_stamps, schedule
-from suite.diagnose.plans.follow import Recording, check_flights
-from suite.diagnose.plans.pilot import Gains, steer
-from suite.diagnose.plans.sensors import Sensors
-from suite.diagnose.plans.simulate import FALL_V_PER_S, FULL_V, SAG_V, Extra
+from suite.diagnose.plans.follow import Gains, Recording, check_flights, steer
+from suite.diagnose.plans.simulate import FALL_V_PER_S, FULL_V, SAG_V, Extra, Sensors
 from suite.diagnose.plans.trajectory import Reference, Trajectory
 
 ROLL_S = 0.25

@@ -22,8 +22,7 @@ from suite.blind.continuous_flight import (
 from suite.blind.oracle.strength import given_vehicle
 from suite.blind.rotorpy_flight import fly_rotorpy
 from suite.diagnose.plans.follow import Recording
-from suite.diagnose.plans.sensors import SENSORS, log_of
-from suite.diagnose.plans.simulate import Extra, fly
+from suite.diagnose.plans.simulate import SENSORS, Extra, fly, log_of
 from suite.diagnose.plans.trajectory import Trajectory
 
 Ways = Sequence[Trajectory]

@@ -11,11 +11,8 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.change.chance import RotorSpread, rotor_spread
-from suite.diagnose.change.motion_change import search_motion_change
-from suite.diagnose.change.reference import changed_task, search_change
-from suite.diagnose.data.flights import ViewFlights, parted, ready
-from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.checks.actuators import LAG, RotorLag, another_lag
+from suite.diagnose.data.flights import ViewFlights, choose_held_out, parted, ready
 from suite.diagnose.data.view import FORCE, View
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import (
@@ -25,14 +22,15 @@ from suite.diagnose.estimate.parameters import (
     make_space,
     with_fitted,
 )
-from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidates
+from suite.diagnose.search.chance import RotorSpread, rotor_spread
+from suite.diagnose.search.change import changed_task, search_change, search_motion_change
 from suite.diagnose.search.look import NamedEffect, SearchResult
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.relevance import EffectSize, Negligible, view_size
-from suite.diagnose.verdict.rotor_lag import LAG, RotorLag, another_lag
-from suite.diagnose.verdict.swing import Swing, swing_left
+from suite.diagnose.verdict.confirmation import EffectSize, Negligible, view_size
+from suite.diagnose.verdict.disturbances import Swing, swing_left
 from suite.diagnose.verdict.view_gap import ViewGap, judge
 
 

@@ -13,15 +13,14 @@ from eval.effects.log_faults import lateness
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.checks.actuators import another_controller, integrator_of, rotors_are_input
-from suite.diagnose.data.flights import ready
-from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.data.flights import choose_held_out, ready
 from suite.diagnose.data.view import FORCE
 from suite.diagnose.data.whitening import Linearisation
 from suite.diagnose.data.windows import LENGTH_S, FlightWindows, cut, take
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates, make_space, with_fitted
 from suite.diagnose.estimate.permutation import folds_of
-from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.evidence.rollouts import (
     information,
@@ -33,19 +32,24 @@ from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.look import SearchResult, rollouts_of
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.confirmation import confirmed, control
+from suite.diagnose.verdict.confirmation import confirmed, control, gap_matters, relevant_part
 from suite.diagnose.verdict.diagnosis import Diagnosis
-from suite.diagnose.verdict.gap import Gap, measure, worse
-from suite.diagnose.verdict.model_error import with_model_error
-from suite.diagnose.verdict.relevance import gap_matters, relevant_part
+from suite.diagnose.verdict.disturbances import Swing, Turbulence, find_turbulence, swing_left
+from suite.diagnose.verdict.gap import (
+    Gap,
+    Verdict,
+    measure,
+    share_left,
+    verdict_on,
+    with_model_error,
+    with_swing,
+    worse,
+)
 from suite.diagnose.verdict.residual_structure import (
     ResidualStructure,
     disturbance_equations,
     residual_structure,
 )
-from suite.diagnose.verdict.swing import Swing, swing_left
-from suite.diagnose.verdict.turbulence import Turbulence, find_turbulence
-from suite.diagnose.verdict.verdict import Verdict, share_left, verdict_on, with_swing
 
 
 class BeyondRollouts(Exception):

@@ -15,17 +15,16 @@ from suite.common.console import Console
 from suite.common.report import write_report
 from suite.delta.run import flight_files
 from suite.diagnose.by_views import diagnose_by_views
-from suite.diagnose.checks.black_box import compare_black_box
+from suite.diagnose.checks.black_box import BlackBoxConfig, compare_black_box
 from suite.diagnose.checks.checks import run_checks
-from suite.diagnose.checks.delta_model import BlackBoxConfig
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.data.windows import remembers
 from suite.diagnose.diagnose import BeyondRollouts, diagnose
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.plans.plan import fly_plan, write_plan_of
+from suite.diagnose.report.charts import write_rollouts
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
-from suite.diagnose.report.recording import write_rollouts
 from suite.diagnose.report.views_json import views_json
 from suite.diagnose.report.views_page import views_page
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds

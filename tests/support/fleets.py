@@ -18,10 +18,9 @@ from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap, Vehicle, command_of_thrust
-from suite.diagnose.identify.data.drive import torque_of
+from suite.diagnose.identify.drive import torque_of
 from suite.diagnose.plans.follow import Recording
-from suite.diagnose.plans.sensors import Sensors, log_of
-from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.simulate import Sensors, fly, log_of
 from suite.diagnose.plans.trajectory import Trajectory
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 

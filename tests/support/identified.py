@@ -9,7 +9,7 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap
-from suite.diagnose.plans.sensors import Sensors
+from suite.diagnose.plans.simulate import Sensors
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.fleets import Fleet, logs_of, recordings_of
 

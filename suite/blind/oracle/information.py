@@ -28,7 +28,7 @@ from suite.blind.oracle.stretches import (
     whitened,
     without_start,
 )
-from suite.diagnose.plans.sensors import Sensors
+from suite.diagnose.plans.simulate import Sensors
 from tracks.geometry.rotation import exp_rot, to_world
 
 THRESHOLD = 12.5

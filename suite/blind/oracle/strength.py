@@ -28,8 +28,7 @@ from suite.blind.oracle.information import (
     information,
 )
 from suite.blind.oracle.stretches import EVERY_S, Stretches, cut
-from suite.diagnose.plans.sensors import SENSORS
-from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.simulate import SENSORS, fly
 from suite.diagnose.plans.trajectory import long_flights, ordinary_flights
 from tracks.common.files import write_json
 from tracks.common.grid import markdown, table

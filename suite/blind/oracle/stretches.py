@@ -19,8 +19,7 @@ from eval.quadrotor.plant import Motion, Plant, Wrench, euler_step, make_plant, 
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.plans.follow import Recording
-from suite.diagnose.plans.sensors import Sensors
-from suite.diagnose.plans.simulate import FULL_V
+from suite.diagnose.plans.simulate import FULL_V, Sensors
 from tracks.geometry.rotation import exp_rot
 
 HORIZON_S = 0.5

@@ -5,18 +5,28 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 
+from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.checks.delta_model import BlackBoxConfig, black_box_gap, fit_black_box
-from suite.diagnose.data.windows import LENGTH_S, FlightWindows, take
+from eval.quadrotor.plant import Motion
+from eval.quadrotor.stepper import Feedback, Inputs
+from policies.networks import delta_network
+from suite.diagnose.data.colour import Noise
+from suite.diagnose.data.windows import LENGTH_S, STATE, FlightWindows, take
 from suite.diagnose.estimate.gauss_newton import fit
+from suite.diagnose.evidence.rollout_model import BATCH, RolloutModel, batches
 from suite.diagnose.evidence.rollouts import start_estimate, weighed_by
 from suite.diagnose.search.look import rollouts_of
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.diagnosis import Diagnosis
-from suite.diagnose.verdict.gap import Gap, measure
+from suite.diagnose.verdict.gap import Gap, gap_of, measure, noise_floor, start_noise, true_starts
+from tracks.geometry.rotation import to_local
 
 
 class BlackBoxComparison(NamedTuple):
@@ -120,3 +130,119 @@ def _speeds(logs: Sequence[FlightLog], windows: FlightWindows) -> tuple[np.ndarr
         found.append((speed.max(), speed.mean()))
     top, mean = np.array(found).T
     return top, mean
+
+
+PERIOD_S = 0.02
+"""The network decides this often, and its correction is held [s]."""
+OUTPUT_SCALE = (1.0, 1.0, 1.0, 5.0, 5.0, 5.0)
+"""Brings m/s^2 and rad/s^2 to order one."""
+
+
+@dataclass(frozen=True)
+class BlackBoxConfig:
+    """The fit of the black box."""
+
+    iterations: int = 300
+    """Gradient steps, of a dozen windows each."""
+    rate: float = 5e-3
+    """Peak learning rate; it falls to zero as a cosine."""
+    seed: int = 0
+    """Of the network and of the batches."""
+
+
+def fit_black_box(
+    model: RolloutModel,
+    windows: FlightWindows,
+    noise: Noise,
+    config: BlackBoxConfig,
+    show: Callable[[int, str], None] = lambda *_: None,
+) -> dict[str, np.ndarray]:
+    """Return the network fitted to `windows`, of such `noise`, at the start numbers.
+
+    `show` is called with (iteration, words) as it goes.
+
+    Raises:
+        FloatingPointError: where the fit diverges.
+    """
+    theta = model.space.array("start")
+    offset = true_starts(model, theta, windows)
+    slope = model.linearise(theta, offset, windows, model.starts).slope[..., :STATE, :STATE]
+    weight = 1.0 / (noise_floor(slope, start_noise(noise.sigma, windows, STATE)) + 1e-9)
+    optimizer = optax.adam(optax.cosine_decay_schedule(config.rate, config.iterations))
+
+    def loss(params: Any, offset: Any, windows: FlightWindows, weight: Any) -> Any:
+        over = _apart(model, theta, params, offset, windows)[..., :STATE] * weight
+        # Far from the record a square would let one window decide.
+        return (jnp.sqrt(1.0 + over**2) - 1.0).mean()
+
+    @jax.jit
+    def update(params: Any, state: Any, *batch: Any) -> tuple[Any, Any, Any]:
+        value, gradient = jax.value_and_grad(loss)(params, *batch)
+        change, state = optimizer.update(gradient, state)
+        return optax.apply_updates(params, change), state, value
+
+    rng = np.random.default_rng(config.seed)
+    with jax.enable_x64(True):
+        params = _start(config.seed)
+        state = optimizer.init(params)
+        for iteration in range(config.iterations):
+            rows = rng.choice(len(offset), BATCH, replace=len(offset) < BATCH)
+            batch = (offset[rows], take(windows, rows), weight[rows])
+            params, state, value = update(params, state, *batch)
+            if not np.isfinite(value):
+                raise FloatingPointError(f"the black box's fit diverged at step {iteration + 1}")
+            show(iteration + 1, f"error {float(value):.2f}")
+        return {name: np.asarray(value) for name, value in params.items()}
+
+
+def black_box_gap(
+    model: RolloutModel,
+    params: dict[str, np.ndarray],
+    windows: FlightWindows,
+    noise: Noise,
+    limits: Thresholds = THRESHOLDS,
+) -> Gap:
+    """Return the gap on `windows` that is left with the fitted network."""
+    theta = model.space.array("start")
+    offset = true_starts(model, theta, windows)
+    linear = model.linearise(theta, offset, windows, model.starts)
+    fly = jax.jit(lambda x, w: _apart(model, theta, params, x, w))
+    with jax.enable_x64(True):
+        parts = [np.asarray(fly(x, w))[:count] for x, w, count in batches(offset, windows)]
+    return gap_of(linear._replace(residual=-np.concatenate(parts)), windows, noise, limits)
+
+
+def _start(seed: int) -> dict[str, Any]:
+    params = {k: jnp.asarray(v, float) for k, v in delta_network.init(jax.random.key(seed)).items()}
+    params["output.weight"] = jnp.zeros((delta_network.HIDDEN, len(OUTPUT_SCALE)))
+    params["output.bias"] = jnp.zeros(len(OUTPUT_SCALE))
+    return params
+
+
+def _apart(
+    model: RolloutModel, theta: Any, params: Any, offset: Any, windows: FlightWindows
+) -> Any:
+    """Return simulated - measured (B, N, 19) under the network."""
+    count, every = len(offset), max(1, round(PERIOD_S / model.dt))
+    scale, up = jnp.asarray(OUTPUT_SCALE), jnp.array([0.0, 0.0, 1.0])
+
+    def act(carry: Any, motion: Motion, inputs: Inputs, index: Any) -> tuple[Any, Any]:
+        assert inputs.command is not None
+        thrust = inputs.command.thrust
+        if inputs.rotor_speed is not None:  # these drive then, and no command may be there
+            nominal = model.given.nominal
+            force = nominal.thrust_coefficient * (inputs.rotor_speed**2).sum(-1)
+            thrust = force / nominal.mass
+
+        def decide(_: Any) -> Any:
+            row3 = motion.rot_w[:, 2]
+            action_b = thrust[:, None] * up - GRAVITY * row3
+            vel_b = to_local(motion.rot_w, motion.vel_w)
+            push, hidden = delta_network.step(params, carry[0], vel_b, row3, action_b)
+            return hidden, scale * push
+
+        carry = jax.lax.cond(index % every == 0, decide, lambda _: carry, None)
+        return carry, carry[1]
+
+    start = (jnp.zeros((count, delta_network.HIDDEN)), jnp.zeros((count, len(OUTPUT_SCALE))))
+    return model.fly(theta, offset, windows, None, Feedback(start, act))[0]

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
+from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
-from eval.vehicles.vehicle import Vehicle
+from eval.quadrotor.mixer import mix
+from eval.quadrotor.plant import make_plant, nominal_quadrotor
+from eval.vehicles.vehicle import Vehicle, motor_speed
 from suite.diagnose.checks.actuators import wrench_difference
-from suite.diagnose.data.completed import completed
-from suite.diagnose.data.rotors import ActingRotors, acting_rotors
-from suite.diagnose.data.sampling import on_every_row
+from suite.diagnose.data.noise import noise_like
+from suite.diagnose.data.sampling import LONGEST_S, interpolate, on_every_row
 from suite.diagnose.data.view import (
     FORCE,
+    LEAST_ROWS,
     TORQUE,
     FlightRows,
     SmoothedFlight,
@@ -23,8 +28,9 @@ from suite.diagnose.data.view import (
     rows_of,
     smoothed,
 )
-from suite.diagnose.data.weak_form import LEAST_ROWS
+from suite.diagnose.data.windows import LENGTH_S
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from tracks.geometry.rotation import rot_to_quat
 
 SLOW_WIDTH_S = 1.0
 """Width of the bumps where rates come from a path, which tells them as means over a second [s]."""
@@ -168,3 +174,144 @@ def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
         power.append(sigma**2 * gain)
     floor = np.sqrt(np.mean(power, axis=0))
     return np.full(3, floor.mean()) if view.in_world else floor
+
+
+SMOOTH_S = 0.1
+"""Standard deviation of what smooths the path's acceleration [s]."""
+
+
+def completed(log: FlightLog) -> FlightLog:
+    """Return `log` with the attitude from its path and the rates from the attitude, if it has none.
+
+    Raises:
+        ValueError: for a log without positions.
+    """
+    if "pos" in log.partial:
+        raise ValueError(f"{log.name}: no position: nothing says how it moved")
+    if "quat" in log.partial:
+        log = replace(log, quat_wxyz=np.asarray(rot_to_quat(_leaning(log))))
+    if "rate" in log.partial:
+        log = replace(log, rate_b=_turning(log.time_s, log.rot_w))
+    return log
+
+
+def _leaning(log: FlightLog) -> np.ndarray:
+    """Return attitudes (N, 3, 3) whose z axis is along the path's acceleration less gravity."""
+    step = float(np.median(np.diff(log.time_s)))
+    if not np.isfinite(log.vel_w).any(axis=0).all():
+        raise ValueError(f"{log.name}: no velocity and no positions to derive it from")
+    vel_w = interpolate(log.time_s, log.time_s, log.vel_w)
+    smooth = gaussian_filter1d(vel_w, SMOOTH_S / step, axis=0)
+    acc_w = np.gradient(smooth, log.time_s, axis=0) + [0.0, 0.0, GRAVITY]
+    up = acc_w / np.linalg.norm(acc_w, axis=1, keepdims=True)
+    left = np.cross(up, [1.0, 0.0, 0.0])
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    return np.stack([np.cross(left, up), left, up], axis=-1)
+
+
+def _turning(time_s: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
+    """Return the body rates (N, 3) of attitudes (N, 3, 3)."""
+    slope = np.gradient(rot_w, time_s, axis=0)
+    spin = np.swapaxes(rot_w, 1, 2) @ slope
+    return np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+
+
+def choose_held_out(
+    logs: Sequence[FlightLog],
+    flight: np.ndarray,
+    start_s: np.ndarray,
+    information: np.ndarray,
+    limits: Thresholds = THRESHOLDS,
+) -> tuple[np.ndarray, list[str]]:
+    """Return which windows are fitted, (W,) bool, and the names of what is held out.
+
+    `flight` (W,) is the number of each window's flight, `start_s` (W,) when it starts there.
+
+    Held out are the flights that can best be spared: those of whose `information` (W, K), of each
+    window on each number of the catalogue, the others have most. What was measured has no say in
+    it, only what was flown; a lone chirp or the only pass near the ground is fitted.
+    """
+    flight = np.asarray(flight)
+    there = list(np.unique(flight))
+    if len(there) == 1:
+        log = logs[int(there[0])]
+        cut_s = limits.lone_fitted_share * log.duration_s
+        return np.asarray(start_s) + LENGTH_S <= cut_s, [f"{log.name} from {cut_s:.1f} s"]
+    by_flight = {k: information[flight == k].sum(axis=0) for k in there}
+    held: list[int] = []
+    for _ in range(max(1, round(limits.held_out_share * len(there)))):
+        kept = [k for k in there if k not in held]
+        whole = np.sum([by_flight[k] for k in kept], axis=0)
+        seen = whole > 0.0
+        lost = {k: (by_flight[k][seen] / whole[seen]).max(initial=0.0) for k in kept}
+        held.append(min(reversed(kept), key=lambda k: lost[k]))
+    return ~np.isin(flight, held), [logs[int(k)].name for k in sorted(held)]
+
+
+class ActingRotors(NamedTuple):
+    """Rotor speeds of a log, and what they tell."""
+
+    speed: np.ndarray
+    """(N, 4) [rad/s]."""
+    source: str
+    """For people."""
+    each: bool
+    """Whether each rotor's own is known; of a collective thrust only their sum is."""
+    noise: np.ndarray | None = None
+    """(N, 4) a draw of noise as large as the speed's own [rad/s]; None where none was measured."""
+
+
+def acting_rotors(
+    log: FlightLog, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
+) -> ActingRotors | None:
+    """Return the speeds that turned in `log`, measured or as asked for; None where nothing says.
+
+    They are those of every row, as far as no hole is in between. What was asked for is followed by
+    the vehicle's lag.
+    """
+    noise = None
+    if log.rotor_speed is not None:
+        drawn = replace(log, rotor_speed=noise_like(log.rotor_speed, limits))
+        noise = on_every_row(drawn, limits).rotor_speed
+    log = on_every_row(log, limits)
+    if log.rotor_speed is not None:
+        return ActingRotors(log.rotor_speed, "measured rotor speeds", True, noise)
+    if log.rotor_speed_cmd is not None:
+        return ActingRotors(_lagged(log, vehicle, log.rotor_speed_cmd), "motor commands", True)
+    if log.pwm is not None and vehicle.motors is not None:
+        voltage = log.voltage
+        if voltage is not None:
+            voltage = interpolate(log.time_s, log.time_s, voltage[:, None])[:, 0]
+        speed = np.asarray(motor_speed(vehicle, log.pwm, voltage))
+        return ActingRotors(_lagged(log, vehicle, speed), "motor commands and battery", True)
+    if log.thrust_cmd is None:
+        return None
+    force = vehicle.mass * np.maximum(log.thrust_cmd, 0.0)
+    torque_b = np.zeros((len(force), 3)) if log.torque_cmd_b is None else log.torque_cmd_b
+    nominal, _ = nominal_quadrotor(vehicle)
+    each = mix(nominal.unmixer, nominal.thrust_max, force, torque_b)
+    speed = np.sqrt(np.maximum(each, 0.0) / vehicle.rotors.thrust_coefficient)
+    if log.torque_cmd_b is None:
+        return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust", False)
+    return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust and torques", True)
+
+
+def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
+    """Return the speeds that follow `wanted` (N, 4), each held until the next row.
+
+    They do so after the vehicle's delay, by its lag.
+    """
+    constants = make_plant(vehicle, LONGEST_S).constants
+    since = log.time_s - float(constants.delay)
+    row = np.searchsorted(log.time_s, since + 1e-9, side="right") - 1
+    wanted = wanted[np.maximum(row, 0)]  # with its gaps
+    lag = float(constants.time_constant)
+    if lag <= 0.0:
+        return wanted
+    left = np.exp(-np.diff(log.time_s) / lag)[:, None]
+    speed = wanted.copy()
+    for row in range(1, len(wanted)):
+        before = np.where(np.isfinite(speed[row - 1]), speed[row - 1], wanted[row])
+        asked = np.where(np.isfinite(wanted[row - 1]), wanted[row - 1], before)
+        speed[row] = asked + left[row - 1] * (before - asked)
+    return np.where(np.isfinite(wanted), speed, np.nan)

@@ -15,14 +15,17 @@ from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.loops import NOMINAL
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.sampling import interpolate, longest_gap_s, on_every_row, thinned
-from suite.diagnose.data.steps import (
+from suite.diagnose.data.sampling import (
     LONGEST_S,
     StepGrid,
+    interpolate,
+    longest_gap_s,
+    on_every_row,
     padded_grid,
     rotors_at,
     start_rotor_error,
     step_grid,
+    thinned,
     with_lost_rows,
 )
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds

@@ -14,7 +14,7 @@ from eval.effects.log_faults import lateness, measured, restored
 from eval.quadrotor.continuous import Carry, Steps, fly, look, turn_rotors
 from eval.quadrotor.plant import Motion, Plant, Wrench, unpacked
 from eval.quadrotor.stepper import Feedback, Inputs, wanted_speed
-from suite.diagnose.data.steps import LONGEST_S
+from suite.diagnose.data.sampling import LONGEST_S
 from suite.diagnose.data.windows import CHANNELS, KNOTS, LENGTH_S, STATE, FlightWindows
 from tracks.geometry.rotation import exp_rot
 

@@ -16,7 +16,7 @@ from eval.quadrotor.loops import Loop, loop_of
 from eval.quadrotor.plant import Nominal, assemble, nominal_quadrotor
 from eval.quadrotor.stepper import Feedback
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.steps import LONGEST_S
+from suite.diagnose.data.sampling import LONGEST_S
 from suite.diagnose.data.whitening import Linearisation
 from suite.diagnose.data.windows import KNOTS, STATE, FlightWindows, step_s, take
 from suite.diagnose.estimate.parameters import ParameterLayout, ParameterSpace, effects_at

@@ -15,8 +15,7 @@ from eval.effects.com_offset import ComOffset
 from eval.logs.flight_log import FlightLog, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import with_effects
-from suite.diagnose.plans.sensors import Sensors, log_of
-from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.simulate import Sensors, fly, log_of
 from suite.diagnose.plans.trajectory import Trajectory
 
 FOLDER = Path(__file__).parent

@@ -14,12 +14,10 @@ from eval.effects.interface import at
 from eval.vehicles.vehicle import Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.identify import force
-from suite.diagnose.identify.data.drive import MotorGuess
+from suite.diagnose.identify.drive import MotorGuess
 from suite.diagnose.identify.fit import Fitted
-from suite.diagnose.identify.numbers import Number, number
+from suite.diagnose.identify.numbers import DELAY, Number, number
 from suite.diagnose.identify.torque import inertia_ratio
-
-DELAY = "effects.command_delay.delay"
 
 
 def inertia_of(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate, without_nuisance
+from suite.diagnose.estimate.gauss_newton import Z95, intervals95
 from suite.diagnose.estimate.gauss_newton import fit as fit_numbers
-from suite.diagnose.estimate.intervals import Z95, intervals95
 from suite.diagnose.estimate.parameters import FittedNumber, ParameterSpace
 from suite.diagnose.thresholds import THRESHOLDS
 

@@ -16,10 +16,12 @@ from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.flights import ViewFlights, ready
 from suite.diagnose.data.view import TORQUE
 from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
-from suite.diagnose.identify.fit import Z95
-from suite.diagnose.identify.numbers import Number
+from suite.diagnose.identify.drive import MotorGuess
+from suite.diagnose.identify.entries import inertia_of, of_force, put
+from suite.diagnose.identify.fit import Z95, Fitted
+from suite.diagnose.identify.numbers import Number, told
 from suite.diagnose.search.look import SearchResult
 from suite.diagnose.search.search import search
 
@@ -72,3 +74,46 @@ def _step(task: ViewEvidence, found: SearchResult) -> float:
     then = replace(task, weights=last.weights)
     hessian, gradient = then.linearise(then.at(theta), [at]).equations().sums()
     return float(gradient[0] / hessian[0, 0])
+
+
+MOTORS = ("thrust", "curve", "battery")
+INERTIA = ("inertia_x", "inertia_y")
+
+
+def one_off(fitted: Fitted, names: tuple[str, ...]) -> list[Fitted]:
+    """Return the fit with the numbers `names` one standard deviation off, each way independent."""
+    given = fitted.give(*names)
+    if not given.names:
+        return []
+    variance, ways = np.linalg.eigh(given.covariance)
+    found = []
+    for size, way in zip(np.sqrt(np.maximum(variance, 0.0)), ways.T, strict=True):
+        value = fitted.value.copy()
+        value[[fitted.index(name) for name in given.names]] += size * way
+        found.append(replace(fitted, value=value))
+    return found
+
+
+def doubted(
+    vehicle: Vehicle, start: Vehicle, drive: str, guess: MotorGuess, force: Fitted, torque: Fitted
+) -> list[Vehicle]:
+    """Return `vehicle` with its motors or its inertia off, by what force and torque leave open.
+
+    Args:
+        vehicle: as identified.
+        start: what it was identified from.
+        drive: what drove the flights.
+        guess: the start's motors.
+        force: the fit of the force.
+        torque: that of the torque.
+    """
+    found = []
+    for fit in one_off(force, MOTORS):
+        other = vehicle
+        for entry in of_force(start, drive, guess, fit):
+            if not entry.key.startswith("effects."):
+                other = put(other, entry)
+        found.append(other)
+    for fit in one_off(torque, INERTIA):
+        found.append(replace(vehicle, inertia=tuple(inertia_of(start, told(fit)).tolist())))
+    return found

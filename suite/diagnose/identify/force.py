@@ -7,21 +7,22 @@ together (differential flatness; Mellinger and Kumar 2011), and only its size is
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify.data.drive import (
+from suite.diagnose.identify.drive import (
     MotorGuess,
     delayed,
+    filled,
     lagged,
     motor_thrusts,
     rotor_thrusts,
 )
-from suite.diagnose.identify.data.grid import FlightGrid, Windows, blocks_of, over, windows_of
-from suite.diagnose.identify.fit import Fitted, Rows, Unknown, fit
+from suite.diagnose.identify.fit import Fitted, Given, Rows, Unknown, fit
+from suite.diagnose.identify.grid import STEP_S, FlightGrid, Windows, blocks_of, over, windows_of
 
 WIDTH_S = 0.4
 BLOCK_S = 2.0
@@ -184,9 +185,105 @@ def _prepared(flight: FlightGrid, driven: str) -> _Prepared:
 
 def _velocity(pos_w: np.ndarray) -> np.ndarray:
     """Return the slope over 0.1 s, for the drag only."""
-    from suite.diagnose.identify.data.grid import STEP_S
+    from suite.diagnose.identify.grid import STEP_S
 
     reach = round(0.05 / STEP_S)
     out = np.full_like(pos_w, np.nan)
     out[reach:-reach] = (pos_w[2 * reach :] - pos_w[: -2 * reach]) / (2 * reach * STEP_S)
     return out
+
+
+LOOP_WIDTH_S = 0.06
+FREE = np.array([True, True, True])
+
+
+def gains() -> list[Unknown]:
+    """Return the loop's gains as logarithms of ratios to the start's."""
+    return [Unknown(f"gain_{axis}", 0.0, -3.0, 3.0, 0.35, 1e-2, 0.02) for axis in "xyz"]
+
+
+def couplings(vehicle: Vehicle) -> list[Unknown]:
+    """Return how much two axes' rates turn the third, `(J_z - J_y) / J_x` and so on.
+
+    They are of no use but for the others' sake: the inertia behind them may be wrong.
+    """
+    x, y, z = vehicle.inertia
+    starts = ((z - y) / x, (x - z) / y, (y - x) / z)
+    both = zip("xyz", starts, strict=True)
+    return [Unknown(f"coupling_{a}", start, -1.0, 1.0, 0.2, 1e-2) for a, start in both]
+
+
+def air_torques(flights: Sequence[FlightGrid]) -> list[Unknown]:
+    """Return how much moving air turns the body, acceleration over speed (flapping) [1/(m s)].
+
+    They are of no use but for the others' sake, and none where the velocity is not known.
+    """
+    if not all(flight.has("vel_w", "rot_w") for flight in flights):
+        return []
+    return [Unknown(f"air_{axis}", 0.0, -20.0, 20.0, 2.0, 1e-2) for axis in "xy"]
+
+
+def fit_loop(
+    flights: Sequence[FlightGrid],
+    vehicle: Vehicle,
+    unknowns: Sequence[Unknown],
+    fixed: Mapping[str, float],
+    doubted: Given | None = None,
+) -> Fitted:
+    """Return gains, lag and delay; a constant rate of each flight is free (bias, trim).
+
+    Args:
+        flights: with rates and commanded rates.
+        vehicle: gains to start from, and how often the loop looks.
+        unknowns: `gains`, `couplings` and `torque.lag_and_delay`, or some of them.
+        fixed: the others.
+        doubted: those of `unknowns` that another fit has told.
+    """
+    names = [unknown.name for unknown in unknowns]
+    prepared = []
+    for flight in flights:
+        windows = windows_of(flight, LOOP_WIDTH_S, ("rate_b", "rate_cmd_b"))
+        rates = over(windows, flight.known["rate_b"])
+        prepared.append((windows, rates, blocks_of(flight, windows, BLOCK_S)))
+
+    def misses(value: np.ndarray) -> list[Rows]:
+        told = {**fixed, **dict(zip(names, value, strict=True))}
+        return [
+            Rows(rates - over(windows, followed(flight, vehicle, told)), block, FREE)
+            for flight, (windows, rates, block) in zip(flights, prepared, strict=True)
+        ]
+
+    return fit(misses, unknowns, given=doubted)
+
+
+def followed(flight: FlightGrid, vehicle: Vehicle, told: Mapping[str, float]) -> np.ndarray:
+    """Return the rates (G, 3) of the loop under its commands alone [rad/s]."""
+    from scipy.signal import cont2discrete, lfilter, lfilter_zi
+
+    # The loop looks at rates that are half a period old on average: exp(-half s), to second order.
+    half = 0.5 / vehicle.controller.frequency
+    lag = max(told["lag"], 1e-4)
+    wanted = filled(delayed(flight.known["rate_cmd_b"], told["late"] - told["lag"]))
+    ratio = np.exp([told.get(f"gain_{axis}", 0.0) for axis in "xyz"])
+    gains = np.asarray(vehicle.controller.rate_gain) * ratio
+
+    def answer(pushes: np.ndarray, tops: Sequence[list[float]]) -> np.ndarray:
+        out = np.empty_like(pushes)
+        for k, (gain, top) in enumerate(zip(gains, tops, strict=True)):
+            bottom = [lag + 0.5 * gain * half**2, 1.0 - gain * half, gain]
+            found: Any = cont2discrete((top, bottom), STEP_S, method="foh")
+            above, below = np.ravel(found[0]), found[1]
+            state = lfilter_zi(above, below) * pushes[0, k]
+            out[:, k] = lfilter(above, below, pushes[:, k], zi=state)[0]
+        return out
+
+    linear = answer(wanted, [[gain] for gain in gains])
+    # The controller makes up for `w x J w` by rotors that lag.
+    products = linear[:, [1, 2, 0]] * linear[:, [2, 0, 1]]
+    coupled = products * [told[f"coupling_{axis}"] for axis in "xyz"]
+    push = lagged(coupled, told["lag"]) - coupled
+    if "air_x" in told:
+        vel_b = filled(np.einsum("gji,gj->gi", flight.known["rot_w"], flight.known["vel_w"]))
+        push[:, 0] += told["air_x"] * vel_b[:, 1]
+        push[:, 1] -= told["air_y"] * vel_b[:, 0]
+    return linear + answer(push, [[lag, 1.0]] * 3)

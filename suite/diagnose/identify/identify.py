@@ -14,8 +14,8 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify import force, loop, torque
-from suite.diagnose.identify.data.drive import (
+from suite.diagnose.identify import force, torque
+from suite.diagnose.identify.drive import (
     MotorGuess,
     drive_of,
     guess_of,
@@ -23,10 +23,8 @@ from suite.diagnose.identify.data.drive import (
     rotor_thrusts,
     with_battery,
     with_motors,
+    with_own_numbers,
 )
-from suite.diagnose.identify.data.grid import FlightGrid, grid_of
-from suite.diagnose.identify.data.start import with_own_numbers
-from suite.diagnose.identify.doubts import doubted
 from suite.diagnose.identify.entries import (
     enter,
     fast_enough,
@@ -36,9 +34,9 @@ from suite.diagnose.identify.entries import (
     of_torque,
 )
 from suite.diagnose.identify.fit import Fitted, NothingWhole, Unknown
-from suite.diagnose.identify.flapping import flapping_of
-from suite.diagnose.identify.numbers import Number, told
-from suite.diagnose.identify.untold import beside, unasked, untold
+from suite.diagnose.identify.flapping import doubted, flapping_of
+from suite.diagnose.identify.grid import FlightGrid, grid_of
+from suite.diagnose.identify.numbers import Number, beside, told, unasked, untold
 
 ROUNDS = 2
 """Force and torque in turn."""
@@ -247,10 +245,10 @@ class _Start:
         teller = self.fitted.get("rotors", self.fitted.get("torque"))
         doubted = teller.give("late", "lag") if known and teller is not None else None
         wanted = [u for u in both if not known or (doubted and u.name in doubted.names)]
-        besides = [*loop.couplings(self.start), *loop.air_torques(flown)]
-        unknowns = [*loop.gains(), *besides, *wanted]
+        besides = [*force.couplings(self.start), *force.air_torques(flown)]
+        unknowns = [*force.gains(), *besides, *wanted]
         found = self.tried(
-            "loop", lambda: loop.fit_loop(flown, self.start, unknowns, self.lags(), doubted)
+            "loop", lambda: force.fit_loop(flown, self.start, unknowns, self.lags(), doubted)
         )
         if found is not None:
             self.keep("loop", found)

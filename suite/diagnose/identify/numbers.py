@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.identify.fit import Z95, Fitted
+from suite.diagnose.identify.grid import FlightGrid
+
+DELAY = "effects.command_delay.delay"
 
 
 class Number(NamedTuple):
@@ -94,3 +98,158 @@ def as_json(numbers: Sequence[Number]) -> dict[str, Any]:
             "ci95": spans[0] if one else spans,
         }
     return found
+
+
+WHY = {
+    "thrust": "thrust: too little of the force along body z is explained",
+    "curve": "curvature of the thrust curve: the motor commands hardly change",
+    "battery": "voltage_exponent: the voltage hardly changes",
+    "drag_x": "drag along body x: too slow, or too little of it",
+    "drag_y": "drag along body y: too slow, or too little of it",
+    "drag_z": "drag along body z: too slow, or too little of it",
+    "inertia_x": "inertia about x: the body hardly rolls, or the rotors' lag may be another",
+    "inertia_y": "inertia about y: the body hardly pitches, or the rotors' lag may be another",
+    "inertia_z": "inertia about z: the body hardly yaws, or not while it rolls and pitches",
+    "yaw": "torque_coefficient: the body hardly yaws",
+    "lag": "time_constant of the rotors: nothing fast enough is asked of them",
+    "late": "command_delay: nothing fast enough is asked of the motors",
+    "gain_x": "rate_gain about x: the body hardly rolls",
+    "gain_y": "rate_gain about y: the body hardly pitches",
+    "gain_z": "rate_gain about z: the body hardly yaws",
+}
+"""What was fitted and not told, and what the flights lack for it."""
+STILL = "no body rates and no attitude in these logs"
+NEVER = "these logs have no stretch with both"
+"""Where the columns are there, and holes in them leave no window whole."""
+
+
+def untold(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[str]:
+    """Return what no fit has told of what was looked for.
+
+    Args:
+        fitted: what was fitted, by the fit's name.
+        entries: of the vehicle file, by their keys.
+    """
+    seen = {u.name for found in fitted.values() for u in found.unknowns if found.has(u.name)}
+    names = dict.fromkeys(name for found in fitted.values() for name in found.untold)
+    lines = [WHY[name] for name in names if name not in seen and name in WHY]
+    late = [told(found)["late"] for found in fitted.values() if found.has("late")]
+    if late and not entries[DELAY].is_told:
+        rest = max(entries[DELAY].value[0], 0.0)
+        lines.append(
+            f"command_delay: only that it and the rotors' lag make {late[-1]:.3g} s together; of "
+            f"that the file's lag leaves {rest:.3g} s, which is its delay"
+        )
+    return lines
+
+
+def unasked(
+    flights: Sequence[FlightGrid],
+    vehicle: Vehicle,
+    drive: str,
+    fitted: Mapping[str, Fitted],
+    leave: Sequence[str],
+    broken: Collection[str] = (),
+) -> list[str]:
+    """Return what was not even looked for, since the logs have no such columns, or none whole.
+
+    Args:
+        flights: on their grids.
+        vehicle: the start.
+        drive: what drove the flights.
+        fitted: what was fitted, by the fit's name.
+        leave: what was not to be fitted.
+        broken: fits for which the logs have the columns, and no stretch in which all of them go on.
+    """
+    lines = []
+
+    def anywhere(*names: str) -> bool:
+        return any(flight.has(*names) for flight in flights)
+
+    force = fitted.get("force")
+    if force is None:
+        if not {"drag", "motors"} <= set(leave):
+            why = "these logs have no stretch with a position"
+            if "force" in broken:
+                slow = "" if anywhere("rot_w") else ", slow enough to do without an attitude"
+                why = f"{NEVER} the path and what drove the motors{slow}"
+            lines.append(f"thrust and drag: {why}")
+    elif "drag" not in leave and not any(u.name == "drag_x" for u in force.unknowns):
+        lines.append(
+            "drag along body x and y: without an attitude a force across the thrust looks like "
+            "a body that leans"
+        )
+    if drive == "pwm" and "motors" not in leave and not anywhere("voltage"):
+        motors = vehicle.motors
+        by = "it is 0, so that none counts"
+        if motors is not None and motors.voltage_exponent:
+            by = f"what they tell of the thrust is taken for that at {motors.voltage:.4g} V"
+        lines.append(f"voltage_exponent: these logs have no voltage; {by}")
+    if "torque" not in fitted and "inertia" not in leave:
+        if drive in ("rates", "thrust"):
+            lines.append(
+                "inertia and torque_coefficient: commanded rates and thrust say nothing of "
+                "torques; that needs motor commands, rotor speeds or commanded torques"
+            )
+        else:
+            why = f"{NEVER} body rates and what drove the motors" if "torque" in broken else STILL
+            lines.append(f"inertia and torque_coefficient: {why}")
+    lags = any(u.name == "late" for found in fitted.values() for u in found.unknowns)
+    if not lags and "lag" not in leave:
+        why = STILL
+        if "rotors" in broken:
+            why = f"{NEVER} measured and commanded rotor speeds"
+        elif drive == "rotors":
+            why = (
+                "measured rotor speeds are past them; that needs commanded ones (motor_cmd_1 to "
+                "motor_cmd_4) beside, and all four in every row"
+            )
+        elif {"torque", "loop"} & set(broken):
+            why = f"{NEVER} body rates and what was commanded"
+        elif drive in ("rates", "thrust") and anywhere("rate_b"):
+            why = "commanded thrust tells none; that needs the gains of a nominal rate loop beside"
+        lines.append(f"time_constant and command_delay: {why}")
+    if "loop" not in fitted and "loop" not in leave:
+        why = "rate_gain: these logs have no commanded body rates"
+        if vehicle.controller.kind != "p":
+            why = f"the rate loop: settings of a {vehicle.controller.kind} loop are not fitted"
+        elif "loop" in broken:
+            why = f"rate_gain: {NEVER} body rates and commanded ones"
+        lines.append(why)
+    return lines
+
+
+def beside(
+    flights: Sequence[FlightGrid], unheard: Collection[str], begun: Vehicle, found: Vehicle
+) -> list[str]:
+    """Return what was done with flights and vehicle that the numbers do not show.
+
+    Args:
+        flights: on their grids.
+        unheard: names of flights without a voltage, where others have one.
+        begun: the vehicle that was given.
+        found: what became of it.
+    """
+    lines = [
+        f"{flight.name}: no row has all columns of {', '.join(flight.in_turn)}; each is taken by "
+        "its own rows, so that what is fast is blurred, and a delay too short by up to half of "
+        "their distance"
+        for flight in flights
+        if flight.in_turn
+    ]
+    if unheard:
+        lines.append(
+            f"no voltage in {', '.join(sorted(unheard))}: what hangs on the motors' thrust is told "
+            "by the other flights alone"
+        )
+    motors, had = found.motors, begun.motors
+    volts = any(flight.has("voltage") for flight in flights)
+    if volts and motors is not None and (had is None or motors.voltage != had.voltage):
+        lines.append(f"motors.voltage = {motors.voltage:.4g} V, the usual one of these flights")
+    if found.rotors.speed_max != begun.rotors.speed_max:
+        lines.append(
+            f"rotors.speed_max = {found.rotors.speed_max:.4g} rad/s, which these flights reach: by "
+            f"the thrust that they tell, {begun.rotors.speed_max:.4g} rad/s would be too slow to "
+            "hover"
+        )
+    return lines

@@ -14,7 +14,7 @@ from suite.common.provenance import stamp
 from suite.delta.run import flight_files
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.estimate.parameters import refuse_own_motion
-from suite.diagnose.identify.data.start import unknown_to_the_fits
+from suite.diagnose.identify.drive import unknown_to_the_fits
 from suite.diagnose.identify.identify import Identified, identify
 from suite.diagnose.identify.numbers import as_json
 

@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.estimate.intervals import TINY
-from suite.diagnose.identify.data.drive import delayed, lagged, torque_of
-from suite.diagnose.identify.data.grid import (
+from suite.diagnose.estimate.gauss_newton import TINY
+from suite.diagnose.identify.drive import delayed, lagged, torque_of
+from suite.diagnose.identify.fit import Z95, Fitted, Given, Rows, Unknown, fit
+from suite.diagnose.identify.force import BLOCK_S
+from suite.diagnose.identify.grid import (
     ROTOR_NOISE,
     FlightGrid,
     Windows,
@@ -18,8 +20,6 @@ from suite.diagnose.identify.data.grid import (
     over,
     windows_of,
 )
-from suite.diagnose.identify.fit import Z95, Fitted, Given, Rows, Unknown, fit
-from suite.diagnose.identify.force import BLOCK_S
 
 WIDTH_S = 0.2
 BAND = WIDTH_S / (2.0 * np.pi)

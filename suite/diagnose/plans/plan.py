@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +12,16 @@ import numpy as np
 from eval.logs.flight_log import write_flight
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.windows import SLICES
-from suite.diagnose.plans.files import NAME, SCHEMA, remove_plan, write_plan
+from suite.diagnose.estimate.parameters import effects_in
 from suite.diagnose.plans.follow import FlightFailed
-from suite.diagnose.plans.sensors import Sensors, log_of
-from suite.diagnose.plans.separating import plan_for, separations_of
-from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.simulate import Sensors, fly, log_of
 from suite.diagnose.plans.trajectory import Trajectory
-from tracks.common.files import write_json
+from tracks.common.files import write_json, write_text
 from tracks.common.provenance import stamp
+from tracks.input.reading import read_json
 
 RATE_HZ = 100.0
-"""Of simulated logs, or the nearest rate below that divides the rate loop's."""
+"""Of set points, and of simulated logs, or the nearest rate below that divides the rate loop's."""
 TURNED = 2.1
 """By which the second flight of each trajectory is turned about z [rad]: one of the two may be
 held out, and both look elsewhere."""
@@ -149,3 +148,194 @@ def _sensors(sigma: np.ndarray, rate_hz: float, words: list[str]) -> Sensors:
         rotor=noise("rotor speed") or (5.0 if "rotor speeds" in asked else 0.0),
         voltage=0.02 if "voltage" in asked else 0.0,
     )
+
+
+SCHEMA = 1
+"""Version of plan.json."""
+COLUMNS = (
+    "time",
+    *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"),
+    "yaw",
+)
+"""Of a CSV: s, m, m/s, m/s^2 in the world, and rad about world z."""
+NAME = "plan.json"
+KEYS = ("file", "flown")
+"""Of a flight in it: its set points, and its log where it was flown in simulation."""
+
+
+def remove_plan(folder: Path) -> None:
+    """Remove what an earlier plan.json in `folder` lists, and itself; other files stay."""
+    path = folder / NAME
+    if not path.is_file():
+        return
+    try:
+        listed = [flight.get(key) for flight in read_json(path)["flights"] for key in KEYS]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return  # none of ours; it is written over
+    for name in listed:
+        if isinstance(name, str) and (folder / name).resolve().is_relative_to(folder.resolve()):
+            (folder / name).unlink(missing_ok=True)
+    path.unlink()
+
+
+def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
+    """Write `ways`, one a flight, in `folder`; return what plan.json holds.
+
+    `words` say to people what the flights are for.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    flights = []
+    for number, way in enumerate(ways, 1):
+        name = f"{number}_{way.kind}.csv"
+        time_s = np.arange(0.0, way.duration_s + 0.5 / RATE_HZ, 1.0 / RATE_HZ)
+        wanted = way.reference(time_s)
+        table = np.column_stack([time_s, wanted.pos_w, wanted.vel_w, wanted.acc_w, wanted.yaw])
+        rows = [",".join(COLUMNS), *(",".join(f"{v:.6g}" for v in row) for row in table)]
+        write_text(folder / name, "\n".join(rows) + "\n")
+        flights.append(
+            {
+                "file": name,
+                "trajectory": asdict(way),
+                "room": np.ptp(wanted.pos_w, axis=0).tolist(),
+                "top_speed": float(np.linalg.norm(wanted.vel_w, axis=1).max()),
+                "top_acceleration": float(np.linalg.norm(wanted.acc_w, axis=1).max()),
+                "flown": None,
+            }
+        )
+    plan = {"flights": flights, "words": list(words)}
+    write_json(folder / NAME, {**plan, **stamp(SCHEMA, None)})
+    return plan
+
+
+_FAST_WOBBLE = Trajectory("figure_eight", speed=6.5, size=4.0, turn="wobble")
+_SWEEP = Trajectory("speed_range", speed=8.0, size=6.0, turn="sweep")
+_CHIRP = Trajectory("chirp", speed=1.6, turn="wobble")
+_PUNCHES = Trajectory("punches", speed=4.0, size=4.0)
+_RANGE = Trajectory("speed_range", speed=9.0, size=7.0)
+_CIRCLE = Trajectory("circle", speed=3.0, size=3.0)
+_SLOW_EIGHT = Trajectory("figure_eight", speed=2.0, size=3.0)
+_HOVER = Trajectory("hover")
+_UP_DOWN = Trajectory("vertical", speed=1.5, size=1.0)
+OTHERWISE = "fly faster, with changes of thrust, speed, heading and height"
+"""What to do about a pair that is not known."""
+
+
+@dataclass(frozen=True)
+class Separation:
+    """A pair of effects, flights that leave it a pair, and flights that separate it."""
+
+    pair: tuple[str, str]
+    """Names of the two effects."""
+    words: str
+    """What to do, for people."""
+    blurred: tuple[Trajectory, ...]
+    """Flights after which either name explains the data."""
+    separating: tuple[Trajectory, ...]
+    """Flights to add."""
+    measure: tuple[str, ...] = ()
+    """What to log besides: `motor`, `voltage`, or `scale` for a weighing."""
+
+
+SEPARATIONS: tuple[Separation, ...] = (
+    Separation(
+        ("linear_drag", "rotor_drag"),
+        "change the thrust at held speed: bob up and down quickly on a circle",
+        (_SLOW_EIGHT, _CIRCLE),
+        (_PUNCHES, _FAST_WOBBLE),
+    ),
+    Separation(
+        ("linear_drag", "quadratic_drag"),
+        "fly a range of speeds of at least three to one",
+        (_CIRCLE, Trajectory("circle", speed=3.0, size=4.0)),
+        (_RANGE, _UP_DOWN),
+    ),
+    Separation(
+        ("quadratic_drag", "rotor_drag"),
+        "fly a range of speeds of at least three to one",
+        (_CIRCLE, Trajectory("circle", speed=3.0, size=4.0)),
+        (_RANGE, _PUNCHES),
+    ),
+    Separation(
+        ("inflow", "linear_drag"),
+        "fly forward at speed as well as up and down",
+        (_UP_DOWN, Trajectory("vertical", speed=1.0, size=1.5)),
+        (_RANGE, _FAST_WOBBLE),
+    ),
+    Separation(
+        ("command_delay", "motor_lag"),
+        "fly fast chirps with yaw and log the rotor speeds",
+        (_UP_DOWN, _HOVER),
+        (_CHIRP, _FAST_WOBBLE),
+        ("motor",),
+    ),
+    Separation(
+        ("constant_wind", "frame_tilt"),
+        "fly with at least two headings: turn on and on at speed, over a range of speeds",
+        (_SLOW_EIGHT, _HOVER),
+        (_SWEEP, _RANGE),
+    ),
+    Separation(
+        ("frame_tilt", "thrust_tilt"),
+        "turn the heading on and on",
+        (_SLOW_EIGHT, _HOVER),
+        (_SWEEP, Trajectory("hover", turn="sweep")),
+    ),
+    Separation(
+        ("com_offset", "torque_trim"),
+        "change the collective thrust: bob up and down quickly",
+        (_HOVER, _SLOW_EIGHT),
+        (_PUNCHES, Trajectory("vertical", speed=3.0, size=0.8)),
+    ),
+    Separation(
+        ("com_offset", "weak_motor"),
+        "turn the heading quickly: a weak rotor also twists",
+        (_HOVER,),
+        (_CHIRP, _FAST_WOBBLE),
+    ),
+    Separation(
+        ("mass_offset", "thrust_scale"),
+        "weigh the vehicle; failing that, fly fast turns that ask for large torques",
+        (_HOVER, _UP_DOWN),
+        (_CHIRP, _FAST_WOBBLE),
+        ("scale",),
+    ),
+    Separation(
+        ("inertia_scale", "rate_gain"),
+        "log the rotor speeds",
+        (_SLOW_EIGHT, _CIRCLE),
+        (_CHIRP, _FAST_WOBBLE),
+        ("motor",),
+    ),
+    Separation(
+        ("battery_sag", "thrust_scale"),
+        "fly for minutes, or log the voltage",
+        (Trajectory("hover", duration_s=4.0),),
+        (Trajectory("figure_eight", duration_s=60.0, speed=4.0, size=4.0),),
+        ("voltage",),
+    ),
+)
+"""Pairs that effects of a quadrotor form on gentle flights, with the way out."""
+
+
+def separations_of(names: Iterable[str]) -> list[Separation]:
+    """Return the known ways to split the set `names`: those whose two effects are both in it.
+
+    Of effects that are one hypothesis each counts.
+    """
+    wanted = {effect for name in names for effect in effects_in(name)}
+    return [entry for entry in SEPARATIONS if wanted.issuperset(entry.pair)]
+
+
+def plan_for(names: Iterable[str]) -> list[Trajectory]:
+    """Return the flights that split the set `names` as far as flights can, each only once.
+
+    A set that holds no known pair gets the flights that excite most: speeds, turns and chirps.
+    """
+    found = [way for entry in separations_of(names) for way in entry.separating]
+    return list(dict.fromkeys(found or [_RANGE, _SWEEP, _CHIRP, _FAST_WOBBLE]))
+
+
+def advice(name: str, rival: str) -> str:
+    """Return a line that says which flight would tell `name` from `rival`."""
+    known = separations_of((name, rival))
+    return f"{name} from {rival}: {known[0].words if known else OTHERWISE}"

@@ -11,9 +11,14 @@ from suite.diagnose.checks.checks import Checks
 from suite.diagnose.data.windows import UNITS
 from suite.diagnose.estimate.composites import in_words
 from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
-from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
 from suite.diagnose.report.parameters_json import cells, components, grid, short_name, size_words
-from suite.diagnose.report.result_sections import held_out_section, residual_section
+from suite.diagnose.report.sections import (
+    actuators_section,
+    held_out_section,
+    logs_section,
+    noise_section,
+    residual_section,
+)
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from tracks.common.grid import Cell, Grid
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
 from suite.diagnose.estimate.composites import acts_through, begin_of, lent_at
-from suite.diagnose.estimate.gauss_newton import chi2_by_part, fit, gauss_newton_step
-from suite.diagnose.estimate.intervals import intervals95
+from suite.diagnose.estimate.gauss_newton import chi2_by_part, fit, gauss_newton_step, intervals95
 from suite.diagnose.estimate.parameters import Candidate, indices_of
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.evidence import Evidence

@@ -13,11 +13,10 @@ from suite.diagnose.data.windows import FlightWindows, cut
 from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.search.look import SearchResult, rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.gap import Gap
-from suite.diagnose.verdict.relevance import EffectSize, Negligible
+from suite.diagnose.verdict.confirmation import EffectSize, Negligible
+from suite.diagnose.verdict.disturbances import Turbulence
+from suite.diagnose.verdict.gap import Gap, Verdict
 from suite.diagnose.verdict.residual_structure import ResidualStructure
-from suite.diagnose.verdict.turbulence import Turbulence
-from suite.diagnose.verdict.verdict import Verdict
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,27 @@ the noise of the start made of it; the second is known from the model's slopes.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from eval.effects.log_faults import lateness
-from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.whitening import Linearisation, make_whitening, rotor_spread, slow_energy
+from suite.diagnose.data.colour import Noise, measured_noise
+from suite.diagnose.data.whitening import (
+    Linearisation,
+    make_whitening,
+    project_out_start,
+    rotor_spread,
+    slow_energy,
+    whiten,
+)
 from suite.diagnose.data.windows import SLICES, STATE, STATE_GROUPS, FlightWindows
+from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.evidence.rollouts import block_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.residual_structure import ResidualStructure
 
 HORIZONS_S = (0.1, 0.5, 1.0)
 """Lengths of the plain rollouts [s]."""
@@ -155,3 +165,118 @@ def _blocks(count: int, seed: int, limits: Thresholds) -> np.ndarray:
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt((values**2).sum(axis=-1).mean()))
+
+
+class Verdict(NamedTuple):
+    """A verdict and its reasons."""
+
+    label: str
+    """no_gap, named, partly or unknown."""
+    share_left: float = 0.0
+    """What is left of the gap on held-out flights, see `share_left`: 1 where nothing is
+    named, 0 where there is none."""
+    where: str | None = None
+    """What the residual goes with, in words."""
+
+
+def verdict_on(
+    named: bool,
+    slow_errors: tuple[np.ndarray, np.ndarray],
+    residual: ResidualStructure,
+    gaps: tuple[Gap, Gap],
+    rotor_input: bool,
+    limits: Thresholds = THRESHOLDS,
+) -> Verdict:
+    """Return the verdict on what was found and on the structure in what it leaves over.
+
+    Args:
+        named: whether something was named.
+        slow_errors: as `RolloutEvidence.slow_errors` has them.
+        residual: the structure.
+        gaps: those before and after it was found.
+        rotor_input: whether measured rotor speeds drive.
+        limits: from where on structure is none of noise.
+    """
+    slow, expected = slow_errors
+    shape = residual.shapes[0] if residual.shapes else None
+    if shape is not None and shape.p_value > limits.shape_p_value:
+        shape = None
+    coloured = [
+        axis
+        for axis, p_value in residual.coloured.items()
+        if p_value <= limits.colour_p_value and not rotor_input
+    ]
+    loud = limits.structure_rotor_input if rotor_input else limits.structure
+    if not (shape or coloured or slow.sum() / expected.sum() > loud):
+        return Verdict("named", share_left(*gaps)) if named else Verdict("no_gap")
+    share = share_left(*gaps) if named else 1.0
+    where = [shape.label] if shape else []
+    if coloured:
+        where.append("a changing " + ", ".join(coloured))
+    partly = named and share <= limits.unexplained_share
+    where = "; ".join(where) or _loudest(slow.sum(axis=0), expected.sum(axis=0))
+    return Verdict("partly" if partly else "unknown", share, where)
+
+
+def with_swing(verdict: Verdict, words: str, named: bool) -> Verdict:
+    """Return `verdict` where a force swings, which nothing that is fitted does.
+
+    `words` say how; `named` whether something was named besides.
+    """
+    where = f"{words}; {verdict.where}" if verdict.where else words
+    if verdict.where is None:
+        return Verdict(
+            "partly" if named else "unknown", verdict.share_left if named else 1.0, where
+        )
+    return verdict._replace(where=where)
+
+
+def share_left(before: Gap, after: Gap) -> float:
+    """Return how much of the gap above the noise floor is left, 0 to 1."""
+    left = max(after.rms - 1.0, 0.0)
+    return left / max(before.rms - 1.0, left, 1e-9)
+
+
+def _loudest(slow: np.ndarray, expected: np.ndarray) -> str:
+    """Return the channels with most energy (12,) beyond what is expected, in words."""
+    energy = np.maximum(slow / np.maximum(expected, 1e-9) - 1.0, 0.0)
+    loudest = [k for k in np.argsort(-energy)[:3] if energy[k] > 0]
+    return "errors of " + ", ".join(f"{STATE_GROUPS[k // 3]} {'xyz'[k % 3]}" for k in loudest)
+
+
+def with_model_error(
+    model: RolloutModel,
+    at: Estimate,
+    windows: FlightWindows,
+    linear: Linearisation,
+    coarser: FlightWindows,
+    limits: Thresholds,
+) -> Thresholds:
+    """Return `limits` whose least noise of each group of channels is the model's own error or more.
+
+    Args:
+        model: the rollout.
+        at: where `linear` was taken.
+        windows: W of them.
+        linear: residuals and slopes along everything.
+        coarser: the same windows, cut more coarsely.
+        limits: whose least noise is raised.
+    """
+    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    whitening = make_whitening(linear, noise, windows, limits)
+    apart = model.residual(at.theta, at.free, coarser) - linear.residual
+    good = np.isfinite(apart).all(axis=(1, 2), keepdims=True)
+    apart = np.where(good, apart, 0.0)
+    left = project_out_start(whitening, whiten(whitening, apart[..., None]))[..., 0]
+    count, rows, channels = apart.shape
+    over = left[:, : rows * channels].reshape(apart.shape)
+    sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
+    seen = np.asarray(windows.seen) & good
+    power = (np.where(seen, over * sigma, 0.0) ** 2).sum(axis=(0, 1)) / np.maximum(
+        seen.sum(axis=(0, 1)), 1
+    )
+    least = [
+        max(floor, float(np.sqrt(power[channel].mean())))
+        for floor, channel in zip(limits.least_noise, SLICES.values(), strict=True)
+    ]
+    return replace(limits, least_noise=tuple(least))

@@ -15,8 +15,7 @@ import numpy as np
 from suite.common.errors import WorkFailed
 from suite.diagnose.data.noise import noise_of
 from suite.diagnose.estimate.block import NormalEquations
-from suite.diagnose.estimate.gauss_newton import fit
-from suite.diagnose.estimate.intervals import intervals95
+from suite.diagnose.estimate.gauss_newton import fit, intervals95
 from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.evidence.rollouts import start_estimate, weighed_by
 from suite.experiments.bench.compare import Comparison, Figure, in_turn

@@ -57,8 +57,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
     """
     from suite.blind.oracle.strength import given_vehicle
     from suite.diagnose.plans.follow import FlightFailed
-    from suite.diagnose.plans.sensors import SENSORS, log_of
-    from suite.diagnose.plans.simulate import fly
+    from suite.diagnose.plans.simulate import SENSORS, fly, log_of
     from suite.diagnose.plans.trajectory import ordinary_flights
 
     def attempt(number: int) -> Task:

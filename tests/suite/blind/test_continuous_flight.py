@@ -12,7 +12,7 @@ from suite.blind.continuous_flight import (
 )
 from suite.blind.outside import make_outside
 from suite.diagnose.plans.follow import FlightFailed
-from suite.diagnose.plans.sensors import SENSORS
+from suite.diagnose.plans.simulate import SENSORS
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 

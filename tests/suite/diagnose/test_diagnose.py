@@ -19,7 +19,7 @@ from suite.cli import main
 from suite.common.report import html
 from suite.diagnose.checks.checks import run_checks
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.plans.sensors import SENSORS, log_of
+from suite.diagnose.plans.simulate import SENSORS, log_of
 from suite.diagnose.plans.simulate import fly as fly_ways
 from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json

@@ -9,7 +9,7 @@ import suite.blind.continuous
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL
 from suite.blind.continuous.timing import Conditions
 from suite.blind.continuous_flight import fly_continuous, with_loop
-from suite.diagnose.plans.sensors import SENSORS
+from suite.diagnose.plans.simulate import SENSORS
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.suite.test_imports import imported
 from tests.support.vehicles import PLAIN, with_effects, with_lag

@@ -13,8 +13,7 @@ from suite.blind.oracle.stretches import (
     whitened,
     without_start,
 )
-from suite.diagnose.plans.sensors import SENSORS
-from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.simulate import SENSORS, fly
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.ways import BARE, bare_flights
 

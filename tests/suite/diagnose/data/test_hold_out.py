@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.data.flights import choose_held_out
 from suite.diagnose.data.windows import cut
 from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN, with_lag

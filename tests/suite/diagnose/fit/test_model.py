@@ -8,8 +8,7 @@ from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.plans.sensors import SENSORS, log_of
-from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.simulate import SENSORS, fly, log_of
 from suite.diagnose.plans.trajectory import Trajectory, ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.gap import true_starts

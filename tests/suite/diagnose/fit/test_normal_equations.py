@@ -3,8 +3,7 @@
 import numpy as np
 
 from suite.diagnose.estimate.block import NormalEquations, products
-from suite.diagnose.estimate.gauss_newton import solve
-from suite.diagnose.estimate.intervals import intervals95
+from suite.diagnose.estimate.gauss_newton import intervals95, solve
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.estimate.permutation import folds_of, score_candidates
 from tests.support.vehicles import PLAIN

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from suite.diagnose.identify.data.drive import MotorGuess
-from suite.diagnose.identify.doubts import doubted, one_off
+from suite.diagnose.identify.drive import MotorGuess
 from suite.diagnose.identify.fit import Fitted, Unknown
+from suite.diagnose.identify.flapping import doubted, one_off
 from tests.support import identified as known
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.data.drive import MotorGuess
+from suite.diagnose.identify.drive import MotorGuess
 from suite.diagnose.identify.entries import (
     DELAY,
     enter,

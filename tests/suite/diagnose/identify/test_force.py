@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.data.drive import MotorGuess
-from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
+from suite.diagnose.identify.drive import MotorGuess
 from suite.diagnose.identify.fit import NothingWhole
 from suite.diagnose.identify.force import fit_force, force_of, unknowns_of
+from suite.diagnose.identify.grid import STEP_S, FlightGrid
 from tests.support.vehicles import PLAIN
 
 NONE = MotorGuess(0.0, 0.0, 0.0, 1.0, 1.0)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
-from suite.diagnose.identify.loop import air_torques, couplings, followed
+from suite.diagnose.identify.force import air_torques, couplings, followed
+from suite.diagnose.identify.grid import STEP_S, FlightGrid
 from tests.support.vehicles import PLAIN
 
 COUPLED = {unknown.name: unknown.start for unknown in couplings(PLAIN)}

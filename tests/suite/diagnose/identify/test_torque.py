@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.data.drive import delayed, lagged
-from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
+from suite.diagnose.identify.drive import delayed, lagged
 from suite.diagnose.identify.fit import Fitted
+from suite.diagnose.identify.grid import STEP_S, FlightGrid
 from suite.diagnose.identify.torque import (
     fit_rotor_lag,
     inertia_ratio,

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.data.drive import MotorGuess, motor_thrusts, torque_of
-from suite.diagnose.identify.data.grid import grid_of
+from suite.diagnose.identify.drive import MotorGuess, motor_thrusts, torque_of
+from suite.diagnose.identify.grid import grid_of
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.fleets import (
     DELAY,

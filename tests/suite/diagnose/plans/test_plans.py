@@ -9,12 +9,19 @@ import pytest
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.plant import Motion
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.plans.files import COLUMNS, write_plan
-from suite.diagnose.plans.pilot import Gains, steer
-from suite.diagnose.plans.plan import fly_plan, sets_of, ways_for, write_plan_of
-from suite.diagnose.plans.sensors import SENSORS, log_of
-from suite.diagnose.plans.separating import OTHERWISE, SEPARATIONS, advice
-from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.follow import Gains, steer
+from suite.diagnose.plans.plan import (
+    COLUMNS,
+    OTHERWISE,
+    SEPARATIONS,
+    advice,
+    fly_plan,
+    sets_of,
+    ways_for,
+    write_plan,
+    write_plan_of,
+)
+from suite.diagnose.plans.simulate import SENSORS, fly, log_of
 from suite.diagnose.plans.trajectory import Reference, Trajectory
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from tests.support.vehicles import PLAIN, with_effects, with_lag

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.plans.sensors import SENSORS, log_of
-from suite.diagnose.plans.simulate import fly
+from suite.diagnose.plans.simulate import SENSORS, fly, log_of
 from tests.support.ways import BARE, EIGHT, bare_flights, having
 
 

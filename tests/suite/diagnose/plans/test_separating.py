@@ -1,7 +1,7 @@
 """Plans that tell two effects apart."""
 
 from eval.effects import EFFECTS
-from suite.diagnose.plans.separating import SEPARATIONS, plan_for, separations_of
+from suite.diagnose.plans.plan import SEPARATIONS, plan_for, separations_of
 
 
 def test_plans_name_catalogue_effects_and_end_in_flights():

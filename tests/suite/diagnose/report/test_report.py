@@ -16,9 +16,9 @@ from suite.diagnose.report.charts import (
     disagreement_chart,
     drift_chart,
     gains_chart,
+    write_rollouts,
 )
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
-from suite.diagnose.report.log_sections import actuators_section, logs_section, noise_section
 from suite.diagnose.report.page import _disagreement, page
 from suite.diagnose.report.parameters_json import (
     UNSEEN,
@@ -29,8 +29,13 @@ from suite.diagnose.report.parameters_json import (
     parameters_json,
     short_name,
 )
-from suite.diagnose.report.recording import write_rollouts
-from suite.diagnose.report.result_sections import held_out_section, residual_section
+from suite.diagnose.report.sections import (
+    actuators_section,
+    held_out_section,
+    logs_section,
+    noise_section,
+    residual_section,
+)
 from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
 from tracks.common.grid import Grid

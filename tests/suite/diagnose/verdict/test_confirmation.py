@@ -6,8 +6,7 @@ import numpy as np
 
 from suite.diagnose.search.look import NamedEffect, rollouts_of
 from suite.diagnose.verdict.confirmation import confirmed
-from suite.diagnose.verdict.gap import measure
-from suite.diagnose.verdict.verdict import verdict_on
+from suite.diagnose.verdict.gap import measure, verdict_on
 
 
 def spoilt(drag, steps):

@@ -4,8 +4,13 @@ import jax
 import numpy as np
 import pytest
 
-from suite.diagnose.checks.black_box import compare_black_box
-from suite.diagnose.checks.delta_model import BlackBoxConfig, _start, black_box_gap, fit_black_box
+from suite.diagnose.checks.black_box import (
+    BlackBoxConfig,
+    _start,
+    black_box_gap,
+    compare_black_box,
+    fit_black_box,
+)
 from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.windows import CHANNELS, KNOTS, cut, take
 from suite.diagnose.diagnose import diagnose

@@ -8,14 +8,14 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.thresholds import Thresholds
-from suite.diagnose.verdict.gap import Gap
-from suite.diagnose.verdict.relevance import (
+from suite.diagnose.verdict.confirmation import (
     EffectSize,
     gap_matters,
     rollout_size,
     sizes_of,
     view_size,
 )
+from suite.diagnose.verdict.gap import Gap
 
 LIMITS = Thresholds()
 

@@ -10,7 +10,17 @@ from suite.diagnose.data.windows import KNOTS, STATE
 from suite.diagnose.search.look import rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict import diagnosis
-from suite.diagnose.verdict.gap import Gap, measure, noise_floor, start_noise, worse
+from suite.diagnose.verdict.disturbances import _likelihood, find_turbulence
+from suite.diagnose.verdict.gap import (
+    Gap,
+    Verdict,
+    measure,
+    noise_floor,
+    share_left,
+    start_noise,
+    verdict_on,
+    worse,
+)
 from suite.diagnose.verdict.residual_structure import (
     AXES,
     DisturbanceEquations,
@@ -20,8 +30,6 @@ from suite.diagnose.verdict.residual_structure import (
     residual_structure,
     shape_library,
 )
-from suite.diagnose.verdict.turbulence import _likelihood, find_turbulence
-from suite.diagnose.verdict.verdict import Verdict, share_left, verdict_on
 
 
 def gap(energy):

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from suite.diagnose.by_views import diagnose_by_views
-from suite.diagnose.data.view import SmoothedFlight
-from suite.diagnose.data.weak_form import weak_form
+from suite.diagnose.data.view import SmoothedFlight, weak_form
 from suite.diagnose.report.views_json import views_json
-from suite.diagnose.verdict.swing import Swing, find_swing
+from suite.diagnose.verdict.disturbances import Swing, find_swing
 from tests.support.real_flights import VEHICLE, flights
 
 TIME_S = np.arange(0.0, 20.0, 0.01)

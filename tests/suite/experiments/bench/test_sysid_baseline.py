@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.noise import noise_of
-from suite.diagnose.estimate.intervals import intervals95
+from suite.diagnose.estimate.gauss_newton import intervals95
 from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.evidence.rollouts import start_estimate
 from suite.experiments.bench import diagnose, sysid_baseline

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.vehicles.vehicle import MotorMap
-from suite.diagnose.identify.data.drive import (
+from suite.diagnose.identify.drive import (
     MotorGuess,
     delayed,
     drive_of,
@@ -16,7 +16,7 @@ from suite.diagnose.identify.data.drive import (
     with_battery,
     with_motors,
 )
-from suite.diagnose.identify.data.grid import STEP_S, FlightGrid
+from suite.diagnose.identify.grid import STEP_S, FlightGrid
 from tests.support.vehicles import PLAIN
 
 TIME = STEP_S * np.arange(400)

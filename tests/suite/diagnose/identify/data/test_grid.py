@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.identify.data.grid import (
+from suite.diagnose.identify.grid import (
     ROTOR_NOISE,
     STEP_S,
     FlightGrid,

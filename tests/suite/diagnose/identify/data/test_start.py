@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.quadrotor.plant import make_plant
-from suite.diagnose.identify.data.start import unknown_to_the_fits, with_own_numbers
+from suite.diagnose.identify.drive import unknown_to_the_fits, with_own_numbers
 from suite.diagnose.identify.identify import identify
 from tests.support import identified as known
 from tests.support.vehicles import PLAIN, with_effects

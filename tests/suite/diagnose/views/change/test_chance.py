@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.change.chance import chance_of
 from suite.diagnose.evidence.moments import ViewData, Weights, whitened
+from suite.diagnose.search.chance import chance_of
 
 FREEDOM = 12
 SIZES = np.random.default_rng(0).chisquare(FREEDOM, (999, 3)) / FREEDOM

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.change.chance import RotorSpread, rotor_spread
-from suite.diagnose.change.reference import search_change
 from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE, TORQUE
 from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.evidence.force_torque import ForceModel
+from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence
+from suite.diagnose.search.chance import RotorSpread, rotor_spread
+from suite.diagnose.search.change import search_change
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
 

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.change.motion_change import own_changes, search_motion_change, within_flights
 from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE
 from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.evidence.force_torque import ForceModel
-from suite.diagnose.evidence.moments import ViewData
+from suite.diagnose.evidence.moments import ForceModel, ViewData
 from suite.diagnose.evidence.views import ViewEvidence
+from suite.diagnose.search.change import own_changes, search_motion_change, within_flights
 from tests.support.real_flights import VEHICLE, flights
 
 SPACE = make_space(VEHICLE)

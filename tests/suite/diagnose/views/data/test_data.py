@@ -8,11 +8,8 @@ import pytest
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import MotorMap
-from suite.diagnose.data.completed import completed
-from suite.diagnose.data.flights import parted, ready
-from suite.diagnose.data.rotors import acting_rotors
-from suite.diagnose.data.view import FORCE, TORQUE, rows_of, smoothed
-from suite.diagnose.data.weak_form import weak_form
+from suite.diagnose.data.flights import acting_rotors, completed, parted, ready
+from suite.diagnose.data.view import FORCE, TORQUE, rows_of, smoothed, weak_form
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects

@@ -15,8 +15,8 @@ from suite.diagnose.estimate.parameters import (
     make_space,
     usual_first,
 )
-from suite.diagnose.evidence.force_torque import ForceModel
 from suite.diagnose.evidence.moments import (
+    ForceModel,
     ViewData,
     Weights,
     block_of,

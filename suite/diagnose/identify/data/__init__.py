@@ -1,1 +1,0 @@
-"""What flew, on an even grid: what was measured, and what drove it."""
