@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from eval.vehicles.vehicle import MotorMap
-from suite.diagnose.identify.entries import DELAY
 from suite.diagnose.identify.fit import Fitted, Unknown
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
-from suite.diagnose.identify.numbers import Number, beside, unasked, untold
+from suite.diagnose.identify.numbers import DELAY, Number, beside, unasked, untold
 from tests.support.vehicles import PLAIN
 
 
