@@ -24,9 +24,8 @@ from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.plans.plan import fly_plan, write_plan_of
 from suite.diagnose.report.charts import write_rollouts
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
-from suite.diagnose.report.page import page
+from suite.diagnose.report.page import page, views_page
 from suite.diagnose.report.views_json import views_json
-from suite.diagnose.report.views_page import views_page
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp

@@ -1,16 +1,28 @@
-"""What the report of a diagnosis shows: the answer first, then the eight steps that led to it."""
+"""What a report shows: the answer in a sentence, what it does and means, then the evidence."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from eval.effects import EFFECTS
+from suite.common.charts import png, titled
 from suite.common.report import Details, Links, Part, Picture, Report, Section
+from suite.diagnose.by_views import ViewsDiagnosis
 from suite.diagnose.checks.checks import Checks
 from suite.diagnose.data.windows import UNITS
 from suite.diagnose.estimate.composites import in_words
-from suite.diagnose.report.charts import disagreement_chart, drift_chart, gains_chart
+from suite.diagnose.report.charts import (
+    AFTER,
+    BEFORE,
+    FLOOR,
+    disagreement_chart,
+    drift_chart,
+    gains_chart,
+)
 from suite.diagnose.report.parameters_json import cells, components, grid, short_name, size_words
 from suite.diagnose.report.sections import (
     actuators_section,
@@ -37,6 +49,20 @@ FILES = (
 """Beside the report, where they were written."""
 RIVALS = 6
 """Other names in the table of what fits as well."""
+STRETCH_S = 10.0
+"""Length of the stretch in the picture [s]."""
+WHAT = {"force": "acceleration", "torque": "angular acceleration"}
+CHANNELS = (
+    "As given and with what was named: what the model leaves, as RMS. Noise floor: what the noise "
+    "of the measured velocities or rates alone would leave. Repeatability: how far the means of "
+    "flights of the unchanged vehicle lie apart. Named: the share of the variance within a flight "
+    "that the names close; black box: what a regression without any physics closes of it, fitted "
+    "to the same flights. All on flights that took no part in finding or fitting anything."
+)
+FLIGHTS = (
+    "The fall of the squared error of each flight under what the others' fit says, in units of "
+    "independent noise. A name needs all flights but one."
+)
 
 
 def page(
@@ -47,8 +73,15 @@ def page(
     `toml` is the vehicle file that was written, `files` which of `FILES` there are.
     """
     gap = found["gap"]
+    facts = {
+        "gap before": f"{gap['before']:.2f}",
+        "gap after": f"{gap['after']:.2f}",
+        "noise floor": "1",
+        "held out": _few(gap["held_out"]),
+        "driven by": found["driven_by"],
+    }
     sections = [
-        Section("The answer", _answer(found)),
+        Section("The answer", _answer(found, TOTALS)),
         logs_section(diagnosis, checks),
         noise_section(diagnosis),
         _disagreement(found, checks),
@@ -57,24 +90,48 @@ def page(
         _identity(diagnosis, found),
         residual_section(diagnosis, found),
         held_out_section(diagnosis, found, checks),
-        _written(found, toml, files),
     ]
-    if found["warnings"]:
-        sections.append(
-            Section("Warnings", [Details("what was odd", "\n".join(found["warnings"]))])
-        )
+    return _report(found, _lead(found), facts, sections, toml, files)
+
+
+def views_page(found: ViewsDiagnosis, told: Mapping[str, Any], toml: str) -> Report:
+    """Return the report; `told` is the JSON, `toml` the vehicle file that was written."""
+    facts = {
+        "flights": str(len(found.flights.names)),
+        "reference": str(len(found.references)) if found.references else "none",
+        "held out": ", ".join(told["gap"]["held_out"]),
+        "rotors by": told["driven_by"],
+    }
+    sections = [
+        Section("What was measured, and what the model says", _picture(found, told)),
+        Section("The answer in numbers", _answer(told, VIEW_TOTALS)),
+        Section("Each view, axis by axis", [_channels(told)]),
+        Section("Do the flights agree", _agreement(found)),
+        Section("What the views compare", _views(found)),
+    ]
+    files = {"vehicle.toml", "diagnosis.json"}
+    return _report(told, told["headline"], facts, sections, toml, files)
+
+
+def _report(
+    found: Mapping[str, Any],
+    lead: str,
+    facts: Mapping[str, str],
+    sections: Sequence[Section],
+    toml: str,
+    files: set[str],
+) -> Report:
+    """Return a report with what every one has: what was written, and warnings."""
+    warnings = [Details("what was odd", "\n".join(found["warnings"]))]
     return Report(
         title=f"Diagnosis: {found['verdict']}",
-        lead=_lead(found),
-        facts={
-            "gap before": f"{gap['before']:.2f}",
-            "gap after": f"{gap['after']:.2f}",
-            "noise floor": "1",
-            "held out": _few(gap["held_out"]),
-            "driven by": found["driven_by"],
-            "took": f"{found['seconds']:.0f} s",
-        },
-        sections=sections,
+        lead=lead,
+        facts={**facts, "took": f"{found['seconds']:.0f} s"},
+        sections=[
+            *sections,
+            _written(found, toml, files),
+            *([Section("Warnings", warnings)] if found["warnings"] else []),
+        ],
     )
 
 
@@ -95,33 +152,43 @@ def _few(names: list[str]) -> str:
     return ", ".join(short[:3]) + (f" and {len(short) - 3} more" if len(short) > 3 else "")
 
 
-def _answer(found: Mapping[str, Any]) -> list[Part]:
-    if not found["effects"]:
-        return [VERDICTS[found["verdict"]]]
+TOTALS = (
+    "Values are totals: what the vehicle file had of an effect is replaced. Of the gap: the "
+    "share that this effect takes away when it is added last. Chance gives a false name with "
+    "a probability of at most {chance:.1g}."
+)
+VIEW_TOTALS = (
+    "Totals: what the vehicle file had of an effect is replaced. 95 % with flights as draws."
+)
+
+
+def _answer(found: Mapping[str, Any], note: str) -> list[Part]:
+    """Return the names, what they are and do, and their numbers."""
+    effects = found["effects"]
+    if not effects:
+        return [f"{VERDICTS[found['verdict']]} Nothing was named: the vehicle file is as it was."]
     rows = [
         (
             effect["name"],
             ", ".join(effect["alternatives"]) or "none",
+            effect.get("view", "whole"),
             one.label,
             *one.shown(),
             "exempt" if effect["gap_removed"] is None else f"{100 * effect['gap_removed']:.0f} %",
         )
-        for effect in found["effects"]
+        for effect in effects
         for one in sorted(components(effect), key=lambda one: not one.found)
     ]
-    headers = ["effect", "not distinguishable from", "parameter", "total", "95 %", "of the gap"]
-    words = [
-        f"{effect['name']}: {EFFECTS[effect['name']].summary}: {EFFECTS[effect['name']].equation}."
-        for effect in found["effects"]
-    ]
-    words += [f"{size_words(effect)}." for effect in found["effects"]]
-    words += in_words([(e["name"], *e["alternatives"]) for e in found["effects"]])
-    note = (
-        "Values are totals: what the vehicle file had of an effect is replaced. Of the gap: the "
-        "share that this effect takes away when it is added last. Chance gives a false name with "
-        f"a probability of at most {max(effect['p_value'] for effect in found['effects']):.1g}."
-    )
-    return [*words, grid("", headers, rows, note)]
+    about = [EFFECTS[effect["name"]] for effect in effects]
+    words: list[Part] = [f"{one.name}: {one.summary}: {one.equation}." for one in about]
+    words += [f"{size_words(effect)}." for effect in effects]
+    words += in_words([(e["name"], *e["alternatives"]) for e in effects])
+    headers = [
+        "effect", "not distinguishable from", "view", "parameter", "total", "95 %", "of the gap"
+    ]  # fmt: skip
+    note = note.format(chance=max(effect["p_value"] for effect in effects))
+    words.append(grid("", headers, rows, note))
+    return [*words, *(f"What would tell {line}." for line in found["separate_with"])]
 
 
 LEAST_FLOOR = 1e-9
@@ -222,20 +289,16 @@ def _identity(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
         parts.append("Nothing was named, so that there is nothing to tell apart.")
     elif not found["separate_with"]:
         parts.append("No other name explains the same flights as well.")
-    parts += [f"What would tell {line}." for line in found["separate_with"]]
     if found["separate_with"]:
         parts.append("suite diagnose --plan writes such flights as commanded trajectories.")
     return Section("5. What could stand in its place", parts)
 
 
 def _written(found: Mapping[str, Any], toml: str, files: set[str]) -> Section:
+    words = "Nothing was named: the vehicle file is as it was."
+    if found["effects"]:
+        words = "The vehicle file with the named effects, for every other command (--vehicle)."
     links = [(path, words) for path, words in FILES if path in files]
-    named = bool(found["effects"])
-    words = (
-        "The vehicle file with the named effects, for every other command (--vehicle)."
-        if named
-        else "Nothing was named: the vehicle file is as it was."
-    )
     parts: list[Part] = [words, Details("vehicle.toml", toml), Links(links)]
     plan = found.get("plan")
     if plan:
@@ -253,4 +316,84 @@ def _written(found: Mapping[str, Any], toml: str, files: set[str]) -> Section:
         ]
         headers = ["flight", "kind", "lasts", "speed", "acceleration", "needs", "flown as"]
         parts.append(grid("Flights to fly next", headers, rows, " ".join(plan["words"])))
-    return Section("8. What was written", parts)
+    return Section("What was written", parts)
+
+
+def _picture(found: ViewsDiagnosis, told: Mapping[str, Any]) -> list[Part]:
+    """Return measured, simulated, and simulated with what was named, over a held-out stretch."""
+    one = found.main
+    before = one.held.left(one.search.start.theta)
+    after = one.held.left(one.search.estimate.theta)
+    axis = max(one.view.axes, key=lambda k: float(one.gap.closed[k] * one.gap.variance[k]))
+    rows = before.flight == before.flight[0]
+    middle = before.middle_s[rows]
+    moved = np.abs(before.residual[rows, axis] - after.residual[rows, axis])
+    count = max(int((middle < middle[0] + STRETCH_S).sum()), 2)
+    sums = np.convolve(moved, np.ones(min(count, len(moved))), "valid")
+    first = int(sums.argmax())
+    shown = slice(first, first + count)
+    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    axes = figure.subplots()
+    measured = (before.value + before.residual)[rows, axis][shown]
+    time_s = middle[shown] - middle[shown][0]
+    axes.plot(time_s, measured, color=FLOOR, lw=1.6, label="measured")
+    axes.plot(time_s, before.value[rows, axis][shown], color=BEFORE, lw=1.4, label="simulated")
+    named = bool(one.names)
+    if named:
+        with_it = measured - after.residual[rows, axis][shown]
+        axes.plot(time_s, with_it, color=AFTER, lw=1.4, label="with what was named")
+    axes.set_xlabel("time [s]", fontsize=8)
+    axes.legend(fontsize=8, frameon=False, ncols=3)
+    titled(axes, f"{WHAT[one.view.name].capitalize()} along body {'xyz'[axis]} [{one.view.unit}]")
+    name = told["gap"]["held_out"][0]
+    caption = f"A stretch of {name}, which took no part in finding or fitting anything."
+    return [Picture(png(figure), caption)]
+
+
+def _channels(told: Mapping[str, Any]) -> Grid:
+    def short(value: float | None, percent: bool = False) -> str:
+        if value is None:
+            return "not told"
+        return f"{100 * value:.0f} %" if percent else f"{value:.3g}"
+
+    rows = [
+        (
+            f"{view} {axis}",
+            short(one["before"]),
+            short(one["after"]),
+            short(one["noise_floor"]),
+            short(one["repeatability"]),
+            short(one["closed"], percent=True),
+            short(one["explainable"], percent=True),
+        )
+        for view, axes in told["gap"]["channels"].items()
+        for axis, one in axes.items()
+    ]
+    headers = ["", "as given", "with names", "noise floor", "repeatability", "named", "black box"]
+    return grid("", headers, rows, CHANNELS)
+
+
+def _agreement(found: ViewsDiagnosis) -> list[Part]:
+    parts: list[Part] = []
+    for result, name in found.named:
+        if name.gains:
+            rows = [(f"{k + 1}", f"{gain:.1f}") for k, gain in enumerate(name.gains)]
+            title = f"{result.view.name}: {name.candidate.label}"
+            parts.append(grid(title, ["fitted flight", "gain"], rows, FLIGHTS))
+    if found.spread is not None:
+        parts.append(
+            f"The {len(found.references)} reference flights differ as though each rotor's thrust "
+            f"were off by {100 * found.spread.share:.1f} % from flight to flight "
+            f"({found.spread.freedom} degrees of freedom); along an axis its own differences count "
+            "beside that. A change is named where it stands out of them."
+        )
+    return parts or ["Nothing was named on which flights could agree."]
+
+
+def _views(found: ViewsDiagnosis) -> list[Part]:
+    words: list[Part] = [
+        f"{one.view.name}: {one.view.about} ({found.flights.source}), smoothed over "
+        f"{one.view.width_s:g} s, along body {', '.join('xyz'[axis] for axis in one.view.axes)}."
+        for one in found.results
+    ]
+    return words

@@ -23,7 +23,7 @@ STEPS = (
     "5. What could stand in its place",
     "6. What is left",
     "7. The evidence",
-    "8. What was written",
+    "What was written",
 )
 
 

@@ -1,8 +1,8 @@
 """What the report says of real flights."""
 
 from suite.common.report import html
+from suite.diagnose.report.page import views_page
 from suite.diagnose.report.views_json import views_json
-from suite.diagnose.report.views_page import views_page
 from tracks.common.files import plain
 
 
