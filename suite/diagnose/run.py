@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from suite.diagnose.report.charts import write_rollouts
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page, views_page
 from suite.diagnose.report.views_json import views_json
-from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.thresholds import THRESHOLDS
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
 
@@ -104,10 +104,14 @@ def diagnose_files(
         return found
 
     def by_views() -> dict[str, Any]:
-        told = [*warnings, *unused]
-        return noted(
-            diagnose_views(logs, before, vehicle, out, console, SCHEMA, seed, told, limits)
-        )
+        result = diagnose_by_views(logs, vehicle, before, console.note, seed, limits)
+        told = views_json(result)
+        told["warnings"] = [*warnings, *unused, *told["warnings"]]
+        found = {**plain(told), **stamp(SCHEMA, seed)}
+        toml = _vehicle_file(result.vehicle, vehicle, found, out)
+        write_report(out / "report.html", views_page(result, found, toml))
+        write_json(out / "diagnosis.json", found)
+        return noted(found)
 
     if before or only_views(logs, vehicle):
         return by_views()
@@ -126,24 +130,20 @@ def diagnose_files(
     told = found["disagreement"]["after" if result.search.named else "before"]
     if found["unexplained"]["where"] and told:
         found["unexplained"]["where"] += f"; most in {told}"
-    out.mkdir(parents=True, exist_ok=True)
     if plan or truth is not None:
-        folder, sigma = out / "plan", result.sigma
+        folder = out / "plan"
         found["plan"] = write_plan_of(found, folder)
         if truth is not None:
-            found["plan"] = fly_plan(found["plan"], sigma, vehicle, truth, folder, seed)
+            found["plan"] = fly_plan(found["plan"], result.sigma, vehicle, truth, folder, seed)
         found["warnings"] += found["plan"].pop("warnings", [])
     found = {**plain(found), **stamp(SCHEMA, seed)}
-    names = ", ".join(effect["name"] for effect in found["effects"]) or "nothing"
-    comment = f"{vehicle.name} with what suite diagnose named: {names}"
-    save_vehicle(result.vehicle, out / "vehicle.toml", comment)
+    toml = _vehicle_file(result.vehicle, vehicle, found, out)
     files = {"vehicle.toml", "diagnosis.json"}
     if recording:
         write_rollouts(out / "recording.rrd", result)
         files.add("recording.rrd")
     if found.get("plan", {}).get("flights"):
         files.add("plan/plan.json")
-    toml = (out / "vehicle.toml").read_text(encoding="utf-8")
     write_report(out / "report.html", page(result, found, checks, toml, files))
     return noted(found)
 
@@ -160,42 +160,10 @@ def only_views(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
     )
 
 
-def diagnose_views(
-    logs: Sequence[FlightLog],
-    references: Sequence[FlightLog],
-    vehicle: Vehicle,
-    out: Path,
-    console: Console,
-    schema: int,
-    seed: int,
-    warnings: Sequence[str] = (),
-    limits: Thresholds = THRESHOLDS,
-) -> dict[str, Any]:
-    """Diagnose `logs` by their views; write what was found and return what diagnosis.json holds.
-
-    Args:
-        logs: flights.
-        references: flights of the same vehicle before what changed; none for what is missing.
-        vehicle: what a simulation uses.
-        out: folder for the files.
-        console: told of the work as it goes.
-        schema: version of diagnosis.json.
-        seed: of all draws.
-        warnings: of the files.
-        limits: of every step.
-
-    Raises:
-        ValueError: for flights that cannot be used.
-    """
-    result = diagnose_by_views(logs, vehicle, references, console.note, seed, limits)
-    told = views_json(result)
-    told["warnings"] = [*warnings, *told["warnings"]]
-    found = {**plain(told), **stamp(schema, seed)}
-    out.mkdir(parents=True, exist_ok=True)
+def _vehicle_file(named: Vehicle, given: Vehicle, found: Mapping[str, Any], out: Path) -> str:
+    """Write the vehicle with what was `named` into the folder `out`, and return the file's text."""
     names = ", ".join(effect["name"] for effect in found["effects"]) or "nothing"
-    comment = f"{vehicle.name} with what suite diagnose named: {names}"
-    save_vehicle(result.vehicle, out / "vehicle.toml", comment)
-    toml = (out / "vehicle.toml").read_text(encoding="utf-8")
-    write_report(out / "report.html", views_page(result, found, toml))
-    write_json(out / "diagnosis.json", found)
-    return found
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / "vehicle.toml"
+    save_vehicle(named, path, f"{given.name} with what suite diagnose named: {names}")
+    return path.read_text(encoding="utf-8")
