@@ -127,9 +127,6 @@ def diagnose_files(
         checks = replace(checks, black_box=compared)
     found: dict[str, Any] = {**diagnosis_json(result), **checks_json(checks, seed)}
     found["warnings"] = [*warnings, *found["warnings"]]
-    told = found["disagreement"]["after" if result.search.named else "before"]
-    if found["unexplained"]["where"] and told:
-        found["unexplained"]["where"] += f"; most in {told}"
     if plan or truth is not None:
         folder = out / "plan"
         found["plan"] = write_plan_of(found, folder)

@@ -237,16 +237,6 @@ class Thresholds:
     """Fall of the log-likelihood at the ends of a 95 % interval (Wilks 1938)."""
     check_stride_s: float = 0.5
     """From one window to the next where more of them are wanted than the search has [s]."""
-    most_bins: int = 6
-    """Bins of a condition at most, as many as a chart can show."""
-    least_in_bin: int = 8
-    """Rollouts in a bin at least."""
-    thrust_mean_s: float = 0.5
-    """A rollout's thrust is the mean over this time [s]."""
-    beyond_noise: float = 4.0
-    """Standard errors by which the energy of errors is off where they are beyond noise."""
-    condition_p_value: float = 1e-3
-    """Chance below which errors are said to go with a condition."""
     slow_share: float = 0.6
     """Share of the windows, the slowest, that are fitted where the fast ones judge [1]."""
     least_judged: int = 6

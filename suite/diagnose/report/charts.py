@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 from eval.logs.flight_log import FlightLog
 from eval.view.comparison import Compared, Simulation, Track, write_comparison
-from suite.common.charts import plain_axes, png, titled
+from suite.common.charts import png, titled
 from suite.diagnose.checks.black_box import BlackBoxComparison
-from suite.diagnose.checks.disagreement import UNITS, Disagreement, binned, by_group
-from suite.diagnose.data.windows import LENGTH_S, STATE_GROUPS, FlightWindows, take
+from suite.diagnose.data.windows import LENGTH_S, SLICES, UNITS, FlightWindows, take
 from suite.diagnose.estimate.permutation import CandidateScore
+from suite.diagnose.search.look import rollouts_of
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap, true_starts
 from tracks.geometry.rotation import exp_rot, rot_to_quat
@@ -25,10 +25,6 @@ BEFORE, AFTER, WRONG, BOX = "#8b93a1", "#2463c9", "#e0892b", "#7a5cb8"
 FLOOR = "#1d2430"
 SHOWN = 14
 """Candidates in the chart."""
-HORIZON = 1
-"""Place among the horizons of what is drawn against conditions: 0.5 s."""
-CELLS = 7
-"""Places at which the drift is averaged."""
 
 
 def gains_chart(
@@ -57,53 +53,6 @@ def gains_chart(
     axes.set_xscale("symlog", linthresh=10.0)
     axes.set_xlim(left=0.0)
     titled(axes, "Fall of the squared error on stretches left out [noise variances]")
-    return png(figure)
-
-
-def disagreement_chart(found: Disagreement) -> bytes:
-    """Return errors of 0.5 s rollouts over their noise floor, against what was flown."""
-    figure = Figure(figsize=(11.0, 7.4), layout="constrained")
-    # Three channels each; what no log measured has nothing to show.
-    each = found.before[HORIZON].reshape(-1, len(STATE_GROUPS), 3)
-    shown = np.flatnonzero(np.isfinite(each).any(axis=(0, 2)))
-    grid = figure.subplots(len(shown), len(UNITS), sharey="row", squeeze=False)
-    for column, (condition, unit) in enumerate(UNITS.items()):
-        edges = found.edges[condition]
-        middle = 0.5 * (edges[1:] + edges[:-1])
-        for label, colour, over in _before_after(found.before, found.after):
-            rows = by_group(binned(found, over, condition)[0][HORIZON])
-            for axes, line in zip(grid[:, column], rows.T[shown], strict=True):
-                axes.plot(middle, line, "o-", ms=3.5, lw=1.5, color=colour, label=label)
-        grid[-1][column].set_xlabel(f"{condition} [{unit}]", fontsize=9)
-    for row, group in enumerate(STATE_GROUPS[k] for k in shown):
-        for axes in grid[row]:
-            axes.axhline(1.0, color=FLOOR, lw=0.8, ls=":")
-            axes.set_yscale("log")
-            _few_ticks(axes)
-            plain_axes(axes)
-        grid[row][0].set_ylabel(f"{group}\nerror / noise floor", fontsize=9)
-    _legend_above(figure, grid[0][0])
-    return png(figure)
-
-
-def drift_chart(found: Disagreement) -> bytes:
-    """Return what acceleration the model lacks against velocity, and its turn against rates."""
-    figure = Figure(figsize=(11.0, 5.2), layout="constrained")
-    grid = figure.subplots(2, 3)
-    series = _before_after(found.drift_before, found.drift_after)
-    small = {"loc": "left", "fontsize": 9}
-    for axis, name in enumerate("xyz"):
-        for row, (state, scale) in enumerate(((found.vel_b, 1.0), (found.rate_b, 180.0 / np.pi))):
-            axes = grid[row][axis]
-            for label, colour, drift in series:
-                _binned_means(axes, state[:, axis], scale * drift[:, 3 * row + axis], colour, label)
-            axes.axhline(0.0, color=FLOOR, lw=0.8, ls=":")
-            plain_axes(axes)
-        grid[0][axis].set_title(f"lacking acceleration along body {name} [m/s²]", **small)
-        grid[0][axis].set_xlabel(f"velocity along body {name} [m/s]", fontsize=8)
-        grid[1][axis].set_title(f"lacking turn about body {name} in 0.5 s [deg]", **small)
-        grid[1][axis].set_xlabel(f"rate about body {name} [rad/s]", fontsize=8)
-    _legend_above(figure, grid[0][0])
     return png(figure)
 
 
@@ -152,15 +101,6 @@ def labelled_gaps(side: BlackBoxComparison) -> list[tuple[str, Gap | None]]:
     ]
 
 
-def _before_after(before: np.ndarray, after: np.ndarray) -> list[tuple[str, str, np.ndarray]]:
-    return [("as given", BEFORE, before), ("with what was named", AFTER, after)]
-
-
-def _legend_above(figure: Figure, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False, fontsize=9)
-
-
 def _gap_bars(axes: Axes, rows: Sequence[tuple[str, Gap, str]], seed: int) -> None:
     """Draw gaps (label, gap, colour) with their 95 % intervals, from top to bottom."""
     for place, (_, gap, colour) in enumerate(rows[::-1]):
@@ -173,23 +113,6 @@ def _gap_bars(axes: Axes, rows: Sequence[tuple[str, Gap, str]], seed: int) -> No
     axes.set_xscale("log")
     axes.set_xlim(0.8, 1.25 * max(1.5, *(gap.ci95(seed)[1] for _, gap, _ in rows)))
     _few_ticks(axes, "x")
-
-
-def _binned_means(
-    axes: Axes, state: np.ndarray, drift: np.ndarray, colour: str, label: str
-) -> None:
-    good = np.isfinite(drift)
-    state, drift = state[good], drift[good]
-    if not len(state):
-        return
-    axes.plot(state, drift, ".", ms=2.5, color=colour, alpha=0.3)
-    edges = np.unique(np.quantile(state, np.linspace(0.0, 1.0, CELLS + 1)))
-    place = np.clip(np.searchsorted(edges, state, side="right") - 1, 0, max(len(edges) - 2, 0))
-    rows = [place == b for b in np.unique(place)]
-    middle = [state[row].mean() for row in rows]
-    mean = [drift[row].mean() for row in rows]
-    error = [1.96 * drift[row].std() / np.sqrt(row.sum()) for row in rows]
-    axes.errorbar(middle, mean, error, fmt="o-", ms=4, lw=1.5, color=colour, label=label)
 
 
 def _few_ticks(axes: Axes, which: str = "y") -> None:
@@ -209,25 +132,78 @@ MOST = 4
 """Held-out flights in a recording."""
 
 
+def held_out_rollouts(diagnosis: Diagnosis) -> tuple[FlightWindows, dict[str, np.ndarray]]:
+    """Return windows of 1 s over what was held out, and measured - simulated (W, N, 19) in them.
+
+    As given and, where something was named, with it, by what it is called.
+    """
+    model, windows, held = diagnosis.model, diagnosis.cut(LENGTH_S), diagnosis.held_windows
+    chosen = np.isin(windows.flight, np.unique(held.flight)[:MOST])
+    chosen &= np.asarray(windows.start_s) >= _first_s(diagnosis) - 1e-6
+    windows = take(windows, chosen)
+    series = {"simulated as given": diagnosis.start}
+    if diagnosis.fitted is not None:
+        series["simulated with what was named"] = diagnosis.fitted
+    return windows, {
+        label: model.residual(theta, true_starts(model, theta, windows), windows)
+        for label, theta in series.items()
+    }
+
+
+def _first_s(diagnosis: Diagnosis) -> float:
+    """Return from when on a flight was held out [s]."""
+    fitted, held = rollouts_of(diagnosis.search.last).windows, diagnosis.held_windows
+    lone = bool(np.isin(held.flight, fitted.flight).any())
+    return float(np.min(held.start_s)) if lone else 0.0
+
+
+def held_out_chart(
+    windows: FlightWindows, simulated: Mapping[str, np.ndarray], sigma: np.ndarray
+) -> bytes:
+    """Return a held-out flight as measured and as simulated, where the model misses most.
+
+    Args:
+        windows: from `held_out_rollouts`, and `simulated`.
+        simulated: measured - simulated by label.
+        sigma: (19,) noise of the channels.
+    """
+    measured = {
+        "position": windows.row_pos_w, "velocity": windows.row_vel_w, "rates": windows.row_rate_b
+    }  # fmt: skip
+    of = np.asarray(windows.flight) == windows.flight[0]
+    seen = np.asarray(windows.seen)[of]
+    first = next(iter(simulated.values()))[of]
+
+    def missed(group: str, axis: int) -> float:
+        at = SLICES[group].start + axis
+        there = seen[..., at] & np.isfinite(first[..., at])
+        return float(np.sqrt((first[..., at][there] ** 2).mean()) / sigma[at]) if there.any() else 0
+
+    group, axis = max(((g, k) for g in measured for k in range(3)), key=lambda one: missed(*one))
+    at = SLICES[group].start + axis
+    time_s = (np.asarray(windows.start_s)[:, None] + np.asarray(windows.row_s))[of]
+    value = np.where(seen[..., at], np.asarray(measured[group])[of][..., axis], np.nan)
+    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(time_s.ravel(), value.ravel(), color=FLOOR, lw=1.6, label="measured")
+    for (label, residual), colour in zip(simulated.items(), (BEFORE, AFTER), strict=False):
+        for row, line in enumerate(value - residual[of][..., at]):
+            axes.plot(time_s[row], line, color=colour, lw=1.4, label="" if row else label)
+    axes.set_xlabel("time [s]", fontsize=8)
+    axes.legend(fontsize=8, frameon=False, ncols=3)
+    frame = "body" if group == "rates" else "world"
+    titled(axes, f"{group.capitalize()} along {frame} {'xyz'[axis]} [{UNITS[group]}]")
+    return png(figure)
+
+
 def write_rollouts(path: Path, diagnosis: Diagnosis) -> Path:
     """Write rollouts of 1 s over what was held out, as given and with what was named, as `.rrd`.
 
     Raises:
         OSError: where the file cannot be written; nothing is left under its name.
     """
-    model, windows, held = diagnosis.model, diagnosis.cut(LENGTH_S), diagnosis.held_windows
-    first_s = float(np.min(held.start_s)) if len(np.unique(windows.flight)) == 1 else 0.0
-    chosen = np.isin(windows.flight, np.unique(held.flight)[:MOST])
-    chosen &= np.asarray(windows.start_s) >= first_s - 1e-6
-    windows = take(windows, chosen)
-    series = [("simulated as given", diagnosis.start)]
-    if diagnosis.fitted is not None:
-        series.append(("simulated with what was named", diagnosis.fitted))
-    simulated = {
-        label: model.residual(theta, true_starts(model, theta, windows), windows)
-        for label, theta in series
-    }
-    flights = []
+    windows, simulated = held_out_rollouts(diagnosis)
+    first_s, flights = _first_s(diagnosis), []
     for number in np.unique(windows.flight):
         rows = np.flatnonzero(windows.flight == number)
         simulations = []

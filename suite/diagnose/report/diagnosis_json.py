@@ -9,7 +9,6 @@ import numpy as np
 
 from suite.diagnose.checks.black_box import BlackBoxComparison
 from suite.diagnose.checks.checks import Checks, Kinematics
-from suite.diagnose.checks.disagreement import UNITS, Disagreement, binned, by_group, in_words
 from suite.diagnose.data.windows import STATE_GROUPS
 from suite.diagnose.plans.plan import advice
 from suite.diagnose.report.parameters_json import parameters_json, short_name
@@ -17,15 +16,13 @@ from suite.diagnose.search.look import NamedEffect
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.disturbances import Turbulence
-from suite.diagnose.verdict.gap import HEADLINE_S, HORIZONS_S, MEASURE, Gap
+from suite.diagnose.verdict.gap import HEADLINE_S, MEASURE, Gap
 
 SHOWN = 5
 """Shapes of the residual that are listed."""
 SIZES = ("force", "torque", "drift")
 """Of an effect: mean acceleration over half a second [m/s^2], angular acceleration [rad/s^2] and
 distance after a second [m], as RMS over the flights."""
-DIGITS = 4
-"""Of the errors by condition, which are many."""
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -86,15 +83,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 def checks_json(checks: Checks, seed: int) -> dict[str, Any]:
     """Return the entries that `checks` add to diagnosis.json; `seed` is of the intervals' draws."""
-    found, black_box = checks.disagreement, checks.black_box
+    black_box = checks.black_box
     return {
         "kinematics": checks.kinematics and _kinematics(checks.kinematics),
-        "disagreement": {
-            "before": in_words(found, found.before),
-            "after": in_words(found, found.after),
-            "unit": "RMS error over its noise floor",
-            "by": {name: _by_condition(found, name) for name in UNITS},
-        },
         "actuators": [{**one._asdict(), "followed": one.followed} for one in checks.actuators],
         "black_box": black_box
         and {
@@ -187,26 +178,6 @@ def _kinematics(found: Kinematics) -> dict[str, Any]:
         },
         "velocity_over_path": found.velocity_scale,
     }
-
-
-def _by_condition(found: Disagreement, condition: str) -> dict[str, Any]:
-    series = {"before": found.before, "after": found.after}
-    tables = {name: binned(found, over, condition) for name, over in series.items()}
-    by_horizon = {
-        name: {
-            f"{horizon:g} s": {
-                group: _short(by_group(table[h])[:, g]) for g, group in enumerate(STATE_GROUPS)
-            }
-            for h, horizon in enumerate(HORIZONS_S)
-        }
-        for name, (table, _) in tables.items()
-    }
-    edges = _short(found.edges[condition])
-    return {"edges": edges, "rollouts": tables["before"][1], **by_horizon}
-
-
-def _short(values: np.ndarray) -> list[float | None]:
-    return [float(f"{v:.{DIGITS}g}") if np.isfinite(v) else None for v in values]
 
 
 def _comparison(found: BlackBoxComparison, seed: int) -> dict[str, Any]:

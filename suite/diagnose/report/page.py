@@ -19,9 +19,9 @@ from suite.diagnose.report.charts import (
     AFTER,
     BEFORE,
     FLOOR,
-    disagreement_chart,
-    drift_chart,
     gains_chart,
+    held_out_chart,
+    held_out_rollouts,
 )
 from suite.diagnose.report.parameters_json import cells, components, grid, short_name, size_words
 from suite.diagnose.report.sections import (
@@ -81,10 +81,10 @@ def page(
         "driven by": found["driven_by"],
     }
     sections = [
-        Section("The answer", _answer(found, TOTALS)),
+        Section("What was measured, and what the model says", _held_out(diagnosis, found)),
+        Section("The answer in numbers", _answer(found, TOTALS)),
         logs_section(diagnosis, checks),
         noise_section(diagnosis),
-        _disagreement(found, checks),
         *actuators_section(checks, diagnosis.input_source),
         _candidates(diagnosis),
         _identity(diagnosis, found),
@@ -195,7 +195,8 @@ LEAST_FLOOR = 1e-9
 """A noise floor below this is that of what no log measured, in any unit."""
 
 
-def _disagreement(found: Mapping[str, Any], checks: Checks) -> Section:
+def _held_out(diagnosis: Diagnosis, found: Mapping[str, Any]) -> list[Part]:
+    """Return measured, simulated, and simulated with what was named, as picture and numbers."""
     rows = []
     for horizon, groups in found["gap"]["channels"].items():
         for group, values in groups.items():
@@ -208,36 +209,17 @@ def _disagreement(found: Mapping[str, Any], checks: Checks) -> Section:
                 row.append(Cell(f"{values[key]:.4g}", tone))
             rows.append([*row, *cells(f"{floor:.4g}")])
     headers = ["rollout of", "RMS error", "as given", "with what was named", "noise floor"]
-    told = found["disagreement"]
-    words = [
-        "Rollouts start from measured states; the noise floor is what the noise of the start and "
-        "of the row compared would make of a perfect model."
-    ]
-    if told["before"]:
-        words.append(f"As given, errors stand out most in {told['before']}.")
-    else:
-        words.append("As given, no error stands out from the noise.")
-    if told["after"]:
-        words.append(f"With what was named, most in {told['after']}.")
-    return Section(
-        "3. Where they disagree",
-        [
-            *words,
-            Picture(disagreement_chart(checks.disagreement), ERRORS),
-            Picture(drift_chart(checks.disagreement), DRIFT),
-            Grid("On held-out flights", headers, rows),
-        ],
-    )
+    picture = held_out_chart(*held_out_rollouts(diagnosis), diagnosis.sigma)
+    return [Picture(picture, HELD_OUT), Grid("On held-out flights", headers, rows, note=FROM)]
 
 
-ERRORS = (
-    "Errors of rollouts of 0.5 s over their noise floor, all flights, against what was flown at "
-    "their starts. A line that stays at the dotted one is noise; one that rises says with what the "
-    "disagreement grows."
+HELD_OUT = (
+    "A flight that took no part in finding or fitting anything, in rollouts of a second from "
+    "measured states, along the axis where the model misses most."
 )
-DRIFT = (
-    "Measured minus simulated in the body axes of the start: the mean acceleration over 0.5 s that "
-    "the model lacks, and the turn that it lacks. Dots are rollouts; lines are means with 95 %."
+FROM = (
+    "Rollouts start from measured states; the noise floor is what the noise of the start and of "
+    "the row compared would make of a perfect model."
 )
 
 
@@ -262,7 +244,7 @@ def _candidates(diagnosis: Diagnosis) -> Section:
     )
     head = f"{'effect':32}{'gain':>12}{'p':>8}"
     return Section(
-        "4. The candidates",
+        "3. The candidates",
         [
             words,
             Picture(gains_chart(scores, chance, named), "The best fourteen; blue were named."),
@@ -291,7 +273,7 @@ def _identity(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
         parts.append("No other name explains the same flights as well.")
     if found["separate_with"]:
         parts.append("suite diagnose --plan writes such flights as commanded trajectories.")
-    return Section("5. What could stand in its place", parts)
+    return Section("4. What could stand in its place", parts)
 
 
 def _written(found: Mapping[str, Any], toml: str, files: set[str]) -> Section:

@@ -168,7 +168,7 @@ def residual_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
         rows = [(axis, f"{p:.2g}") for axis, p in residual.coloured.items()]
         note = "How often noise alone has as much energy in a smooth push along the axis."
         parts.append(grid("A push that no shape follows", ["axis", "p"], rows, note))
-    return Section("6. What is left", parts)
+    return Section("5. What is left", parts)
 
 
 def held_out_section(diagnosis: Diagnosis, found: Mapping[str, Any], checks: Checks) -> Section:
@@ -206,7 +206,7 @@ def held_out_section(diagnosis: Diagnosis, found: Mapping[str, Any], checks: Che
         parts += [_comparison(side, seed) for side in sides]
         if checks.black_box.outside is None:
             parts.append("There are too few stretches to fit slow ones and judge fast ones.")
-    return Section("7. The evidence", parts)
+    return Section("6. The evidence", parts)
 
 
 def _comparison(side: BlackBoxComparison, seed: int) -> Grid:

@@ -18,12 +18,10 @@ from tests.support.vehicles import PLAIN, with_effects
 STEPS = (
     "1. The logs and their faults",
     "2. The measurement noise",
-    "3. Where they disagree",
-    "4. The candidates",
-    "5. What could stand in its place",
-    "6. What is left",
-    "7. The evidence",
-    "What was written",
+    "3. The candidates",
+    "4. What could stand in its place",
+    "5. What is left",
+    "6. The evidence",
 )
 
 
@@ -46,7 +44,7 @@ def test_every_step_is_in_the_report(written):
     heads = re.findall(r"<h2>(.*?)</h2>", text)
     assert [head for head in heads if head[0].isdigit()] == list(STEPS)
     assert "Actuators, apart from the air" in heads
-    assert text.count("data:image/png;base64,") >= 4
+    assert text.count("data:image/png;base64,") >= 3
     assert "<script" not in text and not re.search(r'(src|href)="https?:', text)
     for link in re.findall(r'href="([^"]+)"', text):
         assert (written / link).is_file()
@@ -55,13 +53,6 @@ def test_every_step_is_in_the_report(written):
 def test_the_numbers_beside_the_names_are_in_the_json(written):
     found = json.loads((written / "diagnosis.json").read_text(encoding="utf-8"))
     assert found["seed"] == 3 and found["black_box"] is None
-    assert "velocity" in found["disagreement"]["before"]
-    by_speed = found["disagreement"]["by"]["speed"]
-    assert by_speed["edges"] == sorted(by_speed["edges"])
-    rollouts = sum(by_speed["rollouts"])
-    assert rollouts > 20
-    before, after = (by_speed[key]["0.5 s"]["velocity"] for key in ("before", "after"))
-    assert max(after) < 1.5 and before[-1] > 2.0 and before[-1] >= before[0]
     assert found["actuators"][0]["followed"] > 0.9
     assert abs(found["kinematics"]["gyro_bias"]["value"][0]) < 0.01
     effect = found["effects"][0]

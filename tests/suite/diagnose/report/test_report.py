@@ -4,22 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from suite.common.report import html
 from suite.diagnose.checks.black_box import BlackBoxComparison, BlackBoxComparisons
-from suite.diagnose.checks.disagreement import by_group
 from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.report import charts
 from suite.diagnose.report.charts import (
     black_box_chart,
-    disagreement_chart,
-    drift_chart,
     gains_chart,
+    held_out_chart,
+    held_out_rollouts,
     write_rollouts,
 )
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
-from suite.diagnose.report.page import _disagreement, page
+from suite.diagnose.report.page import _held_out, page
 from suite.diagnose.report.parameters_json import (
     UNSEEN,
     cells,
@@ -107,14 +105,6 @@ def test_a_weak_motor_says_which_and_how_surely():
     assert labels == ["scale 2 [1]", "scale 4 [1]"]
 
 
-def test_groups_leave_out_what_was_not_measured():
-    table = np.ones((2, 12))
-    table[0, :3] = [3.0, np.nan, 1.0]
-    table[1, 9:] = np.nan
-    rms = by_group(table)
-    assert rms[0, 0] == pytest.approx(np.sqrt(5.0)) and np.isnan(rms[1, 3])
-
-
 def test_sections_show_the_numbers(drag, drag_checks, found):
     logs = logs_section(drag, drag_checks)
     assert isinstance(logs.parts[0], Grid) and len(logs.parts[0].rows) == 3
@@ -131,42 +121,25 @@ def test_sections_show_the_numbers(drag, drag_checks, found):
     assert texts(tables[0])[-1][0] == "with what was named" and len(tables) == 2
 
 
-def test_what_no_log_measured_is_neither_in_the_table_nor_in_the_picture(
-    drag, drag_checks, found, monkeypatch
-):
+def test_what_no_log_measured_is_not_in_the_table(drag, found):
     gap = {horizon: {**groups, "velocity": {"before": 0.0, "after": 0.0, "noise_floor": 1e-12}}
            for horizon, groups in found["gap"]["channels"].items()}  # fmt: skip
     lacks = {**found, "gap": {**found["gap"], "channels": gap}}
-    (table,) = [g for g in _disagreement(lacks, drag_checks).parts if isinstance(g, Grid)]
+    (table,) = [part for part in _held_out(drag, lacks) if isinstance(part, Grid)]
     assert not any("velocity" in row[1] for row in texts(table)) and len(table.rows) > 3
-    rows = []
-    subplots = Figure.subplots
-
-    def counted(self, count=1, *args, **options):
-        rows.append(count)
-        return subplots(self, count, *args, **options)
-
-    monkeypatch.setattr(Figure, "subplots", counted)
-    monkeypatch.setattr(charts, "png", lambda figure: b"")
-    before, after = (x.copy() for x in (drag_checks.disagreement.before,
-                                        drag_checks.disagreement.after))  # fmt: skip
-    before[..., 6:9] = after[..., 6:9] = np.nan
-    disagreement_chart(drag_checks.disagreement._replace(before=before, after=after))
-    disagreement_chart(drag_checks.disagreement)
-    assert rows == [3, 4]
 
 
-def test_charts_are_pictures(drag, drag_checks, monkeypatch):
-    over, scores = drag_checks.disagreement, drag.search.first
+def test_charts_are_pictures(drag, monkeypatch):
+    scores = drag.search.first
     assert gains_chart(scores, None, set()) != gains_chart(scores, 5.0, {"linear_drag"})
-    for chart in (disagreement_chart, drift_chart):
-        assert chart(over).startswith(PNG)
     assert black_box_chart([compared(drag).held_out], 0).startswith(PNG)
-    drawn = lambda figure: str([line.get_ydata() for line in figure.axes[0].lines])  # noqa: E731
+    windows, simulated = held_out_rollouts(drag)
+    assert held_out_chart(windows, simulated, drag.sigma).startswith(PNG)
+    drawn = lambda figure: figure.axes[0]  # noqa: E731
     monkeypatch.setattr(charts, "png", drawn)
-    bare = over._replace(after=over.before, drift_after=over.drift_before)
-    for chart in (disagreement_chart, drift_chart):
-        assert chart(bare) != chart(over), "what was named has a line of its own"
+    axes = held_out_chart(windows, simulated, drag.sigma)
+    labels = [line.get_label() for line in axes.lines if not line.get_label().startswith("_")]
+    assert labels == ["measured", *simulated] and len(simulated) == 2
 
 
 def test_the_page_stands_alone(drag, drag_checks, found):

@@ -184,5 +184,3 @@ def test_checks_know_the_logs_and_their_motors(drag, drag_checks):
     assert isinstance(drag_checks, checks.Checks) and drag_checks.black_box is None
     assert [fact.name for fact in drag_checks.facts] == [log.name for log in drag.logs]
     assert drag_checks.actuators[0].followed > 0.9
-    over = drag_checks.disagreement
-    assert np.nanmean(over.after**2) < np.nanmean(over.before**2)
