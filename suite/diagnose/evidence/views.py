@@ -63,6 +63,11 @@ class ViewEvidence(Evidence):
         return self.model.space
 
     @property
+    def repeatability(self) -> np.ndarray:
+        """(3,) how flights' means differ among themselves; infinite where too few tell it."""
+        return np.full(3, np.inf) if self.weights is None else self.weights.trim
+
+    @property
     def start(self) -> Estimate:
         """The vehicle file's numbers."""
         return self.at(self.space.array("start"))

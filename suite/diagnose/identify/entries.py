@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.identify import force
 from suite.diagnose.identify.drive import MotorGuess
 from suite.diagnose.identify.fit import Fitted
-from suite.diagnose.identify.numbers import DELAY, Number, number
+from suite.diagnose.identify.numbers import DELAY, Derived, Number, number
 from suite.diagnose.identify.torque import inertia_ratio
 
 
@@ -36,66 +35,43 @@ def motors_of(guess: MotorGuess, numbers: Mapping[str, float], volts: float) -> 
     return np.array([size * first, size * second, shape.battery])
 
 
+class _Entries(list[Number]):
+    """Entries of a vehicle file from one fit."""
+
+    def __init__(self, fitted: Fitted) -> None:
+        super().__init__()
+        self.fitted, self.names = fitted, {unknown.name for unknown in fitted.unknowns}
+
+    def add(self, key: str, unit: str, derived: Derived, *needs: str, room: float = np.inf) -> None:
+        """Add an entry whose components need these numbers of the fit."""
+        self.append(number(key, unit, self.fitted, derived, [(name,) for name in needs], room))
+
+
 def of_force(vehicle: Vehicle, drive: str, guess: MotorGuess, fitted: Fitted) -> list[Number]:
     """Return the entries that the force tells: motors or rotors, and drag."""
-    entries = []
-    names = [unknown.name for unknown in fitted.unknowns]
-    if "thrust" in names and drive == "pwm":
+    entries = _Entries(fitted)
+    if "thrust" in entries.names and drive == "pwm":
         assert vehicle.motors is not None
         volts = vehicle.motors.voltage
-        entries.append(
-            number(
-                "motors.thrust",
-                "N",
-                fitted,
-                lambda n: motors_of(guess, n, volts)[:2],
-                [("thrust",)] * 2,
-            )
-        )
-        entries.append(
-            number(
-                "motors.voltage_exponent",
-                "1",
-                fitted,
-                lambda n: motors_of(guess, n, volts)[2:],
-                [("battery",)],
-            )
-        )
-    elif "thrust" in names and drive == "rotors":
-        start = vehicle.rotors.thrust_coefficient
-        entries.append(
-            number(
-                "rotors.thrust_coefficient",
-                "N/(rad/s)^2",
-                fitted,
-                lambda n: np.array([start * np.exp(n["thrust"])]),
-                [("thrust",)],
-            )
-        )
-    elif "thrust" in names:
-        entries.append(
-            number(
-                "effects.thrust_scale.scale",
-                "1",
-                fitted,
-                lambda n: np.array([np.exp(n["thrust"])]),
-                [("thrust",)],
-            )
-        )
-    if "drag_z" in names:
+        thrust = ("thrust", "thrust")
+        entries.add("motors.thrust", "N", lambda n: motors_of(guess, n, volts)[:2], *thrust)
+        exponent = "motors.voltage_exponent"
+        entries.add(exponent, "1", lambda n: motors_of(guess, n, volts)[2:], "battery")
+    elif "thrust" in entries.names:
+        key, unit, start = "effects.thrust_scale.scale", "1", 1.0
+        if drive == "rotors":
+            key, unit = "rotors.thrust_coefficient", "N/(rad/s)^2"
+            start = vehicle.rotors.thrust_coefficient
+        entries.add(key, unit, lambda n: np.array([start * np.exp(n["thrust"])]), "thrust")
+    if "drag_z" in entries.names:
         drag = vehicle.effects.get("linear_drag")
         begun = (0.0, 0.0, 0.0) if drag is None else drag.coefficient
-        entries.append(
-            number(
-                "effects.linear_drag.coefficient",
-                "1/s",
-                fitted,
-                lambda n: np.array(
-                    [n.get(f"drag_{axis}", have) for axis, have in zip("xyz", begun, strict=True)]
-                ),
-                [(f"drag_{axis}",) for axis in "xyz"],
-            )
-        )
+        axes = [f"drag_{axis}" for axis in "xyz"]
+
+        def drags(n: Mapping[str, float]) -> np.ndarray:
+            return np.array([n.get(name, have) for name, have in zip(axes, begun, strict=True)])
+
+        entries.add("effects.linear_drag.coefficient", "1/s", drags, *axes)
     return entries
 
 
@@ -111,67 +87,40 @@ def of_torque(
         scale: logarithm of the thrust's scale, by the force.
         lag_s: of the rotors, where the fit has none [s].
     """
-    entries = []
-    names = [unknown.name for unknown in fitted.unknowns]
-    if "inertia_x" in names:
-        entries.append(
-            number(
-                "inertia",
-                "kg m^2",
-                fitted,
-                lambda n: inertia_of(vehicle, n),
-                [("inertia_x",), ("inertia_y",), ("inertia_z",)],
-            )
-        )
-    if "yaw" in names:
+    entries = _Entries(fitted)
+    inertias = ("inertia_x", "inertia_y", "inertia_z")
+    if "inertia_x" in entries.names:
+        entries.add("inertia", "kg m^2", lambda n: inertia_of(vehicle, n), *inertias)
+    if "yaw" in entries.names:
         # Torque per inertia is what is seen. The inertia about z is as far as it was told; what
         # stays is given, and no doubt of this number.
         start = vehicle.rotors.torque_coefficient
-        axes = [name for name in ("inertia_x", "inertia_y", "inertia_z") if fitted.has(name)]
+        axes = [name for name in inertias if fitted.has(name)]
 
-        def twist(n: Any) -> np.ndarray:
+        def twist(n: Mapping[str, float]) -> np.ndarray:
             inertia = inertia_ratio({name: n[name] for name in axes})[2]
             scaled = scale if drive == "rotors" else 0.0
             return np.array([start * np.exp(n["yaw"] + scaled + inertia)])
 
-        entries.append(
-            number("rotors.torque_coefficient", "N m/(rad/s)^2", fitted, twist, [("yaw",)])
-        )
+        entries.add("rotors.torque_coefficient", "N m/(rad/s)^2", twist, "yaw")
     return [*entries, *of_loop(vehicle, fitted, lag_s)]
 
 
 def of_loop(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
     """Return the entries of lag, delay and rate gains, as far as the fit has them."""
-    entries = []
-    names = [unknown.name for unknown in fitted.unknowns]
-    if "lag" in names:
-        entries.append(
-            number("rotors.time_constant", "s", fitted, lambda n: np.array([n["lag"]]), [("lag",)])
-        )
-    if "late" in names:
-        entries.append(
-            number(
-                DELAY,
-                "s",
-                fitted,
-                lambda n: np.array([n["late"] - n.get("lag", lag_s)]),
-                [("late",)],
-                # With a lag in doubt it is as much in doubt, however well their sum is told: the
-                # file keeps the sum.
-                fitted.unknowns[fitted.index("late")].room,
-            )
-        )
-    if "gain_x" in names:
-        gain = np.asarray(vehicle.controller.rate_gain)
-        entries.append(
-            number(
-                "controller.rate_gain",
-                "1/s",
-                fitted,
-                lambda n: gain * np.exp([n[f"gain_{axis}"] for axis in "xyz"]),
-                [(f"gain_{axis}",) for axis in "xyz"],
-            )
-        )
+    entries = _Entries(fitted)
+    if "lag" in entries.names:
+        entries.add("rotors.time_constant", "s", lambda n: np.array([n["lag"]]), "lag")
+    if "late" in entries.names:
+        # With a lag in doubt it is as much in doubt, however well their sum is told: the file keeps
+        # the sum.
+        room = fitted.unknowns[fitted.index("late")].room
+        late = lambda n: np.array([n["late"] - n.get("lag", lag_s)])  # noqa: E731
+        entries.add(DELAY, "s", late, "late", room=room)
+    if "gain_x" in entries.names:
+        gain, names = np.asarray(vehicle.controller.rate_gain), [f"gain_{axis}" for axis in "xyz"]
+        gains = lambda n: gain * np.exp([n[name] for name in names])  # noqa: E731
+        entries.add("controller.rate_gain", "1/s", gains, *names)
     return entries
 
 

@@ -101,6 +101,11 @@ class ChangeEvidence(ViewEvidence):
     spread: RotorSpread | None = None
 
     @property
+    def repeatability(self) -> np.ndarray:
+        """(3,) how flights' means differ, without that doubt."""
+        return np.full(3, np.inf) if self.sure is None else self.sure.trim
+
+    @property
     def name_p_value(self) -> float:
         """Chance of a false name of a change."""
         return self.limits.change_p_value

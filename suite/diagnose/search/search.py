@@ -148,9 +148,10 @@ def _next_name(
     explained = total - chi2_fall(begin.equations, theta, space, beside) - least
     slack = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     alike = [one for one in tried if one[0] - least <= slack]
-    cost, best, (one, at) = min(alike, key=lambda t: (*judge.order(t[2][1], t[1]), t[0]))
-    if one.p_value > evidence.name_p_value:
+    sure = [one for one in alike if one[2][0].p_value <= evidence.name_p_value]
+    if not sure:
         return None
+    cost, best, (one, at) = min(sure, key=lambda t: (*judge.order(t[2][1], t[1]), t[0]))
     rivals = dict.fromkeys(c.name for _, c, _ in alike if c.name != best.name)
     worse_by = {c.label: other - cost for other, c, _ in tried if c != best}
     return replace(one, rivals=tuple(rivals), worse_by=worse_by), at

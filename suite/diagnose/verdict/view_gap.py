@@ -46,9 +46,9 @@ def judge(found: SearchResult, held: ViewEvidence, floor: np.ndarray) -> ViewGap
     """Return what `found` is worth on the flights of `held`; `floor` (3,) is the noise's."""
     before, after = held.left(found.start.theta), held.left(found.estimate.theta)
     evidence = found.last.evidence
-    assert isinstance(evidence, ViewEvidence) and evidence.weights
+    assert isinstance(evidence, ViewEvidence)
     if held.means:
-        return _judge_change(before, after, floor, evidence.weights.trim)
+        return _judge_change(before, after, floor, evidence.repeatability)
     start, fitted = evidence.left(found.start.theta), evidence.left(found.estimate.theta)
     inside = np.concatenate([inputs_of(flight) for flight in evidence.flights])
     outside = np.concatenate([inputs_of(flight) for flight in held.flights])
@@ -68,7 +68,7 @@ def judge(found: SearchResult, held: ViewEvidence, floor: np.ndarray) -> ViewGap
         before=_rms(before.residual),
         after=_rms(after.residual),
         floor=floor,
-        repeatability=_finite(evidence.weights.trim),
+        repeatability=_finite(evidence.repeatability),
         closed=closed,
         explainable=np.maximum(explainable, closed),
         left=both - closed,
