@@ -1,4 +1,11 @@
-"""The named effect beside a black box: on flights left out, and outside the speeds of the fit."""
+"""The named effect beside a black box: on flights left out, and outside the speeds of the fit.
+
+The black box is the Delta Action Model in the quadrotor that is diagnosed. The paper's network (Su
+et al. 2026, Sec. III-D) takes velocity in body axes, attitude and the net acceleration that the
+command asks for. Its output is added to the body's acceleration, as in the point mass; three more
+outputs turn the body, since these commands hold body rates besides. It is fitted by gradients
+through the rollouts of the windows, to the same errors by which names are judged.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""Flights made ready for the views: completed, smoothed, parted into fitted and held-out ones."""
+"""Flights made ready for the views: completed, smoothed, parted into fitted and held-out ones.
+
+What a partial log lacks comes from what it has: rates are those of the attitude, and where that is
+lacking as well, thrust is along body z and in slow flight nearly all of the force besides gravity,
+so that the body's z axis is that of the path's acceleration less gravity (differential flatness;
+Mellinger and Kumar 2011). The yaw is taken for none then. A force across the thrust cannot be told,
+and rates only as means over a second.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,12 @@
-"""Signals that are logged at rates of their own, in rows that merge them.
+"""Signals that are logged at rates of their own, in rows that merge them, and the model's steps.
 
 A log's rows are the times of all its signals together: of the signals that are slower, most rows
 have no value. Each signal counts on its own rows. Where a value is needed on another row it lies on
 a line between two of its own, but not across a hole; what is commanded is held.
+
+A row's command acts from its stamp on and the rate loop starts its period there, so every step of
+the model lies between two rows. Between them the loop looks about as often as the vehicle's own
+does, or every `LONGEST_S` where that is rarer, and carries the rates on by what that leaves out.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""A flight as rows of what acts and what moves; force and torque, what each compares of them."""
+"""A flight as rows of what acts and what moves; force and torque, what each compares of them.
+
+Velocities and models are weighed by the same smooth bumps. Over a bump w(t) that is zero at both
+ends, the mean of an acceleration is -integral(w' v) over integral(w): what was measured is never
+differentiated (modulating functions; Shinbrot 1957, Trans. ASME 79).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What drove a flight, as thrusts, forces and torques on its grid."""
+"""What drove a flight, as thrusts, forces and torques on its grid, and the vehicle of the start.
+
+Effects of the start that are another word for its numbers are in them.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """What moving air turns: the coefficient of blade flapping, by the torque view.
 
 Inertia and lags are told by fast changes alone (`torque.py`), since motors answer what disturbs the
-body slowly. What they answer is what flapping is told by, once all else is known.
+body slowly. What they answer is what flapping is told by, once all else is known; what is in doubt
+of that widens its interval.
 """
 
 from __future__ import annotations

@@ -1,7 +1,15 @@
-"""The force on the body: thrust by what drove the motors, and drag, under the measured attitude.
+"""The force on the body, and the nominal rate loop, by what was commanded and measured.
 
-Where no flight has an attitude, thrust is along what the path's acceleration and gravity make up
-together (differential flatness; Mellinger and Kumar 2011), and only its size is asked for.
+Force: thrust by what drove the motors, and drag, under the measured attitude. Where no flight has
+an attitude, thrust is along what the path's acceleration and gravity make up together (differential
+flatness; Mellinger and Kumar 2011), and only its size is asked for.
+
+The loop is flown by its commands alone and compared with the gyro (output error; Ljung 1999, Sec.
+4.3): measured rates in the loop's own equation would make the gyro's noise look like slower gains.
+Per axis, `lag d2w/dt2 + dw/dt + K w = K rate_cmd(t - delay) + lag de/dt + e`, where `e` is what is
+missed of `w x J w`, since the controller makes up for it by rotors that lag, and what moving air
+turns besides. It is that of the rates without it (one step of Picard's iteration); rotor speeds are
+taken to change by little.
 """
 
 from __future__ import annotations

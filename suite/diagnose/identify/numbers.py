@@ -1,4 +1,4 @@
-"""Fitted numbers as those of a vehicle file: values, intervals, and what was left as it was."""
+"""Fitted numbers as those of a vehicle file, and what flights cannot tell of it, in words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pilot follows trajectories with whatever flies: the loop that simulators share."""
+"""A pilot follows trajectories with whatever flies: position errors to a command (CTBR)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Flights that would tell apart what the data could not: written, and flown in simulation."""
+"""Flights that would tell apart what the data could not: which, as files, and flown in simulation.
+
+`plan.json` holds the numbers that make each trajectory again; a CSV holds where to be, how fast,
+how accelerated and where to look at every hundredth of a second, for autopilots that follow set
+points.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Charts of a diagnosis as PNG."""
+"""Charts of a diagnosis as PNG, and held-out flights as a recording for rerun."""
 
 from __future__ import annotations
 

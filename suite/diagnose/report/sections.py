@@ -1,4 +1,4 @@
-"""The report's part about the logs: what they hold, their faults, their noise, the actuators."""
+"""The report's parts about the logs, their noise, the actuators, what is left and the evidence."""
 
 from __future__ import annotations
 

@@ -4,6 +4,10 @@ The vehicle file need not be right: what the reference flights leave of it, on a
 velocity, is carried along. How much flights of an unchanged vehicle differ is taken from them too
 (`rotor_spread`); the reference flights' mean is off by it as well, for all others alike. A change
 is named where it is large beside that, for all candidates together (`chance`).
+
+Where no mean has changed, each flight's own numbers of what shows in motion, as a drag, are two
+samples, whose means are compared by how flights differ within each (Welch 1947, doi
+10.1093/biomet/34.1-2.28), after Bonferroni over all candidates and their numbers.
 """
 
 from __future__ import annotations

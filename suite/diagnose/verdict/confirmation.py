@@ -1,4 +1,10 @@
-"""Names held against flights that took no part: what they do not want is withdrawn."""
+"""What stands of the names: what held-out flights do not want and what is too small is withdrawn.
+
+With little noise any difference is significant, the model's own small errors among them. What does
+less than the thresholds of practical relevance is no finding, however small its p-value
+(equivalence testing; Lakens 2017, doi 10.1177/1948550617697177): it is left out where the upper end
+of the interval of its size is below all of them.
+"""
 
 from __future__ import annotations
 

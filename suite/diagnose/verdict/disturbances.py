@@ -1,10 +1,15 @@
-"""A force that swings: what a load that hangs on a line leaves of every model without one.
+"""Forces that no number of the catalogue repeats: one that swings, and random wind.
 
-What the force view leaves across the vertical has a narrow peak in its spectrum then, at one period
-in all flights, whatever was flown. A flight's own motion makes peaks as well, wherever a model is
-wrong: but then the force that is left is a small share of the acceleration at that period, while a
-load's pull is what moves the vehicle there. Spectra are compared by their likelihood (Whittle 1953)
-with and without a peak on a smooth background.
+A load on a line leaves a narrow peak in the spectrum of what the force view leaves across the
+vertical, at one period in all flights, whatever was flown. A flight's own motion makes peaks as
+well, wherever a model is wrong: but then the force that is left is a small share of the
+acceleration at that period. Spectra are compared by their likelihood (Whittle 1953) with and
+without a peak on a smooth background.
+
+The wind at the knots of a window is a normal variable with the covariance of `gusts`; through the
+drag of the vehicle it adds a covariance to the residuals. Intensity and length are where the
+likelihood of the residuals is largest. Whether it is wind is asked by a rival that may push along
+the body axes as it likes.
 """
 
 from __future__ import annotations
