@@ -29,8 +29,7 @@ from suite.diagnose.data.colour import Noise, measured_noise
 from suite.diagnose.data.windows import cut
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.evidence.rollouts import start_estimate
+from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.plans.follow import FlightFailed
 from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json

@@ -11,7 +11,6 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.checks.actuators import LAG, RotorLag, another_lag
 from suite.diagnose.data.flights import ViewFlights, choose_held_out, parted, ready
 from suite.diagnose.data.view import FORCE, View
 from suite.diagnose.estimate.composites import composites
@@ -29,7 +28,8 @@ from suite.diagnose.search.change import changed_task, search_change, search_mot
 from suite.diagnose.search.look import NamedEffect, SearchResult
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.confirmation import EffectSize, Negligible, view_size
+from suite.diagnose.verdict.actuators import LAG, RotorLag, another_lag
+from suite.diagnose.verdict.diagnosis import EffectSize, Negligible, view_size
 from suite.diagnose.verdict.disturbances import Swing, swing_left
 from suite.diagnose.verdict.view_gap import ViewGap, judge
 

@@ -12,7 +12,6 @@ from eval.effects import EFFECTS
 from eval.effects.log_faults import lateness
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.checks.actuators import another_controller, integrator_of, rotors_are_input
 from suite.diagnose.data.flights import choose_held_out, ready
 from suite.diagnose.data.view import FORCE
 from suite.diagnose.data.whitening import Linearisation
@@ -21,8 +20,8 @@ from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates, make_space, with_fitted
 from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.moments import ForceModel
-from suite.diagnose.evidence.rollout_model import RolloutModel
 from suite.diagnose.evidence.rollouts import (
+    RolloutModel,
     information,
     least_left,
     start_estimate,
@@ -32,8 +31,14 @@ from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.look import SearchResult, rollouts_of
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.confirmation import confirmed, control, gap_matters, relevant_part
-from suite.diagnose.verdict.diagnosis import Diagnosis
+from suite.diagnose.verdict.actuators import another_controller, integrator_of, rotors_are_input
+from suite.diagnose.verdict.diagnosis import (
+    Diagnosis,
+    confirmed,
+    control,
+    gap_matters,
+    relevant_part,
+)
 from suite.diagnose.verdict.disturbances import Swing, Turbulence, find_turbulence, swing_left
 from suite.diagnose.verdict.gap import (
     Gap,

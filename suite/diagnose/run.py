@@ -15,8 +15,6 @@ from suite.common.console import Console
 from suite.common.report import write_report
 from suite.delta.run import flight_files
 from suite.diagnose.by_views import diagnose_by_views
-from suite.diagnose.checks.black_box import BlackBoxConfig, compare_black_box
-from suite.diagnose.checks.checks import run_checks
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.data.windows import remembers
 from suite.diagnose.diagnose import BeyondRollouts, diagnose
@@ -27,6 +25,8 @@ from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page, views_page
 from suite.diagnose.report.views_json import views_json
 from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.verdict.black_box import BlackBoxConfig, compare_black_box
+from suite.diagnose.verdict.checks import run_checks
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
 

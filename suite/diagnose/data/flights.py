@@ -21,7 +21,6 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mix
 from eval.quadrotor.plant import make_plant, nominal_quadrotor
 from eval.vehicles.vehicle import Vehicle, motor_speed
-from suite.diagnose.checks.actuators import wrench_difference
 from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.sampling import LONGEST_S, interpolate, on_every_row
 from suite.diagnose.data.view import (
@@ -37,6 +36,7 @@ from suite.diagnose.data.view import (
 )
 from suite.diagnose.data.windows import LENGTH_S
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.actuators import wrench_difference
 from tracks.geometry.rotation import rot_to_quat
 
 SLOW_WIDTH_S = 1.0

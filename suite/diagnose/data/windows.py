@@ -182,6 +182,30 @@ def take(windows: FlightWindows, chosen: Array) -> FlightWindows:
     return FlightWindows(*(np.asarray(field)[chosen] for field in windows))
 
 
+def trusted(
+    windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
+) -> FlightWindows:
+    """Return `windows`, each up to where the model has not left the flight by too much.
+
+    Beyond, slopes taken where the model is say nothing of where the flight was: it may have turned
+    over, or sunk below the ground. What is named brings the model back, and the next look is
+    longer. `residual` is (W, N, 19).
+    """
+    error = np.abs(residual)
+    height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
+    lost = (error[..., SLICES["position"]].max(axis=-1) > limits.trusted_m) | (
+        error[..., SLICES["attitude"]].max(axis=-1) > limits.trusted_rad
+    )
+    lost |= (error[..., 2] > limits.trusted_height_share * height) & (height > 0.0)
+    row_s = np.asarray(windows.row_s)
+    until_s = np.full(len(row_s), limits.trusted_horizons_s[-1])
+    for horizon in reversed(limits.trusted_horizons_s):
+        there = ~(lost & (row_s <= horizon)).any(axis=1)
+        until_s = np.where(there, horizon, until_s)
+    seen = np.asarray(windows.seen) & (row_s <= until_s[:, None] + 1e-9)[..., None]
+    return windows._replace(seen=seen)
+
+
 def _starts(
     log: FlightLog, whole: np.ndarray, rotor_input: bool, stride_s: float, hole_s: float
 ) -> list[int]:

@@ -33,7 +33,7 @@ from suite.diagnose.estimate.parameters import (
     ParameterSpace,
     effects_at,
 )
-from suite.diagnose.evidence.rollout_model import VehicleArrays, grouped
+from suite.diagnose.evidence.rollouts import VehicleArrays, grouped
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 CHUNK = 1024

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from eval.effects import EFFECTS
+from eval.effects.interface import Constants
+from eval.quadrotor.loops import Loop, loop_of
+from eval.quadrotor.plant import Nominal, assemble, nominal_quadrotor
+from eval.quadrotor.stepper import Feedback
+from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.colour import Noise, left_as_noise, measured_noise
+from suite.diagnose.data.sampling import LONGEST_S
 from suite.diagnose.data.whitening import (
     Linearisation,
     Whitening,
@@ -16,12 +27,17 @@ from suite.diagnose.data.whitening import (
     whiten,
     whitened_residual,
 )
-from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.data.windows import KNOTS, STATE, FlightWindows, step_s, take, trusted
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import gauss_newton_step
-from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
+from suite.diagnose.estimate.parameters import (
+    Candidate,
+    ParameterLayout,
+    ParameterSpace,
+    effects_at,
+)
 from suite.diagnose.evidence.evidence import Evidence, flights_agree
-from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.evidence.rollout import Flown, at_knots, difference, fly_windows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
@@ -171,25 +187,191 @@ def least_left(
     return (float(equations.chi2.sum()) - fall) / max(seen, 1)
 
 
-def trusted(
-    windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
-) -> FlightWindows:
-    """Return `windows`, each up to where the model has not left the flight by too much.
+BATCH = 12
+"""Windows a call: one shape, compiled once."""
+DIRECTIONS = 8
+"""Slopes a call, compiled once: a wider program beside it would take longer to compile than it
+saves in a diagnosis of fewer than some 150 stretches."""
+COMPILED = {"xla_cpu_use_fusion_emitters": False}
+"""XLA's options for the model: its newer code for loops is no faster, and compiles half as fast."""
 
-    Beyond, slopes taken where the model is say nothing of where the flight was: it may have turned
-    over, or sunk below the ground. What is named brings the model back, and the next look is
-    longer. `residual` is (W, N, 19).
-    """
-    error = np.abs(residual)
-    height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
-    lost = (error[..., SLICES["position"]].max(axis=-1) > limits.trusted_m) | (
-        error[..., SLICES["attitude"]].max(axis=-1) > limits.trusted_rad
-    )
-    lost |= (error[..., 2] > limits.trusted_height_share * height) & (height > 0.0)
-    row_s = np.asarray(windows.row_s)
-    until_s = np.full(len(row_s), limits.trusted_horizons_s[-1])
-    for horizon in reversed(limits.trusted_horizons_s):
-        there = ~(lost & (row_s <= horizon)).any(axis=1)
-        until_s = np.where(there, horizon, until_s)
-    seen = np.asarray(windows.seen) & (row_s <= until_s[:, None] + 1e-9)[..., None]
-    return windows._replace(seen=seen)
+
+class KnotResponse(NamedTuple):
+    """What a disturbance at each knot of W windows does, and where the model is then."""
+
+    slope: np.ndarray
+    """(W, N, 19, KNOTS * 6) of the simulated values, per m/s^2 and rad/s^2 in body axes."""
+    knot: Flown
+    """(W, KNOTS, ...) the state at the knots."""
+
+
+class VehicleArrays(NamedTuple):
+    """What a vehicle file fixes, as arrays, so that one compiled rollout serves every vehicle."""
+
+    nominal: Nominal
+    constants: Constants
+    base: dict[str, Any]
+    """Values of every effect."""
+    loop: Loop | None = None
+    """A firmware's rate loop."""
+
+
+class RolloutModel:
+    """A vehicle's compiled rollout: residuals of windows and their slopes."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        space: ParameterSpace,
+        rotor_input: bool,
+        voltage: bool,
+        integrator: str = "continuous",
+    ) -> None:
+        """Prepare the rollout of `vehicle` with the numbers of `space`.
+
+        With `rotor_input` measured rotor speeds are the input, not the commands; `voltage` says
+        whether the windows have one; `integrator` is that of `fly_windows`.
+        """
+        self.space = space
+        self.size = len(space.entries)
+        self.free = STATE + 4 * (KNOTS if rotor_input else 1)
+        """Numbers F that are free in each window: its start, and the rotor speeds' errors, where
+        they are the input all along it."""
+        self.starts = list(range(self.size, self.size + self.free))
+        """Places of the free numbers among all directions."""
+        base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}
+        self.given = VehicleArrays(*nominal_quadrotor(vehicle), base, loop_of(vehicle))
+        self.dt = step_s(vehicle)
+        """About the length of a step [s]."""
+        self.integrator = integrator
+        self._kind = (space.layout, rotor_input, voltage, integrator)
+        self._linear = _slopes(*self._kind)
+        self.fly: Callable[..., Any] = partial(_flight(*self._kind), self.given)
+        """(theta, offset, windows, push, feedback) -> (simulated - measured, the flight), to be
+        compiled by who needs it."""
+
+    def residual(self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows) -> np.ndarray:
+        """Return measured - simulated (W, N, 19) from starts moved by `offset` (W, F)."""
+        return self.linearise(theta, offset, windows, []).residual
+
+    def respond(
+        self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows
+    ) -> KnotResponse:
+        """Return what further forces and torques along each window would do to its rows."""
+        pushed = _responses(*self._kind)
+        with jax.enable_x64(True):
+            parts = [
+                jax.tree.map(lambda x, n=count: np.asarray(x)[:n], pushed(self.given, theta, x, w))
+                for x, w, count in batches(offset, windows)
+            ]
+        return jax.tree.map(lambda *p: np.concatenate(p), *parts)
+
+    def linearise(
+        self,
+        theta: np.ndarray,
+        offset: np.ndarray,
+        windows: FlightWindows,
+        indices: Sequence[int] | None,
+    ) -> Linearisation:
+        """Return residuals and slopes along the numbers at `indices`.
+
+        With None the directions are all numbers and then the F free ones, whose places are
+        `starts`.
+        """
+        everything = np.eye(self.size + self.free)
+        asked, groups = (
+            len(everything if indices is None else indices),
+            grouped(everything, indices),
+        )
+        values, slopes = [], []
+        with jax.enable_x64(True):
+            for x, w, count in batches(offset, windows):
+                answers = [self._linear(self.given, theta, x, w, group) for group in groups]
+                values.append(np.asarray(answers[0][0])[:count])
+                slopes.append(np.concatenate([np.asarray(a[1])[:count] for a in answers], axis=-1))
+        slope = np.concatenate(slopes)[..., :asked]
+        return Linearisation(-np.concatenate(values), slope, offset)
+
+
+def grouped(everything: np.ndarray, indices: Sequence[int] | None) -> list[np.ndarray]:
+    """Return `DIRECTIONS` rows at a time, at least once, of `everything` or those at `indices`."""
+    asked = everything if indices is None else everything[list(indices)]
+    parts = [asked[k : k + DIRECTIONS] for k in range(0, max(len(asked), 1), DIRECTIONS)]
+    return [np.pad(part, ((0, DIRECTIONS - len(part)), (0, 0))) for part in parts]
+
+
+def batches(
+    offset: np.ndarray, windows: FlightWindows
+) -> Iterator[tuple[np.ndarray, FlightWindows, int]]:
+    """Yield `BATCH` offsets and windows at a time, and how many of them are no repetition."""
+    count = len(windows.flight)
+    for first in range(0, count, BATCH):
+        rows = np.minimum(np.arange(first, first + BATCH), count - 1)
+        yield offset[rows], take(windows, rows), min(BATCH, count - first)
+
+
+@cache
+def _slopes(
+    layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
+) -> Callable[..., Any]:
+    """Return the compiled slopes: XLA takes longer over them than a diagnosis does."""
+    fly = _flight(layout, rotor_input, voltage, integrator)
+
+    def linear(
+        given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows, directions: Any
+    ) -> Any:
+        size = len(layout)
+
+        def along(direction: Any) -> Any:
+            tangent = (direction[:size], jnp.tile(direction[size:], (BATCH, 1)))
+            return jax.jvp(lambda t, x: fly(given, t, x, windows)[0], (theta, offset), tangent)
+
+        values, slopes = jax.vmap(along, out_axes=(None, -1))(directions)
+        return values, slopes
+
+    return jax.jit(linear, compiler_options=COMPILED)
+
+
+@cache
+def _responses(
+    layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
+) -> Callable[..., Any]:
+    fly = _flight(layout, rotor_input, voltage, integrator)
+
+    def respond(
+        given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows
+    ) -> KnotResponse:
+        none = jnp.zeros((BATCH, KNOTS, 6))
+
+        def along(direction: Any) -> Any:
+            tangent = jnp.broadcast_to(direction.reshape(KNOTS, 6), none.shape)
+            return jax.jvp(lambda p: fly(given, theta, offset, windows, p)[0], (none,), (tangent,))
+
+        slopes = jax.vmap(lambda d: along(d)[1], out_axes=-1)(jnp.eye(KNOTS * 6))
+        _, flown = fly(given, theta, offset, windows)
+        return KnotResponse(slopes, at_knots(flown, windows))
+
+    return jax.jit(respond, compiler_options=COMPILED)
+
+
+def _flight(
+    layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
+) -> Callable[..., tuple[Any, Flown]]:
+    """Return the function that flies windows: simulated - measured, and the flight itself."""
+
+    def fly(
+        given: VehicleArrays,
+        theta: Any,
+        offset: Any,
+        windows: FlightWindows,
+        push: Any = None,
+        feedback: Feedback | None = None,
+    ) -> tuple[Any, Flown]:
+        values = effects_at(layout, given.base, theta)
+        plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0, given.loop)
+        flown = fly_windows(
+            plant, values, rotor_input, voltage, integrator, offset, windows, push, feedback
+        )
+        return difference(values, integrator, flown, windows), flown
+
+    return fly

@@ -157,19 +157,8 @@ class _Start:
         fixed["thrust"] = self.begun_scale
         if not unknowns:
             return
-        found = self.tried(
-            "force",
-            lambda: force.fit_force(
-                flights,
-                self.start,
-                self.drive,
-                self.guess,
-                unknowns,
-                self.lag_s,
-                self.delay_s,
-                fixed,
-            ),
-        )
+        how = (self.start, self.drive, self.guess, unknowns, self.lag_s, self.delay_s, fixed)
+        found = self.tried("force", lambda: force.fit_force(flights, *how))
         if found is not None:
             self.fitted["force"] = found
             self.scale = told(found).get("thrust", self.begun_scale)

@@ -1,4 +1,4 @@
-"""Commanded trajectories flown in MuJoCo's C engine, and what is logged of them with how much noise."""
+"""Commanded trajectories flown in MuJoCo's C engine, and what is logged of them, with noise."""
 
 from __future__ import annotations
 

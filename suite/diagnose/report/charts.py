@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from eval.logs.flight_log import FlightLog
 from eval.view.comparison import Compared, Simulation, Track, write_comparison
 from suite.common.charts import png, titled
-from suite.diagnose.checks.black_box import BlackBoxComparison
 from suite.diagnose.data.windows import LENGTH_S, SLICES, UNITS, FlightWindows, take
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.search.look import rollouts_of
+from suite.diagnose.verdict.black_box import BlackBoxComparison
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap, true_starts
 from tracks.geometry.rotation import exp_rot, rot_to_quat

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from suite.diagnose.checks.black_box import BlackBoxComparison
-from suite.diagnose.checks.checks import Checks, Kinematics
 from suite.diagnose.data.windows import STATE_GROUPS
 from suite.diagnose.plans.plan import advice
 from suite.diagnose.report.parameters_json import parameters_json, short_name
 from suite.diagnose.search.look import NamedEffect
 from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.verdict.black_box import BlackBoxComparison
+from suite.diagnose.verdict.checks import Checks, Kinematics
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.disturbances import Turbulence
 from suite.diagnose.verdict.gap import HEADLINE_S, MEASURE, Gap

@@ -12,7 +12,6 @@ from eval.effects import EFFECTS
 from suite.common.charts import png, titled
 from suite.common.report import Details, Links, Part, Picture, Report, Section
 from suite.diagnose.by_views import ViewsDiagnosis
-from suite.diagnose.checks.checks import Checks
 from suite.diagnose.data.windows import UNITS
 from suite.diagnose.estimate.composites import in_words
 from suite.diagnose.report.charts import (
@@ -31,6 +30,7 @@ from suite.diagnose.report.sections import (
     noise_section,
     residual_section,
 )
+from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from tracks.common.grid import Cell, Grid
 

@@ -9,9 +9,6 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from suite.common.report import Part, Picture, Section
-from suite.diagnose.checks.actuators import ActuatorMismatch
-from suite.diagnose.checks.black_box import BlackBoxComparison
-from suite.diagnose.checks.checks import Checks, Kinematics
 from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.report.charts import (
     AFTER,
@@ -22,6 +19,9 @@ from suite.diagnose.report.charts import (
     labelled_gaps,
 )
 from suite.diagnose.report.parameters_json import grid, short_name
+from suite.diagnose.verdict.actuators import ActuatorMismatch
+from suite.diagnose.verdict.black_box import BlackBoxComparison
+from suite.diagnose.verdict.checks import Checks, Kinematics
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import MEASURE, Gap
 from tracks.common.grid import Grid

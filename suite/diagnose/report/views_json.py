@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from suite.diagnose.by_views import ViewResult, ViewsDiagnosis
-from suite.diagnose.checks.actuators import LAG, RotorLag
 from suite.diagnose.plans.plan import advice
 from suite.diagnose.report.parameters_json import parameters_json, short_name
 from suite.diagnose.search.look import NamedEffect
+from suite.diagnose.verdict.actuators import LAG, RotorLag
 from suite.diagnose.verdict.view_gap import gap_without
 
 MEASURE = (

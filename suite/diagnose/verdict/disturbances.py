@@ -29,7 +29,7 @@ from suite.diagnose.data.view import SmoothedFlight
 from suite.diagnose.data.windows import KNOTS
 from suite.diagnose.evidence.evidence import flights_agree
 from suite.diagnose.evidence.rollout import Flown
-from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.residual_structure import DisturbanceEquations

@@ -29,8 +29,7 @@ from suite.diagnose.data.whitening import (
 )
 from suite.diagnose.data.windows import SLICES, STATE, STATE_GROUPS, FlightWindows
 from suite.diagnose.estimate.block import Estimate
-from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.evidence.rollouts import block_of
+from suite.diagnose.evidence.rollouts import RolloutModel, block_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.residual_structure import ResidualStructure
 

@@ -20,7 +20,7 @@ from suite.diagnose.data.windows import KNOTS, FlightWindows
 from suite.diagnose.estimate.block import Estimate, products
 from suite.diagnose.estimate.permutation import permutation_test
 from suite.diagnose.evidence.rollout import Flown
-from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 AXES = ("force x", "force y", "force z", "torque x", "torque y", "torque z")

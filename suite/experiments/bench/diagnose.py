@@ -16,8 +16,7 @@ from suite.common.errors import WorkFailed
 from suite.diagnose.data.noise import noise_of
 from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.gauss_newton import fit, intervals95
-from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.evidence.rollouts import start_estimate, weighed_by
+from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate, weighed_by
 from suite.experiments.bench.compare import Comparison, Figure, in_turn
 from suite.experiments.bench.rigid_body import Task, make_task
 

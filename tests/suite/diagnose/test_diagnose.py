@@ -17,7 +17,6 @@ from eval.logs.flight_log import write_flight
 from eval.quadrotor.loops import KINDS
 from suite.cli import main
 from suite.common.report import html
-from suite.diagnose.checks.checks import run_checks
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.plans.simulate import SENSORS, log_of
 from suite.diagnose.plans.simulate import fly as fly_ways
@@ -25,6 +24,7 @@ from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.thresholds import Thresholds
+from suite.diagnose.verdict.checks import run_checks
 from tests.support.broken_logs import BREAKAGES
 from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.pendulum import Pendulum

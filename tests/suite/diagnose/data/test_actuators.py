@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.checks.actuators import actuator_mismatches
+from suite.diagnose.verdict.actuators import actuator_mismatches
 from tests.support.diagnosis_flights import NOISE, fly, fly_all
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.checks.actuators import another_controller, rotors_are_input
+from suite.diagnose.verdict.actuators import another_controller, rotors_are_input
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.checks.checks import check_kinematics, facts_of
+from suite.diagnose.verdict.checks import check_kinematics, facts_of
 from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.vehicles import PLAIN, with_effects
 

@@ -13,10 +13,16 @@ from suite.diagnose.data.whitening import (
     whiten,
     whitened_residual,
 )
-from suite.diagnose.data.windows import KNOTS, STATE
+from suite.diagnose.data.windows import KNOTS, STATE, trusted
 from suite.diagnose.estimate.parameters import candidates, effects_at, indices_of, make_space
-from suite.diagnose.evidence.rollout_model import BATCH, DIRECTIONS, batches
-from suite.diagnose.evidence.rollouts import block_of, start_estimate, trusted, weighed_by
+from suite.diagnose.evidence.rollouts import (
+    BATCH,
+    DIRECTIONS,
+    batches,
+    block_of,
+    start_estimate,
+    weighed_by,
+)
 from suite.diagnose.search.look import NamedEffect
 from suite.diagnose.search.search import search
 from tests.support.vehicles import PLAIN, with_effects, with_lag

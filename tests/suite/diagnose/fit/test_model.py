@@ -7,7 +7,7 @@ import pytest
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.plans.simulate import SENSORS, fly, log_of
 from suite.diagnose.plans.trajectory import Trajectory, ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json

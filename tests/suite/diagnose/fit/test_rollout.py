@@ -7,7 +7,7 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.rollout_model import RolloutModel
+from suite.diagnose.evidence.rollouts import RolloutModel
 from tests.support.continuous_flights import fly_finely
 from tests.support.diagnosis_flights import NOISE
 from tests.support.vehicles import PLAIN, with_effects

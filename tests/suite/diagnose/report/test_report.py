@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from suite.common.report import html
-from suite.diagnose.checks.black_box import BlackBoxComparison, BlackBoxComparisons
 from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.report import charts
 from suite.diagnose.report.charts import (
@@ -34,6 +33,7 @@ from suite.diagnose.report.sections import (
     noise_section,
     residual_section,
 )
+from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
 from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
 from tracks.common.grid import Grid

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from suite.diagnose.checks.actuators import RotorLag
 from suite.diagnose.report.views_json import MEASURE, effects_json, headline, views_json
+from suite.diagnose.verdict.actuators import RotorLag
 from tracks.common.files import plain
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from suite.diagnose.search.look import NamedEffect, rollouts_of
-from suite.diagnose.verdict.confirmation import confirmed
+from suite.diagnose.verdict.diagnosis import confirmed
 from suite.diagnose.verdict.gap import measure, verdict_on
 
 

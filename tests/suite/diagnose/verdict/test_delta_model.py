@@ -4,18 +4,18 @@ import jax
 import numpy as np
 import pytest
 
-from suite.diagnose.checks.black_box import (
+from suite.diagnose.data.colour import Noise
+from suite.diagnose.data.windows import CHANNELS, KNOTS, cut, take
+from suite.diagnose.diagnose import diagnose
+from suite.diagnose.estimate.parameters import make_space
+from suite.diagnose.evidence.rollouts import BATCH, RolloutModel
+from suite.diagnose.verdict.black_box import (
     BlackBoxConfig,
     _start,
     black_box_gap,
     compare_black_box,
     fit_black_box,
 )
-from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.windows import CHANNELS, KNOTS, cut, take
-from suite.diagnose.diagnose import diagnose
-from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.rollout_model import BATCH, RolloutModel
 from suite.diagnose.verdict.gap import measure, true_starts
 from tests.support.diagnosis_flights import NOISE, fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag

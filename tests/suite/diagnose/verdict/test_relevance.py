@@ -8,7 +8,7 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.thresholds import Thresholds
-from suite.diagnose.verdict.confirmation import (
+from suite.diagnose.verdict.diagnosis import (
     EffectSize,
     gap_matters,
     rollout_size,

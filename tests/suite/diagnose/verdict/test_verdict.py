@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.checks import black_box, checks
 from suite.diagnose.data.windows import KNOTS, STATE
 from suite.diagnose.search.look import rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict import diagnosis
+from suite.diagnose.verdict import black_box, checks, diagnosis
 from suite.diagnose.verdict.disturbances import _likelihood, find_turbulence
 from suite.diagnose.verdict.gap import (
     Gap,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from suite.diagnose.by_views import diagnose_by_views
-from suite.diagnose.checks.actuators import another_lag
 from suite.diagnose.report.views_json import views_json
+from suite.diagnose.verdict.actuators import another_lag
 from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 

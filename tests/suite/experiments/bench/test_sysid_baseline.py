@@ -5,8 +5,7 @@ import pytest
 
 from suite.diagnose.data.noise import noise_of
 from suite.diagnose.estimate.gauss_newton import intervals95
-from suite.diagnose.evidence.rollout_model import RolloutModel
-from suite.diagnose.evidence.rollouts import start_estimate
+from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.experiments.bench import diagnose, sysid_baseline
 from suite.experiments.bench.rigid_body import REFITTED, make_task
 

@@ -27,8 +27,13 @@ from policies.networks import delta_network
 from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.windows import LENGTH_S, STATE, FlightWindows, take
 from suite.diagnose.estimate.gauss_newton import fit
-from suite.diagnose.evidence.rollout_model import BATCH, RolloutModel, batches
-from suite.diagnose.evidence.rollouts import start_estimate, weighed_by
+from suite.diagnose.evidence.rollouts import (
+    BATCH,
+    RolloutModel,
+    batches,
+    start_estimate,
+    weighed_by,
+)
 from suite.diagnose.search.look import rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.diagnosis import Diagnosis

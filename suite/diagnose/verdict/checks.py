@@ -15,11 +15,11 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.logs.velocity import velocity_from_position
-from suite.diagnose.checks.actuators import ActuatorMismatch, actuator_mismatches
-from suite.diagnose.checks.black_box import BlackBoxComparisons
 from suite.diagnose.data.sampling import on_every_row
 from suite.diagnose.estimate.gauss_newton import Z95
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.actuators import ActuatorMismatch, actuator_mismatches
+from suite.diagnose.verdict.black_box import BlackBoxComparisons
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from tracks.geometry.rotation import quat_to_rot
 

@@ -1,1 +1,0 @@
-"""What stands next to the names: log consistency, actuators, conditions, a black box."""
