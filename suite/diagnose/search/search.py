@@ -16,6 +16,7 @@ import numpy as np
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import chi2_fall, fit
 from suite.diagnose.estimate.parameters import Candidate, indices_of
+from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.evidence import Evidence
 from suite.diagnose.search.look import Look, NamedEffect, SearchResult, chi2_of, fit_beside, look_at
 from suite.diagnose.thresholds import Thresholds
@@ -53,7 +54,8 @@ def search(
     for _ in range(2 * limits.most_names):  # a name that went may come again
         found = None
         if len(named) < limits.most_names:
-            found = _next_name(task, look, named, among)
+            scores = first if look.at is start else None
+            found = _next_name(task, look, named, among, scores)
         if found is None or (named and found[0].gain <= limits.least_name_share * first[0].gain):
             break
         one, at = found
@@ -78,7 +80,7 @@ def search(
 
 def _scores(
     task: SearchTask, look: Look, beside: Sequence[int], among: Sequence[Candidate]
-) -> list:
+) -> list[CandidateScore]:
     return look.evidence.scores(look.block, look.equations, look.at.theta, beside, among, task.seed)
 
 
@@ -99,16 +101,18 @@ def _next_name(
     look: Look,
     named: Sequence[NamedEffect],
     among: Sequence[Candidate],
+    known: Sequence[CandidateScore] | None = None,
     now: Candidate | None = None,
 ) -> tuple[NamedEffect, Estimate] | None:
     """Return the best name beside `named`, and the fit with it; None where there is none.
 
-    With `now`, a name that `look` is taken without, all that may stand in its place is tried.
+    `known` are the scores there, to save their calculation. With `now`, a name that `look` is taken
+    without, all that may stand in its place is tried.
     """
     limits, evidence, space = task.limits, look.evidence, look.evidence.space
     beside = indices_of([n.candidate for n in named])
     left = [c for c in among if not set(c.indices) & set(beside)]
-    scores = {s.candidate: s for s in _scores(task, look, beside, left)}
+    scores = {s.candidate: s for s in known or _scores(task, look, beside, left)}
     near = list(scores)
     if now is None:
         most = limits.near_share * max((s.gain for s in scores.values()), default=0.0)
@@ -175,7 +179,7 @@ def _judged(
     others = [*named[:place], *named[place + 1 :]]
     left = [c for c in (task.among if among is None else among) if one not in c.parts]
     look = look_at(evidence.again(without), without, left)
-    found = _next_name(task, look, others, left, one)
+    found = _next_name(task, look, others, left, None, one)
     if found is None:
         return others, without
     new = [replace(found[0], candidate=single) for single in found[0].candidate.singles]
