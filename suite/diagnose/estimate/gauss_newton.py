@@ -210,11 +210,14 @@ def intervals95(
     numbers = [] if flight is None or not differ_p else np.unique(flight)
     if len(numbers) >= FEWEST:
         inside = np.array([flight == number for number in numbers], dtype=float)
-        q = (inside @ moved) ** 2 / np.maximum(inside @ moved**2, 1e-300)
+        away, share = inside @ moved, len(numbers) / (len(numbers) - 1)
+        q = away**2 / np.maximum(inside @ moved**2, 1e-300)
         differ = chi2.sf(q.sum(axis=0), len(numbers) - 1) < differ_p
-        own = np.einsum("fb,bij->fij", inside, equations.hessian)
-        away = moves(own, inside @ gradient)
-        among = (len(numbers) - 1) / len(numbers) * ((away - away.mean(axis=0)) ** 2).sum(axis=0)
+        if not leave_out:  # a flight with much to say fits itself, where its stretches do not
+            own = np.einsum("fb,bij->fij", inside, equations.hessian)
+            away, share = moves(own, inside @ gradient), 1.0 / share
+            away -= away.mean(axis=0)
+        among = share * (away**2).sum(axis=0)
         wide = np.sqrt(among) * float(student.ppf(0.975, len(numbers) - 1))
         widths = np.where(differ, np.maximum(widths, wide), widths)
     return Intervals(widths, by_stretch, inverse)
