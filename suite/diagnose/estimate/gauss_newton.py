@@ -185,7 +185,9 @@ def intervals95(
         return Intervals(np.zeros(0), none, none)
     given = np.zeros(size) if prior is None else prior
     hessian = equations.hessian.sum(axis=0) + np.diag(given)
-    gradient = equations.gradient - equations.gradient.mean(axis=0)
+    gradient = equations.gradient
+    if not leave_out:  # what stands at a bound pulls on, in every stretch alike
+        gradient = gradient - gradient.mean(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), TINY))
     both = np.outer(scale, scale)
 
