@@ -110,7 +110,6 @@ def diagnose_files(
         found = {**plain(told), **stamp(SCHEMA, seed)}
         toml = _vehicle_file(result.vehicle, vehicle, found, out)
         write_report(out / "report.html", views_page(result, found, toml))
-        write_json(out / "diagnosis.json", found)
         return noted(found)
 
     if before or only_views(logs, vehicle):
