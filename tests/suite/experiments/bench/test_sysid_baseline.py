@@ -18,7 +18,7 @@ def both():
         task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
     )
     begin = start_estimate(model, task.windows)
-    residual = model.residual(begin.theta, begin.offset, task.windows)
+    residual = model.residual(begin.theta, begin.free, task.windows)
     return task, model, sysid_baseline.prepare(task, noise_of(residual, task.windows)), residual
 
 
