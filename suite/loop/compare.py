@@ -189,7 +189,7 @@ def told_apart(difference: Interval) -> str:
     """Return how one policy's successes stand to another's, in words."""
     if difference.low > 0:
         return "more than"
-    return "fewer than" if difference.high < 0 else "not to be told from"
+    return "fewer than" if difference.high < 0 else "not significantly different from"
 
 
 def points(difference: Interval) -> str:

@@ -98,7 +98,13 @@ def verdict(
         return f"{100 * by_name[name].success.value:.0f} %"
 
     lost = apart[NOMINAL]
-    back = "above" if lost.low > 0 else "below" if lost.high < 0 else "not to be told from"
+    back = (
+        "above"
+        if lost.low > 0
+        else "below"
+        if lost.high < 0
+        else "not significantly different from"
+    )
     told = (
         f"In {where} {percent(BEFORE)} of {trials} trials succeed, in the simulation's "
         f"vehicle {percent(NOMINAL)}. The diagnosis names {named_effects(diagnosis)}. Fine-tuned "

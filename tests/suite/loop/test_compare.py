@@ -52,7 +52,7 @@ def test_differences_are_of_the_same_trials():
 def test_no_difference_is_called_none():
     rows = [_result(k, k < 5, 3.0) for k in range(10)]
     lines: list[Line] = compare({"before": rows, "without": rows, "with": rows})
-    assert "not to be told from" in verdict(lines[-1])
+    assert "not significantly different from" in verdict(lines[-1])
     cell = grids(lines)[0].rows[-1][6]
     assert cell.tone == "" and cell.text.startswith("+0 [")
     speed = grids(lines)[2].rows[-1][6]
