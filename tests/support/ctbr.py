@@ -92,7 +92,8 @@ class AsCtbr:
 def levelled(up_b: np.ndarray) -> np.ndarray:
     """Return the rotation (n, 3, 3) from the body to axes of its heading, by its third row."""
     x, y, z = up_b.T
-    flat = np.hypot(y, z)
+    # Rows of empty slots are zero.
+    flat = np.maximum(np.hypot(y, z), 1e-9)
     sin_roll, cos_roll, zero = y / flat, z / flat, np.zeros_like(x)
     rows = [
         [flat, -x * sin_roll, -x * cos_roll],
