@@ -184,6 +184,9 @@ def _header(data: bytes, name: str) -> tuple[int, dict[int, Kind], int]:
             text, at = _text(data, at)
             variable, _, code = text.rpartition("(")
             fields.append((variable, CODES[code.rstrip(")")]))
+        names = {v for v, _ in fields} - {"", "timestamp"}
+        if len(names) < len(fields):
+            raise ValueError(f"a variable of event {kind_name!r} has no name of its own")
         kinds[number] = Kind(kind_name, tuple(v for v, _ in fields), np.dtype(fields))
     return version, kinds, at
 

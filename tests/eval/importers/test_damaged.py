@@ -121,3 +121,14 @@ def test_steps_of_time_that_nothing_can_be_divided_by_are_no_steps():
     time = np.array([0.0, 1e-310, 1.0, 2.0, *range(3, 60)])
     found, finding = signal(time, np.zeros(len(time)), "log", "gyro")
     assert found is not None and len(found.time_s) == len(time) - 1 and finding is not None
+
+
+@pytest.mark.parametrize("name", [b"", b"timestamp", b"gyro.y"])
+def test_a_variable_without_a_name_of_its_own_is_a_broken_header(tmp_path, name):
+    path = made.write_usd(tmp_path / "log.usd", (0.0, 1.2))
+    whole = path.read_bytes()
+    for old in (b"gyro.x(", b"stateEstimateZ.rateRoll("):
+        whole = whole.replace(old, name + b"(")
+    path.write_bytes(whole)
+    with pytest.raises(FlightLogError, match="header is broken .*has no name of its own"):
+        import_log(path, "crazyflie", ImportOptions(partial=True))
