@@ -158,9 +158,10 @@ def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
         steady = np.abs(change) < 0.3 * np.abs(c)
         large = steady & (np.abs(c) > 0.6 * limit)
         small = steady & (np.abs(c) < 0.4 * limit)
-        if limit < 3.0 * CALM_RATE or min(large.sum(), small.sum()) < 30 or not r[small].std():
+        if limit < 3.0 * CALM_RATE or min(large.sum(), small.sum()) < 30:
             continue
-        if np.corrcoef(c[small], r[small])[0, 1] > CLOSE:
+        varies = min(c[small].std(), r[small].std()) > 0.0
+        if varies and np.corrcoef(c[small], r[small])[0, 1] > CLOSE:
             slopes = [float(np.median(r[m] / c[m])) for m in (large, small)]
             bends.append(slopes[0] / slopes[1] - 1.0)
     # Less of large commands than of small ones is no curve: motors reach their limits.

@@ -31,8 +31,9 @@ def test_processes_fly_what_one_process_flies():
         return RaceEnv(track="circular", level=3, rules=SHORT)
 
     seen = []
-    for kind in (AsyncVectorEnv, SyncVectorEnv):
-        env = kind([make, make])
+    # A process that has loaded JAX runs threads, and must not be forked.
+    for kind, how in ((AsyncVectorEnv, {"context": "spawn"}), (SyncVectorEnv, {})):
+        env = kind([make, make], **how)
         first, _ = env.reset(seed=4)
         steps = [env.step(np.full((2, 3), 0.1, np.float32))[0] for _ in range(3)]
         seen.append([first, *steps])

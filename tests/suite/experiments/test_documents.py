@@ -57,7 +57,7 @@ def test_seeds_are_trained_once_and_compared(sky, made, tmp_path):
     assert len(made) == 2 and len(sky.flown) == 24
     text, numbers = page(tmp_path, "seeds")
     assert set(numbers["spread"]["mean_success"]) == {"seed 0", "seed 4"}
-    assert "- recipe: small episode.batch=2\n" in text
+    assert "- recipe: quick episode.batch=2\n" in text
     digest = next((tmp_path / "cache" / "trainings").glob("*/policy"))
     rows = [{"iteration": k, "seconds": 45.2, "cold": k == 0} for k in range(3)]
     append(digest.parent, rows)

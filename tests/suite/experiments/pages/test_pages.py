@@ -46,7 +46,7 @@ def test_a_page_has_its_facts_its_tables_and_numbered_figures(tmp_path):
     said = write_document(place, "seeds", Config(7), made(), Console())
     text = (tmp_path / "docs" / "seeds.md").read_text()
     assert text.startswith("# seeds\n\nThe policies of several training seeds")
-    assert f"\n\n{BEGIN}\n\n- recipe: small\n- command: `" in text and text.endswith(f"{END}\n")
+    assert f"\n\n{BEGIN}\n\n- recipe: quick\n- command: `" in text and text.endswith(f"{END}\n")
     assert "## Part\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n\nBelow." in text
     assert "![A figure.](seeds.png)" in text and "![A figure.](seeds-2.png)" in text
     numbers = json.loads((tmp_path / "docs" / "seeds.json").read_text())
