@@ -147,25 +147,29 @@ def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
     """Return how much more of large commands the body does than of small ones, as a share.
 
     Of commands that hardly change within the loop's response: the body never reaches a short large
-    one. Of the axes on which small ones are followed closely; 0 where they do not agree, or where
-    large commands are followed less.
+    one. Of the axes on which small ones are followed closely, the least of both halves of the
+    flight; 0 where they do not agree, or where large commands are followed less: that is no curve,
+    motors reach their limits.
     """
     both = np.isfinite(command).all(axis=1) & np.isfinite(rate).all(axis=1)
-    time_s, bends = time_s[both], []
-    for c, r in zip(command[both].T, rate[both].T, strict=True):
-        limit = np.quantile(np.abs(c), 0.9)
-        change = np.interp(time_s + STEADY_S, time_s, c) - np.interp(time_s - STEADY_S, time_s, c)
-        steady = np.abs(change) < 0.3 * np.abs(c)
-        large = steady & (np.abs(c) > 0.6 * limit)
-        small = steady & (np.abs(c) < 0.4 * limit)
-        if limit < 3.0 * CALM_RATE or min(large.sum(), small.sum()) < 30:
-            continue
-        varies = min(c[small].std(), r[small].std()) > 0.0
-        if varies and np.corrcoef(c[small], r[small])[0, 1] > CLOSE:
+    time_s, command, rate = time_s[both], command[both], rate[both]
+    before, after = (
+        np.column_stack([np.interp(time_s + shift, time_s, c) for c in command.T])
+        for shift in (-STEADY_S, STEADY_S)
+    )
+    steady, half = np.abs(after - before) < 0.3 * np.abs(command), len(time_s) // 2
+    limits = np.quantile(np.abs(command), 0.9, axis=0)
+    bends = []
+    for axis in np.flatnonzero(limits > 3.0 * CALM_RATE):
+        for part in (slice(None, half), slice(half, None)):
+            c, r = command[part, axis][steady[part, axis]], rate[part, axis][steady[part, axis]]
+            share = np.abs(c) / limits[axis]
+            large, small = share > 0.6, (share > 0.15) & (share < 0.4)
+            if min(large.sum(), small.sum()) < 30:
+                return 0.0
             slopes = [float(np.median(r[m] / c[m])) for m in (large, small)]
-            bends.append(slopes[0] / slopes[1] - 1.0)
-    # Less of large commands than of small ones is no curve: motors reach their limits.
-    return float(np.median(bends)) if bends and min(bends) > 0.0 else 0.0
+            bends.append(slopes[0] / slopes[1] - 1.0 if slopes[1] > 0.0 else 0.0)
+    return max(0.0, min(bends, default=0.0))
 
 
 def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> list[Finding]:
