@@ -22,9 +22,9 @@ USUAL_S = 0.08
 GAIN = (0.8, 1.25)
 """What the body does of a steady rate command, where nothing is wrong."""
 UNITS = {"in degrees per second": 1.0 / DEG, "ten times too large (blackbox_high_resolution)": 10.0}
-OPPOSITE, CLOSE, FOLLOWED, BENT = -0.5, 0.9, 0.92, 0.4
-"""Correlations of commands and gyro: of another sign, of small commands that are followed closely,
-of commands whose gain says something for sure; and how much bend is a curve."""
+OPPOSITE, FOLLOWED, BENT = -0.5, 0.92, 0.4
+"""Correlations of commands and gyro: of another sign, and of commands whose gain says something for
+sure; and how much bend is a curve."""
 RANGES = (
     ("0 to 1", 1.0, (0.03, 0.97), ""),
     ("percent", 100.0, (8.0, 90.0), "0.01"),
@@ -147,9 +147,8 @@ def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
     """Return how much more of large commands the body does than of small ones, as a share.
 
     Of commands that hardly change within the loop's response: the body never reaches a short large
-    one. Of the axes on which small ones are followed closely, the least of both halves of the
-    flight; 0 where they do not agree, or where large commands are followed less: that is no curve,
-    motors reach their limits.
+    one. Of the axes that turn and both halves of the flight the least; 0 where one of them has too
+    few commands, or follows large ones less: that is no curve, motors reach their limits.
     """
     both = np.isfinite(command).all(axis=1) & np.isfinite(rate).all(axis=1)
     time_s, command, rate = time_s[both], command[both], rate[both]
