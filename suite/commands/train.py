@@ -44,8 +44,8 @@ class Config:
     delta: Path | None = None
     """Train under this frozen Delta Action Model (a checkpoint of `suite delta`)."""
     set: tuple[str, ...] = ()
-    """Change settings by name, in every phase, such as loss.progress=0.4; in the second phase
-    alone: phases.2.loss.progress=0.4."""
+    """Change settings by name, in every phase, such as loss.progress=0.4; from the second phase
+    on: phases.2.loss.progress=0.4."""
     joined: tyro.conf.OmitArgPrefixes[Joined] = Joined()
     """Several processes, for devices of several hosts."""
     json: bool = False

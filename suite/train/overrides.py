@@ -30,7 +30,7 @@ NEEDS = {
 }
 """Settings that do nothing where another is 0 or False."""
 PREFIX = "phases."
-"""What a change of one phase begins with."""
+"""What a change that comes with a phase begins with."""
 
 
 def override(config: T, changes: Iterable[str]) -> T:
@@ -184,10 +184,11 @@ def check_phases(config: TrainConfig) -> None:
     total = math.fsum(phase.share for phase in config.phases)
     if config.phases and not math.isclose(total, 1.0, abs_tol=1e-6):
         raise ValueError(f"the shares of phases add up to {total:g}, allowed is 1")
+    common = _in_common(config, config)
     for number, one in enumerate(phase_configs(config), 1):
         check(one)
         for key, value in _in_common(one, config).items():
-            if value != _in_common(config, config)[key]:
+            if value != common[key]:
                 raise ValueError(
                     f"phase {number} changes {key}, which a whole run has in common (of spec, "
                     "rate_hz and speed may change); set it without a phase"
@@ -203,11 +204,12 @@ def _in_common(config: TrainConfig, run: TrainConfig) -> dict[str, object]:
 
 
 def changed(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
-    """Return a run with a user's changes made: SETTING=VALUE in every phase, or in one alone.
+    """Return a run with a user's changes made: SETTING=VALUE in every phase, or from one on.
 
     Args:
         config: the run.
-        changes: such as "loss.progress=0.4", or "phases.2.loss.progress=0.4" for its second phase.
+        changes: such as "loss.progress=0.4", or "phases.2.loss.progress=0.4" from its second phase
+            until another phase changes that.
 
     Raises:
         ValueError: naming the setting, what is wrong with it and what is allowed.
