@@ -68,8 +68,9 @@ def _state(path: Path) -> dict[str, Any]:
         return {"commit": "", "newer": None}
     page = json.loads(path.read_text(encoding="utf-8"))
     flown = re.findall(r"([\w-]+), SHA-256 ([0-9a-f]{16})", json.dumps(page["made_by"]))
-    current = {name: policy_digest(name)[:16] for name in shipped.names()}
-    newer = ["policy"] if any(current.get(name) != digest for name, digest in flown) else []
+    names = shipped.names()
+    stale = (name not in names or policy_digest(name)[:16] != digest for name, digest in flown)
+    newer = ["policy"] if any(stale) else []
     newer += ["code"] if page.get("code_sha256") != code_digest(*FLIES) else []
     return {"commit": page["git_commit"] or "", "newer": newer}
 
