@@ -1,11 +1,9 @@
-"""Make the training runs behind a policy and its judgement a shipped policy with its card.
+"""Make a training run and its judgement a shipped policy with its card.
 
-    python tools/ship.py RUN [RUN ...] --eval EVAL [--name race] [--speed 0.8] [--rays 2]
+    python tools/ship.py RUN --eval EVAL [--name race] [--speed 0.8]
 
-Each RUN is a folder of `suite train` that started from the one before it; the last one's policy is
-shipped. EVAL is a folder of `suite eval`; without it the card has no table yet. A policy that takes
-how fast to fly as an input flies at --speed where nobody says otherwise, and its camera casts
---rays across and down a pixel.
+RUN is a folder of `suite train`. EVAL is a folder of `suite eval`; without it the card has no table
+yet. A policy whose speed is an input flies at --speed where nothing else is given.
 """
 
 from __future__ import annotations
@@ -14,9 +12,7 @@ import argparse
 import json
 import shlex
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from policies.formats.checkpoint import CONFIG, WEIGHTS
 from policies.formats.policy_file import load_policy_checkpoint
@@ -29,21 +25,18 @@ from tracks.common.files import replacing_folder, write_json
 SHELF = Path(__file__).resolve().parent.parent / "policies" / "shipped"
 
 
-def card(name: str, runs: Sequence[Path], judged: Path | None) -> str:
+def card(name: str, run: Path, judged: Path | None) -> str:
     """Return the card as Markdown: how it was made, its curve, its table."""
-    made = [json.loads((run / "run.json").read_text(encoding="utf-8")) for run in runs]
-    lines = []
-    for run, facts in zip(runs, made, strict=True):
-        rows = curve.read(run)
-        seconds = sum(row["seconds"] for row in rows)
-        lines.append(
-            f"| `{shlex.join(facts['command'])}` | {facts['seed']} | {facts['git_commit']} "
-            f"| {len(rows)} | {duration(seconds)} |"
-        )
-    machine = made[-1]["machine"]
-    stored = load_policy_checkpoint(runs[-1] / "policy")
+    made, rows = json.loads((run / "run.json").read_text(encoding="utf-8")), curve.read(run)
+    seconds = sum(row["seconds"] for row in rows)
+    line = (
+        f"| `{shlex.join(made['command'])}` | {made['seed']} | {made['git_commit']} "
+        f"| {len(rows)} | {duration(seconds)} |"
+    )
+    machine = made["machine"]
+    stored = load_policy_checkpoint(run / "policy")
     size = sum(array.size for array in stored.params.values())
-    flown = made[-1]["config"]["quadrotor"]
+    flown = made["config"]["quadrotor"]
     where = f"quadrotors around `{flown['vehicle']['name']}`" if flown else "the point mass"
     text = f"""# {name}
 
@@ -54,7 +47,7 @@ earlier recipes on the judged tracks and vehicle, at other seeds.
 
 | made by | seed | commit | iterations | time |
 |---|---|---|---|---|
-{chr(10).join(lines)}
+{line}
 
 On {machine["processor"]}, {machine["cores"]} cores.
 
@@ -73,32 +66,23 @@ number. The trials' seeds were not flown while the recipe was made.
 {table}"""
 
 
-def joined_curve(runs: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return the runs' curves one after the other, iterations counted through."""
-    rows = [row for run in runs for row in curve.read(run)]
-    return [{**row, "iteration": number} for number, row in enumerate(rows)]
-
-
 def main() -> None:
     """Write policies/shipped/NAME from the command line's folders."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("runs", type=Path, nargs="+", help="folders of suite train, in order")
-    parser.add_argument("--eval", type=Path, help="folder of suite eval of the last run's policy")
+    parser.add_argument("run", type=Path, help="folder of suite train")
+    parser.add_argument("--eval", type=Path, help="folder of suite eval of the run's policy")
     parser.add_argument("--name", default="race", help="the shipped policy's name")
     parser.add_argument("--speed", type=float, help="spec.speed, in the place of the run's own")
-    parser.add_argument("--rays", type=int, help="spec.camera.rays, in the place of the run's own")
     options = parser.parse_args()
     with replacing_folder(SHELF / options.name) as beside:
-        policy = options.runs[-1] / "policy"
+        policy = options.run / "policy"
         shutil.copy(policy / WEIGHTS, beside / WEIGHTS)
         config = json.loads((policy / CONFIG).read_text(encoding="utf-8"))
         if options.speed is not None:
             config["spec"]["speed"] = options.speed
-        if options.rays is not None:
-            config["spec"]["camera"]["rays"] = options.rays
         write_json(beside / CONFIG, config)
-        (beside / "curve.png").write_bytes(training_chart({BEFORE: joined_curve(options.runs)}))
-        text = card(options.name, options.runs, options.eval)
+        (beside / "curve.png").write_bytes(training_chart({BEFORE: curve.read(options.run)}))
+        text = card(options.name, options.run, options.eval)
         (beside / "card.md").write_text(text, encoding="utf-8")
     print(f"shipped {SHELF / options.name}")
 
