@@ -23,7 +23,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
 from suite.train.dynamics.quadrotor import QuadrotorParams, quadrotor_dynamics
-from tests.support.training import doubled
+from tests.support.training import ALIKE, doubled
 from tracks.geometry.field import attractive_field, magnetic_field
 from tracks.geometry.gates import rectangle
 from tracks.geometry.rotation import exp_rot
@@ -71,16 +71,6 @@ def from_rest(action_b):
         return step(body, constants, action_b[None], gate_w, key), None
 
     return jax.lax.scan(decide, body, length=3)[0].vel_w[0]
-
-
-ALIKE = {
-    "mass_std": 0.0,
-    "lag_spread": 0.0,
-    "drag_spread": 0.0,
-    "delay_spread_s": 0.0,
-    "gain_spread": 0.0,
-    "wind_std": (0.0, 0.0, 0.0),
-}
 
 
 def field_at(point_w, opening=OPENING):

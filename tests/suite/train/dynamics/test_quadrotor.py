@@ -23,7 +23,14 @@ from suite.train.recipes import named_recipe, with_quadrotor
 from suite.train.rollout import make_rollout
 from suite.train.worlds import sample_worlds
 from tests.support.courses import straight
-from tests.support.training import SPEC, boxes_worlds, doubled, fresh_params, small_config
+from tests.support.training import (
+    ALIKE,
+    SPEC,
+    boxes_worlds,
+    doubled,
+    fresh_params,
+    small_config,
+)
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tracks.geometry.camera import Camera
 
@@ -37,15 +44,6 @@ HIDDEN = with_effects(
     rate_gain=((0.6, 0.7, 1.2),),
 )
 """Effects that a point mass cannot hold."""
-ALIKE = {
-    "mass_std": 0.0,
-    "lag_spread": 0.0,
-    "drag_spread": 0.0,
-    "delay_spread_s": 0.0,
-    "gain_spread": 0.0,
-    "wind_std": (0.0, 0.0, 0.0),
-}
-"""All worlds have the vehicle file's quadrotor."""
 FAR_W = np.array([40.0, 5.0, 3.0])
 """A gate that is never reached."""
 
