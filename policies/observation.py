@@ -33,6 +33,8 @@ class View(NamedTuple):
     """(..., 3) that of the gate of `second_w`."""
     depth_m: Any = None
     """(..., H, W) planar depth, clipped to the camera's range [m]; None without a camera."""
+    gate_number: Any = None
+    """(...,) of the next gate, counted from the track's first; None where no sensor model asks."""
 
 
 class Observation(NamedTuple):

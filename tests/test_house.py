@@ -5,7 +5,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("tracks", "policies", "eval", "suite")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-CATALOGUES = ("eval/effects", "suite/commands")
+CATALOGUES = ("eval/effects", "eval/sensors", "suite/commands")
 """Folders that hold one file a thing, however many there are."""
 LINES_MOST, FILES_MOST, ENTRIES_MOST = 400, 12, 9
 
@@ -26,7 +26,8 @@ def test_a_folder_is_one_idea():
 
 
 def test_a_packages_root_is_seen_at_one_glance():
-    hidden = ("__init__.py", "py.typed", "__pycache__", "commands")
+    catalogues = [Path(name).name for name in CATALOGUES]
+    hidden = ("__init__.py", "py.typed", "__pycache__", *catalogues)
     for package in PACKAGES:
         entries = [path.name for path in (ROOT / package).iterdir() if path.name not in hidden]
         assert len(entries) <= ENTRIES_MOST, (package, entries)

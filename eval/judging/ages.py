@@ -1,4 +1,4 @@
-"""States and images that are old when a policy decides, and images that never come.
+"""States and images that are old when a policy decides: the sensor model `delay`.
 
 Views are taken between decisions, at the physics step that lies an age before the decision that
 will see them, and kept until then. Ages may jitter: each decision then has an age of its own, drawn
@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.judging.sensors import SensorNoise
-from eval.worlds.slots import IMAGE_AGES, LOSSES, STATE_AGES, generator_of
+from eval.sensors.interface import Ages
+from eval.worlds.slots import IMAGE_AGES, STATE_AGES, generator_of
 from eval.worlds.trial import TrialSpec
 from policies.observation import View
 from tracks.common.masks import select
@@ -109,34 +109,23 @@ class Aged:
 
 
 class Delays:
-    """Ages of states and images, and losses of images, in the slots of a judge."""
+    """Ages of states and images in the slots of a judge."""
 
-    def __init__(self, noise: SensorNoise, slots: int, period_steps: float, dt: float) -> None:
-        """Make it for `noise` and the physics steps between decisions and their length [s]."""
-        self._loss = noise.image_loss
+    def __init__(self, ages: Ages, slots: int, period_steps: float, dt: float) -> None:
+        """Make it for `ages` and the physics steps between decisions and their length [s]."""
         self.state, self.image = (
-            Aged(age_s, noise.age_jitter, slots, period_steps, dt)
-            for age_s in (noise.state_age_s, noise.image_age_s)
+            Aged(age_s, ages.jitter, slots, period_steps, dt)
+            for age_s in (ages.state_s, ages.image_s)
         )
-        self._draws = [np.random.default_rng(0)] * slots
-        self._shown: np.ndarray | None = None
 
     def start(self, slot: int, trial: TrialSpec) -> None:
         """Begin `trial` in `slot`."""
-        self._draws[slot] = generator_of(trial, LOSSES)
         self.state.start(slot, generator_of(trial, STATE_AGES))
         self.image.start(slot, generator_of(trial, IMAGE_AGES))
 
     def see(self, now: View, fresh: np.ndarray, flying: np.ndarray) -> View:
         """Return what there is to see at a decision; see `Aged.see`."""
         depth_m = self.image.see(now, fresh, flying).depth_m
-        if self._loss:
-            lost = np.zeros(len(fresh), bool)
-            for slot in np.flatnonzero(flying).tolist():
-                lost[slot] = self._draws[slot].random() < self._loss
-            before = depth_m if self._shown is None else self._shown
-            depth_m = np.where((lost & ~fresh)[:, None, None], before, depth_m)
-            self._shown = depth_m
         return self.state.see(now, fresh, flying)._replace(depth_m=depth_m)
 
     def moments(self) -> Iterator[Moment]:

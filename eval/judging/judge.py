@@ -19,8 +19,10 @@ from eval.judging.ages import Delays
 from eval.judging.guard import ActionLimits, ask, first_action, limits_of
 from eval.judging.outputs import Outputs
 from eval.judging.recorder import Recorder
-from eval.judging.sensors import SensorNoise, Sensors, check_noise
+from eval.judging.sensors import Sensors
 from eval.logs.flight import Flight
+from eval.sensors import sensing
+from eval.sensors.sensors_file import PERFECT, SensorSet
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import REFERENCE, World, compiles, flown_by, world_class
 from eval.worlds.slots import fitting, layout_of
@@ -77,8 +79,8 @@ class JudgeOptions:
     """When a trial ends."""
     limits: ActionLimits = field(default_factory=ActionLimits)
     """What an action may be."""
-    noise: SensorNoise = field(default_factory=SensorNoise)
-    """What is wrong with the policy's observation."""
+    sensors: SensorSet = PERFECT
+    """What the policy sees of the truth."""
 
 
 @dataclass(frozen=True)
@@ -119,13 +121,12 @@ def fly(
         tracks: custom tracks by the name that trials call them; others are families.
 
     Raises:
-        ValueError: for an unknown world or track, noise that cannot be, a policy faster than the
-            physics, or a policy that returns something else than actions.
+        ValueError: for an unknown world or track, a policy faster than the physics, or a policy
+            that returns something else than actions.
         WorkerDied: where a process that works for this one died, and again at the same piece.
     """
     options = options or JudgeOptions()
     world_class(world)
-    check_noise(options.noise)
     tracks = tracks or {}
     for trial in trials:
         if trial.track not in tracks:
@@ -204,7 +205,7 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
         for index, trial in share:
             result = world_class(REFERENCE)(
                 policy, trial, track_of(task.tracks, trial), task.vehicle, options.rules,
-                options.limits, options.slots, options.noise,
+                options.limits, options.slots, options.sensors,
             )  # fmt: skip
             yield index, result, None
         return
@@ -256,11 +257,11 @@ class _Slots:
         self._fresh = np.ones(n, bool)
         self._hidden = policy.start(n)
         self._recorder = Recorder(n, task.record.depth, self._first) if task.record else None
-        noise, range_m = task.options.noise, policy.spec.camera.range_m
-        self._sensors = None if noise.is_none else Sensors(noise, n, rate, range_m)
-        self._delays = None
-        if noise.is_late:
-            self._delays = Delays(noise, n, self._steps_a_decision, world.dt)
+        wanted, self._sensors, self._delays = task.options.sensors, None, None
+        if sensing(wanted.models):
+            self._sensors = Sensors(wanted, n, rate, policy.spec.camera)
+        if wanted.is_late:
+            self._delays = Delays(wanted.ages, n, self._steps_a_decision, world.dt)
 
     def run(self, share: Sequence[Numbered]) -> Iterator[Ended]:
         """Fly the numbered trials; every slot takes the next one when its own has ended."""
@@ -293,7 +294,7 @@ class _Slots:
                 self._recorder.start(slot)
             track = track_of(self._task.tracks, trial)
             if self._sensors:
-                self._sensors.start(slot, trial, len(track.scene.gates.center_w))
+                self._sensors.start(slot, trial)
             if self._delays:
                 self._delays.start(slot, trial)
             entries.append((slot, track, trial))
@@ -307,7 +308,7 @@ class _Slots:
         if self._delays:
             seen = self._delays.see(seen, self._fresh, flying)
         if self._sensors:
-            seen = self._sensors.see(seen, flying)
+            seen = self._sensors.see(seen, self._fresh, flying)
         state, image = observe(spec, seen, self._action_b)
         state = np.where(flying[:, None], state, 0).astype(np.float32)
         image = image.astype(np.float32)
@@ -340,11 +341,11 @@ class _Slots:
         self._advance(steps - done)
 
     def _look(self, flying: np.ndarray, images: np.ndarray | None = None) -> View:
-        """Return what there is to see now, gates as the map has them; images of all that fly."""
+        """Return what there is to see now; images of all that fly."""
         view = self._world.view(flying if images is None else images)
         if not self._sensors:
             return view
-        return self._sensors.misplace(view, self._world.progress.gates, flying)
+        return view._replace(gate_number=np.array(self._world.progress.gates))
 
     def _advance(self, steps: np.ndarray) -> None:
         for row in self._world.advance(self._action_b, steps, bool(self._recorder)):

@@ -11,9 +11,11 @@ import numpy as np
 
 from eval.judging.guard import ActionLimits, Guarded, ask, first_action, limits_of
 from eval.judging.outputs import Outputs
-from eval.judging.sensors import SensorNoise, Sensors
+from eval.judging.sensors import Sensors
 from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import Motion, uses_noise
+from eval.sensors import sensing
+from eval.sensors.sensors_file import PERFECT, SensorSet
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import REFERENCE
 from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
@@ -35,7 +37,7 @@ def fly_trial(
     rules: Rules | None = None,
     limits: ActionLimits | None = None,
     rows: int = 64,
-    noise: SensorNoise | None = None,
+    wanted: SensorSet = PERFECT,
 ) -> TrialResult:
     """Fly one trial.
 
@@ -48,12 +50,12 @@ def fly_trial(
         limits: what an action may be.
         rows: of the policy's inputs; all but the first are zero. The rows of a call to the policy
             are as many as in the batched worlds, since some policies answer otherwise then.
-        noise: what is wrong with the policy's observation.
+        wanted: what the policy sees of the truth.
 
     Raises:
-        ValueError: for observations that are old or lost, which this world has not.
+        ValueError: for observations that are old, which this world has not.
     """
-    if noise and noise.is_late:
+    if wanted.is_late:
         raise ValueError("world 'reference' shows nothing late; fly in 'mujoco', which flies alike")
     rules, limits = rules or Rules(), limits or ActionLimits()
     autopilot = make_autopilot(vehicle, policy.spec.action)
@@ -69,9 +71,9 @@ def fly_trial(
     eye, hidden = Eye(spec.camera), policy.start(rows)
     loops = start_autopilot(autopilot, motion_of(data), draws[:1] if len(draws) > 1 else None)
     sensors = None
-    if noise and not noise.is_none:
-        sensors = Sensors(noise, 1, spec.rate_hz, spec.camera.range_m)
-        sensors.start(0, trial, count)
+    if sensing(wanted.models):
+        sensors = Sensors(wanted, 1, spec.rate_hz, spec.camera)
+        sensors.start(0, trial)
     limits, action_b = (
         limits_of(limits, spec.action, vehicle),
         first_action(spec.action, vehicle)[None],
@@ -118,8 +120,8 @@ def fly_trial(
             gate, after = (Gates(*(field[[number]] for field in gates)) for number in numbers)
             seen = view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, after, depth[None])
             if sensors:
-                wanted = np.array([True])
-                seen = sensors.see(sensors.misplace(seen, np.array([passed]), wanted), wanted)
+                seen = seen._replace(gate_number=np.array([passed]))
+                seen = sensors.see(seen, np.array([decisions == 0]), np.array([True]))
             state, image = observe(spec, seen, action_b)
             fresh = np.full(rows, decisions == 0)
             inputs = (_padded(x, rows) for x in (state, image))

@@ -74,7 +74,7 @@ def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
     return Gates(*(field[index] for field in gates._replace(opening_g=opening)))
 
 
-GUSTS, PIXELS, GATES, STATE, LOSSES, STATE_AGES, IMAGE_AGES = range(1, 8)
+GUSTS, SENSED, STATE_AGES, IMAGE_AGES = range(1, 5)
 """What a trial's random numbers are for; each use has a stream of its own."""
 GUSTS_AT_ONCE = 1024
 """Steps whose draws are made together."""
@@ -82,13 +82,13 @@ IDLE = TrialSpec("", 0, 0)
 """In a slot where none has been loaded."""
 
 
-def generator_of(trial: TrialSpec, use: int) -> np.random.Generator:
-    """Return the random numbers of a trial for one use, set by the two alone.
+def generator_of(trial: TrialSpec, use: int, part: str = "") -> np.random.Generator:
+    """Return the random numbers of a trial for a part of one use, set by the three alone.
 
     Of a track's file the name counts, however the way to it was written.
     """
     name = PurePath(trial.track).name
-    key = [trial.seed, trial.difficulty, *name.encode(), use]
+    key = [trial.seed, trial.difficulty, *name.encode(), use, *part.encode()]
     return np.random.default_rng(np.random.SeedSequence(key))
 
 

@@ -31,6 +31,7 @@ from tracks.common.work import Workers
 if TYPE_CHECKING:
     from eval.judging.plans import OverPlan
     from eval.judging.results import Journal
+    from eval.sensors.sensors_file import SensorSet
     from eval.vehicles.vehicle import Vehicle
     from eval.worlds.trial import TrialResult
     from policies.policy import Policy
@@ -102,7 +103,7 @@ def evaluate(
         "sentences": _sentences(results),
         "judged": evaluation,
         "policies": [about_policy(flier.source, flier.policy) for flier in fliers],
-        "sha256": file_digests(course.vehicle, course.tracks),
+        "sha256": file_digests(course.vehicle, course.tracks, course.sensors),
         "flown_otherwise": course.differences,
     }
     write_results(
@@ -172,14 +173,19 @@ def _actions(flier: Flier, results: Sequence[TrialResult], console: Console) -> 
     return found
 
 
-def file_digests(vehicle: Vehicle, tracks: Mapping[str, Track]) -> dict[str, str]:
+def file_digests(
+    vehicle: Vehicle, tracks: Mapping[str, Track], sensors: SensorSet
+) -> dict[str, str]:
     """Return the SHA-256 of what a file may describe, as it was read, by what it is.
 
     Not of the file's bytes: a comment in it may change and the flights be the same.
     """
     from eval.quadrotor.vehicle_file import vehicle_table
+    from eval.sensors.sensors_file import sensors_table
 
     parts: dict[str, object] = {"vehicle": vehicle_table(vehicle)}
+    if sensors.models:
+        parts["sensors"] = sensors_table(sensors)
     parts |= {f"track {name}": track for name, track in tracks.items()}
     return {what: digest_of(part) for what, part in parts.items()}
 
@@ -212,6 +218,7 @@ def _open_journals(
             "policy": about_policy(flier.source, flier.policy),
             "speed": flier.manner.speed,
             "vehicle": course.vehicle,
+            "sensors": course.sensors,
             "world": evaluation.world,
             "deadline_s": evaluation.deadline_s,
             "time_limit_s": evaluation.time_limit_s,
@@ -239,6 +246,7 @@ def _fly_one(
         workers=workers,
         rules=Rules(time_limit_s=evaluation.time_limit_s),
         limits=ActionLimits(deadline_s=evaluation.deadline_s),
+        sensors=course.sensors,
     )
     with journal:
         missing = journal.missing(course.trials)

@@ -17,6 +17,7 @@ from tracks.common.work import Workers, crew, usable_cores
 from tracks.input.ranges import check_ranges
 
 if TYPE_CHECKING:
+    from eval.sensors.sensors_file import SensorSet
     from eval.vehicles.vehicle import Vehicle
     from eval.worlds.trial import TrialSpec
     from policies.policy import Policy
@@ -110,6 +111,8 @@ class Course(NamedTuple):
     """Those that come from files, by the name that trials call them."""
     vehicle: Vehicle
     """On what."""
+    sensors: SensorSet
+    """Through which sensors."""
     differences: list[str]
     """What of the vehicle the world flies otherwise, in sentences."""
     notes: list[str]
@@ -124,6 +127,7 @@ def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Cou
     """
     from eval.effects import EFFECTS
     from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.sensors.sensors_file import PERFECT, load_sensors
     from eval.worlds import differences, world_class
     from eval.worlds.engine import refuse_start_contact
 
@@ -131,9 +135,11 @@ def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Cou
     check_ranges(wanted, options=True)
     names = parse_tracks(wanted.track)
     vehicle = load_vehicle(wanted.vehicle)
+    sensors = load_sensors(wanted.sensors) if isinstance(wanted, Evaluation) else PERFECT
     flown_otherwise, notes = differences(wanted.world, vehicle), list[str]()
     levels, tracks = parse_levels(wanted.difficulty), custom_tracks(names)
-    once = not (real_time or any(EFFECTS[name].random for name in vehicle.effects))
+    by_chance = sensors.models or any(EFFECTS[name].random for name in vehicle.effects)
+    once = not (real_time or by_chance)
     if once and wanted.trials > 1:
         notes = [
             f"{name}: flown once, not {wanted.trials} times: a track from a file and a vehicle on "
@@ -144,7 +150,7 @@ def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Cou
         refuse_start_contact(name, track, vehicle)
         notes += _in_millimetres(name, track)
     trials = trial_list(names, levels, wanted.trials, wanted.seed, once)
-    return Course(trials, tracks, vehicle, flown_otherwise, notes)
+    return Course(trials, tracks, vehicle, sensors, flown_otherwise, notes)
 
 
 def _in_millimetres(name: str, track: Track) -> list[str]:

@@ -106,26 +106,30 @@ def fly_again(
         judged: the SHA-256 of what flew, as `read_digests` has it; None compares nothing.
 
     Raises:
-        ValueError: where the policy, the vehicle or a track is not what was judged.
+        ValueError: where the policy, vehicle, sensors or a track is not what was judged.
     """
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, Record, fly
     from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.sensors.sensors_file import load_sensors
     from eval.view.recording import Drone
     from eval.worlds.trial import Rules, track_of
 
+    sensors = load_sensors(evaluation.sensors)
     options = JudgeOptions(
         workers=1,
         rules=Rules(time_limit_s=evaluation.time_limit_s),
         limits=ActionLimits(deadline_s=evaluation.deadline_s),
+        sensors=sensors,
     )
     name = policy or (evaluation.policies or (default_policy(),))[0]
     flier = load_flier(name, evaluation.trust, manners(evaluation.speed, monitor=False)[0])
     vehicle = load_vehicle(evaluation.vehicle)
     tracks = custom_tracks(parse_tracks(evaluation.track))
     if judged is not None:
-        digests = {"policy": policy_digest(name), **file_digests(vehicle, tracks)}
-        _refuse_changed({"policy": name, "vehicle": evaluation.vehicle}, digests, judged)
+        digests = {"policy": policy_digest(name), **file_digests(vehicle, tracks, sensors)}
+        sources = {"policy": name, "vehicle": evaluation.vehicle, "sensors": evaluation.sensors}
+        _refuse_changed(sources, digests, judged)
     flights: dict[TrialSpec, Flight] = {}
 
     def keep(result: TrialResult, flight: Flight | None) -> None:

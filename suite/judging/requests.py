@@ -44,6 +44,9 @@ class Evaluation:
     world: str = "mujoco"
     """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (another
     simulator; pip install diffracing-suite[rotorpy]), or one of an installed package."""
+    sensors: str = "perfect"
+    """What the policy sees of the truth: shipped sensors' name (perfect, vio, stereo-depth, ...) or
+    a sensors file (.toml)."""
     time_limit_s: TimeLimit = 20.0
     """A trial ends at this time; a long course of your own needs more than the tables' 20 [s]."""
     deadline_s: Annotated[float, Range(0.0, 3600.0, above=True)] | None = None

@@ -27,7 +27,7 @@ def nowhere(mask: Array) -> bool:
 def select(mask: Array, new: Any, old: Any) -> Any:
     """Return `new` in the rows where `mask` (N,) and `old` elsewhere.
 
-    Both are arrays (N, ...), or alike nested tuples and dicts of such.
+    Both are arrays (N, ...), or alike nested tuples and dicts of such; None stays None.
     """
     if everywhere(mask):
         return new
@@ -40,6 +40,8 @@ def _selected(mask: Array, new: Any, old: Any) -> Any:
     if isinstance(new, tuple):
         parts = [_selected(mask, a, b) for a, b in zip(new, old, strict=True)]
         return type(new)(*parts) if hasattr(new, "_fields") else tuple(parts)
+    if new is None:
+        return None
     xp = mask.__array_namespace__()
     return xp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
 

@@ -41,11 +41,11 @@ def condition_grid(
         mine = f"{name}: " if len(names) > 1 else ""
         headers += [f"{mine}success", f"{mine}change"]
     headers += [f"{name} - {names[0]}" for name in names[1:]]
-    plain = (base.condition.vehicle, base.condition.noise)
+    plain = (base.condition.vehicle, base.condition.sensors)
     lines = []
     for entry in entries:
         line: list[str | Cell] = [*(entry.condition.name, entry.condition.words)[-len(first) :]]
-        same = entry.condition.vehicle is plain[0] and entry.condition.noise == plain[1]
+        same = entry.condition.vehicle is plain[0] and entry.condition.sensors == plain[1]
         for name in names:
             change = paired_success(entry.won(name), base.won(name))
             line += [percent(entry.success(name)), "" if same else points_cell(change)]

@@ -12,10 +12,10 @@ import numpy as np
 
 from eval.effects import EFFECTS, constant_wind
 from eval.effects.interface import Effect, at, neutral
-from eval.judging.sensors import SensorNoise
+from eval.sensors.sensors_file import PERFECT, SensorSet, sensor_set
 from eval.vehicles.vehicle import Vehicle
 
-STATE_UNIT = SensorNoise(pos_m=0.03, vel=0.1, attitude_rad=math.radians(1.0))
+STATE_UNIT = {"position": 0.03, "velocity": 0.1, "attitude": math.radians(1.0)}
 """What 1 means in the sweep of the state's estimate."""
 DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")
 """Effects that grow in the sweep of drag, as many of them as the vehicle has."""
@@ -32,7 +32,7 @@ class Condition:
     words: str
     """How strong it is, for people, with its unit."""
     vehicle: Vehicle
-    noise: SensorNoise = SensorNoise()
+    sensors: SensorSet = PERFECT
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Sweep:
     """The size's meaning and unit."""
     sizes: Sequence[float]
     """Growing; the first is the undisturbed vehicle's own."""
-    make: Callable[[Vehicle, float], tuple[Vehicle, SensorNoise]]
+    make: Callable[[Vehicle, float], tuple[Vehicle, SensorSet]]
     """Returns what flies at one size."""
 
 
@@ -107,25 +107,25 @@ def sweep_conditions(vehicle: Vehicle, sweep: Sweep) -> list[Condition]:
 
 def _effect(
     name: str, field: str, scale: float | tuple[float, ...]
-) -> Callable[..., tuple[Vehicle, SensorNoise]]:
-    def make(vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorNoise]:
+) -> Callable[..., tuple[Vehicle, SensorSet]]:
+    def make(vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
         values = EFFECTS[name].values(**{field: _plain(np.asarray(scale) * size)})
-        return with_effect(vehicle, name, values), SensorNoise()
+        return with_effect(vehicle, name, values), PERFECT
 
     return make
 
 
-def _heavier(vehicle: Vehicle, percent: float) -> tuple[Vehicle, SensorNoise]:
+def _heavier(vehicle: Vehicle, percent: float) -> tuple[Vehicle, SensorSet]:
     values = EFFECTS["mass_offset"].values(offset=percent / 100 * vehicle.mass)
-    return with_effect(vehicle, "mass_offset", values), SensorNoise()
+    return with_effect(vehicle, "mass_offset", values), PERFECT
 
 
-def _draggier(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorNoise]:
+def _draggier(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorSet]:
     for name in _drags(vehicle):
         own = vehicle.effects[name]
         more = _plain(factor * np.asarray(own.coefficient, float))
         vehicle = with_effect(vehicle, name, own._replace(coefficient=more))
-    return vehicle, SensorNoise()
+    return vehicle, PERFECT
 
 
 def _drags(vehicle: Vehicle) -> list[str]:
@@ -146,17 +146,19 @@ def _drag_sweep(vehicle: Vehicle) -> Sweep:
 
 
 def _sensing(
-    scale: float, *fields: str, jitter: float = 0.0
-) -> Callable[..., tuple[Vehicle, SensorNoise]]:
-    def make(vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorNoise]:
-        return vehicle, SensorNoise(age_jitter=jitter, **dict.fromkeys(fields, scale * size))
+    model: str, scale: float, *names: str, **held: float
+) -> Callable[..., tuple[Vehicle, SensorSet]]:
+    """Return what makes parameters of a sensor model `scale` times a size; `held` stay."""
+
+    def make(vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
+        return vehicle, sensor_set({model: dict.fromkeys(names, scale * size) | held})
 
     return make
 
 
-def _estimating(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorNoise]:
-    grown = {name: factor * getattr(STATE_UNIT, name) for name in ("pos_m", "vel", "attitude_rad")}
-    return vehicle, replace(STATE_UNIT, **grown)
+def _estimating(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorSet]:
+    grown = {name: factor * size for name, size in STATE_UNIT.items()}
+    return vehicle, sensor_set({"state_noise": {**grown, "correlation": 0.5}})
 
 
 def sweeps(vehicle: Vehicle) -> list[Sweep]:
@@ -180,18 +182,18 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
         Sweep("wind", "constant wind [m/s]", more(wind, 2, 4, 6, 8),
               _effect("constant_wind", "velocity", constant_wind.EFFECT.parameters[0].direction)),
         Sweep("depth noise", "standard deviation of inverse depth [1/m]", (0, 0.01, 0.03, 0.1, 0.3),
-              _sensing(1, "inverse_depth")),
+              _sensing("stereo", 1, "noise", focal=1.0, baseline=1.0)),
         Sweep("gate-pose error", "standard deviation per axis [m]", (0, 0.05, 0.1, 0.2, 0.3),
-              _sensing(1, "gate_m")),
+              _sensing("gate_map", 1, "moved")),
         Sweep("age of the state", "age at the decision [ms]", (0, 20, 40, 60, 80, 100),
-              _sensing(1e-3, "state_age_s")),
+              _sensing("delay", 1e-3, "state")),
         Sweep("age of the image", "age at the decision [ms]", (0, 20, 40, 60, 80, 100),
-              _sensing(1e-3, "image_age_s")),
+              _sensing("delay", 1e-3, "image")),
         Sweep("age of both", "age at the decision [ms]", (0, 20, 40, 60, 80, 100),
-              _sensing(1e-3, "state_age_s", "image_age_s")),
+              _sensing("delay", 1e-3, "state", "image")),
         Sweep("jittering age of both", "mean age at the decision [ms]", (0, 20, 40, 60, 80, 100),
-              _sensing(1e-3, "state_age_s", "image_age_s", jitter=1.0)),
+              _sensing("delay", 1e-3, "state", "image", jitter=1.0)),
         Sweep("lost images", "share of the images [%]", (0, 10, 30, 50, 80),
-              _sensing(1e-2, "image_loss")),
+              _sensing("frame_loss", 1e-2, "share")),
         Sweep("state-estimation noise", "times 3 cm, 0.1 m/s, 1 deg", (0, 1, 2, 4, 8), _estimating),
     ]  # fmt: skip

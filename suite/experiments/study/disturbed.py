@@ -88,7 +88,7 @@ def flown_under(
     """
     conditions = [*alone, *(point for points in grown.values() for point in points)]
     orders = {
-        (at, name, part): Order(Flier(policy, condition.vehicle, condition.noise), trials)
+        (at, name, part): Order(Flier(policy, condition.vehicle, condition.sensors), trials)
         for name, parts in fliers.items()
         for at, condition in enumerate(conditions)
         for part, (policy, trials) in enumerate(parts)
@@ -114,7 +114,7 @@ def tested_numbers(entry: Tested, base: Tested) -> dict[str, Any]:
         "name": entry.condition.name,
         "size": entry.condition.size,
         "words": entry.condition.words,
-        "noise": entry.condition.noise,
+        "sensors": entry.condition.sensors,
         "effects": dict(entry.condition.vehicle.effects),
         "policies": {},
     }

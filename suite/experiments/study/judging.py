@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -17,8 +17,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from eval.judging.judge import MOST_A_PIECE, JudgeOptions, Task, fly_share
 from eval.judging.results import Journal
-from eval.judging.sensors import SensorNoise
 from eval.judging.tables import Tally, summarise
+from eval.sensors.sensors_file import PERFECT, SensorSet
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy, load_policy
@@ -43,8 +43,8 @@ class Flier:
     """A shipped policy's name, a checkpoint's folder, or a policy file."""
     vehicle: Vehicle
     """On what."""
-    noise: SensorNoise = field(default_factory=SensorNoise)
-    """What is wrong with what it sees."""
+    sensors: SensorSet = PERFECT
+    """What it sees of the truth."""
     world: str = "mujoco"
     """In which world."""
 
@@ -171,7 +171,7 @@ def _about(flier: Flier, digests: Mapping[str, str]) -> dict[str, Any]:
     return {
         "policy_sha256": digests[flier.policy],
         "vehicle": flier.vehicle,
-        "noise": flier.noise,
+        "sensors": flier.sensors,
         "world": flier.world,
         "code": code_digest(*FLIES),
         "engines": engines(),
@@ -224,7 +224,7 @@ def _fly_piece(loaders: Loaders, piece: Sequence[Share]) -> Iterator[tuple[int, 
     for number, flier, trials in piece:
         if flier.policy not in loaded:
             loaded[flier.policy] = loaders[flier.policy]()
-        options = JudgeOptions(workers=1, noise=flier.noise)
+        options = JudgeOptions(workers=1, sensors=flier.sensors)
         task = Task(loaded[flier.policy], flier.vehicle, flier.world, options)
         for _, result, _ in fly_share(task, list(enumerate(trials))):
             yield number, result

@@ -1,14 +1,13 @@
-"""States and images that are old at the decision, and images that never come."""
-
-from dataclasses import replace
+"""States and images that are old at the decision."""
 
 import numpy as np
 import pytest
 
 from eval.judging.ages import Aged, Delays
 from eval.judging.judge import JudgeOptions, fly
-from eval.judging.sensors import SensorNoise
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.sensors.interface import Ages
+from eval.sensors.sensors_file import PERFECT, sensor_set
 from eval.worlds.trial import Rules, TrialSpec
 from policies.observation import View
 from policies.spec import PolicySpec
@@ -35,10 +34,10 @@ def seen_at(time_s, n=2):
     return View(at, np.zeros((n, 3, 3)), at, at, at, at, at, image)
 
 
-def ages_seen(noise, trials, decisions):
+def ages_seen(ages, trials, decisions):
     """Ages (decisions, 2, N) of state and image at each decision, as a judge would take them."""
     n = len(trials)
-    delays = Delays(noise, n, STEPS, DT)
+    delays = Delays(ages, n, STEPS, DT)
     for slot, trial in enumerate(trials):
         delays.start(slot, trial)
     found = []
@@ -60,12 +59,12 @@ def ages_seen(noise, trials, decisions):
 
 @pytest.mark.parametrize("age_s", [0.0, 0.01, 0.05, 0.066, 0.1, 0.2])
 def test_what_is_seen_has_the_age_that_is_asked_for(age_s):
-    for noise, which in (
-        (SensorNoise(state_age_s=age_s), [0]),
-        (SensorNoise(image_age_s=age_s), [1]),
-        (SensorNoise(state_age_s=age_s, image_age_s=age_s), [0, 1]),
+    for ages, which in (
+        (Ages(state_s=age_s), [0]),
+        (Ages(image_s=age_s), [1]),
+        (Ages(state_s=age_s, image_s=age_s), [0, 1]),
     ):
-        found = ages_seen(noise, TRIALS, 20)
+        found = ages_seen(ages, TRIALS, 20)
         assert (found[0] == 0).all(), "at the start what is seen is the start"
         assert found[6:, which] == pytest.approx(age_s, abs=1e-9)
         others = [k for k in (0, 1) if k not in which]
@@ -74,7 +73,7 @@ def test_what_is_seen_has_the_age_that_is_asked_for(age_s):
 
 @pytest.mark.parametrize(("age_s", "steps"), [(0.0506, 25), (0.0514, 26), (0.0006, 0)])
 def test_an_age_between_two_physics_steps_is_that_of_the_nearer_one(age_s, steps):
-    found = ages_seen(SensorNoise(state_age_s=age_s), TRIALS, 12)[6:, 0]
+    found = ages_seen(Ages(state_s=age_s), TRIALS, 12)[6:, 0]
     assert found == pytest.approx(steps * DT, abs=1e-9)
 
 
@@ -90,8 +89,8 @@ def test_a_fresh_trial_sees_its_own_start_while_the_others_go_on():
 
 @pytest.mark.parametrize(("age_s", "jitter"), [(0.05, 1.0), (0.1, 0.4), (0.02, 1.0)])
 def test_ages_that_jitter_have_the_mean_and_the_spread_that_are_asked_for(age_s, jitter):
-    noise = SensorNoise(state_age_s=age_s, image_age_s=age_s, age_jitter=jitter)
-    found = ages_seen(noise, TRIALS, 600)[6:]
+    ages = Ages(age_s, age_s, jitter)
+    found = ages_seen(ages, TRIALS, 600)[6:]
     spread = jitter * age_s
     assert found.min() >= age_s - spread - DT / 2 - 1e-9
     assert found.max() <= age_s + spread + DT / 2 + 1e-9
@@ -99,25 +98,8 @@ def test_ages_that_jitter_have_the_mean_and_the_spread_that_are_asked_for(age_s,
     assert found.std() == pytest.approx(spread / np.sqrt(3), rel=0.1)
     state, image = found[:, 0].ravel(), found[:, 1].ravel()
     assert abs(np.corrcoef(state, image)[0, 1]) < 0.1, "that of the state says nothing of the other"
-    turned = ages_seen(noise, TRIALS[::-1], 600)[6:]
+    turned = ages_seen(ages, TRIALS[::-1], 600)[6:]
     assert np.array_equal(turned[:, :, ::-1], found), "they are set by the trial"
-
-
-def test_a_lost_image_is_the_one_before_and_the_state_comes_all_the_same():
-    delays, fly_all = Delays(SensorNoise(image_loss=0.4), 2, 33.0, 0.002), np.ones(2, bool)
-    for slot, trial in enumerate(TRIALS[:2]):
-        delays.start(slot, trial)
-    assert list(delays.moments()) == []
-    repeats, before = 0, None
-    for k in range(500):
-        shown = delays.see(seen_at(k), np.full(2, k == 0), fly_all)
-        assert (shown.pos_w == k).all()
-        image = shown.depth_m[:, 0, 0]
-        if before is not None:
-            assert ((image == k) | (image == before)).all()
-            repeats += int((image == before).sum())
-        before = image
-    assert repeats / 1000 == pytest.approx(0.4, abs=0.05)
 
 
 class Watcher:
@@ -134,54 +116,46 @@ class Watcher:
         return action_b, hidden
 
 
-def watched(pilot, noise, trials=TRIALS[:1], slots=1, rules=RULES):
+def watched(pilot, sensors, trials=TRIALS[:1], slots=1, rules=RULES):
     watcher = Watcher(pilot)
-    options = JudgeOptions(slots=slots, workers=1, rules=rules, noise=noise)
+    options = JudgeOptions(slots=slots, workers=1, rules=rules, sensors=sensors)
     return fly(watcher, trials, VEHICLE, options=options), watcher
 
 
-def given(noise, trials=TRIALS[:1], slots=1):
-    results, watcher = watched(Pursuit(spec=SPEC), noise, trials, slots)
+def given(sensors, trials=TRIALS[:1], slots=1):
+    results, watcher = watched(Pursuit(spec=SPEC), sensors, trials, slots)
     return results, watcher.given
 
 
 def test_in_the_judge_an_age_of_a_period_shows_the_decision_before():
     """Both fly the same as long as the answers are the same: over the first two decisions."""
-    _, truth = given(SensorNoise())
-    _, late = given(SensorNoise(state_age_s=0.04))
+    _, truth = given(PERFECT)
+    _, late = given(sensor_set({"delay": {"state": 0.04}}))
     assert np.array_equal(late[0][0], truth[0][0]) and np.array_equal(
         late[1][0][:, :9], truth[0][0][:, :9]
     )
     assert not np.array_equal(truth[1][0][:, :9], truth[0][0][:, :9])
-    _, dim = given(SensorNoise(image_age_s=0.04))
+    _, dim = given(sensor_set({"delay": {"image": 0.04}}))
     assert np.array_equal(dim[1][1], truth[0][1]) and np.array_equal(dim[1][0], truth[1][0])
 
 
 def test_an_old_state_has_the_misplaced_gate_that_was_next_then():
     rules = Rules(time_limit_s=4.0)
-    (result,), watcher = watched(Pursuit(spec=SPEC), SensorNoise(), rules=rules)
+    (result,), watcher = watched(Pursuit(spec=SPEC), PERFECT, rules=rules)
     assert result.gates_passed >= 2, "the flight is to pass gates"
+    moved = {"gate_map": {"moved": 0.3}}
     same = Scripted(np.array(watcher.answers_b), spec=SPEC)
     prompt, late = (
-        np.stack([state[0, :9] for state, _ in watched(same, noise, rules=rules)[1].given])
-        for noise in (SensorNoise(gate_m=0.3), SensorNoise(gate_m=0.3, state_age_s=0.12))
+        np.stack([state[0, :9] for state, _ in watched(same, sensors, rules=rules)[1].given])
+        for sensors in (sensor_set(moved), sensor_set(moved | {"delay": {"state": 0.12}}))
     )
     assert np.array_equal(late[3:], prompt[:-3])
 
 
 def test_a_late_trials_outcome_is_set_by_the_trial_alone():
-    steady = SensorNoise(state_age_s=0.05, image_age_s=0.03)
-    noise = replace(steady, age_jitter=1.0, image_loss=0.2)
-    together, _ = given(noise, TRIALS, slots=2)
-    for other in (SensorNoise(), steady):
+    ages = {"state": 0.05, "image": 0.03}
+    steady, jitters = (sensor_set({"delay": ages | {"jitter": share}}) for share in (0.0, 1.0))
+    together, _ = given(jitters, TRIALS, slots=2)
+    for other in (PERFECT, steady):
         assert together != given(other, TRIALS, slots=2)[0]
-    assert together == [given(noise, [trial])[0][0] for trial in TRIALS]
-
-
-def test_what_cannot_be_is_refused():
-    for name in ("image_loss", "age_jitter"):
-        with pytest.raises(ValueError, match=f"{name} is 1.5; allowed are shares"):
-            given(SensorNoise(**{name: 1.5}))
-    with pytest.raises(ValueError, match="shows nothing late"):
-        options = JudgeOptions(noise=SensorNoise(state_age_s=0.1))
-        fly(Pursuit(), TRIALS[:1], VEHICLE, "reference", options)
+    assert together == [given(jitters, [trial])[0][0] for trial in TRIALS]

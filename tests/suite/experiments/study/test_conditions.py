@@ -5,8 +5,8 @@ import pytest
 
 from eval.effects import EFFECTS
 from eval.effects.interface import at
-from eval.judging.sensors import SensorNoise
 from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
+from eval.sensors.sensors_file import PERFECT, sensor_set
 from suite.experiments.study.conditions import (
     effect_conditions,
     sweep_conditions,
@@ -25,7 +25,7 @@ def test_every_effect_that_touches_a_flight_is_flown_at_its_usual_size():
         assert condition.vehicle.effects[condition.name] is not None
         others = {k: v for k, v in condition.vehicle.effects.items() if k != condition.name}
         own = {k: v for k, v in VEHICLE.effects.items() if k != condition.name}
-        assert others == own and condition.noise == SensorNoise()
+        assert others == own and condition.sensors == PERFECT
     by_words = {(c.name, c.words): c.vehicle.effects[c.name] for c in conditions}
     # The vehicle has drag of its own; what is more of the two stays, axis by axis.
     assert by_words["linear_drag", "coefficient (0.5, 0.5, 0.72) 1/s"].coefficient[2] == 0.72
@@ -43,9 +43,9 @@ def test_every_effect_that_touches_a_flight_is_flown_at_its_usual_size():
 def test_sweeps_begin_at_the_vehicle_as_it_is_and_grow():
     for sweep in sweeps(VEHICLE):
         first, *rest = sweep_conditions(VEHICLE, sweep)
-        assert first.vehicle is VEHICLE and first.noise == SensorNoise() and len(rest) >= 4
+        assert first.vehicle is VEHICLE and first.sensors == PERFECT and len(rest) >= 4
         assert list(sweep.sizes) == sorted(set(sweep.sizes))
-        seen = [(repr(c.vehicle), c.noise) for c in (first, *rest)]
+        seen = [(repr(c.vehicle), repr(c.sensors)) for c in (first, *rest)]
         assert len(set(seen)) == len(seen), sweep.name
     named = {sweep.name: sweep for sweep in sweeps(VEHICLE)}
     assert named["motor lag"].sizes[0] == pytest.approx(30)
@@ -57,13 +57,14 @@ def test_sweeps_begin_at_the_vehicle_as_it_is_and_grow():
     assert drag.effects["quadratic_drag"].coefficient == pytest.approx((0.04, 0.04, 0.16))
     late, _ = named["latency"].make(VEHICLE, 80)
     assert late.effects["command_delay"].delay == pytest.approx(0.08)
-    _, noise = named["jittering age of both"].make(VEHICLE, 40)
-    assert noise == SensorNoise(state_age_s=0.04, image_age_s=0.04, age_jitter=1.0)
-    _, noise = named["age of both"].make(VEHICLE, 60)
-    assert noise == SensorNoise(state_age_s=0.06, image_age_s=0.06)
-    _, noise = named["state-estimation noise"].make(VEHICLE, 2)
-    assert (noise.pos_m, noise.vel) == pytest.approx((0.06, 0.2))
-    assert noise.attitude_rad == pytest.approx(np.radians(2)) and noise.correlation_s == 0.5
+    _, sensors = named["jittering age of both"].make(VEHICLE, 40)
+    assert sensors == sensor_set({"delay": {"state": 0.04, "image": 0.04, "jitter": 1.0}})
+    _, sensors = named["age of both"].make(VEHICLE, 60)
+    assert sensors == sensor_set({"delay": {"state": 0.06, "image": 0.06}})
+    _, sensors = named["state-estimation noise"].make(VEHICLE, 2)
+    values = sensors.models["state_noise"]
+    assert (values.position, values.velocity) == pytest.approx((0.06, 0.2))
+    assert values.attitude == pytest.approx(np.radians(2)) and values.correlation == 0.5
 
 
 def test_sweeps_of_a_vehicle_with_effects_begin_at_those():

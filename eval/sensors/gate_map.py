@@ -1,0 +1,86 @@
+"""The map of the gates: shifted, turned and stretched as a whole, and gates moved since.
+
+Its errors stay for a whole trial. They turn and stretch about the place where the trial begins.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, column, yawed
+from tracks.geometry.rotation import to_world
+
+GATES = 32
+"""Gates with an error of their own; on a longer course the errors come again."""
+
+
+class GateMap(NamedTuple):
+    """Values of `gate_map`."""
+
+    shift: Array
+    yaw: Array
+    scale: Array
+    moved: Array
+    turned: Array
+
+
+def start(values: GateMap, moment: Moment) -> dict[str, Any]:
+    """Return where the map begins and what is wrong with it."""
+    draws, pos_w = moment.draws.normal, moment.truth.pos_w
+    moved = draws[..., 5 : 5 + 3 * GATES].reshape(*draws.shape[:-1], GATES, 3)
+    return {
+        "origin_w": pos_w,
+        "shift_w": column(values.shift) * draws[..., :3],
+        "yaw": values.yaw * draws[..., 3],
+        "scale": 1.0 + values.scale * draws[..., 4],
+        "moved_w": values.moved[..., None, None] * moved,
+        "turned": column(values.turned) * draws[..., 5 + 3 * GATES :],
+    }
+
+
+def sense(
+    values: GateMap, memory: dict[str, Any], seen: View, moment: Moment
+) -> tuple[View, dict[str, Any]]:
+    """Return the view with both gates where the map has them."""
+    number = moment.truth.gate_number % GATES
+    # The last gate is its own next one.
+    last = (moment.truth.second_w == moment.truth.gate_w).all(-1)
+    second = (number + (~last).astype(number.dtype)) % GATES
+    gate_w, axis_w = _mapped(memory, seen.gate_w, seen.axis_w, number)
+    second_w, second_axis_w = _mapped(memory, seen.second_w, seen.second_axis_w, second)
+    seen = seen._replace(
+        gate_w=gate_w, axis_w=axis_w, second_w=second_w, second_axis_w=second_axis_w
+    )
+    return seen, memory
+
+
+def _mapped(
+    memory: dict[str, Any], gate_w: Array, axis_w: Array, number: Array
+) -> tuple[Array, Array]:
+    xp = gate_w.__array_namespace__()
+    moved_w = xp.take_along_axis(memory["moved_w"], number[..., None, None], axis=-2)[..., 0, :]
+    turned = xp.take_along_axis(memory["turned"], number[..., None], axis=-1)[..., 0]
+    away_w = to_world(yawed(memory["yaw"]), gate_w - memory["origin_w"])
+    mapped_w = memory["origin_w"] + column(memory["scale"]) * away_w + memory["shift_w"] + moved_w
+    return mapped_w, to_world(yawed(memory["yaw"] + turned), axis_w)
+
+
+SENSOR = Sensor(
+    name="gate_map",
+    summary="The map of the gates is off, and gates were moved after it was made",
+    equation="p = o + (1 + k) Rz(psi) (p_true - o) + t + m_i, normal k, psi, t, m_i of the trial",
+    source="Foehn et al. 2022 (AlphaPilot): gates up to decimetres from their surveyed places; "
+    "usual sizes are our estimate",
+    values=GateMap,
+    parameters=(
+        Parameter("shift", "m", 0.0, 0.0, 5.0, (0.02, 0.2)),
+        Parameter("yaw", "rad", 0.0, 0.0, 1.0, (0.002, 0.02)),
+        Parameter("scale", "1", 0.0, 0.0, 0.5, (0.001, 0.01)),
+        Parameter("moved", "m", 0.0, 0.0, 5.0, (0.02, 0.2)),
+        Parameter("turned", "rad", 0.0, 0.0, 1.0, (0.02, 0.1)),
+    ),
+    grows=("shift", "yaw", "scale", "moved", "turned"),
+    trial=Needs(normal=5 + 4 * GATES),
+    start=start,
+    sense=sense,
+)

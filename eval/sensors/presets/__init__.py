@@ -1,0 +1,1 @@
+"""Sensors files that come with the suite."""

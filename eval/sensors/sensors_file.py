@@ -1,0 +1,166 @@
+"""The sensors file (TOML): which models act, and how strongly; read, checked by key, written.
+
+A parameter that is left out has its neutral value: of it nothing is wrong.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from eval.sensors import SENSORS, scaled
+from eval.sensors.interface import Ages, Sensor
+from tracks.common.files import write_text
+from tracks.common.names import printable, unknown_name
+from tracks.common.toml_table import Table, to_toml
+from tracks.input.reading import InputError, read_toml, reason
+
+SCHEMA = 1
+PRESETS = Path(__file__).resolve().parent / "presets"
+NO_AGES = Ages()
+
+
+class SensorsFileError(ValueError):
+    """A sensors file that cannot be used; the message says where and what is allowed."""
+
+
+@dataclass(frozen=True)
+class SensorSet:
+    """What a drone sees and knows; without models it is the truth."""
+
+    name: str = "perfect"
+    """For people."""
+    models: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    """Values (the model's NamedTuple of numbers) by the model's name, see
+    `eval.sensors.SENSORS`."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled and copied: a read-only view of a dict cannot be."""
+        return {**vars(self), "models": dict(self.models)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, models=MappingProxyType(state["models"]))
+
+    @property
+    def ages(self) -> Ages:
+        """How old what is seen is."""
+        found = [SENSORS[name].ages for name in self.models]
+        late = [(name, ages) for name, ages in zip(self.models, found, strict=True) if ages]
+        return next((ages(self.models[name]) for name, ages in late), NO_AGES)
+
+    @property
+    def is_late(self) -> bool:
+        """Whether anything is old at the decision."""
+        return bool(self.ages.state_s or self.ages.image_s)
+
+
+PERFECT = SensorSet()
+"""The truth."""
+
+
+def sensor_set(models: Mapping[str, Mapping[str, float]], name: str = "custom") -> SensorSet:
+    """Return a checked set of models from the parameters that differ from neutral.
+
+    Args:
+        models: the parameters of each model, by its name.
+        name: for people.
+
+    Raises:
+        ValueError: as `parse_sensors`.
+    """
+    return parse_sensors({"name": name, "sensors": models})
+
+
+def grown(sensors: SensorSet, magnitude: float) -> SensorSet:
+    """Return `sensors` with what is wrong grown by `magnitude`; 0: the truth, 1: as they are."""
+    if magnitude == 0.0:
+        return PERFECT
+    models = {name: scaled(name, values, magnitude) for name, values in sensors.models.items()}
+    return SensorSet(f"{sensors.name} x {magnitude:g}", MappingProxyType(models))
+
+
+def shipped_sensors() -> list[str]:
+    """Return the names of the sensors files that come with the suite."""
+    return sorted(path.stem for path in PRESETS.glob("*.toml"))
+
+
+def load_sensors(source: str | os.PathLike[str]) -> SensorSet:
+    """Return the sensors of a file, or shipped ones by their name.
+
+    Args:
+        source: a path (it ends in .toml, has a folder or exists) or a shipped name.
+
+    Raises:
+        SensorsFileError: for what the file says or lacks.
+        ValueError: for a name that is neither.
+    """
+    path = Path(source)
+    if path.suffix != ".toml" and len(path.parts) == 1 and not path.is_file():
+        if str(source) not in shipped_sensors():
+            raise unknown_name("sensors (or file)", str(source), shipped_sensors())
+        path = PRESETS / f"{source}.toml"
+    try:
+        return parse_sensors(read_toml(path))
+    except FileNotFoundError as error:
+        known = ", ".join(shipped_sensors())
+        raise SensorsFileError(f"{path}: no such file; shipped by name: {known}") from error
+    except OSError as error:
+        raise SensorsFileError(f"{path}: cannot be read: {reason(error)}") from error
+    except InputError as error:
+        raise SensorsFileError(str(error)) from error
+    except ValueError as error:
+        raise SensorsFileError(f"{path}: {error}") from error
+
+
+def parse_sensors(table: Mapping[str, Any]) -> SensorSet:
+    """Return the sensors that a file's `table` describes.
+
+    Raises:
+        ValueError: with the key, the value and what is allowed.
+    """
+    top = Table("", "", table)
+    top.expect(("name", "schema", "sensors"))
+    if top.whole("schema", SCHEMA) != SCHEMA:
+        raise top.error("schema", table["schema"], f"{SCHEMA}: this version of the suite reads it")
+    tables = top.table("sensors", {})
+    given = {name: _values(SENSORS.find(name), tables.table(name)) for name in tables.values}
+    models = {name: given[name] for name in SENSORS if name in given}
+    return SensorSet(top.text("name"), MappingProxyType(models))
+
+
+def _values(sensor: Sensor, table: Table) -> Any:
+    table.expect(parameter.name for parameter in sensor.parameters)
+    return sensor.values(
+        *(
+            table.number(p.name, p.neutral, least=p.low, most=p.high)  # pyright: ignore[reportArgumentType]
+            for p in sensor.parameters
+        )
+    )
+
+
+def sensors_table(sensors: SensorSet) -> dict[str, Any]:
+    """Return `sensors` as the nested table of their file."""
+    models = {name: values._asdict() for name, values in sensors.models.items()}
+    named = {"name": sensors.name, "schema": SCHEMA}
+    return {**named, "sensors": models} if models else named
+
+
+def save_sensors(sensors: SensorSet, path: str | os.PathLike[str], comment: str = "") -> None:
+    """Write `sensors` as a file that `load_sensors` reads back equal, whole or not at all.
+
+    Args:
+        sensors: what to write; they are checked as a file would be.
+        path: where to.
+        comment: lines for the head of the file.
+
+    Raises:
+        ValueError: for sensors that could not be read back.
+    """
+    table = sensors_table(sensors)
+    parse_sensors(table)
+    head = "".join(f"# {printable(line)}\n" for line in comment.splitlines())
+    write_text(path, head + to_toml(table))

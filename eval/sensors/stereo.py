@@ -1,0 +1,106 @@
+"""Depth by stereo: errors in disparity, holes at edges and on thin things, limits of the range.
+
+Disparity is that of a camera with `focal` pixels, whose image the policy's 24 x 32 is made of. A
+hole reads as the camera's range, as deployed drivers fill it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, over_image
+from tracks.geometry.camera import Camera
+
+NEAREST_M = 1e-3
+"""Depths below this count as this where they are inverted [m]."""
+EDGE = 1.25
+"""A neighbour nearer by this factor makes an edge."""
+
+
+class Stereo(NamedTuple):
+    """Values of `stereo`."""
+
+    noise: Array
+    offset: Array
+    step: Array
+    least: Array
+    near: Array
+    edge_holes: Array
+    thin_holes: Array
+    smear: Array
+    focal: Array
+    baseline: Array
+
+
+def start(values: Stereo, moment: Moment) -> Array:
+    """Return the trial's error of the disparity's zero (...,) [pixel]."""
+    return values.offset * moment.draws.normal[..., 0]
+
+
+def sense(values: Stereo, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
+    """Return the view with the image as stereo gives it."""
+    depth_m, grain, chance = seen.depth_m, moment.draws.grain, moment.draws.chance
+    xp, range_m = depth_m.__array_namespace__(), moment.camera.range_m
+    left, right = beside(depth_m, -1), beside(depth_m, 1)
+    nearer, further = xp.minimum(left, right), xp.maximum(left, right)
+    edge = EDGE * nearer < depth_m
+    thin = EDGE * depth_m < xp.minimum(left, right)
+    smeared = edge & (chance[..., 0, :, :] < over_image(values.smear))
+    hole = edge & (chance[..., 1, :, :] < over_image(values.edge_holes)) & ~smeared
+    gone = thin & (chance[..., 2, :, :] < over_image(values.thin_holes))
+    true_m = xp.where(smeared, nearer, xp.where(gone, further, depth_m))
+    found_m = in_disparity(values, memory, true_m, grain[..., 0, :, :], moment.camera)
+    found_m = xp.where(hole | (true_m < over_image(values.near)), range_m, found_m)
+    return seen._replace(depth_m=found_m), memory
+
+
+def beside(depth_m: Array, side: int) -> Array:
+    """Return each pixel's left (-1) or right (1) neighbour; at the border the pixel itself."""
+    xp = depth_m.__array_namespace__()
+    if side < 0:
+        return xp.concatenate([depth_m[..., :1], depth_m[..., :-1]], axis=-1)
+    return xp.concatenate([depth_m[..., 1:], depth_m[..., -1:]], axis=-1)
+
+
+def in_disparity(
+    values: Stereo, offset: Array, depth_m: Array, grain: Array, camera: Camera
+) -> Array:
+    """Return depths [m] whose disparity has noise, an offset and steps."""
+    xp = depth_m.__array_namespace__()
+    strength = over_image(values.focal * values.baseline)
+    disparity = strength / xp.maximum(depth_m, NEAREST_M)
+    disparity = disparity + over_image(values.noise) * grain + over_image(offset)
+    step = over_image(values.step)
+    stepped = step * xp.rint(disparity / xp.where(step > 0.0, step, 1.0))
+    disparity = xp.where(step > 0.0, stepped, disparity)
+    least = xp.maximum(over_image(values.least), strength / camera.range_m)
+    found_m = strength / xp.maximum(disparity, least)
+    return xp.where(disparity < least, camera.range_m, found_m)
+
+
+SENSOR = Sensor(
+    name="stereo",
+    summary="Depth by stereo: noise and steps of disparity, holes, smearing, limits of the range",
+    equation="d = f b / z + n + o, in steps; z = f b / d; the range where d < least, z < near or a "
+    "hole is",
+    source="Grunnet-Jepsen et al., tuning guide of RealSense D400: 0.08 pixel RMS, steps of 1/32, "
+    "D435 at 848 x 480: f = 424, b = 0.05 m, nearest 0.17 m; shares at edges are our estimate",
+    values=Stereo,
+    parameters=(
+        Parameter("noise", "pixel", 0.0, 0.0, 20.0, (0.05, 0.3)),
+        Parameter("offset", "pixel", 0.0, 0.0, 10.0, (0.02, 0.1)),
+        Parameter("step", "pixel", 0.0, 0.0, 10.0, (1 / 32, 1 / 8)),
+        Parameter("least", "pixel", 0.0, 0.0, 100.0, (1.0, 3.0)),
+        Parameter("near", "m", 0.0, 0.0, 5.0, (0.15, 0.3)),
+        Parameter("edge_holes", "1", 0.0, 0.0, 1.0, (0.05, 0.3)),
+        Parameter("thin_holes", "1", 0.0, 0.0, 1.0, (0.05, 0.3)),
+        Parameter("smear", "1", 0.0, 0.0, 1.0, (0.05, 0.3)),
+        Parameter("focal", "pixel", 424.0, 1.0, 1e4, (300.0, 700.0)),
+        Parameter("baseline", "m", 0.05, 1e-3, 10.0, (0.03, 0.1)),
+    ),
+    grows=("noise", "offset", "step", "least", "near", "edge_holes", "thin_holes", "smear"),
+    trial=Needs(normal=1),
+    observation=Needs(grain=1, chance=3),
+    start=start,
+    sense=sense,
+)

@@ -1,0 +1,66 @@
+"""The sensors file: read and written alike, grown, and refused by name, value and limits."""
+
+import pytest
+
+from eval.sensors import SENSORS
+from eval.sensors.sensors_file import (
+    PERFECT,
+    SensorsFileError,
+    grown,
+    load_sensors,
+    save_sensors,
+    sensor_set,
+    shipped_sensors,
+)
+
+
+@pytest.mark.parametrize("name", shipped_sensors())
+def test_a_shipped_file_reads_back_equal_and_grows_within_its_limits(name, tmp_path):
+    sensors = load_sensors(name)
+    assert sensors.name == name
+    save_sensors(sensors, tmp_path / "again.toml", "a comment\x1b")
+    assert load_sensors(tmp_path / "again.toml") == sensors
+    assert grown(sensors, 0.0) == PERFECT
+    for model, values in grown(sensors, 1e6).models.items():
+        sensor, own = SENSORS[model], sensors.models[model]
+        for parameter, value in zip(sensor.parameters, values, strict=True):
+            usual = getattr(own, parameter.name)
+            moves = parameter.name in sensor.grows and usual != parameter.neutral
+            assert value == (parameter.high if moves else usual), parameter.name
+
+
+def test_all_holds_every_model():
+    assert set(load_sensors("all").models) >= set(SENSORS) - {"tof", "imu"}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[sensors.state_nose]\n", "unknown sensor model 'state_nose'. Did you mean 'state_noise'"),
+        ("[sensors.stereo]\nnoize = 1\n", "'noize' in .sensors.stereo. is unknown. Did you mean"),
+        (
+            "[sensors.stereo]\nnoise = -1\n",
+            "sensors.stereo.noise is -1, allowed is a number",
+        ),
+        ("[sensors.stereo]\nnoise = nan\n", "sensors.stereo.noise is nan, allowed is a number"),
+        ("[sensors]\nstereo = 3\n", "sensors.stereo is 3, allowed is a table"),
+        ("schema = 2\n", "schema is 2, allowed is 1: this version"),
+        ("noise = 1\n", "key 'noise' at the top is unknown"),
+        ("[", "odd.toml"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(text, words, tmp_path):
+    path = tmp_path / "odd.toml"
+    path.write_text(text if text[0] in "[" and len(text) == 1 else 'name = "odd"\n' + text)
+    with pytest.raises(SensorsFileError, match=words) as error:
+        load_sensors(path)
+    assert str(path) in str(error.value)
+
+
+def test_unknown_names_say_what_there_is():
+    with pytest.raises(ValueError, match="unknown sensors .or file. 'vioo'. Did you mean 'vio'"):
+        load_sensors("vioo")
+    with pytest.raises(SensorsFileError, match="no such file; shipped by name: all, "):
+        load_sensors("none/there.toml")
+    with pytest.raises(ValueError, match="delay.jitter is 1.5, allowed is a number from 0 to 1"):
+        sensor_set({"delay": {"jitter": 1.5}})
