@@ -17,16 +17,19 @@ import numpy as np
 from eval.importers.formats.table import read_table
 from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.options import ImportOptions
-from eval.importers.rows import averaged, continuous
+from eval.importers.rows import averaged, continuous, row_times, rows_at
 from eval.importers.signals import Recording, Signal, median_step
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
+from eval.logs.faults.pose import GOOD, TIMES_BETTER, look_at_pose
 from eval.logs.faults.reading import TIMES, read_as
 from eval.logs.files import MOST_ROWS
 from tracks.geometry.rotation import rot_to_quat
 
 FIRST_REACH_S = 15.0
 """The fit begins with this much on both sides of the middle [s]."""
+COARSE_HZ = 100.0
+"""The path is looked at on at most so many rows a second."""
 GRID_S = 0.005
 """Step of the cross-correlation [s]."""
 SPAN_S = 0.025
@@ -37,18 +40,23 @@ ALIKE = 0.6
 """Correlation of the rates below which the clocks count as not aligned."""
 SURE = 0.9
 """Correlation above which a reading of the quaternion is taken without trying others."""
-READINGS = (
-    ("xyzw", "xyzw"),
-    ("world to body", "inverse"),
-    ("xyzw and world to body", "xyzw+inverse"),
-)
-"""What the attitude may be instead: words, and the steps of `read_as`."""
+READINGS = {
+    "xyzw": "xyzw",
+    "inverse": "world to body",
+    "xyzw+inverse": "xyzw and world to body",
+}
+"""What the attitude may be instead: the steps of `read_as`, and words."""
+SIGNS = ("-roll", "-pitch", "-yaw")
+"""By these, and by a gyro that is mirrored, clocks are aligned too. Which of the two is wrong is
+for the checks that hold both against the path (`eval/logs/faults/pose.py`, `vectors.py`)."""
 USUAL_STEP_S = 1.0 / 150.0
 """Cameras and trackers give 30 to 1000 poses a second."""
 LONG_S = 7200.0
 """Longer recordings are not aligned (a clock that jumps, or a wrong unit of time) [s]."""
 DRIFT_MAX = 2e-3
 """Clocks that differ by more than this are not believed."""
+DRIFT = 2e-4
+"""Clocks of crystals differ by less than this."""
 TURN_DEG = 15.0
 """A turn between the body frames above this is corrected (below, it may be a real tilt)."""
 
@@ -67,6 +75,13 @@ class Alignment:
     """Of the rates, after all is aligned."""
     offset_sd_s: float
     """Standard error of the offset in the middle of the flight [s]."""
+    drift_sd: float
+    """Standard error of the drift."""
+
+    @property
+    def turn_deg(self) -> float:
+        """Angle of `turn` [deg]."""
+        return float(np.rad2deg(np.linalg.norm(_vector(self.turn))))
 
 
 def with_pose(
@@ -89,14 +104,21 @@ def with_pose(
         raise FlightLogError(recording.name, None, None, "holds no gyro to align a pose with")
     pose, unit = _in_seconds(pose)
     quat, alignment, reading = _best_reading(pose, recording, options.fix)
-    turn_deg = np.rad2deg(np.linalg.norm(_vector(alignment.turn)))
+    turn_deg = alignment.turn_deg
     text = (
         f"its clock is {alignment.offset_s:+.4f} s (± {1e3 * alignment.offset_sd_s:.2g} ms) "
         f"from the log's and runs {1e6 * alignment.drift:+.0f} ppm off; "
         f"rates correlate by {alignment.correlation:.3f}"
     )
     findings = [*pose.findings, *unit, Finding("ok", "pose clock", text), *reading]
-    if turn_deg > TURN_DEG:
+    if abs(alignment.drift) > max(DRIFT, 4.0 * alignment.drift_sd):
+        text = (
+            f"its clock runs {1e6 * alignment.drift:+.0f} ppm (± {1e6 * alignment.drift_sd:.0f}) "
+            "off the log's, more than two crystals do: the pose is moved by that"
+        )
+        about = ("clock_drift", alignment.drift, 0.95)
+        findings.append(Finding("corrected", "pose clock", text, *about))
+    if turn_deg > TURN_DEG and not _has_a_sign(_moved(recording, pose, quat, alignment)):
         axis = ", ".join(f"{v:+.2f}" for v in _vector(alignment.turn) / np.deg2rad(turn_deg))
         text = f"its body is turned by {turn_deg:.1f} deg about ({axis}) against the gyro"
         if options.fix:
@@ -107,12 +129,27 @@ def with_pose(
     elif turn_deg > 1.0:
         text = f"its body is turned by {turn_deg:.1f} deg against the gyro; left as it is"
         findings.append(Finding("note", "pose axes", text))
+    return _moved(recording, pose, quat, alignment), tuple(findings)
+
+
+def _moved(recording: Recording, pose: Recording, quat: Signal, alignment: Alignment) -> Recording:
+    """Return `recording` with the pose, its attitude `quat`, on the recording's clock."""
     signals = dict(recording.signals)
     for name, samples in {**pose.signals, "quat": quat}.items():
         if name in ("pos", "quat", "vel"):
             time_s = alignment.offset_s + (1.0 + alignment.drift) * samples.time_s
             signals[name] = Signal(time_s, samples.value)
-    return replace(recording, signals=signals), tuple(findings)
+    return replace(recording, signals=signals)
+
+
+def _has_a_sign(recording: Recording) -> bool:
+    """Return whether the path shows that an angle's sign, no turned body, parts pose and gyro."""
+    times = row_times(recording, COARSE_HZ, 0.0, None)
+    looked = look_at_pose({k: v for k, v in rows_at(recording, times).items() if k != "rate"})
+    if looked is None or looked.given.force is None or looked.best.force is None:
+        return False
+    better = looked.best.force < GOOD and looked.given.force > TIMES_BETTER * looked.best.force
+    return better and looked.best.quat in SIGNS
 
 
 def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
@@ -132,18 +169,25 @@ def _best_reading(
     """Return the attitude in the order and sense in which it turns as the gyro does."""
     quat, rate = pose.signals["quat"], recording.signals["rate"]
     given = align(quat, rate, pose.name)
-    if given.correlation > SURE:
+    enough = max(SURE, 0.5 + 0.5 * given.correlation)
+    if given.correlation > SURE and given.turn_deg <= TURN_DEG:
         return quat, given, []
-    others = [Signal(quat.time_s, read_as("quat", quat.value, steps)) for _, steps in READINGS]
-    found = [align(other, rate, pose.name) for other in others]
+    found = {
+        steps: align(Signal(quat.time_s, read_as("quat", quat.value, steps)), rate, pose.name)
+        for steps in (*READINGS, *SIGNS)
+    }
     # Of readings that turn alike, the one whose body is the gyro's.
-    best = max(range(len(found)), key=lambda k: found[k].correlation + 0.1 * found[k].turn.trace())
-    if fix and found[best].correlation > SURE:
-        words, steps = READINGS[best]
-        fault = "quaternion_order" if "xyzw" in steps else "quaternion_direction"
-        text = f"it turns as the gyro does only if it is {words}"
+    best = max(found, key=lambda steps: found[steps].correlation + 0.1 * found[steps].turn.trace())
+    if fix and best in READINGS and found[best].correlation > enough:
+        fault = "quaternion_order" if "xyzw" in best else "quaternion_direction"
+        text = f"it turns as the gyro does only if it is {READINGS[best]}"
         about = (fault, None, found[best].correlation)
-        return others[best], found[best], [Finding("corrected", "pose attitude", text, *about)]
+        read = Signal(quat.time_s, read_as("quat", quat.value, best))
+        return read, found[best], [Finding("corrected", "pose attitude", text, *about)]
+    mirrored = align(quat, rate, pose.name, mirrored=True)
+    signed = max((mirrored, *(found[s] for s in SIGNS)), key=lambda one: one.correlation)
+    if signed.correlation > enough:
+        return quat, replace(signed, turn=np.eye(3)), []
     if given.correlation < ALIKE or abs(given.drift) > DRIFT_MAX:
         reason = (
             f"its clock cannot be aligned with the log's: at best the body rates correlate by "
@@ -154,8 +198,14 @@ def _best_reading(
     return quat, given, []
 
 
-def align(quat: Signal, rate: Signal, name: str) -> Alignment:
+def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alignment:
     """Return how the clock and body of the attitude `quat` lie to those of the gyro `rate`.
+
+    Args:
+        quat: body to world, on the pose's clock.
+        rate: of the gyro, on the log's clock.
+        name: of the pose's file, for messages.
+        mirrored: take one axis of the gyro, whichever fits, as inverted.
 
     Raises:
         FlightLogError: where either is too short or too coarse to be aligned.
@@ -170,20 +220,22 @@ def align(quat: Signal, rate: Signal, name: str) -> Alignment:
     offset = _coarse(centre_s, by_pose, rate, name)
     shared = (centre_s + offset > rate.time_s[0]) & (centre_s + offset < rate.time_s[-1])
     middle = float(np.mean(centre_s[shared]))
-    result = _Fit(offset, 0.0, np.eye(3), 0.0, np.inf)
+    result = _Fit(offset, 0.0, np.eye(3), 0.0, np.inf, np.inf)
     reach, whole = FIRST_REACH_S, float(np.max(np.abs(centre_s - middle)))
     # From the middle outwards: over a long flight the drift alone is more than can be followed.
     while True:
         near = np.abs(centre_s - middle) <= reach
         for _ in range(20):
-            result, change = _refine(centre_s[near], by_pose[near], rate, middle, result)
+            result, change = _refine(centre_s[near], by_pose[near], rate, middle, result, mirrored)
             if np.all(np.abs(change) < [1e-7, 1e-9]):
                 break
         if reach >= whole:
             break
         reach *= 2.0
     start = result.offset - result.drift * middle
-    return Alignment(start, result.drift, result.turn, result.correlation, result.sd)
+    return Alignment(
+        start, result.drift, result.turn, result.correlation, result.sd, result.drift_sd
+    )
 
 
 class _Fit(NamedTuple):
@@ -193,10 +245,16 @@ class _Fit(NamedTuple):
     turn: np.ndarray
     correlation: float
     sd: float
+    drift_sd: float
 
 
 def _refine(
-    centre_s: np.ndarray, by_pose: np.ndarray, rate: Signal, middle: float, fit: _Fit
+    centre_s: np.ndarray,
+    by_pose: np.ndarray,
+    rate: Signal,
+    middle: float,
+    fit: _Fit,
+    mirrored: bool,
 ) -> tuple[_Fit, np.ndarray]:
     """Return one Gauss-Newton step from `fit`, and by how much offset and drift changed."""
     at = centre_s + fit.offset + fit.drift * (centre_s - middle)
@@ -209,7 +267,7 @@ def _refine(
     later = averaged(rate.time_s, rate.value, at + step, SPAN_S)
     sooner = averaged(rate.time_s, rate.value, at - step, SPAN_S)
     slope = (later - sooner) / (2.0 * step)
-    turn = _kabsch(seen - seen.mean(0), gyro - gyro.mean(0))
+    turn = _kabsch(seen - seen.mean(0), gyro - gyro.mean(0), mirrored)
     turned = seen @ turn.T
     # The size is left open: a gyro in other units is for `faults/vectors.py` to find.
     centred = turned - turned.mean(0)
@@ -226,9 +284,9 @@ def _refine(
     noise = float(np.mean(weight * (rest.ravel() - design @ solution) ** 2))
     # Neighbouring differences share poses and gyro samples: that many fewer are independent.
     shared = max(1.0, SPAN_S / median_step(centre_s))
-    sd = float(np.sqrt(shared * noise / max(float(normal[0, 0]), 1e-12)))
+    sd, drift_sd = np.sqrt(shared * noise / np.maximum(np.diag(normal)[:2], 1e-12)).tolist()
     alike = _alike(gyro, seen @ turn.T)
-    return _Fit(fit.offset - change[0], fit.drift - change[1], turn, alike, sd), change
+    return _Fit(fit.offset - change[0], fit.drift - change[1], turn, alike, sd, drift_sd), change
 
 
 def _pose_rates(quat: Signal) -> tuple[np.ndarray, np.ndarray]:
@@ -287,12 +345,12 @@ def _coarse(centre_s: np.ndarray, by_pose: np.ndarray, rate: Signal, name: str) 
     return float(log_grid[0] - pose_grid[0] + lag * GRID_S)
 
 
-def _kabsch(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) that takes `source` (K, 3) nearest to `target`."""
+def _kabsch(source: np.ndarray, target: np.ndarray, mirrored: bool) -> np.ndarray:
+    """Return the rotation (3, 3), or mirrored one, that takes `source` (K, 3) to `target`."""
     u, s, vt = np.linalg.svd(target.T @ source)
     if s[1] < 1e-3 * s[0]:
         return np.eye(3)  # turning about one axis only does not tell the frames apart
-    sign = np.sign(np.linalg.det(u @ vt))
+    sign = np.sign(np.linalg.det(u @ vt)) * (-1.0 if mirrored else 1.0)
     return u @ np.diag([1.0, 1.0, sign]) @ vt
 
 
