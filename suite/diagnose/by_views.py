@@ -228,8 +228,8 @@ def _reference_tasks(
     if before.views != flights.views or before.source != flights.source:
         raise ValueError(
             f"the reference flights are driven by {before.source} and allow "
-            f"{', '.join(view.name for view in before.views)}, the others by {flights.source} and "
-            f"{', '.join(view.name for view in flights.views)}: log both alike"
+            f"{_allowed(before)}, the others by {flights.source} and {_allowed(flights)}: log both "
+            "alike"
         )
     tasks = {
         view.name: ViewEvidence(view, model, before.smoothed[view.name], limits)
@@ -237,6 +237,14 @@ def _reference_tasks(
     }
     after = [replace(task, flights=flights.smoothed[name]) for name, task in tasks.items()]
     return tasks, rotor_spread([*tasks.values(), *after]), before.notes
+
+
+def _allowed(flights: ViewFlights) -> str:
+    """Return what flights allow, down to what may differ: axes, and the time of a mean."""
+    return " and ".join(
+        f"{view.name} (along {''.join('xyz'[k] for k in view.axes)}, means of {view.width_s:g} s)"
+        for view in flights.views
+    )
 
 
 def _held(

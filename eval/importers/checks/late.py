@@ -25,15 +25,24 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
         return recording, []
     delay, error = found.delay_s, found.error_s
     figures = f"it is {1e3 * delay:+.1f} ms (± {1e3 * error:.1f} ms) late against the gyro"
-    if abs(delay) < max(LEAST_S, SURE * error):
-        return recording, [Finding("ok", "pose delay", figures)]
-    sure = 0.95 if abs(delay) > LATE_S else 0.8
-    about = ("clock_offset", delay, sure, "leave --no-fix out: the pose is moved")
-    if not fix:
-        return recording, [Finding("doubt", "pose delay", f"{figures}; left as it is", *about)]
-    signals = {
-        name: Signal(s.time_s - delay, s.value) if name in LATE else s
-        for name, s in recording.signals.items()
-    }
-    text = f"{figures}: pose and velocity are moved by that"
-    return replace(recording, signals=signals), [Finding("corrected", "pose delay", text, *about)]
+    is_late, findings = abs(delay) > max(LEAST_S, SURE * error), []
+    keep = "leave --no-fix out: the pose is moved"
+    status = "corrected" if fix else "doubt"
+    if found.drifts:
+        about = ("clock_drift", found.drift, 0.95, keep)
+        findings.append(Finding(status, "pose clock", found.drift_figures(), *about))
+    if is_late:
+        sure = 0.95 if abs(delay) > LATE_S else 0.8
+        text = f"{figures}: pose and velocity are moved by that" if fix else f"{figures}; left so"
+        about = ("clock_offset", delay, sure, keep)
+        findings.append(Finding(status, "pose delay", text, *about))
+    else:
+        findings.append(Finding("ok", "pose delay", figures))
+    if not fix or not (is_late or found.drifts):
+        return recording, findings
+    drift = found.drift if found.drifts else 0.0
+    by = {name: delay + drift * (s.time_s - found.middle_s)
+          for name, s in recording.signals.items() if name in LATE}  # fmt: skip
+    moved = {name: recording.signals[name] for name in by}
+    signals = {name: Signal(s.time_s - by[name], s.value) for name, s in moved.items()}
+    return replace(recording, signals={**recording.signals, **signals}), findings

@@ -35,6 +35,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "time_unit": ("times are in ms, us or ns", TILT),
     "time_stamps": ("stamps are 0 or go back", "log again"),
     "clock_offset": ("the pose is late against the gyro", ROTATE),
+    "clock_drift": ("the pose's clock runs faster or slower than the gyro's", ROTATE),
     "motor_order": ("motors are in another order", PULSE),
     "motor_spin": ("motors turn the other way round", PULSE),
     "motor_dead": ("a motor never turns", PULSE),

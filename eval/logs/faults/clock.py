@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.importers.frames import conjugate, multiply, rotation_vector
-from eval.logs.faults.finding import Finding
+from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import SPAN_S, Rows
 from eval.logs.faults.reading import TIMES, option
 
@@ -25,6 +25,11 @@ CALM = 0.2
 """Turns slower than this tell nothing (root mean square) [rad/s]."""
 LEAST_S, SURE = 0.002, 4.0
 """A delay below the first [s], or within so many standard errors of none, is left alone."""
+GROWN_S, DRIFT, SURE_DRIFT = 0.005, 3e-4, 5.0
+"""Clocks drift that part by more than the first over a flight [s], by more than the second (two
+crystals part by less than 200 ppm), and by more than so many standard errors."""
+SEEN = 0.005
+"""A flight that does not bound the drift by this does not show it."""
 LATE_S = 0.025
 """A diagnosis estimates smaller offsets itself (the effect clock_offset) [s]."""
 
@@ -37,6 +42,25 @@ class Late(NamedTuple):
     """Standard error [s]."""
     drift: float
     """By how much that grows in a second of the flight."""
+    drift_error: float
+    """Standard error of the drift."""
+    middle_s: float
+    """When it is `delay_s` late [s]."""
+    duration_s: float
+    """Of the flight [s]."""
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the clocks part by more than their crystals do, and than is known anyway."""
+        grown = abs(self.drift) * self.duration_s
+        return grown > GROWN_S and abs(self.drift) > max(DRIFT, SURE_DRIFT * self.drift_error)
+
+    def drift_figures(self) -> str:
+        """Return the drift in words."""
+        return (
+            f"it gets later by {1e6 * self.drift:+.0f} ppm (± {1e6 * self.drift_error:.0f}), "
+            f"{1e3 * self.drift * self.duration_s:+.1f} ms over the flight"
+        )
 
 
 def check_time(rows: Rows) -> list[Finding]:
@@ -65,13 +89,21 @@ def check_clock(rows: Rows) -> list[Finding]:
     )
     found = delay_of(quat_time, quat, rate_time, rate)
     if found is None:
-        return []
+        text = "the flight turns too little to hold its clocks against each other"
+        return unseen("pose clock", text, "clock_offset", "clock_drift")
+    drift = []
+    if not found.drifts and not SURE_DRIFT * found.drift_error < SEEN:
+        drift = unseen("pose clock", found.drift_figures(), "clock_drift")
+    if found.drifts:
+        fix = "suite import of the log that it was made of: the pose is moved"
+        about = ("clock_drift", found.drift, 0.95, fix)
+        drift = [Finding("doubt", "pose clock", found.drift_figures(), *about)]
     figures = f"it is {1e3 * found.delay_s:+.1f} ms (± {1e3 * found.error_s:.1f} ms) late"
     if abs(found.delay_s) < max(LATE_S, SURE * found.error_s):
-        return [Finding("ok", "pose delay", figures + " against the gyro")]
+        return [Finding("ok", "pose delay", figures + " against the gyro"), *drift]
     fix = "suite import moves it; or [effects.clock_offset] of the vehicle file"
-    return [Finding("doubt", "pose delay", figures + " against the gyro", "clock_offset",
-                    found.delay_s, 0.95, fix)]  # fmt: skip
+    about = ("clock_offset", found.delay_s, 0.95, fix)
+    return [Finding("doubt", "pose delay", figures + " against the gyro", *about), *drift]
 
 
 def delay_of(
@@ -100,36 +132,62 @@ def delay_of(
     area = 0.5 * np.diff(rate_time)[:, None] * (rate[1:] + rate[:-1])
     full = np.concatenate([np.zeros((1, 3)), np.cumsum(area, axis=0)])
 
-    def gyro(late_s: float) -> np.ndarray:
+    middle, duration = 0.5 * float(last[-1] + first[0]), float(last[-1] - first[0])
+
+    def gyro(late_s: float, drift: float) -> np.ndarray:
         at = [
-            np.stack([np.interp(t - late_s, rate_time, c) for c in full.T], axis=1)
+            np.stack(
+                [np.interp(t - late_s - drift * (t - middle), rate_time, c) for c in full.T], 1
+            )
             for t in (first, last)
         ]
         return (at[1] - at[0]) / (last - first)[:, None]
 
-    if np.sqrt(np.mean(np.sum(gyro(0.0) ** 2, axis=1))) < CALM:
+    if np.sqrt(np.mean(np.sum(gyro(0.0, 0.0) ** 2, axis=1))) < CALM:
         return None
     trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
     block = np.minimum((np.arange(len(first)) * BLOCKS) // len(first), BLOCKS - 1)
-    cost = np.empty((BLOCKS, len(trials)))
-    for k, late_s in enumerate(trials):
-        off = turns - gyro(late_s)
-        size = np.linalg.norm(off - np.median(off, axis=0), axis=1)
-        # The noise of one turn is that of two attitudes: wild ones must not decide.
-        limit = 3.0 * np.median(size)
-        loss = np.where(size < limit, 0.5 * size**2, limit * (size - 0.5 * limit))
-        cost[:, k] = np.bincount(block, weights=loss, minlength=BLOCKS)
+
+    def costs(drift: float) -> np.ndarray:
+        cost = np.empty((BLOCKS, len(trials)))
+        for k, late_s in enumerate(trials):
+            off = turns - gyro(late_s, drift)
+            size = np.linalg.norm(off - np.median(off, axis=0), axis=1)
+            # The noise of one turn is that of two attitudes: wild ones must not decide.
+            limit = 3.0 * np.median(size)
+            loss = np.where(size < limit, 0.5 * size**2, limit * (size - 0.5 * limit))
+            cost[:, k] = np.bincount(block, weights=loss, minlength=BLOCKS)
+        return cost
+
+    first_drift, _ = _drift(trials, costs(0.0), duration)
+    cost = costs(first_drift)  # within a block, too, a drift would pass for scatter
+    more, drift_error = _drift(trials, cost, duration)
     whole = _lowest(trials, cost.sum(axis=0))
     parts = [_lowest(trials, cost.sum(axis=0) - cost[b]) for b in range(BLOCKS)]
     if whole is None or any(part is None for part in parts):
         return None
-    left_out = np.array([part for part in parts if part is not None])
-    spread = (BLOCKS - 1) / BLOCKS * np.sum((left_out - left_out.mean()) ** 2)
-    halves = [_lowest(trials, cost[k * BLOCKS // 2 :][: BLOCKS // 2].sum(axis=0)) for k in (0, 1)]
-    drift = 0.0
-    if None not in halves:
-        drift = (halves[1] - halves[0]) / (0.5 * (last[-1] - first[0]))  # type: ignore[operator]
-    return Late(whole, float(np.sqrt(spread)), drift)
+    error = _jackknife(np.array(parts, dtype=np.float64))
+    return Late(whole, error, first_drift + more, drift_error, middle, duration)
+
+
+def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[float, float]:
+    """Return by how much the delay grows in a second, from half to half, and its error."""
+    half = BLOCKS // 2
+    halves = [
+        [_lowest(trials, part.sum(axis=0) - gone) for gone in (0.0, *part)]
+        for part in (cost[:half], cost[half:])
+    ]
+    if any(part is None for each in halves for part in each):
+        return 0.0, np.inf
+    both = np.array(halves, dtype=np.float64)
+    error = float(np.hypot(*(_jackknife(each[1:]) for each in both)))
+    return float(both[1, 0] - both[0, 0]) / (0.5 * duration_s), error / (0.5 * duration_s)
+
+
+def _jackknife(left_out: np.ndarray) -> float:
+    """Return the standard error of an estimate by those with one block left out each."""
+    count = len(left_out)
+    return float(np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2)))
 
 
 def _lowest(trials: np.ndarray, cost: np.ndarray) -> float | None:

@@ -44,6 +44,12 @@ class Match(NamedTuple):
         return bool(worse.any() and (self.alike[self.seen] > ALIKE).all())
 
     @property
+    def is_mirrored(self) -> bool:
+        """Whether an axis surely has the other sign, though others are too small to confirm it."""
+        worse = self.seen & (self.alike - self.as_given > UNLIKE) & (self.alike > ALIKE)
+        return bool(worse.any() and "".join(self.axes.split(",")).replace("-", "") == "xyz")
+
+    @property
     def fits(self) -> bool:
         """Whether every axis that can be judged fits as it is given."""
         return bool(self.seen.any() and (self.as_given[self.seen] > SEEN).all())

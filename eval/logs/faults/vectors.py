@@ -38,6 +38,8 @@ NEAR = 1.06
 """A scale within this factor of a unit's is of that unit."""
 SAME = 1.1
 """A scale within this factor of 1 is no fault."""
+FAR = 1.15
+"""A scale within this factor is worth a word: filters of an attitude make as much."""
 SLOW = 1.25
 """The same of a velocity, which filters make smaller or larger."""
 CALM_SPEED = 0.3
@@ -78,11 +80,12 @@ def check_gyro(rows: Rows) -> list[Finding]:
     if apart < APART:
         text = f"body and world axes are {100 * apart:.0f} % of its turns apart only"
         findings.append(Finding("not identifiable", "gyro", text, "gyro_frame"))
-    if found.is_turned:
+    if found.is_turned or found.is_mirrored:
         findings.append(_turned(found, "rate", "gyro"))
     elif not found.seen.any():
         text = "its noise hides how the attitude turns"
         return unseen("gyro", text, "gyro_scale", "gyro_axes", "gyro_frame", "body_frame")
+    findings += _unseen_axes(found, "gyro", "gyro_axes", "body_frame")
     findings += _unit(found, RATES, "rate", "gyro", "gyro_scale", "the attitude's turns")
     return findings
 
@@ -95,7 +98,15 @@ def _turned(found: Match, signal: str, subject: str) -> Finding:
     text = f"correlations with what it should be are {alike}; its axes are {found.axes}"
     sure = float(np.clip(np.min(found.alike[found.seen]), 0.0, 0.99))
     fix = option((signal, found.axes))
-    return Finding("corrected", subject, text, frame, None, max(sure, 0.9), fix)
+    status = "corrected" if found.is_turned else "doubt"
+    return Finding(status, subject, text, frame, None, max(sure, 0.9), fix)
+
+
+def _unseen_axes(found: Match, subject: str, *faults: str) -> list[Finding]:
+    """Return that the axes along which nothing happens cannot be checked."""
+    axes = " and ".join(axis for axis, seen in zip("xyz", found.seen, strict=True) if not seen)
+    text = f"along {axes} there is too little to check its sign by"
+    return unseen(subject, text, *faults) if axes else []
 
 
 def _unit(
@@ -112,6 +123,8 @@ def _unit(
     figures = f"it is {scale:.3g} times {of} ({low:.3g} to {high:.3g})"
     if not np.isfinite(scale) or low / same < 1.0 < high * same:
         return [Finding("ok", subject, figures)]
+    if low / FAR < 1.0 < high * FAR:
+        return [Finding("note", subject, f"{figures}: filters, or a range that is a little off")]
     off = {words: abs(np.log(scale / factor)) for words, factor in units.items()}
     words, *others = sorted(off, key=lambda name: off[name])
     if low / NEAR < units[words] < high * NEAR and off[words] < np.log(1.3):
@@ -155,7 +168,7 @@ def check_velocity(rows: Rows) -> list[Finding]:
         findings = [Finding("corrected", "velocity", text, "velocity_frame", None, 0.98,
                             option(("vel", best)))]  # fmt: skip
         here = found[best]
-    elif here.is_turned:
+    elif here.is_turned or here.is_mirrored:
         findings = [_turned(here, "vel", "velocity")._replace(fault="velocity_frame")]
     elif left[""] > BAD:
         text = f"{figures}, and no other frame of it fits"
@@ -167,6 +180,7 @@ def check_velocity(rows: Rows) -> list[Finding]:
         if apart < APART:
             text = f"body and world axes are {100 * apart:.0f} % of it apart only"
             findings.append(Finding("not identifiable", "velocity", text, "velocity_frame"))
+        findings += _unseen_axes(here, "velocity", "velocity_frame")
     unit = _unit(here, SPEEDS, "vel", "velocity", "velocity_unit", "the path's derivative", SLOW)
     return findings + [one for one in unit if one.status != "ok"]
 

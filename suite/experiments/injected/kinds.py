@@ -96,6 +96,19 @@ def _late(parts: Parts, _: np.random.Generator) -> Parts:
     return {**kept, **{n: parts[n][:-count] for n in ("pos", "vel", "quat")}}
 
 
+def _drifting(parts: Parts, _: np.random.Generator) -> Parts:
+    """The pose's clock runs 0.5 % fast: it is half a millisecond later with every 0.1 s."""
+    time_s = parts["time"]
+    at = time_s - 0.005 * (time_s - time_s.mean())
+    moved = {
+        n: np.stack([np.interp(at, time_s, c) for c in parts[n].T], axis=1)
+        for n in ("pos", "vel", "quat")
+        if n in parts
+    }
+    moved["quat"] /= np.linalg.norm(moved["quat"], axis=1, keepdims=True)
+    return {**parts, **moved}
+
+
 def _sunk(parts: Parts, _: np.random.Generator) -> Parts:
     """Two seconds on the ground; then the barometer falls by 1.6 m as the motors start."""
     step = float(np.median(np.diff(parts["time"])))
@@ -161,6 +174,7 @@ KINDS: dict[str, Kind] = {
         ("attitude_sign",), ("quat=-pitch", "rate=-x,y,z"), race=True
     ),
     "pose late by 60 ms": Kind(("clock_offset",), change=_late, of=("quat", "vel", "rate")),
+    "pose's clock off by 0.5 %": Kind(("clock_drift",), change=_drifting, of=("quat", "rate")),
     "rotor speeds in rpm": Kind(("motor_unit",), (f"motor={RPM}",)),
     "electrical rotor speeds": Kind(("motor_unit",), ("motor=7",)),
     "12 poles declared of 14": Kind(("motor_poles",), (f"motor={14.0 / 12.0}",)),

@@ -9,6 +9,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.pose import align
 from eval.importers.signals import Signal
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.reading import read_as
 from tests.support import foreign_logs as made
 from tests.support import known_flight
 
@@ -94,6 +95,37 @@ def test_a_turned_marker_body_is_corrected_only_where_allowed(tmp_path):
     np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-5)
     _, findings = _import(tmp_path, fix=False)
     assert "pose axes" in {f.signal for f in findings if f.status == "doubt"}
+
+
+@pytest.mark.parametrize("steps", ["-roll", "-pitch", "-yaw"])
+def test_an_angle_of_the_wrong_sign_is_no_turned_body(tmp_path, steps):
+    def source(time):
+        truth = known_flight.fly(time)
+        wrong = Rotation.from_quat(read_as("quat", truth.quat, steps), scalar_first=True)
+        return truth._replace(rot=wrong.as_matrix())
+
+    made.write_mocap(tmp_path / "pose.csv", span=(1.0003, 11), offset=4.0, source=source)
+    _, findings = _import(tmp_path)
+    assert {f.fault for f in findings if f.status == "corrected"} == {"attitude_sign"}
+
+
+def test_a_mirrored_gyro_is_no_turned_body(tmp_path):
+    def source(time):
+        truth = known_flight.fly(time)
+        return truth._replace(rate=truth.rate * [1.0, -1.0, 1.0])
+
+    made.write_mocap(tmp_path / "pose.csv", span=(1, 11), offset=4.0)
+    log = made.write_blackbox(tmp_path / "log.csv", span=(0, 12), rate=500.0, source=source)
+    options = ImportOptions(pose=tmp_path / "pose.csv", full_thrust=30.0)
+    _, findings = import_log(log, None, options)
+    assert {"gyro_axes"} == {f.fault for f in findings if f.status == "corrected"}
+
+
+def test_a_pose_clock_that_no_crystal_keeps_is_named(tmp_path):
+    made.write_mocap(tmp_path / "pose.csv", span=(1, 11), offset=4.0, drift=1e-3)
+    _, findings = _import(tmp_path)
+    (drift,) = [f for f in findings if f.fault == "clock_drift"]
+    assert drift.size == pytest.approx(1e-3, rel=0.05)
 
 
 def test_poses_of_another_flight_are_refused(tmp_path):
