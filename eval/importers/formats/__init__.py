@@ -50,7 +50,7 @@ FORMATS: Registry[Format] = Registry(
     "diffracing_suite.formats",
     {
         name: f"eval.importers.formats.{name}"
-        for name in ("px4", "betaflight", "crazyflie", "table", "mcap")
+        for name in ("px4", "betaflight", "ardupilot", "crazyflie", "table", "mcap")
     },
     _wrong,
 )

@@ -1,11 +1,11 @@
-"""CSV files of `blackbox_decode` (Betaflight).
+"""Blackbox logs of Betaflight: raw ones (`.bbl`, `.bfl`), and CSV files of `blackbox_decode`.
 
 Betaflight's body is forward-left-up already: roll right, nose down and a turn to the left are
 positive, in the gyro, the set points and the motor mixer alike. Rates are in deg/s, also where
 the header names no unit (ten times that under `blackbox_high_resolution`, which the attitude shows:
 `eval/logs/faults/vectors.py`). Units that `blackbox_decode` was told to use stand in brackets after
 a column's name.
-Position and attitude are not logged: --pose brings them.
+Position and attitude are not logged: --pose brings them, or --partial does without.
 """
 
 from __future__ import annotations
@@ -13,22 +13,29 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from eval.effects.interface import GRAVITY
+from eval.importers.formats.blackbox import MARKER, decode
 from eval.importers.formats.table import numbers
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.motors import check_count
-from eval.logs.files import first_line, read_columns
+from eval.logs.files import first_line, read_columns, read_head
 
-SUMMARY = "CSV of blackbox_decode; needs --pose"
+SUMMARY = "Blackbox log (.bbl, .bfl), or CSV of blackbox_decode; --pose or --partial"
 TAKES_MAP = TAKES_SOURCE = False
 MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 """Motors 1 to 4 (x forward, y left): rear right, front right, rear left, front left."""
+DSHOT, PULSES = (48.0, 2047.0), (1000.0, 2000.0)
+"""Least and largest motor output, in steps of DShot or as pulses [us]."""
+RAW_HEAD = 512
+"""A raw log begins within so many bytes."""
+ABOUT = {"Firmware revision": "firmware", "Craft name": "craft", "Board information": "board"}
 DEG = np.pi / 180.0
 ACC_1G = 2048.0
 """Raw counts of accSmooth per g, on all boards of Betaflight 4."""
@@ -45,15 +52,9 @@ _ERPM = re.compile(r"^eRPM(?:\(/100\))?\[(\d)\]$")
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
-    """Return whether a file with these first bytes is a decoded Blackbox log.
-
-    Raises:
-        ValueError: for one that is not decoded.
-    """
-    if head.startswith(b"H Product:Blackbox"):
-        raise ValueError(
-            "a Blackbox log that is not decoded; run blackbox_decode on it, import the CSV"
-        )
+    """Return whether a file with these first bytes is a Blackbox log, decoded or not."""
+    if MARKER in head[:RAW_HEAD]:
+        return True
     # Blackbox Explorer writes the log's settings before the header.
     explorer = head.lstrip(b'\xef\xbb\xbf"').startswith(b'Product","Blackbox')
     line = first_line(head)
@@ -64,9 +65,16 @@ class Blackbox:
     """The columns of one file, found by name whatever their unit."""
 
     def __init__(self, path: Path) -> None:
-        """Read the table at `path`."""
+        """Read the log at `path`, raw or as a table."""
         self.name = str(path)
-        self.columns, _, self.warnings = read_columns(path)
+        self.header: Mapping[str, Any] = {}
+        self.findings: list[Finding] = []
+        if MARKER in read_head(path)[:RAW_HEAD]:
+            self.columns, self.header, findings = decode(path)
+            self.findings += findings
+        else:
+            self.columns, _, warnings = read_columns(path)
+            self.findings += [Finding("note", "file", text) for text in warnings]
         self._found: dict[str, tuple[str, str]] = {}
         for column in self.columns:
             match = _UNIT.match(column)
@@ -110,7 +118,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         FlightLogError: where a column of every Betaflight log is missing or unusable.
     """
     box = Blackbox(path)
-    findings = [Finding("note", "file", text) for text in box.warnings]
+    findings = list(box.findings)
     time_s = box.values(["time"], _TIME)[:, 0]
     if np.isfinite(time_s).any():
         time_s = time_s - np.nanmin(time_s)
@@ -128,9 +136,12 @@ def read(path: Path, options: ImportOptions) -> Recording:
     if box.has("vbatLatest"):
         told = box.unit("vbatLatest")
         parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), told, options.fix, findings)
-    parts |= _motors(box, options.motor_poles, findings)
+    poles = box.header.get("motor_poles", options.motor_poles)
+    parts |= _motors(box, poles if options.motor_poles == 14 else options.motor_poles, findings)
+    parts |= _outputs(box, findings)
     signals, more = collect({name: (time_s, value) for name, value in parts.items()}, box.name)
-    return Recording(box.name, signals, (*findings, *more), MOTOR_SIDE)
+    about = {ours: str(box.header[key]) for key, ours in ABOUT.items() if box.header.get(key)}
+    return Recording(box.name, signals, (*findings, *more), MOTOR_SIDE, about)
 
 
 def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -> np.ndarray:
@@ -148,6 +159,20 @@ def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -
     about = ("voltage", middle, 0.95)
     findings.append(Finding("corrected" if fix else "doubt", "voltage", text, *about))
     return voltage / 10.0 if fix else voltage
+
+
+def _outputs(box: Blackbox, findings: list[Finding]) -> dict[str, np.ndarray]:
+    """Return motor commands from 0 to 1, by the range in the header or by DShot's."""
+    names = [f"motor[{k}]" for k in range(4)]
+    if not box.has(*names):
+        return {}
+    raw = box.values(names, {"": 1.0})
+    low, high = box.header.get("motorOutput", PULSES if np.nanmin(raw) >= PULSES[0] else DSHOT)
+    if not high > low:
+        return {}
+    text = f"motor outputs from {low:g} to {high:g} are 0 to 1"
+    findings.append(Finding("note", "motors", text))
+    return {"pwm": np.clip((raw - low) / (high - low), 0.0, 1.0)}
 
 
 def _motors(box: Blackbox, poles: int, findings: list[Finding]) -> dict[str, np.ndarray]:

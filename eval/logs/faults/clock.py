@@ -180,7 +180,7 @@ def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[flo
     if any(part is None for each in halves for part in each):
         return 0.0, np.inf
     both = np.array(halves, dtype=np.float64)
-    error = float(np.hypot(*(_jackknife(each[1:]) for each in both)))
+    error = float(np.hypot(_jackknife(both[0, 1:]), _jackknife(both[1, 1:])))
     return float(both[1, 0] - both[0, 0]) / (0.5 * duration_s), error / (0.5 * duration_s)
 
 
