@@ -17,6 +17,8 @@ ArduPilot's documentation of its log messages (Copter 4.x); the first that is th
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -59,7 +61,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
     Raises:
         FlightLogError: where the reader is not installed, or it is no such log.
     """
-    messages, parameters, findings, about = _load(path)
+    messages, parameters, about = _load(path)
+    findings: list[Finding] = []
     parts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def take(name: str, kinds: tuple[str, ...], columns: str, factor: Any) -> None:
@@ -101,32 +104,34 @@ def read(path: Path, options: ImportOptions) -> Recording:
     return Recording(str(path), signals, (*findings, *more), side, about)
 
 
-def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], list[Finding], dict[str, str]]:
-    """Return columns by message, parameters, what was noticed, and what the log says of itself."""
+def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]]:
+    """Return columns by message, parameters, and what the log says of itself."""
     try:
         from pymavlink.DFReader import DFReader_binary
     except ImportError:
         raise FlightLogError(str(path), None, None, MISSING) from None
     table: dict[str, list[dict[str, Any]]] = {name: [] for name in MESSAGES}
     try:
-        reader = DFReader_binary(str(path))
-        try:
+        # The reader prints what it makes of damaged files.
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(io.StringIO()),
+            DFReader_binary(str(path)) as reader,
+        ):
             while (message := reader.recv_match(type=list(MESSAGES))) is not None:
                 table[message.get_type()].append(message.to_dict())
-        finally:
-            reader.close()
     except Exception as error:
         reason = f"an ArduPilot log that cannot be read ({type(error).__name__}: {error})"
         raise FlightLogError(str(path), None, None, reason) from None
     parameters = {str(one["Name"]): float(one["Value"]) for one in table.pop("PARM")}
     told = [str(one["Message"]) for one in table.pop("MSG")]
     messages = {name: _columns(rows, name) for name, rows in table.items() if rows}
-    return messages, parameters, [], {"firmware": told[0]} if told else {}
+    return messages, parameters, {"firmware": told[0]} if told else {}
 
 
 def _columns(rows: list[dict[str, Any]], name: str) -> Rows:
     """Return a message's numbers by column, of its first instance or core; of all ESCs."""
-    first = [r for r in rows if not r.get("I", r.get("C", 0))] if name not in ("ESC",) else rows
+    first = [r for r in rows if not r.get("I", r.get("C", 0))] if name != "ESC" else rows
     rows = first or rows
     numbers = [k for k, v in rows[0].items() if isinstance(v, (int, float))]
     return {k: np.array([r[k] for r in rows], dtype=np.float64) for k in numbers}

@@ -136,7 +136,9 @@ def test_unknown_formats_and_files(tmp_path):
 
 def test_each_format_is_told_by_its_first_bytes(tmp_path):
     table = write(tmp_path / "table.csv", flight(end=1.5))
+    (tmp_path / "log.bin").write_bytes(b"\xa3\x95\x80\x80\x59FMT")
     files = {
+        "ardupilot": tmp_path / "log.bin",
         "px4": made.write_ulog(tmp_path / "log.ulg", span=(0, 2)),
         "betaflight": made.write_blackbox(tmp_path / "log.csv", span=(0, 2)),
         "crazyflie": made.write_usd(tmp_path / "log00", span=(0, 2)),
