@@ -16,9 +16,9 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.mixer import mixer_matrix
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap, Vehicle, command_of_thrust
-from suite.diagnose.identify.drive import torque_of
 from suite.diagnose.plans.follow import Recording
 from suite.diagnose.plans.simulate import Sensors, fly, log_of
 from suite.diagnose.plans.trajectory import Trajectory
@@ -167,6 +167,14 @@ def logs_of(
                 changed["rate_cmd_b"] = recording.command.rate_b[rows].copy()
         found.append(replace(log, **changed))
     return found
+
+
+def torque_of(vehicle: Vehicle, thrust: np.ndarray) -> np.ndarray:
+    """Return the torques (T, 3) [N m] of rotor thrusts (T, 4) on the vehicle's arms."""
+    rotors = vehicle.rotors
+    ratio = rotors.torque_coefficient / rotors.thrust_coefficient
+    mixer = mixer_matrix(np.array(rotors.position), np.array(rotors.spin), ratio)
+    return thrust @ mixer[1:].T
 
 
 def truths(fleet: Fleet, drive: str, told: str = "xyz") -> Mapping[str, tuple[float, ...]]:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
@@ -196,13 +197,13 @@ def completed(log: FlightLog) -> FlightLog:
     if "pos" in log.partial:
         raise ValueError(f"{log.name}: no position: nothing says how it moved")
     if "quat" in log.partial:
-        log = replace(log, quat_wxyz=np.asarray(rot_to_quat(_leaning(log))))
+        log = replace(log, quat_wxyz=np.asarray(rot_to_quat(leaning(log))))
     if "rate" in log.partial:
-        log = replace(log, rate_b=_turning(log.time_s, log.rot_w))
+        log = replace(log, rate_b=turning_of(log.time_s, log.quat_wxyz))
     return log
 
 
-def _leaning(log: FlightLog) -> np.ndarray:
+def leaning(log: FlightLog) -> np.ndarray:
     """Return attitudes (N, 3, 3) whose z axis is along the path's acceleration less gravity."""
     step = float(np.median(np.diff(log.time_s)))
     if not np.isfinite(log.vel_w).any(axis=0).all():
@@ -216,11 +217,21 @@ def _leaning(log: FlightLog) -> np.ndarray:
     return np.stack([np.cross(left, up), left, up], axis=-1)
 
 
-def _turning(time_s: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
-    """Return the body rates (N, 3) of attitudes (N, 3, 3)."""
-    slope = np.gradient(rot_w, time_s, axis=0)
-    spin = np.swapaxes(rot_w, 1, 2) @ slope
-    return np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+def turning_of(time_s: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
+    """Return the body rates (T, 3) of attitudes (T, 4), by each row's neighbours [rad/s].
+
+    NaN where one of them is missing, and in the first and the last row.
+    """
+    rate_b = np.full((len(quat_wxyz), 3), np.nan)
+    whole = np.asarray(np.isfinite(quat_wxyz).all(axis=1))
+    rows = 1 + np.flatnonzero(whole[:-2] & whole[2:])
+    if len(rows):
+        before, after = (
+            Rotation.from_quat(quat_wxyz[rows + d], scalar_first=True) for d in (-1, 1)
+        )
+        step_s = (time_s[rows + 1] - time_s[rows - 1])[:, None]
+        rate_b[rows] = (before.inv() * after).as_rotvec() / step_s
+    return rate_b
 
 
 def choose_held_out(

@@ -42,7 +42,7 @@ def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
             continue
         table = values.reshape(len(values), -1)
         if name == "quat_wxyz":
-            table = _one_side(table)
+            table = on_one_side(table)
         columns = [_column(log.time_s, c, limits.longest_hole_s, name in HELD) for c in table.T]
         table = np.stack(columns, axis=1)
         if name == "quat_wxyz":
@@ -127,7 +127,7 @@ def _column(time_s: np.ndarray, column: np.ndarray, hole_s: float, held: bool) -
     return np.where(np.isfinite(column), column, np.where(inside & near, whole, np.nan))
 
 
-def _one_side(quat: np.ndarray) -> np.ndarray:
+def on_one_side(quat: np.ndarray) -> np.ndarray:
     """Return quaternions (T, 4) of which neighbours do not differ by sign alone."""
     own = np.flatnonzero(np.isfinite(quat).all(axis=1))
     flips = np.cumsum((quat[own][1:] * quat[own][:-1]).sum(axis=1) < 0.0)

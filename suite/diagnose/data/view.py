@@ -167,8 +167,16 @@ class WeakForm(NamedTuple):
     mean: sparse.csr_array
     """(M, N) takes accelerations to their means."""
 
+    def take(self, chosen: np.ndarray) -> WeakForm:
+        """Return the bumps that are `chosen` (M,) bool."""
+        at = np.flatnonzero(chosen)
+        matrices = (sparse.csr_array(part[at]) for part in (self.change, self.mean))
+        return WeakForm(self.middle_s[at], self.middle_row[at], *matrices)
 
-def weak_form(time_s: np.ndarray, good: np.ndarray, width_s: float, hole_s: float) -> WeakForm:
+
+def weak_form(
+    time_s: np.ndarray, good: np.ndarray, width_s: float, hole_s: float, slope: bool = False
+) -> WeakForm:
     """Return bumps of `width_s`, half of it apart, that reach across no bad row and no hole.
 
     Args:
@@ -176,6 +184,8 @@ def weak_form(time_s: np.ndarray, good: np.ndarray, width_s: float, hole_s: floa
         good: (N,) bool: rows that can be used.
         width_s: from a bump's begin to its end [s].
         hole_s: rows further apart are a hole [s].
+        slope: weigh by -w'(t) in place of the bump w(t): `mean` takes accelerations to the mean
+            of their slopes, and `change` positions to mean accelerations.
     """
     span = np.diff(time_s)
     middle = 0.5 * (time_s[1:] + time_s[:-1])
@@ -186,8 +196,14 @@ def weak_form(time_s: np.ndarray, good: np.ndarray, width_s: float, hole_s: floa
         first, last = np.searchsorted(middle, (centre - 0.5 * width_s, centre + 0.5 * width_s))
         if last - first < LEAST_ROWS or not usable[first:last].all():
             continue
-        share = np.cos(np.pi * (middle[first:last] - centre) / width_s) ** 2
-        share /= (share * span[first:last]).sum()
+        since = middle[first:last] - centre
+        if slope:
+            share = np.sin(2.0 * np.pi * since / width_s)
+            share -= (share * span[first:last]).sum() / span[first:last].sum()
+            share /= (share * since * span[first:last]).sum()
+        else:
+            share = np.cos(np.pi * since / width_s) ** 2
+            share /= (share * span[first:last]).sum()
         rows.append(np.full(last - first, len(kept)))
         columns.append(np.arange(first, last))
         shares.append(share)

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.effects.interface import Sample
+from eval.effects.interface import Array, Sample
 from eval.effects.log_faults import restored
-from eval.quadrotor.plant import Motion, accelerations, assemble, nominal_quadrotor
+from eval.quadrotor.plant import Motion, Plant, accelerations, assemble, nominal_quadrotor
 from eval.quadrotor.rotors import steady
 from eval.quadrotor.stepper import Inputs, wind_and_flow, wrench_on
 from eval.vehicles.vehicle import Vehicle
@@ -81,6 +81,23 @@ class ForceModel:
         return RowForces(np.concatenate(values), np.concatenate(slopes))
 
 
+def accelerations_on(plant: Plant, rows: FlightRows, voltage: bool) -> tuple[Array, Array]:
+    """Return dv/dt (N, 3) in the world [m/s^2] and dw/dt (N, 3) in body axes [rad/s^2] on `rows`.
+
+    Numpy or JAX; `voltage`: whether the rows have one.
+    """
+    motion, rotors = motion_of(plant, rows), steady(rows.rotor_speed)
+    inputs = Inputs(voltage_drop=rows.voltage_drop if voltage else None)
+    _, flow = wind_and_flow(plant, {}, motion, rotors, inputs, rows.time_s)
+    return accelerations(plant, motion, wrench_on(plant, rotors, flow))
+
+
+def motion_of(plant: Plant, rows: FlightRows) -> Motion:
+    """Return how the body moved (N, ...) where the faults of the log among the effects are true."""
+    logged = Sample(rows.pos_w, rows.rot_w, rows.vel_w, rows.rate_b, 0.0 * rows.rate_b)
+    return Motion(*restored(plant.effects, logged)[:4])
+
+
 @cache
 def _forces(layout: ParameterLayout, voltage: bool) -> Callable[..., Any]:
     """Return the compiled accelerations and their slopes, the same for every vehicle."""
@@ -88,13 +105,7 @@ def _forces(layout: ParameterLayout, voltage: bool) -> Callable[..., Any]:
     def act(given: VehicleArrays, theta: Any, rows: FlightRows) -> Any:
         values = effects_at(layout, given.base, theta)
         plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0)
-        logged = Sample(rows.pos_w, rows.rot_w, rows.vel_w, rows.rate_b, 0.0 * rows.rate_b)
-        motion = Motion(*restored(values, logged)[:4])
-        rotors = steady(rows.rotor_speed)
-        inputs = Inputs(voltage_drop=rows.voltage_drop if voltage else None)
-        _, flow = wind_and_flow(plant, {}, motion, rotors, inputs, rows.time_s)
-        acc_w, turn_b = accelerations(plant, motion, wrench_on(plant, rotors, flow))
-        return jnp.concatenate([acc_w, turn_b], axis=-1)
+        return jnp.concatenate(accelerations_on(plant, rows, voltage), axis=-1)
 
     def both(given: VehicleArrays, theta: Any, rows: FlightRows, directions: Any) -> Any:
         def along(direction: Any) -> Any:

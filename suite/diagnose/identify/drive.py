@@ -1,20 +1,24 @@
-"""What drove a flight, as thrusts, forces and torques on its grid, and the vehicle of the start.
+"""What drove a flight, and the vehicle with trial numbers on a flight's grid.
 
-Effects of the start that are another word for its numbers are in them.
+The equations are those of the plant, as in the views of a diagnosis. Effects of the start that are
+another word for its numbers are in them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 
-from eval.quadrotor.plant import make_plant
-from eval.vehicles.vehicle import MotorMap, Vehicle
+from eval.effects import EFFECTS
+from eval.quadrotor.plant import Plant, Wrench, accelerations, make_plant
+from eval.vehicles.vehicle import MotorMap, Vehicle, motor_speed
 from eval.vehicles.vehicle_check import check_vehicle
+from suite.diagnose.data.sampling import LONGEST_S, follow_lag
+from suite.diagnose.data.view import FlightRows
+from suite.diagnose.evidence.moments import accelerations_on, motion_of
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
 
 DRIVES = {
@@ -25,19 +29,6 @@ DRIVES = {
     "thrust": ("thrust_cmd",),
 }
 """Signals by drive; the first that all flights have counts."""
-
-
-class MotorGuess(NamedTuple):
-    """A motor's thrust [N]: `size ((1 - curve) v + curve v^2)` with `v = command / usual`.
-
-    The command is that of the voltage `volts`: `command (V / volts)^battery`.
-    """
-
-    size: float
-    curve: float
-    battery: float
-    usual: float
-    volts: float
 
 
 def drive_of(flights: Sequence[FlightGrid]) -> str:
@@ -85,16 +76,145 @@ def _volts(flights: Sequence[FlightGrid], otherwise: float) -> float:
     return float(np.nanmedian(np.concatenate(have))) if have else otherwise
 
 
-def guess_of(flights: Sequence[FlightGrid], vehicle: Vehicle) -> MotorGuess:
-    """Return the start's motors about the command and the voltage that are usual here."""
-    motors = vehicle.motors
-    assert motors is not None
+@dataclass(frozen=True)
+class Driven:
+    """A vehicle to start from, and what drives its flights; numbers are by their names.
+
+    Those of motors are about a usual command and voltage: there `thrust` is the logarithm of what
+    they give over what the start's do, and `curve` the quadratic part's share.
+    """
+
+    start: Vehicle
+    drive: str
+    """One of `DRIVES`."""
+    command: float = 1.0
+    """Usual motor command."""
+    volts: float = 1.0
+    """Usual voltage [V]."""
+
+    @property
+    def motors(self) -> MotorMap:
+        """The start's motors; none drive flights of another kind."""
+        return self.start.motors or MotorMap((0.0, 1.0), 1.0, 0.0)
+
+    @property
+    def usual_thrust(self) -> tuple[float, float]:
+        """Linear and quadratic part of what the start's motors give as usual [N]."""
+        first, second = self.motors.thrust
+        applied = self.command * (self.volts / self.motors.voltage) ** self.battery
+        return first * applied, second * applied**2
+
+    @property
+    def curve(self) -> float:
+        """Share of the quadratic part in the start's usual thrust."""
+        return self.usual_thrust[1] / sum(self.usual_thrust)
+
+    @property
+    def battery(self) -> float:
+        """The start's voltage exponent."""
+        return self.motors.voltage_exponent
+
+    def motor_map(self, numbers: Mapping[str, float]) -> MotorMap:
+        """Return `[motors]` with `numbers`."""
+        curve, battery = numbers.get("curve", self.curve), numbers.get("battery", self.battery)
+        size = sum(self.usual_thrust) * float(np.exp(numbers.get("thrust", 0.0)))
+        per = (self.motors.voltage / self.volts) ** battery / self.command
+        thrust = (float(size * (1.0 - curve) * per), float(size * curve * per**2))
+        return MotorMap(thrust, self.motors.voltage, float(battery))
+
+    def thrust_coefficient(self, numbers: Mapping[str, float]) -> float:
+        """Return that of the rotors, which their measured speeds tell alone."""
+        scale = float(np.exp(numbers.get("thrust", 0.0))) if self.drive == "rotors" else 1.0
+        return self.start.rotors.thrust_coefficient * scale
+
+    def torque_coefficient(self, numbers: Mapping[str, float]) -> float:
+        """Return that of the rotors: `yaw` is of torque about z over the inertia there."""
+        scaled = numbers.get("thrust", 0.0) if self.drive == "rotors" else 0.0
+        turning = numbers.get("yaw", 0.0) + inertia_ratio(numbers)[2] + scaled
+        return self.start.rotors.torque_coefficient * float(np.exp(turning))
+
+    def drag(self, numbers: Mapping[str, float]) -> tuple[float, ...]:
+        """Return the linear drag [1/s]."""
+        had = self.start.effects.get("linear_drag")
+        begun = (0.0, 0.0, 0.0) if had is None else had.coefficient
+        return tuple(float(numbers.get(f"drag_{a}", d)) for a, d in zip("xyz", begun, strict=True))
+
+    def plant(self, numbers: Mapping[str, float]) -> Plant:
+        """Return the plant with `numbers`, and with all effects of the start that act by state."""
+        effects = {n: v for n, v in self.start.effects.items() if EFFECTS[n].by_state}
+        effects["linear_drag"] = EFFECTS["linear_drag"].values(self.drag(numbers))
+        if self.drive not in KNOWN_MOTORS:
+            scale = float(np.exp(numbers.get("thrust", 0.0)))
+            effects["thrust_scale"] = EFFECTS["thrust_scale"].values(scale)
+        rotors = replace(
+            self.start.rotors,
+            thrust_coefficient=self.thrust_coefficient(numbers),
+            torque_coefficient=self.torque_coefficient(numbers),
+        )
+        inertia = np.asarray(self.start.inertia) * np.exp(inertia_ratio(numbers))
+        vehicle = replace(self.start, rotors=rotors, inertia=_three(inertia), effects=effects)
+        return make_plant(vehicle, LONGEST_S)
+
+    def rotor_speed(self, flight: FlightGrid, numbers: Mapping[str, float]) -> np.ndarray:
+        """Return the rotors' speeds (G, 4): measured, or by their commands [rad/s].
+
+        Commands come behind `lag`, and behind it and the delay together by `late`.
+        """
+        known = flight.known
+        if self.drive == "rotors":
+            return known["rotor_speed"]
+        if self.drive == "pwm":
+            vehicle = replace(self.start, motors=self.motor_map(numbers))
+            volts = np.maximum(known["voltage"], 0.1) if flight.has("voltage") else None
+            # What is asked for is that of the voltage that is usual, where none was measured.
+            volts = np.full(len(flight.time_s), self.volts) if volts is None else volts
+            asked = motor_speed(vehicle, known["pwm"], volts)
+        else:
+            each = 0.25 * self.start.mass * np.maximum(known["thrust_cmd"], 0.0)
+            asked = np.sqrt(each / self.start.rotors.thrust_coefficient)[:, None] * np.ones(4)
+        return behind(asked, numbers)
+
+    def acting(
+        self,
+        flight: FlightGrid,
+        rows: FlightRows,
+        numbers: Mapping[str, float],
+        powered: bool = True,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return dv/dt in the world and dw/dt in body axes (G, 3) on the `rows` of `flight`.
+
+        As of rotors that stand still where nothing says how they turned, or not `powered`.
+        """
+        plant = self.plant(numbers)
+        if powered:
+            rows = rows._replace(rotor_speed=np.nan_to_num(self.rotor_speed(flight, numbers)))
+        acc_w, turn_b = accelerations_on(plant, rows, flight.has("voltage"))
+        if self.drive == "torques":
+            torque_b = np.nan_to_num(behind(flight.known["torque_cmd_b"], numbers))
+            wrench = Wrench(np.zeros_like(torque_b), torque_b)
+            _, turn_b = accelerations(plant, motion_of(plant, rows), wrench)
+        return acc_w, turn_b
+
+
+def driven_by(flights: Sequence[FlightGrid], vehicle: Vehicle, drive: str) -> Driven:
+    """Return `vehicle` under what drives `flights`, about what is usual there."""
+    if drive != "pwm":
+        return Driven(vehicle, drive)
+    assert vehicle.motors is not None
     usual = float(np.nanmedian(np.concatenate([f.known["pwm"].ravel() for f in flights])))
-    volts = _volts(flights, motors.voltage)
-    first, second = motors.thrust
-    v = usual * (volts / motors.voltage) ** motors.voltage_exponent
-    size = first * v + second * v**2
-    return MotorGuess(size, second * v**2 / size, motors.voltage_exponent, usual, volts)
+    return Driven(vehicle, drive, usual, _volts(flights, vehicle.motors.voltage))
+
+
+def inertia_ratio(numbers: Mapping[str, float]) -> np.ndarray:
+    """Return the logarithms (3,) of the inertia over the start's."""
+    x, y, z = (numbers.get(f"inertia_{axis}", 0.0) for axis in "xyz")
+    return np.array([x, y, 0.5 * (x + y) + z])
+
+
+def behind(values: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
+    """Return held commands (G, C) behind what lies between them and the rotors."""
+    lag_s = numbers["lag"]
+    return lagged(delayed(values, numbers["late"] - lag_s), lag_s)
 
 
 def delayed(values: np.ndarray, delay_s: float) -> np.ndarray:
@@ -102,60 +222,21 @@ def delayed(values: np.ndarray, delay_s: float) -> np.ndarray:
 
     A value that holds from one grid point to the next is met half of it later.
     """
-    steps = delay_s / STEP_S + 0.5
-    whole = int(np.floor(steps))
-    part = steps - whole
-    near, far = _shifted(values, whole), _shifted(values, whole + 1)
-    return (1.0 - part) * near + part * far
+    count = len(values)
+    place = np.clip(np.arange(count) - delay_s / STEP_S - 0.5, 0.0, count - 1.0)
+    row = np.minimum(place.astype(int), max(count - 2, 0))
+    part = (place - row).reshape(-1, *[1] * (values.ndim - 1))
+    return (1.0 - part) * values[row] + part * values[np.minimum(row + 1, count - 1)]
 
 
 def lagged(values: np.ndarray, lag_s: float) -> np.ndarray:
     """Return `values` (G, C), joined by lines, behind a first-order lag."""
-    from scipy.signal import lfilter
-
     if lag_s <= 1e-4:
         return values
-    keep = float(np.exp(-STEP_S / lag_s))
     whole = filled(values)
     # The state at a grid point has seen the steps before it, each at its mean.
     before = 0.5 * (np.concatenate([whole[:1], whole[:-1]]) + whole)
-    out = lfilter([1.0 - keep], [1.0, -keep], before, axis=0, zi=keep * whole[:1])[0]
-    return np.where(np.isfinite(values), out, np.nan)
-
-
-def motor_thrusts(
-    flight: FlightGrid, guess: MotorGuess, lag_s: float, delay_s: float
-) -> np.ndarray:
-    """Return the motors' thrusts (G, 4) [N]; the rotors' speeds lag, and thrust is their square."""
-    command = flight.known["pwm"]
-    if flight.has("voltage"):
-        ratio = np.maximum(flight.known["voltage"], 0.1) / guess.volts
-        command = command * (ratio**guess.battery)[:, None]
-    v = delayed(command, delay_s) / guess.usual
-    thrust = guess.size * ((1.0 - guess.curve) * v + guess.curve * v**2)
-    speed = lagged(np.sqrt(np.maximum(thrust, 0.0)), lag_s)
-    return speed**2
-
-
-def rotor_thrusts(flight: FlightGrid, thrust_coefficient: float) -> np.ndarray:
-    """Return the thrusts (G, 4) [N] of measured rotor speeds."""
-    return thrust_coefficient * flight.known["rotor_speed"] ** 2
-
-
-def torque_of(vehicle: Vehicle, thrust: np.ndarray) -> np.ndarray:
-    """Return the torques (G, 3) [N m] of rotor thrusts (G, 4) on the vehicle's arms."""
-    x, y, _ = np.asarray(vehicle.rotors.position).T
-    spin = np.asarray(vehicle.rotors.spin, dtype=float)
-    arm = vehicle.rotors.torque_coefficient / vehicle.rotors.thrust_coefficient
-    return np.stack([thrust @ y, -(thrust @ x), -arm * (thrust @ spin)], axis=1)
-
-
-def _shifted(values: np.ndarray, steps: int) -> np.ndarray:
-    if steps == 0:
-        return values
-    if steps > 0:
-        return np.concatenate([np.repeat(values[:1], steps, axis=0), values[:-steps]])
-    return np.concatenate([values[-steps:], np.repeat(values[-1:], -steps, axis=0)])
+    return np.where(np.isfinite(values), follow_lag(before, STEP_S, lag_s), np.nan)
 
 
 def filled(values: np.ndarray) -> np.ndarray:
@@ -166,6 +247,8 @@ def filled(values: np.ndarray) -> np.ndarray:
     return np.nan_to_num(values[np.maximum(last, first)])
 
 
+KNOWN_MOTORS = ("rotors", "pwm")
+"""Drives under which the rotors' thrusts are known beside the commands."""
 OWN = ("motor_lag", "inertia_scale", "rate_gain")
 """Effects that scale or replace a number which is fitted."""
 FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
@@ -212,8 +295,13 @@ def with_own_numbers(vehicle: Vehicle, known_motors: bool) -> Vehicle:
 
 
 def unknown_to_the_fits(vehicle: Vehicle) -> Sequence[str]:
-    """Return the effects of a start that no fit takes into account, and that stay in its file."""
-    return [name for name in vehicle.effects if name not in (*OWN, *FITTED)]
+    """Return the effects of a start that no fit takes into account, and that stay in its file.
+
+    Force and torque know all that act by the state.
+    """
+    known = (*OWN, *FITTED)
+    unknown = {n for n, e in EFFECTS.items() if not e.by_state or e.late is not None}
+    return [name for name in vehicle.effects if name in unknown and name not in known]
 
 
 def _three(values: np.ndarray) -> tuple[float, float, float]:

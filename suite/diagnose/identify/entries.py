@@ -12,11 +12,9 @@ from eval.effects import EFFECTS
 from eval.effects.interface import at
 from eval.vehicles.vehicle import Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
-from suite.diagnose.identify import force
-from suite.diagnose.identify.drive import MotorGuess
+from suite.diagnose.identify.drive import Driven, inertia_ratio
 from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.numbers import DELAY, Derived, Number, number
-from suite.diagnose.identify.torque import inertia_ratio
 
 
 def inertia_of(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
@@ -24,15 +22,6 @@ def inertia_of(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
     found = np.asarray(vehicle.inertia) * np.exp(inertia_ratio(numbers))
     # No body has more about one axis than about the other two together.
     return np.minimum(found, found.sum() - found)
-
-
-def motors_of(guess: MotorGuess, numbers: Mapping[str, float], volts: float) -> np.ndarray:
-    """Return t1, t2 [N] and the exponent of `[motors]` at the nominal voltage `volts`."""
-    shape = force.with_told(guess, numbers)
-    size = shape.size * np.exp(numbers.get("thrust", 0.0))
-    per = (volts / shape.volts) ** shape.battery / shape.usual
-    first, second = (1.0 - shape.curve) * per, shape.curve * per**2
-    return np.array([size * first, size * second, shape.battery])
 
 
 class _Entries(list[Number]):
@@ -47,60 +36,47 @@ class _Entries(list[Number]):
         self.append(number(key, unit, self.fitted, derived, [(name,) for name in needs], room))
 
 
-def of_force(vehicle: Vehicle, drive: str, guess: MotorGuess, fitted: Fitted) -> list[Number]:
+def of_force(driven: Driven, fitted: Fitted) -> list[Number]:
     """Return the entries that the force tells: motors or rotors, and drag."""
     entries = _Entries(fitted)
-    if "thrust" in entries.names and drive == "pwm":
-        assert vehicle.motors is not None
-        volts = vehicle.motors.voltage
-        thrust = ("thrust", "thrust")
-        entries.add("motors.thrust", "N", lambda n: motors_of(guess, n, volts)[:2], *thrust)
-        exponent = "motors.voltage_exponent"
-        entries.add(exponent, "1", lambda n: motors_of(guess, n, volts)[2:], "battery")
+    if "thrust" in entries.names and driven.drive == "pwm":
+        thrust = lambda n: np.array(driven.motor_map(n).thrust)  # noqa: E731
+        exponent = lambda n: np.array([driven.motor_map(n).voltage_exponent])  # noqa: E731
+        entries.add("motors.thrust", "N", thrust, "thrust", "thrust")
+        entries.add("motors.voltage_exponent", "1", exponent, "battery")
+    elif "thrust" in entries.names and driven.drive == "rotors":
+        key, unit = "rotors.thrust_coefficient", "N/(rad/s)^2"
+        entries.add(key, unit, lambda n: np.array([driven.thrust_coefficient(n)]), "thrust")
     elif "thrust" in entries.names:
-        key, unit, start = "effects.thrust_scale.scale", "1", 1.0
-        if drive == "rotors":
-            key, unit = "rotors.thrust_coefficient", "N/(rad/s)^2"
-            start = vehicle.rotors.thrust_coefficient
-        entries.add(key, unit, lambda n: np.array([start * np.exp(n["thrust"])]), "thrust")
+        key = "effects.thrust_scale.scale"
+        entries.add(key, "1", lambda n: np.array([np.exp(n["thrust"])]), "thrust")
     if "drag_z" in entries.names:
-        drag = vehicle.effects.get("linear_drag")
-        begun = (0.0, 0.0, 0.0) if drag is None else drag.coefficient
-        axes = [f"drag_{axis}" for axis in "xyz"]
-
-        def drags(n: Mapping[str, float]) -> np.ndarray:
-            return np.array([n.get(name, have) for name, have in zip(axes, begun, strict=True)])
-
-        entries.add("effects.linear_drag.coefficient", "1/s", drags, *axes)
+        axes, key = (f"drag_{axis}" for axis in "xyz"), "effects.linear_drag.coefficient"
+        entries.add(key, "1/s", lambda n: np.array(driven.drag(n)), *axes)
     return entries
 
 
-def of_torque(
-    vehicle: Vehicle, drive: str, fitted: Fitted, scale: float, lag_s: float
-) -> list[Number]:
+def of_torque(driven: Driven, fitted: Fitted, scale: float, lag_s: float) -> list[Number]:
     """Return the entries that the torque tells: inertia, yaw torque, lag and delay.
 
     Args:
-        vehicle: the start.
-        drive: what drove the flights.
+        driven: the start.
         fitted: the torque's fit.
         scale: logarithm of the thrust's scale, by the force.
         lag_s: of the rotors, where the fit has none [s].
     """
-    entries = _Entries(fitted)
+    entries, vehicle = _Entries(fitted), driven.start
     inertias = ("inertia_x", "inertia_y", "inertia_z")
     if "inertia_x" in entries.names:
         entries.add("inertia", "kg m^2", lambda n: inertia_of(vehicle, n), *inertias)
     if "yaw" in entries.names:
         # Torque per inertia is what is seen. The inertia about z is as far as it was told; what
         # stays is given, and no doubt of this number.
-        start = vehicle.rotors.torque_coefficient
-        axes = [name for name in inertias if fitted.has(name)]
+        turns = [name for name in inertias if fitted.has(name)]
 
         def twist(n: Mapping[str, float]) -> np.ndarray:
-            inertia = inertia_ratio({name: n[name] for name in axes})[2]
-            scaled = scale if drive == "rotors" else 0.0
-            return np.array([start * np.exp(n["yaw"] + scaled + inertia)])
+            numbers = {name: n[name] for name in (*turns, "yaw")}
+            return np.array([driven.torque_coefficient({**numbers, "thrust": scale})])
 
         entries.add("rotors.torque_coefficient", "N m/(rad/s)^2", twist, "yaw")
     return [*entries, *of_loop(vehicle, fitted, lag_s)]

@@ -19,7 +19,7 @@ from suite.diagnose.data.view import TORQUE
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
-from suite.diagnose.identify.drive import MotorGuess
+from suite.diagnose.identify.drive import Driven
 from suite.diagnose.identify.entries import inertia_of, of_force, put
 from suite.diagnose.identify.fit import Z95, Fitted
 from suite.diagnose.identify.numbers import Number, told
@@ -95,26 +95,22 @@ def one_off(fitted: Fitted, names: tuple[str, ...]) -> list[Fitted]:
     return found
 
 
-def doubted(
-    vehicle: Vehicle, start: Vehicle, drive: str, guess: MotorGuess, force: Fitted, torque: Fitted
-) -> list[Vehicle]:
+def doubted(vehicle: Vehicle, driven: Driven, force: Fitted, torque: Fitted) -> list[Vehicle]:
     """Return `vehicle` with its motors or its inertia off, by what force and torque leave open.
 
     Args:
         vehicle: as identified.
-        start: what it was identified from.
-        drive: what drove the flights.
-        guess: the start's motors.
+        driven: what it was identified from.
         force: the fit of the force.
         torque: that of the torque.
     """
     found = []
     for fit in one_off(force, MOTORS):
         other = vehicle
-        for entry in of_force(start, drive, guess, fit):
+        for entry in of_force(driven, fit):
             if not entry.key.startswith("effects."):
                 other = put(other, entry)
         found.append(other)
     for fit in one_off(torque, INERTIA):
-        found.append(replace(vehicle, inertia=tuple(inertia_of(start, told(fit)).tolist())))
+        found.append(replace(vehicle, inertia=tuple(inertia_of(driven.start, told(fit)).tolist())))
     return found

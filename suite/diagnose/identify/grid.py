@@ -1,8 +1,6 @@
-"""Flights on a fine grid, and smooth windows in which their equations are compared.
+"""Flights on a fine grid, on which what drives them can be late by any part of a row.
 
-An equation of motion is multiplied by a smooth window and integrated (modulating functions;
-Shinbrot 1957): `mean(dv/dt)` over a window `p` is `-mean over p' (v)`, so that nothing noisy is
-differentiated, and both sides are smoothed alike.
+Their equations are compared in the smooth bumps of `data/view.py`, as those of the views are.
 """
 
 from __future__ import annotations
@@ -15,8 +13,11 @@ import numpy as np
 from eval.importers.rows import held
 from eval.importers.signals import Signal
 from eval.logs.flight_log import FlightLog
+from suite.diagnose.data.flights import leaning, turning_of
 from suite.diagnose.data.noise import noise_like
-from tracks.geometry.rotation import quat_to_rot
+from suite.diagnose.data.sampling import on_one_side
+from suite.diagnose.data.view import FlightRows, WeakForm, weak_form
+from tracks.geometry.rotation import quat_to_rot, rot_to_quat
 
 STEP_S = 0.004
 """Of the grid [s]."""
@@ -27,6 +28,10 @@ HOLE_STEPS = 4.0
 ROTOR_NOISE = "rotor_noise"
 """A draw of noise as large as that of the rotor speeds' rows: what it does to a window theirs does
 as well."""
+LEANING = "leaning"
+"""The attitude of the path, where none was measured."""
+PATH_VELOCITY = "path_velocity"
+"""The velocity of the path, where none was measured."""
 VOLTAGE_S = 0.04
 """The voltage's noise is averaged over about this [s]."""
 
@@ -46,23 +51,36 @@ class FlightGrid(NamedTuple):
         """Return whether these signals are there."""
         return all(name in self.known for name in names)
 
+    def form(self, width_s: float, needs: Sequence[str], slope: bool = False) -> WeakForm:
+        """Return bumps of `width_s` in which all of `needs` is known; `slope` as `weak_form` has.
 
-class Windows(NamedTuple):
-    """K windows of one flight."""
+        They begin a while after the first row: what was asked of rotors before it still acts then.
+        """
+        good = self.time_s >= MEMORY_S
+        for name in needs:
+            values = self.known[name]
+            good &= np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+        return weak_form(self.time_s, good, width_s, np.inf, slope)
 
-    first: np.ndarray
-    """(K,) index of each window's first grid point."""
-    weight: np.ndarray
-    """(W,) of the window; they sum to 1."""
-    slope: np.ndarray
-    """(W,) of the mean of a signal's derivative."""
-    bend: np.ndarray
-    """(W,) of the mean of its second derivative."""
+    def rows(self, turned: bool) -> FlightRows:
+        """Return the grid as rows of a view, without rotor speeds and with zeros for NaN.
 
-    @property
-    def middle(self) -> np.ndarray:
-        """(K,) index of each window's middle."""
-        return self.first + len(self.weight) // 2
+        Args:
+            turned: the attitude counts although it may be one of the path, whose yaw is none.
+        """
+        attitude = self.known.get("rot_w", self.known.get(LEANING) if turned else None)
+        count, still = len(self.time_s), np.zeros((len(self.time_s), 3))
+        volts = self.known.get("voltage", np.zeros(count))
+        vel_w = self.known.get("vel_w", self.known.get(PATH_VELOCITY, still))
+        if attitude is None:  # a velocity in unknown axes acts on nothing
+            attitude, vel_w = np.broadcast_to(np.eye(3), (count, 3, 3)), still
+        measured = (self.known.get("pos_w", still), attitude, vel_w)
+        pos_w, rot_w, vel_w, rate_b = map(
+            np.nan_to_num, (*measured, self.known.get("rate_b", still))
+        )
+        speed, good = np.zeros((count, 4)), np.ones(count, dtype=bool)
+        drop = volts[0] - volts
+        return FlightRows(self.time_s, pos_w, rot_w, vel_w, rate_b, speed, drop, good)
 
 
 def grid_of(log: FlightLog) -> FlightGrid:
@@ -89,53 +107,20 @@ def grid_of(log: FlightLog) -> FlightGrid:
         known[name] = (_joined if name in measured else _held)(time_s, values, grid)
     if "rotor_speed" in there:
         known[ROTOR_NOISE] = _joined(time_s, noise_like(there["rotor_speed"]), grid)
+    if "pos_w" in known and "vel_w" not in known:
+        known[PATH_VELOCITY] = _slope(known["pos_w"])
     if _whole_rows(log.quat_wxyz) > 1:
-        known["rot_w"] = quat_to_rot(_attitude(time_s, log.quat_wxyz, grid))
-        turning = _turning(time_s, log.quat_wxyz)
+        known["rot_w"] = _attitude(time_s, log.quat_wxyz, grid)
+        turning = turning_of(time_s, log.quat_wxyz)
         if "rate_b" not in known and _enough(turning):
             known["rate_b"] = _joined(time_s, turning, grid)
+    elif {"pos_w", "vel_w"} & {*known}:
+        known[LEANING] = _attitude(time_s, np.asarray(rot_to_quat(leaning(log))), grid)
     if log.voltage is not None and _enough(log.voltage):
         good = np.isfinite(log.voltage)
         volts = np.interp(grid, time_s[good], log.voltage[good])
         known["voltage"] = _smoothed(volts, round(VOLTAGE_S / STEP_S))
     return FlightGrid(log.name, grid, known, in_turn)
-
-
-def windows_of(flight: FlightGrid, width_s: float, needs: Sequence[str]) -> Windows:
-    """Return windows of `width_s` that overlap by half, in which all of `needs` is known.
-
-    They begin a while after the first row: what was asked of the rotors before it still acts then.
-    """
-    count = 2 * round(0.5 * width_s / STEP_S) + 1
-    turn = 2.0 * np.pi / (count - 1)
-    phase = turn * np.arange(count)
-    weight = 1.0 - np.cos(phase)
-    scale = 1.0 / weight.sum()
-    first = np.arange(round(MEMORY_S / STEP_S), len(flight.time_s) - count, count // 2)
-    good = np.ones(len(flight.time_s), dtype=bool)
-    for name in needs:
-        values = flight.known[name]
-        good &= np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-    bad = np.concatenate([[0], np.cumsum(~good)])
-    whole = bad[first + count] == bad[first]
-    # Exact on lines and parabolas, so that where a signal is adds nothing to how it bends.
-    time_s = STEP_S * (np.arange(count) - count // 2)
-    slope, bend = -np.sin(phase), np.cos(phase)
-    bend[[0, -1]] *= 0.5
-    slope, bend = slope / (slope @ time_s), 2.0 * bend / (bend @ time_s**2)
-    return Windows(first[whole], scale * weight, slope, bend)
-
-
-def over(windows: Windows, values: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
-    """Return the weighted sums (K, ...) of `values` (G, ...) over the windows."""
-    weight = windows.weight if weight is None else weight
-    at = windows.first[:, None] + np.arange(len(weight))
-    return np.tensordot(np.moveaxis(values[at], 1, -1), weight, axes=([-1], [0]))
-
-
-def blocks_of(flight: FlightGrid, windows: Windows, length_s: float) -> np.ndarray:
-    """Return the number of the block of `length_s` that each window's middle is in, (K,)."""
-    return (flight.time_s[windows.middle] / length_s).astype(int)
 
 
 def _enough(values: np.ndarray) -> bool:
@@ -158,28 +143,17 @@ def _joined(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndar
 
 
 def _attitude(time_s: np.ndarray, quat: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    good = np.isfinite(quat).all(axis=1)
-    t, q = time_s[good], quat[good]
-    flips = np.sum(q[1:] * q[:-1], axis=1) < 0
-    q = q * np.concatenate([[1.0], np.where(np.cumsum(flips) % 2, -1.0, 1.0)])[:, None]
-    out = np.stack([np.interp(grid, t, column) for column in q.T], axis=1)
-    out /= np.linalg.norm(out, axis=1, keepdims=True)
-    out[_in_hole(t, grid)] = np.nan
+    """Return attitudes (G, 3, 3) of quaternions (T, 4)."""
+    found = _joined(time_s, on_one_side(quat), grid)
+    return quat_to_rot(found / np.linalg.norm(found, axis=1, keepdims=True))
+
+
+def _slope(pos_w: np.ndarray) -> np.ndarray:
+    """Return the velocity (G, 3) over 0.1 s of a path, for forces that go with it."""
+    reach = round(0.05 / STEP_S)
+    out = np.full_like(pos_w, np.nan)
+    out[reach:-reach] = (pos_w[2 * reach :] - pos_w[: -2 * reach]) / (2 * reach * STEP_S)
     return out
-
-
-def _turning(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """Return the body rates (T, 3) from each row's neighbours; NaN where one is missing."""
-    from scipy.spatial.transform import Rotation
-
-    rate_b = np.full((len(quat), 3), np.nan)
-    whole = np.asarray(np.isfinite(quat).all(axis=1))
-    rows = 1 + np.flatnonzero(whole[:-2] & whole[2:])
-    if len(rows):
-        before, after = (Rotation.from_quat(quat[rows + d][:, [1, 2, 3, 0]]) for d in (-1, 1))
-        step_s = (time_s[rows + 1] - time_s[rows - 1])[:, None]
-        rate_b[rows] = (before.inv() * after).as_rotvec() / step_s
-    return rate_b
 
 
 def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:

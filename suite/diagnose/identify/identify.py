@@ -6,7 +6,7 @@ in both. Mass is never fitted: scaling it together with inertia and thrust chang
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,13 +14,18 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify import force, torque
+from suite.diagnose.identify.body import (
+    GIVEN,
+    fit_force,
+    fit_torque,
+    lag_and_delay,
+    unknowns_of_force,
+    unknowns_of_torque,
+)
 from suite.diagnose.identify.drive import (
-    MotorGuess,
+    KNOWN_MOTORS,
     drive_of,
-    guess_of,
-    motor_thrusts,
-    rotor_thrusts,
+    driven_by,
     with_battery,
     with_motors,
     with_own_numbers,
@@ -36,12 +41,17 @@ from suite.diagnose.identify.entries import (
 from suite.diagnose.identify.fit import Fitted, NothingWhole, Unknown
 from suite.diagnose.identify.flapping import doubted, flapping_of
 from suite.diagnose.identify.grid import FlightGrid, grid_of
+from suite.diagnose.identify.loop import (
+    air_torques,
+    couplings,
+    fit_loop,
+    fit_rotor_lag,
+    gains,
+)
 from suite.diagnose.identify.numbers import Number, beside, told, unasked, untold
 
 ROUNDS = 2
 """Force and torque in turn."""
-KNOWN_MOTORS = ("rotors", "pwm")
-"""Drives under which the rotors' thrusts are known beside the commands."""
 NO_LAG_S = 0.004
 """A rotor's lag below this is not believed where the start has a longer one [s]."""
 
@@ -101,7 +111,7 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
     if drive not in KNOWN_MOTORS or "drag" in leave or not {"force", "torque"} <= {*state.fitted}:
         return found
     force_fit, torque_fit = state.fitted["force"], state.fitted["torque"]
-    others = doubted(found.vehicle, state.start, drive, state.guess, force_fit, torque_fit)
+    others = doubted(found.vehicle, state.driven, force_fit, torque_fit)
     entry = flapping_of(
         [log for log in logs if log.name not in state.unheard], found.vehicle, others
     )
@@ -123,14 +133,11 @@ class _Start:
         self, flights: list[FlightGrid], vehicle: Vehicle, drive: str, leave: tuple[str, ...]
     ) -> None:
         self.flights, self.start, self.drive, self.leave = flights, vehicle, drive, leave
-        self.guess = MotorGuess(0.0, 0.0, 0.0, 1.0, 1.0)
-        if drive == "pwm":
-            if vehicle.motors is None or "motors" not in leave:
-                self.start = with_motors(flights, vehicle)
-            self.guess = guess_of(flights, self.start)
+        if drive == "pwm" and (vehicle.motors is None or "motors" not in leave):
+            self.start = with_motors(flights, vehicle)
+        self.driven = driven_by(flights, self.start, drive)
         self.lag_s: float = vehicle.rotors.time_constant
         self.delay_s: float = _value(vehicle, "command_delay", "delay", 0.0)
-        self.drag = np.asarray(_value(vehicle, "linear_drag", "coefficient", (0.0,) * 3), float)
         self.begun_s = self.lag_s
         self.fitted: dict[str, Fitted] = {}
         self.broken: set[str] = set()
@@ -149,16 +156,13 @@ class _Start:
             return
         flights = self.heard(flights)
         voltage = all(flight.has("voltage") for flight in flights)
-        begun = (self.drag.tolist(), leaning, self.begun_scale)
-        unknowns = force.unknowns_of(self.drive, self.guess, voltage, *begun)
+        unknowns = unknowns_of_force(self.driven, voltage, leaning, self.begun_scale)
         left = {"drag": ("drag_",), "motors": ("thrust", "curve", "battery")}
         unknowns = _without(unknowns, left, self.leave)
-        fixed = {f"drag_{a}": d for a, d in zip("xyz", self.drag, strict=True)}
-        fixed["thrust"] = self.begun_scale
         if not unknowns:
             return
-        how = (self.start, self.drive, self.guess, unknowns, self.lag_s, self.delay_s, fixed)
-        found = self.tried("force", lambda: force.fit_force(flights, *how))
+        fixed = {"thrust": self.begun_scale, **self.lags()}
+        found = self.tried("force", lambda: fit_force(flights, self.driven, unknowns, fixed))
         if found is not None:
             self.fitted["force"] = found
             self.scale = told(found).get("thrust", self.begun_scale)
@@ -178,19 +182,11 @@ class _Start:
             self.broken.add(name)
             return None
 
-    def thrusts(
-        self, flight: FlightGrid, lag_s: float, delay_s: float, numbers: Mapping[str, float]
-    ) -> np.ndarray:
-        scale = float(np.exp(numbers.get("thrust", 0.0)))
-        if self.drive == "rotors":
-            return scale * rotor_thrusts(flight, self.start.rotors.thrust_coefficient)
-        return scale * motor_thrusts(flight, force.with_told(self.guess, numbers), lag_s, delay_s)
-
     def torque(self) -> None:
         flights = [flight for flight in self.flights if flight.has("rate_b")]
         if self.drive in ("rates", "thrust") or not flights:
             return
-        unknowns = torque.unknowns_of(self.drive, self.lag_s, self.delay_s)
+        unknowns = unknowns_of_torque(self.drive, self.lag_s, self.delay_s)
         left = {"inertia": ("inertia_", "yaw"), "lag": ("lag", "late")}
         unknowns = _without(unknowns, left, self.leave)
         if not unknowns:
@@ -199,12 +195,10 @@ class _Start:
         given, doubted = self.lags(), None
         if "force" in self.fitted and self.drive in KNOWN_MOTORS:
             given |= told(self.fitted["force"])
-            doubted = self.fitted["force"].give(*torque.GIVEN)
+            doubted = self.fitted["force"].give(*GIVEN)
 
         def fitted(unknowns: Sequence[Unknown], held: Sequence[str] = ()) -> Fitted:
-            return torque.fit_torque(
-                flights, self.start, self.drive, unknowns, self.thrusts, given, held, doubted
-            )
+            return fit_torque(flights, self.driven, unknowns, given, held, doubted)
 
         found = self.tried("torque", lambda: fitted(unknowns))
         if found is None:
@@ -218,12 +212,12 @@ class _Start:
 
     def loop(self) -> None:
         """Fit the nominal rate loop, and measured rotor speeds behind commanded ones."""
-        both = torque.lag_and_delay(self.lag_s, self.delay_s)
+        both = lag_and_delay(self.lag_s, self.delay_s)
         rotors = ("rotor_speed", "rotor_speed_cmd")
         # Speeds that were asked for in turn are blurred, which would be taken for a lag.
         commanded = [f for f in self.flights if f.has(*rotors) and not {*rotors} & {*f.in_turn}]
         if commanded and "lag" not in self.leave:
-            found = self.tried("rotors", lambda: torque.fit_rotor_lag(commanded, both))
+            found = self.tried("rotors", lambda: fit_rotor_lag(commanded, both))
             if found is not None:
                 self.keep("rotors", found)
         flown = [f for f in self.flights if f.has("rate_b", "rate_cmd_b")]
@@ -234,10 +228,10 @@ class _Start:
         teller = self.fitted.get("rotors", self.fitted.get("torque"))
         doubted = teller.give("late", "lag") if known and teller is not None else None
         wanted = [u for u in both if not known or (doubted and u.name in doubted.names)]
-        besides = [*force.couplings(self.start), *force.air_torques(flown)]
-        unknowns = [*force.gains(), *besides, *wanted]
+        besides = [*couplings(self.start), *air_torques(flown)]
+        unknowns = [*gains(), *besides, *wanted]
         found = self.tried(
-            "loop", lambda: force.fit_loop(flown, self.start, unknowns, self.lags(), doubted)
+            "loop", lambda: fit_loop(flown, self.start, unknowns, self.lags(), doubted)
         )
         if found is not None:
             self.keep("loop", found)
@@ -262,11 +256,9 @@ class _Start:
         """Return what was found, from the vehicle that was `given`."""
         entries = []
         if "force" in self.fitted:
-            entries += of_force(self.start, self.drive, self.guess, self.fitted["force"])
+            entries += of_force(self.driven, self.fitted["force"])
         if "torque" in self.fitted:
-            entries += of_torque(
-                self.start, self.drive, self.fitted["torque"], self.scale, self.lag_s
-            )
+            entries += of_torque(self.driven, self.fitted["torque"], self.scale, self.lag_s)
         for name in ("rotors", "loop"):
             if name in self.fitted:
                 entries += of_loop(self.start, self.fitted[name], self.lag_s)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from suite.diagnose.identify.drive import MotorGuess
+from suite.diagnose.identify.drive import Driven
 from suite.diagnose.identify.fit import Fitted, Unknown
 from suite.diagnose.identify.flapping import doubted, one_off
 from tests.support import identified as known
@@ -26,11 +26,13 @@ def test_what_is_off_has_the_covariance_of_the_fit_and_no_other_number():
 
 def test_motors_are_off_as_they_were_told_and_inertia_by_its_own_doubt():
     start = known.start()
-    guess = MotorGuess(size=2.4, curve=0.5, battery=1.0, usual=0.5, volts=15.0)
-    found = doubted(start, start, "pwm", guess, FORCE, TORQUE)
+    driven = Driven(start, "pwm", command=0.5, volts=15.0)
+    found = doubted(start, driven, FORCE, TORQUE)
     assert len(found) == 4
     hover = [v.motors.thrust[0] * 0.5 + v.motors.thrust[1] * 0.25 for v in found[:2] if v.motors]
-    np.testing.assert_allclose(np.linalg.norm(np.log(np.array(hover) / 2.4)), 0.02, rtol=0.05)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.log(np.array(hover) / sum(driven.usual_thrust))), 0.02, rtol=0.05
+    )
     off = np.log([np.asarray(v.inertia) / start.inertia for v in found[2:]])
     np.testing.assert_allclose(np.linalg.norm(off, axis=0)[:2], [0.1, 0.02], rtol=1e-6)
     assert all(v.motors == start.motors for v in found[2:])

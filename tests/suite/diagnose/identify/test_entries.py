@@ -5,29 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.drive import MotorGuess
-from suite.diagnose.identify.entries import (
-    DELAY,
-    enter,
-    fast_enough,
-    inertia_of,
-    motors_of,
-    of_loop,
-    put,
-)
+from suite.diagnose.identify.body import lag_and_delay
+from suite.diagnose.identify.entries import DELAY, enter, fast_enough, inertia_of, of_loop, put
 from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.numbers import Number
-from suite.diagnose.identify.torque import lag_and_delay
 from tests.support.vehicles import PLAIN, with_effects
-
-
-def test_motors_push_alike_at_any_nominal_voltage():
-    guess = MotorGuess(size=2.0, curve=0.6, battery=1.3, usual=0.5, volts=8.0)
-    for volts in (6.0, 8.0):
-        first, second, power = motors_of(guess, {"thrust": 0.0}, volts)
-        u = 0.4 * (7.0 / volts) ** power
-        v = 0.4 * (7.0 / 8.0) ** 1.3 / 0.5
-        np.testing.assert_allclose(first * u + second * u**2, 2.0 * (0.4 * v + 0.6 * v**2))
 
 
 def test_the_inertia_about_z_follows_within_what_a_body_can_have():

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from suite.diagnose.identify.force import air_torques, couplings, followed
+from suite.diagnose.identify.body import lag_and_delay
+from suite.diagnose.identify.drive import behind
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
+from suite.diagnose.identify.loop import air_torques, couplings, fit_rotor_lag, followed
 from tests.support.vehicles import PLAIN
 
 COUPLED = {unknown.name: unknown.start for unknown in couplings(PLAIN)}
@@ -68,3 +70,14 @@ def test_moving_air_turns_by_its_torque_over_the_gain():
     np.testing.assert_allclose(rate[-1], [0.5 * 2.0 / gain[0], 0.4 * 3.0 / gain[1], 0.0], rtol=1e-3)
     bare = FlightGrid("made", flight.time_s, {"rate_cmd_b": known["rate_cmd_b"]})
     assert air_torques([flight, bare]) == []
+
+
+def test_rotors_behind_their_commands_tell_lag_and_delay():
+    rng = np.random.default_rng(0)
+    asked = np.repeat(1000.0 + 50.0 * rng.normal(size=(500, 4)), 5, axis=0)
+    speed = behind(asked, {"lag": 0.04, "late": 0.052}) + rng.normal(size=asked.shape)
+    time_s = STEP_S * np.arange(len(asked))
+    flight = FlightGrid("made", time_s, {"rotor_speed": speed, "rotor_speed_cmd": asked})
+    found = fit_rotor_lag([flight], lag_and_delay(0.02, 0.0))
+    late, lag = found.value
+    np.testing.assert_allclose([late - lag, lag], [0.012, 0.04], atol=0.001)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.drive import MotorGuess, motor_thrusts, torque_of
+from suite.diagnose.identify.drive import Driven
 from suite.diagnose.identify.grid import grid_of
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.fleets import (
@@ -17,6 +17,7 @@ from tests.support.fleets import (
     logs_of,
     recordings_of,
     start,
+    torque_of,
     truths,
 )
 
@@ -35,12 +36,10 @@ def test_motor_commands_make_the_rotors_turn_as_they_did(flown):
     (log,) = logs_of(fleet, recordings, "pwm", np.random.default_rng(0), sensors=QUIET)
     (rotors,) = logs_of(fleet, recordings, "rotors", np.random.default_rng(0), sensors=QUIET)
     true = fleet.truth
-    first, second = true.motors.thrust
-    guess = MotorGuess(
-        first + second, second / (first + second), true.motors.voltage_exponent, 1.0, 16.0
-    )
     lag_s, delay_s = true.rotors.time_constant, true.effects[DELAY].delay
-    thrust = motor_thrusts(grid_of(log), guess, lag_s, delay_s)[100:]
+    numbers = {"lag": lag_s, "late": lag_s + delay_s}
+    speed = Driven(true, "pwm", 1.0, 16.0).rotor_speed(grid_of(log), numbers)[100:]
+    thrust = true.rotors.thrust_coefficient * speed**2
     wanted = true.rotors.thrust_coefficient * grid_of(rotors).known["rotor_speed"][100:] ** 2
     assert np.abs(thrust - wanted).max() < 0.02 * wanted.mean()
     assert log.thrust_cmd is None and log.rotor_speed is None

@@ -7,39 +7,78 @@ import pytest
 
 from eval.vehicles.vehicle import MotorMap
 from suite.diagnose.identify.drive import (
-    MotorGuess,
+    Driven,
+    behind,
     delayed,
     drive_of,
-    lagged,
-    motor_thrusts,
-    torque_of,
+    unknown_to_the_fits,
     with_battery,
     with_motors,
 )
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
-from tests.support.vehicles import PLAIN
+from tests.support.vehicles import PLAIN, with_effects
 
 TIME = STEP_S * np.arange(400)
 
 
 def test_lag_and_delay_of_a_step():
     """A lag of 0.05 s has made 1 - 1/e of a step after 0.05 s, here after a delay of 0.02 s."""
-    late = lagged(delayed((TIME >= 0.8).astype(float)[:, None], 0.02), 0.05)[:, 0]
+    step = (TIME >= 0.8).astype(float)[:, None]
+    late = behind(step, {"lag": 0.05, "late": 0.07})[:, 0]
     np.testing.assert_allclose(np.interp(0.87, TIME, late), 1.0 - np.exp(-1.0), atol=0.003)
+
+
+def test_what_is_late_by_less_than_nothing_is_early():
+    ramp = TIME[:, None].copy()
+    np.testing.assert_allclose(delayed(ramp, -0.01)[10:-10], ramp[10:-10] + 0.008, atol=1e-12)
+    np.testing.assert_allclose(delayed(ramp, 0.01)[10:-10], ramp[10:-10] - 0.012, atol=1e-12)
+
+
+def driven(**signals):
+    """Rows of 1000 rad/s or of what else is known, still and level."""
+    known = {name: np.full((400, 4) if name != "thrust_cmd" else 400, value)
+             for name, value in signals.items() if name != "voltage"}  # fmt: skip
+    if "voltage" in signals:
+        known["voltage"] = np.full(400, signals["voltage"])
+    return FlightGrid("made", TIME, known)
 
 
 def test_thrust_at_half_the_voltage():
     """v = 0.6 x 0.5 / 0.5 = 0.6: 2 N x (0.25 x 0.6 + 0.75 x 0.36) = 0.84 N."""
-    signals = {"pwm": np.full((400, 4), 0.6), "voltage": np.full(400, 4.0)}
-    guess = MotorGuess(size=2.0, curve=0.75, battery=1.0, usual=0.5, volts=8.0)
-    thrust = motor_thrusts(FlightGrid("made", TIME, signals), guess, 0.03, 0.0)
-    np.testing.assert_allclose(thrust, 0.84)
+    begun = replace(PLAIN, motors=MotorMap((1.0, 6.0), 8.0, 1.0))  # 0.5 N + 1.5 N at 0.5
+    flight, start = driven(pwm=0.6, voltage=4.0), Driven(begun, "pwm", 0.5, 8.0)
+    acc_w, _ = start.acting(flight, flight.rows(turned=True), {"lag": 0.03, "late": 0.03})
+    np.testing.assert_allclose(acc_w[:, 2], 4.0 * 0.84 / PLAIN.mass - 9.81)
 
 
-def test_each_rotor_turns_the_body_its_way():
-    torque = torque_of(PLAIN, np.array([[1.0, 0.0, 0.0, 0.0]]))[0]
-    x, y, _ = PLAIN.rotors.position[0]
-    np.testing.assert_allclose(torque[:2], [y, -x])
+def test_motors_push_alike_at_any_nominal_voltage():
+    for volts in (6.0, 8.0):
+        begun = replace(PLAIN, motors=MotorMap((1.0, 6.0), volts, 1.0))
+        start = Driven(begun, "pwm", 0.5, 8.0)
+        found = start.motor_map({"thrust": np.log(1.5), "curve": 0.6, "battery": 1.3})
+        u, v = 0.4 * (7.0 / volts) ** 1.3, 0.4 * (7.0 / 8.0) ** 1.3 / 0.5
+        wanted = 1.5 * sum(start.usual_thrust) * (0.4 * v + 0.6 * v**2)
+        np.testing.assert_allclose(found.thrust[0] * u + found.thrust[1] * u**2, wanted)
+
+
+def test_commands_scale_and_rotor_speeds_push_by_their_squares():
+    numbers = {"thrust": np.log(1.1), "lag": 0.03, "late": 0.04}
+    flight = driven(thrust_cmd=9.0, rotor_speed=1000.0)
+    rows = flight.rows(turned=True)
+    acc_w, _ = Driven(PLAIN, "rates").acting(flight, rows, numbers)
+    np.testing.assert_allclose(acc_w[:, 2], 9.9 - 9.81, atol=1e-12)
+    acc_w, _ = Driven(PLAIN, "rotors").acting(flight, rows, numbers)
+    by_rotors = 1.1 * 4e6 * PLAIN.rotors.thrust_coefficient / PLAIN.mass
+    np.testing.assert_allclose(acc_w[:, 2], by_rotors - 9.81)
+
+
+def test_effects_of_the_start_act_on_force_and_torque():
+    moved = with_effects(PLAIN, com_offset=((0.01, 0.0, 0.0),))
+    flight = driven(rotor_speed=1000.0)
+    _, turn_b = Driven(moved, "rotors").acting(flight, flight.rows(turned=False), {})
+    thrust = 4e6 * PLAIN.rotors.thrust_coefficient
+    np.testing.assert_allclose(turn_b[0, 1], 0.01 * thrust / PLAIN.inertia[1], rtol=0.05)
+    assert unknown_to_the_fits(moved) == []
 
 
 def flown(name, volts=None):

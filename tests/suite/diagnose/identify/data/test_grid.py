@@ -9,8 +9,6 @@ from suite.diagnose.identify.grid import (
     STEP_S,
     FlightGrid,
     grid_of,
-    over,
-    windows_of,
 )
 
 
@@ -19,26 +17,26 @@ def grid(values):
     return FlightGrid("made", time_s, {"x": np.asarray(values, dtype=float)[:, None]})
 
 
-def test_slope_and_bend_of_a_parabola():
+def test_bumps_are_exact_on_lines_and_parabolas():
     time_s = STEP_S * np.arange(500)
     flight = grid(3.0 + 2.0 * time_s + 5.0 * time_s**2)
-    windows = windows_of(flight, 0.2, ("x",))
-    at = time_s[windows.middle]
     values = flight.known["x"]
-    slope = over(windows, values, windows.slope)[:, 0]
-    np.testing.assert_allclose(slope, 2.0 + 10.0 * at, rtol=1e-9)
-    np.testing.assert_allclose(over(windows, values, windows.bend), 10.0, rtol=1e-8)
-    constant = grid(np.full(500, 7.0)).known["x"]
-    np.testing.assert_allclose(over(windows, constant, windows.bend), 0.0, atol=1e-9)
-    np.testing.assert_allclose(over(windows, constant), 7.0)
+    form, path = (flight.form(0.2, ("x",), slope) for slope in (False, True))
+    assert form.middle_s[0] >= 0.4
+    slope = (form.change @ values)[:, 0]
+    np.testing.assert_allclose(slope, 2.0 + 10.0 * form.middle_s, rtol=1e-3)
+    np.testing.assert_allclose(path.change @ values, 10.0, rtol=1e-3)
+    constant = np.full((500, 1), 7.0)
+    np.testing.assert_allclose(path.mean @ constant, 0.0, atol=1e-9)
+    np.testing.assert_allclose(form.mean @ constant, 7.0)
+    np.testing.assert_allclose(path.mean @ time_s, 1.0, rtol=1e-3)
 
 
-def test_no_window_lies_over_a_hole():
+def test_no_bump_lies_over_a_hole():
     values = np.ones(500)
     values[250] = np.nan
-    flight = grid(values)
-    for first in windows_of(flight, 0.2, ("x",)).first:
-        assert not first <= 250 < first + 51
+    for middle_s in grid(values).form(0.2, ("x",)).middle_s:
+        assert abs(middle_s - 1.0) > 0.095
 
 
 def test_commands_hold_until_the_next_row_and_measurements_are_joined():

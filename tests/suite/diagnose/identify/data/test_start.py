@@ -17,13 +17,13 @@ SAID = with_effects(
     inertia_scale=((1.2, 0.9, 1.1),),
     rate_gain=((0.8, 1.0, 1.3),),
     thrust_scale=(0.9,),
-    com_offset=((0.01, 0.0, 0.0),),
+    clock_offset=(0.01,),
 )
 
 
 def test_the_vehicle_flies_as_before():
     own = with_own_numbers(SAID, True)
-    assert list(own.effects) == ["com_offset"] == list(unknown_to_the_fits(own))
+    assert list(own.effects) == ["clock_offset"] == list(unknown_to_the_fits(own))
     before, after = (make_plant(vehicle, 0.002).constants for vehicle in (SAID, own))
     for name in (
         "inertia",

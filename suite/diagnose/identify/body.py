@@ -1,0 +1,271 @@
+"""The force and the torque on the body, by what drove the flights, and which numbers they tell.
+
+Force: translation under the measured attitude. Where no flight has an attitude it is that of the
+path, and only its size is asked for: thrust is along what the path's acceleration and gravity make
+up together (differential flatness; Mellinger and Kumar 2011).
+
+Torque: rotation under known motors, as changes within a window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from suite.diagnose.data.view import WeakForm
+from suite.diagnose.estimate.gauss_newton import TINY
+from suite.diagnose.identify.drive import Driven
+from suite.diagnose.identify.fit import Z95, Fitted, Given, Rows, Unknown, fit
+from suite.diagnose.identify.grid import LEANING, ROTOR_NOISE, FlightGrid
+
+WIDTH_S = 0.4
+BLOCK_S = 2.0
+PUSHES = {"pwm": "pwm", "rotors": "rotor_speed"}
+"""By drive, what pushes; under all others the commanded thrust."""
+TURNS = {**PUSHES, "torques": "torque_cmd_b"}
+"""By drive, what turns."""
+SLOW = 2.0
+"""Without an attitude, windows faster than this are left out: a drag across the thrust would add to
+its size, by 0.3 % at this speed and 0.4 1/s [m/s]."""
+LEVEL = np.array([True, True, False])
+"""A flight's trim of the attitude is free; along z it would be the thrust."""
+
+
+def unknowns_of_force(
+    driven: Driven, voltage: bool, leaning: bool = False, scale: float = 0.0
+) -> list[Unknown]:
+    """Return the numbers of the force; their starts are those of the vehicle file.
+
+    Args:
+        driven: the start.
+        voltage: whether the flights have one.
+        leaning: whether no flight has an attitude.
+        scale: logarithm of the thrust's scale in the vehicle file.
+    """
+    floor = 0.004 if leaning else 0.001
+    unknowns = [Unknown("thrust", scale, -2.0, 2.0, 0.25, 1e-3, floor)]
+    if driven.drive == "pwm":
+        unknowns.append(Unknown("curve", driven.curve, -0.1, 1.0, 0.35, 1e-2, 0.02))
+        if voltage:
+            unknowns.append(Unknown("battery", driven.battery, 0.0, 4.0, 0.6, 1e-2, 0.02))
+    for axis, start in list(zip("xyz", driven.drag({}), strict=True))[2 if leaning else 0 :]:
+        unknowns.append(Unknown(f"drag_{axis}", start, -2.0, 5.0, 0.25, 1e-2, 0.004))
+    return unknowns
+
+
+def fit_force(
+    flights: Sequence[FlightGrid],
+    driven: Driven,
+    unknowns: Sequence[Unknown],
+    fixed: Mapping[str, float],
+) -> Fitted:
+    """Return the thrust's and the drag's numbers.
+
+    Args:
+        flights: on their grids, with positions; all with an attitude, or none.
+        driven: the start.
+        unknowns: from `unknowns_of_force`.
+        fixed: numbers that are not looked for, `lag` and `late` among them.
+    """
+    return fit(together([_force(flight, driven) for flight in flights], unknowns, fixed), unknowns)
+
+
+Misses = Callable[[Mapping[str, float]], Rows]
+"""From all numbers to the residuals of one flight."""
+
+
+def together(
+    misses: Sequence[Misses], unknowns: Sequence[Unknown], fixed: Mapping[str, float]
+) -> Callable[[np.ndarray], list[Rows]]:
+    """Return the residuals of all flights by the values of `unknowns`, with the numbers `fixed`."""
+    names = [unknown.name for unknown in unknowns]
+
+    def of(value: np.ndarray) -> list[Rows]:
+        numbers = {**fixed, **dict(zip(names, value, strict=True))}
+        return [one(numbers) for one in misses]
+
+    return of
+
+
+def _force(flight: FlightGrid, driven: Driven) -> Misses:
+    pushes = PUSHES.get(driven.drive, "thrust_cmd")
+    moved = "vel_w" if flight.has("vel_w") else "pos_w"
+    leaning = not flight.has("rot_w")
+    needs = (moved, pushes, LEANING if leaning else "rot_w")
+    form, rows = flight.form(WIDTH_S, needs), flight.rows(turned=True)
+    path = form if moved == "vel_w" else flight.form(WIDTH_S, needs, slope=True)
+    if leaning:
+        slow = form.mean @ np.linalg.norm(rows.vel_w, axis=1) < SLOW
+        form, path = form.take(slow), path.take(slow)
+    measured = path.change @ np.nan_to_num(flight.known[moved])
+    to_body = np.swapaxes(rows.rot_w[form.middle_row], 1, 2)
+    axes = slice(2 if leaning else 0, 3)
+
+    def misses(numbers: Mapping[str, float]) -> Rows:
+        acc_w, _ = driven.acting(flight, rows, numbers)
+        away = (to_body @ (measured - form.mean @ acc_w)[..., None])[..., 0]
+        return Rows(away[:, axes], block_of(form), LEVEL[axes])
+
+    return misses
+
+
+def block_of(form: WeakForm) -> np.ndarray:
+    """Return the number (M,) of the block that each bump's middle is in."""
+    return (form.middle_s / BLOCK_S).astype(int)
+
+
+TORQUE_WIDTH_S = 0.2
+BAND = TORQUE_WIDTH_S / (2.0 * np.pi)
+"""Torques are compared in windows of no mean, as changes within one: what a flight asks of the
+motors slowly (trim, flapping at speed) turns nothing. Times this they are accelerations."""
+STILL = np.array([False, False, False])
+DILUTED = ("inertia_x", "inertia_y", "yaw")
+"""What noise of the rotor speeds makes larger or smaller, by axis."""
+GIVEN = ("thrust", "curve", "battery")
+"""The force's numbers that the torque is built on."""
+
+
+def lag_and_delay(lag_s: float, delay_s: float) -> list[Unknown]:
+    """Return the numbers of what lies between a command and the rotors' thrust.
+
+    Slow flights tell how late it is in all, `late`, and not how much of that is the lag.
+    """
+    late = Unknown("late", lag_s + delay_s, -0.02, 0.3, 0.012, 1e-3, 0.0007)
+    return [late, Unknown("lag", lag_s, 0.0, 0.3, 0.012, 1e-3, 0.0007)]
+
+
+def unknowns_of_torque(drive: str, lag_s: float, delay_s: float) -> list[Unknown]:
+    """Return the numbers of the torque; all but lag and delay are logarithms of ratios.
+
+    That of the inertia about z is over the other two's mean, which it follows where nothing tells
+    it; and without known torques `yaw` is of what turns the body about z, over that inertia.
+    """
+    lags = lag_and_delay(lag_s, delay_s)
+    axes = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
+    room = 0.5 if drive == "torques" else 0.25
+    axes.append(Unknown("inertia_z", 0.0, -1.0, 1.0, room, 1e-2, 0.015))
+    if drive == "torques":
+        return [*axes, *lags]
+    yaw = Unknown("yaw", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015)
+    return [*axes, yaw] if drive == "rotors" else [*axes, yaw, *lags]
+
+
+def fit_torque(
+    flights: Sequence[FlightGrid],
+    driven: Driven,
+    unknowns: Sequence[Unknown],
+    fixed: Mapping[str, float],
+    held: Sequence[str] = (),
+    doubted: Given | None = None,
+) -> Fitted:
+    """Return inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
+
+    Noise in measured rotor speeds makes every slope smaller, by its share in the driving torque's
+    variance (errors in variables; Fuller 1987, Sec. 1.1): the inertia would seem larger, the yaw
+    torque smaller. The model is believed without that share, which is known no better than to half
+    of itself. What stands at a limit is left as it was.
+
+    Args:
+        flights: on their grids, with body rates.
+        driven: the start.
+        unknowns: from `unknowns_of_torque`.
+        fixed: numbers that are not looked for, `lag` and `late` among them.
+        held: numbers that are left as they are, in doubt.
+        doubted: numbers of the force among `fixed`, with their covariance.
+    """
+    given, steps = doubted or Given(), {"thrust": 1e-3}
+    unknowns = [
+        *unknowns,
+        *(Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps.get(n, 1e-2)) for n in given.names),
+    ]
+    begun, held = tuple(unknowns), list(held)
+    forms = [
+        flight.form(TORQUE_WIDTH_S, ("rate_b", TURNS[driven.drive]), slope=True)
+        for flight in flights
+    ]
+    start = {**fixed, **{unknown.name: unknown.start for unknown in unknowns}}
+    credible = _credible(flights, forms, driven, start)
+    doubt: dict[str, float] = dict(zip(DILUTED, -0.5 * np.log(credible), strict=True))
+    unknowns = [
+        u._replace(floor=float(np.hypot(u.floor, Z95 * doubt.get(u.name, 0.0)))) for u in unknowns
+    ]
+    parts = zip(flights, forms, strict=True)
+    misses = together([_torque(*part, driven, credible) for part in parts], unknowns, fixed)
+    if any(unknown.name == "late" for unknown in unknowns):
+        best = _likeliest(unknowns, misses, forms, flights)
+        unknowns = [u._replace(start=best) if u.name == "late" else u for u in unknowns]
+    while True:
+        found = fit(misses, unknowns, held, given)
+        value = dict(zip((u.name for u in unknowns), found.value, strict=True))
+        beyond = [
+            u.name
+            for u in unknowns
+            if u.name in doubt and found.has(u.name) and not u.low < value[u.name] < u.high
+        ]
+        if not beyond:
+            return replace(found, unknowns=begun)
+        held += beyond
+
+
+def _torque(flight: FlightGrid, form: WeakForm, driven: Driven, credible: np.ndarray) -> Misses:
+    turned, rows = _turned(flight, form), flight.rows(turned=False)
+
+    def misses(numbers: Mapping[str, float]) -> Rows:
+        _, turn_b = driven.acting(flight, rows, numbers)
+        if (credible < 1.0).any():
+            _, alone_b = driven.acting(flight, rows, numbers, powered=False)
+            turn_b = alone_b + credible * (turn_b - alone_b)
+        return Rows(turned - BAND * (form.mean @ turn_b), block_of(form), STILL)
+
+    return misses
+
+
+def _turned(flight: FlightGrid, form: WeakForm) -> np.ndarray:
+    return np.asarray(BAND * (form.change @ np.nan_to_num(flight.known["rate_b"])))
+
+
+def _credible(
+    flights: Sequence[FlightGrid],
+    forms: Sequence[WeakForm],
+    driven: Driven,
+    numbers: Mapping[str, float],
+) -> np.ndarray:
+    """Return the share (3,) of the torque's variance that is no noise of the rotor speeds."""
+    noise, whole = np.zeros(3), np.zeros(3)
+    for flight, form in zip(flights, forms, strict=True):
+        if driven.drive != "rotors":
+            break
+        rows = flight.rows(turned=False)
+        speed = flight.known["rotor_speed"]
+        noisy = {**flight.known, "rotor_speed": speed + flight.known[ROTOR_NOISE]}
+        turned, other = (
+            form.mean @ driven.acting(one, rows, numbers)[1]
+            for one in (flight, flight._replace(known=noisy))
+        )
+        noise += ((other - turned) ** 2).sum(axis=0)
+        whole += (turned**2).sum(axis=0)
+    return np.maximum(1.0 - noise / np.maximum(whole, TINY), TINY)
+
+
+def _likeliest(
+    unknowns: Sequence[Unknown],
+    misses: Callable[[np.ndarray], list[Rows]],
+    forms: Sequence[WeakForm],
+    flights: Sequence[FlightGrid],
+) -> float:
+    """Return how late the model's turning is most like the measured one, whatever its size."""
+    value = np.array([unknown.start for unknown in unknowns])
+    late = [unknown.name for unknown in unknowns].index("late")
+    trials = np.array([value[late], *np.arange(0.0, 0.13, 0.012)])
+    measured = [_turned(*part) for part in zip(flights, forms, strict=True)]
+    scores = np.zeros(len(trials))
+    for k, trial in enumerate(trials):
+        value[late] = max(trial, 0.0)
+        for rows, turned in zip(misses(value), measured, strict=True):
+            if len(turned):
+                model, turned = (one - np.median(one, 0) for one in (turned - rows.value, turned))
+                size = np.sqrt((model**2).sum(axis=0) * (turned**2).sum(axis=0))
+                scores[k] += ((model * turned).sum(axis=0) / np.maximum(size, 1e-12))[:2].sum()
+    return float(trials[int(np.argmax(scores))])
