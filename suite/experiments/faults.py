@@ -160,7 +160,7 @@ def _checked(
 ) -> dict[Case, Answer]:
     """Return the findings of every case; those of an interrupted run are kept."""
     path = folder / f"checked-{code_digest('suite/experiments/injected', 'eval/importers')}.jsonl"
-    keys = {f"{c.kind}|{c.format}|{c.path.name}": c for c in cases}
+    keys = {f"{c.kind}|{c.format}|{c.path.parent.name}/{c.path.name}": c for c in cases}
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     done = {k: a for k, a in map(json.loads, lines) if k in keys}
     left = [key for key in keys if key not in done]
