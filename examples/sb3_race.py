@@ -33,19 +33,18 @@ class Judged(torch.nn.Module):
         self.policy = model.policy
         run = seen.obs_rms["state"]
         self.mean = torch.tensor(run.mean).float()
-        self.deviation = torch.tensor((run.var + 1e-8) ** 0.5).float()
+        self.deviation = torch.tensor((run.var + seen.epsilon) ** 0.5).float()
 
     def forward(
         self, state: torch.Tensor, image: torch.Tensor, hidden: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the mean action, which the contract clips and scales, and this frame."""
         state = ((state - self.mean) / self.deviation).clamp(-10.0, 10.0)
-        before = hidden[:, state.shape[1] :].reshape(-1, *image.shape[1:])
-        states = torch.cat([hidden[:, : state.shape[1]], state], -1)
-        frames = {"state": states, "image": torch.cat([before, image], -1)}
-        features = self.policy.extract_features(frames, self.policy.pi_features_extractor)
-        actor = self.policy.mlp_extractor.forward_actor(features)
-        return self.policy.action_net(actor), torch.cat([state, image.flatten(1)], -1)
+        now = torch.cat([state, image.flatten(1)], -1)
+        sizes = [state.shape[1], image[0].numel()]
+        frames = zip(hidden.split(sizes, -1), now.split(sizes, -1), strict=True)
+        state, image = (torch.cat(pair, -1) for pair in frames)
+        return self.policy.get_distribution({"state": state, "image": image}).mode(), now
 
 
 def main(out: Path, minutes: float, envs: int = 128, rollout: int = 32) -> Path:
@@ -61,8 +60,9 @@ def main(out: Path, minutes: float, envs: int = 128, rollout: int = 32) -> Path:
     model.learn(10**9, lambda *_: time.monotonic() < end, log_interval=10)
     out.mkdir(parents=True, exist_ok=True)
     memory = (SPEC.state_size + SPEC.camera.height * SPEC.camera.width,)
-    contract = races.races.contract
-    return export_module(Judged(model, normalised), out / "policy.onnx", contract, memory)
+    return export_module(
+        Judged(model, normalised), out / "policy.onnx", races.races.contract, memory
+    )
 
 
 if __name__ == "__main__":

@@ -1,14 +1,44 @@
-"""Many races at once as `VecEnv` of Stable-Baselines3 (`pip install 'diffracing-suite[sb3]'`)."""
+"""Races by the conventions of Stable-Baselines3 (`pip install 'diffracing-suite[sb3]'`).
+
+It takes an image of two axes for a mistake, so here the pixels are one vector, row after row; an
+image with `channel_axis=True` stays an image.
+"""
 
 # pyright: reportMissingImports=false, reportMissingModuleSource=false
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
+import gymnasium
 import numpy as np
+from gymnasium.spaces import Box, Dict
+from gymnasium.wrappers import TransformObservation
 from stable_baselines3.common.vec_env import VecEnv
 
-from eval.envs.gymnasium_env import Observation, RaceVectorEnv
+from eval.envs.gymnasium_env import Observation, RaceEnv, RaceVectorEnv
+
+
+def race_env(**settings: Any) -> gymnasium.Env:
+    """Return `RaceEnv(**settings)` with the spaces of `RaceVecEnv`, for its `check_env`."""
+    env = RaceEnv(**settings)
+    space = vector_space(env.observation_space)
+    return TransformObservation(env, partial(as_space, space), space)
+
+
+def vector_space(space: gymnasium.Space) -> Dict:
+    """Return the space of observations whose image of two axes is one vector."""
+    assert isinstance(space, Dict)
+    image = space["image"]
+    assert isinstance(image, Box)
+    if len(image.shape) == 2:
+        image = Box(image.low.ravel(), image.high.ravel(), dtype=image.dtype.type)
+    return Dict({"state": space["state"], "image": image})
+
+
+def as_space(space: Dict, seen: Observation, *rows: int) -> Observation:
+    """Return observations in the shapes of `space`, with a first axis of `rows` where given."""
+    return {key: part.reshape(*rows, *(space[key].shape or ())) for key, part in seen.items()}
 
 
 class RaceVecEnv(VecEnv):
@@ -23,8 +53,8 @@ class RaceVecEnv(VecEnv):
         """
         self.races = RaceVectorEnv(num_envs, **settings)
         self._actions = np.zeros(self.races.action_space.shape or (), np.float32)
-        spaces = self.races.single_observation_space, self.races.single_action_space
-        super().__init__(num_envs, *spaces)
+        self._space = vector_space(self.races.single_observation_space)
+        super().__init__(num_envs, self._space, self.races.single_action_space)
 
     def reset(self) -> Observation:
         """Start all episodes, with the seed of `seed()` where it was called."""
@@ -32,7 +62,7 @@ class RaceVecEnv(VecEnv):
         seen, infos = self.races.reset(seed=seed)
         self._reset_seeds()
         self.reset_infos = [_of(infos, slot) for slot in range(self.num_envs)]
-        return seen
+        return as_space(self._space, seen, self.num_envs)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions (N, size) that `step_wait` flies."""
@@ -45,9 +75,10 @@ class RaceVecEnv(VecEnv):
         for slot in range(self.num_envs):
             info = _of(infos["final_info"] if over[slot] else infos, slot)
             if over[slot]:
-                info["terminal_observation"] = infos["final_obs"][slot]
+                info["terminal_observation"] = as_space(self._space, infos["final_obs"][slot])
                 info["TimeLimit.truncated"] = bool(truncated[slot])
             told.append(info)
+        seen = as_space(self._space, seen, self.num_envs)
         return seen, reward.astype(np.float32), over, told
 
     def close(self) -> None:

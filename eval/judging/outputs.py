@@ -8,14 +8,14 @@ observations, level flight towards a gate to one side: whoever flies through it 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from eval.judging.guard import Guarded
+from eval.judging.guard import ActionLimits, Guarded
 from eval.worlds.trial import TrialResult
 from policies.policy import Policy
-from policies.spec import ActionSpec, Doubt
+from policies.spec import ActionSpec, Doubt, PolicySpec
 
 LIMITED_MOST = 0.05
 """Share of limited actions above which there is a warning."""
@@ -30,6 +30,9 @@ LIFT = 3.0
 """Whoever wants more than this upwards, even towards a gate below, counts gravity in [m/s^2]."""
 CLEAR = 0.5
 """Differences of an output between two sides below this say nothing [m/s^2]."""
+UNIT_FIX = "check the unit of its output"
+TIMES, ALIKE = 1.5, 1e-3
+"""Another image, and the share of what other images change within which an answer is the same."""
 ASIDE_M, AHEAD_M, SPEED, STEPS = 2.0, 6.0, 3.0, 10
 """How far aside and ahead the gate is [m], the speed towards it [m/s], and the steps of memory."""
 
@@ -79,15 +82,18 @@ def actions_of(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, 
     }
 
 
+def _twice(action: ActionSpec) -> str:
+    return "" if action.is_plain else ", and that module and contract do not both scale it"
+
+
 def _warnings(
     results: Sequence[TrialResult], action: ActionSpec, limited: float, bad: float
 ) -> list[Doubt]:
     found, plain = [], action.kind == "acceleration" and action.is_plain
     largest = [row.output_max for row in results]
     if limited > LIMITED_MOST:
-        twice = "" if action.is_plain else ", and that module and contract do not both scale it"
-        seen, fix = f"{limited:.0%} of its actions were limited", "check the unit of its output"
-        found.append(Doubt("action_limited", seen, fix + twice))
+        seen = f"{limited:.0%} of its actions were limited"
+        found.append(Doubt("action_limited", seen, UNIT_FIX + _twice(action)))
     if bad:
         seen = f"{bad:.1%} of its actions were not finite and the last good one was flown"
         found.append(Doubt("action_not_finite", seen, "check its weights and its normalisation"))
@@ -103,23 +109,34 @@ def _warnings(
     return found
 
 
+@runtime_checkable
+class FromFile(Protocol):
+    """A policy that was read from a file."""
+
+    notes: tuple[Doubt, ...]
+
+
 def notes_of(policy: Policy) -> tuple[Doubt, ...]:
-    """Return what is assumed of a policy, and then what its answers look like."""
-    notes = getattr(policy, "notes", ())
-    return (*notes, *doubts(policy)) if notes else ()
+    """Return what is assumed of a policy's file, and what its answers look like."""
+    return (*policy.notes, *doubts(policy)) if isinstance(policy, FromFile) else ()
 
 
 def doubts(policy: Policy) -> tuple[Doubt, ...]:
     """Return every usual mistake of unit and frame that the policy's answers look like."""
     if policy.spec.action.kind != "acceleration":
         return ()
+    name = policy.name
     action, output = probed(policy)
     left, right, above, below, _ = action
-    aside, up = left[1] - right[1], above[2] - below[2]
-    found, name = [], policy.name
     if not np.isfinite(action).all():
         seen = f"{name}: answers NaN or infinity in level flight towards a gate"
         return (Doubt("action_not_finite", seen, "check its weights and its normalisation"),)
+    largest = float(np.linalg.norm(action, axis=-1).max())
+    if largest > ActionLimits().size:
+        seen = f"{name}: wants up to {largest:.0f} m/s^2 in level flight, more than the limit"
+        return (Doubt("action_limited", seen, UNIT_FIX + _twice(policy.spec.action)),)
+    found = []
+    aside, up = left[1] - right[1], above[2] - below[2]
     if aside < -CLEAR and up < -CLEAR:
         seen = (
             f"{name}: accelerates away from gates to its left and above, as if its action were FRD"
@@ -139,7 +156,22 @@ def doubts(policy: Policy) -> tuple[Doubt, ...]:
         seen = f"{name}: answers within -1 to 1 m/s^2 to gates far aside, as if unscaled"
         fix = "export it with the contract of its environment, or give action.scale"
         found.append(Doubt("action_scale", seen, fix))
+    if _divides_images(policy):
+        seen = f"{name}: answers alike to an image and to {TIMES:g} times that image"
+        fix = "without its scale an image says nothing of distance: do not divide by its maximum"
+        found.append(Doubt("image_scale", seen, fix))
     return tuple(found)
+
+
+def _divides_images(policy: Policy) -> bool:
+    """Return whether a policy makes all multiples of an image one, but sees what is in it."""
+    spec = policy.spec
+    rows = np.linspace(0.5, 2.0, spec.image_shape[-2])[:, None]
+    falling = np.broadcast_to(rows if not spec.depth.uint8 else 50 * rows, spec.image_shape)
+    image = np.stack([falling, TIMES * falling, np.flip(falling, -2)]).astype(np.float32)
+    answers = _answers(policy, _level(spec, np.zeros((len(image), 2))), image)[1][0]
+    multiple, turned = np.abs(answers[1:] - answers[0]).max(-1)
+    return bool(multiple < ALIKE * turned)
 
 
 def probed(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
@@ -149,6 +181,13 @@ def probed(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
     """
     spec = policy.spec
     aside = ASIDE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
+    far = 0.0 if spec.depth.uint8 else spec.depth.bounds(spec.camera.range_m)[0]
+    image = np.full((len(aside), *spec.image_shape), far, np.float32)
+    return _answers(policy, _level(spec, aside), image)
+
+
+def _level(spec: PolicySpec, aside: np.ndarray) -> np.ndarray:
+    """Return states of level flight towards gates that are `aside` (N, 2): to the left, up [m]."""
     state = np.zeros((len(aside), spec.state_size), np.float32)
     state[:, 0], state[:, 5] = SPEED, 1.0
     state[:, 6], state[:, 7:9] = AHEAD_M, aside
@@ -161,11 +200,15 @@ def probed(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
             first += numbers
     if spec.speed_input:
         state[:, -1] = spec.speed
-    far = 0.0 if spec.depth.uint8 else spec.depth.bounds(spec.camera.range_m)[0]
-    image = np.full((len(aside), *spec.image_shape), far, np.float32)
-    hidden, outputs, action = policy.start(len(aside)), [], state[:, 9:12]
+    return state
+
+
+def _answers(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the last actions (N, 3) [m/s^2] and all outputs (STEPS, N, 3), as of `probed`."""
+    spec = policy.spec
+    hidden, outputs, action = policy.start(len(state)), [], state[:, 9:12]
     for step in range(STEPS):
-        fresh = np.full(len(aside), step == 0)
+        fresh = np.full(len(state), step == 0)
         output, hidden = policy.act(hidden, state, image, fresh)
         outputs.append(output)
         action = np.asarray(spec.action.to_si(output), np.float32)

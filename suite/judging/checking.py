@@ -102,8 +102,10 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[
 
     console.say(f"{policy.name}: {summary(contract_of(policy.spec))}")
     found = [_record("contract", *note) for note in getattr(policy, "notes", ())]
-    found += [_record("action", *doubt) for doubt in doubts(policy)]
-    return found + [_record("action", *warning) for warning in _in_flight(policy, trials, console)]
+    found += [_record(doubt.fault.split("_")[0], *doubt) for doubt in doubts(policy)]
+    known = {record["fault"] for record in found}
+    seen = [each for each in _in_flight(policy, trials, console) if each[0] not in known]
+    return found + [_record("action", *warning) for warning in seen]
 
 
 def _in_flight(policy: Policy, trials: int, console: Console) -> list[tuple[str, str, str]]:

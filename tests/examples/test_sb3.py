@@ -16,7 +16,7 @@ pytest.importorskip("stable_baselines3", reason="pip install 'diffracing-suite[s
 
 def test_what_it_exports_answers_as_its_model(tmp_path, monkeypatch):
     path = Path(__file__).resolve().parents[2] / "examples" / "sb3_race.py"
-    assert len(path.read_text().splitlines()) <= 70
+    assert len([line for line in path.read_text().splitlines() if line]) <= 60
     found = importlib.util.spec_from_file_location("sb3_race", path)
     assert found and found.loader
     example = importlib.util.module_from_spec(found)
@@ -35,8 +35,8 @@ def test_what_it_exports_answers_as_its_model(tmp_path, monkeypatch):
         rows = rng.normal(size=(1, 12)), rng.uniform(0.0, 2.0, (1, 6, 8))
         state, image = (row.astype(np.float32) for row in rows)
         action, memory = policy.act(memory, state, image, np.array([fresh]))
-        seen = {"state": (state - judged.mean.numpy()) / judged.deviation.numpy(), "image": image}
-        seen["state"] = seen["state"].clip(-10.0, 10.0)
+        seen = {"state": (state - judged.mean.numpy()) / judged.deviation.numpy()}
+        seen = {"state": seen["state"].clip(-10.0, 10.0), "image": image.reshape(1, -1)}
         before = before or {key: np.zeros_like(part) for key, part in seen.items()}
         frames = {key: np.concatenate([before[key], seen[key]], -1) for key in seen}
         answer, _ = judged.policy.predict(frames, deterministic=True)

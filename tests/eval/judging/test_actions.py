@@ -8,7 +8,7 @@ import pytest
 
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
 from eval.judging.judge import JudgeOptions, fly
-from eval.judging.outputs import actions_of, doubts
+from eval.judging.outputs import actions_of, doubts, notes_of
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
 from policies.block_policy import BlockPolicy
@@ -145,15 +145,20 @@ def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
         "action_gravity": lambda a: a + np.array([0, 0, 9.81], np.float32),
         "action_frame": lambda a: a * np.array([1, -1, -1], np.float32),
         "action_scale": lambda a: a / 20,
+        "action_limited": lambda a: a * 20,
         "action_not_finite": lambda a: a * np.float32("nan"),
+        "image_scale": lambda a: a,
     }
     for fault, change in changes.items():
 
-        def model(*inputs, change=change):
-            action, hidden = policy.model(*inputs)
+        def model(state, image, hidden, change=change, divide=fault == "image_scale"):
+            if divide:
+                most = image.max((1, 2), keepdims=True)
+                image = image / np.where(most == 0.0, 1.0, most)  # zeros fill up a block
+            action, hidden = policy.model(state, image, hidden)
             return change(action), hidden
 
-        assert [doubt.fault for doubt in doubts(replace(policy, model=model))] == [fault]
+        assert [doubt.fault for doubt in notes_of(replace(policy, model=model))] == [fault]
 
 
 def state_of(action):
