@@ -22,10 +22,10 @@ from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, steps_to_next
 from policies.contract import Contract, contract_of
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.observation import View, observe
-from policies.shipped import locate
+from policies.shipped import locate, names
 from policies.spec import ActionSpec, PolicySpec
 from tracks.common.names import unknown_name
-from tracks.families import check_family, make_track
+from tracks.families import LEVELS, check_family, make_track
 from tracks.formats.custom import load_track
 from tracks.track import Track
 
@@ -94,6 +94,12 @@ class RaceConfig:
     """When an episode ends."""
 
 
+def levels_of(config: RaceConfig) -> tuple[int, int]:
+    """Return the lowest and the highest level that is flown."""
+    level = config.level
+    return (level, level) if isinstance(level, int) else (int(level[0]), int(level[1]))
+
+
 def resolved_vehicle(config: RaceConfig, rng: np.random.Generator) -> Vehicle:
     """Return the vehicle of an episode."""
     vehicle = config.vehicle
@@ -106,6 +112,8 @@ def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:
     """Return the spec of the environment, whose actions are -1 to 1 of what `vehicle` can do."""
     spec = config.spec or PolicySpec()
     if isinstance(spec, str):
+        if not locate(spec).exists():
+            raise unknown_name("policy (or folder)", spec, names())
         spec = load_policy_checkpoint(locate(spec)).spec
     if config.channel_axis or config.uint8:
         depth = replace(spec.depth, channel_axis=config.channel_axis, uint8=config.uint8)
@@ -132,8 +140,14 @@ class Races:
         """Check the configuration and make the simulator.
 
         Raises:
-            ValueError: for an unknown track, vehicle, kind of action or reward term.
+            ValueError: for an unknown track, vehicle, kind of action or reward term, a level that
+                is none, or no slots.
         """
+        if slots < 1:
+            raise ValueError(f"num_envs is {slots}, allowed is 1 or more")
+        lowest, highest = levels_of(config)
+        if not LEVELS[0] <= lowest <= highest <= LEVELS[-1]:
+            raise ValueError(f"level is {config.level}, allowed is 0 to 9, or (lowest, highest)")
         self.config, self.slots = config, slots
         for name in config.rewards:
             if name not in REWARDS:
@@ -166,9 +180,8 @@ class Races:
         config = self.config
         entries: list[tuple[int, Track, TrialSpec]] = []
         for slot, rng in zip(slots, rngs, strict=True):
-            level = config.level
-            if not isinstance(level, int):
-                level = int(rng.integers(level[0], level[1] + 1))
+            lowest, highest = levels_of(config)
+            level = lowest if lowest == highest else int(rng.integers(lowest, highest + 1))
             seed = config.track_seed if track_seed is None else track_seed
             seed = int(rng.integers(SEEDS)) if seed is None else int(seed)
             track = self._file or make_track(config.track, level, seed)
