@@ -126,7 +126,12 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
     command = importlib.import_module(f"suite.commands.{name}")
     plain_flags = (tyro.conf.FlagCreatePairsOff,)
     options = command.config_type(args) if hasattr(command, "config_type") else command.Config
-    _refuse_twice(args, options)
+    from tyro.conf import Positional, UseAppendAction
+
+    repeated = set(_marked(options, UseAppendAction))
+    if not list(_marked(options, Positional)):
+        args = _each_with_its_option(args, repeated)
+    _refuse_twice(args, repeated)
     config, left = tyro.cli(
         options, prog=f"suite {name}", args=args, config=plain_flags, return_unknown_args=True
     )
@@ -156,28 +161,39 @@ def _left_over(name: str, args: Sequence[str], word: str) -> ValueError:
     )
 
 
-def _refuse_twice(args: Sequence[str], options: Any) -> None:
+def _each_with_its_option(args: Sequence[str], repeated: set[str]) -> list[str]:
+    """Return `--policy a b` as `--policy a --policy b`, as a shell expands `--policy runs/*`."""
+    found, option, values = [], "", 0
+    for arg in args:
+        if arg.startswith("-"):
+            option, values = arg, 0
+        elif option in repeated:
+            values += 1
+            found += [option] if values > 1 else []
+        found.append(arg)
+    return found
+
+
+def _refuse_twice(args: Sequence[str], repeated: set[str]) -> None:
     """Refuse an option that is given twice: of two `--set` the first would be left out silently."""
     flags = [arg.partition("=")[0].replace("_", "-") for arg in args if arg.startswith("--")]
     twice = {flag for flag in flags if flags.count(flag) > 1}
-    for flag in sorted(twice - set(_once_a_value(options)) if twice else ()):
+    for flag in sorted(twice - repeated):
         raise ValueError(f"{flag} is given twice; give it once, with all its values behind it")
 
 
-def _once_a_value(options: Any) -> Iterator[str]:
-    """Yield those of `options`, a type as tyro reads it, that are given once for each value."""
-    from tyro.conf import UseAppendAction
-
+def _marked(options: Any, marker: Any) -> Iterator[str]:
+    """Yield those of `options`, a type as tyro reads it, that have a mark of `tyro.conf`."""
     for part in get_args(options):
-        yield from _once_a_value(part)
+        yield from _marked(part, marker)
     made = get_origin(options) or options
     if isinstance(made, type) and is_dataclass(made):
         for name, kind in get_type_hints(made, include_extras=True).items():
             extras = getattr(kind, "__metadata__", ())
-            if UseAppendAction in extras:
+            if marker in extras:
                 named = next((x.name for x in extras if getattr(x, "name", None)), name)
                 yield f"--{named.replace('_', '-')}"
-            yield from _once_a_value(kind)
+            yield from _marked(kind, marker)
 
 
 def _run(name: str, args: list[str]) -> int:

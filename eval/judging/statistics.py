@@ -232,7 +232,7 @@ def over_seeds(
         drawn += sign * np.einsum("ds,st,dt->d", seeds, group, trials, optimize=True)
     largest = max(variance, max(parts))
     spread = float(drawn.std())
-    if not spread:
+    if not largest or not spread:
         return Interval(float(value), float(value), float(value))
     degrees = largest**2 / sum(part**2 / df for part, df in zip(parts, freedom, strict=True))
     wide = sqrt(largest) * float(student.ppf(0.975, max(1.0, degrees))) / (1.959964 * spread)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.judging.results import read_trials
-from eval.judging.statistics import Interval, over_seeds, paired_success
+from eval.judging.statistics import Interval, over_seeds, paired_success, wilson
 from eval.worlds.trial import TrialResult, TrialSpec
 from tracks.input.reading import read_json
 
@@ -130,18 +130,25 @@ def seeds_of(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, Any]:
         for group in (runs, others)
         if group
     ]
-    found = over_seeds(groups[0], groups[1] if others else None)
+    found, how = over_seeds(groups[0], groups[1] if others else None), "hierarchical bootstrap"
+    if found.low == found.high:  # Where nothing differs, draws do not either.
+        one, *two = (group[0] > 0.5 for group in groups)
+        found, how = wilson(int(one.sum()), len(one)), "over trials alone: Wilson"
+        if two:
+            found, how = Interval(*paired_success(one, two[0])[:3]), "over trials alone: Newcombe"
     rates = [[float(rate) for rate in group.mean(1)] for group in groups]
     return {
         "trials": len(trials),
         "success_by_seed": rates,
         "spread": [float(np.std(group, ddof=1)) for group in rates],
         "mean": found,
-        "sentence": _seeds_sentence(found, rates, len(trials)),
+        "sentence": _seeds_sentence(found, rates, len(trials), how),
     }
 
 
-def _seeds_sentence(found: Interval, rates: Sequence[Sequence[float]], trials: int) -> str:
+def _seeds_sentence(
+    found: Interval, rates: Sequence[Sequence[float]], trials: int, how: str
+) -> str:
     value, low, high = (100 * number for number in found)
     count = " and ".join(str(len(group)) for group in rates)
     means = " and ".join(
@@ -153,5 +160,5 @@ def _seeds_sentence(found: Interval, rates: Sequence[Sequence[float]], trials: i
     return (
         f"Over {count} training seeds and {trials} trials the success rate was {means}: "
         f"{what}{value:{sign}.1f} {unit} (95 % interval over seeds and trials {low:{sign}.1f} to "
-        f"{high:{sign}.1f}, hierarchical bootstrap)."
+        f"{high:{sign}.1f}, {how})."
     )

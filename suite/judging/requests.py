@@ -29,8 +29,8 @@ class Evaluation:
     policies: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="policy")
     ] = ()
-    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2, .pt or .c file; may be
-    given several times. Without it the shipped policy flies."""
+    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2, .pt or .c file; several may
+    be given. Without it the shipped policy flies."""
     track: str = "all"
     """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
     difficulty: str = "0"

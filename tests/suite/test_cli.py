@@ -185,6 +185,9 @@ def test_options_of_one_value_each_may_be_given_again():
     assert config.experiment.world == ("mjx", "rotorpy")
     _, config = cli.parse("eval", ["--policy", "race", "--policy", "race-paper"])
     assert config.flown.policies == ("race", "race-paper")
+    # As a shell expands runs/seed*/policy.
+    _, config = cli.parse("eval", ["--policy", "race", "race-paper", "runs/a", "--seed", "3"])
+    assert config.flown.policies == ("race", "race-paper", "runs/a")
 
 
 def test_info_says_versions_devices_and_machine(capfd):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from eval.judging.results import write_results
-from eval.judging.statistics import over_seeds
+from eval.judging.statistics import over_seeds, paired_success, wilson
 from eval.worlds.trial import TrialResult
 from suite.commands import compare
 from suite.common.console import Quiet
@@ -88,4 +88,11 @@ def test_two_methods_are_compared_over_their_seeds(tmp_path):
         np.mean(found["success_by_seed"][0]) - np.mean(found["success_by_seed"][1])
     )
     assert "a difference of +" in found["sentence"] and len(found["spread"]) == 2
+    same = read_runs(run_of(tmp_path / "same", [True] * 60))[0]
+    for others, low in (
+        ((), wilson(60, 60).low),
+        ([same, same], paired_success(*[np.ones(60)] * 2).low),
+    ):
+        found = seeds_of([same, same], others)["mean"]
+        assert found.low == pytest.approx(low) and found.low < found.value - 0.05
     assert json.loads((tmp_path / "a0" / "summary.json").read_text())["judged"]
