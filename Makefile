@@ -1,7 +1,7 @@
 # make env    the environment in .venv, from requirements.lock
 # make race   fly a policy where the dynamics hide an effect, name it, train for it, fly again
 # make test   lint, types and tests
-# make lint   ruff and pyright
+# make lint   ruff, pyright, and docs/reference against the code
 # make docs   the pages of docs/ as a site in site/, links checked
 # make lock   requirements.lock from what is installed in .venv
 # make clean  remove caches and build products (runs/ and .venv stay)
@@ -34,13 +34,14 @@ $(STAMP): requirements.lock pyproject.toml setup.py
 	@touch $(STAMP)
 
 race: $(STAMP)
-	$(VENV)/bin/suite loop --world examples/hidden.toml --policy race-paper --recipe quick --no-delta --workers $(JOBS) --out $(OUT)
+	$(VENV)/bin/suite loop --hidden-vehicle examples/hidden.toml --policy race-paper --recipe quick --no-delta --workers $(JOBS) --out $(OUT)
 
 lint: style types
 
 style: $(STAMP)
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
+	$(PY) tools/reference.py --check
 
 types: $(STAMP)
 	$(PY) -m pyright --pythonpath $(PY) --warnings --level warning

@@ -11,10 +11,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from eval.logs.flight_log import read_flight
+from suite import diagnose_flights, read_flight
 from suite.cli import main as suite
-from suite.common.console import Console
-from suite.diagnose.run import diagnose_files
 
 
 def main(folder: Path) -> None:
@@ -24,8 +22,7 @@ def main(folder: Path) -> None:
     flight = read_flight(logs / "flight_1.parquet")
     print(f"flight 1: {len(flight.time_s)} rows over {flight.time_s[-1] - flight.time_s[0]:.1f} s")
 
-    vehicle = str(logs / "vehicle.toml")
-    found = diagnose_files([logs], vehicle, folder, Console(), recording=False)
+    found = diagnose_flights([logs], logs / "vehicle.toml", folder)
     print(f"verdict: {found['verdict']}")
     for effect in found["effects"]:
         for name, entry in effect["parameters"].items():

@@ -10,8 +10,8 @@ import sys
 
 import numpy as np
 
-from eval.envs.gymnasium_env import RaceEnv
 from eval.envs.race import ACTION_LIMIT
+from suite import make_env
 
 
 def pilot(state: np.ndarray) -> np.ndarray:
@@ -23,7 +23,7 @@ def pilot(state: np.ndarray) -> np.ndarray:
 
 def main(episodes: int) -> None:
     """Fly episodes on tracks of their own and print how each ended."""
-    env = RaceEnv(track="circular", level=0)
+    env = make_env(track="circular", level=0)
     seen, info = env.reset(seed=1)
     for _ in range(episodes):
         total, steps, over = 0.0, 0, False

@@ -12,11 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eval.judging.judge import JudgeOptions, fly
-from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds.trial import TrialSpec
 from policies.block_policy import BlockPolicy, proven
 from policies.spec import ActionSpec, PolicySpec
+from suite import evaluate_policy
 
 SPEC = PolicySpec(rate_hz=50.0, action=ActionSpec(scale=(20.0,), clip=1.0))  # actions -1 to 1
 
@@ -40,8 +38,9 @@ def main(trials: int) -> None:
         return np.asarray(compiled(state, image)), hidden  # (0,) hidden: without memory
 
     policy = proven(BlockPolicy("jax", SPEC, model, (0,)), "jax_policy")
-    asked = [TrialSpec("random", 0, seed) for seed in range(trials)]
-    results = fly(policy, asked, load_vehicle("racer5"), options=JudgeOptions(workers=1))
+    results = evaluate_policy(
+        policy, track="random", difficulty=0, trials=trials, vehicle="racer5", workers=1
+    )
     for result in results:
         print(f"seed {result.seed}: {result.gates_passed} gates, {result.ending}")
 

@@ -9,13 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.effects import EFFECTS
 from eval.effects.interface import Array, Effect, Flow, Parameter
-from eval.judging.judge import JudgeOptions, fly
-from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import with_effects
-from eval.worlds.trial import TrialSpec
-from policies.policy import load_policy
+from suite import evaluate_policy, load_policy, load_vehicle, register_effect
 from tracks.geometry.rotation import to_local
 
 
@@ -46,14 +42,12 @@ TETHER = Effect(
 
 def main() -> None:
     """Register the effect, and fly with tethers of growing stiffness."""
-    EFFECTS.register(TETHER.name, TETHER)
+    register_effect(TETHER)
     vehicle, policy = load_vehicle("reference"), load_policy("race")
     for stiffness in (0.0, 0.4):
-        (result,) = fly(
-            policy,
-            [TrialSpec("zigzag", difficulty=0, seed=1)],
-            with_effects(vehicle, {TETHER.name: Tether(stiffness)}),
-            options=JudgeOptions(workers=1),
+        tethered = with_effects(vehicle, {TETHER.name: Tether(stiffness)})
+        (result,) = evaluate_policy(
+            policy, track="zigzag", difficulty=0, trials=1, seed=1, vehicle=tethered, workers=1
         )
         print(f"{stiffness:.1f} N/m: {result.gates_passed} gates, {result.ending}")
 

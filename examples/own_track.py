@@ -13,12 +13,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from eval.judging.judge import JudgeOptions, fly
-from eval.quadrotor.vehicle_file import load_vehicle
 from eval.view.picture import write_picture
-from eval.worlds.trial import TrialSpec
-from policies.policy import load_policy
-from tracks.formats.custom import load_track
+from suite import evaluate_policy, load_track
 
 COURSE = """
 [[gates]]                  # in flight order; metres, degrees, world z is up
@@ -57,13 +53,7 @@ def main(folder: Path) -> None:
     print(f"{track.family}: {len(track.scene.gates.center_w)} gates; solids: {set(track.names)}")
     write_picture(folder / "course.png", track)
     print(f"written: {path} and {folder / 'course.png'}")
-    (result,) = fly(
-        load_policy("race"),
-        [TrialSpec(str(path), difficulty=0, seed=0)],
-        load_vehicle("reference"),
-        options=JudgeOptions(workers=1),
-        tracks={str(path): track},
-    )
+    (result,) = evaluate_policy("race", track=track, trials=1, workers=1)
     print(f"{result.gates_passed} gates, {result.ending} after {result.time_s:.1f} s")
 
 

@@ -1,1 +1,239 @@
-"""What a person runs: the command line, the trainer, the Delta Action loop and benchmarks."""
+"""Train, judge and diagnose drone racing policies: the command line and the Python interface.
+
+The names in `__all__` are the interface that stays stable; everything deeper is for contributors.
+What a name needs is imported when it is first used, so that `import suite` costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import gymnasium
+
+    from eval.effects.interface import Effect
+    from eval.logs.flight_log import read_flight, write_flight
+    from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+    from eval.vehicles.vehicle import Vehicle
+    from eval.worlds.trial import TrialResult
+    from policies.policy import Policy, load_policy
+    from suite.common.console import Console
+    from tracks.families import make_track
+    from tracks.formats.custom import load_track
+    from tracks.track import Track
+
+__all__ = [
+    "diagnose_flights",
+    "evaluate_policy",
+    "identify_vehicle",
+    "load_policy",
+    "load_track",
+    "load_vehicle",
+    "make_env",
+    "make_track",
+    "read_flight",
+    "register_effect",
+    "register_simulator",
+    "register_track",
+    "save_vehicle",
+    "train_policy",
+    "write_flight",
+]
+
+_ELSEWHERE = {
+    "load_policy": "policies.policy",
+    "load_track": "tracks.formats.custom",
+    "load_vehicle": "eval.quadrotor.vehicle_file",
+    "make_track": "tracks.families",
+    "read_flight": "eval.logs.flight_log",
+    "save_vehicle": "eval.quadrotor.vehicle_file",
+    "write_flight": "eval.logs.flight_log",
+}
+"""Name -> the module that it is re-exported from."""
+
+Source = str | PathLike[str]
+"""A shipped name or a path."""
+
+
+def evaluate_policy(
+    policy: Policy | Source = "race",
+    *,
+    track: str | Track = "all",
+    difficulty: str | int = "0,3",
+    trials: int = 10,
+    seed: int = 0,
+    vehicle: Vehicle | Source = "reference",
+    simulator: str = "mujoco",
+    workers: int | None = None,
+) -> list[TrialResult]:
+    """Fly trials and return their results, as `suite eval` does.
+
+    Args:
+        policy: a policy (`load_policy`, or any object with its methods), a shipped name or a file.
+        track: a track of your own, "all" (the judged families), a family, or several with commas.
+        difficulty: a level 0 to 9, "0,3", "0-9" or "all"; without meaning for a track of your own.
+        trials: on every track at every level.
+        seed: of the first trial; the others follow by one.
+        vehicle: a vehicle, a shipped name or a vehicle file.
+        simulator: a name of `suite list simulators`.
+        workers: processes; None takes as many cores as are worth it.
+
+    Raises:
+        ValueError: for anything that cannot be used, before the first flight.
+    """
+    from eval.judging.judge import JudgeOptions, fly
+    from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.worlds.trial import TrialSpec
+    from policies.policy import load_policy
+    from suite.common.choices import parse_levels, parse_tracks
+
+    flown = load_policy(policy) if isinstance(policy, str | PathLike) else policy
+    body = load_vehicle(vehicle) if isinstance(vehicle, str | PathLike) else vehicle
+    seeds, own = range(seed, seed + trials), {}
+    if isinstance(track, str):
+        levels = parse_levels(str(difficulty))
+        asked = [TrialSpec(t, d, s) for t in parse_tracks(track) for d in levels for s in seeds]
+    else:
+        own = {track.family: track}
+        asked = [TrialSpec(track.family, 0, s) for s in seeds]
+    return fly(flown, asked, body, simulator, JudgeOptions(workers=workers), tracks=own)
+
+
+def train_policy(
+    out: Source,
+    recipe: str = "race",
+    *,
+    settings: Sequence[str] = (),
+    iterations: int | None = None,
+    seed: int = 0,
+    progress: bool = True,
+) -> Path:
+    """Train a policy, or resume the training in `out`, and return the policy's folder.
+
+    Args:
+        out: folder of the run.
+        recipe: a name of `suite list recipes`.
+        settings: changes as `suite train --set` takes them, such as "loss.progress=2".
+        iterations: gradient steps, instead of the recipe's.
+        seed: of parameters, tracks and randomisation.
+        progress: print progress.
+
+    Raises:
+        ValueError: for a recipe or setting that cannot be used, or a folder with another run.
+    """
+    from suite.commands.train import Config, resolve
+    from suite.train.run import train
+
+    asked = Config(recipe=recipe, iterations=iterations, set=tuple(settings), seed=seed)
+    outcome = train(resolve(asked), Path(out), _console(progress))
+    return Path(outcome.policy)
+
+
+def diagnose_flights(
+    flights: Sequence[Source],
+    vehicle: Source,
+    out: Source,
+    *,
+    reference: Sequence[Source] = (),
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Name the effect that a vehicle file lacks, and return what diagnosis.json holds.
+
+    Args:
+        flights: flight logs, or folders of them.
+        vehicle: a vehicle file or a shipped name.
+        out: folder for diagnosis.json, vehicle.toml and report.html.
+        reference: flights from before a change: find what has changed since.
+        progress: print progress.
+
+    Raises:
+        ValueError: for flights or a vehicle that cannot be used.
+    """
+    from suite.diagnose.run import diagnose_files
+
+    paths, before = [Path(f) for f in flights], [Path(f) for f in reference]
+    return diagnose_files(paths, str(vehicle), Path(out), _console(progress), reference=before)
+
+
+def identify_vehicle(
+    flights: Sequence[Source], vehicle: Source, out: Source, *, progress: bool = True
+) -> dict[str, Any]:
+    """Estimate the parameters of a vehicle file from flights, and return them with intervals.
+
+    Args:
+        flights: flight logs, or folders of them.
+        vehicle: the file or shipped name to start from.
+        out: the vehicle file to write.
+        progress: print progress.
+
+    Raises:
+        ValueError: for flights or a vehicle that cannot be used.
+    """
+    from suite.diagnose.identify.run import identify_files
+
+    paths = [Path(f) for f in flights]
+    return identify_files(paths, str(vehicle), Path(out), (), _console(progress))
+
+
+def make_env(**settings: Any) -> gymnasium.Env[Any, Any]:
+    """Return the gymnasium environment `diffracing/Race-v0`; see `eval.envs.gymnasium_env`."""
+    import gymnasium
+
+    from eval.envs.gymnasium_env import ID
+
+    return gymnasium.make(ID, **settings)
+
+
+def register_effect(effect: Effect) -> None:
+    """Add a physical effect to the catalogue, for this process.
+
+    Raises:
+        ValueError: for a name that is taken, or an effect that contradicts itself.
+    """
+    from eval.effects import EFFECTS
+
+    EFFECTS.register(effect.name, effect)
+
+
+def register_track(name: str, make: Any) -> None:
+    """Add a track family, make(difficulty, rng) -> (scene, start, names), for this process.
+
+    Raises:
+        ValueError: for a name that is taken, or something that makes no tracks.
+    """
+    from tracks.families import FAMILIES
+
+    FAMILIES.register(name, make)
+
+
+def register_simulator(name: str, simulator: Any) -> None:
+    """Add a simulator, a class as `eval.worlds.World` describes it, for this process.
+
+    Raises:
+        ValueError: for a name that is taken, or something that is no class.
+    """
+    from eval.worlds import WORLDS
+
+    WORLDS.register(name, simulator)
+
+
+def _console(progress: bool) -> Console:
+    from suite.common.console import Console
+    from suite.common.work import Silent
+
+    return Console() if progress else Silent()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ELSEWHERE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(_ELSEWHERE[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_ELSEWHERE])

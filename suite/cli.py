@@ -23,45 +23,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 from suite.common.running.interrupts import end_at_once, ends_in_seconds
 from suite.common.startup import check_names, hush, keep_compiled, open_streams, pin
-
-COMMANDS: dict[str, str] = {
-    "bench": "time a hot path against a plain implementation of the same",
-    "blind": "test cases with hidden effects for the diagnosis: make, run, score",
-    "check": "what is assumed of a policy file, and the usual mistakes of unit and frame",
-    "compare": "the success rates of evaluations on the same trials, with intervals and a test",
-    "collect": "fly a policy and record every flight as a log",
-    "diagnose": "name the physical effect that a vehicle file lacks, by flight logs",
-    "identify": "find the numbers of a vehicle file in flight logs",
-    "effects": "the physical effects that a vehicle file may hold",
-    "eval": "judge policies: success rates, speeds and lap times, with intervals",
-    "example": "flights with a hidden effect, or of a real quadrotor, to try the diagnosis on",
-    "export": "write a policy as torch program, ONNX and C",
-    "fly": "a policy in real time over MAVLink, as a companion computer flies it",
-    "import": "a flight of PX4, Betaflight, a Crazyflie, ROS 2 or a table as a flight log",
-    "info": "versions, devices, memory and commit, for bug reports",
-    "loop": "train, fly, record, fit the Delta Action Model, fine-tune, fly again",
-    "reproduce": "the paper's tables and more, one document each: table2, ablation, robustness",
-    "tracks": "list the track families, or draw a track as a picture",
-    "delta": "fit the Delta Action Model to recorded flights",
-    "train": "train a policy by backpropagation through quadrotors or a point mass",
-    "view": "a recording, pictures and a video of trials",
-}
-"""Name -> one-line summary; the command NAME lives in suite/commands/NAME.py."""
-
-
-def overview() -> str:
-    """Return the text of `suite --help`."""
-    width = max(map(len, COMMANDS))
-    lines = [
-        "usage: suite COMMAND [options]",
-        "",
-        "Train drone racing policies through differentiable dynamics and judge them in MuJoCo.",
-        "",
-        *(f"  {name:<{width}}  {summary}" for name, summary in sorted(COMMANDS.items())),
-        "",
-        "suite COMMAND --help says what a command takes; suite --version, the version.",
-    ]
-    return "\n".join(lines)
+from suite.common.usage import COMMANDS, description, joined_lists, overview, renamed
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -125,6 +87,7 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 
     command = importlib.import_module(f"suite.commands.{name}")
     plain_flags = (tyro.conf.FlagCreatePairsOff,)
+    args = joined_lists(args)
     options = command.config_type(args) if hasattr(command, "config_type") else command.Config
     from tyro.conf import Positional, UseAppendAction
 
@@ -132,33 +95,21 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
     if not list(_marked(options, Positional)):
         args = _each_with_its_option(args, repeated)
     _refuse_twice(args, repeated)
+    about = description(name, command.Config.__doc__ or "")
     config, left = tyro.cli(
-        options, prog=f"suite {name}", args=args, config=plain_flags, return_unknown_args=True
+        options,
+        prog=f"suite {name}",
+        description=about,
+        args=args,
+        config=plain_flags,
+        return_unknown_args=True,
     )
     if left and not any(word.startswith("-") for word in left):
-        raise _left_over(name, args, left[0])
+        raise ValueError(f"{left[0]!r} belongs to no option; suite {name} --help lists them")
     if left:
         # Once more, and it ends by saying which options were meant.
         tyro.cli(options, prog=f"suite {name}", args=args, config=plain_flags)
     return command, config
-
-
-def _left_over(name: str, args: Sequence[str], word: str) -> ValueError:
-    """Return the error for a word that belongs to no option, such as the second of two tracks."""
-    # The same word may stand behind an option that takes it.
-    places = [i for i, arg in enumerate(args) if arg == word]
-    free = (i for i in places if i == 0 or "=" in args[i - 1] or args[i - 1][:2] != "--")
-    before = args[: next(free, places[-1])]
-    last = max((i for i, arg in enumerate(before) if arg.startswith("--")), default=None)
-    hint = f"suite {name} --help says what it takes"
-    if last is None:
-        return ValueError(f"{word!r} belongs to no option; {hint}")
-    option, *values = before[last].split("=", 1) + list(before[last + 1 :])
-    joined = ",".join([*values, word])
-    return ValueError(
-        f"{word!r} after {option} is one word too many; an option that takes several values "
-        f"may want them joined, as in {option} {joined}; {hint}"
-    )
 
 
 def _each_with_its_option(args: Sequence[str], repeated: set[str]) -> list[str]:
@@ -202,6 +153,9 @@ def _run(name: str, args: list[str]) -> int:
 
     for variable in pin():
         _complain(f"{variable} of the environment is set aside: it would change every result")
+    args, notes = renamed(name, args)
+    for note in notes:
+        _complain(note)
     keep_compiled()
     set_threads()
     one_thread_a_product()

@@ -89,7 +89,7 @@ def trials(work: Path) -> dict[str, str]:
     for world, policies in (("mujoco", POLICIES), ("mjx", MJX_POLICIES)):
         for policy in policies:
             out = work / f"eval-{world}-{policy}"
-            suite("eval", "--policy", policy, "--world", world, "--difficulty", "0,9",
+            suite("eval", "--policy", policy, "--simulator", world, "--difficulty", "0,9",
                   "--trials", "5", "--workers", "1", "--out", out)  # fmt: skip
             digests[f"trials {world} {policy}"] = parquet_digest(out / "trials.parquet")
     return digests

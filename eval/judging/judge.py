@@ -161,7 +161,7 @@ def check_records(world: str) -> None:
     """
     if world == REFERENCE:
         raise ValueError(
-            f"world {REFERENCE!r} records no flights; record in 'mujoco', which flies alike"
+            f"simulator {REFERENCE!r} records no flights; record in 'mujoco', which flies alike"
         )
 
 

@@ -23,7 +23,7 @@ from tracks.track import Track
 REFERENCE = "reference"
 """The world without slots: `eval.worlds.reference.fly_trial`, one trial after the other."""
 WORLDS: Registry[Any] = Registry(
-    "world",
+    "simulator",
     "diffracing_suite.worlds",
     {
         "mujoco": "eval.worlds.mujoco:MujocoWorld",
@@ -129,8 +129,8 @@ def flown_by(name: str, action: ActionSpec) -> dict[str, ActionSpec]:
         return {}
     if action.kind not in getattr(WORLDS.find(name), "actions", ()):
         raise ValueError(
-            f"world {name!r} flies no actions of kind {action.kind!r}; fly in 'mujoco', or give "
-            "its class `actions` and the argument `action` (docs/worlds.md)"
+            f"simulator {name!r} flies no actions of kind {action.kind!r}; fly in 'mujoco', or "
+            "give its class `actions` and the argument `action` (docs/worlds.md)"
         )
     return {"action": action}
 

@@ -71,7 +71,7 @@ class Flying(NamedTuple):
 
 
 class MjxWorld:
-    """Slots of one compiled program."""
+    """MuJoCo in JAX, for GPUs: slots of one compiled program."""
 
     name = "mjx"
     integrator = "euler"

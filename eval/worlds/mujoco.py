@@ -12,7 +12,10 @@ from tracks.geometry.rotation import to_world
 
 
 class MujocoWorld(SceneSlots):
-    """MuJoCo moves the bodies under the plant's wrench; a step goes on from the contacts."""
+    """MuJoCo's C engine, the default.
+
+    It moves the bodies under the plant's wrench; a step goes on from the contacts.
+    """
 
     name = "mujoco"
     integrator = "euler"

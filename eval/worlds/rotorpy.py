@@ -45,7 +45,10 @@ class Push(NamedTuple):
 
 
 class RotorpyWorld(SceneSlots):
-    """Slots of RotorPy's `BatchedMultirotor`; its logs count as continuous in time."""
+    """RotorPy, an optional package: slots of its `BatchedMultirotor`.
+
+    Its logs count as continuous in time.
+    """
 
     name = "rotorpy"
     cost = 6.0

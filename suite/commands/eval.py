@@ -49,7 +49,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.rerun:
         from eval.judging.judge import check_records
 
-        check_records(config.flown.world)
+        check_records(config.flown.simulator)
         check_place(config.rerun)
     answer = evaluate(config.flown, config.out, console, asked_workers(config.workers))
     if config.rerun:

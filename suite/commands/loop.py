@@ -29,29 +29,31 @@ class Config:
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials | None = None
     """Trials of each policy on every track at every level; by default 50, or 20 with quick; with
-    --world 25, or 20."""
+    a hidden vehicle 25, or 20."""
     flights: Trials | None = None
-    """Recorded flights on every track at every level; by default 20, or 8 with quick; with --world
-    3."""
+    """Recorded flights on every track at every level; by default 20, or 8 with quick; with a hidden
+    vehicle 3."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
-    world: str | None = None
-    """A vehicle file with an effect that --vehicle lacks: fly there, name the effect, fine-tune
-    through the corrected quadrotor. Without --policy the shipped one flies. Or another simulator
-    (rotorpy), which flies --vehicle, or a file as in rotorpy:FILE."""
+    hidden_vehicle: str | None = None
+    """A vehicle file with an effect that --vehicle lacks: fly it, name the effect, fine-tune
+    through the corrected quadrotor. Without --policy the shipped one flies."""
+    simulator: str = "mujoco"
+    """What flies the hidden vehicle. With another simulator than mujoco (such as rotorpy) and no
+    --hidden-vehicle, what that simulator does otherwise with --vehicle is what is hidden."""
     seed: Annotated[int, Range(0, SEED_MOST - 10**6)] = 0
     """Seed of the training and of the first trial; recorded flights begin 100,000 above."""
     iterations: Iterations | None = None
     """Gradient steps of the training, instead of the recipe's."""
     finetune_iterations: Iterations | None = None
-    """Gradient steps of each fine-tuning; by default a quarter of the recipe's; with --world 60,
-    or 100 with quick."""
+    """Gradient steps of each fine-tuning; by default a quarter of the recipe's; with a hidden
+    vehicle 60, or 100 with quick."""
     fit_iterations: Iterations | None = None
     """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with quick; with
-    --world 200."""
+    a hidden vehicle 200."""
     delta: bool = True
-    """With --world: Delta Action Models as well, and fine-tunings under them, which take half the
-    time; --no-delta leaves them out."""
+    """Leave out the Delta Action Models and the fine-tunings under them, which take half the time;
+    with a hidden vehicle."""
     set: tuple[str, ...] = ()
     """Change settings of the recipe by name, such as loss.progress=0.4 episode.batch=128."""
     out: Path = Path("runs/loop")
@@ -80,7 +82,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     workers = asked_workers(config.workers, whole_cores=True)
     resolved = resolve(
         recipe=config.recipe,
-        world=config.world,
+        hidden_vehicle=config.hidden_vehicle,
+        simulator=config.simulator,
         policy=config.policy,
         track=config.track,
         difficulty=config.difficulty,

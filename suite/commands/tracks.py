@@ -61,15 +61,25 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 
 def _list(console: Console) -> dict[str, Any]:
-    from tracks.families import FAMILIES, JUDGED
+    from tracks.families import JUDGED
 
     families = {}
-    for name, make in FAMILIES.items():
-        # A file of its own says what it is at its head, a function among others in its own words.
-        alone = getattr(make, "__name__", "") == "make"
-        about = ((sys.modules[make.__module__] if alone else make).__doc__ or "").split("\n\n")[0]
-        families[name] = {"about": " ".join(about.split()), "judged": name in JUDGED}
-        console.say(f"{name:<10}{families[name]['about']}")
+    for name, about in family_texts().items():
+        families[name] = {"about": about, "judged": name in JUDGED}
+        console.say(f"{name:<10}{about}")
     console.say()
     console.say("levels 0 (easy) to 9 (hard); suite tracks NAME --difficulty 9 draws one")
     return {"families": families}
+
+
+def family_texts() -> dict[str, str]:
+    """Return what each track family is, by its name."""
+    from tracks.families import FAMILIES
+
+    texts = {}
+    for name, make in FAMILIES.items():
+        # A file of its own is described at its head, a function among others in its docstring.
+        alone = getattr(make, "__name__", "") == "make"
+        about = (sys.modules[make.__module__] if alone else make).__doc__ or ""
+        texts[name] = " ".join(about.split("\n\n")[0].split())
+    return texts

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
+from suite.commands.list import list_settings
 from suite.common.console import Console
 from suite.common.running.hosts import Joined, join, member
+from suite.common.startup import use_device
 from suite.common.work import Silent
 from suite.train.config import TrainConfig
 from suite.train.overrides import changed, check_phases
 from suite.train.recipes import chosen_model, named_recipe, with_iterations
 from tracks.common.files import check_no_input, plain
-from tracks.input.ranges import Iterations, Seed
+from tracks.input.ranges import Iterations, Range, Seed
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,13 @@ class Config:
     """Seed of the parameters, the tracks and the randomisation."""
     iterations: Iterations | None = None
     """Gradient steps, instead of the recipe's."""
+    num_envs: Annotated[int, Range(1, 10**6)] | None = None
+    """Worlds per gradient step, instead of the recipe's; --set episode.batch is the same."""
+    lr: Annotated[float, Range(0.0, 10.0)] | None = None
+    """Peak learning rate of every phase, instead of the recipe's; --set optimizer.rate is the
+    same."""
+    device: Literal["cpu", "gpu"] | None = None
+    """What computes; without it a GPU where JAX finds one, else the CPU."""
     init_from: str | None = None
     """Start from this policy instead of fresh parameters: a checkpoint's folder or a shipped
     policy's name."""
@@ -46,6 +55,8 @@ class Config:
     set: tuple[str, ...] = ()
     """Change settings by name, in every phase, such as loss.progress=0.4; from the second phase
     on: phases.2.loss.progress=0.4."""
+    list_settings: bool = False
+    """Print every setting that --set takes, with value, range and meaning, and train nothing."""
     joined: tyro.conf.OmitArgPrefixes[Joined] = Joined()
     """Several processes, for devices of several hosts."""
     json: bool = False
@@ -54,7 +65,8 @@ class Config:
 
 def written(config: Config) -> list[Path]:
     """Return the folders that the command writes into: of several processes the first."""
-    return [config.out] if member(config.joined).number == 0 else []
+    first = member(config.joined).number == 0
+    return [config.out] if first and not config.list_settings else []
 
 
 def resolve(config: Config) -> TrainConfig:
@@ -68,7 +80,9 @@ def resolve(config: Config) -> TrainConfig:
     run = chosen_model(run, config.model, config.vehicle)
     if config.iterations is not None:
         run = with_iterations(run, config.iterations)
-    run = changed(run, config.set)
+    named = {"episode.batch": config.num_envs, "optimizer.rate": config.lr}
+    changes = [f"{path}={value}" for path, value in named.items() if value is not None]
+    run = changed(run, [*changes, *config.set])
     check_phases(run)
     return run
 
@@ -79,7 +93,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for options that cannot be used or do not go together.
     """
+    if config.list_settings:
+        return {"settings": list_settings(config.recipe, console)}
     one = member(config.joined)
+    use_device(config.device)
     join(one)
     if one.number:
         console = Silent()

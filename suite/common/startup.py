@@ -94,6 +94,26 @@ def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
     values.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
+def use_device(device: str | None) -> None:
+    """Have JAX compute on the CPU ("cpu") or on a GPU ("gpu"); None: a GPU where it finds one.
+
+    Raises:
+        ValueError: where JAX cannot use a GPU.
+    """
+    if device is None:
+        return
+    import jax
+
+    jax.config.update("jax_platforms", "cuda" if device == "gpu" else device)
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError):  # which one depends on whether a driver is there
+        raise ValueError(
+            f"--device {device}: JAX finds none; leave --device out, or install JAX for your GPU: "
+            "pip install 'jax[cuda12]'"
+        ) from None
+
+
 def drop_cut_entries(folder: Path) -> None:
     """Remove compiled programs of which a kill left no more than the name: JAX keeps such a one."""
     for entry in folder.glob("*-cache"):

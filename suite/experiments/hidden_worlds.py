@@ -123,7 +123,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     check_owned(config.set, owned)
     for name in config.only:
         if name not in WORLDS:
-            raise unknown_name("hidden world", name, WORLDS)
+            raise unknown_name("hidden vehicle", name, WORLDS)
     worlds = {name: hidden for name, hidden in WORLDS.items() if name in (config.only or WORLDS)}
     start = None if policy in shipped.names() else checkpoint_folder(policy)
     jobs = []
@@ -138,7 +138,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
             folder = place.cache / "loops" / f"{name.replace(' ', '-')}-{seed}-{digest(about)}"
             jobs.append(Job(Asked(config, name, seed, simulated), folder, start))
     loop_of(jobs[0])
-    came = all_done(run_one, jobs, place.workers, console, "loops in hidden worlds")
+    came = all_done(run_one, jobs, place.workers, console, "loops in hidden vehicles")
     rows, words = pages.rows_of(came), {name: hidden.words for name, hidden in worlds.items()}
     facts = {
         **judging.policy_facts({"policy": policy}),
@@ -188,14 +188,14 @@ def loop_of(job: Job) -> HiddenLoopConfig:
         save_vehicle(world_of(simulated, hidden), path, hidden.words)
     except ValueError as error:
         raise ValueError(
-            f"hidden world {name!r} cannot be made of --vehicle {vehicle}: {error}; leave it "
+            f"hidden vehicle {name!r} cannot be made of --vehicle {vehicle}: {error}; leave it "
             "out by naming others with --only, or give another vehicle"
         ) from error
     if vehicle not in shipped_vehicles():
         vehicle = str(job.folder / "vehicle.toml")
         save_vehicle(simulated, vehicle, "what the simulation knows")
     loop = resolve(
-        world=str(path),
+        hidden_vehicle=str(path),
         policy=config.policy if job.reads is None else str(job.reads),
         difficulty=config.difficulty,
         trials=config.trials,

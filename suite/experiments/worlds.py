@@ -40,8 +40,8 @@ class Config:
     policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
     Without it all shipped policies fly."""
-    world: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A world besides mujoco; may be given several times. Without it mjx and rotorpy."""
+    simulator: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A simulator besides mujoco; may be given several times. Without it mjx and rotorpy."""
     difficulty: str = "0,9"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials = 20
@@ -74,17 +74,17 @@ def columns(config: Config) -> list[Column]:
         ValueError: for a world that there is not, or that lacks a package.
     """
     vehicle = load_vehicle(config.vehicle)
-    twice = next((name for name in config.world if config.world.count(name) > 1), None)
+    twice = next((n for n in config.simulator if config.simulator.count(n) > 1), None)
     if twice is not None:
-        raise ValueError(f"--world {twice} is given twice; give each world once")
+        raise ValueError(f"--simulator {twice} is given twice; give each simulator once")
     found = [Column(BASE, BASE, vehicle)]
-    for name in config.world or (ROUNDING, "rotorpy"):
+    for name in config.simulator or (ROUNDING, "rotorpy"):
         world = world_class(name)
         if name in (BASE, REFERENCE):
             others = ", ".join(known for known in WORLDS if known not in (BASE, REFERENCE))
             raise ValueError(
-                f"--world {name}: flies as {BASE} does, with which others are paired; give one of "
-                + others
+                f"--simulator {name}: flies as {BASE} does, with which others are paired; give "
+                f"one of {others}"
             )
         if hasattr(world, "nearest"):
             label = f"{BASE}, the air of {name}"

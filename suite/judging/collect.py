@@ -59,7 +59,7 @@ def collect(
     from eval.judging.results import Journal
 
     course, manner = read_course(collection), Manner(speed=collection.speed)
-    check_records(collection.world)
+    check_records(collection.simulator)
     refuse_one_name({trial.track for trial in course.trials})
     asked = collection.policy or default_policy()
     policy = load_flier(asked, collection.trust, manner)
@@ -110,10 +110,10 @@ def _fly_missing(
     from eval.worlds.trial import Rules
 
     missing = [trial for trial in course.trials if trial not in rows]
-    workers = workers_for(len(missing), workers, collection.world)
-    what = f"{len(missing)} flights in the {collection.world} world"
-    announce(console, what, flying_needs(len(missing), workers, collection.world))
-    say_notes(console, collection.world, course)
+    workers = workers_for(len(missing), workers, collection.simulator)
+    what = f"{len(missing)} flights in {collection.simulator}"
+    announce(console, what, flying_needs(len(missing), workers, collection.simulator))
+    say_notes(console, collection.simulator, course)
     asked, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
     with console.progress("flights", len(course.trials)) as update:
 
@@ -130,7 +130,7 @@ def _fly_missing(
                 who_flies(policy, asked, collection.trust, workers, manner),
                 missing,
                 course.vehicle,
-                collection.world,
+                collection.simulator,
                 JudgeOptions(workers=workers, rules=Rules(time_limit_s=collection.time_limit_s)),
                 keep,
                 Record(depth=False),

@@ -81,14 +81,14 @@ def evaluate(
     ]
     _refuse_twice([flier.label for flier in fliers])
     count = len(course.trials)
-    workers = workers_for(count, workers, evaluation.world)
+    workers = workers_for(count, workers, evaluation.simulator)
     if (out / "trials.parquet").is_file():
         console.note(f"{out} holds an evaluation; its results will be written over")
     flown = count * len(fliers)
-    needs = flying_needs(flown, workers, evaluation.world)
+    needs = flying_needs(flown, workers, evaluation.simulator)
     journals = _open_journals(evaluation, course, fliers, out)
-    announce(console, f"{flown} trials in the {evaluation.world} world", needs)
-    say_notes(console, evaluation.world, course)
+    announce(console, f"{flown} trials in {evaluation.simulator}", needs)
+    say_notes(console, evaluation.simulator, course)
     for doubt in dict.fromkeys(each for policy in policies for each in notes_of(policy)):
         console.note(str(doubt))
     results: list[TrialResult] = []
@@ -219,7 +219,7 @@ def _open_journals(
             "speed": flier.manner.speed,
             "vehicle": course.vehicle,
             "sensors": course.sensors,
-            "world": evaluation.world,
+            "world": evaluation.simulator,
             "deadline_s": evaluation.deadline_s,
             "time_limit_s": evaluation.time_limit_s,
             "tracks": course.tracks,
@@ -269,7 +269,7 @@ def _fly_one(
                 who_flies(flier.policy, flier.source, evaluation.trust, workers, flier.manner),
                 missing,
                 course.vehicle,
-                evaluation.world,
+                evaluation.simulator,
                 options,
                 keep,
                 tracks=course.tracks,

@@ -131,12 +131,12 @@ def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Cou
     from eval.worlds import differences, world_class
     from eval.worlds.engine import refuse_start_contact
 
-    world_class(wanted.world)
+    world_class(wanted.simulator)
     check_ranges(wanted, options=True)
     names = parse_tracks(wanted.track)
     vehicle = load_vehicle(wanted.vehicle)
     sensors = load_sensors(wanted.sensors) if isinstance(wanted, Evaluation) else PERFECT
-    flown_otherwise, notes = differences(wanted.world, vehicle), list[str]()
+    flown_otherwise, notes = differences(wanted.simulator, vehicle), list[str]()
     levels, tracks = parse_levels(wanted.difficulty), custom_tracks(names)
     by_chance = sensors.models or any(EFFECTS[name].random for name in vehicle.effects)
     once = not (real_time or by_chance)

@@ -41,6 +41,8 @@ def read_evaluation(folder: Path) -> Evaluation:
     try:
         record = read_json(path)
         config: dict[str, Any] = record["config"]
+        if "world" in config:  # its name before version 0.2
+            config["simulator"] = config.pop("world")
         names = {field.name for field in dataclasses.fields(Evaluation)}
         fits = "policies" in config and set(config) <= names
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -140,7 +142,7 @@ def fly_again(
         flier,
         trials,
         vehicle,
-        evaluation.world,
+        evaluation.simulator,
         options,
         keep,
         Record(depth=True),

@@ -33,7 +33,7 @@ class Evaluation:
     be given. Without it the shipped policy flies."""
     track: str = "all"
     """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
-    difficulty: str = "0"
+    difficulty: str = "0,3"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials = 10
     """Trials of every policy on every track at every level."""
@@ -41,7 +41,7 @@ class Evaluation:
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
-    world: str = "mujoco"
+    simulator: str = "mujoco"
     """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (another
     simulator; pip install diffracing-suite[rotorpy]), or one of an installed package."""
     sensors: str = "perfect"
@@ -76,7 +76,7 @@ class Collection:
     """Flights on every track at every level."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
-    world: str = "mujoco"
+    simulator: str = "mujoco"
     """As in suite eval."""
     time_limit_s: TimeLimit = 20.0
     """As in suite eval."""

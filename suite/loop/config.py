@@ -48,7 +48,7 @@ class LoopSize:
 SIZES = {"quick": LoopSize(20, 8, 500), "": LoopSize(50, 20, 1500)}
 """Sizes by recipe; "" is that of the others."""
 HIDDEN_SIZES = {"quick": LoopSize(20, 3, 200, 100), "": LoopSize(25, 3, 200, 60)}
-"""The same of a loop in a world with a hidden effect, as the page hidden_worlds shows it."""
+"""The same of a loop with a hidden vehicle, as the page hidden_worlds shows it."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class LoopConfig:
 
     @property
     def true_simulator(self) -> str:
-        """In which of the judge's worlds the true vehicle flies."""
+        """The simulator in which the true vehicle flies."""
         return OWN[0]
 
 
@@ -107,23 +107,23 @@ class DeltaLoopConfig(LoopConfig):
 
 @dataclass(frozen=True)
 class HiddenLoopConfig(LoopConfig):
-    """A loop in a world that the simulation's vehicle file does not describe."""
+    """A loop whose true vehicle the simulation's vehicle file does not describe."""
 
-    world: str
-    """What is true: a vehicle file; nothing but the flights in it is looked at."""
+    hidden_vehicle: str
+    """The true vehicle's file; the loop reads nothing of it but its flights."""
     simulator: str = OWN[0]
-    """In which of the judge's worlds it flies."""
+    """The simulator in which it flies."""
     delta: bool = True
     """Whether Delta Action Models are fitted, too, and policies fine-tuned under them."""
 
     @property
     def true_vehicle(self) -> str:
-        """What is judged and recorded: the hidden world's vehicle file."""
-        return self.world
+        """What is judged and recorded: the hidden vehicle's file."""
+        return self.hidden_vehicle
 
     @property
     def true_simulator(self) -> str:
-        """In which of the judge's worlds the true vehicle flies."""
+        """The simulator in which the true vehicle flies."""
         return self.simulator
 
 
@@ -143,7 +143,7 @@ def loop_by_content(config: LoopConfig) -> LoopConfig:
         policy = "a file"
     config = replace(config, policy=policy, vehicle=vehicle(config.vehicle))
     if isinstance(config, HiddenLoopConfig):
-        return replace(config, world=vehicle(config.world))
+        return replace(config, hidden_vehicle=vehicle(config.hidden_vehicle))
     return config
 
 
@@ -155,7 +155,8 @@ def recipe_of(policy: str | None) -> str:
 def resolve(
     *,
     recipe: str | None = None,
-    world: str | None = None,
+    hidden_vehicle: str | None = None,
+    simulator: str = OWN[0],
     policy: str | None = None,
     track: str = "all",
     difficulty: str = "0,3",
@@ -171,9 +172,9 @@ def resolve(
 ) -> LoopConfig:
     """Return the loop that a recipe and options ask for; None takes the recipe's size.
 
-    Without a recipe it is the policy's own. With a world nothing is trained from scratch: without
-    a policy the shipped default flies. Where a policy is given, `changes` are of its fine-tuning as
-    it is, else of the recipe that the fine-tuning follows from.
+    Without a recipe it is the policy's own. With a hidden vehicle or another simulator nothing is
+    trained from scratch: without a policy the shipped default flies. Where a policy is given,
+    `changes` are of its fine-tuning as it is, else of the recipe that the fine-tuning follows from.
 
     Raises:
         ValueError: for an option that cannot be used, naming it and what is allowed.
@@ -184,38 +185,43 @@ def resolve(
     from suite.judging.content import policy_digest
     from suite.judging.flying import checkpoint_folder, default_policy
 
-    if world is not None and policy is None:
+    hidden = hidden_vehicle is not None or simulator != OWN[0]
+    if hidden and policy is None:
         policy = default_policy()
     recipe = recipe_of(policy) if recipe is None else recipe
-    training, simulator = replace(named_recipe(recipe), seed=seed), OWN[0]
-    sizes = SIZES if world is None else HIDDEN_SIZES
+    training = replace(named_recipe(recipe), seed=seed)
+    sizes = HIDDEN_SIZES if hidden else SIZES
     size = sizes.get(recipe, sizes[""])
     if iterations is not None:
         training = with_iterations(training, iterations)
     simulated = load_vehicle(vehicle)
     digests = {"vehicle": digest_of(simulated)}
     _check_changes(changes, policy, iterations)
-    if not delta and world is None:
-        raise ValueError("--no-delta: the loop is about the Delta Action Model; give --world, too")
+    if not delta and not hidden:
+        raise ValueError(
+            "--no-delta: without --hidden-vehicle the loop is about the Delta Action Model; leave "
+            "--no-delta out, or give a hidden vehicle"
+        )
     if not delta and fit_iterations is not None:
         raise ValueError(
             f"--fit-iterations is {fit_iterations}, but with --no-delta no Delta Action Model is "
             "fitted; leave one of the two out"
         )
-    if world is None and policy is None:
+    if not hidden and policy is None:
         training = changed(training, changes)
         check_phases(training)
-    if world is not None:
+    true_vehicle = vehicle if hidden_vehicle is None else hidden_vehicle
+    if hidden:
         refuse_own_motion(simulated)
-        simulator, world = parse_world(world, vehicle)
-        true = load_vehicle(world)
+        check_simulator(simulator)
+        true = load_vehicle(true_vehicle)
         if simulated == replace(true, name=simulated.name) and simulator in OWN:
             raise ValueError(
-                f"--world {world} is the simulation's vehicle {vehicle}: nothing is hidden; give a "
-                "vehicle file with an effect more, such as examples/hidden.toml, or another "
-                "simulator, such as rotorpy"
+                f"--hidden-vehicle {true_vehicle} is the simulation's vehicle {vehicle}: nothing "
+                "is hidden; give a vehicle file with an effect more, such as examples/hidden.toml, "
+                "or another simulator, such as --simulator rotorpy"
             )
-        digests["world"] = digest_of(true)
+        digests["hidden_vehicle"] = digest_of(true)
     if policy is not None:
         given = load_policy_checkpoint(checkpoint_folder(policy))
         last = phase_configs(training)[-1]
@@ -225,7 +231,7 @@ def resolve(
     longer = size.finetune_iterations if finetune_iterations is None else finetune_iterations
     if longer is not None:
         tuning = with_iterations(tuning, longer)
-    if world is not None:
+    if hidden:
         tuning = with_quadrotor(tuning, simulated)
     if policy is not None:
         tuning = override(tuning, changes)
@@ -245,9 +251,11 @@ def resolve(
     )
     check_ranges(config)
     _check_seeds(config)
-    if world is None:
+    if not hidden:
         return DeltaLoopConfig(training=training, **vars(config))
-    return HiddenLoopConfig(world=world, simulator=simulator, delta=delta, **vars(config))
+    return HiddenLoopConfig(
+        hidden_vehicle=true_vehicle, simulator=simulator, delta=delta, **vars(config)
+    )
 
 
 def _check_changes(changes: Sequence[str], policy: str | None, iterations: int | None) -> None:
@@ -264,30 +272,25 @@ def _check_changes(changes: Sequence[str], policy: str | None, iterations: int |
         owned["spec"] = "a policy keeps the one that it was trained with"
         if iterations is not None:
             raise ValueError(
-                f"--iterations is {iterations}, but with --policy or --world nothing is trained "
-                "from scratch; say how long to fine-tune with --finetune-iterations"
+                f"--iterations is {iterations}, but with --policy, --hidden-vehicle or "
+                "--simulator nothing is trained from scratch; say how long to fine-tune with "
+                "--finetune-iterations"
             )
     check_owned(changes, owned)
 
 
-def parse_world(text: str, vehicle: str) -> tuple[str, str]:
-    """Return the simulator and the vehicle that `--world` means.
-
-    Args:
-        text: a vehicle (in MuJoCo), SIMULATOR (the simulation's vehicle in it), or both as
-            SIMULATOR:VEHICLE.
-        vehicle: the simulation's.
+def check_simulator(name: str) -> None:
+    """Refuse a simulator that cannot fly a true vehicle.
 
     Raises:
-        ValueError: where the simulator lacks a package.
+        ValueError: where there is no such simulator, where it lacks a package, or where it records
+            no flights.
     """
-    from eval.worlds import REFERENCE, WORLDS, world_class
+    from eval.judging.judge import check_records
+    from eval.worlds import world_class
 
-    simulator, _, flown = text.partition(":")
-    if simulator not in WORLDS or simulator == REFERENCE:
-        return OWN[0], text
-    world_class(simulator)
-    return simulator, flown or vehicle
+    world_class(name)
+    check_records(name)
 
 
 def _check_seeds(config: LoopConfig) -> None:

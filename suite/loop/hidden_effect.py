@@ -1,6 +1,6 @@
-"""The loop in a world with an effect that the simulation lacks: named, and trained for.
+"""The loop with an effect that the simulation lacks: named, and trained for.
 
-The hidden world's file is read by the judge alone. The simulation learns of it through the
+The hidden vehicle's file is read by the judge alone. The simulation learns of it through the
 measured flights only.
 """
 
@@ -67,7 +67,7 @@ def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResu
             "tracks": config.track,
             "levels": config.difficulty,
             "simulation's vehicle": config.vehicle,
-            "hidden world": config.world,
+            "hidden vehicle": config.hidden_vehicle,
             "flown in": config.simulator,
         },
         chart=Picture(success_chart(stand, LABELS), "Bars: 95 % intervals over trials."),
@@ -80,15 +80,15 @@ def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResu
 
 
 def place(config: HiddenLoopConfig) -> str:
-    """Return what a sentence calls the hidden world."""
-    return "the hidden world" if config.simulator in OWN else f"the world {config.simulator}"
+    """Return what a sentence calls the hidden vehicle."""
+    return "the hidden vehicle" if config.simulator in OWN else f"the simulator {config.simulator}"
 
 
 def verdict(
     stand: Sequence[Standing],
     diagnosis: Mapping[str, Any],
     trials: int,
-    where: str = "the hidden world",
+    where: str = "the hidden vehicle",
 ) -> str:
     """Return in a few sentences what the loop showed; `where` the policies were judged."""
     by_name = {one.name: one for one in stand}
@@ -141,12 +141,12 @@ def _diagnosis(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Sectio
 
 
 def what_is_hidden(config: HiddenLoopConfig) -> list[str]:
-    """Return in sentences what is true of the hidden world and the simulation does not know."""
-    simulated, true = load_vehicle(config.vehicle), load_vehicle(config.world)
+    """Return in sentences what is true of the hidden vehicle and the simulation does not know."""
+    simulated, true = load_vehicle(config.vehicle), load_vehicle(config.hidden_vehicle)
     more = hidden_effects(simulated, true)
-    hidden = [f"What the world's file holds and the simulation's does not: {more}."]
+    hidden = [f"What the hidden vehicle's file holds and the simulation's does not: {more}."]
     if simulated == true:
-        hidden = ["The world's vehicle file is the simulation's."]
+        hidden = ["The hidden vehicle's file is the simulation's."]
     if config.simulator not in OWN:
         otherwise = "; ".join(differences(config.simulator, true)) or "nothing"
         hidden.append(f"What {config.simulator} flies otherwise than the file says: {otherwise}.")
@@ -201,7 +201,7 @@ LOOP = Loop(
     hidden=True,
     variants=(
         Variant(NOMINAL, "judging the policy in the simulation's vehicle", simulated=True),
-        Variant(BEFORE, "judging the policy in the hidden world"),
+        Variant(BEFORE, "judging the policy with the hidden vehicle"),
         Variant(
             CONTROL,
             JUDGED.format("as the control"),
@@ -242,9 +242,9 @@ LOOP = Loop(
         ),
     ),
     find=find,
-    reading="The first policy flies in the simulation's vehicle and in the hidden world; the "
+    reading="The first policy flies in the simulation's vehicle and with the hidden vehicle; the "
     "others are fine-tuned from it, for as many iterations on the same random tracks, and fly in "
-    "the hidden world on the same trials. The control is fine-tuned through the simulation's "
+    "the hidden vehicle on the same trials. The control is fine-tuned through the simulation's "
     "quadrotor as it is, the others through it with its Delta Action Model, through the quadrotor "
     "corrected by the named effect, and through that with a Delta Action Model of what it still "
     "lacks. The judge flies the policies alone.",
@@ -267,9 +267,9 @@ WITHOUT_DELTA = replace(
     LOOP,
     variants=[variant for variant in LOOP.variants if variant.delta is None],
     models=(),
-    reading="The first policy flies in the simulation's vehicle and in the hidden world; the "
+    reading="The first policy flies in the simulation's vehicle and with the hidden vehicle; the "
     "others are fine-tuned from it, for as many iterations on the same random tracks, and fly in "
-    "the hidden world on the same trials. The control is fine-tuned through the simulation's "
+    "the hidden vehicle on the same trials. The control is fine-tuned through the simulation's "
     "quadrotor as it is, the other through the quadrotor corrected by the named effect.",
 )
 """The same without Delta Action Models, in half the time."""

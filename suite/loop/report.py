@@ -39,7 +39,7 @@ def write_loop_report(
 
 
 def _flights(out: Path, loop: Loop) -> list[Section]:
-    where = ", in the hidden world" if loop.hidden else ""
+    where = ", with the hidden vehicle" if loop.hidden else ""
     words = (
         "The first seed of every track at the easiest and the hardest level, from above"
         f"{where}. Gates that were passed are green; a star is a finished trial, a cross where it "

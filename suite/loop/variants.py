@@ -1,6 +1,6 @@
 """A loop as data: the policies that it compares, what each is tuned through and judged in.
 
-A loop's folder holds train/ (or given/), eval-X/ of the first policy, flights/, in a hidden world
+A loop's folder holds train/ (or given/), eval-X/ of the first policy, flights/, in a hidden vehicle
 measured/ and diagnosis/, a folder for each Delta Action Model, tuned-X/ and eval-X/ of each
 fine-tuned policy X, and replays/; then table.md, loop.json, report.html and recording.rrd.
 """

@@ -118,9 +118,9 @@ def _begin(run: LoopRun) -> Stage:
     return Stage("given", f"taking {given} instead of training", Estimate(0, 0), copy)
 
 
-def _flying(run: LoopRun, trials: int, world: str) -> Estimate:
-    """Return about how long `trials` take in `world`, and their memory."""
-    return flying_needs(trials, workers_for(trials, run.workers, world), world)
+def _flying(run: LoopRun, trials: int, simulator: str) -> Estimate:
+    """Return about how long `trials` take in `simulator`, and their memory."""
+    return flying_needs(trials, workers_for(trials, run.workers, simulator), simulator)
 
 
 def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
@@ -132,7 +132,7 @@ def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
         trials=config.trials,
         seed=config.seed,
         vehicle=config.vehicle if variant.simulated else config.true_vehicle,
-        world=OWN[0] if variant.simulated else config.true_simulator,
+        simulator=OWN[0] if variant.simulated else config.true_simulator,
     )
 
 
@@ -148,7 +148,7 @@ def _judge(run: LoopRun, variant: Variant) -> Stage:
         run.console.note(f"    {words}")
 
     judged = run.config.trials * run.config.cells
-    needs = _flying(run, judged, _evaluation(run, variant).world)
+    needs = _flying(run, judged, _evaluation(run, variant).simulator)
     return Stage(f"eval-{variant.name}", variant.judged, needs, work, tell)
 
 
@@ -161,7 +161,7 @@ def _record(run: LoopRun) -> Stage:
         difficulty=config.difficulty,
         trials=config.flights,
         vehicle=config.true_vehicle,
-        world=config.true_simulator,
+        simulator=config.true_simulator,
         seed=config.recorded_from,
     )
     return Stage(
@@ -323,4 +323,4 @@ def _replay(run: LoopRun) -> Stage:
         write_recording(folder.parent / "recording.rrd", pairs, drone)
 
     words = "flying a few trials again for the recording and the pictures"
-    return Stage("replays", words, _flying(run, 12, evaluation.world), work)
+    return Stage("replays", words, _flying(run, 12, evaluation.simulator), work)

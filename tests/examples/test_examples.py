@@ -14,12 +14,12 @@ import pytest
 from eval.effects import EFFECTS
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle
+from suite.commands import train as train_command
 from suite.delta.run import flight_files
 from suite.diagnose import run as diagnose_run
-from suite.train import recipes
 from suite.train.overrides import override
 
-RECIPE, DIAGNOSE = recipes.named_recipe, diagnose_run.diagnose_files
+RECIPE, DIAGNOSE = train_command.named_recipe, diagnose_run.diagnose_files
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = {
     "fly_and_plot": (["."], "8 gates, finished", ["trial.png", "trial.gif", "trial.rrd"]),
@@ -58,7 +58,7 @@ def test_every_example_is_run_here_and_shown_to_newcomers():
 def as_a_program(tmp_path, monkeypatch):
     """Run in an empty folder, train in few worlds; effects that a program adds go again."""
     few = ("episode.batch=4", "episode.steps=8")
-    monkeypatch.setattr(recipes, "named_recipe", lambda name: override(RECIPE(name), few))
+    monkeypatch.setattr(train_command, "named_recipe", lambda name: override(RECIPE(name), few))
     monkeypatch.chdir(tmp_path)
     for table in ("_entries", "_values"):
         monkeypatch.setattr(EFFECTS, table, dict(getattr(EFFECTS, table)))

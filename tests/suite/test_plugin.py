@@ -57,7 +57,7 @@ def test_all_four_are_used_by_commands(installed, tmp_path, root):
         [time_s[:, None], circle, level, 0.0 * circle, 800.0 + 0.0 * level], axis=1
     )
     np.savetxt(tmp_path / "flight.simlog", rows, header="simlog")
-    fly = "eval --policy race-paper --track staircase --trials 1 --workers 1 --world"
+    fly = "eval --policy race-paper --track staircase --trials 1 --workers 1 --simulator"
     effects, tracks, drawn, imported, *flown = suite(
         [
             "effects",

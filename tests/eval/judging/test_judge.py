@@ -20,7 +20,7 @@ SHORT = Rules(time_limit_s=0.3)
 
 
 def test_unknown_names_are_refused_before_anything_flies():
-    with pytest.raises(ValueError, match=r"unknown world 'mujoko'.*Did you mean 'mujoco'"):
+    with pytest.raises(ValueError, match=r"unknown simulator 'mujoko'.*Did you mean 'mujoco'"):
         fly(Pursuit(), [TrialSpec("zigzag", 0, 0)], VEHICLE, "mujoko")
     with pytest.raises(ValueError, match="zigzac"):
         fly(Pursuit(), [TrialSpec("zigzac", 0, 0)], VEHICLE)

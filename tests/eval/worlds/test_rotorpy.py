@@ -57,7 +57,7 @@ def test_without_rotorpy_the_install_line_is_said(missing, monkeypatch, tmp_path
     with pytest.raises(ValueError, match="world 'rotorpy' needs the package") as refused:
         world_class("rotorpy")
     assert line in str(refused.value)
-    assert main(["eval", "--world", "rotorpy", "--out", str(tmp_path / "out")]) == 2
+    assert main(["eval", "--simulator", "rotorpy", "--out", str(tmp_path / "out")]) == 2
     assert line in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 

@@ -123,7 +123,7 @@ def rotorpy(monkeypatch):
 
 
 def test_a_policy_in_two_worlds_and_a_control(sky, rotorpy, tmp_path):
-    args = ["--policy", "race-paper", "--world", "rotorpy", "--trials", "1", "--difficulty", "0"]
+    args = "--policy race-paper --simulator rotorpy --trials 1 --difficulty 0".split()
     sky.stop_after = 4
     assert reproduce(tmp_path, "worlds", *args) == 130
     assert reproduce(tmp_path, "worlds", *args) == 0

@@ -27,9 +27,9 @@ def test_an_experiment_that_does_not_exist_is_code_2(capsys):
         ("table2 --delta-policy nowhere/policy", "nowhere/policy: no such file"),
         ("table2 --vehicle referense", "Did you mean 'reference'?"),
         ("worlds --policy {folder}/mine.pt2", "suite reproduce does of no policy"),
-        ("worlds --world reference", "--world reference: flies as mujoco does"),
-        ("worlds --world rotorpi", "Did you mean 'rotorpy'?"),
-        ("worlds --world mjx --world mjx", "--world mjx is given twice"),
+        ("worlds --simulator reference", "--simulator reference: flies as mujoco does"),
+        ("worlds --simulator rotorpi", "Did you mean 'rotorpy'?"),
+        ("worlds --simulator mjx --simulator mjx", "--simulator mjx is given twice"),
         ("robustness --only linear_darg", "Did you mean 'linear_drag'?"),
         (
             "robustness --policy race-paper --policy race-paper",

@@ -115,7 +115,7 @@ def test_what_cannot_be_recorded_is_refused(pilots, tmp_path, capfd):
     tracks = ",".join(str(tmp_path / name / "course.toml") for name in "ab")
     for args, words in (
         (["--track", tracks], "more than one is called 'course'"),
-        (["--world", "reference"], "'reference' records no flights; record in 'mujoco'"),
+        (["--simulator", "reference"], "'reference' records no flights; record in 'mujoco'"),
     ):
         asked = ["--policy", pilots["diver"], "--out", str(tmp_path / "out")]
         assert cli.main(["collect", *args, *asked]) == 2

@@ -14,6 +14,7 @@ from suite.judging.requests import Manner
 
 
 def _eval(out, *args):
+    args = args if "--difficulty" in args else (*args, "--difficulty", "0")
     return cli.main(["eval", "--out", str(out), *args])
 
 
@@ -156,11 +157,11 @@ def test_a_later_policys_journal_is_looked_at_before_the_first_flight(
         (["--difficulty", "10"], "level 10 is not 0 to 9"),
         (["--track", "zigzg"], "Did you mean 'zigzag'?"),
         (["--track", "no_such.toml"], "no_such.toml"),
-        (["--world", "mujco"], "Did you mean 'mujoco'?"),
+        (["--simulator", "mujco"], "Did you mean 'mujoco'?"),
         (["--vehicle", "referense"], "Did you mean 'reference'?"),
         (["--policy", "nobody_we_know"], "nobody_we_know"),
         (["--rerun", "trials.mp4"], "must end in .rrd"),
-        (["--rerun", "trials.rrd", "--world", "reference"], "'reference' records no flights"),
+        (["--rerun", "trials.rrd", "--simulator", "reference"], "'reference' records no flights"),
         (["--rerun", "/proc/nowhere/trials.rrd"], "/proc/nowhere"),
     ],
 )
@@ -197,7 +198,7 @@ def test_what_tables_would_take_for_one_is_refused(pilots, tmp_path, monkeypatch
 @pytest.mark.slow
 def test_the_mjx_world_flies_more_trials_than_it_has_slots(pilots, tmp_path):
     asked = ["--policy", pilots["diver"], "--track", "zigzag", "--trials", "150"]
-    assert _eval(tmp_path / "mjx", *asked, "--world", "mjx") == 0
+    assert _eval(tmp_path / "mjx", *asked, "--simulator", "mjx") == 0
     assert _eval(tmp_path / "mujoco", *asked) == 0
     ends = [
         [row.ended_by for row in read_trials(tmp_path / world / "trials.parquet")]

@@ -31,6 +31,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def _eval(out, *args):
+    args = args if "--difficulty" in args else (*args, "--difficulty", "0")
     return cli.main(["eval", "--out", str(out), *args])
 
 
@@ -86,7 +87,16 @@ def test_what_a_world_flies_otherwise_is_said_once_and_written(
     pilots, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr("eval.worlds.rotorpy.rotorpy", lambda: STAND_IN)
-    args = ["--world", "rotorpy", "--track", "zigzag", "--trials", "2", "--policy", pilots["diver"]]
+    args = [
+        "--simulator",
+        "rotorpy",
+        "--track",
+        "zigzag",
+        "--trials",
+        "2",
+        "--policy",
+        pilots["diver"],
+    ]
     assert _eval(tmp_path / "out", *args) == 0
     said = capsys.readouterr().err
     assert said.count("rotorpy: linear_drag: RotorPy's drag goes with the rotors' speed") == 1

@@ -18,6 +18,7 @@ from tests.support.recordings import columns
 
 
 def _eval(out, *args):
+    args = args if "--difficulty" in args else (*args, "--difficulty", "0")
     return cli.main(["eval", "--out", str(out), *args])
 
 

@@ -12,12 +12,12 @@ from policies import shipped
 from suite import cli
 from suite.common.errors import WorkFailed
 from suite.common.stages import is_done
+from suite.common.usage import renamed
 from suite.loop import delta_action, hidden_effect, work
 from suite.loop.config import (
     DeltaLoopConfig,
     HiddenLoopConfig,
     loop_by_content,
-    parse_world,
     recipe_of,
     resolve,
 )
@@ -45,7 +45,7 @@ EXAMPLE = "examples/hidden.toml"
         (["--finetune-iterations", "0"], "--finetune-iterations is 0"),
         (["--fit-iterations", "0"], "--fit-iterations is 0"),
         (["--set", "loss.progres=1"], "Did you mean 'progress'?"),
-        (["--no-delta"], "--no-delta: the loop is about the Delta Action Model"),
+        (["--no-delta"], "without --hidden-vehicle the loop is about the Delta Action Model"),
         (["--set", "seed=5"], "this command sets seed; give --seed"),
         (["--set", "optimizer.iterations=5"], "give --iterations"),
         (
@@ -58,18 +58,21 @@ EXAMPLE = "examples/hidden.toml"
         ),
         (
             ["--policy", "race-paper", "--iterations", "5"],
-            "--iterations is 5, but with --policy or",
+            "--iterations is 5, but with --policy, --hidden-vehicle or",
         ),
-        (["--world", "reference"], "nothing is hidden"),
-        (["--world", "mjx"], "nothing is hidden"),
-        (["--world", "nowhere.toml"], "nowhere.toml: no such file"),
-        (["--world", "mujoco:nowhere.toml"], "nowhere.toml: no such file"),
-        (["--world", EXAMPLE, "--iterations", "5"], "--finetune-iterations"),
-        (["--world", EXAMPLE, "--no-delta", "--fit-iterations", "5"], "--fit-iterations is 5, but"),
-        (["--world", EXAMPLE, "--policy", "nobody.onnx"], "needs a checkpoint's folder"),
-        (["--world", EXAMPLE, "--track", "my.toml"], "cannot be held apart"),
-        (["--world", EXAMPLE, "--flights", "0"], "--flights is 0"),
-        (["--world", EXAMPLE, "--set", "quadrotor.mas_std=0"], "Did you mean 'mass_std'"),
+        (["--hidden-vehicle", "reference"], "nothing is hidden"),
+        (["--simulator", "mjx"], "nothing is hidden"),
+        (["--hidden-vehicle", "nowhere.toml"], "nowhere.toml: no such file"),
+        (["--simulator", "reference"], "records no flights"),
+        (["--hidden-vehicle", EXAMPLE, "--iterations", "5"], "--finetune-iterations"),
+        (
+            ["--hidden-vehicle", EXAMPLE, "--no-delta", "--fit-iterations", "5"],
+            "--fit-iterations is 5, but",
+        ),
+        (["--hidden-vehicle", EXAMPLE, "--policy", "nobody.onnx"], "needs a checkpoint's folder"),
+        (["--hidden-vehicle", EXAMPLE, "--track", "my.toml"], "cannot be held apart"),
+        (["--hidden-vehicle", EXAMPLE, "--flights", "0"], "--flights is 0"),
+        (["--hidden-vehicle", EXAMPLE, "--set", "quadrotor.mas_std=0"], "Did you mean 'mass_std'"),
     ],
 )
 def test_what_cannot_be_used_is_said_before_anything_is_written(
@@ -89,7 +92,7 @@ def test_a_copy_under_another_name_hides_nothing(tmp_path, root):
     copy.write_text(text.replace('name = "racer5"', 'name = "another"'), encoding="utf-8")
     assert load_vehicle(copy) != load_vehicle("racer5")
     with pytest.raises(ValueError, match="nothing is hidden"):
-        resolve(recipe="quick", vehicle="racer5", world=str(copy))
+        resolve(recipe="quick", vehicle="racer5", hidden_vehicle=str(copy))
 
 
 def test_a_load_on_a_line_may_be_hidden_but_not_known(tmp_path, monkeypatch, root):
@@ -97,9 +100,11 @@ def test_a_load_on_a_line_may_be_hidden_but_not_known(tmp_path, monkeypatch, roo
     monkeypatch.chdir(root)
     loaded = str(tmp_path / "loaded.toml")
     save_vehicle(with_effects(slung_load=(0.05, 0.5)), loaded)
-    assert resolve(recipe="quick", vehicle="reference", world=loaded).true_vehicle == loaded
+    assert (
+        resolve(recipe="quick", vehicle="reference", hidden_vehicle=loaded).true_vehicle == loaded
+    )
     with pytest.raises(ValueError, match="effects.slung_load has a motion of its own"):
-        resolve(recipe="quick", vehicle=loaded, world="reference")
+        resolve(recipe="quick", vehicle=loaded, hidden_vehicle="reference")
 
 
 def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
@@ -111,12 +116,12 @@ def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
     assert loop.tuning.optimizer.rate < loop.training.optimizer.rate
     assert loop.tuning.seed != loop.training.seed and loop.true_simulator == "mujoco"
     assert (loop.recorded_from, loop.cells, loop.true_vehicle) == (100_003, 6, "reference")
-    hidden = resolve(recipe="race", world=EXAMPLE)
+    hidden = resolve(recipe="race", hidden_vehicle=EXAMPLE)
     assert isinstance(hidden, HiddenLoopConfig)
     assert (hidden.trials, hidden.flights, hidden.fit.iterations) == (25, 3, 200)
     assert hidden.tuning.optimizer.iterations == 60 and hidden.tuning.quadrotor is not None
     assert hidden.true_vehicle == EXAMPLE and hidden.policy == shipped.DEFAULT
-    assert set(hidden.digests) == {"vehicle", "world", "policy"}
+    assert set(hidden.digests) == {"vehicle", "hidden_vehicle", "policy"}
 
 
 @pytest.mark.parametrize(
@@ -127,8 +132,8 @@ def test_a_policy_is_fine_tuned_by_its_own_recipe(policy, recipe, root, monkeypa
     monkeypatch.chdir(root)
     assert resolve(policy=policy) == resolve(policy=policy, recipe=recipe)
     hidden = recipe_of(policy or shipped.DEFAULT)
-    assert resolve(policy=policy, world=EXAMPLE) == resolve(
-        policy=policy, world=EXAMPLE, recipe=hidden
+    assert resolve(policy=policy, hidden_vehicle=EXAMPLE) == resolve(
+        policy=policy, hidden_vehicle=EXAMPLE, recipe=hidden
     )
 
 
@@ -154,11 +159,13 @@ def test_where_files_lie_makes_no_other_loop(root, monkeypatch, tmp_path):
     monkeypatch.chdir(root)
     moved = tmp_path / "hidden.toml"
     moved.write_bytes((root / EXAMPLE).read_bytes())
-    here, there = (resolve(recipe="quick", world=str(path)) for path in (EXAMPLE, moved))
+    here, there = (resolve(recipe="quick", hidden_vehicle=str(path)) for path in (EXAMPLE, moved))
     assert here != there and loop_by_content(here) == loop_by_content(there)
     other = tmp_path / "other" / "hidden.toml"
     save_vehicle(with_effects(com_offset=((0.005, 0.0, 0.0),)), other)
-    assert loop_by_content(resolve(recipe="quick", world=str(other))) != loop_by_content(here)
+    assert loop_by_content(resolve(recipe="quick", hidden_vehicle=str(other))) != loop_by_content(
+        here
+    )
 
 
 def test_a_folder_called_like_something_shipped_makes_no_other_loop(tmp_path, monkeypatch):
@@ -166,7 +173,9 @@ def test_a_folder_called_like_something_shipped_makes_no_other_loop(tmp_path, mo
     monkeypatch.chdir(tmp_path)
 
     def asked():
-        return loop_by_content(resolve(recipe="quick", policy="race-paper", world="racer5"))
+        return loop_by_content(
+            resolve(recipe="quick", policy="race-paper", hidden_vehicle="racer5")
+        )
 
     begun = asked()
     for name in ("race-paper", "racer5", "reference"):
@@ -176,9 +185,9 @@ def test_a_folder_called_like_something_shipped_makes_no_other_loop(tmp_path, mo
         (tmp_path / name).rmdir()
     shutil.copytree(shipped.folder("race-paper"), tmp_path / "mine")
     save_vehicle(load_vehicle("racer5"), tmp_path / "racer5")
-    own = loop_by_content(resolve(recipe="quick", policy="mine", world="racer5"))
+    own = loop_by_content(resolve(recipe="quick", policy="mine", hidden_vehicle="racer5"))
     assert isinstance(own, HiddenLoopConfig) and own.digests == begun.digests
-    assert (own.policy, own.world, own.vehicle) == ("a file", "a file", "reference")
+    assert (own.policy, own.hidden_vehicle, own.vehicle) == ("a file", "a file", "reference")
 
 
 @pytest.fixture
@@ -186,23 +195,26 @@ def rotorpy(monkeypatch):
     monkeypatch.setattr(rotorpy_world, "rotorpy", lambda: STAND_IN)
 
 
+def test_another_simulator_hides_what_it_does_otherwise(rotorpy):
+    config = resolve(recipe="quick", simulator="rotorpy")
+    assert isinstance(config, HiddenLoopConfig)
+    assert (config.true_vehicle, config.true_simulator) == ("reference", "rotorpy")
+
+
 @pytest.mark.parametrize(
-    ("text", "meant"),
+    ("old", "new"),
     [
-        (EXAMPLE, ("mujoco", EXAMPLE)),
-        ("racer5", ("mujoco", "racer5")),
-        ("reference", ("mujoco", "reference")),
-        ("rotorpy", ("rotorpy", "racer5")),
-        (f"rotorpy:{EXAMPLE}", ("rotorpy", EXAMPLE)),
-        ("mjx:reference", ("mjx", "reference")),
+        (["--world", "mine.toml"], ["--hidden-vehicle", "mine.toml"]),
+        (["--world=rotorpy"], ["--simulator", "rotorpy"]),
+        (
+            ["--seed", "1", "--world", "rotorpy:mine.toml"],
+            ["--seed", "1", "--simulator", "rotorpy", "--hidden-vehicle", "mine.toml"],
+        ),
     ],
 )
-def test_a_world_is_a_vehicle_a_simulator_or_both(text, meant, rotorpy):
-    assert parse_world(text, "racer5") == meant
-    if text == "rotorpy":
-        config = resolve(recipe="quick", world=text)
-        assert isinstance(config, HiddenLoopConfig)
-        assert (config.true_vehicle, config.true_simulator) == ("reference", "rotorpy")
+def test_the_old_option_is_taken_with_a_note(old, new):
+    args, (note,) = renamed("loop", old)
+    assert args == new and "--world is now" in note and "0.2" in note
 
 
 LOOPS = (delta_action.LOOP, hidden_effect.LOOP)

@@ -1,4 +1,4 @@
-"""suite loop --world: a hidden effect is flown, named, trained for; nothing else leaks.
+"""suite loop --hidden-vehicle: a hidden effect is flown, named, trained for; nothing else leaks.
 
 As in the other loop's test the gradient step is a stand-in and trials are cut short; so are the
 diagnosis and the fit, which have tests of their own.
@@ -32,7 +32,7 @@ from tests.support.engines import STAND_IN
 from tests.support.loops import Small, trial_result
 
 EXAMPLE = "examples/hidden.toml"
-ARGS = ["--world", EXAMPLE, "--recipe", "quick", "--track", "zigzag", "--difficulty", "0"]
+ARGS = ["--hidden-vehicle", EXAMPLE, "--recipe", "quick", "--track", "zigzag", "--difficulty", "0"]
 ARGS += ["--trials", "3", "--flights", "3", "--finetune-iterations", "2", "--seed", "4"]
 ARGS += ["--set", "episode.batch=2"]
 TUNED = [variant.name for variant in LOOP.variants if variant.tuned]
@@ -214,20 +214,20 @@ def test_the_example_hides_one_effect(root):
 def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root, tmp_path):
     monkeypatch.chdir(root)
     monkeypatch.setattr("eval.worlds.rotorpy.rotorpy", lambda: STAND_IN)
-    config = resolve(recipe="quick", world="rotorpy:examples/rotorpy.toml")
+    config = resolve(recipe="quick", simulator="rotorpy", hidden_vehicle="examples/rotorpy.toml")
     assert isinstance(config, HiddenLoopConfig)
     run = work.LoopRun(LOOP, config, tmp_path, Quiet())
     judged = [work._evaluation(run, variant) for variant in LOOP.variants]
-    assert [one.world for one in judged] == ["mujoco"] + ["rotorpy"] * 5
+    assert [one.simulator for one in judged] == ["mujoco"] + ["rotorpy"] * 5
     assert [one.vehicle for one in judged] == ["reference"] + ["examples/rotorpy.toml"] * 5
-    assert place(config) == "the world rotorpy"
+    assert place(config) == "the simulator rotorpy"
     told = what_is_hidden(config)
     assert "rotor_drag (coefficient 7.8e-05 kg/rad)" in told[0] and "no linear_drag" in told[0]
     assert "the rotors' drag acts at each hub" in told[1]
-    same = resolve(recipe="quick", world="rotorpy")
+    same = resolve(recipe="quick", simulator="rotorpy")
     assert isinstance(same, HiddenLoopConfig)
     plain = what_is_hidden(same)
-    assert plain[0] == "The world's vehicle file is the simulation's."
+    assert plain[0] == "The hidden vehicle's file is the simulation's."
     assert "linear_drag: RotorPy's drag goes with the rotors' speed" in plain[1]
 
 

@@ -1,0 +1,65 @@
+"""`suite completion`: what a shell needs to complete commands and options."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import tyro
+
+from suite.common.console import Console
+from suite.common.usage import COMMANDS
+
+BASH = """_suite() {{
+    local word=${{COMP_WORDS[COMP_CWORD]}}
+    if [ "$COMP_CWORD" -eq 1 ]; then
+        COMPREPLY=($(compgen -W "{commands}" -- "$word"))
+        return
+    fi
+    local options=
+    case ${{COMP_WORDS[1]}} in
+{cases}
+    esac
+    COMPREPLY=()
+    case $word in -*) COMPREPLY=($(compgen -W "$options" -- "$word")) ;; esac
+}}
+complete -o default -F _suite suite
+"""
+"""A function of bash that completes commands and options, and files elsewhere."""
+ZSH = "#compdef suite\nautoload -U +X bashcompinit && bashcompinit\n"
+"""How zsh runs a function of bash."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Print a script that completes commands and options, for bash or zsh.
+
+    Put what it prints into ~/.local/share/bash-completion/completions/suite (bash), or into a file
+    _suite in a folder of fpath (zsh).
+    """
+
+    shell: tyro.conf.Positional[Literal["bash", "zsh"]]
+    """For which shell."""
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+
+def run(config: Config, console: Console) -> dict[str, Any]:
+    """Print the script for `config.shell`."""
+    cases = (f'    {name}) options="{" ".join(options_of(name))}" ;;' for name in COMMANDS)
+    script = BASH.format(commands=" ".join(COMMANDS), cases="\n".join(cases))
+    script = script if config.shell == "bash" else ZSH + script
+    console.say(script)
+    return {"script": script}
+
+
+def options_of(name: str) -> list[str]:
+    """Return the options of a command, such as --track."""
+    from tyro.extras import get_parser
+
+    command = importlib.import_module(f"suite.commands.{name}")
+    options = command.config_type([]) if hasattr(command, "config_type") else command.Config
+    parser = get_parser(options, config=(tyro.conf.FlagCreatePairsOff,))
+    found = {text for action in parser._actions for text in action.option_strings}
+    return sorted(text for text in found if text.startswith("--"))

@@ -1,0 +1,198 @@
+"""What `suite --help` prints: the commands in groups, examples of each, former options."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+GROUPS: dict[str, dict[str, str]] = {
+    "Fly": {
+        "eval": "judge policies: success rates, speeds and lap times, with intervals",
+        "compare": "compare success rates of evaluations on the same trials, with a test",
+        "view": "a recording, pictures and a video of trials",
+        "collect": "fly a policy and record every flight as a log",
+        "fly": "fly a policy in real time over MAVLink, as a companion computer does",
+    },
+    "Train": {
+        "train": "train a policy by backpropagation through quadrotors or a point mass",
+        "delta": "fit the Delta Action Model to recorded flights",
+        "loop": "train, fly, record, fit the Delta Action Model, fine-tune, fly again",
+        "export": "write a policy as torch program, ONNX and C",
+    },
+    "Logs": {
+        "import": "read a log of PX4, Betaflight, a Crazyflie, ROS 2 or a table",
+        "check": "find mistakes of unit, frame, sign and scale in logs, vehicle and policy files",
+        "identify": "estimate the parameters of a vehicle file from flight logs",
+        "diagnose": "name the physical effect that a vehicle file lacks, from flight logs",
+        "example": "write example flights: with a hidden effect, or of a real quadrotor",
+    },
+    "Develop": {
+        "list": "list tracks, vehicles, policies, recipes, effects, simulators, settings",
+        "tracks": "describe the track families, or draw a track",
+        "effects": "describe the physical effects that a vehicle file may hold",
+        "reproduce": "make the published tables and charts",
+        "blind": "test the diagnosis on cases with hidden effects: make, run, score",
+        "bench": "time a hot path against a plain implementation of the same",
+        "completion": "print the shell completion for bash or zsh",
+        "info": "versions, devices, memory and commit, for bug reports",
+    },
+}
+"""Group -> command -> one-line summary; the command NAME lives in suite/commands/NAME.py."""
+
+COMMANDS: dict[str, str] = {
+    name: summary for group in GROUPS.values() for name, summary in group.items()
+}
+"""Name -> one-line summary."""
+
+EXAMPLES: dict[str, tuple[str, ...]] = {
+    "eval": (
+        "suite eval --track ellipse --difficulty 9 --trials 50",
+        "suite eval --policy race --policy mine.onnx --difficulty 0,3 --trials 100",
+    ),
+    "compare": (
+        "suite compare runs/a runs/b",
+        "suite compare runs/mine --against runs/race",
+    ),
+    "view": (
+        "suite view runs/eval --pick failed --video",
+        "suite view race --track zigzag --difficulty 9 --seed 3 --gif",
+    ),
+    "collect": (
+        "suite collect --track circular --difficulty 0 --trials 4 --out runs/flights",
+        "suite collect --policy mine.onnx --vehicle mine.toml",
+    ),
+    "fly": ("suite fly", "suite fly --link udp:127.0.0.1:14540 --policy race"),
+    "train": (
+        "suite train --out runs/mine",
+        "suite train --recipe quick --vehicle mine.toml --model quad --out runs/quick",
+    ),
+    "delta": (
+        "suite delta runs/collect --out runs/delta",
+        "suite delta runs/collect --vehicle racer5 --out runs/delta",
+    ),
+    "loop": (
+        "suite loop --policy race --out runs/loop",
+        "suite loop --hidden-vehicle examples/hidden.toml --policy race-paper --recipe quick",
+    ),
+    "export": (
+        "suite export --policy runs/mine/policy --out runs/export",
+        "suite export --format c --out runs/c",
+    ),
+    "import": (
+        "suite import flight.ulg --out flight.parquet",
+        "suite import flight.csv --map mine.toml --out flight.parquet",
+    ),
+    "check": (
+        "suite check flight.parquet --vehicle mine.toml",
+        "suite check --policy mine.onnx",
+    ),
+    "identify": (
+        "suite identify flight.parquet --vehicle racer5 --out mine.toml",
+        "suite identify logs/*.parquet --vehicle mine.toml --out better.toml",
+    ),
+    "diagnose": (
+        "suite diagnose logs/*.parquet --vehicle mine.toml --out runs/diagnosis",
+        "suite diagnose today/*.parquet --reference lastweek/*.parquet --vehicle mine.toml",
+    ),
+    "example": ("suite example --out example", "suite example --real --out real"),
+    "list": ("suite list", "suite list policies"),
+    "tracks": ("suite tracks", "suite tracks ellipse --difficulty 9 --seed 3"),
+    "effects": ("suite effects", "suite effects linear_drag"),
+    "reproduce": ("suite reproduce status", "suite reproduce table2 --out docs/results"),
+    "blind": (
+        "suite blind make --out runs/blind",
+        "suite blind run --out runs/blind",
+    ),
+    "bench": ("suite bench", "suite bench train"),
+    "completion": ("suite completion bash", "suite completion zsh"),
+    "info": ("suite info", "suite info --json"),
+}
+"""Command -> examples that its help begins with."""
+
+JOINED = ("--track", "--difficulty")
+"""Options that take a list in one text; words behind them are joined with commas."""
+
+
+def overview() -> str:
+    """Return the text of `suite --help`."""
+    width = max(map(len, COMMANDS))
+    lines = [
+        "usage: suite COMMAND [options]",
+        "",
+        "Train drone racing policies through differentiable dynamics, judge them in MuJoCo, and",
+        "find out where simulation and flight logs disagree.",
+    ]
+    for title, commands in GROUPS.items():
+        lines += ["", f"{title}:"]
+        lines += [f"  {name:<{width}}  {summary}" for name, summary in commands.items()]
+    lines += [
+        "",
+        "Examples:",
+        "  suite eval --track ellipse --difficulty 9",
+        "  suite train --out runs/mine",
+        "  suite diagnose logs/*.parquet --vehicle mine.toml --out runs/diagnosis",
+        "",
+        "suite COMMAND --help lists a command's options; suite --version prints the version.",
+    ]
+    return "\n".join(lines)
+
+
+def description(name: str, about: str) -> str:
+    """Return the head of a command's help: its purpose, its examples, then what more there is."""
+    first, *more = [" ".join(part.split()) for part in about.split("\n\n")]
+    examples = "\n".join(f"  {line}" for line in EXAMPLES.get(name, ()))
+    return "\n\n".join([first, *([f"Examples:\n{examples}"] if examples else []), *more])
+
+
+def joined_lists(args: Sequence[str]) -> list[str]:
+    """Return `args` with the words behind an option of `JOINED` joined: `--track a b` is `a,b`."""
+    out: list[str] = []
+    open_list = fresh = False
+    for word in args:
+        if word.startswith("-"):
+            out.append(word)
+            open_list = word.partition("=")[0] in JOINED
+            fresh = open_list and "=" not in word
+        elif open_list and not fresh:
+            out[-1] += f",{word}"
+        else:
+            out.append(word)
+            fresh = False
+    return out
+
+
+def _simulator(value: str) -> list[str]:
+    return ["--simulator", value]
+
+
+def _hidden(value: str) -> list[str]:
+    """Return what `suite loop --world` meant: SIMULATOR, FILE, or SIMULATOR:FILE."""
+    from eval.worlds import WORLDS
+
+    simulator, _, vehicle = value.partition(":")
+    if simulator not in WORLDS:
+        return ["--hidden-vehicle", value]
+    return ["--simulator", simulator, *(["--hidden-vehicle", vehicle] if vehicle else [])]
+
+
+RENAMED: dict[str, dict[str, Callable[[str], list[str]]]] = {
+    "eval": {"--world": _simulator},
+    "collect": {"--world": _simulator},
+    "reproduce": {"--world": _simulator},
+    "loop": {"--world": _hidden},
+}
+"""Command -> option of an earlier version -> what it means now; they go with version 0.2."""
+
+
+def renamed(name: str, args: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return `args` with options of earlier versions replaced, and a note for each of them."""
+    old, out, notes = RENAMED.get(name, {}), list[str](), list[str]()
+    words = iter(args)
+    for word in words:
+        option, _, value = word.partition("=")
+        if option not in old:
+            out.append(word)
+            continue
+        new = old[option](value or next(words, ""))
+        out += new
+        notes.append(f"{option} is now {' '.join(new)}; {option} goes with version 0.2")
+    return out, notes

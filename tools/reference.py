@@ -1,0 +1,133 @@
+"""Write docs/reference: commands, Python names, training settings and effects, from the code.
+
+Run: python tools/reference.py [--check]; with --check it writes nothing and ends with 1 where a
+page is not what the code says.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import suite
+from eval.effects import EFFECTS
+from eval.effects.interface import at
+from eval.quadrotor.vehicle_file import load_vehicle
+from suite.common.settings import abouts, settings
+from suite.common.usage import EXAMPLES, GROUPS
+from suite.train.recipes import named_recipe
+
+PAGES = Path(__file__).resolve().parents[1] / "docs" / "reference"
+HEAD = "<!-- Made by tools/reference.py; change the code, not this page. -->\n"
+
+
+def cell(text: Any) -> str:
+    """Return a text for a cell of a table."""
+    return " ".join(str(text).split()).replace("|", "\\|")
+
+
+def options(cls: type) -> Iterator[tuple[str, str, str]]:
+    """Yield (option, default, meaning) of a command's configuration and of those within."""
+    hints, texts = get_type_hints(cls, include_extras=True), abouts(cls)
+    for field in fields(cls):
+        kind = getattr(hints[field.name], "__origin__", hints[field.name])
+        if is_dataclass(kind) and isinstance(kind, type):
+            yield from options(kind)
+            continue
+        notes = getattr(hints[field.name], "__metadata__", ())
+        named = next((n.name for n in notes if getattr(n, "name", None)), field.name)
+        positional = "Positional" in repr(notes)
+        name = field.name.upper() if positional else f"--{named.replace('_', '-')}"
+        if field.default is True:
+            name = f"--no-{named.replace('_', '-')}"
+        plain = isinstance(field.default, str | int | float) and not isinstance(field.default, bool)
+        yield name, str(field.default) if plain else "", texts.get(field.name, "")
+
+
+def commands() -> str:
+    """Return the page of commands."""
+    parts = ["# Commands, option by option\n"]
+    for group, table in GROUPS.items():
+        parts.append(f"## {group}\n")
+        for name, summary in table.items():
+            module = importlib.import_module(f"suite.commands.{name}")
+            parts.append(f"### suite {name}\n\n{summary[0].upper()}{summary[1:]}.\n")
+            parts.append("```sh\n" + "\n".join(EXAMPLES[name]) + "\n```\n")
+            rows = [
+                f"| `{option}` | {cell(default)} | {cell(about)} |"
+                for option, default, about in options(module.Config)
+                if option != "--json"
+            ]
+            if rows:
+                parts.append("\n".join(["| option | default | meaning |", "|---|---|---|", *rows]))
+                parts.append("")
+    return "\n".join(parts)
+
+
+def python() -> str:
+    """Return the page of the Python interface."""
+    parts = [f"# Python\n\n{inspect.getdoc(suite)}\n"]
+    for name in suite.__all__:
+        function = getattr(suite, name)
+        parts.append(f"## {name}\n\n```text\nsuite.{name}{inspect.signature(function)}\n```\n")
+        parts.append(f"```text\n{inspect.getdoc(function)}\n```\n")
+    return "\n".join(parts)
+
+
+def training() -> str:
+    """Return the page of the settings of a training."""
+    rows = [
+        f"| `{one.path}` | {cell(one.default)} | {one.allowed} | {cell(one.about)} |"
+        for one in settings(named_recipe("race"))
+        if not one.path.startswith("quadrotor.vehicle.")
+    ]
+    head = "| setting | in `race`, first phase | allowed | meaning |\n|---|---|---|---|\n"
+    return (
+        "# Settings of a training\n\nWhat `suite train --set` takes.\n\n" + head + "\n".join(rows)
+    )
+
+
+def effects() -> str:
+    """Return the page of the effects that a vehicle file may hold."""
+    vehicle, rows = load_vehicle("reference"), list[str]()
+    for effect in EFFECTS.values():
+        for parameter in effect.parameters:
+            low, high = (at(end, vehicle) for end in (parameter.low, parameter.high))
+            usual = " to ".join(f"{end:g}" for end in parameter.typical)
+            rows.append(
+                f"| `{effect.name}` | {cell(effect.summary)} | {cell(effect.equation)} | "
+                f"`{parameter.name}` [{parameter.unit}] | {usual} | {low:g} to {high:g} |"
+            )
+    head = "| effect | what | equation | parameter | usual size | allowed |\n"
+    return (
+        "# Effects of a vehicle file\n\n" + head + "|---|---|---|---|---|---|\n" + "\n".join(rows)
+    )
+
+
+MADE = {"commands": commands, "python": python, "settings": training, "effects": effects}
+"""Page -> what returns its text."""
+
+
+def main(check: bool) -> int:
+    """Write the pages, or compare them with what would be written."""
+    stale = 0
+    for name, make in MADE.items():
+        path, text = PAGES / f"{name}.md", f"{HEAD}{make().rstrip()}\n"
+        if path.is_file() and path.read_text(encoding="utf-8") == text:
+            continue
+        stale += 1
+        if check:
+            print(f"{path}: not what the code says; run python tools/reference.py")
+        else:
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    return int(check and stale > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main("--check" in sys.argv[1:]))
