@@ -7,7 +7,6 @@ What a name needs is imported when it is first used, so that `import suite` cost
 from __future__ import annotations
 
 from collections.abc import Sequence
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,7 +53,7 @@ _ELSEWHERE = {
 }
 """Name -> the module that it is re-exported from."""
 
-Source = str | PathLike[str]
+Source = str | Path
 """A shipped name or a path."""
 
 
@@ -90,8 +89,8 @@ def evaluate_policy(
     from policies.policy import load_policy
     from suite.common.choices import parse_levels, parse_tracks
 
-    flown = load_policy(policy) if isinstance(policy, str | PathLike) else policy
-    body = load_vehicle(vehicle) if isinstance(vehicle, str | PathLike) else vehicle
+    flown = load_policy(policy) if isinstance(policy, str | Path) else policy
+    body = load_vehicle(vehicle) if isinstance(vehicle, str | Path) else vehicle
     seeds, own = range(seed, seed + trials), {}
     if isinstance(track, str):
         levels = parse_levels(str(difficulty))

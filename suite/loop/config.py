@@ -17,6 +17,7 @@ from suite.train.recipes import (
     at_rate,
     finetune,
     named_recipe,
+    widened,
     with_iterations,
     with_quadrotor,
 )
@@ -232,7 +233,7 @@ def resolve(
     if longer is not None:
         tuning = with_iterations(tuning, longer)
     if hidden:
-        tuning = with_quadrotor(tuning, simulated)
+        tuning = widened(with_quadrotor(tuning, simulated))
     if policy is not None:
         tuning = override(tuning, changes)
     fitted = size.fit_iterations if fit_iterations is None else fit_iterations

@@ -37,8 +37,6 @@ def race() -> TrainConfig:
     a second, with a higher price on tipping over, which ends a judged trial, and with delays of up
     to 80 ms. Its quadrotors vary widely around `racer5`, which is not the vehicle of the tables.
     """
-    from eval.quadrotor.vehicle_file import load_vehicle
-
     fast = (
         "loss.progress=2.2",
         "loss.acceleration=2e-3",
@@ -67,19 +65,7 @@ def race() -> TrainConfig:
             speed_input=True,
         ),
         physics=PointMassConfig(drag_up=(0.2, 2.0)),
-        quadrotor=QuadrotorConfig(
-            load_vehicle("racer5"),
-            attitude_hz=60.0,
-            physics_hz=120.0,
-            mass_std=0.08,
-            lag_spread_s=0.03,
-            drag_spread=0.5,
-            delay_spread_s=0.07,
-            gain_spread=0.3,
-            thrust_spread=0.1,
-            com_std_m=0.003,
-            trim_std=0.01,
-        ),
+        quadrotor=replace(_varied(), attitude_hz=60.0, physics_hz=120.0),
         loss=LossConfig(
             clearance=4.2,
             collide=0.28,
@@ -234,6 +220,45 @@ def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:
         trim_std=min(inertia * own.trim_std, TRIM_STD_MOST),
     )
     return replace(config, quadrotor=own)
+
+
+SPREADS = (
+    *("mass_std", "lag_spread_s", "drag_spread", "delay_spread_s"),
+    *("gain_spread", "thrust_spread", "com_std_m", "trim_std"),
+)
+"""What `widened` widens."""
+
+
+def widened(config: TrainConfig) -> TrainConfig:
+    """Return `config` with quadrotors that vary at least as much as a vehicle file may be wrong.
+
+    A policy that is fine-tuned through one exact vehicle loses its margin to what that vehicle
+    lacks: with a hidden offset of the centre of mass it flew far worse than before.
+    """
+    own = config.quadrotor
+    if own is None:
+        return config
+    base = replace(_varied(), com_std_m=0.008, trim_std=0.03)
+    wide = with_quadrotor(replace(config, quadrotor=base), own.vehicle).quadrotor
+    most = {name: max(getattr(own, name), getattr(wide, name)) for name in SPREADS}
+    return replace(config, quadrotor=replace(own, **most))
+
+
+def _varied() -> QuadrotorConfig:
+    """Return quadrotors that vary widely around `racer5`."""
+    from eval.quadrotor.vehicle_file import load_vehicle
+
+    return QuadrotorConfig(
+        load_vehicle("racer5"),
+        mass_std=0.08,
+        lag_spread_s=0.03,
+        drag_spread=0.5,
+        delay_spread_s=0.07,
+        gain_spread=0.3,
+        thrust_spread=0.1,
+        com_std_m=0.003,
+        trim_std=0.01,
+    )
 
 
 def _arm_m(vehicle: Vehicle) -> float:
