@@ -13,32 +13,13 @@ import numpy as np
 
 from eval import sensors
 from eval.sensors import SENSORS
-from eval.sensors.interface import Draws, Needs
+from eval.sensors.draws import blank_draws, draw
 from eval.sensors.sensors_file import SensorSet
 from eval.worlds.slots import SENSED, generator_of
 from eval.worlds.trial import TrialSpec
 from policies.observation import View
 from tracks.common.masks import select, take
 from tracks.geometry.camera import Camera
-
-
-def blank_draws(needs: Needs, rows: int, camera: Camera) -> Draws:
-    """Return room for as many draws as `needs` says, of `rows` rows."""
-    shape = camera.height, camera.width
-    return Draws(
-        np.zeros((rows, needs.normal)),
-        np.zeros((rows, needs.uniform)),
-        np.zeros((rows, needs.grain, *shape)),
-        np.zeros((rows, needs.chance, *shape)),
-    )
-
-
-def draw(into: Draws, row: int, generator: np.random.Generator) -> None:
-    """Draw one row's numbers of one observation."""
-    for numbers, normal in zip(into, (True, False, True, False), strict=True):
-        if numbers[row].size:
-            fill = generator.standard_normal if normal else generator.random
-            fill(out=numbers[row])
 
 
 class Sensors:

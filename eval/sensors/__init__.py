@@ -10,7 +10,21 @@ from collections.abc import Mapping
 from typing import Any
 
 from eval.effects.interface import as_arrays
-from eval.sensors import delay, frame_loss, gate_map, state_noise, stereo
+from eval.sensors import (
+    delay,
+    exposure,
+    frame_loss,
+    gate_detection,
+    gate_map,
+    image_motion,
+    imu,
+    state_drift,
+    state_loss,
+    state_noise,
+    stereo,
+    tof,
+    wrong_gate,
+)
 from eval.sensors.interface import Draws, Moment, Sensor, View
 from tracks.common.names import Registry
 from tracks.geometry.camera import Camera
@@ -32,7 +46,21 @@ def _wrong(name: str, sensor: Any) -> str | None:
 
 _OWN = {
     module.SENSOR.name: module.SENSOR
-    for module in (delay, gate_map, state_noise, stereo, frame_loss)
+    for module in (
+        delay,
+        gate_map,
+        state_drift,
+        state_noise,
+        state_loss,
+        gate_detection,
+        wrong_gate,
+        image_motion,
+        stereo,
+        tof,
+        exposure,
+        frame_loss,
+        imu,
+    )
 }
 # In the order in which they act; each takes what those before it made of the truth.
 SENSORS: Registry[Sensor] = Registry("sensor model", "diffracing_suite.sensors", _OWN, _wrong)
@@ -69,6 +97,11 @@ def scaled(name: str, values: Any, magnitude: Any) -> Any:
                 changed = min(max(changed, parameter.low), parameter.high)
             grown[parameter.name] = changed
     return values._replace(**grown)
+
+
+def magnified(models: Models, magnitude: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `models` with each grown by its own magnitude, as `scaled`."""
+    return {name: scaled(name, values, magnitude[name]) for name, values in models.items()}
 
 
 def start(

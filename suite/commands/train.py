@@ -13,7 +13,7 @@ from suite.common.console import Console
 from suite.common.running.hosts import Joined, join, member
 from suite.common.startup import use_device
 from suite.common.work import Silent
-from suite.train.config import TrainConfig
+from suite.train.config import SensorsConfig, TrainConfig
 from suite.train.overrides import changed, check_phases
 from suite.train.recipes import chosen_model, named_recipe, with_iterations
 from tracks.common.files import check_no_input, plain
@@ -34,6 +34,10 @@ class Config:
     vehicle: str | None = None
     """What the training's quadrotors are drawn around: a shipped vehicle's name or a vehicle file
     (.toml); with --model quad, or with a recipe that trains through quadrotors."""
+    sensors: str | None = None
+    """Train through sensor models: a shipped name (vio, gate-relative, stereo-depth, all, ...) or a
+    sensors file (.toml). Each world draws every model's magnitude evenly from 0 to 1
+    (--set sensors.magnitude=(0,1.5): to more)."""
     out: Path = Path("runs/train")
     """Folder of the run; a run that stands there is resumed."""
     seed: Seed = 0
@@ -78,6 +82,10 @@ def resolve(config: Config) -> TrainConfig:
     """
     run = replace(named_recipe(config.recipe), seed=config.seed)
     run = chosen_model(run, config.model, config.vehicle)
+    if config.sensors is not None:
+        from eval.sensors.sensors_file import load_sensors
+
+        run = replace(run, sensors=SensorsConfig(load_sensors(config.sensors)))
     if config.iterations is not None:
         run = with_iterations(run, config.iterations)
     named = {"episode.batch": config.num_envs, "optimizer.rate": config.lr}

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from eval.sensors.sensors_file import SensorSet
 from eval.vehicles.vehicle import Vehicle
 from policies.spec import PolicySpec, check_network, check_spec
 from tracks.input.ranges import Iterations, Range, Seed, Share, check_ranges
@@ -86,6 +87,21 @@ class QuadrotorConfig:
     trim_std: Annotated[float, Range(0.0, TRIM_STD_MOST)] = 0.0
     """Standard deviation of a constant torque about x and about y, around the vehicle's, cut off at
     twice that; about z a fifth of it [N m]."""
+
+
+@dataclass(frozen=True)
+class SensorsConfig:
+    """What policies see in training, by the models that the judge has; drawn per world and model.
+
+    A model's magnitude is drawn evenly from a range: 0 is the truth, 1 what the file says.
+    """
+
+    seen: SensorSet
+    """The models at magnitude 1."""
+    magnitude: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.0, 1.0)
+    """Range of the magnitude [1]."""
+    perfect_share: Share = 0.1
+    """Share of the worlds in which every magnitude is 0."""
 
 
 @dataclass(frozen=True)
@@ -225,6 +241,8 @@ class TrainConfig:
     """Dynamics and their randomisation."""
     quadrotor: QuadrotorConfig | None = None
     """Train through this quadrotor; None: through the point mass of `physics`."""
+    sensors: SensorsConfig | None = None
+    """Sensor models between the truth and the policy; None: there are none."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Weights of the loss and of the field."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)

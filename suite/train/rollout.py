@@ -15,6 +15,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from eval import sensors
+from eval.sensors import SENSORS, scaled, sensing
+from eval.sensors.draws import keyed_draws
+from eval.sensors.interface import product, turned_by
 from policies.networks import delta_network, network
 from policies.observation import Observation, View, observe
 from suite.train import losses
@@ -22,9 +26,10 @@ from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import DynamicsState, make_dynamics
 from suite.train.step import make_step, target_gate
 from suite.train.worlds import Worlds
+from tracks.common.masks import select
 from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.depth import depth_image
-from tracks.geometry.rotation import to_local
+from tracks.geometry.rotation import exp_rot, to_local
 from tracks.geometry.scene import Counts
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
@@ -50,6 +55,8 @@ class RolloutCarry(NamedTuple):
     """(B, 32) of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 while the world counts in the loss: until it crashes, stops or finishes, then 0."""
+    sensed: Any = ()
+    """What the sensor models remember."""
 
 
 class StepRecord(NamedTuple):
@@ -86,7 +93,9 @@ def view_in(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
     gate, target_w = target_gate(gates, target)
     after, second_w = target_gate(gates, target, ahead=1)
     axes_w = gate.rot_w[:, :, 0], after.rot_w[:, :, 0]
-    return View(state.pos_w, state.rot_w, state.vel_w, target_w, second_w, *axes_w)
+    return View(
+        state.pos_w, state.rot_w, state.vel_w, target_w, second_w, *axes_w, gate_number=target
+    )
 
 
 def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -100,22 +109,93 @@ def world_keys(key: jax.Array, worlds: Worlds) -> jax.Array:
     return jax.vmap(jax.random.fold_in, (None, 0))(key, worlds.number)
 
 
-def make_sight(config: TrainConfig) -> Callable[..., Observation]:
-    """Return sight(worlds, state, target, last_action_b, keys (B,)) -> what the policy is given.
+class Senses(NamedTuple):
+    """The sensor models of a training, as pure functions over B worlds."""
 
-    The image has its noise, and carries no gradient to the state.
+    start: Callable[[Worlds, View], Any]
+    """(worlds, view at the start) -> what the models remember."""
+    see: Callable[[Worlds, View, jax.Array, Any], tuple[View, Any]]
+    """(worlds, truth, keys (B,), memory) -> (what is seen, memory)."""
+
+
+def make_senses(config: TrainConfig) -> Senses:
+    """Return the sensor models of `config.sensors`, with each world's magnitudes and draws.
+
+    The functions are the judge's own. The trainer knows states at decisions alone: in between an
+    old one is interpolated, an old image is this or the last one with as much chance, and ages
+    count up to one policy period (more of it is `physics.state_delay` and `image_delay`).
     """
+    assert config.sensors is not None
+    held, spec, dt_s = config.sensors.seen.models, config.spec, 1.0 / config.spec.rate_hz
+    parts, late = sensing(held), "delay" in held
+
+    def grown(worlds: Worlds) -> dict[str, Any]:
+        assert worlds.sensed is not None
+        return sensors.magnified(parts, worlds.sensed.magnitude)
+
+    def start(worlds: Worlds, truth: View) -> Any:
+        assert worlds.sensed is not None
+        about = worlds.sensed.trial, dt_s, spec.camera
+        return truth if late else (), sensors.start(grown(worlds), truth, *about)
+
+    def see(worlds: Worlds, truth: View, keys: jax.Array, memory: Any) -> tuple[View, Any]:
+        before, kept = memory
+        draws = {}
+        for number, name in enumerate(parts):
+            own = jax.vmap(jax.random.fold_in, (0, None))(keys, number + 1)
+            needs = SENSORS[name].observation
+            draws[name] = jax.vmap(lambda key, n=needs: keyed_draws(n, key, spec.camera))(own)
+        old = truth
+        if late:
+            assert worlds.sensed is not None
+            delay = scaled("delay", held["delay"], worlds.sensed.magnitude["delay"])
+            own = jax.vmap(jax.random.fold_in, (0, None))(keys, 0)
+            chance = jax.vmap(lambda key: jax.random.uniform(key, (3,)))(own)
+            shake = 1.0 + delay.jitter * (2.0 * chance[:, :2] - 1.0)
+            ages = jnp.stack([delay.state, delay.image], -1) * shake / dt_s
+            old = older(truth, before, jnp.minimum(ages[:, 0], 1.0), chance[:, 2] < ages[:, 1])
+        seen, kept = sensors.sense(grown(worlds), kept, old, draws, dt_s, spec.camera)
+        image = jax.lax.stop_gradient(seen.depth_m)
+        kept = jax.lax.stop_gradient(kept)
+        return seen._replace(depth_m=image), (truth if late else (), kept)
+
+    return Senses(start, see)
+
+
+def older(now: View, before: View, share: jax.Array, last: jax.Array) -> View:
+    """Return what was seen a `share` (B,) of a policy period ago; of the images where `last` (B,).
+
+    The next gate is that of the nearer of the two moments.
+    """
+    part = share[:, None]
+    turn_b = turned_by(before.rot_w, now.rot_w)
+    gates = select(share > 0.5, before, now)
+    return gates._replace(
+        pos_w=now.pos_w + part * (before.pos_w - now.pos_w),
+        vel_w=now.vel_w + part * (before.vel_w - now.vel_w),
+        rot_w=product(now.rot_w, exp_rot(part * turn_b)),
+        depth_m=select(last, before.depth_m, now.depth_m),
+    )
+
+
+class Sight(NamedTuple):
+    """What policies see, as pure functions over B worlds; the image carries no gradient."""
+
+    start: Callable[[Worlds, DynamicsState], Any]
+    """(worlds, state at the start) -> what the sensor models remember; nothing without models."""
+    see: Callable[..., tuple[Observation, Any]]
+    """(worlds, state, target, last_action_b, keys (B,), memory) -> what the policy is given,
+    memory; `memory` may be left out where there are no sensor models."""
+
+
+def make_sight(config: TrainConfig) -> Sight:
+    """Return what policies see in training: the image has its noise, and sensors their errors."""
     spec, camera, noise = config.spec, config.spec.camera, config.physics.depth_noise
     # One ray a pixel, whatever the camera casts in flight: more cost time and gained nothing.
     rays = jnp.asarray(pixel_rays_b(camera), jnp.float32)
+    senses = None if config.sensors is None else make_senses(config)
 
-    def sight(
-        worlds: Worlds,
-        state: DynamicsState,
-        target: jax.Array,
-        last_action_b: jax.Array,
-        keys: jax.Array,
-    ) -> Observation:
+    def look(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
         # Scaling the rays across the optical axis changes the field of view; every world of an
         # iteration shares it, so that the rays stay one array.
         axis = rays.mean(0)
@@ -123,12 +203,29 @@ def make_sight(config: TrainConfig) -> Callable[..., Observation]:
         pos_w, rot_w = jax.lax.stop_gradient((state.pos_w, state.rot_w))
         depth_m = depth_image(worlds.scene, pos_w, rot_w, wide, camera.range_m, SEEN)
         image_m = depth_m.reshape(-1, camera.height, camera.width)
-        view = view_in(worlds, state, target)._replace(depth_m=image_m)
-        seen = observe(spec, view, last_action_b, worlds.wanted)
-        grain = jax.vmap(lambda key: jax.random.normal(key, image_m.shape[1:]))(keys)
-        return seen._replace(image=seen.image + noise * grain)
+        return view_in(worlds, state, target)._replace(depth_m=image_m)
 
-    return sight
+    def start(worlds: Worlds, state: DynamicsState) -> Any:
+        if senses is None:
+            return ()
+        return senses.start(worlds, look(worlds, state, jnp.asarray(worlds.target)))
+
+    def see(
+        worlds: Worlds,
+        state: DynamicsState,
+        target: jax.Array,
+        last_action_b: jax.Array,
+        keys: jax.Array,
+        memory: Any = (),
+    ) -> tuple[Observation, Any]:
+        view = look(worlds, state, target)
+        if senses is not None:
+            view, memory = senses.see(worlds, view, keys, memory)
+        seen = observe(spec, view, last_action_b, worlds.wanted)
+        grain = jax.vmap(lambda key: jax.random.normal(key, view.depth_m.shape[1:]))(keys)
+        return seen._replace(image=seen.image + noise * grain), memory
+
+    return Sight(start, see)
 
 
 def observed_at_start(worlds: Worlds, state: DynamicsState, config: TrainConfig) -> jax.Array:
@@ -162,6 +259,7 @@ def make_rollout(
             observed=observed_at_start(worlds, state, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
+            sensed=sight.start(worlds, state),
         )
 
     def rollout(
@@ -180,7 +278,7 @@ def make_rollout(
             shift_now, key_now, number = inputs
             before, target = carry.state, carry.target
             keys = world_keys(key_now, worlds)
-            seen = sight(worlds, before, target, carry.action_b, keys)
+            seen, sensed = sight.see(worlds, before, target, carry.action_b, keys, carry.sensed)
             embedding = encode(params, seen.image) + shift_now
             embedding, embeddings = queue(carry.embeddings, embedding)
             state, observed = queue(carry.observed, seen.state)
@@ -223,6 +321,7 @@ def make_rollout(
                 observed=observed,
                 delta_hidden=delta_hidden,
                 alive=carry.alive * unhurt * goes_on,
+                sensed=sensed,
             )
             return carry, record
 

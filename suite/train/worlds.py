@@ -10,6 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from eval.sensors import SENSORS, sensing
+from eval.sensors.draws import blank_draws, draw
+from eval.sensors.interface import Draws
 from suite.train.config import TrainConfig
 from suite.train.dynamics import interface as dynamics
 from suite.train.dynamics import point_mass
@@ -18,6 +21,15 @@ from tracks.families.random import Mix
 from tracks.geometry.cull import Bounds, bounds
 from tracks.geometry.scene import Array, Scene, stack
 from tracks.track import Track, first_gates
+
+
+class Sensed(NamedTuple):
+    """What a batch of worlds draws for its sensor models, by the models' names."""
+
+    magnitude: dict[str, Array]
+    """(B,) [1]."""
+    trial: dict[str, Draws]
+    """(B, ...) what a model draws once; empty for one that senses nothing itself."""
 
 
 class Worlds(NamedTuple):
@@ -46,6 +58,8 @@ class Worlds(NamedTuple):
     """(B,) this iteration's scale of the rays across the optical axis."""
     wanted: Array | None = None
     """(B,) the commanded speed, 0 to 1, where the policy has that input [1]."""
+    sensed: Sensed | None = None
+    """Where there are sensor models."""
 
 
 def _clearance(track: Track, point_w: np.ndarray) -> float:
@@ -151,6 +165,24 @@ def _wanted(config: TrainConfig, iteration: int) -> Array | None:
     return np.where(races, 1.0, rng.random(batch)).astype(np.float32)
 
 
+def _sensed(config: TrainConfig, iteration: int) -> Sensed | None:
+    """Return what the sensor models of each world draw, from draws of their own."""
+    if config.sensors is None:
+        return None
+    rng, batch = np.random.default_rng([config.seed, iteration, 4]), config.episode.batch
+    camera, magnitude, trial = config.spec.camera, dict[str, Array](), dict[str, Draws]()
+    perfect = rng.random(batch) < config.sensors.perfect_share
+    for name in config.sensors.seen.models:
+        drawn = rng.uniform(*config.sensors.magnitude, batch)
+        magnitude[name] = np.where(perfect, 0.0, drawn).astype(np.float32)
+    for name in sensing(config.sensors.seen.models):
+        blank = blank_draws(SENSORS[name].trial, batch, camera)
+        for row in range(batch):
+            draw(blank, row, rng)
+        trial[name] = Draws(*(numbers.astype(np.float32) for numbers in blank))
+    return Sensed(magnitude, trial)
+
+
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     """Return the worlds of an iteration."""
     rng = np.random.default_rng([config.seed, iteration])
@@ -192,4 +224,5 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         number=np.arange(batch, dtype=np.int32),
         fov_scale=np.full(batch, rng.uniform(*config.physics.fov_scale), np.float32),
         wanted=_wanted(config, iteration),
+        sensed=_sensed(config, iteration),
     )

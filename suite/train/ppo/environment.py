@@ -41,6 +41,8 @@ class Episode(NamedTuple):
     """(B, image_delay, height, width) on their way, oldest first."""
     observed: jax.Array
     """(B, state_delay, state_size) on their way, oldest first."""
+    sensed: Any = ()
+    """What the sensor models remember."""
 
 
 class Flown(NamedTuple):
@@ -80,13 +82,18 @@ def make_race(config: TrainConfig) -> Race:
             # An image of zeros is embedded as zeros, which is how the trainer's rollouts start.
             images=jnp.zeros((batch, physics.image_delay, spec.camera.height, spec.camera.width)),
             observed=observed_at_start(worlds, state, config),
+            sensed=sight.start(worlds, state),
         )
 
     def observe(worlds: Worlds, episode: Episode, keys: jax.Array) -> tuple[Observation, Episode]:
-        seen = sight(worlds, episode.state, episode.target, episode.action_b, keys)
+        seen, sensed = sight.see(
+            worlds, episode.state, episode.target, episode.action_b, keys, episode.sensed
+        )
         state, observed = queue(episode.observed, seen.state)
         image, images = queue(episode.images, seen.image)
-        return Observation(state, image), episode._replace(images=images, observed=observed)
+        return Observation(state, image), episode._replace(
+            images=images, observed=observed, sensed=sensed
+        )
 
     def fly(
         worlds: Worlds, episode: Episode, action_b: jax.Array, keys: jax.Array

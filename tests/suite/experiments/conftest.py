@@ -23,7 +23,7 @@ class Sky:
     def fly(self, task, share):
         options = replace(task.options, slots=8, rules=Rules(time_limit_s=0.2))
         for index, result, flight in self._fly(replace(task, options=options), share):
-            self.flown.append((task.policy.name, task.vehicle, options.noise, result.trial))
+            self.flown.append((task.policy.name, task.vehicle, options.sensors, result.trial))
             yield index, result, flight
             if self.stop_after == len(self.flown):
                 self.stop_after = None

@@ -70,7 +70,8 @@ def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight():
     def image(rays):
         camera = replace(SPEC.camera, rays=rays)
         sight = rollout.make_sight(replace(config, spec=replace(SPEC, camera=camera)))
-        return np.array(sight(worlds, state, jnp.asarray(worlds.target), state.pos_w, keys).image)
+        seen, _ = sight.see(worlds, state, jnp.asarray(worlds.target), state.pos_w, keys)
+        return np.array(seen.image)
 
     np.testing.assert_array_equal(image(2), image(1))
 

@@ -1,0 +1,88 @@
+"""An inertial measurement unit: bias, noise, vibration that grows with thrust, saturation.
+
+It acts on samples of a gyroscope and an accelerometer, which an estimator uses, and not on what the
+policy sees.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from eval.sensors.interface import Array, Draws, Inertial, Moment, Needs, Parameter, Sensor, column
+
+UNLIMITED = 1e6
+"""Where a sensor does not saturate."""
+
+
+class Imu(NamedTuple):
+    """Values of `imu`."""
+
+    gyro_noise: Array
+    gyro_bias: Array
+    gyro_walk: Array
+    gyro_limit: Array
+    acc_noise: Array
+    acc_bias: Array
+    acc_walk: Array
+    acc_limit: Array
+    acc_per_thrust: Array
+    vibration: Array
+
+
+def start(values: Imu, moment: Moment) -> dict[str, Any]:
+    """Return the trial's biases and its error of the accelerometer per thrust (..., 3)."""
+    draws = moment.draws.normal
+    return {
+        "gyro": column(values.gyro_bias) * draws[..., :3],
+        "acc": column(values.acc_bias) * draws[..., 3:6],
+        "per_thrust": column(values.acc_per_thrust) * draws[..., 6:],
+    }
+
+
+def measure(
+    values: Imu, memory: dict[str, Any], truth: Inertial, draws: Draws, dt_s: Any
+) -> tuple[Inertial, dict[str, Any]]:
+    """Return what is measured of a true sample, and the biases, which walk on."""
+    normal = draws.normal
+    xp = normal.__array_namespace__()
+    root = dt_s**0.5
+    gyro = memory["gyro"] + column(values.gyro_walk) * root * normal[..., 6:9]
+    acc = memory["acc"] + column(values.acc_walk) * root * normal[..., 9:12]
+    thrust = column(abs(truth.acc_b[..., 2]))
+    rate_b = truth.rate_b + gyro + column(values.gyro_noise) / root * normal[..., :3]
+    grain = column(values.acc_noise) / root + column(values.vibration) * thrust
+    acc_b = truth.acc_b + acc + memory["per_thrust"] * thrust + grain * normal[..., 3:6]
+    limits = column(values.gyro_limit), column(values.acc_limit)
+    rate_b, acc_b = (xp.clip(v, -m, m) for v, m in zip((rate_b, acc_b), limits, strict=True))
+    return Inertial(rate_b, acc_b), memory | {"gyro": gyro, "acc": acc}
+
+
+SENSOR = Sensor(
+    name="imu",
+    summary="Gyroscope and accelerometer: bias, noise, vibration with thrust, saturation",
+    equation="w + b_w + s_w n / sqrt(dt); a + b_a + k |a_z| + (s_a / sqrt(dt) + v |a_z|) n; "
+    "db = walk sqrt(dt) n; held to the limits",
+    source="data sheets of BMI270, BMI088 and ICM-42688-P: 0.003 to 0.014 deg/s/sqrt(Hz), 65 to "
+    "230 ug/sqrt(Hz), 2000 deg/s, 16 to 24 g; biases, walks and vibration are our estimate",
+    values=Imu,
+    parameters=(
+        Parameter("gyro_noise", "rad/s/Hz^0.5", 0.0, 0.0, 1.0, (1e-4, 1e-3)),
+        Parameter("gyro_bias", "rad/s", 0.0, 0.0, 2.0, (0.002, 0.02)),
+        Parameter("gyro_walk", "rad/s^1.5", 0.0, 0.0, 1.0, (1e-5, 1e-3)),
+        Parameter("gyro_limit", "rad/s", UNLIMITED, 0.1, UNLIMITED, (8.7, 34.9)),
+        Parameter("acc_noise", "m/s^2/Hz^0.5", 0.0, 0.0, 10.0, (1e-3, 1e-2)),
+        Parameter("acc_bias", "m/s^2", 0.0, 0.0, 20.0, (0.05, 0.3)),
+        Parameter("acc_walk", "m/s^2.5", 0.0, 0.0, 10.0, (1e-4, 1e-2)),
+        Parameter("acc_limit", "m/s^2", UNLIMITED, 1.0, UNLIMITED, (78.5, 235.0)),
+        Parameter("acc_per_thrust", "1", 0.0, 0.0, 1.0, (0.005, 0.03)),
+        Parameter("vibration", "1", 0.0, 0.0, 10.0, (0.02, 0.2)),
+    ),
+    grows=(
+        *("gyro_noise", "gyro_bias", "gyro_walk", "acc_noise", "acc_bias", "acc_walk"),
+        *("acc_per_thrust", "vibration"),
+    ),
+    trial=Needs(normal=9),
+    observation=Needs(normal=12),
+    start=start,
+    measure=measure,
+)

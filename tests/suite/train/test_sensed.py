@@ -1,0 +1,109 @@
+"""Sensor models in training: drawn per world, nothing at magnitude 0, finite gradients."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from eval.sensors import SENSORS
+from eval.sensors.sensors_file import load_sensors, sensor_set
+from suite.commands.train import Config, resolve
+from suite.train.config import SensorsConfig
+from suite.train.dynamics.interface import make_dynamics
+from suite.train.rollout import make_sight, older, view_in, world_keys
+from suite.train.worlds import sample_worlds
+from tests.support.training import KEY, boxes_worlds, small_config
+
+BATCH = 6
+SMALL = small_config(batch=BATCH)
+ALL = SensorsConfig(load_sensors("all"))
+
+
+def sensed(**changes):
+    return replace(SMALL, sensors=replace(ALL, **changes))
+
+
+def seen(config, steps=2):
+    """Return what is seen of a drone that moves on, view after view, in a function of its start."""
+    sight = make_sight(config)
+    worlds = boxes_worlds(config)
+    start = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
+    target = jnp.asarray(worlds.target)
+
+    def of(state):
+        memory, shown = sight.start(worlds, state), []
+        for step in range(steps):
+            keys = world_keys(jax.random.fold_in(KEY, step), worlds)
+            state = state._replace(pos_w=state.pos_w + 0.05 * state.vel_w)
+            one, memory = sight.see(worlds, state, target, state.pos_w, keys, memory)
+            shown.append(one)
+        return shown
+
+    return of, start
+
+
+def test_at_magnitude_nothing_the_truth_is_seen():
+    (perfect, state), (none, _) = seen(sensed(perfect_share=1.0)), seen(SMALL)
+    for one, two in zip(perfect(state), none(state), strict=True):
+        np.testing.assert_allclose(one.state, two.state, atol=2e-5)
+        np.testing.assert_allclose(one.image, two.image, atol=2e-5)
+    noisy, _ = seen(sensed(perfect_share=0.0, magnitude=(1.0, 1.0)))
+    last = noisy(state)[-1]
+    assert np.ptp(last.state - none(state)[-1].state) > 1e-2
+    assert np.ptp(last.image - none(state)[-1].image) > 1e-2
+
+
+def test_the_state_carries_a_finite_gradient_and_the_image_none():
+    of, state = seen(sensed(perfect_share=0.0, magnitude=(2.0, 2.0)), steps=3)
+
+    def total(part):
+        return jax.grad(
+            lambda pos_w: sum(getattr(one, part).sum() for one in of(state._replace(pos_w=pos_w)))
+        )(state.pos_w)
+
+    gradient = np.array(total("state"))
+    assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0.1
+    assert not np.array(total("image")).any()
+
+
+def test_magnitudes_are_drawn_per_world_and_model_from_the_range():
+    config = replace(sensed(perfect_share=0.25, magnitude=(0.5, 2.0)), episode=replace(
+        SMALL.episode, batch=200))  # fmt: skip
+    drawn = sample_worlds(config, 0).sensed
+    assert set(drawn.magnitude) == set(ALL.seen.models)
+    table = np.stack(list(drawn.magnitude.values()))
+    none = (table == 0.0).all(0)
+    assert none.mean() == pytest.approx(0.25, abs=0.1)
+    assert table[:, ~none].min() >= 0.5 and table[:, ~none].max() <= 2.0
+    assert len(np.unique(table[:, ~none])) == table[:, ~none].size
+    assert drawn.trial["gate_map"].normal.shape == (200, SENSORS["gate_map"].trial.normal)
+    plain, again = (sample_worlds(c, 0) for c in (replace(config, sensors=None), config))
+    for field in ("pos_w", "target", "stop", "fov_scale"):
+        assert np.array_equal(getattr(plain, field), getattr(again, field)), field
+    assert plain.sensed is None
+
+
+def test_an_old_view_lies_between_two_decisions():
+    worlds = boxes_worlds(SMALL)
+    state = make_dynamics(SMALL).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
+    now = view_in(worlds, state, jnp.asarray(worlds.target))
+    now = now._replace(depth_m=jnp.ones((BATCH, 2, 2)))
+    before = now._replace(pos_w=now.pos_w - 1.0, gate_w=now.gate_w + 5.0, depth_m=now.depth_m * 2)
+    share = jnp.linspace(0.0, 1.0, BATCH)
+    old = older(now, before, share, share > 0.3)
+    assert np.array(now.pos_w - old.pos_w) == pytest.approx(np.array(share[:, None] + jnp.zeros(3)))
+    assert np.array_equal(old.gate_w != now.gate_w, np.repeat(share[:, None] > 0.5, 3, 1))
+    assert np.array_equal(old.depth_m[:, 0, 0], jnp.where(share > 0.3, 2.0, 1.0))
+
+
+def test_the_command_trains_through_a_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('name = "mine"\n[sensors.stereo]\nnoise = 0.2\n')
+    run = resolve(Config(recipe="quick", sensors=str(path), set=("sensors.magnitude=(0.0,1.5)",)))
+    assert run.sensors is not None and run.sensors.magnitude == (0.0, 1.5)
+    assert run.sensors.seen == sensor_set({"stereo": {"noise": 0.2}}, "mine")
+    assert resolve(Config(recipe="quick")).sensors is None
+    with pytest.raises(ValueError, match="Did you mean 'stereo-depth'"):
+        resolve(Config(recipe="quick", sensors="stereo-dept"))
