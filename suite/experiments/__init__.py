@@ -13,9 +13,9 @@ EXPERIMENTS: dict[str, str] = {
     "seeds": "the policies of several training seeds on the same trials, and their median",
     "ablation": "trainings with the vector field and without it, flown on unseen worlds",
     "schemes": "PPO, our method, and it without the field, measured as they learn",
-    "hidden_worlds": "loops that regain a hidden effect by its name and by a Delta Action Model",
+    "hidden_vehicles": "loops that regain a hidden effect by its name and by a Delta Action Model",
     "faults": "faults of a log's interface put into good logs: how many are named, by kind",
-    "worlds": "the shipped policies on the same trials in every world",
+    "simulators": "the shipped policies on the same trials in every simulator",
 }
 """Name -> one-line summary; NAME lives in suite/experiments/NAME.py."""
 OVER_ALL: dict[str, str] = {

@@ -185,7 +185,9 @@ def test_a_reader_that_leaves_ends_the_program_quietly(args):
 
 
 def test_options_of_one_value_each_may_be_given_again():
-    _, config = cli.parse("reproduce", ["worlds", "--simulator", "mjx", "--simulator", "rotorpy"])
+    _, config = cli.parse(
+        "reproduce", ["simulators", "--simulator", "mjx", "--simulator", "rotorpy"]
+    )
     assert config.experiment.simulator == ("mjx", "rotorpy")
     _, config = cli.parse("eval", ["--policy", "race", "--policy", "race-paper"])
     assert config.flown.policies == ("race", "race-paper")

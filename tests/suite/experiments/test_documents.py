@@ -9,7 +9,7 @@ from eval.worlds import rotorpy as rotorpy_world
 from policies import shipped
 from suite.common.curve import append
 from suite.experiments.seeds import repeats
-from suite.experiments.worlds import WHY, Column, Config, changes, columns
+from suite.experiments.simulators import WHY, Column, Config, changes, columns
 from tests.support.documents import another_racer, page, reproduce
 from tests.support.engines import STAND_IN
 from tests.support.judged_cells import cell
@@ -125,12 +125,12 @@ def rotorpy(monkeypatch):
 def test_a_policy_in_two_worlds_and_a_control(sky, rotorpy, tmp_path):
     args = "--policy race-paper --simulator rotorpy --trials 1 --difficulty 0".split()
     sky.stop_after = 4
-    assert reproduce(tmp_path, "worlds", *args) == 130
-    assert reproduce(tmp_path, "worlds", *args) == 0
+    assert reproduce(tmp_path, "simulators", *args) == 130
+    assert reproduce(tmp_path, "simulators", *args) == 0
     assert len(sky.flown) == 3 * 3
     drags = ["linear_drag" in vehicle.effects for _, vehicle, _, _ in sky.flown]
     assert drags == [True] * 3 + [False] * 3 + [True] * 3
-    text, numbers = page(tmp_path, "worlds")
+    text, numbers = page(tmp_path, "simulators")
     labels = [entry["column"] for entry in numbers["success"]]
     assert labels == ["mujoco", "mujoco, the air of rotorpy", "rotorpy"]
     assert "| rotorpy | linear_drag: RotorPy's drag goes with the rotors' speed" in text
@@ -138,7 +138,7 @@ def test_a_policy_in_two_worlds_and_a_control(sky, rotorpy, tmp_path):
 
 
 def test_why_is_told_by_the_controls(rotorpy):
-    flown_in = columns(Config(world=("mjx", "rotorpy")))
+    flown_in = columns(Config(simulator=("mjx", "rotorpy")))
     base, single, aired, other = (column.label for column in flown_in)
     assert flown_in[2] == Column(aired, "mujoco", flown_in[2].vehicle, "rotorpy")
     won = {base: "1111", single: "0111", aired: "1011", other: "0001"}

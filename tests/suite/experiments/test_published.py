@@ -21,12 +21,12 @@ def write_page(folder, name, flown, code):
 def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
     code, current = code_digest(*FLIES), policy_digest(shipped.DEFAULT)
     write_page(tmp_path, "table2", (shipped.DEFAULT, current), code)
-    write_page(tmp_path, "worlds", (shipped.DEFAULT, "0" * 16), code)
+    write_page(tmp_path, "simulators", (shipped.DEFAULT, "0" * 16), code)
     write_page(tmp_path, "robustness", ("gone-policy", current), "another")
     config = Config(published.Status(), out=tmp_path)
     pages = command.run(config, Console())["pages"]
     assert pages["table2"] == {"commit": "f8502435b6b42b44", "newer": []}
-    assert pages["worlds"]["newer"] == ["policy"]
+    assert pages["simulators"]["newer"] == ["policy"]
     assert pages["robustness"]["newer"] == ["policy", "code"]
     assert pages["ablation"]["newer"] is None
     assert "not made" in capsys.readouterr().out

@@ -18,7 +18,7 @@ from suite.experiments.pages.document import (
     write_document,
 )
 from suite.experiments.pages.goals import goals
-from suite.experiments.pages.hidden_worlds import Came, named_grid, rows_of
+from suite.experiments.pages.hidden_vehicles import Came, named_grid, rows_of
 from suite.experiments.pages.tables import points_cell
 from suite.loop.hidden_effect import LABELS, NAMED
 from tests.support.judged_cells import cell

@@ -1,4 +1,4 @@
-"""The shipped policies in every world on the same trials: where worlds differ, and why."""
+"""The shipped policies in every simulator on the same trials: where simulators differ, and why."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from tracks.common.grid import Grid, table
 from tracks.input.ranges import Seed, Trials
 
 BASE = "mujoco"
-"""The world that the others are compared with."""
+"""The simulator that the others are compared with."""
 ROUNDING = "mjx"
-"""The world that flies as the first does but for rounding to single precision, contacts by distance
-and images by analytic rays."""
+"""The simulator that differs from the first by rounding to single precision, contacts by distance and
+images by analytic rays."""
 WHY = ("rounding", "air", "rest")
-"""Why a trial changes: `rounding`, it does in mjx too; `air`, in mujoco with that world's air too;
-`rest`, neither."""
+"""Why a trial changes: `rounding`, it does in mjx too; `air`, in mujoco with that simulator's air
+too; `rest`, neither."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Fly the shipped policies on the same trials in every world."""
+    """Fly the shipped policies on the same trials in every simulator."""
 
     policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
@@ -45,7 +45,7 @@ class Config:
     difficulty: str = "0,9"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials = 20
-    """Trials of every policy on every track at every level in every world."""
+    """Trials of every policy on every track at every level in every simulator."""
     seed: Seed = 0
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
@@ -53,14 +53,14 @@ class Config:
 
 
 class Column(NamedTuple):
-    """A world as the tables have it."""
+    """A simulator as the tables have it."""
 
     label: str
-    world: str
+    simulator: str
     vehicle: Vehicle
-    """What it is given; for a control, one that flies as another world's does."""
+    """What it is given; for a control, one that flies as another simulator's does."""
     control_of: str | None = None
-    """The world whose air the vehicle has."""
+    """The simulator whose air the vehicle has."""
 
 
 Flown = Mapping[tuple[str, str], Sequence[TrialResult]]
@@ -71,7 +71,7 @@ def columns(config: Config) -> list[Column]:
     """Return what is flown, mujoco first.
 
     Raises:
-        ValueError: for a world that there is not, or that lacks a package.
+        ValueError: for a simulator that there is not, or that lacks a package.
     """
     vehicle = load_vehicle(config.vehicle)
     twice = next((n for n in config.simulator if config.simulator.count(n) > 1), None)
@@ -79,16 +79,16 @@ def columns(config: Config) -> list[Column]:
         raise ValueError(f"--simulator {twice} is given twice; give each simulator once")
     found = [Column(BASE, BASE, vehicle)]
     for name in config.simulator or (ROUNDING, "rotorpy"):
-        world = world_class(name)
+        simulator = world_class(name)
         if name in (BASE, REFERENCE):
             others = ", ".join(known for known in WORLDS if known not in (BASE, REFERENCE))
             raise ValueError(
                 f"--simulator {name}: flies as {BASE} does, with which others are paired; give "
                 f"one of {others}"
             )
-        if hasattr(world, "nearest"):
+        if hasattr(simulator, "nearest"):
             label = f"{BASE}, the air of {name}"
-            found.append(Column(label, BASE, world.nearest(vehicle), name))
+            found.append(Column(label, BASE, simulator.nearest(vehicle), name))
         found.append(Column(name, name, vehicle))
     return found
 
@@ -101,24 +101,24 @@ def document(config: Config, place: Place, console: Console) -> Made:
     trials = judging.trials_of(config)
     orders = {
         (name, column.label): judging.Order(
-            judging.Flier(policy, column.vehicle, world=column.world), trials
+            judging.Flier(policy, column.vehicle, world=column.simulator), trials
         )
         for name, policy in policies.items()
         for column in flown_in
     }
-    what = "flying in every world"
+    what = "flying in every simulator"
     results = judging.flown(orders, place.cache, console, what, place.workers)
     changed = changes(names, flown_in, results)
     facts = {
         **judging.policy_facts(policies),
         "trials": f"three tracks, levels {config.difficulty}, seeds "
-        f"{options.judged_seeds(config)}: {len(trials)} of each policy in each world",
+        f"{options.judged_seeds(config)}: {len(trials)} of each policy in each simulator",
         "vehicle": config.vehicle,
     }
     parts = {
-        "Success by world": [_overall(names, flown_in, results)],
+        "Success by simulator": [_overall(names, flown_in, results)],
         "Trials that change their success": [_each(changed, flown_in)],
-        "What the worlds fly otherwise": [_otherwise(flown_in)],
+        "What the simulators fly otherwise": [_otherwise(flown_in)],
     }
     numbers = {
         "success": [
@@ -155,7 +155,7 @@ def _numbers(results: Flown, name: str, label: str) -> dict[str, Any]:
 
 
 def _overall(names: Sequence[str], flown_in: Sequence[Column], results: Flown) -> Grid:
-    headers = ["policy", "world", "success", "minus mujoco", "p", "ends alike"]
+    headers = ["policy", "simulator", "success", "minus mujoco", "p", "ends alike"]
     headers += ["lap apart [s]", "mean speed apart [m/s]"]
     lines = []
     for name in names:
@@ -176,17 +176,17 @@ def _overall(names: Sequence[str], flown_in: Sequence[Column], results: Flown) -
 def changes(
     names: Sequence[str], flown_in: Sequence[Column], results: Flown
 ) -> list[dict[str, Any]]:
-    """Return the trials whose success in a world is not that in mujoco.
+    """Return the trials whose success in a simulator is not that in mujoco.
 
     Each has the endings by column, and `why`: one of `WHY`, by the controls that were flown; in
     `ROUNDING` itself and in controls it is None.
     """
-    has_rounding = any(column.world == ROUNDING for column in flown_in)
+    has_rounding = any(column.simulator == ROUNDING for column in flown_in)
     found = []
     for name in names:
         for column in flown_in[1:]:
-            own = [c.label for c in flown_in if c.control_of == column.world]
-            explained = column.world not in (BASE, ROUNDING)
+            own = [c.label for c in flown_in if c.control_of == column.simulator]
+            explained = column.simulator not in (BASE, ROUNDING)
             for number, base in enumerate(results[name, BASE]):
                 row = results[name, column.label][number]
                 if row.success == base.success:
@@ -222,6 +222,6 @@ def _otherwise(flown_in: Sequence[Column]) -> Grid:
     lines = [
         [column.label, sentence]
         for column in flown_in
-        for sentence in differences(column.world, column.vehicle)
+        for sentence in differences(column.simulator, column.vehicle)
     ]
-    return table(["world", "difference to the vehicle's file"], lines)
+    return table(["simulator", "difference to the vehicle's file"], lines)

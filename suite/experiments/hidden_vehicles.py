@@ -15,9 +15,9 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.running.apart import Job
 from suite.common.work import all_done
-from suite.experiments.pages import hidden_worlds as pages
+from suite.experiments.pages import hidden_vehicles as pages
 from suite.experiments.pages.document import Made, Place
-from suite.experiments.pages.hidden_worlds import Came
+from suite.experiments.pages.hidden_vehicles import Came
 from suite.experiments.study import judging, options
 from suite.experiments.study.cache import LOOP_ROOMS, code_digest, digest, engines
 from suite.judging.content import policy_digest
