@@ -10,6 +10,7 @@ import tyro
 
 from suite.commands.list import list_settings
 from suite.common.console import Console
+from suite.common.curve import tensorboard
 from suite.common.running.hosts import Joined, join, member
 from suite.common.startup import use_device
 from suite.common.work import Silent
@@ -59,6 +60,8 @@ class Config:
     set: tuple[str, ...] = ()
     """Change settings by name, in every phase, such as loss.progress=0.4; from the second phase
     on: phases.2.loss.progress=0.4."""
+    tensorboard: bool = False
+    """Also write the curve for TensorBoard, into tensorboard/ of the run (extra `tensorboard`)."""
     list_settings: bool = False
     """Print every setting that --set takes, with value, range and meaning, and train nothing."""
     joined: tyro.conf.OmitArgPrefixes[Joined] = Joined()
@@ -130,7 +133,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         fit = stored.config.get("fit", {})
         check_corrects(fit, dynamics, resolved.spec.rate_hz, config.delta)
         delta = jax.tree.map(jax.numpy.asarray, stored.params)
-    outcome = train(resolved, config.out, console, params, delta)
+    mirror = tensorboard(config.out) if config.tensorboard and not one.number else None
+    outcome = train(resolved, config.out, console, params, delta, mirror=mirror)
     if one.number:
         return {"process": one.number, "processes": one.of, "iterations": outcome.iterations}
     last = outcome.last

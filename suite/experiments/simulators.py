@@ -26,8 +26,8 @@ from tracks.input.ranges import Seed, Trials
 BASE = "mujoco"
 """The simulator that the others are compared with."""
 ROUNDING = "mjx"
-"""The simulator that differs from the first by rounding to single precision, contacts by distance and
-images by analytic rays."""
+"""The simulator that differs from the first by rounding to single precision, contacts by distance
+and images by analytic rays."""
 WHY = ("rounding", "air", "rest")
 """Why a trial changes: `rounding`, it does in mjx too; `air`, in mujoco with that simulator's air
 too; `rest`, neither."""

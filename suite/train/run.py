@@ -19,6 +19,7 @@ import numpy as np
 from policies.networks import delta_network, network
 from policies.spec import PolicySpec
 from suite.common.console import Console
+from suite.common.curve import Mirror
 from suite.common.running import hosts
 from suite.common.stages import Estimate
 from suite.train.config import TrainConfig
@@ -89,6 +90,7 @@ def train(
     params: network.Params | None = None,
     delta: delta_network.Params | None = None,
     watch: Watch | None = None,
+    mirror: Mirror | None = None,
 ) -> Outcome:
     """Train until the configured iterations are done; the same call again resumes.
 
@@ -99,6 +101,7 @@ def train(
         params: start from these instead of fresh ones.
         delta: a frozen Delta Action network to train under.
         watch: measures the policy on the way; in one process alone.
+        mirror: shows the curve elsewhere as well.
 
     Raises:
         ValueError: for settings that cannot be used, where the folder holds a run of another
@@ -125,7 +128,7 @@ def train(
         )
         for one, begin, end, seen in zip(configs, begins, ends, specs, strict=True)
     ]
-    run = Run(config, config.seed, origin, folder, estimate(config))
+    run = Run(config, config.seed, origin, folder, estimate(config), mirror)
     return train_in_folder(methods, run, start_state(configs[0], params), console, watch)
 
 

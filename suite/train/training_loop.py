@@ -104,6 +104,8 @@ class Run(NamedTuple):
     """Where it lives."""
     estimate: Estimate
     """What the whole run needs."""
+    mirror: curve.Mirror | None = None
+    """Shows the curve elsewhere as well."""
 
 
 def train_in_folder(
@@ -227,6 +229,8 @@ class _Recorder:
         if not hosts.writes():
             return
         curve.append(self.run.folder, self.rows)
+        if self.run.mirror:
+            self.run.mirror(self.rows)
         if self.watched:
             curve.append(self.run.folder, self.watched, curve.WATCHED)
         self.rows, self.watched = [], []
