@@ -28,15 +28,15 @@ class Config:
     set: Literal["tuning", "published"] = "tuning"
     """Which seeds: the published ones are run once."""
     seed: Seed | None = None
-    """Of a set of your own, in place of the two."""
+    """Seed of a set of your own, in place of --set."""
     count: Annotated[int, Range(1, 100_000)] | None = None
     """About how many cases, every kind with its share, at least one; if not given all 244, or 60 of
     another simulator."""
     simulator: Literal["mujoco", "rotorpy", "continuous"] = "mujoco"
-    """Who flies the cases: rotorpy (pip install diffracing-suite[rotorpy]) and continuous, an
-    engine in continuous time that shares no code with the model that fits, make 60."""
+    """What simulates the cases: rotorpy (pip install diffracing-suite[rotorpy]) and continuous, an
+    engine in continuous time that shares no code with the fitted model, make 60."""
     effects: tuple[str, ...] = ()
-    """For plan: names that your data could not tell apart."""
+    """For plan: effects that your flights do not separate."""
     workers: WorkersOption = None
     """For make and run, who shares the cases: N processes of this machine, or ADDRESS, a cluster's.
     Without it they are done one after the other."""

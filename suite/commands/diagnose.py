@@ -22,32 +22,31 @@ class Config:
     vehicle: str
     """The vehicle file that the simulation used, or a shipped vehicle's name."""
     reference: tuple[Path, ...] = ()
-    """Flights of the same vehicle before what changed, or folders of them: say what has changed
-    since, beyond how those differ among themselves."""
+    """Earlier flights of the same vehicle, or folders of them: name what has changed since, beyond
+    the differences between unchanged flights."""
     out: Path = Path("runs/diagnosis")
     """Folder for diagnosis.json, vehicle.toml, report.html and recording.rrd."""
     drive: Literal["auto", "commands", "motors"] = "auto"
     """What drives the model: logged commands, measured rotor speeds, or what the logs allow."""
     integrator: Literal["auto", "continuous", "euler"] = "auto"
-    """How the flights' bodies were moved: by the equations themselves, as every real one, by
-    MuJoCo's Euler steps of the rate loop's period, or as the logs say."""
+    """How the flights were integrated: in continuous time, as every real one; by MuJoCo's Euler
+    steps of the rate loop's period; or as the logs say."""
     relevance: Annotated[tuple[float, float, float], Range(0.0, 1e6)] = (0.05, 0.5, 0.025)
-    """The least force [m/s^2], torque over inertia [rad/s^2] and drift after a second [m] that is a
-    finding: an effect below all three is left out, however sure. 0 0 0 reports all that is
-    significant."""
+    """Thresholds of practical relevance: force [m/s^2], torque over inertia [rad/s^2], drift after
+    a second [m]. An effect below all three is left out. 0 0 0 reports everything significant."""
     compare_delta: bool = False
-    """Fit a Delta Action Model to the same flights and show what it removes; takes minutes."""
+    """Fit a Delta Action Model to the same flights and compare it; takes minutes."""
     plan: bool = False
-    """Write flights that would tell apart what these could not, in OUT/plan."""
+    """Write flights that separate the effects which these do not, in OUT/plan."""
     fly: str | None = None
     """Fly the plan in simulation with this vehicle (a file or a shipped name); write its logs."""
     recording: bool = True
     """Write the held-out flights, measured and simulated, as a recording for rerun; --no-recording
     leaves it out."""
     accept: tuple[str, ...] = ()
-    """Faults of the log's interface that are known (names of suite check): go on all the same."""
+    """Known faults of the log's interface (names of suite check) that do not stop the command."""
     seed: Seed = 0
-    """Seed of the null's draws, of the intervals' and of simulated noise."""
+    """Seed of the permutation test, the intervals and simulated noise."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -104,7 +103,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if result["unexplained"]["where"]:
         console.say(f"unexplained: {result['unexplained']['where']}")
     for line in result["separate_with"]:
-        console.say(f"would tell {line}")
+        console.say(f"to separate {line}")
     for side in ("held_out", "outside"):
         compared = (result.get("black_box") or {}).get(side)
         if compared:

@@ -25,7 +25,7 @@ class Config:
     leave: tuple[str, ...] = ()
     """What to leave as it is: any of drag, motors, inertia, lag, loop."""
     accept: tuple[str, ...] = ()
-    """Faults of the log's interface that are known (names of suite check): go on all the same."""
+    """Known faults of the log's interface (names of suite check) that do not stop the command."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -36,7 +36,7 @@ def written(config: Config) -> list[Path]:
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Identify, and say what was told and what was not.
+    """Identify, and report what is identifiable and what is not.
 
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
@@ -54,7 +54,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         values, spans = entry["value"], entry["ci95"]
         if not isinstance(values, list):
             values, spans = [values], [spans]
-        # What yaws follows what rolls and pitches; of these at least one was told, then.
+        # Inertia about z is scaled with those about x and y, of which one is identifiable then.
         left = {2: "goes with the others"} if key == "inertia" else {}
         shown = [
             f"{v:.4g} ({s[0]:.4g} to {s[1]:.4g})" if s else f"{v:.4g} ({left.get(k, 'as it was')})"
@@ -62,7 +62,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ]
         console.say(f"  {key}: {', '.join(shown)} {entry['unit']}")
     for text in result["untold"]:
-        console.say(f"  not told by these flights, {text}")
+        console.say(f"  not identifiable from these flights, {text}")
     for warning in result["warnings"]:
         console.say(f"warning: {warning}")
     console.say(f"written: {config.out}")

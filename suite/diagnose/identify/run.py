@@ -1,4 +1,4 @@
-"""From flight logs to a vehicle file with the numbers that they tell."""
+"""From flight logs to a vehicle file with the numbers that they identify."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def identify_files(
         if part not in PARTS:
             raise ValueError(f"--leave {part!r}: allowed: {', '.join(PARTS)}")
     if set(PARTS) <= set(leave):
-        raise ValueError(f"--leave {' '.join(leave)}: nothing remains to look for")
+        raise ValueError(f"--leave {' '.join(leave)}: nothing remains to estimate")
     start = load_vehicle(vehicle)
     refuse_own_motion(start)
     logs, warnings = read_flights(flight_files(flights), partial=True)
@@ -62,8 +62,8 @@ def identify_files(
     if beside := unknown_to_the_fits(start):
         warnings = [
             *warnings,
-            f"{start.name} has {', '.join(beside)} besides: the fits do not know of them, so that "
-            "what is told holds their share, and they stay in the file; start without them",
+            f"{start.name} has {', '.join(beside)} besides: the fits do not model them, so the "
+            "estimates include their share, and they stay in the file; start without them",
         ]
     found = identify(logs, start, leave)
     head = _head(found, vehicle)
@@ -97,5 +97,5 @@ def _head(found: Identified, start: str) -> str:
             if span is not None:
                 between = f"{span[0]:.4g} to {span[1]:.4g} {entry.unit}"
                 lines.append(f"{entry.key}{part} = {value:.4g}: {between}")
-    lines += [f"not told: {text}" for text in found.untold]
+    lines += [f"not identifiable: {text}" for text in found.untold]
     return "\n".join(lines)

@@ -22,7 +22,7 @@ def test_a_part_that_is_not_there_is_refused(tmp_path):
 
 
 def test_leaving_everything_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="nothing remains to look for"):
+    with pytest.raises(ValueError, match="nothing remains to estimate"):
         identify_files([tmp_path], "reference", tmp_path / "v.toml", PARTS, Console())
 
 
@@ -35,7 +35,7 @@ def test_what_was_found_is_said_where_no_file_may_hold_it(tmp_path, monkeypatch)
     out = tmp_path / "v.toml"
     with pytest.raises(ValueError, match="must grow with the command") as refused:
         identify_files([tmp_path / "one.parquet"], "reference", out, [], Console())
-    assert "motors.thrust[0] = 9: 8 to 10 N\nnot told: the rest" in str(refused.value)
+    assert "motors.thrust[0] = 9: 8 to 10 N\nnot identifiable: the rest" in str(refused.value)
     assert not out.exists()
 
 
