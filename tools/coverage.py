@@ -1,12 +1,12 @@
-"""How often do the intervals of `suite identify` hold the truth, number by number?
+"""How often do the intervals of `suite identify` contain the true value, number by number?
 
     python tools/coverage.py COUNT [SEED] [CASES] [OUT.json]
 
 Identifies COUNT simulated fleets of drawn numbers (`tests/support/fleets.py`) by each of
-CASES (with commas between; else all). Prints, for every number of a vehicle file, how many fleets
-told it, in how many of these the 95 % interval holds the truth (with Wilson's interval), its
-half-width over the truth (the median), and the pulls (errors in half-widths): mean and root mean
-square, wanted 0 and 0.51.
+CASES (with commas between; else all). Prints, for every number of a vehicle file: for how many
+fleets it was estimated, in how many of these the 95 % interval contains the true value (with
+Wilson's interval), the median half-width over the true value, and the pulls (errors in
+half-widths): mean and root mean square, 0 and 0.51 for exact intervals.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""A model that is wrong by design: does the diagnosis still say the truth about a drag?
+"""A model that is wrong by design: is what the diagnosis names still true?
 
     python tools/misfit.py COUNT [SEED]
 
-Every case hides a linear drag and, beside it, a force that goes with the place in a way that no
-effect describes, so strong that the flights are 20 times the noise off a model that has the drag.
+Every case hides a linear drag and a force over the place that no effect describes. The force is so
+strong that a model with the right drag is off by 20 times the noise.
 Prints a line a case, one process a core, then how many 95 % intervals of the drag hold the truth
 and how many cases have a false name.
 """
