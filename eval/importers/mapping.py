@@ -19,9 +19,9 @@ from eval.importers.frames import (
 )
 from eval.importers.mapping_file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
-from eval.importers.rows import measured
+from eval.importers.rows import continuous, measured
 from eval.importers.signals import Recording, Signal, collect
-from eval.logs.columns import FlightLogError
+from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.faults.finding import Finding
 
 Part = tuple[np.ndarray, np.ndarray]
@@ -29,6 +29,8 @@ Find = Callable[[tuple[str, ...]], Part | None]
 """Time [s] and values (N, C) of columns, or None where one of them is not there."""
 KEPT = "kept:"
 """Before the name of a column that is kept as it is."""
+ESTIMATED = ("pos", "quat", "vel")
+"""Signals of which an on-board estimate may stand beside motion capture."""
 
 
 def recording_of(
@@ -69,6 +71,7 @@ def recording_of(
             parts.setdefault(quat, (time_s, from_euler(value)))
             taken.setdefault(quat, Column((), ()))
     parts = {signal: _turned(signal, *part, taken, mapping) for signal, part in parts.items()}
+    parts |= _estimates(mapping, taken, find, name)
     for column in mapping.keep:
         part = find((column,))
         if part is not None:
@@ -95,6 +98,27 @@ def _first(
                 raise FlightLogError(name, None, None, reason)
             return column, part
     return alternatives[0], None
+
+
+def _estimates(
+    mapping: LogMap, taken: Mapping[str, Column], find: Find, name: str
+) -> dict[str, Part]:
+    """Return the estimate of each signal that is taken from motion capture, as columns to keep."""
+    kept = {}
+    for signal in ESTIMATED:
+        if signal not in taken or taken[signal].source != "mocap":
+            continue
+        for column in mapping.columns[signal]:
+            part = find(column.names) if column.source == "estimate" else None
+            if part is None or _is_world(signal, column) != (signal == "vel"):
+                continue
+            told = {signal: column}
+            time_s, value = _turned(signal, *_values(part, column, name), told, mapping)
+            value = continuous(value) if signal == "quat" else value
+            for k, group in enumerate(GROUPS[signal]):
+                kept[f"{KEPT}{ESTIMATE}{group}"] = (time_s, value[:, k : k + 1])
+            break
+    return kept
 
 
 def _values(part: Part, column: Column, name: str) -> Part:

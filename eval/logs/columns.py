@@ -14,6 +14,7 @@
 | `motor_cmd_1` to `motor_cmd_4` | rad/s, commanded | no |
 | `acc_x acc_y acc_z` | m/s^2, specific force, body | no |
 | `voltage` | V | no |
+| `est_pos_x` ..., `est_quat_w` ..., `est_vel_x` ... | of an on-board estimate | no |
 
 Missing values are null or NaN. Rows are counted from 1; a CSV's header is not a row. A partial log
 (its metadata say so) may lack all but the time and one more group.
@@ -55,6 +56,8 @@ NEEDED = ("time", "pos", "quat", "rate")
 """Groups without which a whole log is refused; so is one without any of `COMMANDS`."""
 COMMANDS = (("cmd_thrust", "cmd_rate"), ("cmd_thrust", "cmd_torque"), ("motor",), ("pwm",))
 """What may drive a model: one of these must be there."""
+ESTIMATE = "est_"
+"""Before a column of position, attitude or velocity: what the drone itself estimated."""
 KNOWN = frozenset(column for group in GROUPS.values() for column in group)
 """Every column that the rules know."""
 

@@ -94,6 +94,40 @@ def test_nanobench_by_the_estimate_is_late_and_moved():
     assert log.duration_s > 30
 
 
+@pytest.mark.parametrize("source", ["", "estimate"])
+def test_an_estimate_next_to_motion_capture_is_kept(tmp_path, source):
+    columns = {"t": np.arange(0.0, 4.0, 0.01)}
+    half = 0.1 * np.sin(columns["t"])
+    quat = np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half])
+    parts = {"x": columns["t"] ** 2, "y": 0.0 * half, "z": 1.0 + half}
+    for k, (name, value) in enumerate(parts.items()):
+        columns |= {name: value, f"e{name}": 1e3 * (value + 0.01 * (k + 1))}
+    columns |= {f"{p}q{a}": v for p in ("", "e") for a, v in zip("wxyz", quat, strict=True)}
+    columns |= {"gx": np.gradient(2.0 * half, 0.01), "gy": 0.0 * half, "gz": 0.0 * half}
+    np.savetxt(
+        tmp_path / "log.csv", np.stack([*columns.values()], 1), "%.9g", ",",
+        header=",".join(columns), comments="",
+    )  # fmt: skip
+    text = '[time]\ncolumn = "t"\n[rate]\ncolumns = ["gx", "gy", "gz"]\n'
+    for start, where, unit in (("", "mocap", "m"), ("e", "estimate", "mm")):
+        names = [f"{start}{axis}" for axis in "xyz"]
+        text += f'[[pos]]\ncolumns = {names}\nunit = "{unit}"\nsource = "{where}"\n'
+        names = [f"{start}q{part}" for part in "wxyz"]
+        text += f'[[quat]]\ncolumns = {names}\nsource = "{where}"\n'
+    (tmp_path / "map.toml").write_text(text)
+    options = ImportOptions(
+        map=tmp_path / "map.toml", source=source, partial=True, trim=False, fix=False
+    )
+    log, _ = import_log(tmp_path / "log.csv", None, options)
+    kept = {name for name in log.extra if name.startswith("est_")}
+    if source:
+        assert not kept
+        return
+    assert kept == {f"est_pos_{a}" for a in "xyz"} | {f"est_quat_{a}" for a in "wxyz"}
+    for k, axis in enumerate("xyz"):
+        near(log.extra[f"est_pos_{axis}"] - log.pos_w[:, k], 0.01 * (k + 1), 1e-6)
+
+
 @real
 @pytest.mark.parametrize(
     ("path", "lacks"),
