@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from eval.judging.ages import Delays
+from eval.judging.filtered import Filtered, single_steps
 from eval.judging.guard import ActionLimits, ask, first_action, limits_of
 from eval.judging.outputs import Outputs
 from eval.judging.recorder import Recorder
@@ -258,6 +259,11 @@ class _Slots:
         self._hidden = policy.start(n)
         self._recorder = Recorder(n, task.record.depth, self._first) if task.record else None
         wanted, self._sensors, self._delays = task.options.sensors, None, None
+        self._filtered = None
+        if wanted.estimator:
+            room = layout_of(task.tracks.values())
+            about = world.dt, policy.spec.camera, room.gates * room.corners
+            self._filtered = Filtered(wanted, n, *about)
         if sensing(wanted.models):
             self._sensors = Sensors(wanted, n, rate, policy.spec.camera)
         if wanted.is_late:
@@ -297,6 +303,8 @@ class _Slots:
                 self._sensors.start(slot, trial)
             if self._delays:
                 self._delays.start(slot, trial)
+            if self._filtered:
+                self._filtered.start(slot, trial, track.scene.gates)
             entries.append((slot, track, trial))
         if entries:
             self._world.load(entries)
@@ -304,11 +312,13 @@ class _Slots:
     def _decide_and_fly(self) -> None:
         """Ask the policy once and fly its answers, but late ones, until its next decision."""
         spec, flying = self._policy.spec, self._index >= 0
-        seen = self._look(flying)
+        seen = truth = self._look(flying)
         if self._delays:
             seen = self._delays.see(seen, self._fresh, flying)
         if self._sensors:
             seen = self._sensors.see(seen, self._fresh, flying)
+        if self._filtered:
+            seen = self._filtered.see(seen, truth, self._fresh, flying)
         state, image = observe(spec, seen, self._action_b)
         state = np.where(flying[:, None], state, 0).astype(np.float32)
         image = image.astype(np.float32)
@@ -348,9 +358,13 @@ class _Slots:
         return view._replace(gate_number=np.array(self._world.progress.gates))
 
     def _advance(self, steps: np.ndarray) -> None:
-        for row in self._world.advance(self._action_b, steps, bool(self._recorder)):
-            if self._recorder:
-                self._recorder.add(row)
+        for part in single_steps(steps) if self._filtered else (steps,):
+            for row in self._world.advance(self._action_b, part, bool(self._recorder)):
+                if self._recorder:
+                    self._recorder.add(row)
+            if self._filtered:
+                flew = (part > 0) & (self._world.progress.ended == FLYING)
+                self._filtered.follow(self._world.view(np.zeros(len(part), bool)), flew)
 
     def _result(self, slot: int) -> TrialResult:
         trial, task = self._trial[slot], self._task

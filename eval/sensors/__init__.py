@@ -15,9 +15,11 @@ from eval.sensors import (
     exposure,
     frame_loss,
     gate_detection,
+    gate_filter,
     gate_map,
     image_motion,
     imu,
+    measured_state,
     state_drift,
     state_loss,
     state_noise,
@@ -51,6 +53,7 @@ _OWN = {
         gate_map,
         state_drift,
         state_noise,
+        measured_state,
         state_loss,
         gate_detection,
         wrong_gate,
@@ -60,6 +63,7 @@ _OWN = {
         exposure,
         frame_loss,
         imu,
+        gate_filter,
     )
 }
 # In the order in which they act; each takes what those before it made of the truth.

@@ -107,6 +107,8 @@ class Sensor:
     """Takes what the models before it made of the truth; returns what is seen, and the memory."""
     ages: Callable[[Values], Ages] | None = None
     """For a delay: how old what is seen is."""
+    estimate: Callable[[Values], Any] | None = None
+    """For an estimator in the loop: its `eval.sensors.filter.settings.FilterSettings`."""
     measure: Callable[[Values, Memory, Inertial, Draws, Any], tuple[Inertial, Memory]] | None = None
     """For an inertial sensor: (values, memory, truth, draws, dt_s) -> what it measures, memory."""
 

@@ -57,6 +57,15 @@ class SensorSet:
         """Whether anything is old at the decision."""
         return bool(self.ages.state_s or self.ages.image_s)
 
+    @property
+    def estimator(self) -> Any:
+        """Settings of the estimator in the loop; None where the state comes as it is."""
+        for name, values in self.models.items():
+            make = SENSORS[name].estimate
+            if make:
+                return make(values)
+        return None
+
 
 PERFECT = SensorSet()
 """The truth."""

@@ -53,10 +53,11 @@ def fly_trial(
         wanted: what the policy sees of the truth.
 
     Raises:
-        ValueError: for observations that are old, which this world has not.
+        ValueError: for observations that are old or filtered, which this world has not.
     """
-    if wanted.is_late:
-        raise ValueError("world 'reference' shows nothing late; fly in 'mujoco', which flies alike")
+    if wanted.is_late or wanted.estimator:
+        lacks = "has no estimator in the loop" if wanted.estimator else "shows nothing late"
+        raise ValueError(f"world 'reference' {lacks}; fly in 'mujoco', which flies alike")
     rules, limits = rules or Rules(), limits or ActionLimits()
     autopilot = make_autopilot(vehicle, policy.spec.action)
     dt, spec = autopilot.dt, policy.spec

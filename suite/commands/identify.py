@@ -1,4 +1,4 @@
-"""`suite identify`: the numbers of a vehicle file from flights."""
+"""`suite identify`: the numbers of a vehicle file, or of a sensors file, from flights."""
 
 from __future__ import annotations
 
@@ -14,14 +14,20 @@ from tracks.common.files import check_no_input
 
 @dataclass(frozen=True)
 class Config:
-    """Find thrust, inertia, lag, delay, rate gains and drag of a quadrotor in its flight logs."""
+    """Find thrust, inertia, lag, delay, rate gains and drag of a quadrotor in its flight logs.
+
+    With --sensors, the errors of its state estimate instead.
+    """
 
     flights: tyro.conf.Positional[tuple[Path, ...]]
     """Flight logs of one vehicle, or folders of them."""
-    vehicle: str
+    vehicle: str = ""
     """The vehicle file to start from (or a shipped vehicle's name): mass, arms, what stays."""
-    out: Path = Path("vehicle.toml")
-    """The vehicle file to write."""
+    sensors: bool = False
+    """Fit the errors of an on-board estimate against the logs' reference instead, without a
+    vehicle, and write a sensors file."""
+    out: Path | None = None
+    """The file to write; vehicle.toml by default, with --sensors sensors.toml."""
     leave: tuple[str, ...] = ()
     """What to leave as it is: any of drag, motors, inertia, lag, loop."""
     accept: tuple[str, ...] = ()
@@ -32,7 +38,7 @@ class Config:
 
 def written(config: Config) -> list[Path]:
     """Return the folders that the command writes into."""
-    return [config.out.parent]
+    return [_out(config).parent]
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
@@ -41,13 +47,24 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
+    out = _out(config)
+    if out.suffix.lower() != ".toml":
+        raise ValueError(f"--out is {str(out)!r}; its ending must be .toml")
+    if config.sensors:
+        from suite.diagnose.sensors import run as of_sensors
+
+        if config.vehicle or config.leave or config.accept:
+            raise ValueError("--sensors takes no --vehicle, --leave and --accept: leave them out")
+        result = of_sensors.identify_sensors(config.flights, out, console)
+        of_sensors.say(result, console)
+        return result
     from suite.diagnose.identify.run import identify_files
 
-    if config.out.suffix.lower() != ".toml":
-        raise ValueError(f"--out is {str(config.out)!r}; its ending must be .toml")
-    check_no_input(config.out, [config.vehicle], "--out")
+    if not config.vehicle:
+        raise ValueError("--vehicle is missing: the vehicle file to start from, or a shipped name")
+    check_no_input(out, [config.vehicle], "--out")
     result = identify_files(
-        config.flights, config.vehicle, config.out, config.leave, console, config.accept
+        config.flights, config.vehicle, out, config.leave, console, config.accept
     )
     console.say(f"driven by {DRIVEN[result['drive']]}")
     for key, entry in result["parameters"].items():
@@ -65,8 +82,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(f"  not identifiable from these flights, {text}")
     for warning in result["warnings"]:
         console.say(f"warning: {warning}")
-    console.say(f"written: {config.out}")
+    console.say(f"written: {out}")
     return result
+
+
+def _out(config: Config) -> Path:
+    """Return the file to write."""
+    return config.out or Path("sensors.toml" if config.sensors else "vehicle.toml")
 
 
 DRIVEN = {

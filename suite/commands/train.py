@@ -88,7 +88,13 @@ def resolve(config: Config) -> TrainConfig:
     if config.sensors is not None:
         from eval.sensors.sensors_file import load_sensors
 
-        run = replace(run, sensors=SensorsConfig(load_sensors(config.sensors)))
+        seen = load_sensors(config.sensors)
+        if seen.estimator:
+            raise ValueError(
+                f"--sensors {config.sensors}: its estimator follows flights of the judge, not of "
+                "the trainer; train with vio, or with what suite identify --sensors writes"
+            )
+        run = replace(run, sensors=SensorsConfig(seen))
     if config.iterations is not None:
         run = with_iterations(run, config.iterations)
     named = {"episode.batch": config.num_envs, "optimizer.rate": config.lr}

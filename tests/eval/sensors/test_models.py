@@ -296,7 +296,7 @@ def highest(name):
 def usual(name):
     return next(
         load_sensors(source).models[name]
-        for source in ("all", "tof-depth")
+        for source in ("all", "tof-depth", "nanobench")
         if name in load_sensors(source).models
     )
 

@@ -1,0 +1,269 @@
+"""The estimator in the loop of a judge: it follows each flight and gives the policy its state.
+
+After every physics step the IMU measures what the step did; frames of gate corners are taken at
+their rate and reach the filter one delay later. Everything random is drawn from the trial's seed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from eval.effects.interface import as_arrays
+from eval.sensors import SENSORS
+from eval.sensors.draws import blank_draws, draw
+from eval.sensors.filter.delayed import Delayed, present, step, wait
+from eval.sensors.filter.kalman import (
+    GRAVITY,
+    SIZE,
+    Corners,
+    FilterState,
+    project,
+    start,
+    update_gate,
+)
+from eval.sensors.filter.settings import FilterSettings
+from eval.sensors.interface import Inertial, Moment, sticky, turned_by
+from eval.sensors.sensors_file import SensorSet
+from eval.worlds.slots import SENSED, generator_of
+from eval.worlds.trial import TrialSpec
+from policies.observation import View
+from tracks.common.masks import packed, select, take
+from tracks.geometry.camera import Camera
+from tracks.geometry.rotation import exp_rot, to_local, to_world
+from tracks.geometry.scene import Gates
+
+NEAR_M = 0.2
+"""Corners nearer than this are not found [m]."""
+
+
+class Pending(NamedTuple):
+    """A frame of each slot on its way to the filter."""
+
+    image: np.ndarray
+    """(N, K, 2) tangents."""
+    seen: np.ndarray
+    """(N, K) bool."""
+    due: np.ndarray
+    """(N,) physics step at which it arrives; -1 for none."""
+
+
+class Filtered:
+    """The filters of N slots, with the IMU and the detections of the trial in each."""
+
+    def __init__(
+        self, wanted: SensorSet, slots: int, dt: float, camera: Camera, corners: int
+    ) -> None:
+        """Make the filters.
+
+        Args:
+            wanted: the sensors, with an estimator among them.
+            slots: how many trials fly at once.
+            dt: length of a physics step, at which the IMU measures [s].
+            camera: the policy's; the gates are seen by one that looks alike.
+            corners: room for as many of a track's gates.
+
+        Raises:
+            ValueError: where the state is late besides.
+        """
+        if wanted.ages.state_s:
+            raise ValueError(
+                f"sensors {wanted.name!r}: delay.state is {wanted.ages.state_s:g} s next to an "
+                "estimator, which has a delay of its own: leave it out"
+            )
+        settings: FilterSettings = wanted.estimator
+        self._settings, self._dt, self._camera = settings, dt, camera
+        self._imu = {
+            name: as_arrays(values)
+            for name, values in wanted.models.items()
+            if SENSORS[name].measure
+        }
+        self._trial, self._sample = (
+            {name: blank_draws(needs(SENSORS[name]), slots, camera) for name in self._imu}
+            for needs in (lambda sensor: sensor.trial, lambda sensor: sensor.observation)
+        )
+        self._late = round(settings.delay_s / dt)
+        self._period = 1.0 / (settings.frame_hz * dt)
+        self._half_view = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) / 2.0)
+        self._sigma = settings.corner_sigma * 2.0 * self._half_view[0] / settings.width
+        pitch = np.deg2rad(camera.pitch_deg)
+        cos, sin = np.cos(pitch), np.sin(pitch)
+        self._camera_b = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+        nobody = np.random.default_rng(0)
+        self._frame_draws, self._imu_draws = [nobody] * slots, [nobody] * slots
+        self._corner_w = np.zeros((slots, corners, 3))
+        self._real = np.zeros((slots, corners), bool)
+        self._steps, self._frame = np.zeros(slots, int), np.zeros(slots, int)
+        self._lost = np.zeros(slots, bool)
+        self._pending = [
+            Pending(
+                np.zeros((slots, corners, 2)), np.zeros((slots, corners), bool), np.full(slots, -1)
+            )
+            for _ in range(math.ceil(self._late / self._period) + 1)
+        ]
+        self._error = np.zeros((slots, SIZE))
+        self._memory: dict[str, Any] | None = None
+        self._truth: View | None = None
+        self.filters: Delayed | None = None
+        """Of all slots; what lies in an empty one is no flight."""
+
+    def start(self, slot: int, trial: TrialSpec, gates: Gates) -> None:
+        """Begin `trial`, on a track with these gates, in `slot`."""
+        own = generator_of(trial, SENSED, "gate_filter")
+        self._error[slot] = own.standard_normal(SIZE) * self._settings.start_sigma
+        self._lost[slot] = own.random() < self._settings.dropout
+        self._frame_draws[slot] = own
+        self._imu_draws[slot] = generator_of(trial, SENSED, "imu")
+        for drawn in self._trial.values():
+            draw(drawn, slot, self._imu_draws[slot])
+        corner_w = corners_of(gates)
+        self._real[slot] = np.arange(self._real.shape[1]) < len(corner_w)
+        self._corner_w[slot, : len(corner_w)] = corner_w
+        self._steps[slot] = self._frame[slot] = 0
+        for pending in self._pending:
+            pending.due[slot] = -1
+
+    def see(self, seen: View, truth: View, fresh: np.ndarray, flying: np.ndarray) -> View:
+        """Return `seen` with the filters' position, velocity and attitude.
+
+        Args:
+            seen: what the other sensors show.
+            truth: (N, ...) what there is; its depth is not looked at.
+            fresh: (N,) bool, slots whose trial begins.
+            flying: (N,) bool, the slots that fly.
+        """
+        new = fresh & flying
+        if new.any():
+            self._begin(truth, new)
+            self._look(new)
+        assert self.filters is not None
+        state = present(self.filters)
+        own = View(state.pos_w, state.rot_w, state.vel_w, *seen[3:])
+        return select(flying, own, seen)
+
+    def _begin(self, truth: View, new: np.ndarray) -> None:
+        truth = truth._replace(depth_m=None, gate_number=None)
+        kept = View(*truth[:3], *(np.zeros(len(new)),) * 4)
+        self._truth = kept if self._truth is None else select(new, kept, self._truth)
+        error, sigma = self._error, self._settings.start_sigma
+        # The truth is off the estimate by the error, in the estimate's axes.
+        guess = start(
+            kept.pos_w - error[:, :3],
+            kept.vel_w - error[:, 3:6],
+            np.matmul(kept.rot_w, exp_rot(-error[:, 6:9])),
+            sigma,
+        )
+        begun = wait(guess, self._late)
+        filters = begun if self.filters is None else select(new, begun, self.filters)
+        self.filters = packed(filters)
+        memory = {
+            name: begin(values, Moment(truth, self._trial[name], self._dt, self._camera))
+            if (begin := SENSORS[name].start)
+            else ()
+            for name, values in self._imu.items()
+        }
+        self._memory = memory if self._memory is None else select(new, memory, self._memory)
+
+    def follow(self, view: View, flew: np.ndarray) -> None:
+        """Let the filters go on by a physics step.
+
+        Args:
+            view: the truth after it.
+            flew: (N,) bool, the slots that flew it.
+        """
+        assert self._truth is not None and self.filters is not None and self._memory is not None
+        before, dt = self._truth, np.full(len(flew), self._dt)
+        with np.errstate(invalid="ignore", over="ignore"):  # of slots that hold no flight
+            sample = inertial(before, view, self._dt)
+            for name, values in self._imu.items():
+                measure = SENSORS[name].measure
+                assert measure is not None
+                for slot in np.flatnonzero(flew).tolist():
+                    draw(self._sample[name], slot, self._imu_draws[slot])
+                memory = self._memory[name]
+                sample, memory = measure(values, memory, sample, self._sample[name], self._dt)
+                self._memory[name] = select(flew, memory, self._memory[name])
+            own = sample.rate_b, sample.acc_b, dt, flew
+            self.filters = packed(step(self.filters, *own, self._settings.imu))
+        now = View(view.pos_w, view.rot_w, view.vel_w, *before[3:])
+        self._truth = select(flew, now, before)
+        self._steps += flew
+        self._arrive(flew)
+        self._look(flew & (self._steps == np.rint(self._frame * self._period)))
+
+    def _look(self, due: np.ndarray) -> None:
+        """Take a frame in the slots where one is `due`."""
+        rows, settings = np.flatnonzero(due), self._settings
+        if not len(rows):
+            return
+        assert self._truth is not None
+        truth, corner_w = take(self._truth[:3], rows), self._corner_w[rows]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            image, forward = project(truth[0], truth[1], self._camera_b, corner_w)
+        inside = (np.abs(image) <= self._half_view).all(-1)
+        seen = self._real[rows] & inside & (forward > NEAR_M) & (forward < settings.range_m)
+        chance, noise = np.zeros(len(rows)), np.zeros(image.shape)
+        for k, slot in enumerate(rows.tolist()):
+            draws, own = self._frame_draws[slot], int(self._real[slot].sum())
+            chance[k], noise[k, :own] = draws.random(), draws.standard_normal((own, 2))
+        share, length_s = np.asarray(settings.dropout), np.asarray(settings.dropout_s)
+        lost = sticky(self._lost[rows], chance, share, length_s, 1.0 / settings.frame_hz)
+        self._lost[rows] = lost
+        for place in np.unique(self._frame[rows] % len(self._pending)).tolist():
+            some = self._frame[rows] % len(self._pending) == place
+            pending, to = self._pending[place], rows[some]
+            pending.image[to] = (image + self._sigma * noise)[some]
+            pending.seen[to] = (seen & ~lost[:, None])[some]
+            pending.due[to] = self._steps[to] + self._late
+        self._frame[rows] += 1
+        if not self._late:
+            self._arrive(due)
+
+    def _arrive(self, flew: np.ndarray) -> None:
+        """Give the filters the frames that have come to them."""
+        assert self.filters is not None
+        for pending in self._pending:
+            rows = np.flatnonzero(flew & (pending.due == self._steps) & pending.seen.any(1))
+            if not len(rows):
+                continue
+            corners = Corners(pending.image[rows], self._corner_w[rows], pending.seen[rows])
+            state = take(self.filters.state, rows)
+            after = update_gate(state, corners, self._sigma**2, self._camera_b)
+            parts = zip(self.filters.state, after, strict=True)
+            state = FilterState(*(_with_rows(whole, rows, new) for whole, new in parts))
+            self.filters = self.filters._replace(state=state)
+            pending.due[rows] = -1
+
+
+def _with_rows(whole: np.ndarray, rows: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Return a copy of `whole` with `new` in some rows: arrays of a state may be shared."""
+    changed = whole.copy()
+    changed[rows] = new
+    return changed
+
+
+def single_steps(steps: np.ndarray) -> list[np.ndarray]:
+    """Return each slot's steps (N,) one by one."""
+    return [(steps > done).astype(int) for done in range(int(steps.max(initial=0)))]
+
+
+def corners_of(gates: Gates) -> np.ndarray:
+    """Return the corners (K, 3) of all openings in the world, each once [m]."""
+    opening = np.asarray(gates.opening_g)
+    corner_g = np.concatenate([np.zeros((*opening.shape[:2], 1)), opening], axis=-1)
+    corner_w = gates.center_w[:, None] + to_world(gates.rot_w[:, None], corner_g)
+    repeated = np.zeros(opening.shape[:2], bool)
+    repeated[:, 1:] = (opening[:, 1:] == opening[:, :-1]).all(-1)
+    return corner_w[~repeated]
+
+
+def inertial(before: View, after: View, dt: float) -> Inertial:
+    """Return what an ideal IMU measures in a step: means, in the body axes of its middle."""
+    sine_b = turned_by(after.rot_w, before.rot_w)
+    size = np.sqrt((sine_b**2).sum(-1))[..., None]
+    turn_b = sine_b * np.where(size > 1e-9, np.arcsin(np.minimum(size, 1.0)) / (size + 1e-300), 1.0)
+    acc_w = (after.vel_w - before.vel_w) / dt + [0.0, 0.0, GRAVITY]
+    middle_w = np.matmul(before.rot_w, exp_rot(0.5 * turn_b))
+    return Inertial(turn_b / dt, to_local(middle_w, acc_w))

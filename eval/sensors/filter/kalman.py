@@ -1,0 +1,246 @@
+"""An error-state Kalman filter on an IMU and the corners of known gates (numpy and JAX).
+
+The nominal state is position, velocity, attitude R (body to world) and the biases of accelerometer
+and gyro. Its error dx = (dp, dv, dtheta, da, dw) is small, with R_true = R Exp(dtheta), and has the
+covariance P (Solà 2017, "Quaternion kinematics for the error-state Kalman filter", sections 5 and
+6: local angular error). With a = acc - bias_a and w = gyro - bias_w, means over dt:
+
+    predict   v += (R Exp(w dt / 2) a + g) dt,  p += (v_before + v_after) dt / 2,  R = R Exp(w dt)
+              dp += dv dt,  dv += -R [a]x dtheta dt - R da dt,  dtheta = Exp(-w dt) dtheta - dw dt
+    observe   c = C R^T (m - p),  (u, v) = (c_y, c_z) / c_x     of a corner m, camera axes C
+              dc = C [R^T (m - p)]x dtheta - C R^T dp
+    update    P' = (P^-1 + H^T H / r)^-1,  dx = P' H^T z / r    of residuals z with variance r
+    reset     dtheta -> (I - [dtheta / 2]x) dtheta              as R takes the correction
+
+An update costs the same however many corners there are, as H has the columns of dp and dtheta
+alone. Arrays have N leading rows, a drone each; every row is computed by itself.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from tracks.geometry.rotation import cross, exp_rot, to_local, to_world
+from tracks.geometry.scene import Array
+
+GRAVITY = 9.81
+"""[m/s^2]."""
+SIZE = 15
+"""Numbers in the error: position, velocity, attitude, accelerometer bias, gyro bias."""
+
+
+class ImuNoise(NamedTuple):
+    """What the filter takes the IMU's errors for: spectral densities, each a number or (N,)."""
+
+    acc: Array
+    """White noise of the accelerometer [m/s^2/sqrt(Hz)]."""
+    gyro: Array
+    """White noise of the gyro [rad/s/sqrt(Hz)]."""
+    acc_walk: Array
+    """Random walk of the accelerometer's bias [m/s^3/sqrt(Hz)]."""
+    gyro_walk: Array
+    """Random walk of the gyro's bias [rad/s^2/sqrt(Hz)]."""
+
+
+class FilterState(NamedTuple):
+    """What the filter knows of N drones."""
+
+    pos_w: Array
+    """(N, 3) [m]."""
+    vel_w: Array
+    """(N, 3) [m/s]."""
+    rot_w: Array
+    """(N, 3, 3) body to world."""
+    acc_bias_b: Array
+    """(N, 3) [m/s^2]."""
+    gyro_bias_b: Array
+    """(N, 3) [rad/s]."""
+    covariance: Array
+    """(N, 15, 15) of the error, in the order of the module's text."""
+
+
+class Corners(NamedTuple):
+    """Corners of gates as a camera at the body's origin sees them, K for each drone."""
+
+    image: Array
+    """(N, K, 2) tangents (left, up) from the optical axis [1]."""
+    corner_w: Array
+    """(N, K, 3) where the map has them [m]."""
+    seen: Array
+    """(N, K) bool; the others count for nothing."""
+
+
+def start(pos_w: Array, vel_w: Array, rot_w: Array, sigma: Array) -> FilterState:
+    """Return the state of drones whose biases are taken for zero.
+
+    Args:
+        pos_w: (N, 3) [m].
+        vel_w: (N, 3) [m/s].
+        rot_w: (N, 3, 3) body to world.
+        sigma: (15,) or (N, 15) standard deviations of the error, each in its unit.
+    """
+    xp = pos_w.__array_namespace__()
+    still, variance = xp.zeros_like(pos_w), xp.zeros((pos_w.shape[0], SIZE)) + sigma**2
+    return FilterState(pos_w, vel_w, rot_w, still, still, variance[..., None] * xp.eye(SIZE))
+
+
+def move(state: FilterState, gyro_b: Array, acc_b: Array, dt: Array) -> FilterState:
+    """Return the nominal state after `dt`; the covariance stays. See `predict`."""
+    xp = gyro_b.__array_namespace__()
+    step = dt[:, None]
+    turn_b = (gyro_b - state.gyro_bias_b) * step
+    middle_w = xp.matmul(state.rot_w, exp_rot(0.5 * turn_b))
+    acc_w = to_world(middle_w, acc_b - state.acc_bias_b) - xp.asarray([0.0, 0.0, GRAVITY])
+    vel_w = state.vel_w + step * acc_w
+    return state._replace(
+        pos_w=state.pos_w + 0.5 * step * (state.vel_w + vel_w),
+        vel_w=vel_w,
+        rot_w=xp.matmul(state.rot_w, exp_rot(turn_b)),
+    )
+
+
+def predict(
+    state: FilterState, gyro_b: Array, acc_b: Array, dt: Array, noise: ImuNoise
+) -> FilterState:
+    """Return the state one IMU sample later.
+
+    Args:
+        state: before.
+        gyro_b: (N, 3) measured mean body rates during `dt` [rad/s].
+        acc_b: (N, 3) measured mean specific force, in the body axes of the middle [m/s^2].
+        dt: (N,) [s]; a row with 0 stays as it is.
+        noise: of the IMU.
+    """
+    xp = gyro_b.__array_namespace__()
+    step = dt[:, None, None]
+    zero, one = xp.zeros_like(state.rot_w), xp.zeros_like(state.rot_w) + xp.eye(3)
+    pushed = xp.matmul(state.rot_w, _skew(acc_b - state.acc_bias_b))
+    turned = exp_rot(-(gyro_b - state.gyro_bias_b) * dt[:, None])
+    change = _blocks(
+        [
+            [one, one * step, zero, zero, zero],
+            [zero, one, -pushed * step, -state.rot_w * step, zero],
+            [zero, zero, turned, zero, -one * step],
+            [zero, zero, zero, one, zero],
+            [zero, zero, zero, zero, one],
+        ]
+    )
+    densities = xp.stack([0.0 * dt + part for part in (0.0, noise.acc, noise.gyro, *noise[2:])], -1)
+    added = xp.repeat(densities**2 * dt[:, None], 3, axis=-1)
+    covariance = xp.matmul(xp.matmul(change, state.covariance), xp.matrix_transpose(change))
+    covariance = covariance + added[..., None] * xp.eye(SIZE)
+    return move(state, gyro_b, acc_b, dt)._replace(covariance=covariance)
+
+
+def project(pos_w: Array, rot_w: Array, camera_b: Array, corner_w: Array) -> tuple[Array, Array]:
+    """Return where corners are in the image (N, K, 2) and their depth (N, K) [m].
+
+    Args:
+        pos_w: (N, 3) [m].
+        rot_w: (N, 3, 3) body to world.
+        camera_b: (3, 3) camera axes (forward, left, up) as rows in body axes.
+        corner_w: (N, K, 3) [m].
+    """
+    corner_b = to_local(rot_w[:, None], corner_w - pos_w[:, None])
+    corner_c = to_world(camera_b, corner_b)
+    return corner_c[..., 1:] / corner_c[..., :1], corner_c[..., 0]
+
+
+def update_gate(
+    state: FilterState, observation: Corners, variance: Array, camera_b: Array
+) -> FilterState:
+    """Return the state after corners of gates were seen from where it stands.
+
+    Args:
+        state: at the time of the image.
+        observation: what was seen.
+        variance: (N, K) of each number of `Corners.image`, or one for all [1].
+        camera_b: (3, 3) camera axes (forward, left, up) as rows in body axes.
+    """
+    xp = state.pos_w.__array_namespace__()
+    corner_b = to_local(state.rot_w[:, None], observation.corner_w - state.pos_w[:, None])
+    corner_c = to_world(camera_b, corner_b)
+    seen = observation.seen & (corner_c[..., 0] > 0.0)
+    forward = xp.where(seen, corner_c[..., 0], 1.0)[..., None]
+    expected = corner_c[..., 1:] / forward
+    # Rows of (C_side - image C_forward) / forward: how a move of the corner in body axes shows.
+    sides = (camera_b[1:] - expected[..., None] * camera_b[0]) / forward[..., None]
+    by_pos = -xp.matmul(sides, xp.matrix_transpose(state.rot_w)[:, None])
+    by_turn = xp.matmul(sides, _skew(corner_b))
+    slope = xp.concatenate([by_pos, by_turn], axis=-1)  # (N, K, 2, 6)
+    weight = (xp.where(seen, 1.0, 0.0) / variance)[..., None]
+    residual = xp.where(seen[..., None], observation.image - expected, 0.0)
+    rows = slope.reshape(*slope.shape[:-3], -1, 6)
+    weights = (weight + 0.0 * residual).reshape(*rows.shape[:-1], 1)
+    transposed = xp.matrix_transpose(rows * weights)
+    information = xp.matmul(transposed, rows)  # (N, 6, 6)
+    gathered = xp.matmul(transposed, residual.reshape(*rows.shape[:-1], 1))
+    # With U the columns of dp and dtheta: P' = P - P U (I + A U^T P U)^-1 A U^T P.
+    before = state.covariance
+    reach = xp.concatenate([before[..., 0:3], before[..., 6:9]], axis=-1)  # P U, (N, 15, 6)
+    own = xp.concatenate([reach[..., 0:3, :], reach[..., 6:9, :]], axis=-2)
+    solved = xp.linalg.solve(xp.eye(6) + xp.matmul(information, own), xp.concatenate(
+        [xp.matmul(information, xp.matrix_transpose(reach)), gathered], axis=-1))  # fmt: skip
+    covariance = before - xp.matmul(reach, solved[..., :-1])
+    error = xp.matmul(reach, solved[..., -1:])[..., 0]
+    return _corrected(state, error, covariance)
+
+
+def _corrected(state: FilterState, error: Array, covariance: Array) -> FilterState:
+    """Return the state with the error (N, 15) put into it, and the error's frame moved along."""
+    xp = error.__array_namespace__()
+    turn_b = error[:, 6:9]
+    zero, one = xp.zeros_like(state.rot_w), xp.zeros_like(state.rot_w) + xp.eye(3)
+    reset = one - 0.5 * _skew(turn_b)
+    moved = _blocks([
+        [reset if row == column == 2 else one if row == column else zero for column in range(5)]
+        for row in range(5)
+    ])  # fmt: skip
+    covariance = xp.matmul(xp.matmul(moved, covariance), xp.matrix_transpose(moved))
+    return FilterState(
+        state.pos_w + error[:, 0:3],
+        state.vel_w + error[:, 3:6],
+        xp.matmul(state.rot_w, exp_rot(turn_b)),
+        state.acc_bias_b + error[:, 9:12],
+        state.gyro_bias_b + error[:, 12:15],
+        0.5 * (covariance + xp.matrix_transpose(covariance)),
+    )
+
+
+def error_of(state: FilterState, truth: FilterState) -> Array:
+    """Return what the state is off by, (N, 15): the truth's covariance is not looked at."""
+    xp = state.pos_w.__array_namespace__()
+    turn = xp.matmul(xp.matrix_transpose(state.rot_w), truth.rot_w)
+    sine_b = 0.5 * xp.stack(
+        [
+            turn[:, 2, 1] - turn[:, 1, 2],
+            turn[:, 0, 2] - turn[:, 2, 0],
+            turn[:, 1, 0] - turn[:, 0, 1],
+        ],
+        axis=-1,
+    )
+    parts = [truth.pos_w - state.pos_w, truth.vel_w - state.vel_w, sine_b]
+    parts += [truth.acc_bias_b - state.acc_bias_b, truth.gyro_bias_b - state.gyro_bias_b]
+    return xp.concatenate(parts, axis=-1)
+
+
+def nees(state: FilterState, truth: FilterState) -> Array:
+    """Return the normalised estimation error squared, (N,): chi-squared of 15 where P is right.
+
+    Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
+    """
+    xp = state.pos_w.__array_namespace__()
+    error = error_of(state, truth)[..., None]
+    return xp.sum(error * xp.linalg.solve(state.covariance, error), axis=(-2, -1))
+
+
+def _skew(vector: Array) -> Array:
+    """Return the matrices (..., 3, 3) with [a]x b = a x b."""
+    xp = vector.__array_namespace__()
+    eye = xp.eye(3)
+    return xp.stack([cross(vector, eye[k] + 0.0 * vector) for k in range(3)], axis=-1)
+
+
+def _blocks(rows: list[list[Array]]) -> Array:
+    xp = rows[0][0].__array_namespace__()
+    return xp.concatenate([xp.concatenate(row, axis=-1) for row in rows], axis=-2)

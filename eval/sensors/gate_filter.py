@@ -1,0 +1,85 @@
+"""A state estimator in the loop: a Kalman filter on the IMU and the corners of known gates.
+
+The policy is given what the filter makes of them (`eval/sensors/filter/`), and no true state. The
+gates stand where the map says; corners are seen where they are in the field of view and in range,
+through whatever stands between.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from eval.sensors.filter.kalman import ImuNoise
+from eval.sensors.filter.settings import FilterSettings
+from eval.sensors.interface import Array, Parameter, Sensor
+
+
+class GateFilter(NamedTuple):
+    """Values of `gate_filter`."""
+
+    pixel: Array
+    width: Array
+    rate: Array
+    dropout: Array
+    dropout_length: Array
+    delay: Array
+    range: Array
+    position: Array
+    velocity: Array
+    attitude: Array
+    acc_bias: Array
+    gyro_bias: Array
+    acc_noise: Array
+    gyro_noise: Array
+    acc_walk: Array
+    gyro_walk: Array
+
+
+def estimate(values: GateFilter) -> FilterSettings:
+    """Return the settings of the filter and of the detections."""
+    start = (values.position, values.velocity, values.attitude, values.acc_bias, values.gyro_bias)
+    return FilterSettings(
+        corner_sigma=float(values.pixel),
+        width=float(values.width),
+        frame_hz=float(values.rate),
+        dropout=float(values.dropout),
+        dropout_s=float(values.dropout_length),
+        delay_s=float(values.delay),
+        range_m=float(values.range),
+        start_sigma=np.repeat(np.array(start, float), 3),
+        imu=ImuNoise(values.acc_noise, values.gyro_noise, values.acc_walk, values.gyro_walk),
+    )
+
+
+SENSOR = Sensor(
+    name="gate_filter",
+    summary="The state is what a Kalman filter makes of the IMU and of gate corners seen late",
+    equation="error-state Kalman filter (eval/sensors/filter/kalman.py); corners (u, v) + s n, of "
+    "frames `delay` ago, none in `dropout` of them",
+    source="Solà 2017 (filter); corners to a pixel: Foehn et al. 2022 (AlphaPilot, gate corners "
+    "by a network); noise densities and walks: ten times those of a MEMS data sheet (ICM-20689), "
+    "as vibration asks for",
+    values=GateFilter,
+    parameters=(
+        Parameter("pixel", "1", 0.05, 0.05, 50.0, (0.5, 3.0), required=False),
+        Parameter("width", "1", 640.0, 16.0, 8192.0, (320.0, 1280.0), required=False),
+        Parameter("rate", "Hz", 30.0, 0.1, 500.0, (15.0, 60.0), required=False),
+        Parameter("dropout", "1", 0.0, 0.0, 0.95, (0.05, 0.5), required=False),
+        Parameter("dropout_length", "s", 0.0, 0.0, 60.0, (0.1, 0.5), required=False),
+        Parameter("delay", "s", 0.0, 0.0, 0.5, (0.02, 0.1), required=False),
+        Parameter("range", "m", 15.0, 0.5, 1000.0, (5.0, 20.0), required=False),
+        Parameter("position", "m", 0.001, 1e-4, 10.0, (0.02, 0.2), required=False),
+        Parameter("velocity", "m/s", 0.001, 1e-4, 10.0, (0.01, 0.1), required=False),
+        Parameter("attitude", "rad", 0.0005, 1e-5, 0.5, (0.005, 0.03), required=False),
+        Parameter("acc_bias", "m/s^2", 0.05, 1e-5, 5.0, (0.05, 0.3), required=False),
+        Parameter("gyro_bias", "rad/s", 0.005, 1e-6, 1.0, (0.002, 0.02), required=False),
+        Parameter("acc_noise", "m/s^2/sqrt(Hz)", 0.02, 1e-5, 5.0, (0.005, 0.1), required=False),
+        Parameter("gyro_noise", "rad/s/sqrt(Hz)", 0.001, 1e-6, 1.0, (0.0002, 0.01), required=False),
+        Parameter("acc_walk", "m/s^3/sqrt(Hz)", 0.002, 0.0, 5.0, (0.0005, 0.01), required=False),
+        Parameter("gyro_walk", "rad/s^2/sqrt(Hz)", 0.0001, 0.0, 1.0, (1e-5, 1e-3), required=False),
+    ),
+    grows=("pixel", "dropout", "dropout_length", "delay", "position", "velocity", "attitude"),
+    estimate=estimate,
+)

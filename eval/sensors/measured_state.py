@@ -1,0 +1,142 @@
+"""Errors of an estimated state axis by axis, as `suite identify --sensors` measures them.
+
+Position has its axes in the world, velocity and attitude theirs in the body.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from eval.sensors.interface import (
+    Array,
+    Moment,
+    Needs,
+    Parameter,
+    Sensor,
+    View,
+    column,
+    length,
+    product,
+    remembered,
+)
+from tracks.geometry.rotation import exp_rot, to_world
+
+GROUPS = {"position": ("m", 10.0), "velocity": ("m/s", 10.0), "attitude": ("rad", 0.5)}
+"""Parts of the state: the unit of their errors, and the largest."""
+AXES = tuple(f"{group}_{axis}" for group in GROUPS for axis in "xyz")
+"""The nine errors, in order."""
+LASTS_S = 0.5
+"""How long errors last where a file does not say [s]."""
+
+
+class Axis(NamedTuple):
+    """What is wrong along one axis: its parameters are `position_x`, `position_x_bias`, ..."""
+
+    noise: Array
+    """Standard deviation of what comes and goes."""
+    bias: Array
+    """Standard deviation of what stays for a trial."""
+    fast: Array
+    """Share of the noise's variance that changes fast [1]."""
+    fast_lasts: Array
+    """Correlation time of that share; 0: it is new at every observation [s]."""
+    lasts: Array
+    """Correlation time of the rest [s]."""
+
+
+def _named(axis: str) -> tuple[str, ...]:
+    return (axis, *(f"{axis}_{name}" for name in Axis._fields[1:]))
+
+
+_FIELDS = [*(name for axis in AXES for name in _named(axis)), "velocity_scale", "position_drift"]
+MeasuredState: Any = NamedTuple("MeasuredState", [(name, Array) for name in _FIELDS])  # pyright: ignore
+MeasuredState.__doc__ = "Values of `measured_state`."
+
+
+def axes_of(values: Any) -> Axis:
+    """Return the values of all axes, each (..., 9)."""
+    xp = values.velocity_scale.__array_namespace__()
+    columns = zip(*([getattr(values, name) for name in _named(axis)] for axis in AXES), strict=True)
+    return Axis(*(xp.stack(list(column), axis=-1) for column in columns))
+
+
+def start(values: Any, moment: Moment) -> dict[str, Any]:
+    """Return unit errors and biases (..., 9), no drift (..., 3) and where the drone is."""
+    draws, pos_w = moment.draws.normal, moment.truth.pos_w
+    return {
+        "slow": draws[..., :9],
+        "fast": draws[..., 9:18],
+        "bias": draws[..., 18:],
+        "drift_w": 0.0 * pos_w,
+        "pos_w": pos_w,
+    }
+
+
+def sense(
+    values: Any, memory: dict[str, Any], seen: View, moment: Moment
+) -> tuple[View, dict[str, Any]]:
+    """Return the view with an estimated position, velocity and attitude."""
+    xp, axes, draws = seen.pos_w.__array_namespace__(), axes_of(values), moment.draws.normal
+    slow = _later(memory["slow"], axes.lasts, draws[..., :9], moment.dt_s)
+    fast = _later(memory["fast"], axes.fast_lasts, draws[..., 9:18], moment.dt_s)
+    unit = xp.sqrt(1.0 - axes.fast) * slow + xp.sqrt(axes.fast) * fast
+    off = axes.noise * unit + axes.bias * memory["bias"]
+    flown_m = length(moment.truth.pos_w - memory["pos_w"])
+    drift_w = memory["drift_w"] + column(values.position_drift * xp.sqrt(flown_m)) * draws[..., 18:]
+    scaled_w = column(1.0 + values.velocity_scale) * seen.vel_w
+    seen = seen._replace(
+        pos_w=seen.pos_w + off[..., :3] + drift_w,
+        vel_w=scaled_w + to_world(seen.rot_w, off[..., 3:6]),
+        rot_w=product(seen.rot_w, exp_rot(off[..., 6:])),
+    )
+    now = {"slow": slow, "fast": fast, "drift_w": drift_w, "pos_w": moment.truth.pos_w}
+    return seen, memory | now
+
+
+def _later(error: Array, lasts_s: Array, draws: Array, dt_s: Any) -> Array:
+    """Return unit errors one observation later."""
+    xp = error.__array_namespace__()
+    kept = xp.exp(-dt_s / xp.maximum(lasts_s, 1e-9))
+    return kept * error + remembered(kept) * draws
+
+
+def _parameters() -> tuple[Parameter, ...]:
+    found = []
+    for group, (unit, most) in GROUPS.items():
+        usual = {"position": (0.01, 0.1), "velocity": (0.05, 0.3), "attitude": (0.005, 0.03)}[group]
+        for axis in "xyz":
+            noise, bias, fast, fast_lasts, lasts = _named(f"{group}_{axis}")
+            found += [
+                Parameter(noise, unit, 0.0, 0.0, most, usual),
+                Parameter(bias, unit, 0.0, 0.0, most, usual),
+                Parameter(fast, "1", 0.0, 0.0, 1.0, (0.05, 0.5), required=False),
+                Parameter(fast_lasts, "s", 0.0, 0.0, 1000.0, (0.01, 0.1), required=False),
+                Parameter(lasts, "s", LASTS_S, 0.0, 1000.0, (0.1, 2.0), required=False),
+            ]
+    return (
+        *found,
+        Parameter("velocity_scale", "1", 0.0, -0.5, 0.5, (0.005, 0.05)),
+        Parameter("position_drift", "m/sqrt(m)", 0.0, 0.0, 10.0, (0.01, 0.1)),
+    )
+
+
+SENSOR = Sensor(
+    name="measured_state",
+    summary="Errors of an estimated state with a size, a bias and a colour for every axis",
+    equation="p + b_p + n_p + d, (1 + k) v + R (b_v + n_v), R Exp(b_R + n_R); n = s (sqrt(f) e_f "
+    "+ sqrt(1 - f) e), e' = a e + sqrt(1 - a^2) white, a = exp(-dt / lasts), e_f alike; "
+    "d' = d + c sqrt(|dp|) white",
+    source="first-order Gauss-Markov processes (Gelb 1974, Applied Optimal Estimation); the "
+    "numbers by `suite identify --sensors`",
+    values=MeasuredState,
+    parameters=_parameters(),
+    grows=(
+        *(name for axis in AXES for name in _named(axis)[:2]),
+        "velocity_scale",
+        "position_drift",
+    ),
+    trial=Needs(normal=27),
+    observation=Needs(normal=21),
+    start=start,
+    sense=sense,
+)

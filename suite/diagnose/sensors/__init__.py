@@ -1,0 +1,1 @@
+"""Models of sensors and estimators from flights with a reference."""

@@ -1,0 +1,150 @@
+"""Sensors identified from estimates that a known model made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from eval import sensors
+from eval.logs.flight_log import FlightLog, write_flight
+from eval.sensors.interface import Draws, View
+from eval.sensors.sensors_file import load_sensors, sensor_set
+from suite.common.console import Console
+from suite.diagnose.sensors.identify import fit_sensors, held_out, parameters_of
+from suite.diagnose.sensors.run import identify_sensors
+from tracks.geometry.camera import Camera
+from tracks.geometry.rotation import exp_rot, rot_to_quat
+
+STEP_S, LONG_S, FLIGHTS = 0.02, 40.0, 6
+TRUE = {
+    **{f"position_{a}": 0.03 for a in "xyz"},
+    **{f"position_{a}_fast": 0.3 for a in "xyz"},
+    **{f"velocity_{a}": size for a, size in zip("xyz", (0.1, 0.05, 0.2), strict=True)},
+    **{f"velocity_{a}_lasts": lasts for a, lasts in zip("xyz", (0.3, 0.6, 0.15), strict=True)},
+    **{f"attitude_{a}": 0.01 for a in "xyz"},
+    **{f"attitude_{a}_bias": 0.02 for a in "xyz"},
+    "velocity_scale": 0.05,
+}
+DELAY_S = 0.06
+
+
+def flown(numbers: Sequence[int], delay_s: float = DELAY_S, **changed: float) -> list[FlightLog]:
+    """Return flights with an estimate by a model of `TRUE` that is late by `delay_s`."""
+    lead, count = round(delay_s / STEP_S), round(LONG_S / STEP_S)
+    time_s = STEP_S * np.arange(-lead, count)
+    drawn = np.array([np.random.default_rng(number).uniform(size=(2, 3)) for number in numbers])
+    speed = 1.0 + 0.6 * drawn[:, 0]
+    phase = speed * time_s[:, None, None] + 6.0 * drawn[:, 1]  # (T, N, 3)
+    pos_w, vel_w = 3.0 * np.sin(phase), 3.0 * speed * np.cos(phase)
+    rot_w = exp_rot(0.3 * np.sin(phase + 1.0))
+    turn = np.swapaxes(rot_w[:-1], -1, -2) @ rot_w[1:]
+    rate_b = np.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], axis=-1) / STEP_S
+    models = sensors.sensing(sensor_set({"measured_state": {**TRUE, **changed}}).models)
+    sensor, camera, rng = sensors.SENSORS["measured_state"], Camera(), np.random.default_rng(99)
+    none: Any = np.zeros((len(numbers), 0))
+
+    def draws(count: int) -> dict[str, Draws]:
+        return {"measured_state": Draws(rng.normal(size=(len(numbers), count)), *[none] * 3)}
+
+    seen, memory = [], None
+    for place in zip(pos_w, rot_w, vel_w, strict=True):
+        view = View(*place, *[none] * 4)
+        if memory is None:
+            memory = sensors.start(models, view, draws(sensor.trial.normal), STEP_S, camera)
+        now = draws(sensor.observation.normal)
+        view, memory = sensors.sense(models, memory, view, now, STEP_S, camera)
+        seen.append(view)
+    logs = []
+    for k, number in enumerate(numbers):
+        rows = slice(lead, len(time_s) - 1)
+        quat = rot_to_quat(np.stack([view.rot_w[k] for view in seen]))
+        estimate = {
+            **{f"est_pos_{a}": [v.pos_w[k, i] for v in seen] for i, a in enumerate("xyz")},
+            **{f"est_vel_{a}": [v.vel_w[k, i] for v in seen] for i, a in enumerate("xyz")},
+            **{f"est_quat_{a}": quat[:, i] for i, a in enumerate("wxyz")},
+        }
+        logs.append(
+            FlightLog(
+                f"flight{number}",
+                time_s[rows],
+                pos_w[rows, k],
+                rot_to_quat(rot_w[rows, k]),
+                vel_w[rows, k],
+                rate_b[rows, k],
+                np.full(count - 1, 9.81),
+                rate_b[rows, k],
+                extra={name: np.array(v)[: count - 1] for name, v in estimate.items()},
+            )
+        )
+    return logs
+
+
+@cache
+def flights() -> list[FlightLog]:
+    return flown(range(FLIGHTS))
+
+
+def test_what_was_put_in_is_within_the_intervals():
+    found = parameters_of(fit_sensors(flights()))
+    true = {f"measured_state.{name}": value for name, value in TRUE.items()}
+    for axis in (f"{group}_{a}" for group in ("position", "attitude") for a in "xyz"):
+        true.setdefault(f"measured_state.{axis}_lasts", 0.5)
+    true["delay.state"] = DELAY_S
+    missed = {k: (v, found[k][0]) for k, v in true.items() if not _within(found[k][0], v)}
+    # One in twenty of the intervals may miss.
+    assert len(missed) <= 0.05 * len(true) + 2, missed
+    assert "delay.state" not in missed
+    delay = found["delay.state"][0]
+    assert delay.high - delay.low < 0.02
+    noise = found["measured_state.velocity_z"][0]
+    assert noise.high / noise.low < 1.5
+
+
+def _within(found: Any, true: float) -> bool:
+    return found.low <= true <= found.high
+
+
+def test_the_noise_fits_flights_that_it_was_not_fitted_to():
+    assert all(one.fits for one in held_out(flights()).values())
+
+
+def test_a_colour_that_the_other_half_has_not_is_seen():
+    others = flown(range(9, 12), velocity_z_lasts=2.0)
+    mixed = [flight for pair in zip(flights()[:3], others, strict=True) for flight in pair]
+    assert not held_out(mixed)["velocity_z"].fits
+
+
+def test_a_drift_is_found():
+    none = {"position_x": 0.0, "position_y": 0.0}
+    drifting = flown(range(20, 24), 0.0, position_drift=0.05, **none)
+    drift = fit_sensors(drifting).axes["position_x"].drift
+    assert drift.low <= 0.05 <= drift.high
+    assert drift.value > 0.02
+
+
+def test_the_file_that_is_written_reads_back_with_what_was_found(tmp_path):
+    for number, log in enumerate(flights()[:2]):
+        write_flight(tmp_path / f"{number}.parquet", log)
+    result = identify_sensors([tmp_path], tmp_path / "mine.toml", Console())
+    read = load_sensors(tmp_path / "mine.toml")
+    told = result["parameters"]["measured_state.velocity_z"]["value"]
+    assert read.models["measured_state"].velocity_z == pytest.approx(told, rel=1e-3)
+    delay_s = result["parameters"]["delay.state"]["value"]
+    assert read.ages.state_s == pytest.approx(delay_s, rel=1e-3)
+    assert "95 % intervals" in (tmp_path / "mine.toml").read_text()
+
+
+def test_a_log_without_an_estimate_or_a_reference_is_refused(tmp_path):
+    log = flights()[0]
+    write_flight(tmp_path / "bare.parquet", replace(log, extra={}))
+    with pytest.raises(ValueError, match=r"bare.parquet: no on-board estimate.*est_vel_x"):
+        identify_sensors([tmp_path], tmp_path / "mine.toml", Console())
+    lost = replace(log, pos_w=np.full_like(log.pos_w, np.nan), about={"partial": ["pos"]})
+    write_flight(tmp_path / "bare.parquet", lost)
+    with pytest.raises(ValueError, match="column pos_x: no reference for the estimate"):
+        identify_sensors([tmp_path], tmp_path / "mine.toml", Console())
