@@ -66,6 +66,7 @@ def evaluate_policy(
     seed: int = 0,
     vehicle: Vehicle | Source = "reference",
     simulator: str = "mujoco",
+    sensors: str | Path = "perfect",
     workers: int | None = None,
 ) -> list[TrialResult]:
     """Fly trials and return their results, as `suite eval` does.
@@ -78,6 +79,7 @@ def evaluate_policy(
         seed: of the first trial; the others follow by one.
         vehicle: a vehicle, a shipped name or a vehicle file.
         simulator: a name of `suite list simulators`.
+        sensors: what the policy sees and knows: a shipped name or a sensors file.
         workers: processes; None takes as many cores as are worth it.
 
     Raises:
@@ -85,6 +87,7 @@ def evaluate_policy(
     """
     from eval.judging.judge import JudgeOptions, fly
     from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.sensors.sensors_file import load_sensors
     from eval.worlds.trial import TrialSpec
     from policies.policy import load_policy
     from suite.common.choices import parse_levels, parse_tracks
@@ -98,7 +101,8 @@ def evaluate_policy(
     else:
         own = {track.family: track}
         asked = [TrialSpec(track.family, 0, s) for s in seeds]
-    return fly(flown, asked, body, simulator, JudgeOptions(workers=workers), tracks=own)
+    options = JudgeOptions(workers=workers, sensors=load_sensors(sensors))
+    return fly(flown, asked, body, simulator, options, tracks=own)
 
 
 def train_policy(

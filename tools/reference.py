@@ -1,4 +1,4 @@
-"""Write docs/reference: commands, Python names, training settings and effects, from the code.
+"""Write docs/reference: commands, Python names, settings, effects and sensors, from the code.
 
 Run: python tools/reference.py [--check]; with --check it writes nothing and ends with 1 where a
 page is not what the code says.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -18,6 +18,7 @@ import suite
 from eval.effects import EFFECTS
 from eval.effects.interface import at
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.sensors import SENSORS
 from suite.common.settings import abouts, settings
 from suite.common.usage import EXAMPLES, GROUPS
 from suite.train.recipes import named_recipe
@@ -92,24 +93,30 @@ def training() -> str:
     )
 
 
-def effects() -> str:
-    """Return the page of the effects that a vehicle file may hold."""
+def catalogue(title: str, entries: Iterable[Any]) -> str:
+    """Return the page of a catalogue: effects of a vehicle file, or sensor models."""
     vehicle, rows = load_vehicle("reference"), list[str]()
-    for effect in EFFECTS.values():
-        for parameter in effect.parameters:
+    for entry in entries:
+        for parameter in entry.parameters:
             low, high = (at(end, vehicle) for end in (parameter.low, parameter.high))
             usual = " to ".join(f"{end:g}" for end in parameter.typical)
             rows.append(
-                f"| `{effect.name}` | {cell(effect.summary)} | {cell(effect.equation)} | "
+                f"| `{entry.name}` | {cell(entry.summary)} | {cell(entry.equation)} | "
                 f"`{parameter.name}` [{parameter.unit}] | {usual} | {low:g} to {high:g} |"
             )
-    head = "| effect | what | equation | parameter | usual size | allowed |\n"
-    return (
-        "# Effects of a vehicle file\n\n" + head + "|---|---|---|---|---|---|\n" + "\n".join(rows)
+    head = (
+        "| name | what | equation | parameter | usual size | allowed |\n|---|---|---|---|---|---|\n"
     )
+    return f"# {title}\n\n{head}" + "\n".join(rows)
 
 
-MADE = {"commands": commands, "python": python, "settings": training, "effects": effects}
+MADE = {
+    "commands": commands,
+    "python": python,
+    "settings": training,
+    "effects": lambda: catalogue("Effects of a vehicle file", EFFECTS.values()),
+    "sensors": lambda: catalogue("Models of a sensors file", SENSORS.values()),
+}
 """Page -> what returns its text."""
 
 

@@ -16,8 +16,8 @@ from tracks.common.names import unknown_name
 class Config:
     """List what other commands take by name.
 
-    Kinds: tracks, vehicles, policies, recipes, effects, simulators, benchmarks, settings (of suite
-    train --set).
+    Kinds: tracks, vehicles, policies, recipes, effects, sensors (files), sensor-models, simulators,
+    benchmarks, settings (of suite train --set).
     """
 
     kind: tyro.conf.Positional[str] = ""
@@ -108,6 +108,21 @@ def _effects() -> dict[str, str]:
     return {effect.name: effect.summary for effect in EFFECTS.values()}
 
 
+def _sensors() -> dict[str, str]:
+    from eval.sensors.sensors_file import load_sensors, shipped_sensors
+
+    def about(name: str) -> str:
+        return ", ".join(load_sensors(name).models) or "the truth"
+
+    return {name: about(name) for name in shipped_sensors()}
+
+
+def _sensor_models() -> dict[str, str]:
+    from eval.sensors import SENSORS
+
+    return {sensor.name: sensor.summary for sensor in SENSORS.values()}
+
+
 def _simulators() -> dict[str, str]:
     from eval.worlds import WORLDS
 
@@ -126,6 +141,8 @@ KINDS: dict[str, Callable[[], dict[str, str]]] = {
     "policies": _policies,
     "recipes": _recipes,
     "effects": _effects,
+    "sensors": _sensors,
+    "sensor-models": _sensor_models,
     "simulators": _simulators,
     "benchmarks": _benchmarks,
 }
