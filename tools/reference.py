@@ -97,13 +97,15 @@ def catalogue(title: str, entries: Iterable[Any]) -> str:
     """Return the page of a catalogue: effects of a vehicle file, or sensor models."""
     vehicle, rows = load_vehicle("reference"), list[str]()
     for entry in entries:
+        about = f"`{entry.name}` | {cell(entry.summary)} | {cell(entry.equation)}"
         for parameter in entry.parameters:
             low, high = (at(end, vehicle) for end in (parameter.low, parameter.high))
             usual = " to ".join(f"{end:g}" for end in parameter.typical)
             rows.append(
-                f"| `{entry.name}` | {cell(entry.summary)} | {cell(entry.equation)} | "
-                f"`{parameter.name}` [{parameter.unit}] | {usual} | {low:g} to {high:g} |"
+                f"| {about} | `{parameter.name}` [{parameter.unit}] | {usual} | "
+                f"{low:g} to {high:g} |"
             )
+            about = " | | "
     head = (
         "| name | what | equation | parameter | usual size | allowed |\n|---|---|---|---|---|---|\n"
     )

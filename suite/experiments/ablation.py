@@ -24,8 +24,8 @@ NORMALISED = (1.6, 3.2, 6.4)
 """lambda_p of L_p^norm without the field."""
 KINDS = ("field", "progress", "normalised")
 """First words of rows' keys."""
-RATES = ("success_cross", "success_rate")
-SPREADS = ("success_cross", "success_rate", "v_max", "v_max_most", "gates")
+RATES = ("success_cross", "collision_free")
+SPREADS = ("success_cross", "collision_free", "v_max", "v_max_most", "gates")
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     parts = {
         "The paper's table, and ours": [
             _main(rows, config.trials),
-            Picture(chart, "Success cross, success rate and v_max by setting"),
+            Picture(chart, "Success cross, collision-free rate and v_max by setting"),
         ],
     }
     numbers = [
@@ -127,7 +127,8 @@ def pooled(row: Summary, name: str, trials: int) -> Interval:
 
 def _main(rows: Sequence[Summary], trials: int) -> Grid:
     source, theirs = paper.ablation()
-    headers = ["setting", "lambda_p", "success cross [%]", "pooled", "paper", "success rate [%]",
+    headers = ["setting", "lambda_p", "success cross [%]", "pooled", "paper",
+               "collision-free rate [%]",
                "pooled", "paper", "v_max [m/s]", "most", "paper", "gates", "diverged"]  # fmt: skip
     lines = []
     for row in rows:

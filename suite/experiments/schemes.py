@@ -20,7 +20,7 @@ from tracks.input.ranges import Iterations, Range, Trials
 
 PROJECTION, PROJECTION_DECAY = 3.0, 0.5
 """lambda_proj and beta_3 of the paper's scheme without the field."""
-FIGURE = ("reward", "v_max", "success_rate", "gates")
+FIGURE = ("reward", "v_max", "collision_free", "gates")
 """What the paper's figure shows."""
 WANTED = (1, 2, 3)
 """Mean gates a trial, of four, whose first time the table gives."""

@@ -80,13 +80,14 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "vehicle": config.vehicle,
         "seeds": f"{options.judged_seeds(config)}, {config.trials} trials a cell, the same for all",
     }
+    named = [c._replace(policy=judging.name_of(policies[c.policy])) for c in everything]
     delta = {"With the Delta Action Model": compare.grids(lines)[:1]} if lines else {}
     parts = {
         "Compared with the paper": [against_the_paper(cells)],
         **delta,
         **{f"Goals by cell: {name}": [goal_grid(some)] for name, some in cells.items()},
         "All ten levels": [
-            Picture(level_chart(everything), "Success and v_max at every level"),
+            Picture(level_chart(named), "Success and v_max at every level"),
             *every_cell(everything),
         ],
     }

@@ -4,6 +4,7 @@ Eight programs are shown in docs/start.md; a file that is not in the table here 
 """
 
 import inspect
+import json
 import re
 import runpy
 import sys
@@ -90,3 +91,14 @@ def diagnosed(paths, vehicle, out, console, **options):
         "verdict": "named",
         "effects": [{"name": "com_offset", "parameters": {"offset": entry}}],
     }
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_from_top_to_bottom():
+    cells = json.loads((ROOT / "examples" / "tour.ipynb").read_text(encoding="utf-8"))["cells"]
+    spaces = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            text = "".join(cell["source"]).replace("TRIALS = 100, 10", "TRIALS = 2, 2")
+            exec(compile(text, cell["id"], "exec"), spaces)
+    assert spaces["found"]["verdict"] == "named" and "com_offset" in spaces["corrected"].effects

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from eval.judging.statistics import Interval, wilson
 from eval.judging.tables import Tally
-from suite.common.charts import LINES, png, titled
+from suite.common.charts import LINES, plain_axes, png, titled
 from suite.experiments.pages.paper import Ablated, sim_to_sim
 from suite.experiments.study.conditions import Sweep
 from suite.experiments.study.disturbed import Tested
 from suite.experiments.study.intervals import Spread
 from suite.experiments.study.summary import METRICS, Summary
 from tracks.families import JUDGED
-
-STYLES = ("-", "--", ":")
-"""Of the policies over levels, in order."""
 
 
 def _legend(figure: Figure, axes: Axes, columns: int = 3) -> None:
@@ -30,33 +30,52 @@ def _legend(figure: Figure, axes: Axes, columns: int = 3) -> None:
         text.set_parse_math(False)  # a policy's name may hold dollar signs
 
 
+def _percent_axis(axes: Axes, low: float, vertical: bool = True) -> None:
+    """Have an axis of percentages cover the data, whose lowest value or interval end is `low`."""
+    ends = (max(-2.0, 5.0 * math.floor(low / 5.0) - 2.0), 101.5)
+    (axes.set_ylim if vertical else axes.set_xlim)(*ends)
+
+
+def _dots(
+    axes: Axes, at: Any, found: Sequence[Interval], scale: float, label: str, **style: Any
+) -> None:
+    """Draw values with their intervals."""
+    value, low, high = scale * np.array(found).T
+    axes.errorbar(
+        at, value, np.maximum([value - low, high - value], 0), lw=1.2, label=label, **style
+    )
+
+
 def level_chart(cells: Sequence[Tally]) -> bytes:
-    """Return success (left) and v_max (right) by level; colours are tracks, styles policies."""
-    figure = Figure(figsize=(10.4, 4.0), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    policies = list(dict.fromkeys(cell.policy for cell in cells))
-    for colour, track in zip(LINES, JUDGED, strict=False):
-        for style, policy in zip(STYLES, policies, strict=False):
-            mine = [cell for cell in cells if (cell.policy, cell.track) == (policy, track)]
-            levels = [cell.difficulty for cell in mine]
-            label = track if len(policies) == 1 else f"{track}, {policy}"
-            value, low, high = 100 * np.array([cell.success for cell in mine]).T
-            left.fill_between(levels, low, high, color=colour, alpha=0.12, lw=0)
-            left.plot(levels, value, style, marker="o", ms=4, color=colour, label=label)
-            speeds = [cell.v_max.value for cell in mine]
-            right.plot(levels, speeds, style, marker="o", ms=4, color=colour)
+    """Return success (above) and v_max (below) by level, a column a track, next to the paper's."""
+    figure = Figure(figsize=(10.4, 5.4), layout="constrained")
+    rows = figure.subplots(2, len(JUDGED), sharex=True, sharey="row")
+    policies, lowest = list(dict.fromkeys(cell.policy for cell in cells)), 100.0
+    for number, track in enumerate(JUDGED):
+        upper, lower = rows[:, number]
         theirs = [c for c in sim_to_sim().cells if (c.method, c.track) == ("with_delta", track)]
-        levels, hollow = [cell.level for cell in theirs], {"mfc": "none", "mec": colour, "ls": ""}
-        left.plot(levels, [100 * c.won / c.trials for c in theirs], marker="D", ms=7, **hollow)
-        right.plot(levels, [c.v_max for c in theirs], marker="D", ms=7, **hollow)
-    titled(left, "Success [%]")
-    titled(right, "v_max, median over trials [m/s]")
-    left.set_ylim(-3, 103)
-    right.set_ylim(0, 1.05 * max(right.get_ylim()[1], 7.1))
-    for axes in (left, right):
-        axes.set_xlabel("level", fontsize=9)
-        axes.set_xticks(range(10))
-    _legend(figure, left)
+        at = np.array([c.level for c in theirs]) + 0.25
+        words = f"the paper, {theirs[0].trials} trials a level"
+        hollow = {"fmt": "D", "ms": 5, "color": "#555b66", "mfc": "none"}
+        printed = [wilson(c.won, c.trials) for c in theirs]
+        _dots(upper, at, printed, 100, words, **hollow)
+        lower.plot(at, [c.v_max for c in theirs], "D", ms=5, color="#555b66", mfc="none")
+        for colour, policy in zip(LINES, policies, strict=False):
+            mine = [cell for cell in cells if (cell.policy, cell.track) == (policy, track)]
+            levels, style = [c.difficulty for c in mine], {"fmt": "o", "ms": 4, "color": colour}
+            words = f"{policy}, {mine[0].trials} trials a level"
+            _dots(upper, levels, [c.success for c in mine], 100, words, **style)
+            _dots(lower, levels, [c.v_max for c in mine], 1, "", **style)
+            lowest = min(lowest, *(100 * c.success.low for c in mine))
+        lowest = min(lowest, *(100 * c.value for c in printed))
+        titled(upper, track)
+        plain_axes(lower)
+        lower.set_xlabel("level", fontsize=9)
+        lower.set_xticks(range(10))
+    _percent_axis(rows[0, 0], lowest)
+    rows[0, 0].set_ylabel("success [%]", fontsize=9)
+    rows[1, 0].set_ylabel("v_max, median [m/s]", fontsize=9)
+    _legend(figure, rows[0, 0])
     return png(figure)
 
 
@@ -66,13 +85,12 @@ def cells_chart(cells: Mapping[str, Sequence[Tally]]) -> bytes:
     axes = figure.subplots()
     first = next(iter(cells.values()))
     for number, (name, some) in enumerate(cells.items()):
-        value, low, high = 100 * np.array([cell.success for cell in some]).T
         at = np.arange(len(some)) + 0.12 * (number - (len(cells) - 1) / 2)
-        reach = np.maximum([value - low, high - value], 0)
-        colour = LINES[number % len(LINES)]
-        axes.errorbar(at, value, reach, fmt="o", ms=4, lw=1.2, color=colour, label=name)
-    titled(axes, "Success with 95 % Wilson intervals [%]")
-    axes.set_ylim(-3, 103)
+        label, colour = f"{name}, {some[0].trials} trials a cell", LINES[number % len(LINES)]
+        _dots(axes, at, [c.success for c in some], 100, label, fmt="o", ms=4, color=colour)
+    titled(axes, "Success with 95 % Wilson intervals")
+    axes.set_ylabel("success [%]", fontsize=9)
+    _percent_axis(axes, min(100 * cell.success.low for some in cells.values() for cell in some))
     axes.set_xticks(range(len(first)), [f"{c.track}\nlevel {c.difficulty}" for c in first])
     axes.tick_params(labelsize=7)
     _legend(figure, axes, columns=6)
@@ -80,23 +98,29 @@ def cells_chart(cells: Mapping[str, Sequence[Tally]]) -> bytes:
 
 
 def effects_chart(entries: Sequence[Tested]) -> bytes:
-    """Return success under each effect as dots with intervals, the undisturbed as a line."""
-    figure = Figure(figsize=(8.6, 1.2 + 0.24 * len(entries)), layout="constrained")
+    """Return success under each effect, the worst on top; the first entry is undisturbed."""
+    first, *others = entries
+    names = list(first.results)
+    others.sort(key=lambda entry: max(entry.success(name).value for name in names), reverse=True)
+    shown = [*others, first]
+    figure = Figure(figsize=(8.6, 1.4 + 0.24 * len(shown)), layout="constrained")
     axes = figure.subplots()
-    at, names = np.arange(len(entries))[::-1], list(entries[0].results)
+    at = np.arange(len(shown))
     for number, name in enumerate(names):
-        colour = LINES[number % len(LINES)]
-        value, low, high = 100 * np.array([entry.success(name) for entry in entries]).T
+        colour, place = LINES[number % len(LINES)], 0.22 * (number - (len(names) - 1) / 2)
+        found = [entry.success(name) for entry in shown]
+        value, low, high = 100 * np.array(found).T
         reach = np.maximum([value - low, high - value], 0)
-        places = at - 0.22 * (number - (len(names) - 1) / 2)
-        axes.errorbar(value, places, xerr=reach, fmt="o", ms=4, lw=1.4, color=colour, label=name)
-        axes.axvline(value[0], color=colour, lw=1, ls="--", alpha=0.6)
-    axes.set_yticks(at, [f"{e.condition.name}  {e.condition.words}".strip() for e in entries])
-    axes.set_xlim(-3, 103)
-    titled(axes, "Success [%]")
+        label = f"{name}, {len(first.results[name])} trials a row; dashed: undisturbed"
+        style = {"fmt": "o", "ms": 4, "lw": 1.4, "color": colour, "label": label}
+        axes.errorbar(value, at - place, xerr=reach, **style)
+        axes.axvline(100 * first.success(name).value, color=colour, lw=1, ls="--", alpha=0.6)
+    axes.set_yticks(at, [f"{e.condition.name}  {e.condition.words}".strip() for e in shown])
+    _percent_axis(axes, min(100 * e.success(n).low for e in shown for n in names), vertical=False)
+    axes.set_xlabel("success [%]", fontsize=9)
+    titled(axes, "Success under one effect at a time, with 95 % Wilson intervals")
     axes.tick_params(axis="y", labelsize=7)
-    if len(names) > 1:
-        _legend(figure, axes)
+    _legend(figure, axes)
     return png(figure)
 
 
@@ -118,9 +142,9 @@ def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]], names: Sequence[str] =
             axes.plot(sizes, value, "o-", ms=3.5, lw=1.6, color=colour, label=name)
         titled(axes, sweep.name)
         axes.set_xlabel(sweep.axis, fontsize=8)
-        axes.set_ylim(-3, 103)
-    if len(names) > 1:
-        _legend(figure, panels[0])
+        axes.set_ylabel("success [%]", fontsize=8)
+        _percent_axis(axes, min(100 * p.success(name).low for p in points for name in names))
+    _legend(figure, panels[0])
     return png(figure)
 
 
@@ -136,21 +160,24 @@ def bars_chart(
     """
     figure = Figure(figsize=(10.4, 5.2), layout="constrained")
     every = figure.subplots(1, 3, sharey=True)
-    for axes, name in zip(every, ("success_cross", "success_rate", "v_max"), strict=True):
+    for axes, name in zip(every, ("success_cross", "collision_free", "v_max"), strict=True):
         title, scale, _ = METRICS[name]
         for at, (key, numbers) in enumerate(rows.items()):
             colour = LINES[kinds.index(key.split()[0])]
             mean, least, most = (scale * value for value in numbers[name])
             axes.barh(at, mean, height=0.55, color=colour, alpha=0.6)
-            axes.plot([least, most], [at, at], "o-", ms=4, lw=1.2, color=colour)
+            label = "least and most of the training seeds" if at == 0 else None
+            axes.plot([least, most], [at, at], "o-", ms=4, lw=1.2, color=colour, label=label)
             if key in printed:
                 theirs = scale * getattr(printed[key], name)
-                axes.plot(theirs, at, "D", ms=7, mfc="none", mec="black")
+                label = "the paper" if at == 0 else None
+                axes.plot(theirs, at, "D", ms=7, mfc="none", mec="black", label=label)
         titled(axes, title)
         if scale == 100:
             axes.set_xlim(-3, 103)
     every[0].set_yticks(range(len(rows)), list(rows))
     every[0].invert_yaxis()
+    _legend(figure, every[0])
     return png(figure)
 
 
@@ -170,6 +197,6 @@ def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
             axes.set_xlabel(words, fontsize=9)
             titled(axes, title if name == "v_max" else title[0].upper() + title[1:])
         if scale == 100:
-            upper[column].set_ylim(-3, 103)
+            _percent_axis(upper[column], min(100 * p[name].least for row in rows for p in row.at))
     _legend(figure, upper[0])
     return png(figure)

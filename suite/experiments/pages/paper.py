@@ -40,7 +40,7 @@ class Ablated(NamedTuple):
 
     success_cross: float
     """Share of trials with all four gates and no collision."""
-    success_rate: float
+    collision_free: float
     """Share of trials without a collision."""
     v_max: float
     """[m/s]; the paper does not say over what it is the maximum."""

@@ -21,7 +21,7 @@ class Metric(NamedTuple):
 METRICS = {
     "reward": Metric("reward", 1, 0),
     "success_cross": Metric("success cross [%]", 100, 0),
-    "success_rate": Metric("success rate [%]", 100, 0),
+    "collision_free": Metric("collision-free rate [%]", 100, 0),
     "v_max": Metric("v_max [m/s]", 1, 1),
     "gates": Metric("gates", 1, 2),
 }

@@ -200,7 +200,7 @@ def train_one(
         points = [found]
         console.note(
             f"{key}, seed {config.seed}: success cross {found['success_cross']:.0%}, "
-            f"success rate {found['success_rate']:.0%}, v_max {found['v_max']:.1f} m/s"
+            f"collision-free {found['collision_free']:.0%}, v_max {found['v_max']:.1f} m/s"
         )
     return diverged, points
 

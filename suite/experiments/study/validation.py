@@ -115,13 +115,13 @@ def make_flight(
 def measured(scores: Scores) -> dict[str, float]:
     """Return what the trials came to.
 
-    They are `success_cross` (all gates passed without a collision), `success_rate` (no collision,
+    They are `success_cross` (all gates passed without a collision), `collision_free` (no collision,
     whatever gates were passed), `v_max` (median of the trials' largest speeds) and `v_max_most`
     (the largest of them) [m/s], and the means of `gates` and `reward`.
     """
     numbers = {
         "success_cross": scores.crossed.mean(),
-        "success_rate": 1.0 - scores.collided.mean(),
+        "collision_free": 1.0 - scores.collided.mean(),
         "v_max": jnp.median(scores.v_max),
         "v_max_most": scores.v_max.max(),
         "gates": scores.gates.mean(),

@@ -58,7 +58,7 @@ def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, capfd):
     assert (normalised["seeds"], normalised["diverged"]) == (1, 1)
     # In half a second nobody passes four gates; who has not moved far hits nothing.
     assert field["over"]["success_cross"]["most"] == field["pooled"]["success_cross"]["low"] == 0
-    assert field["over"]["success_rate"]["least"] == 1 and field["over"]["v_max"]["mean"] > 0
+    assert field["over"]["collision_free"]["least"] == 1 and field["over"]["v_max"]["mean"] > 0
     assert "| without, L_p^norm | 6.4 | diverged | - |" in text and "| 1 of 1 |" in text
     assert "| 95 |" in text
     capfd.readouterr()
@@ -69,7 +69,7 @@ def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, capfd):
 
 def runs_of(key, *cross, rate=1.0, v_max=5.0):
     for seed, value in enumerate(cross):
-        numbers = {"success_cross": value, "success_rate": rate, "v_max": v_max + seed,
+        numbers = {"success_cross": value, "collision_free": rate, "v_max": v_max + seed,
                    "v_max_most": v_max + 2, "gates": 4.0}  # fmt: skip
         diverged = "" if value is not None else "it diverged"
         yield Trained(key, seed, "", 60.0, 5.0, "c", diverged, [] if diverged else [numbers])

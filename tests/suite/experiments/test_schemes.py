@@ -41,7 +41,7 @@ def test_the_comparison_from_one_command_and_again(tmp_path, monkeypatch):
     assert [row["scheme"] for row in numbers["rows"]] == ["ppo", "ours"]
     for row in numbers["rows"]:
         assert row["steps"] == [0, 4 * 6, 2 * 4 * 6] and row["time"][0] == 0 < row["time"][1]
-        assert row["curves"]["success_rate"][0]["mean"] == 1.0
+        assert row["curves"]["collision_free"][0]["mean"] == 1.0
         assert row["compile_s"] > 0 and row["reached"]["1"] == []
     # Before the first step both are the same network in the same worlds.
     one, two = (row["curves"]["reward"][0] for row in numbers["rows"])
@@ -57,7 +57,7 @@ def learnt(scheme, seed, pace, gates, diverged=""):
     """Return a run measured at 0, 100 and 200 steps."""
     points = [
         {"steps": 100.0 * k, "time": pace * k, "gates": g, "reward": 10 * g, "v_max": 4.0,
-         "success_rate": 1.0, "success_cross": g / 4}
+         "collision_free": 1.0, "success_cross": g / 4}
         for k, g in enumerate(gates)
     ]  # fmt: skip
     return Trained(scheme, seed, "", 60.0, 5.0, "c", diverged, points)

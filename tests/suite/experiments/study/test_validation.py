@@ -51,7 +51,7 @@ def straight(wall_x):
 
 def test_a_straight_flight_through_two_gates_is_a_success():
     numbers = measure(straight(wall_x=FAR))
-    assert numbers["success_cross"] == numbers["success_rate"] == 1.0
+    assert numbers["success_cross"] == numbers["collision_free"] == 1.0
     assert numbers["gates"] == 2 and numbers["v_max"] == pytest.approx(SPEED)
     # 0.2 m a step: the first gate in step 10 or 11 and the last in step 20 or 21, the trial's end.
     assert numbers["reward"] == pytest.approx(10 * 1 + 10 * 2, abs=2)
@@ -59,19 +59,19 @@ def test_a_straight_flight_through_two_gates_is_a_success():
 
 def test_a_wall_in_one_of_two_worlds_is_one_collision_and_ends_that_trial():
     numbers = measure(straight(wall_x=3.0))
-    assert numbers["success_cross"] == numbers["success_rate"] == 0.5
+    assert numbers["success_cross"] == numbers["collision_free"] == 0.5
     assert numbers["gates"] == 1.5 and numbers["v_max"] == pytest.approx(SPEED)
 
 
 def test_a_wall_behind_the_last_gate_is_no_collision():
-    assert measure(straight(wall_x=5.5))["success_rate"] == 1.0
+    assert measure(straight(wall_x=5.5))["collision_free"] == 1.0
 
 
 def test_whoever_falls_faster_than_the_policy_can_brake_collides():
     worlds = straight(wall_x=FAR)
     falling = worlds._replace(vel_w=np.array([[0, 0, -20]] * 2, np.float32))
     numbers = measure(falling)
-    assert numbers["success_rate"] == numbers["success_cross"] == numbers["gates"] == 0.0
+    assert numbers["collision_free"] == numbers["success_cross"] == numbers["gates"] == 0.0
 
 
 def test_scores_by_hand():
