@@ -22,6 +22,7 @@ from eval.importers.options import ImportOptions
 from eval.judging.results import Journal, read_trials, write_trials
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.sensors.sensors_file import PRESETS, load_sensors
 from policies import shipped
 from policies.formats.onnx_file import read_checked
 from policies.formats.policy_file import load_policy_checkpoint
@@ -40,8 +41,8 @@ from tracks.formats.mesh_reader import load_convex_parts
 
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = (
-    *("set", "vehicle", "track", "mapping", "checkpoint", "policy.onnx", "flight.parquet"),
-    *("flight.csv", "run.json", "journal"),
+    *("set", "vehicle", "sensors", "track", "mapping", "checkpoint", "policy.onnx"),
+    *("flight.parquet", "flight.csv", "run.json", "journal"),
 )
 FOREIGN = ("ulg", "mcap", "blackbox", "usd", "trials.parquet", "obj", "stl", "glb", "ply")
 """Formats that other programs write, or that others hand over."""
@@ -151,6 +152,8 @@ def drawn_and_used(kind, folder):
     if kind == "vehicle":
         text = (ROOT / "examples" / "hidden.toml").read_text()
         return mutated_toml(text), filed(load_vehicle, "odd.toml")
+    if kind == "sensors":
+        return mutated_toml((PRESETS / "all.toml").read_text()), filed(load_sensors, "odd.toml")
     if kind == "track":
         text = (ROOT / "tracks" / "examples" / "yard.toml").read_text()
         return mutated_toml(text), filed(load_track, "odd.toml")

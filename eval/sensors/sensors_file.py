@@ -86,8 +86,8 @@ def sensor_set(models: Mapping[str, Mapping[str, float]], name: str = "custom") 
 
 def grown(sensors: SensorSet, magnitude: float) -> SensorSet:
     """Return `sensors` with what is wrong grown by `magnitude`; 0: the truth, 1: as they are."""
-    if magnitude == 0.0:
-        return PERFECT
+    if magnitude in (0.0, 1.0):
+        return sensors if magnitude else PERFECT
     models = {name: scaled(name, values, magnitude) for name, values in sensors.models.items()}
     return SensorSet(f"{sensors.name} x {magnitude:g}", MappingProxyType(models))
 

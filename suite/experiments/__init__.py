@@ -9,6 +9,7 @@ in `pages/`.
 EXPERIMENTS: dict[str, str] = {
     "table2": "a policy on three tracks at all ten levels, next to the paper and the baseline",
     "robustness": "policies under every physical effect and under growing disturbances",
+    "perception": "policies through every sensor model, as its magnitude grows",
     "randomisation": "one recipe with randomised dynamics and with fixed ones, disturbed",
     "seeds": "the policies of several training seeds on the same trials, and their median",
     "ablation": "trainings with the vector field and without it, flown on unseen worlds",

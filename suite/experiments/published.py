@@ -19,6 +19,7 @@ from tracks.common.grid import Grid, table
 PUBLISHED: dict[str, tuple[str, ...]] = {
     "table2": ("--seed", "9600000"),
     "robustness": ("--seed", "9700000", "--trials", "16"),
+    "perception": ("--seed", "9720000"),
     "simulators": ("--seed", "9750000"),
     "ablation": (),
     "schemes": (

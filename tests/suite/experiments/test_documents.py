@@ -27,11 +27,28 @@ def test_robustness(sky, tmp_path, capfd):
     winds = {flight[1].effects["constant_wind"].velocity for flight in sky.flown
              if "constant_wind" in flight[1].effects}  # fmt: skip
     assert sorted(round(y / 0.8) for _, y, _ in winds) == [2, 4, 6, 8]
-    assert {flight[2].gate_m for flight in sky.flown} == {0, 0.05, 0.1, 0.2, 0.3}
+    maps = [flight[2].models.get("gate_map") for flight in sky.flown]
+    assert {values and values.moved for values in maps} == {None, 0.05, 0.1, 0.2, 0.3}
     text, numbers = page(tmp_path, "robustness")
     assert len(numbers["conditions"]) == 1 + 2 + 5 + 5
     assert text.count("| 0 % [0, 56] |") == 13
     assert (tmp_path / "docs" / "robustness-2.png").is_file()
+
+
+def test_perception(sky, tmp_path):
+    args = ["--only", "vio", "stereo", "--difficulty", "0,3", "--trials", "1", "--growing-trials"]
+    args += ["1", "--policy", "race-paper"]
+    assert reproduce(tmp_path, "perception", *args) == 0
+    # Perfect and one preset on two levels; two sets at four magnitudes on one of the two.
+    assert len(sky.flown) == 3 * (2 * 2 + 2 * 4 - 1), "magnitude 1 of a preset is that preset"
+    noises = {flight[2].models["stereo"].noise for flight in sky.flown
+              if list(flight[2].models) == ["stereo"]}  # fmt: skip
+    assert sorted(noises) == pytest.approx([0.05, 0.1, 0.15, 0.2])
+    text, numbers = page(tmp_path, "perception")
+    assert len(numbers["conditions"]) == 2 + 2 * 5
+    assert text.count("| 0 % [0, 56] | 0 % [0, 56] | 0 % [0, 39] |") == 2
+    assert text.count("| stereo | race-paper | 0 % [0, 56], ") == 1
+    assert (tmp_path / "docs" / "perception.png").is_file()
 
 
 def test_the_median_policy_and_the_repeats():

@@ -35,6 +35,7 @@ def test_an_experiment_that_does_not_exist_is_code_2(capsys):
             "robustness --policy race-paper --policy race-paper",
             "--policy race-paper is given twice",
         ),
+        ("perception --only stero", "Did you mean 'stereo'?"),
         ("seeds --policies race-paper race-paper", "--policies race-paper is given twice"),
         ("seeds --recipe quik", "Did you mean 'quick'?"),
         ("seeds --training-seeds 1 1", "--training-seeds is 1 1"),

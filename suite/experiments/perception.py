@@ -1,0 +1,171 @@
+"""Success and speed through sensor models: each preset, and each model as its magnitude grows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from types import MappingProxyType
+
+import numpy as np
+import tyro
+
+from eval.judging.statistics import paired_success, wilson
+from eval.judging.tables import percent
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.sensors import SENSORS
+from eval.sensors.sensors_file import PERFECT, SensorSet, grown, load_sensors, shipped_sensors
+from eval.vehicles.vehicle import Vehicle
+from suite.common.console import Console
+from suite.common.report import Picture
+from suite.experiments.pages.document import Made, Place
+from suite.experiments.pages.tables import points_cell
+from suite.experiments.study import disturbed, judging, options
+from suite.experiments.study.conditions import Condition, Sweep, sweep_conditions
+from suite.experiments.study.disturbed import Tested
+from suite.judging.flying import default_policy
+from tracks.common.grid import Cell, Grid, table
+from tracks.common.names import unknown_name
+from tracks.input.ranges import Seed, Trials
+
+MAGNITUDES = (0.0, 0.5, 1.0, 1.5, 2.0)
+"""1: as the shipped files have it."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Judge policies through sensor models: all presets on every cell, and growing magnitudes.
+
+    All fly the same trials under every condition. A policy trained with sensor models next to the
+    first shows what that training gains, and what it costs with perfect sensors.
+    """
+
+    policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
+    Without it the shipped policy flies."""
+    difficulty: str = "0,3,6,9"
+    """Levels of the table of presets: 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
+    trials: Trials = 50
+    """Trials of every policy on every track at every level through every preset."""
+    growing_trials: Trials = 32
+    """Trials of every policy on every track at level 3 at every magnitude."""
+    seed: Seed = 0
+    """Seed of the first trial; the others follow by one."""
+    vehicle: str = "reference"
+    """What flies: a shipped vehicle's name or a vehicle file (.toml)."""
+    only: tuple[str, ...] = ()
+    """Only these presets and models, by name; by default all."""
+
+
+def document(config: Config, place: Place, console: Console) -> Made:
+    """Return tables and numbers; what is missing is flown first."""
+    from suite.experiments.pages.charts import sweeps_chart
+
+    vehicle, sets = load_vehicle(config.vehicle), asked_sets(config.only)
+    policies = judging.named_policies(config.policy or (default_policy(),))
+    cells, growing = judging.trials_of(config), replace(config, trials=config.growing_trials)
+    base = Condition("perfect", 0.0, "", vehicle)
+    presets = [
+        Condition(name, 1.0, "", vehicle, sensors)
+        for name, sensors in sets.items()
+        if name in shipped_sensors()
+    ]
+    tested, _ = disturbed.flown_under(
+        [base, *presets], {}, {name: [(path, cells)] for name, path in policies.items()},
+        place.cache, console, place.workers,
+    )  # fmt: skip
+    sweeps = {sweep: sweep_conditions(vehicle, sweep) for sweep in growing_sweeps(sets)}
+    again = judging.trials_of(growing, [3])
+    (_, grown_points) = disturbed.flown_under(
+        [], sweeps, {name: [(path, again)] for name, path in policies.items()},
+        place.cache, console, place.workers,
+    )  # fmt: skip
+    facts = {
+        **judging.policy_facts(policies),
+        "presets": f"three tracks, levels {config.difficulty}, seeds "
+        f"{options.judged_seeds(config)}: {len(cells)} trials a preset, the same in all",
+        "magnitudes": f"three tracks, level 3, seeds {options.judged_seeds(growing)}: "
+        f"{len(again)} trials a magnitude",
+        "vehicle": config.vehicle,
+    }
+    parts: dict[str, list[Grid | Picture]] = {
+        "Presets on every cell": [preset_grid(tested)],
+        "Growing magnitudes": [
+            Picture(sweeps_chart(grown_points), "Success against the magnitude of each"),
+            magnitude_grid(grown_points),
+        ],
+    }
+    numbers = [
+        disturbed.tested_numbers(entry, entries[0])
+        for entries in (tested, *grown_points.values())
+        for entry in entries
+    ]
+    return Made(facts, parts, {"conditions": numbers})
+
+
+def asked_sets(only: Sequence[str]) -> dict[str, SensorSet]:
+    """Return the presets, then each model alone at its usual size, that are in `only`, or all.
+
+    Raises:
+        ValueError: for a name that does not exist.
+    """
+    presets = {name: load_sensors(name) for name in shipped_sensors() if name != "perfect"}
+    usual = {**presets["tof-depth"].models, **presets["all"].models}
+    alone = {
+        name: SensorSet(name, MappingProxyType({name: usual[name]}))
+        for name, sensor in SENSORS.items()
+        if name in usual and not sensor.measure
+    }
+    known = {**presets, **alone}
+    for name in only:
+        if name not in known:
+            raise unknown_name("preset or sensor model", name, known)
+    return {name: found for name, found in known.items() if name in (only or known)}
+
+
+def growing_sweeps(sets: Mapping[str, SensorSet]) -> list[Sweep]:
+    """Return a sweep of the magnitude of each of `sets`."""
+
+    def at(sensors: SensorSet, vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
+        return vehicle, grown(sensors, size)
+
+    return [
+        Sweep(name, "magnitude, times the usual", MAGNITUDES, partial(at, sensors))
+        for name, sensors in sets.items()
+    ]
+
+
+def _speed(entry: Tested, policy: str) -> float:
+    """Return the median of the trials' mean speeds [m/s]."""
+    return float(np.median([row.v_mean for row in entry.results[policy]]))
+
+
+def preset_grid(tested: Sequence[Tested]) -> Grid:
+    """Return success by level, over all, its change from perfect, and speed, a row a preset."""
+    base, lines = tested[0], []
+    levels = list(dict.fromkeys(row.difficulty for row in next(iter(base.results.values()))))
+    for entry in tested:
+        for name, rows in entry.results.items():
+            line: list[str | Cell] = [entry.condition.name, name]
+            for level in levels:
+                won = [row.success for row in rows if row.difficulty == level]
+                line.append(percent(wilson(sum(won), len(won))))
+            change = paired_success(entry.won(name), base.won(name))
+            speed, before = _speed(entry, name), _speed(base, name)
+            same = entry.condition.sensors == PERFECT
+            line += [percent(entry.success(name)), "" if same else points_cell(change)]
+            line.append(f"{speed:.2f} ({speed / before - 1:+.1%})")
+            lines.append(line)
+    headers = ["sensors", "policy", *(f"level {level}" for level in levels)]
+    return table([*headers, "all", "change", "v_mean [m/s]"], lines)
+
+
+def magnitude_grid(grown_points: Mapping[Sweep, Sequence[Tested]]) -> Grid:
+    """Return success and speed at every magnitude, a row for each set and policy."""
+    lines = []
+    for sweep, points in grown_points.items():
+        for name in points[0].results:
+            cells = (f"{percent(p.success(name))}, {_speed(p, name):.2f} m/s" for p in points)
+            lines.append([sweep.name, name, *cells])
+    headers = ["sensors", "policy", *(f"x {size:g}" for size in MAGNITUDES)]
+    return table(headers, lines, "Success with its 95 % interval, and the median of v_mean")
