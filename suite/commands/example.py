@@ -38,7 +38,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     names = sorted(copied)
     console.say(f"wrote {', '.join(names)} to {config.out}")
     if config.real:
-        console.say(f"now: what {config.out / 'README.md'} says, or docs/vehicle.md's walk")
+        console.say(f"now: what {config.out / 'README.md'} says, or docs/measure.md's tutorial")
     else:
         vehicle = config.out / "vehicle.toml"
         console.say(f"now: suite diagnose {config.out} --vehicle {vehicle} --out runs/example")
