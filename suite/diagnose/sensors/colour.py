@@ -177,7 +177,7 @@ def _colour(theta: np.ndarray) -> Colour:
 def _noise(flights: Sequence[Series], rows: _Rows, walk: float) -> _Noise:
     """Return the noise next to a random walk of `walk` a metre.
 
-    A fast part is there only where its share is told.
+    A fast part is there only where its share is significant.
     """
     step_s = max(flight.step_s for flight in flights)
     lag_s = np.linspace(step_s, max(SHORT_S, step_s), SHORT)
