@@ -25,6 +25,7 @@ def ages(values: Delay) -> Ages:
 
 SENSOR = Sensor(
     name="delay",
+    stage="state",
     summary="State and image are old when the policy decides",
     equation="seen(t) = true(t - a), a = age (1 + jitter u), u even from -1 to 1 each decision",
     source="Falanga et al. 2019 (latency of vision in flight): 10 to 100 ms",

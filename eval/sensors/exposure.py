@@ -29,6 +29,7 @@ def sense(values: Exposure, memory: Array, seen: View, moment: Moment) -> tuple[
 
 SENSOR = Sensor(
     name="exposure",
+    stage="depth",
     summary="The camera is blind for a while; its image reads as the range everywhere",
     equation="Markov chain: blind for `share` of the images, `length` at a time; z = range",
     source="our estimate",

@@ -32,6 +32,7 @@ def sense(
 
 SENSOR = Sensor(
     name="frame_loss",
+    stage="depth",
     summary="Images are lost, alone or in bursts, and the one before is seen again",
     equation="Markov chain: lost for `share` of the images, `length` at a time; z = z of the last",
     source="our estimate",

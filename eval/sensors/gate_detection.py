@@ -117,6 +117,7 @@ def in_view(there_b: Array, camera: Camera) -> Array:
 
 SENSOR = Sensor(
     name="gate_detection",
+    stage="gates",
     summary="The next gates are detected: noise of corners as PnP gives it, gaps, out of view",
     equation="p = p_true + e, e normal: s r / (sqrt(2) f) across, s r^2 / (sqrt(8) f a) along the "
     "view; gaps: Markov chain, `missed` of the observations, `length` at a time",

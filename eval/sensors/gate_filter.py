@@ -55,6 +55,7 @@ def estimate(values: GateFilter) -> FilterSettings:
 
 SENSOR = Sensor(
     name="gate_filter",
+    stage="state",
     summary="The state is what a Kalman filter makes of the IMU and of gate corners seen late",
     equation="error-state Kalman filter (eval/sensors/filter/kalman.py); corners (u, v) + s n, of "
     "frames `delay` ago, none in `dropout` of them",

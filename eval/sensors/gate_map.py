@@ -67,6 +67,7 @@ def _mapped(
 
 SENSOR = Sensor(
     name="gate_map",
+    stage="gates",
     summary="The map of the gates is off, and gates were moved after it was made",
     equation="p = o + (1 + k) Rz(psi) (p_true - o) + t + m_i, normal k, psi, t, m_i of the trial",
     source="Foehn et al. 2022 (AlphaPilot): gates up to decimetres from their surveyed places; "

@@ -63,6 +63,7 @@ def shifted(image: Array, pixels: Array, axis: int) -> Array:
 
 SENSOR = Sensor(
     name="image_motion",
+    stage="depth",
     summary="Turning blurs the image over the exposure and shears it over the readout",
     equation="1/z at (u - w t): mean of t = row time -+ exposure / 2; w: pixels a second",
     source="geometry of a pinhole; usual times are those of data sheets of such cameras",

@@ -59,6 +59,7 @@ def measure(
 
 SENSOR = Sensor(
     name="imu",
+    stage="imu",
     summary="Gyroscope and accelerometer: bias, noise, vibration with thrust, saturation",
     equation="w + b_w + s_w n / sqrt(dt); a + b_a + k |a_z| + (s_a / sqrt(dt) + v |a_z|) n; "
     "db = walk sqrt(dt) n; held to the limits",

@@ -20,6 +20,10 @@ Values = Any  # the model's own NamedTuple of floats or arrays (...,)
 Memory = Any  # arrays (..., K), or nested tuples and dicts of them
 
 
+STAGES = ("state", "gates", "depth", "imu")
+"""What models act on: estimated state, gates, depth image, inertial sensor."""
+
+
 class Needs(NamedTuple):
     """How many random numbers a model takes."""
 
@@ -84,7 +88,9 @@ class Sensor:
     """A sensor or estimator model; a model has the hooks that it needs."""
 
     name: str
-    """As in a sensors file."""
+    """The `kind` of its table in a sensors file."""
+    stage: str
+    """The table of a sensors file that it stands in, one of `STAGES`."""
     summary: str
     """One sentence for people."""
     equation: str

@@ -122,6 +122,7 @@ def _parameters() -> tuple[Parameter, ...]:
 
 SENSOR = Sensor(
     name="measured_state",
+    stage="state",
     summary="Errors of an estimated state with a size, a bias and a colour for every axis",
     equation="p + b_p + n_p + d, (1 + k) v + R (b_v + n_v), R Exp(b_R + n_R); n = s (sqrt(f) e_f "
     "+ sqrt(1 - f) e), e' = a e + sqrt(1 - a^2) white, a = exp(-dt / lasts), e_f alike; "

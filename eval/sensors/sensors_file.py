@@ -1,6 +1,7 @@
 """The sensors file (TOML): which models act, and how strongly; read, checked by key, written.
 
-A parameter that is left out has its neutral value: of it nothing is wrong.
+Each model has a table under what it acts on ([state], [gates], [depth] or [imu]; several as
+[[state]]), whose `kind` is its name. A parameter that is left out has its neutral value.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from eval.sensors import SENSORS, scaled
-from eval.sensors.interface import Ages, Sensor
+from eval.sensors.interface import STAGES, Ages, Sensor
 from tracks.common.files import write_text
 from tracks.common.names import printable, unknown_name
 from tracks.common.toml_table import Table, to_toml
@@ -81,7 +82,7 @@ def sensor_set(models: Mapping[str, Mapping[str, float]], name: str = "custom") 
     Raises:
         ValueError: as `parse_sensors`.
     """
-    return parse_sensors({"name": name, "sensors": models})
+    return parse_sensors(_table(name, models))
 
 
 def grown(sensors: SensorSet, magnitude: float) -> SensorSet:
@@ -132,17 +133,26 @@ def parse_sensors(table: Mapping[str, Any]) -> SensorSet:
         ValueError: with the key, the value and what is allowed.
     """
     top = Table("", "", table)
-    top.expect(("name", "schema", "sensors"))
+    top.expect(("name", "schema", *STAGES))
     if top.whole("schema", SCHEMA) != SCHEMA:
         raise top.error("schema", table["schema"], f"{SCHEMA}: this version of the suite reads it")
-    tables = top.table("sensors", {})
-    given = {name: _values(SENSORS.find(name), tables.table(name)) for name in tables.values}
+    given: dict[str, Any] = {}
+    for stage in STAGES:
+        alone = isinstance(table.get(stage), Mapping)
+        for entry in [top.table(stage)] if alone else top.tables(stage):
+            sensor = SENSORS.find(entry.text("kind"))
+            if sensor.stage != stage:
+                raise entry.error("kind", sensor.name, f"a model of [{stage}]; put this one under "
+                                  f"[[{sensor.stage}]]")  # fmt: skip
+            if sensor.name in given:
+                raise entry.error("kind", sensor.name, "each model once")
+            given[sensor.name] = _values(sensor, entry)
     models = {name: given[name] for name in SENSORS if name in given}
     return SensorSet(top.text("name"), MappingProxyType(models))
 
 
 def _values(sensor: Sensor, table: Table) -> Any:
-    table.expect(parameter.name for parameter in sensor.parameters)
+    table.expect(("kind", *(parameter.name for parameter in sensor.parameters)))
     return sensor.values(
         *(
             table.number(p.name, p.neutral, least=p.low, most=p.high)  # pyright: ignore[reportArgumentType]
@@ -154,8 +164,14 @@ def _values(sensor: Sensor, table: Table) -> Any:
 def sensors_table(sensors: SensorSet) -> dict[str, Any]:
     """Return `sensors` as the nested table of their file."""
     models = {name: values._asdict() for name, values in sensors.models.items()}
-    named = {"name": sensors.name, "schema": SCHEMA}
-    return {**named, "sensors": models} if models else named
+    return _table(sensors.name, models)
+
+
+def _table(name: str, models: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    stages: dict[str, list[dict[str, Any]]] = {}
+    for kind, values in models.items():
+        stages.setdefault(SENSORS.find(kind).stage, []).append({"kind": kind, **values})
+    return {"name": name, "schema": SCHEMA, **stages}
 
 
 def save_sensors(sensors: SensorSet, path: str | os.PathLike[str], comment: str = "") -> None:

@@ -76,6 +76,7 @@ def root(size: Array) -> Array:
 
 SENSOR = Sensor(
     name="state_drift",
+    stage="state",
     summary="Dead reckoning drifts with distance and turning, and its scale is off",
     equation="dp_est = (1 + k) Rz(psi) dp + s_p sqrt(|dp|) n, "
     "dpsi = s_y sqrt(|dp|) n + s_t sqrt(angle) n; v, R turn with psi",

@@ -48,6 +48,7 @@ def sense(
 
 SENSOR = Sensor(
     name="state_loss",
+    stage="state",
     summary="The estimator loses track for a while, runs away, and is reset with a jump",
     equation="Markov chain; lost: v + a t, p + a t^2 / 2, normal a; found again: p + normal jump",
     source="our estimate: the acceleration is that of 2 deg of tilt and an accelerometer's bias",

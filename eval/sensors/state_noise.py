@@ -56,6 +56,7 @@ def sense(
 
 SENSOR = Sensor(
     name="state_noise",
+    stage="state",
     summary="The estimated position, velocity and attitude have coloured noise and a bias",
     equation="e' = a e + sqrt(1 - a^2) n, a = exp(-dt / correlation); p + s_p e_p, "
     "v + s_v e_v + R b_v, R exp(s_R e_R + b_R)",

@@ -80,6 +80,7 @@ def in_disparity(
 
 SENSOR = Sensor(
     name="stereo",
+    stage="depth",
     summary="Depth by stereo: noise and steps of disparity, holes, smearing, limits of the range",
     equation="d = f b / z + n + o, in steps; z = f b / d; the range where d < least, z < near or a "
     "hole is",

@@ -50,6 +50,7 @@ def sense(values: TimeOfFlight, memory: Array, seen: View, moment: Moment) -> tu
 
 SENSOR = Sensor(
     name="tof",
+    stage="depth",
     summary="Depth by time of flight: noise, multipath, mixed pixels at edges, wrapped ranges",
     equation="z (1 + b + s n); at edges u z_near + (1 - u) z, u even; some z mod c / (2 f)",
     source="Hansard et al. 2012 (time-of-flight cameras); data sheets of the Flexx2 and Azure "

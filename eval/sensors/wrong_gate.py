@@ -30,6 +30,7 @@ def sense(values: WrongGate, memory: Array, seen: View, moment: Moment) -> tuple
 
 SENSOR = Sensor(
     name="wrong_gate",
+    stage="gates",
     summary="The gate after the next one is taken for the next, for a while",
     equation="Markov chain: wrong for `share` of the observations, `length` at a time",
     source="our estimate",

@@ -251,15 +251,22 @@ def to_toml(table: Mapping[str, Any], prefix: str = "") -> str:
     lines = [
         f"{key} = {_value(entry)}\n"
         for key, entry in table.items()
-        if not isinstance(entry, Mapping)
+        if not isinstance(entry, Mapping) and not _is_array(entry)
     ]
     for key, entry in table.items():
+        for one in entry if _is_array(entry) else ():
+            lines.append(f"\n[[{prefix}{key}]]\n{to_toml(one, f'{prefix}{key}.')}")
         if isinstance(entry, Mapping):
             inside = to_toml(entry, f"{prefix}{key}.")
             only_tables = entry and all(isinstance(value, Mapping) for value in entry.values())
             head = "" if only_tables else f"\n[{prefix}{key}]\n"
             lines.append(head + inside)
     return "".join(lines)
+
+
+def _is_array(entry: Any) -> bool:
+    """Say whether this is an array of tables."""
+    return isinstance(entry, list) and bool(entry) and all(isinstance(o, Mapping) for o in entry)
 
 
 def _value(value: Any) -> str:

@@ -13,6 +13,8 @@ from eval.sensors.sensors_file import (
     shipped_sensors,
 )
 
+STEREO = '[[depth]]\nkind = "stereo"\n'
+
 
 @pytest.mark.parametrize("name", shipped_sensors())
 def test_a_shipped_file_reads_back_equal_and_grows_within_its_limits(name, tmp_path):
@@ -41,14 +43,15 @@ def test_all_holds_every_model():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[sensors.state_nose]\n", "unknown sensor model 'state_nose'. Did you mean 'state_noise'"),
-        ("[sensors.stereo]\nnoize = 1\n", "'noize' in .sensors.stereo. is unknown. Did you mean"),
-        (
-            "[sensors.stereo]\nnoise = -1\n",
-            "sensors.stereo.noise is -1, allowed is a number",
-        ),
-        ("[sensors.stereo]\nnoise = nan\n", "sensors.stereo.noise is nan, allowed is a number"),
-        ("[sensors]\nstereo = 3\n", "sensors.stereo is 3, allowed is a table"),
+        ('[state]\nkind = "state_nose"\n', "unknown sensor model 'state_nose'. Did you mean"),
+        (f"{STEREO}noize = 1\n", "'noize' in .depth.0.. is unknown. Did you mean 'noise'"),
+        (f"{STEREO}noise = -1\n", "depth.0..noise is -1, allowed is a number"),
+        (f"{STEREO}noise = nan\n", "depth.0..noise is nan, allowed is a number"),
+        ('[depth]\nkind = "stereo"\nnoise = -1\n', "depth.noise is -1, allowed is a number"),
+        (STEREO + STEREO, "depth.1..kind is 'stereo', allowed is each model once"),
+        ('[gates]\nkind = "stereo"\n', r"allowed is a model of .gates.; put this one under"),
+        ("[[depth]]\nnoise = 1\n", "has no 'kind'; add it"),
+        ("depth = 3\n", "depth is 3, allowed is tables"),
         ("schema = 2\n", "schema is 2, allowed is 1: this version"),
         ("noise = 1\n", "key 'noise' at the top is unknown"),
         ("[", "odd.toml"),
@@ -67,5 +70,5 @@ def test_unknown_names_say_what_there_is():
         load_sensors("vioo")
     with pytest.raises(SensorsFileError, match="no such file; shipped by name: all, "):
         load_sensors("none/there.toml")
-    with pytest.raises(ValueError, match="delay.jitter is 1.5, allowed is a number from 0 to 1"):
+    with pytest.raises(ValueError, match="state.0..jitter is 1.5, allowed is a number from 0 to 1"):
         sensor_set({"delay": {"jitter": 1.5}})

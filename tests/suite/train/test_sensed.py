@@ -100,7 +100,7 @@ def test_an_old_view_lies_between_two_decisions():
 
 def test_the_command_trains_through_a_file(tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text('name = "mine"\n[sensors.stereo]\nnoise = 0.2\n')
+    path.write_text('name = "mine"\n[depth]\nkind = "stereo"\nnoise = 0.2\n')
     run = resolve(Config(recipe="quick", sensors=str(path), set=("sensors.magnitude=(0.0,1.5)",)))
     assert run.sensors is not None and run.sensors.magnitude == (0.0, 1.5)
     assert run.sensors.seen == sensor_set({"stereo": {"noise": 0.2}}, "mine")
