@@ -41,6 +41,8 @@ class Config:
     simulator: str = "mujoco"
     """What flies the hidden vehicle. With another simulator than mujoco (such as rotorpy) and no
     --hidden-vehicle, what that simulator does otherwise with --vehicle is what is hidden."""
+    sensors: str = "perfect"
+    """What policies see of the truth, in every flight: shipped sensors' name or a sensors file."""
     seed: Annotated[int, Range(0, SEED_MOST - 10**6)] = 0
     """Seed of the training and of the first trial; recorded flights begin 100,000 above."""
     iterations: Iterations | None = None
@@ -84,6 +86,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         recipe=config.recipe,
         hidden_vehicle=config.hidden_vehicle,
         simulator=config.simulator,
+        sensors=config.sensors,
         policy=config.policy,
         track=config.track,
         difficulty=config.difficulty,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from eval.judging.tables import Tally, percent
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.sensors.sensors_file import load_sensors
 from eval.worlds.trial import TrialResult
 from suite.common.choices import LEVELS
 from suite.common.console import Console
@@ -51,6 +52,8 @@ class Config:
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
+    sensors: str = "perfect"
+    """What policies see of the truth: shipped sensors' name or a sensors file (.toml)."""
 
 
 def document(config: Config, place: Place, console: Console) -> Made:
@@ -58,6 +61,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     from suite.experiments.pages.charts import level_chart
 
     vehicle, printed = load_vehicle(config.vehicle), sim_to_sim()
+    sensors = load_sensors(config.sensors)
     given = {WITH: config.delta_policy, CONTROL: config.control_policy}
     policies = {OURS: config.policy or default_policy(), **{n: p for n, p in given.items() if p}}
     for path in policies.values():
@@ -65,7 +69,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     about = judging.policy_facts(policies)
     orders = {
         name: judging.Order(
-            judging.Flier(policy, vehicle),
+            judging.Flier(policy, vehicle, sensors),
             judging.trials_of(config, LEVELS if name == OURS else printed.levels),
         )
         for name, policy in policies.items()
@@ -78,6 +82,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     facts = {
         **about,
         "vehicle": config.vehicle,
+        "sensors": config.sensors,
         "seeds": f"{options.judged_seeds(config)}, {config.trials} trials a cell, the same for all",
     }
     named = [c._replace(policy=judging.name_of(policies[c.policy])) for c in everything]

@@ -115,6 +115,8 @@ def _fly_missing(
     announce(console, what, flying_needs(len(missing), workers, collection.simulator))
     say_notes(console, collection.simulator, course)
     asked, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
+    rules = Rules(time_limit_s=collection.time_limit_s)
+    options = JudgeOptions(workers=workers, rules=rules, sensors=course.sensors)
     with console.progress("flights", len(course.trials)) as update:
 
         def keep(result: TrialResult, flight: Flight | None) -> None:
@@ -131,7 +133,7 @@ def _fly_missing(
                 missing,
                 course.vehicle,
                 collection.simulator,
-                JudgeOptions(workers=workers, rules=Rules(time_limit_s=collection.time_limit_s)),
+                options,
                 keep,
                 Record(depth=False),
                 course.tracks,

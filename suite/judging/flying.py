@@ -127,7 +127,7 @@ def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Cou
     """
     from eval.effects import EFFECTS
     from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.sensors.sensors_file import PERFECT, load_sensors
+    from eval.sensors.sensors_file import load_sensors
     from eval.worlds import differences, world_class
     from eval.worlds.engine import refuse_start_contact
 
@@ -135,7 +135,7 @@ def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Cou
     check_ranges(wanted, options=True)
     names = parse_tracks(wanted.track)
     vehicle = load_vehicle(wanted.vehicle)
-    sensors = load_sensors(wanted.sensors) if isinstance(wanted, Evaluation) else PERFECT
+    sensors = load_sensors(wanted.sensors)
     flown_otherwise, notes = differences(wanted.simulator, vehicle), list[str]()
     levels, tracks = parse_levels(wanted.difficulty), custom_tracks(names)
     by_chance = sensors.models or any(EFFECTS[name].random for name in vehicle.effects)

@@ -78,6 +78,8 @@ class Collection:
     """A shipped vehicle's name or a vehicle file (.toml)."""
     simulator: str = "mujoco"
     """As in suite eval."""
+    sensors: str = "perfect"
+    """As in suite eval; the logs hold the truth, not what the policy sees."""
     time_limit_s: TimeLimit = 20.0
     """As in suite eval."""
     speed: Annotated[float, Range(0.0, 1.0)] | None = None

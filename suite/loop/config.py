@@ -72,10 +72,12 @@ class LoopConfig:
     """Recorded flights on every track at every level."""
     vehicle: str
     """What the simulation knows: a shipped vehicle's name or a vehicle file."""
+    sensors: str
+    """What policies see of the truth in every flight: shipped sensors' name or a sensors file."""
     seed: Annotated[int, LOOP_SEEDS]
     """Seed of what is trained and of the first judged trial."""
     digests: dict[str, str]
-    """SHA-256 of what comes from files: vehicles and, where one is given, the policy."""
+    """SHA-256 of what comes from files: vehicles, sensors and, where one is given, the policy."""
 
     @property
     def recorded_from(self) -> int:
@@ -142,7 +144,8 @@ def loop_by_content(config: LoopConfig) -> LoopConfig:
     policy = config.policy
     if policy is not None and policy not in shipped.names():
         policy = "a file"
-    config = replace(config, policy=policy, vehicle=vehicle(config.vehicle))
+    vehicle_file, sensors = vehicle(config.vehicle), vehicle(config.sensors)
+    config = replace(config, policy=policy, vehicle=vehicle_file, sensors=sensors)
     if isinstance(config, HiddenLoopConfig):
         return replace(config, hidden_vehicle=vehicle(config.hidden_vehicle))
     return config
@@ -158,6 +161,7 @@ def resolve(
     recipe: str | None = None,
     hidden_vehicle: str | None = None,
     simulator: str = OWN[0],
+    sensors: str = "perfect",
     policy: str | None = None,
     track: str = "all",
     difficulty: str = "0,3",
@@ -181,6 +185,7 @@ def resolve(
         ValueError: for an option that cannot be used, naming it and what is allowed.
     """
     from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.sensors.sensors_file import load_sensors, sensors_table
     from policies.formats.policy_file import load_policy_checkpoint
     from suite.diagnose.estimate.parameters import refuse_own_motion
     from suite.judging.content import policy_digest
@@ -196,7 +201,10 @@ def resolve(
     if iterations is not None:
         training = with_iterations(training, iterations)
     simulated = load_vehicle(vehicle)
-    digests = {"vehicle": digest_of(simulated)}
+    digests = {
+        "vehicle": digest_of(simulated),
+        "sensors": digest_of(sensors_table(load_sensors(sensors))),
+    }
     _check_changes(changes, policy, iterations)
     if not delta and not hidden:
         raise ValueError(
@@ -247,6 +255,7 @@ def resolve(
         trials=size.trials if trials is None else trials,
         flights=size.flights if flights is None else flights,
         vehicle=vehicle,
+        sensors=sensors,
         seed=seed,
         digests=digests,
     )

@@ -133,6 +133,7 @@ def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
         seed=config.seed,
         vehicle=config.vehicle if variant.simulated else config.true_vehicle,
         simulator=OWN[0] if variant.simulated else config.true_simulator,
+        sensors=config.sensors,
     )
 
 
@@ -162,6 +163,7 @@ def _record(run: LoopRun) -> Stage:
         trials=config.flights,
         vehicle=config.true_vehicle,
         simulator=config.true_simulator,
+        sensors=config.sensors,
         seed=config.recorded_from,
     )
     return Stage(

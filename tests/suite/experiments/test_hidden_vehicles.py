@@ -85,4 +85,4 @@ def test_a_loop_needs_none_of_our_files_where_it_runs(tmp_path):
     shutil.move(mine, tmp_path / "reads")
     vehicle.unlink()
     there = loop_by_content(loop_of(Job(asked, tmp_path / "there", tmp_path / "reads")))
-    assert here == there and set(here.digests) == {"policy", "vehicle", "hidden_vehicle"}
+    assert here == there and set(here.digests) == {"policy", "vehicle", "sensors", "hidden_vehicle"}

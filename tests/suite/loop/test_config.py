@@ -121,7 +121,7 @@ def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
     assert (hidden.trials, hidden.flights, hidden.fit.iterations) == (25, 3, 200)
     assert hidden.tuning.optimizer.iterations == 60 and hidden.tuning.quadrotor is not None
     assert hidden.true_vehicle == EXAMPLE and hidden.policy == shipped.DEFAULT
-    assert set(hidden.digests) == {"vehicle", "hidden_vehicle", "policy"}
+    assert set(hidden.digests) == {"vehicle", "hidden_vehicle", "sensors", "policy"}
 
 
 @pytest.mark.parametrize(
