@@ -106,7 +106,7 @@ def verdict(
         else "not significantly different from"
     )
     told = (
-        f"In {where} {percent(BEFORE)} of {trials} trials succeed, in the simulation's "
+        f"With {where} {percent(BEFORE)} of {trials} trials succeed, with the simulation's "
         f"vehicle {percent(NOMINAL)}. The diagnosis names {named_effects(diagnosis)}. Fine-tuned "
         f"with it, {percent(NAMED)} succeed there: {told_apart(apart[CONTROL])} the "
         f"same fine-tuning without it ({percent(CONTROL)}; difference {points(apart[CONTROL])}), "

@@ -234,7 +234,7 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
 @pytest.mark.parametrize(
     ("nominal", "control", "named", "how"),
     [
-        (39, 12, 36, "25 % of 40 trials succeed, in the simulation's vehicle 98 %"),
+        (39, 12, 36, "25 % of 40 trials succeed, with the simulation's vehicle 98 %"),
         (39, 12, 36, "more than the same fine-tuning without it (30 %; difference +60 points [+"),
         (40, 20, 20, "not significantly different from the same fine-tuning without it"),
         (39, 10, 40, ", and not significantly different from the policy where nothing is hidden"),
