@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from itertools import pairwise
+from math import ceil
 from typing import Any, NamedTuple
 
 import jax
@@ -122,12 +124,14 @@ def make_senses(config: TrainConfig) -> Senses:
     """Return the sensor models of `config.sensors`, with each world's magnitudes and draws.
 
     The functions are the judge's own. The trainer knows states at decisions alone: in between an
-    old one is interpolated, an old image is this or the last one with as much chance, and ages
-    count up to one policy period (more of it is `physics.state_delay` and `image_delay`).
+    old one is interpolated, and an old image is that of one of the two, by chance.
     """
     assert config.sensors is not None
     held, spec, dt_s = config.sensors.seen.models, config.spec, 1.0 / config.spec.rate_hz
-    parts, late = sensing(held), "delay" in held
+    parts, longest = sensing(held), config.sensors.magnitude[1]
+    ages = (scaled(name, held[name], longest) for name in held if name == "delay")
+    # Views kept: as many as the oldest that is ever seen is policy periods old.
+    periods = max((ceil((1 + d.jitter) * max(d.state, d.image) / dt_s) for d in ages), default=0)
 
     def grown(worlds: Worlds) -> dict[str, Any]:
         assert worlds.sensed is not None
@@ -136,46 +140,52 @@ def make_senses(config: TrainConfig) -> Senses:
     def start(worlds: Worlds, truth: View) -> Any:
         assert worlds.sensed is not None
         about = worlds.sensed.trial, dt_s, spec.camera
-        return truth if late else (), sensors.start(grown(worlds), truth, *about)
+        return (truth,) * periods, sensors.start(grown(worlds), truth, *about)
 
     def see(worlds: Worlds, truth: View, keys: jax.Array, memory: Any) -> tuple[View, Any]:
-        before, kept = memory
-        draws = {}
+        past, kept = memory
+        draws, views = {}, (truth, *past)
         for number, name in enumerate(parts):
             own = jax.vmap(jax.random.fold_in, (0, None))(keys, number + 1)
             needs = SENSORS[name].observation
             draws[name] = jax.vmap(lambda key, n=needs: keyed_draws(n, key, spec.camera))(own)
         old = truth
-        if late:
+        if past:
             assert worlds.sensed is not None
             delay = scaled("delay", held["delay"], worlds.sensed.magnitude["delay"])
             own = jax.vmap(jax.random.fold_in, (0, None))(keys, 0)
             chance = jax.vmap(lambda key: jax.random.uniform(key, (3,)))(own)
             shake = 1.0 + delay.jitter * (2.0 * chance[:, :2] - 1.0)
             ages = jnp.stack([delay.state, delay.image], -1) * shake / dt_s
-            old = older(truth, before, jnp.minimum(ages[:, 0], 1.0), chance[:, 2] < ages[:, 1])
+            old = older(views, ages[:, 0], jnp.floor(ages[:, 1] + chance[:, 2]))
         seen, kept = sensors.sense(grown(worlds), kept, old, draws, dt_s, spec.camera)
         image = jax.lax.stop_gradient(seen.depth_m)
-        kept = jax.lax.stop_gradient(kept)
-        return seen._replace(depth_m=image), (truth if late else (), kept)
+        return seen._replace(depth_m=image), (views[:periods], jax.lax.stop_gradient(kept))
 
     return Senses(start, see)
 
 
-def older(now: View, before: View, share: jax.Array, last: jax.Array) -> View:
-    """Return what was seen a `share` (B,) of a policy period ago; of the images where `last` (B,).
+def older(views: tuple[View, ...], age: jax.Array, image_age: jax.Array) -> View:
+    """Return what was seen some policy periods ago; the next gate is that of the nearer decision.
 
-    The next gate is that of the nearer of the two moments.
+    Args:
+        views: of this decision, of the one before, and so on.
+        age: (B,) of the state [policy periods].
+        image_age: (B,) of the image, whole numbers [policy periods].
     """
-    part = share[:, None]
-    turn_b = turned_by(before.rot_w, now.rot_w)
-    gates = select(share > 0.5, before, now)
-    return gates._replace(
-        pos_w=now.pos_w + part * (before.pos_w - now.pos_w),
-        vel_w=now.vel_w + part * (before.vel_w - now.vel_w),
-        rot_w=product(now.rot_w, exp_rot(part * turn_b)),
-        depth_m=select(last, before.depth_m, now.depth_m),
-    )
+    seen = views[0]
+    for number, (late, before) in enumerate(pairwise(views)):
+        share = age - number
+        part, turn_b = share[:, None], turned_by(before.rot_w, late.rot_w)
+        old = select(share > 0.5, before, late)._replace(
+            pos_w=late.pos_w + part * (before.pos_w - late.pos_w),
+            vel_w=late.vel_w + part * (before.vel_w - late.vel_w),
+            rot_w=product(late.rot_w, exp_rot(part * turn_b)),
+            depth_m=seen.depth_m,
+        )
+        seen = select(share > 0.0, old, seen)
+        seen = seen._replace(depth_m=select(image_age > number, before.depth_m, seen.depth_m))
+    return seen
 
 
 class Sight(NamedTuple):

@@ -91,11 +91,13 @@ def test_an_old_view_lies_between_two_decisions():
     now = view_in(worlds, state, jnp.asarray(worlds.target))
     now = now._replace(depth_m=jnp.ones((BATCH, 2, 2)))
     before = now._replace(pos_w=now.pos_w - 1.0, gate_w=now.gate_w + 5.0, depth_m=now.depth_m * 2)
-    share = jnp.linspace(0.0, 1.0, BATCH)
-    old = older(now, before, share, share > 0.3)
-    assert np.array(now.pos_w - old.pos_w) == pytest.approx(np.array(share[:, None] + jnp.zeros(3)))
-    assert np.array_equal(old.gate_w != now.gate_w, np.repeat(share[:, None] > 0.5, 3, 1))
-    assert np.array_equal(old.depth_m[:, 0, 0], jnp.where(share > 0.3, 2.0, 1.0))
+    first = before._replace(pos_w=now.pos_w - 3.0, depth_m=now.depth_m * 3)
+    age = jnp.linspace(0.0, 2.0, BATCH)  # 0, 0.4, 0.8, 1.2, 1.6, 2
+    old = older((now, before, first), age, jnp.round(age))
+    away = np.array(now.pos_w - old.pos_w)[:, 0]
+    assert away == pytest.approx([0.0, 0.4, 0.8, 1.4, 2.2, 3.0], abs=1e-5)
+    assert np.array_equal(old.gate_w != now.gate_w, np.repeat(age[:, None] > 0.5, 3, 1))
+    assert np.array_equal(old.depth_m[:, 0, 0], [1, 1, 2, 2, 3, 3])
 
 
 def test_the_command_trains_through_a_file(tmp_path):
