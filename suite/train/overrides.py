@@ -29,6 +29,12 @@ NEEDS = {
     "episode.stop_from": "episode.rest_share",
 }
 """Settings that do nothing where another is 0 or False."""
+ABSENT = {
+    "quadrotor": "quadrotor; take a recipe that trains through quadrotors (suite train: or add "
+    "--model quad and --vehicle)",
+    "sensors": "sensor models; suite train: add --sensors",
+}
+"""What to do where a part of a run is None."""
 PREFIX = "phases."
 """What a change that comes with a phase begins with."""
 
@@ -107,11 +113,8 @@ def _changed(config: T, path: list[str], text: str, change: str) -> T:
     if name not in names:
         raise unknown_name(f"--set {change}: setting", name, names)
     old = getattr(config, name)
-    if rest and old is None and name == "quadrotor":
-        raise ValueError(
-            f"--set {change}: this run has no quadrotor; take a recipe that trains through "
-            "quadrotors (suite train: or add --model quad and --vehicle)"
-        )
+    if rest and old is None and name in ABSENT:
+        raise ValueError(f"--set {change}: this run has no {ABSENT[name]}")
     if rest:
         return dataclasses.replace(config, **{name: _changed(old, rest, text, change)})
     if dataclasses.is_dataclass(old):

@@ -107,5 +107,7 @@ def test_the_command_trains_through_a_file(tmp_path):
     assert run.sensors is not None and run.sensors.magnitude == (0.0, 1.5)
     assert run.sensors.seen == sensor_set({"stereo": {"noise": 0.2}}, "mine")
     assert resolve(Config(recipe="quick")).sensors is None
+    with pytest.raises(ValueError, match="has no sensor models; suite train: add --sensors"):
+        resolve(Config(recipe="quick", set=("sensors.magnitude=(0.0,1.5)",)))
     with pytest.raises(ValueError, match="Did you mean 'stereo-depth'"):
         resolve(Config(recipe="quick", sensors="stereo-dept"))
