@@ -3,7 +3,8 @@
     python tools/mutants.py COUNT [--seed N] [--out FILE.json]
 
 A mutant has another operator (+ and -, * and /, < and <=, == and !=, and/or, & and |), a sign or
-a `not` less, or another number. Messages, annotations and ranges stay. AREAS says which files are
+a `not` less, or another number. Messages, annotations and ranges stay, and what has no right value:
+defaults of settings and the catalogue's bounds and usual sizes. AREAS says which files are
 changed and which tests run, in a copy of the files that git tracks, up to the first that fails.
 Every mutant is run in a fork of a process that has the libraries loaded. The same command goes on
 where it was stopped. Prints those that survive; exit 1 where they are more than 5 %.
@@ -46,6 +47,8 @@ AREAS = (
 """Files, and the beginnings of the paths of their tests (eval/ where no package is named)."""
 PAIRS = "+ - * / < <= > >= == != and or & |".split()
 OTHER = {one: PAIRS[k ^ 1] for k, one in enumerate(PAIRS)} | {"**": "*"}
+CHOICE = re.compile(r"(low|high|typical)=|\w+: [^#]* = ")
+"""Begins a line of a bound, a usual size or a default."""
 C_TOKEN = re.compile(r"(?<= )(\+|-|\*|/|<|<=|>|>=|==|!=|&&)(?= )|(?<![\w.])\d+\.\d*f?\b")
 
 
@@ -120,6 +123,13 @@ def mutants(copy: Path) -> list[list[Mutant]]:
     return found
 
 
+def line_of(copy: Path, mutant: Mutant) -> tuple[int, str]:
+    """Return the number and the text of the line that a mutant changes."""
+    source = (copy / mutant.file).read_bytes()
+    line = source[: mutant.first].count(b"\n") + 1
+    return line, source.splitlines()[line - 1].decode().strip()
+
+
 def fail(copy: Path, tests: str) -> bool:
     """Say whether tests fail.
 
@@ -151,7 +161,9 @@ def main() -> int:
         copy = Path(folder)
         copied(ROOT, copy)
         areas = [draw.sample(area, len(area)) for area in mutants(copy)]
-        order = [area[k] for k in range(asked.count) for area in areas if k < len(area)]
+        most = max(map(len, areas))
+        order = [area[k] for k in range(most) for area in areas if k < len(area)]
+        order = [mutant for mutant in order if not CHOICE.match(line_of(copy, mutant)[1])]
         for mutant in order[: asked.count]:
             if mutant.tests not in done:
                 done[mutant.tests] = fail(copy, mutant.tests)
@@ -159,8 +171,7 @@ def main() -> int:
                 raise SystemExit(f"{mutant.tests}: fail without any mutant; repair them")
             path = copy / mutant.file
             right = path.read_bytes()
-            old, line = right[mutant.first : mutant.last], right[: mutant.first].count(b"\n") + 1
-            text = right.splitlines()[line - 1].decode().strip()
+            old, (line, text) = right[mutant.first : mutant.last], line_of(copy, mutant)
             name = f"{mutant.file}:{line}: {old.decode()!r} -> {mutant.new!r} in {text!r}"
             if name not in done:
                 path.write_bytes(right[: mutant.first] + mutant.new.encode() + right[mutant.last :])

@@ -69,6 +69,15 @@ def test_a_parameter_that_is_no_number_is_as_one_that_is_missing(ulog, value):
     assert "THR_MDL_FAC is 0" in text(findings, "thrust")
 
 
+def test_motors_of_a_small_quadrotor_are_where_its_log_says():
+    """PX4's y is to the right."""
+    places = ((0.03, -0.04), (-0.03, 0.04), (0.03, 0.04), (-0.03, -0.04))
+    said = {
+        f"CA_ROTOR{k}_P{a}": v for k, at in enumerate(places) for a, v in zip("XY", at, strict=True)
+    }
+    assert px4._motor_side(said) == (tuple((x, -y) for x, y in places), [])
+
+
 @pytest.mark.parametrize(
     ("before", "after"),
     [

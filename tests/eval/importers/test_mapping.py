@@ -79,7 +79,8 @@ column = "u"
 unit = "65535"
 """
     )
-    log, _ = imported(tmp_path, mapping, columns)
+    log, findings = imported(tmp_path, mapping, columns)
+    assert not [found for found in findings if found.status == "corrected"], "nothing to correct"
     near(log.pos_w, truth.pos, 1e-9)
     near(log.rate_b, truth.rate, 1e-6)
     near(log.acc_b, truth.acc, 1e-6)

@@ -64,6 +64,8 @@ def test_limits_are_the_vehicle_files():
     found = guard_action(limits, asked, last, 0.0, "p")
     assert found.limited.all() and found.largest[0] == 99.0
     assert found.action_b[0] == pytest.approx([VEHICLE.full_thrust, most[0], -most[1], 1.0])
+    found = guard_action(limits, np.array([[-1.0, 0.0, 0.0, 0.0]]), last, 0.0, "p")
+    assert found.action_b[0].tolist() == [0.0] * 4 and found.limited.all()
     normalised = ActionSpec("motors", (0.5,), (0.5,))
     limits = limits_of(ActionLimits(), normalised, VEHICLE)
     found = guard_action(limits, np.array([[-1.0, 0.0, 1.0, 2.0]]), last, 0.0, "p")

@@ -83,6 +83,8 @@ def leaning(angle_deg):
 def test_a_trial_ends_as_tipped_from_90_degrees_on_and_not_before():
     assert judged((0, 0, 1), rot_w=leaning(89.9)).ended[0] == FLYING
     assert judged((0, 0, 1), rot_w=leaning(90.1)).ended[0] == TIPPED
+    on_its_side = np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
+    assert judged((0, 0, 1), rot_w=on_its_side).ended[0] == FLYING
 
 
 def test_gates_of_the_first_8_s_count_up_to_that_very_step():
@@ -142,7 +144,7 @@ def test_a_trials_random_numbers_are_its_own_for_each_use():
         assert (noise_of(other, 5) != noise_of(TRIAL, 5)).all()
     here, there = (TRIAL._replace(track=f"{way}own.toml") for way in ("", "./courses/"))
     np.testing.assert_array_equal(noise_of(here, 5), noise_of(there, 5))
-    assert generator_of(TRIAL, slots.GATES).standard_normal() != noise_of(TRIAL, 1)[0, 0]
+    assert generator_of(TRIAL, slots.SENSED).standard_normal() != noise_of(TRIAL, 1)[0, 0]
 
 
 def test_gusts_are_drawn_as_the_flight_goes_on():

@@ -7,7 +7,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from suite.delta.fit import FitConfig, _descend, fit, fit_network, identify
+from suite.delta.fit import (
+    FitConfig,
+    _descend,
+    _loss,
+    fit,
+    fit_network,
+    identify,
+    window_errors,
+)
 from suite.delta.replay import PointMassModel, nominal_model, replay
 from suite.delta.run import table
 from suite.delta.windows import cut_windows
@@ -64,6 +72,37 @@ def test_the_correction_that_is_found_is_the_known_one_to_two_per_cent():
     found = fit_network(config, nominal, windows, windows)
     correction_b = np.asarray(nominal(windows, found.params)[2]).mean((0, 1))
     assert np.linalg.norm(correction_b - known_b) < 0.02 * np.linalg.norm(known_b)
+
+
+def test_a_replay_is_held_against_the_record_of_its_own_time():
+    """The record itself has no error; one that is off by 3 and 4 has that of a distance of 5."""
+    rng = np.random.default_rng(0)
+    record = Record(*rng.normal(size=(2, 4, 6, 3)))
+    config = FitConfig(velocity_weight=0.5, size_weight=0.25)
+
+    def flown(off_m, off_m_s, correction):
+        move = np.array([3.0, 0.0, 4.0])
+        pos_w, vel_w = record.pos_w[:, 1:] + off_m * move, record.vel_w[:, 1:] + off_m_s * move
+        return lambda windows, delta: (pos_w, vel_w, np.full((4, 5, 3), correction))
+
+    for off_m, off_m_s, correction, loss in (
+        (0, 0, 0, 0),
+        (1, 0, 0, 5),
+        (0, 1, 0, 2.5),
+        (0, 0, 2, 3),
+    ):
+        assert _loss(config, flown(off_m, off_m_s, correction), record, None) == pytest.approx(
+            loss, abs=1e-3
+        )
+    for error, size in zip(window_errors(flown(1, 2, 0), record, None), (5, 10), strict=True):
+        np.testing.assert_allclose(error, np.full(4, size), rtol=1e-5)
+
+
+class Record(NamedTuple):
+    """Windows that were flown."""
+
+    pos_w: np.ndarray
+    vel_w: np.ndarray
 
 
 def test_the_steps_of_a_descent_become_small():

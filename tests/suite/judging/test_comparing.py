@@ -5,6 +5,7 @@ from math import erf, sqrt
 
 import numpy as np
 import pytest
+from scipy.stats import t as student
 
 from eval.judging.results import write_results
 from eval.judging.statistics import over_seeds, paired_success, wilson
@@ -34,6 +35,25 @@ def test_the_hierarchical_bootstrap_covers_as_it_says(two):
         truth = mean(0.8) - (mean(0.4) if two else 0.0)
         hit += found.low <= truth <= found.high
     assert 0.93 <= hit / count <= 0.97, hit
+
+
+def test_the_interval_of_a_small_layout_is_that_of_its_mean_squares():
+    """Satterthwaite 1946: the mean's variance is (MS seeds + MS trials - MS rest) / (S T)."""
+    table = [[-1, -4, 2, -1, 3], [3, 0, 0, 3, -1], [2, -3, -1, -4, 1], [2, 0, 2, 0, 1]]
+    values = np.array(table, float)
+    seeds, trials = values.shape
+    rest = values - values.mean(1, keepdims=True) - values.mean(0) + values.mean()
+    squares = np.array([
+        trials * values.mean(1).var(ddof=1),
+        seeds * values.mean(0).var(ddof=1),
+        (rest**2).sum() / ((seeds - 1) * (trials - 1)),
+    ])  # fmt: skip
+    variance = squares @ [1, 1, -1] / values.size
+    freedom = [seeds - 1, trials - 1, (seeds - 1) * (trials - 1)]
+    degrees = variance**2 / ((squares / values.size) ** 2 / freedom).sum()
+    found = over_seeds(values)
+    half = student.ppf(0.975, degrees) * sqrt(variance)
+    assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.03)
 
 
 def test_one_seed_or_other_trials_are_refused():

@@ -191,6 +191,8 @@ def test_progress_counts_up_to_the_speed_that_is_asked_for_and_what_is_faster_co
 
     pull = jax.grad(total)(ahead)
     np.testing.assert_allclose(pull[:, 0], [0.4, -0.4, -0.4], rtol=1e-6)
+    costs = weighted(config, step._replace(vel_w=3 * ahead))["progress"]
+    np.testing.assert_allclose(costs, [2.8, 0.8, -3.6], rtol=1e-6)
     fast = jax.grad(total)(3 * ahead)
     np.testing.assert_allclose(fast[:, 0], [0.4, 0.4, -0.4], rtol=1e-6, err_msg="a race has no end")
 

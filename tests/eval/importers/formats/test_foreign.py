@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
+from eval.importers.formats import betaflight
 from eval.importers.formats.crazyflie import unpack_quaternion
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
@@ -114,6 +115,8 @@ def test_betaflights_tenfold_values_are_found(tmp_path, fix):
 
 
 def test_betaflight_counts_the_motors_poles(tmp_path):
+    # Its quadrotor X: rear right, front right, rear left, front left; (forward, left).
+    assert betaflight.MOTOR_SIDE == ((-1, -1), (1, -1), (-1, 1), (1, 1))
     path = made.write_blackbox(tmp_path / "log.csv", span=(0, 8), poles=12)
     pose = made.write_mocap(tmp_path / "pose.csv", span=(0, 8))
     log, _ = import_log(path, None, ImportOptions(pose=pose, motor_poles=12, full_thrust=30.0))
