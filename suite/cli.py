@@ -152,7 +152,7 @@ def _run(name: str, args: list[str]) -> int:
     from tracks.common.work.threads import one_thread_a_product, set_threads
 
     for variable in pin():
-        _complain(f"{variable} of the environment is set aside: it would change every result")
+        _complain(f"{variable} of the environment is set aside: it might change results")
     args, notes = renamed(name, args)
     for note in notes:
         _complain(note)

@@ -36,6 +36,10 @@ _NO_BACKEND = ("Unable to initialize backend", "Unknown backend")
 """At the start of what JAX says where JAX_PLATFORMS names what is not there."""
 
 
+_NO_SETTING = "invalid value for environment variable"
+"""At the start of what MuJoCo says of MUJOCO_GL."""
+
+
 class WorkFailed(RuntimeError):
     """The input was fine and the work could not be done; the message says what to do next."""
 
@@ -63,6 +67,8 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         asked = os.environ.get("JAX_PLATFORMS", "")
         first = str(error).splitlines()[0][:SHOWN]
         return UNUSABLE, f"JAX_PLATFORMS is {asked!r} in the environment: {first}; unset it"
+    if isinstance(error, RuntimeError) and str(error).startswith(_NO_SETTING):
+        return UNUSABLE, f"{error}; unset it"
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return FAILED, "out of memory: use fewer trials, a smaller batch, or a larger machine"
     return None

@@ -16,12 +16,17 @@ from pathlib import Path
 
 from tracks.common.files import user_cache
 
-PINNED = (
-    *("JAX_ENABLE_X64", "JAX_DEFAULT_DTYPE_BITS", "JAX_NUMPY_DTYPE_PROMOTION"),
-    *("JAX_NUMPY_RANK_PROMOTION", "JAX_DEFAULT_MATMUL_PRECISION", "JAX_DEFAULT_PRNG_IMPL"),
-    *("JAX_THREEFRY_PARTITIONABLE", "JAX_ENABLE_CUSTOM_PRNG"),
+KEPT = (
+    *("JAX_PLATFORM", "JAX_CUDA_", "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_"),
+    *("JAX_TRACEBACK_", "JAX_LOGGING_LEVEL"),
 )
-"""Variables that would change what every command computes; set aside."""
+"""Beginnings of the variables of JAX that say where work runs, what is kept, and what is logged."""
+SWITCHES = (
+    *("JAX_DISABLE_JIT", "JAX_DEBUG_NANS", "JAX_DEBUG_INFS", "JAX_LOG_COMPILES"),
+    *("JAX_EXPLAIN_CACHE_MISSES", "JAX_ENABLE_COMPILATION_CACHE", "JAX_CHECK_TRACER_LEAKS"),
+    "JAX_DISABLE_MOST_OPTIMIZATIONS",
+)
+"""Those for people who look for a mistake; 0 or 1."""
 
 
 def open_streams() -> None:
@@ -67,9 +72,21 @@ def check_names(args: Iterable[str]) -> None:
 
 
 def pin(environment: MutableMapping[str, str] | None = None) -> list[str]:
-    """Set aside variables that would change what is computed, in place, and return their names."""
+    """Set aside variables of JAX that might change what is computed or end the command, in place.
+
+    JAX has a hundred of them, so those are listed that do not.
+
+    Returns:
+        Their names.
+    """
     values = os.environ if environment is None else environment
-    return [name for name in PINNED if values.pop(name, "")]
+    known = ("0", "1", "true", "false")
+    fine = {name for name in SWITCHES if values.get(name, "0").lower() in known}
+    found = [name for name, value in values.items() if name.startswith("JAX_") and value]
+    aside = [name for name in found if name not in fine and not name.startswith(KEPT)]
+    for name in aside:
+        del values[name]
+    return sorted(aside)
 
 
 def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:

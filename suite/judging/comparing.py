@@ -36,14 +36,15 @@ def read_runs(folder: Path) -> list[Run]:
     """Return the policies of an evaluation's folder.
 
     Raises:
-        ValueError: where it holds none.
+        ValueError: where it holds none, or not what an evaluation writes.
     """
     path = folder / "trials.parquet"
     if not path.is_file():
         raise ValueError(f"{folder}: holds no trials.parquet; give the --out of a suite eval")
-    results, summary = read_trials(path), read_json(folder / "summary.json")
-    judged = summary.get("judged", {})
-    conditions = {key: judged.get(key) for key in CONDITIONS}
+    results, summary = read_trials(path), read_json(folder / "summary.json", judged=dict)
+    if len({(row.trial, row.policy) for row in results}) < len(results):
+        raise ValueError(f"{path}: holds a trial twice; run suite eval again")
+    conditions = {key: summary["judged"].get(key) for key in CONDITIONS}
     conditions["files"] = summary.get("sha256")
     names = list(dict.fromkeys(row.policy for row in results))
     return [

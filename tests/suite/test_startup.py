@@ -134,10 +134,10 @@ def test_the_longest_name_of_a_file_can_be_written(tmp_path):
 
 
 def test_variables_that_change_results_are_set_aside(monkeypatch, capsys):
-    own = {"JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu", "JAX_DISABLE_JIT": ""}
-    assert startup.pin(own) == ["JAX_ENABLE_X64"] and set(own) == {
-        "JAX_PLATFORMS", "JAX_DISABLE_JIT",
-    }  # fmt: skip
+    kept = {"JAX_PLATFORMS": "cpu", "JAX_DISABLE_JIT": "", "JAX_DEBUG_NANS": "True", "HOME": "/"}
+    aside = {"JAX_ENABLE_X64": "1", "JAX_DEBUG_INFS": "perhaps", "JAX_TRANSFER_GUARD": "disallow"}
+    own = kept | aside
+    assert startup.pin(own) == sorted(aside) and own == kept
     monkeypatch.setenv("JAX_ENABLE_X64", "1")
     assert cli.main(["effects"]) == 0
     assert "JAX_ENABLE_X64 of the environment is set aside" in capsys.readouterr().err
@@ -156,6 +156,11 @@ def test_a_platform_that_is_not_there_is_one_line(monkeypatch):
     error = RuntimeError("Unable to initialize backend 'cuda': no device\nmore\nlines")
     code, said = explain(error) or (None, "")
     assert code == UNUSABLE and said.startswith("JAX_PLATFORMS is 'cuda'") and "\n" not in said
+
+
+def test_a_display_that_mujoco_does_not_have_is_one_line():
+    error = RuntimeError("invalid value for environment variable MUJOCO_GL: glx2")
+    assert explain(error) == (UNUSABLE, f"{error}; unset it")
 
 
 def test_jax_says_of_a_missing_platform_what_we_expect(root, tmp_path):

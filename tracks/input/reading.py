@@ -69,14 +69,27 @@ def read_bytes(path: str | os.PathLike[str], most_bytes: int = TEXT_BYTES) -> by
     return data
 
 
-def read_json(path: str | os.PathLike[str]) -> Any:
-    """Return the value of a JSON file.
+def read_json(path: str | os.PathLike[str], **keys: type) -> dict[str, Any]:
+    """Return the object of a JSON file.
+
+    Args:
+        path: of the file.
+        keys: that it must hold, with the type of what stands there.
 
     Raises:
-        InputError: where it is no plain file, too large or no JSON.
+        InputError: where it is no plain file, too large or no JSON, or holds something else.
         OSError: where it cannot be read.
     """
-    return parse_json(read_bytes(path), os.fspath(path))
+    value = parse_json(read_bytes(path), os.fspath(path))
+    if not isinstance(value, dict):
+        raise InputError(f"{os.fspath(path)}: holds a {type(value).__name__}, expected an object")
+    for key, kind in keys.items():
+        if not isinstance(value.get(key), kind):
+            raise InputError(
+                f"{os.fspath(path)}: {key!r} is no {kind.__name__}; it was changed or cut: make "
+                "the file again"
+            )
+    return value
 
 
 def parse_json(text: str | bytes, where: str) -> Any:

@@ -17,7 +17,7 @@ from policies.formats.spec_json import embed
 from policies.native import native_policy
 from policies.policy import Policy
 from policies.spec import PolicyError, PolicySpec
-from tracks.common.names import unknown_name
+from tracks.common.names import printable, unknown_name
 
 DTYPES = ("float32", "int8")
 VECTORS = 12
@@ -66,6 +66,7 @@ def c_project(
             )
         layers = quantise(params, spec, observed)
         name = f"{name}-int8"
+    name = printable(name, keep="")  # it stands in comments
     label = embed(spec, name, checkpoint.seed)
     part = Observed(*(x[:VECTORS] for x in observed or drawn(spec, VECTORS)))
     part = part._replace(fresh=np.arange(len(part.state)) == 0)

@@ -96,6 +96,25 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
             compare.run(compare.Config((a, folder) if folder else (a,)), Quiet())
 
 
+@pytest.mark.parametrize(
+    ("summary", "said"),
+    [("[1]", "holds a list"), ('{"judged": [1]}', "'judged' is no dict"), ("{", "not JSON")],
+)
+def test_a_summary_that_is_none_is_refused(tmp_path, summary, said):
+    run_of(tmp_path, [True])
+    (tmp_path / "summary.json").write_text(summary)
+    with pytest.raises(ValueError, match=rf"summary\.json: .*{said}"):
+        read_runs(tmp_path)
+
+
+def test_a_trial_that_is_there_twice_is_refused(tmp_path):
+    run_of(tmp_path, [True])
+    rows = [result(0, True)] * 2
+    write_results(tmp_path, rows, table_markdown="", summary={"judged": {}}, seed=0)
+    with pytest.raises(ValueError, match="holds a trial twice"):
+        read_runs(tmp_path)
+
+
 def test_two_methods_are_compared_over_their_seeds(tmp_path):
     rng = np.random.default_rng(1)
     folders = {
