@@ -124,7 +124,7 @@ FAULTS = (
           "delta/test_windows"),
     # suite: diagnosis
     Fault("suite/diagnose", "(slow**2).sum(axis=(2, 3)) - (taken**2).sum(axis=(2, 3))",
-          "(slow**2).sum(axis=(2, 3))", "test_normal_equations test_whitening test_verdict"),
+          "(slow**2).sum(axis=(2, 3))", "diagnose/fit/test_fit"),
     Fault("suite/diagnose", "float((1 + (null >= fall).sum()) / (1 + draws))",
           "float((null >= fall).sum() / (1 + draws))", "test_permutation"),
     # suite: blind cases, link
