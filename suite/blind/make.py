@@ -122,7 +122,7 @@ def load_manifest(out: Path) -> Manifest:
     path = out / "manifest.json"
     if not path.is_file():
         raise ValueError(f"{path}: missing; make the set first with `suite blind make`")
-    table = read_json(path, cases=dict, answers=dict, failed=list)
+    table = read_json(path, cases=dict, answers=dict, failed=dict)
     return Manifest(table["cases"], table["answers"], table["failed"])
 
 
