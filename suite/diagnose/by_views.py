@@ -12,6 +12,7 @@ from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.flights import ViewFlights, choose_held_out, parted, ready
+from suite.diagnose.data.inertial import UNSEEN, is_inertial
 from suite.diagnose.data.view import FORCE, View
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import (
@@ -25,7 +26,7 @@ from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidates
 from suite.diagnose.search.chance import RotorSpread, rotor_spread
 from suite.diagnose.search.change import changed_task, search_change, search_motion_change
-from suite.diagnose.search.look import NamedEffect, SearchResult
+from suite.diagnose.search.look import NamedEffect, SearchResult, contradicted
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import LAG, RotorLag, another_lag
@@ -139,6 +140,11 @@ def diagnose_by_views(
     voltage = all(log.voltage is not None for log in [*logs, *references])
     model = ForceModel(vehicle, space, voltage)
     among = candidates(space, voltage, ())
+    unseen: list[str] = []
+    if any(is_inertial(log) for log in [*logs, *references]):
+        among = [one for one in among if EFFECTS[one.name].wind is None]
+        limits = replace(limits, least_view_share=limits.least_inertial_share)
+        unseen = [f"without a position these flights do not show {what}" for what in UNSEEN]
     whole = not any(log.partial for log in [*logs, *references])
     known, spread, left_out = _reference_tasks(flights, model, vehicle, references, limits)
     say(f"views: {', '.join(view.about for view in flights.views)}; by {flights.source}")
@@ -159,6 +165,11 @@ def diagnose_by_views(
             begun = task.weighed(task.start)
             seen = view_candidates([*among, *composites(among)], begun[1])
             found = search(begun[0], task.start, seen, say, seed, begun)
+            for refused, words in contradicted(results[0].search, found) if results else ():
+                text = f"{view.name}: {refused.label} is contradicted by {results[0].view.name}"
+                unseen.append(f"{text} ({words}): left out")
+                seen = [c for c in seen if not set(c.indices) & set(refused.indices)]
+                found = search(begun[0], task.start, seen, say, seed, begun)
             apart = replace(task, flights=held[view.name])
         gap = judge(found, apart, flights.floor[view.name])
         widths = found.half_widths()
@@ -170,7 +181,7 @@ def diagnose_by_views(
             f"{100 * gap.share(gap.explainable):.0f} % by a black box")  # fmt: skip
     results, withdrawn = _confirmed(tuple(results))
     results, told = _one_cause(results)
-    warnings = [*flights.notes, *left_out, *withdrawn, *told]
+    warnings = [*flights.notes, *unseen, *left_out, *withdrawn, *told]
     warnings += [
         f"{one.name}: left out, too small to matter: {one.size.words()}"
         for result in results

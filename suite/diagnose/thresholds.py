@@ -150,6 +150,8 @@ class Thresholds:
     """Fast changes that surely ask for less than this share of a name speak against it [1]."""
     least_view_share: float = 0.03
     """An effect that takes less than this share of a view's squared error is not named [1]."""
+    least_inertial_share: float = 0.06
+    """The same in flights without a position: what is not known of their pose makes as much [1]."""
     implausible_times: float = 3.0
     """Beyond so many times its usual size an effect is said to be implausible [1]."""
     hopeless_chi2: float = 10.0

@@ -153,7 +153,7 @@ def not_examined(logs: Sequence[FlightLog]) -> list[str]:
     """Return what of the motion no log allows to examine, in words: force, torque."""
     drives = ("rotor_speed", "pwm")
     force = any(
-        not {"pos", "quat"} & set(log.partial)
+        (not {"pos", "quat"} & set(log.partial) or (log.acc_b is not None and "pos" in log.partial))
         and any(getattr(log, name) is not None for name in (*drives, "thrust_cmd"))
         for log in logs
     )

@@ -22,11 +22,13 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mix
 from eval.quadrotor.plant import make_plant, nominal_quadrotor
 from eval.vehicles.vehicle import Vehicle, motor_speed
+from suite.diagnose.data.inertial import by_inertia, is_inertial
 from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.sampling import LONGEST_S, interpolate, on_every_row
 from suite.diagnose.data.view import (
     FORCE,
     LEAST_ROWS,
+    SPECIFIC,
     TORQUE,
     FlightRows,
     SmoothedFlight,
@@ -82,20 +84,29 @@ def ready(
     rows = [
         rows_of(log, vehicle, one.speed, limits) for log, one in zip(whole, acting, strict=True)
     ]
-    views = [FORCE]
-    if any("quat" in log.partial for log in logs):
+    inertial = [is_inertial(log) for log in logs]
+    views = [SPECIFIC if all(inertial) else FORCE]
+    if any("pos" in log.partial and not own for log, own in zip(logs, inertial, strict=True)):
+        views = []
+    elif any("quat" in log.partial and not own for log, own in zip(logs, inertial, strict=True)):
         views = [replace(FORCE, axes=(2,))]
     if all(one.each for one in acting):
         slow = any({"quat", "rate"} <= set(log.partial) for log in logs)
         views.append(replace(TORQUE, width_s=SLOW_WIDTH_S) if slow else TORQUE)
+    if not views:
+        raise ValueError(
+            f"{', '.join(log.name for log in logs)}: no position, and no accelerometer or no motor "
+            "of its own beside the gyro: nothing says what moved"
+        )
     parts = {view.name: [smoothed(view, one, limits) for one in rows] for view in views}
+    main = views[0]
     if TORQUE.name in parts:
         parts[TORQUE.name] = [
             _calibrated(flight, one, vehicle)
             for flight, one in zip(parts[TORQUE.name], acting, strict=True)
         ]
-    kept = [k for k, flight in enumerate(parts[FORCE.name]) if len(flight.form.middle_s)]
-    without = f"no stretch of {FORCE.width_s:g} s in flight without a hole"
+    kept = [k for k, flight in enumerate(parts[main.name]) if len(flight.form.middle_s)]
+    without = f"no stretch of {main.width_s:g} s in flight without a hole"
     if not kept:
         raise ValueError(f"{', '.join(log.name for log in logs)}: {without}")
     notes = [f"{log.name}: {without}" for k, log in enumerate(logs) if k not in kept]
@@ -111,7 +122,7 @@ def ready(
                 f"{view.name}: not looked at, as {', '.join(empty)} has no {view.width_s:g} s "
                 f"with {LEAST_ROWS} rows; log faster"
             )
-            views, parts = views[:1], {FORCE.name: parts[FORCE.name]}
+            views, parts = views[:1], {main.name: parts[main.name]}
     return ViewFlights(
         tuple(views),
         tuple(logs[k].name for k in kept),
@@ -149,7 +160,7 @@ def parted(
         )
     first, last = {}, {}
     # Of what was flown: a log may begin or end on the ground.
-    flown_s = flights.smoothed[FORCE.name][0].form.middle_s
+    flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
     until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
     for view in flights.views:
         whole = flights.smoothed[view.name][0]
@@ -173,12 +184,14 @@ def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
     """Return the noise (3,) of the measured accelerations, by that of neighbouring rows."""
     power = []
     for flight in flights:
-        series = np.asarray(flight.rows.vel_w if view.in_world else flight.rows.rate_b)
-        series = series[np.asarray(flight.rows.good)]
+        felt_w = flight.rows.felt_w if view.in_world else None
+        path = flight.rows.vel_w if view.in_world else flight.rows.rate_b
+        series = np.asarray(path if felt_w is None else felt_w)[np.asarray(flight.rows.good)]
         bend = series[2:] - 2.0 * series[1:-1] + series[:-2]
         # Median, for a filter's or an estimator's steps are no noise of every row.
         sigma = np.median(np.abs(bend), axis=0) / 0.6745 / np.sqrt(6.0)
-        gain = flight.form.change.power(2).sum(axis=1).mean()
+        weights = flight.form.change if felt_w is None else flight.form.mean
+        gain = weights.power(2).sum(axis=1).mean()
         power.append(sigma**2 * gain)
     floor = np.sqrt(np.mean(power, axis=0))
     return np.full(3, floor.mean()) if view.in_world else floor
@@ -191,11 +204,19 @@ SMOOTH_S = 0.1
 def completed(log: FlightLog) -> FlightLog:
     """Return `log` with the attitude from its path and the rates from the attitude, if it has none.
 
+    All of its pose is by gyro and accelerometer where it has no position; without an accelerometer
+    it has none, which only its turning does without.
+
     Raises:
-        ValueError: for a log without positions.
+        ValueError: for a log without positions and without rates.
     """
+    if is_inertial(log):
+        return by_inertia(log)
+    if "pos" in log.partial and "rate" in log.partial:
+        raise ValueError(f"{log.name}: no position and no gyro: nothing says how it moved")
     if "pos" in log.partial:
-        raise ValueError(f"{log.name}: no position: nothing says how it moved")
+        level, still = np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time_s), 1)), 0.0 * log.rate_b
+        return replace(log, pos_w=still, vel_w=still, quat_wxyz=level)
     if "quat" in log.partial:
         log = replace(log, quat_wxyz=np.asarray(rot_to_quat(leaning(log))))
     if "rate" in log.partial:

@@ -7,7 +7,7 @@ differentiated (modulating functions; Shinbrot 1957, Trans. ASME 79).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from eval.effects.interface import GRAVITY
 from eval.importers.rows import nearest
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.inertial import InertialLog, specific_force_w
 from suite.diagnose.data.sampling import interpolate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.scene import Array
@@ -41,6 +42,10 @@ class FlightRows(NamedTuple):
     """(N,) battery voltage at the start less now [V]; zeros where there is none."""
     good: Array
     """(N,) bool: nothing is missing."""
+    felt_w: Array | None = None
+    """(N, 3) acceleration by the accelerometer, in flights without a pose [m/s^2]."""
+    sway_b: Array | None = None
+    """(N, 3, K) what is not known of such a flight's pose makes of its drag [m/s^2]."""
 
     @property
     def vel_b(self) -> Array:
@@ -63,6 +68,11 @@ def rows_of(
     parts = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
     good = np.isfinite(np.concatenate(parts, axis=1)).all(axis=1)
     good &= np.isfinite(rot_w).all(axis=(1, 2))
+    felt_w = specific_force_w(log)
+    if felt_w is not None:
+        good &= np.isfinite(felt_w).all(axis=1)
+        felt_w = np.nan_to_num(felt_w)
+    sway_b = log.sway_b if isinstance(log, InertialLog) else None
     push = vehicle.rotors.thrust_coefficient * (rotor_speed**2).sum(axis=1)
     stands = (push < limits.ground_thrust * vehicle.mass * GRAVITY) & (
         np.linalg.norm(log.vel_w, axis=1) < limits.ground_speed
@@ -75,7 +85,7 @@ def rows_of(
     pos_w, vel_w, rate_b, speed = (np.nan_to_num(part) for part in parts)
     rot_w = np.where(np.isfinite(rot_w), rot_w, np.eye(3))
     since = log.time_s - log.time_s[0]
-    return FlightRows(since, pos_w, rot_w, vel_w, rate_b, speed, drop, good)
+    return FlightRows(since, pos_w, rot_w, vel_w, rate_b, speed, drop, good, felt_w, sway_b)
 
 
 def _near(time_s: np.ndarray, marked: np.ndarray, margin_s: float) -> np.ndarray:
@@ -112,6 +122,7 @@ class View:
 FORCE = View(
     "force", "translation under the measured attitude and thrust", "m/s^2", slice(0, 3), 0.2, True
 )
+SPECIFIC = replace(FORCE, about="specific force by the accelerometer under the measured thrust")
 TORQUE = View(
     "torque", "rotation under the measured rotor speeds", "rad/s^2", slice(3, 6), 0.1, False
 )
@@ -131,6 +142,8 @@ class SmoothedFlight(NamedTuple):
 def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> SmoothedFlight:
     """Return a flight's measured side in `view`."""
     form = weak_form(rows.time_s, rows.good, view.width_s, limits.longest_hole_s)
+    if view.in_world and rows.felt_w is not None:
+        return SmoothedFlight(rows, form, form.mean @ rows.felt_w)
     measured = form.change @ (rows.vel_w if view.in_world else rows.rate_b)
     return SmoothedFlight(rows, form, measured)
 

@@ -40,6 +40,10 @@ CHUNK = 1024
 """Rows a call: one shape, compiled once."""
 
 
+FELT = FlightRows._fields.index("felt_w")
+"""Fields of rows from here on are no input of a model."""
+
+
 class RowForces(NamedTuple):
     """What the equations say of N rows."""
 
@@ -73,7 +77,7 @@ class ForceModel:
         with jax.enable_x64(True):
             for first in range(0, count, CHUNK):
                 at = np.minimum(np.arange(first, first + CHUNK), count - 1)
-                part = FlightRows(*(np.asarray(field)[at] for field in rows))
+                part = FlightRows(*(np.asarray(field)[at] for field in rows[:FELT]))
                 said = [self._compiled(self._given, theta, part, group) for group in directions]
                 values.append(np.asarray(said[0][0])[: count - first])
                 slope = np.concatenate([np.asarray(each) for _, each in said], axis=-1)
@@ -129,6 +133,9 @@ class ViewData(NamedTuple):
     """(M, 3) measured - model, body axes."""
     slope: np.ndarray
     """(M, 3, K) of the model along numbers."""
+    sway: np.ndarray
+    """(M, 3, L) what is not known of the pose makes of the model, by standard deviations; L may be
+    0."""
 
 
 class Weights(NamedTuple):
@@ -168,7 +175,17 @@ def compare(
             slope = to_body @ slope
         dumb = [axis for axis in range(3) if axis not in view.axes]
         residual[:, dumb], slope[:, dumb] = 0.0, 0.0
-        parts.append(ViewData(np.full(count, number), flight.form.middle_s, value, residual, slope))
+        sway_b = flight.rows.sway_b if view.in_world else None
+        sway = np.zeros((count, 3, 0))
+        if sway_b is not None:
+            sway = (mean @ sway_b.reshape(len(sway_b), -1)).reshape(count, 3, -1)
+        about = (flight.form.middle_s, value, residual, slope, sway)
+        parts.append(ViewData(np.full(count, number), *about))
+    widest = max(part.sway.shape[2] for part in parts)
+    parts = [
+        part._replace(sway=np.pad(part.sway, ((0, 0), (0, 0), (0, widest - part.sway.shape[2]))))
+        for part in parts
+    ]
     return ViewData(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
@@ -238,6 +255,11 @@ def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
         share = 1.0 - np.sqrt(own / (own + weights.trim**2))
         residual[rows] -= share * residual[rows].mean(axis=0)
         slope[rows] -= share[:, None] * slope[rows].mean(axis=0)
+        if data.sway.any():
+            unit = weights.scatter * np.sqrt(weights.memory)
+            residual[rows], slope[rows] = _steadied(
+                residual[rows], slope[rows], data.sway[rows], unit
+            )
     if weights.base is not None:
         # Where flights' means tell nothing this is 0.
         own = weights.scatter**2 * weights.memory + weights.trim**2
@@ -246,6 +268,26 @@ def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
         slope -= share[:, None] * slope.mean(axis=0)
     unit = weights.scatter * np.sqrt(weights.memory)
     return residual / unit, slope / unit[:, None]
+
+
+def _steadied(
+    residual: np.ndarray, slope: np.ndarray, sway: np.ndarray, unit: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return residual (M, 3) and slope (M, 3, P) of one flight as if its pose were known.
+
+    What is not known of it is a random effect: whatever `sway` (M, 3, L) is large along counts less
+    (whitening by the inverse root of `1 + sway sway'`, in units (3,) of the noise).
+    """
+    count = residual.size
+    basis, size, _ = np.linalg.svd((sway / unit[:, None]).reshape(count, -1), full_matrices=False)
+    less = 1.0 / np.sqrt(1.0 + size**2) - 1.0
+
+    def steady(values: np.ndarray) -> np.ndarray:
+        scale = unit.reshape(3, *[1] * (values.ndim - 2))
+        flat = (values / scale).reshape(count, -1)
+        return (flat + basis @ (less[:, None] * (basis.T @ flat))).reshape(values.shape) * scale
+
+    return steady(residual), steady(slope)
 
 
 def stretch_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> np.ndarray:

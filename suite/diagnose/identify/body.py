@@ -18,7 +18,7 @@ from suite.diagnose.data.view import WeakForm
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.identify.drive import Driven
 from suite.diagnose.identify.fit import Z95, Fitted, Given, Rows, Unknown, fit
-from suite.diagnose.identify.grid import LEANING, ROTOR_NOISE, FlightGrid
+from suite.diagnose.identify.grid import FELT, LEANING, ROTOR_NOISE, FlightGrid
 
 WIDTH_S = 0.4
 BLOCK_S = 2.0
@@ -91,15 +91,16 @@ def together(
 
 def _force(flight: FlightGrid, driven: Driven) -> Misses:
     pushes = PUSHES.get(driven.drive, "thrust_cmd")
-    moved = "vel_w" if flight.has("vel_w") else "pos_w"
+    moved = next(name for name in (FELT, "vel_w", "pos_w") if flight.has(name))
     leaning = not flight.has("rot_w")
     needs = (moved, pushes, LEANING if leaning else "rot_w")
     form, rows = flight.form(WIDTH_S, needs), flight.rows(turned=True)
-    path = form if moved == "vel_w" else flight.form(WIDTH_S, needs, slope=True)
+    path = flight.form(WIDTH_S, needs, slope=True) if moved == "pos_w" else form
     if leaning:
         slow = form.mean @ np.linalg.norm(rows.vel_w, axis=1) < SLOW
         form, path = form.take(slow), path.take(slow)
-    measured = path.change @ np.nan_to_num(flight.known[moved])
+    takes = path.mean if moved == FELT else path.change
+    measured = takes @ np.nan_to_num(flight.known[moved])
     to_body = np.swapaxes(rows.rot_w[form.middle_row], 1, 2)
     axes = slice(2 if leaning else 0, 3)
 

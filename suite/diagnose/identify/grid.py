@@ -14,6 +14,7 @@ from eval.importers.rows import held
 from eval.importers.signals import Signal
 from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.flights import leaning, turning_of
+from suite.diagnose.data.inertial import by_inertia, is_inertial, specific_force_w
 from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.sampling import on_one_side
 from suite.diagnose.data.view import FlightRows, WeakForm, weak_form
@@ -30,6 +31,8 @@ ROTOR_NOISE = "rotor_noise"
 as well."""
 LEANING = "leaning"
 """The attitude of the path, where none was measured."""
+FELT = "felt_w"
+"""The acceleration by the accelerometer, where no position was measured."""
 PATH_VELOCITY = "path_velocity"
 """The velocity of the path, where none was measured."""
 VOLTAGE_S = 0.04
@@ -84,13 +87,18 @@ class FlightGrid(NamedTuple):
 
 
 def grid_of(log: FlightLog) -> FlightGrid:
-    """Return `log` on the grid."""
+    """Return `log` on the grid; where it has no position, its pose is by inertia."""
+    felt_w = None
+    if is_inertial(log):
+        log = by_inertia(log)
+        felt_w = specific_force_w(log)
     time_s = log.time_s - log.time_s[0]
     grid = np.arange(0.0, time_s[-1], STEP_S)
     known: dict[str, np.ndarray] = {}
     measured = {
         "pos_w": log.pos_w,
         "vel_w": None if log.velocity_derived else log.vel_w,
+        FELT: felt_w,
         "rate_b": log.rate_b,
         "rotor_speed": log.rotor_speed,
     }

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.inertial import UNSEEN
 from suite.diagnose.identify.fit import Z95, Fitted
-from suite.diagnose.identify.grid import FlightGrid
+from suite.diagnose.identify.grid import FELT, FlightGrid
 
 DELAY = "effects.command_delay.delay"
 
@@ -166,6 +167,8 @@ def unasked(
     def anywhere(*names: str) -> bool:
         return any(flight.has(*names) for flight in flights)
 
+    if anywhere(FELT):
+        lines += UNSEEN
     force = fitted.get("force")
     if force is None:
         if not {"drag", "motors"} <= set(leave):

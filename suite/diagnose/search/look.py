@@ -164,3 +164,31 @@ class SearchResult:
         """Return the estimate where the numbers at `indices` alone are fitted from `begin`."""
         judged = self.judged.evidence
         return fit(judged, begin, indices, limits=judged.limits)[0]
+
+
+APART = 1.5
+"""Numbers whose 95 % intervals are further apart than their half-widths by this contradict."""
+
+
+def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate, str]]:
+    """Return which names of `found` the evidence `by` refuses, and in words what it says of them.
+
+    It does where the name's numbers, fitted to it beside its own names, come out elsewhere.
+    """
+    refused = []
+    widths = dict(zip(found.indices, found.half_widths(), strict=True))
+    evidence = by.judged.evidence
+    for name in found.candidates:
+        at = list(name.indices)
+        if not evidence.linearise(by.estimate, at).acts().any() or name in by.candidates:
+            continue
+        every = sorted({*by.indices, *at})
+        best, block = fit(evidence, by.estimate, every, limits=evidence.limits)
+        inside = intervals95(block.equations().along_numbers(every), evidence.draws).half_width
+        for k in at:
+            here, there = found.estimate.theta[k], best.theta[k]
+            wide = float(inside[every.index(k)])
+            if abs(here - there) > APART * (widths[k] + wide):
+                refused.append((name, f"{here:.3g} here, {there:.3g} ± {wide:.2g} there"))
+                break
+    return refused

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from suite.diagnose.by_views import diagnose_by_views
+from suite.diagnose.estimate.parameters import candidates
 from suite.diagnose.evidence.moments import centred
+from suite.diagnose.search.look import Look, NamedEffect, contradicted
 from suite.diagnose.verdict.view_gap import closed_share, fit_black_box, inputs_of, judge
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
@@ -32,6 +34,20 @@ def test_what_was_judged_can_be_judged_again(found):
     one = found.main
     again = judge(one.search, one.held, one.gap.floor)
     assert np.allclose(again.after, one.gap.after)
+
+
+@pytest.mark.parametrize(("scale", "count"), [(0.9, 1), (1.0, 0)])
+def test_a_thrust_that_the_force_refuses_is_contradicted(found, scale, count):
+    force, space = found.results[0].search, found.space
+    (one,) = [c for c in candidates(space, False, ()) if c.name == "thrust_scale"]
+    theta = space.array("start")
+    theta[list(one.indices)] = scale
+    evidence, at = force.judged.evidence, replace(force.estimate, theta=theta)
+    block = evidence.linearise(at, one.indices)
+    look = Look(evidence, at, block, block.equations())
+    named = (NamedEffect(one, 0.001, 1.0),)
+    torque = replace(force, named=named, last=look, judged=look)
+    assert [name for name, _ in contradicted(force, torque)] == [one] * count
 
 
 def test_a_drag_that_only_the_file_has_is_named_and_goes():

@@ -46,6 +46,6 @@ def test_each_flights_own_number_knows_no_trim():
     flight, slope = np.repeat([0, 1], 200), rng.standard_normal((400, 3, 2))
     true, trim = np.array([[0.5, -1.0], [0.7, 0.0]]), np.array([3.0, -2.0])
     residual = np.einsum("mak,mk->ma", slope, true[flight]) + trim[flight, None]
-    data = ViewData(flight, np.arange(400.0), residual, residual, slope)
+    data = ViewData(flight, np.arange(400.0), residual, residual, slope, np.zeros((400, 3, 0)))
     found = own_changes(within_flights(data), [0, 1], np.ones(3))
     np.testing.assert_allclose(found, true, atol=1e-9)

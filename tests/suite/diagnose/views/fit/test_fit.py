@@ -59,7 +59,8 @@ def made(rng, count=6, moments=200, trim=(0.5, 0.0, 2.0), scatter=0.3):
     means = rng.standard_normal((count, 3)) * trim
     residual = scatter * rng.standard_normal((count * moments, 3)) + means[flight]
     middle = np.tile(np.arange(moments) * 0.1, count)
-    return ViewData(flight, middle, 0.0 * residual, residual, np.ones((len(flight), 3, 1)))
+    slope, none = np.ones((len(flight), 3, 1)), np.zeros((len(flight), 3, 0))
+    return ViewData(flight, middle, 0.0 * residual, residual, slope, none)
 
 
 def test_the_vehicle_itself_leaves_only_noise_and_a_drag_leaves_the_drag(dragged):

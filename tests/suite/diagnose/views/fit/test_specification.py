@@ -18,7 +18,9 @@ def data_of(residual, slope):
     """Two flights of one minute; `slope` (M, 3) is that along the only number."""
     flight = np.repeat([0, 1], ROWS // 2)
     middle_s = np.tile(STEP_S * np.arange(ROWS // 2), 2)
-    return ViewData(flight, middle_s, slope, residual, slope[..., None])
+    return ViewData(
+        flight, middle_s, slope, residual, slope[..., None], np.zeros((len(flight), 3, 0))
+    )
 
 
 def fitted(slow, *, closed_loop, seed=0) -> tuple[Any, np.ndarray]:

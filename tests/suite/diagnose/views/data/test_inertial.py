@@ -1,0 +1,84 @@
+"""Flights without a pose: velocity, drag and thrust by gyro, accelerometer and rotor speeds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from eval.logs.flight_log import FlightLog
+from suite.diagnose.data.flights import completed, ready
+from suite.diagnose.data.inertial import by_inertia
+from suite.diagnose.data.view import SPECIFIC, TORQUE
+from suite.diagnose.identify.identify import identify
+from tests.support.real_flights import VEHICLE
+
+DRAG = 0.4
+LACKS = {"partial": ["pos", "quat"]}
+
+
+def flown(seed=0, end_s=10.0, bias=1.0):
+    """A flight from rest along smooth curves under the same drag along all axes; its velocity."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, end_s, 0.01)
+    phase = 2.0 * np.pi * (np.array([0.21, 0.17, 0.13]) + 0.02 * seed) * time_s[:, None]
+    vel_w = np.array([4.0, 3.0, 1.0]) * np.sin(phase) ** 2 * np.tanh(time_s)[:, None]
+    force_w = np.gradient(vel_w, time_s, axis=0) + [0.0, 0.0, 9.81] + DRAG * vel_w
+    thrust = np.linalg.norm(force_w, axis=1)
+    up = force_w / thrust[:, None]
+    left = np.cross(up, [1.0, 0.0, 0.0])
+    left /= np.linalg.norm(left, axis=1)[:, None]
+    rot = Rotation.from_matrix(np.stack([np.cross(left, up), left, up], axis=-1))
+    turns = (rot[:-1].inv() * rot[1:]).as_rotvec() / 0.01
+    rate_b = np.concatenate([turns[:1], 0.5 * (turns[1:] + turns[:-1]), turns[-1:]])
+    acc_b = rot.inv().apply(force_w - DRAG * vel_w)
+    rate_b = rate_b + bias * 0.005 * rng.normal(size=3) + 0.02 * rng.normal(size=rate_b.shape)
+    acc_b = acc_b + bias * 0.05 * rng.normal(size=3) + 0.2 * rng.normal(size=acc_b.shape)
+    each = np.sqrt(VEHICLE.mass * thrust / 4.0 / VEHICLE.rotors.thrust_coefficient)
+    lost = np.full((len(time_s), 4), np.nan)
+    log = FlightLog(
+        f"flight {seed}",
+        time_s,
+        lost[:, :3],
+        lost,
+        lost[:, :3],
+        rate_b,
+        rotor_speed=each[:, None] + rng.normal(size=(len(time_s), 4)),
+        acc_b=acc_b,
+        about=LACKS,
+        velocity_derived=True,
+    )
+    return log, vel_w, rot
+
+
+@pytest.mark.parametrize("end_s", [10.0, 40.0])
+def test_gyro_and_accelerometer_tell_the_velocity(end_s):
+    log, vel_w, rot = flown(end_s=end_s)
+    found = by_inertia(log)
+    off = found.vel_w - vel_w
+    assert np.sqrt((off**2).mean()) < 0.3
+    lean = (rot.as_matrix()[:, :, 2] * found.rot_w[:, :, 2]).sum(axis=1)
+    assert np.degrees(np.arccos(np.clip(lean, -1.0, 1.0))).mean() < 2.0
+    assert found.sway_b is not None and found.sway_b.shape[:2] == (len(off), 3)
+
+
+def test_thrust_and_drag_are_identified_without_a_pose():
+    found = identify([flown(seed)[0] for seed in range(3)], VEHICLE)
+    numbers = {number.key: number for number in found.numbers}
+    told = numbers["rotors.thrust_coefficient"].value[0]
+    assert told == pytest.approx(VEHICLE.rotors.thrust_coefficient, rel=0.01)
+    drag = numbers["effects.linear_drag.coefficient"].value
+    assert drag == pytest.approx([DRAG] * 3, abs=0.05)
+    assert any("heading" in line for line in found.untold)
+
+
+def test_views_are_of_what_a_log_has():
+    log = flown()[0]
+    assert [view.about for view in ready([log], VEHICLE).views] == [SPECIFIC.about, TORQUE.about]
+    assert ready([replace(log, acc_b=None)], VEHICLE).views == (TORQUE,)
+    without = replace(log, about={"partial": ["pos", "quat", "rate"]})
+    with pytest.raises(ValueError, match="no position and no gyro"):
+        completed(without)
+    thrust = replace(log, acc_b=None, rotor_speed=None, thrust_cmd=np.full(len(log.time_s), 9.81))
+    with pytest.raises(ValueError, match="no accelerometer or no motor"):
+        ready([thrust], VEHICLE)
