@@ -1,6 +1,6 @@
 """Flights of the judge without a pose: which effects are named by gyro, accelerometer and motors?
 
-    python tools/poseless.py runs/poseless [CASES] [SEED]
+    python tools/poseless.py runs/poseless [CASES [SEED [FIRST]]]
 
 Every case hides one effect of usual size, or none, in a vehicle that flies six tracks. Its logs
 hold gyro, accelerometer, set points, rotor speeds and voltage alone, with noise and constant biases
@@ -68,10 +68,10 @@ def without_pose(log: FlightLog, vehicle: Vehicle, rng: np.random.Generator) -> 
     return as_log({name: parts[name] for name in KEPT}, log.name)
 
 
-def run(out: Path, cases: int, seed: int) -> Iterator[dict[str, Any]]:
+def run(out: Path, cases: int, seed: int, first: int = 0) -> Iterator[dict[str, Any]]:
     """Yield what was hidden and what was found, case by case."""
     nominal, console = load_vehicle(NOMINAL), Console()
-    for number in range(cases):
+    for number in range(first, cases):
         rng = np.random.default_rng([seed, number])
         name = "" if number % GOOD_EACH == 0 else SEEN[number % len(SEEN)]
         name = SEEN[int(rng.integers(len(SEEN)))] if name else ""
@@ -94,21 +94,26 @@ def run(out: Path, cases: int, seed: int) -> Iterator[dict[str, Any]]:
 
 def covered(truth: Any, effect: dict[str, Any]) -> Iterator[bool]:
     """Yield for every number of a named effect whether its interval holds the truth."""
-    for key, told in effect["parameters"].items():
+    parameters = effect["parameters"]
+    rotor = parameters.get("index", {}).get("value")
+    for key, told in parameters.items():
+        if key == "index" or told["ci95"] is None:
+            continue
         true = np.atleast_1d(getattr(truth, key))
-        limits = np.atleast_2d(np.array(told["ci95"], dtype=float))
-        for value, (low, high) in zip(true, limits, strict=False):
-            if np.isfinite(low) and np.isfinite(high) and high > low:
-                yield bool(low <= value <= high)
+        true = true[[int(rotor) - 1]] if rotor is not None else true
+        pairs = told["ci95"] if isinstance(told["value"], list) else [told["ci95"]]
+        for value, pair in zip(true, pairs, strict=False):
+            if pair is not None and None not in pair and pair[1] > pair[0]:
+                yield bool(pair[0] <= value <= pair[1])
 
 
 def main() -> None:
     """Run the cases and print their table."""
     out, *rest = sys.argv[1:]
-    cases, seed = (int(v) for v in (*rest, *("60", "560000")[len(rest) :]))
+    cases, seed, first = (int(v) for v in (*rest, *("60", "560000", "0")[len(rest) :]))
     keep_compiled()
     outcome, held = Counter[str](), []
-    for one in run(Path(out), cases, seed):
+    for one in run(Path(out), cases, seed, first):
         effects, name = one["found"]["effects"], one["hidden"]
         alike = [{e["name"], *e["alternatives"]} for e in effects]
         if not name:

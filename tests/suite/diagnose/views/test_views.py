@@ -42,7 +42,7 @@ def test_a_thrust_that_the_force_refuses_is_contradicted(found, scale, count):
     (one,) = [c for c in candidates(space, False, ()) if c.name == "thrust_scale"]
     theta = space.array("start")
     theta[list(one.indices)] = scale
-    evidence, at = force.judged.evidence, replace(force.estimate, theta=theta)
+    evidence, at = force.judged.evidence, force.estimate._replace(theta=theta)
     block = evidence.linearise(at, one.indices)
     look = Look(evidence, at, block, block.equations())
     named = (NamedEffect(one, 0.001, 1.0),)
