@@ -133,7 +133,7 @@ class _Piece:
 
     def fitted(self, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers (12,) by which drag is against the velocity, and its usual size."""
-        numbers, drag = np.zeros(12), DRAG
+        numbers, drag, usual = np.zeros(12), DRAG, DRAG[:2]
         for _ in range(ROUNDS):
             rot_w, vel_w = self.flown(numbers)
             to_body = np.swapaxes(rot_w, 1, 2)
@@ -154,7 +154,8 @@ class _Piece:
             left = np.concatenate([left, (middle - now) / size])
             now = now + np.linalg.lstsq(design, left, rcond=None)[0]
             numbers, drag = now[:12], np.maximum(now[12:], 0.0)
-        return numbers, drag[:2] + drag[2] * float(speed.mean())
+            usual = drag[:2] + drag[2] * float(speed.mean())
+        return numbers, usual
 
     def summed(self, values: np.ndarray) -> np.ndarray:
         """Return the integral (N, ...) of `values` (N, ...) from the first row."""
