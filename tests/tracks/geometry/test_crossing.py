@@ -87,3 +87,9 @@ def test_any_leading_shape_and_both_libraries():
 def test_the_radius_rule_is_a_ball_of_35_cm(distance, near):
     direction = np.array([2.0, -1.0, 2.0]) / 3
     assert is_near(np.ones(3), np.ones(3) + distance * direction) == near
+
+
+def test_a_regular_polygon_stands_on_its_first_side():
+    corner = regular_polygon(5, 0.5)
+    np.testing.assert_allclose(corner[:2, 1], -0.5, atol=1e-12)
+    assert corner[1, 0] == pytest.approx(-corner[0, 0]) and corner[1, 0] > 0
