@@ -28,6 +28,8 @@ LEAST_S, SURE = 0.002, 4.0
 GROWN_S, DRIFT, SURE_DRIFT = 0.005, 3e-4, 5.0
 """Clocks drift that part by more than the first over a flight [s], by more than the second (two
 crystals part by less than 200 ppm), and by more than so many standard errors."""
+LIKELY = 2.5
+"""A drift of so many standard errors is taken off before its own error is judged."""
 SEEN = 0.005
 """A flight that does not bound the drift by this does not show it."""
 LATE_S = 0.025
@@ -159,9 +161,11 @@ def delay_of(
             cost[:, k] = np.bincount(block, weights=loss, minlength=BLOCKS)
         return cost
 
-    first_drift, _ = _drift(trials, costs(0.0), duration)
-    cost = costs(first_drift)  # within a block, too, a drift would pass for scatter
-    more, drift_error = _drift(trials, cost, duration)
+    cost = costs(0.0)
+    first_drift, (more, drift_error) = 0.0, _drift(trials, cost, duration)
+    if abs(more) > LIKELY * drift_error:  # within a block, too, a drift would pass for scatter
+        first_drift, cost = more, costs(more)
+        more, drift_error = _drift(trials, cost, duration)
     whole = _lowest(trials, cost.sum(axis=0))
     parts = [_lowest(trials, cost.sum(axis=0) - cost[b]) for b in range(BLOCKS)]
     if whole is None or any(part is None for part in parts):
