@@ -32,7 +32,11 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import LAG, RotorLag, another_lag
 from suite.diagnose.verdict.diagnosis import EffectSize, Negligible, view_size
 from suite.diagnose.verdict.disturbances import Swing, swing_left
-from suite.diagnose.verdict.view_gap import ViewGap, judge
+from suite.diagnose.verdict.view_gap import ViewGap, gap_without, judge
+
+
+BASE_S, ROW_S = 5.0, 4e-4
+"""About how long it takes, in all and a row more, on two cores [s]."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,13 @@ class ViewResult:
         size = EffectSize(rms, 0.0, None) if self.view.in_world else EffectSize(0.0, rms, None)
         return share if size.relevant(limits) else 0.0
 
+    def removed(self, names: Sequence[NamedEffect]) -> float:
+        """Return the share of the gap that `names` take away when added last."""
+        gap, indices = self.gap, sorted(i for name in names for i in name.candidate.indices)
+        without = gap.rms(gap_without(self.search, self.held, indices))
+        whole = gap.rms(gap.before) - gap.rms(gap.floor)
+        return (without - gap.rms(gap.after)) / max(whole, 1e-9)
+
     def size(self, names: Sequence[NamedEffect]) -> tuple[EffectSize, EffectSize]:
         """Return what `names` do together in this view, and the upper end of its interval."""
         at = sorted({i for name in names for i in name.candidate.indices})
@@ -76,7 +87,7 @@ class ViewResult:
 class ViewsDiagnosis:
     """What the views of real flights found."""
 
-    verdict: str
+    label: str
     """no_gap, named, partly or unknown."""
     results: tuple[ViewResult, ...]
     """By view, in their order."""
@@ -96,6 +107,12 @@ class ViewsDiagnosis:
     """In what the force view leaves with its names."""
     lag: RotorLag | None = None
     """Of the rotors, where it is not the given vehicle's."""
+    limits: Thresholds = THRESHOLDS
+
+    @property
+    def input_source(self) -> str:
+        """What is taken for the rotors' speeds."""
+        return self.flights.source
 
     @property
     def main(self) -> ViewResult:
@@ -147,7 +164,9 @@ def diagnose_by_views(
         unseen = [f"without a position these flights do not show {what}" for what in UNSEEN]
     whole = not any(log.partial for log in [*logs, *references])
     known, spread, left_out = _reference_tasks(flights, model, vehicle, references, limits)
-    say(f"views: {', '.join(view.about for view in flights.views)}; by {flights.source}")
+    rows = sum(len(log.time_s) for log in logs)
+    about = ", ".join(view.about for view in flights.views)
+    say(f"views: {about}; by {flights.source}; {rows} rows: about {BASE_S + rows * ROW_S:.0f} s")
     held_numbers, held_names = _held(logs, flights, model, limits)
     inside, held = parted(flights, held_numbers, limits)
     results = []
@@ -200,7 +219,7 @@ def diagnose_by_views(
     if lag:
         say(f"commands and rotor speeds: {LAG}, {lag.time_constant:.3g} s")
     return ViewsDiagnosis(
-        verdict=_verdict(results, swing, lag, limits),
+        label=_verdict(results, swing, lag, limits),
         results=results,
         space=space,
         flights=flights,
@@ -212,6 +231,7 @@ def diagnose_by_views(
         seconds=time.monotonic() - began,
         swing=swing,
         lag=lag,
+        limits=limits,
     )
 
 

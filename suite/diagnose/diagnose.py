@@ -56,6 +56,9 @@ from suite.diagnose.verdict.residual_structure import (
     residual_structure,
 )
 
+BASE_S, STRETCH_S = 5.0, 0.25
+"""About how long a diagnosis takes, in all and a stretch more, on two cores [s]."""
+
 
 class BeyondRollouts(Exception):
     """Rollouts of a second leave far more than noise, whatever of the catalogue is fitted."""
@@ -132,7 +135,11 @@ def _diagnose(
         raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
     warnings += notes
     _enough(len(whole.flight), limits)  # before anything is compiled
-    say("flying the model from every stretch; its first time on a machine takes half a minute")
+    count = len(whole.flight)
+    say(
+        f"{count} stretches of 1 s of {len(np.unique(whole.flight))} flights: about "
+        f"{BASE_S + count * STRETCH_S:.0f} s, and half a minute more the first time on a machine"
+    )
     begin = start_estimate(model, whole)
     linear = model.linearise(begin.theta, begin.free, whole, None)
     good = _sound(linear, limits)
@@ -143,7 +150,8 @@ def _diagnose(
     whole, linear = take(whole, good), _take(linear, good)
     if rough is not None:
         limits = with_model_error(model, begin, whole, linear, take(rough, good), limits)
-    if or_else and least_left(model, whole, linear, limits) > limits.hopeless_chi2:
+    most = limits.hopeless_chi2
+    if or_else and least_left(model, whole, linear, limits, most) > most:
         raise BeyondRollouts
     told = information(linear, whole, model.size, limits)
     inside, names = choose_held_out(logs, whole.flight, whole.start_s, told, limits)
@@ -212,7 +220,7 @@ def _diagnose(
     return Diagnosis(
         verdict=verdict,
         search=found,
-        half_widths=found.half_widths(),
+        half_width=dict(zip(found.indices, map(float, found.half_widths()), strict=True)),
         vehicle=_with_effects(vehicle, model, found, turbulence),
         before=before,
         after=after,
@@ -347,10 +355,10 @@ def _held_out(
     """Return overlapping windows over what is held out, of which `apart` do not overlap."""
     if not len(apart.flight):
         raise ValueError("nothing is left to hold out: fly longer, or log a second flight")
-    many, _ = cut(logs, vehicle, rotor_input, limits.gap_stride_s, limits, integrator)
+    how = (rotor_input, limits.gap_stride_s, limits, integrator)
+    many, _ = cut(logs, vehicle, *how, only=np.unique(apart.flight).tolist())
     assert many is not None
-    inside = np.isin(many.flight, apart.flight) & (many.start_s >= apart.start_s.min() - 1e-6)
-    return take(many, inside)
+    return take(many, many.start_s >= apart.start_s.min() - 1e-6)
 
 
 def _with_effects(

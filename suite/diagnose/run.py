@@ -22,11 +22,11 @@ from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.plans.plan import fly_plan, write_plan_of
 from suite.diagnose.report.charts import write_rollouts
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
-from suite.diagnose.report.page import page, views_page
-from suite.diagnose.report.views_json import views_json
+from suite.diagnose.report.page import page
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.black_box import BlackBoxConfig, compare_black_box
 from suite.diagnose.verdict.checks import run_checks
+from suite.diagnose.verdict.diagnosis import Diagnosis
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
 
@@ -103,45 +103,45 @@ def diagnose_files(
         write_json(out / "diagnosis.json", found)
         return found
 
-    def by_views() -> dict[str, Any]:
+    result, checks = None, None
+    if not before and not only_views(logs, vehicle):
+        try:
+            result = diagnose(logs, vehicle, drive, console.note, seed, limits, integrator, True)
+        except BeyondRollouts:
+            console.note("rollouts of a second leave these flights, whatever is fitted: by views")
+    if result is None:
         result = diagnose_by_views(logs, vehicle, before, console.note, seed, limits)
-        told = views_json(result)
-        told["warnings"] = [*warnings, *unused, *told["warnings"]]
-        found = {**plain(told), **stamp(SCHEMA, seed)}
-        toml = _vehicle_file(result.vehicle, vehicle, found, out)
-        write_report(out / "report.html", views_page(result, found, toml))
-        return noted(found)
-
-    if before or only_views(logs, vehicle):
-        return by_views()
-    try:
-        result = diagnose(logs, vehicle, drive, console.note, seed, limits, integrator, True)
-    except BeyondRollouts:
-        console.note("rollouts of a second leave these flights, whatever is fitted: by views")
-        return by_views()
-    checks = run_checks(result)
-    if compare_delta:
-        with console.progress("fitting the Delta Action Model", 1.0) as show:
-            compared = compare_black_box(result, BlackBoxConfig(seed=seed), show)
-        checks = replace(checks, black_box=compared)
-    found: dict[str, Any] = {**diagnosis_json(result), **checks_json(checks, seed)}
+        warnings += unused
+    found: dict[str, Any] = diagnosis_json(result)
     found["warnings"] = [*warnings, *found["warnings"]]
-    if plan or truth is not None:
-        folder = out / "plan"
-        found["plan"] = write_plan_of(found, folder)
-        if truth is not None:
-            found["plan"] = fly_plan(found["plan"], result.sigma, vehicle, truth, folder, seed)
-        found["warnings"] += found["plan"].pop("warnings", [])
+    files = {"vehicle.toml", "diagnosis.json"}
+    if isinstance(result, Diagnosis):
+        checks = run_checks(result)
+        if compare_delta:
+            with console.progress("fitting the Delta Action Model", 1.0) as show:
+                compared = compare_black_box(result, BlackBoxConfig(seed=seed), show)
+            checks = replace(checks, black_box=compared)
+        found |= checks_json(checks, seed)
+        if plan or truth is not None:
+            folder = out / "plan"
+            found["plan"] = write_plan_of(found, folder)
+            if truth is not None:
+                found["plan"] = fly_plan(found["plan"], result.sigma, vehicle, truth, folder, seed)
+            found["warnings"] += found["plan"].pop("warnings", [])
+            files |= {"plan/plan.json"} if found["plan"].get("flights") else set()
+        if recording:
+            write_rollouts(out / "recording.rrd", result)
+            files.add("recording.rrd")
     found = {**plain(found), **stamp(SCHEMA, seed)}
     toml = _vehicle_file(result.vehicle, vehicle, found, out)
-    files = {"vehicle.toml", "diagnosis.json"}
-    if recording:
-        write_rollouts(out / "recording.rrd", result)
-        files.add("recording.rrd")
-    if found.get("plan", {}).get("flights"):
-        files.add("plan/plan.json")
     write_report(out / "report.html", page(result, found, checks, toml, files))
-    return noted(found)
+    for warning in found["warnings"][len(warnings) :]:
+        console.note(f"warning: {warning}")
+    found["findings"], found["not_examined"] = findings, not_examined(logs)
+    if found["verdict"] == "no_gap" and found["not_examined"]:
+        console.note(f"not examined: {', '.join(found['not_examined'])}")
+    write_json(out / "diagnosis.json", found)
+    return found
 
 
 def only_views(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:

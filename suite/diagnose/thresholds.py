@@ -9,6 +9,8 @@ from dataclasses import dataclass
 class Thresholds:
     """What counts as enough, near, sure or beyond noise, in the order of the diagnosis's steps."""
 
+    most_windows: int = 200
+    """Stretches of a second that are flown at most: more take longer and tell little more."""
     longest_hole_s: float = 0.1
     """Rows further apart are a hole: no window or rotor lag reaches across it [s]."""
     fitted_loop_share: float = 0.5
@@ -41,13 +43,8 @@ class Thresholds:
     """Share of the flights that is held out, at least one [1]."""
     lone_fitted_share: float = 0.7
     """Share of a lone flight that is fitted; the end is held out [1]."""
-    turn_span_s: float = 0.06
-    """The attitude's turn is held against the gyro over about this time [s]."""
-    turn_block_s: float = 0.5
-    """Comparisons of turns this near to each other are not independent [s]."""
-    calm: float = 2.0
-    """Rates that change by less tell no clock offset: the gyro's noise changes as much (mean square
-    over the axes together [rad^2/s^4])."""
+    turn_block_s: float = 1.0
+    """Gyro less the attitude's turn is averaged over so long; such means are independent [s]."""
     clock_resolution_s: float = 0.002
     """Offsets below are left unsaid: sampling and a simulator's steps shift pose and gyro so far
     against each other [s]."""
@@ -157,6 +154,10 @@ class Thresholds:
     hopeless_chi2: float = 10.0
     """Squared error a row, in units of the noise, that all numbers of the catalogue together leave:
     beyond it flights are not judged by rollouts of a second, but by their views."""
+    hopeless_windows: int = 16
+    """Stretches to which all numbers are fitted where slopes alone say that so much is left."""
+    hopeless_rounds: int = 6
+    """Steps of that fit."""
     view_left_share: float = 0.1
     """Share of a view's squared error that a black box may close beyond what was named, before
     something is said to be missing [1]."""

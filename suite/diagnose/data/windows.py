@@ -6,7 +6,7 @@ speeds are joined by the curve of the rotors' lag. What was measured stays on it
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -139,40 +139,48 @@ def cut(
     limits: Thresholds = THRESHOLDS,
     integrator: str = "continuous",
     coarser: FlightWindows | None = None,
+    only: Collection[int] | None = None,
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` and warnings; None where no flight has one.
+
+    Of more than `limits.most_windows` so many are kept, evenly spread over the flights.
 
     Args:
         logs: flights, known by their place.
         vehicle: whose rate loop's frequency and motor lag are used.
-        rotor_input: the measured rotor speeds are the input; they are no measurement then.
-        stride_s: from the start of one window to that of the next [s]; by default no row counts
-            twice.
+        rotor_input: measured rotor speeds are the input, and no measurement.
+        stride_s: from the start of a window to the next's [s]; by default no row counts twice.
         limits: the longest hole in a window.
-        integrator: whose steps they are: those of "euler" are the rate loop's periods.
-        coarser: the same windows, to be cut with steps of twice the length, which those of "euler"
-            never are, and every second measured rotor speed.
+        integrator: whose steps they are; those of "euler" are the rate loop's periods.
+        coarser: the same windows, for steps twice as long and every second rotor speed.
+        only: places of the flights that count; all if not given.
     """
-    places: list[tuple[int, int]] = []
-    warnings: list[str] = []
+    places, warnings = list[tuple[int, int]](), list[str]()
     shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
     states = [on_every_row(log, limits) for log in logs]
     for number, (log, state) in enumerate(zip(logs, states, strict=True)):
+        if number not in (range(len(logs)) if only is None else only):
+            continue
         starts = _starts(log, state.whole, rotor_input, stride_s, limits.longest_hole_s)
         if not starts:
             warnings.append(f"{log.name}: no stretch of {shortest_s:g} s without a hole")
         places += [(number, first) for first in starts]
     if not places:
         return None, warnings
+    if len(places) > limits.most_windows:
+        warnings.append(
+            f"{limits.most_windows} stretches of 1 s, evenly spread, are used of {len(places)}"
+        )
+        kept = np.linspace(0, len(places) - 1, limits.most_windows).astype(int)
+        places = [places[k] for k in kept]
     longest_s = 1.0 / vehicle.controller.frequency if integrator == "euler" else LONGEST_S
     if coarser is not None and integrator != "euler":
         longest_s *= 2.0
     drives = [_drive(logs[number], first, vehicle, longest_s) for number, first in places]
-    drives = _of_one_shape(drives, coarser)
     every = 1 if coarser is None else 2
     parts = [
         _window(logs[number], states[number], number, first, vehicle, rotor_input, drive, every)
-        for (number, first), drive in zip(places, drives, strict=True)
+        for (number, first), drive in zip(places, _of_one_shape(drives, coarser), strict=True)
     ]
     return FlightWindows(*(np.stack(field) for field in zip(*parts, strict=True))), warnings
 

@@ -15,6 +15,9 @@ from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 from suite.diagnose.estimate.permutation import CandidateScore, folds_of, score_candidates
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
+NOTHING = 1e-9
+"""Squared error in units of the noise below which there is nothing to explain."""
+
 
 class Evidence(ABC):
     """A source of information on the numbers of a space."""
@@ -98,7 +101,7 @@ class Evidence(ABC):
             gains: (G,) fall of the squared error of each part by the others' fit.
         """
         del at, candidate, gains
-        return 1.0 - float((then.residual**2).sum() / max((now.residual**2).sum(), 1e-300))
+        return 1.0 - float((then.residual**2).sum() / max((now.residual**2).sum(), NOTHING))
 
     def order(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
         """Return by what those that fit alike are ordered, before how well they fit."""

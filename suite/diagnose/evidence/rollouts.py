@@ -29,7 +29,7 @@ from suite.diagnose.data.whitening import (
 )
 from suite.diagnose.data.windows import KNOTS, STATE, FlightWindows, step_s, take, trusted
 from suite.diagnose.estimate.block import Block, Estimate
-from suite.diagnose.estimate.gauss_newton import gauss_newton_step
+from suite.diagnose.estimate.gauss_newton import fit, gauss_newton_step
 from suite.diagnose.estimate.parameters import (
     Candidate,
     ParameterLayout,
@@ -172,19 +172,36 @@ def information(
 
 
 def least_left(
-    model: RolloutModel, windows: FlightWindows, linear: Linearisation, limits: Thresholds
+    model: RolloutModel,
+    windows: FlightWindows,
+    linear: Linearisation,
+    limits: Thresholds,
+    enough: float = 0.0,
 ) -> float:
     """Return the squared error a value, 1 of noise, that all numbers of the catalogue leave.
 
-    To first order about `linear`, the slopes of `windows` along all numbers.
+    To first order about `linear`, the slopes of `windows` along all numbers. Slopes say too little
+    of large effects: where more than `enough` is left, all numbers are fitted to some windows.
     """
     evidence, block = weighed_by(model, windows, linear, limits)
+
+    def left(chi2: float) -> float:
+        return chi2 / max(int(np.asarray(evidence.trusted.seen).sum()), 1)
+
     equations = block.equations()
-    told = np.einsum("bkk->k", equations.hessian)
-    some = equations.take(np.flatnonzero(told > 1e-9).tolist())
-    _, fall = gauss_newton_step(some, model.space.array("start"), model.space)
-    seen = int(np.asarray(evidence.trusted.seen).sum())
-    return (float(equations.chi2.sum()) - fall) / max(seen, 1)
+    some = np.flatnonzero(np.einsum("bkk->k", equations.hessian) > 1e-9).tolist()
+    start = model.space.array("start")
+    _, fall = gauss_newton_step(equations.take(some), start, model.space)
+    first = left(float(equations.chi2.sum()) - fall)
+    if first <= enough:
+        return first
+    few = np.linspace(0, len(windows.flight) - 1, limits.hopeless_windows).astype(int)
+    few = np.unique(few)
+    part = Linearisation(*(field[few] for field in linear))
+    evidence, block = weighed_by(model, take(windows, few), part, limits)
+    at = Estimate(start, linear.offset[few])
+    _, block = fit(evidence, at, some, limits.hopeless_rounds, block, limits)
+    return min(first, left(float((block.residual**2).sum())))
 
 
 BATCH = 12

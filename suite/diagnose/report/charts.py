@@ -137,10 +137,9 @@ def held_out_rollouts(diagnosis: Diagnosis) -> tuple[FlightWindows, dict[str, np
 
     As given and, where something was named, with it, by what it is called.
     """
-    model, windows, held = diagnosis.model, diagnosis.cut(LENGTH_S), diagnosis.held_windows
-    chosen = np.isin(windows.flight, np.unique(held.flight)[:MOST])
-    chosen &= np.asarray(windows.start_s) >= _first_s(diagnosis) - 1e-6
-    windows = take(windows, chosen)
+    model, held = diagnosis.model, diagnosis.held_windows
+    windows = diagnosis.cut(LENGTH_S, np.unique(held.flight)[:MOST].tolist())
+    windows = take(windows, np.asarray(windows.start_s) >= _first_s(diagnosis) - 1e-6)
     series = {"simulated as given": diagnosis.start}
     if diagnosis.fitted is not None:
         series["simulated with what was named"] = diagnosis.fitted

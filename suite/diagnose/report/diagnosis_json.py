@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from suite.diagnose.by_views import ViewResult, ViewsDiagnosis
 from suite.diagnose.data.windows import STATE_GROUPS
 from suite.diagnose.plans.plan import advice
 from suite.diagnose.report.parameters_json import parameters_json, short_name
 from suite.diagnose.search.look import NamedEffect
 from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.verdict.actuators import LAG, RotorLag
 from suite.diagnose.verdict.black_box import BlackBoxComparison
 from suite.diagnose.verdict.checks import Checks, Kinematics
 from suite.diagnose.verdict.diagnosis import Diagnosis
@@ -20,64 +22,100 @@ from suite.diagnose.verdict.gap import HEADLINE_S, MEASURE, Gap
 
 SHOWN = 5
 """Shapes of the residual that are listed."""
+VIEW_MEASURE = (
+    "RMS over the axes of what the model leaves of {about} on held-out flights [{unit}], both "
+    "sides smoothed over {width:g} s"
+)
 SIZES = ("force", "torque", "drift")
 """Of an effect: mean acceleration over half a second [m/s^2], angular acceleration [rad/s^2] and
 distance after a second [m], as RMS over the flights."""
 
 
-def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
+def diagnosis_json(found: Diagnosis | ViewsDiagnosis) -> dict[str, Any]:
     """Return what diagnosis.json says of the names and of the gap."""
-    named, seed = diagnosis.search.named, diagnosis.seed
-    before, after, control = diagnosis.before, diagnosis.after, diagnosis.control
-    names = dict.fromkeys(one.candidate.name for one in named)
-    effects = [_effect(diagnosis, name) for name in names]
-    return {
-        "verdict": diagnosis.verdict.label,
-        "effects": effects + _gusts(diagnosis.turbulence),
+    named = [name for _, name in found.named]
+    shared = {
+        "verdict": found.label,
+        "effects": effects_json(found),
         "negligible": [
             {"name": one.name, "size": one.size.as_json(), "relevant": False}
-            for one in diagnosis.negligible
+            for result in found.results
+            for one in result.negligible
         ],
-        "relevance": dict(zip(SIZES, diagnosis.limits.relevance, strict=True)),
-        "gap": {
-            "measure": MEASURE,
-            "before": before.rms,
-            "after": after.rms,
-            "noise_floor": 1.0,
-            "model_error": model_error(diagnosis),
-            "before_ci95": before.ci95(seed, diagnosis.limits),
-            "after_ci95": after.ci95(seed, diagnosis.limits),
-            "horizon_s": HEADLINE_S,
-            "held_out": [short_name(name) for name in diagnosis.held_out],
-            "channels": {
-                f"{horizon:g} s": {
-                    group: {
-                        "before": error,
-                        "after": after.table[horizon][group][0],
-                        "noise_floor": floor,
-                    }
-                    for group, (error, floor) in table.items()
-                }
-                for horizon, table in before.table.items()
-            },
-        },
-        "views": ["whole"],
-        "control": control
-        and {
-            "effect": control[0],
-            "after": control[1].rms,
-            "after_ci95": control[1].ci95(seed, diagnosis.limits),
-        },
-        "unexplained": {
-            "share": diagnosis.verdict.share_left,
-            "where": diagnosis.verdict.where,
-            "shapes": [shape._asdict() for shape in diagnosis.residual.shapes[:SHOWN]],
-            "coloured": diagnosis.residual.coloured,
-        },
+        "relevance": dict(zip(SIZES, found.limits.relevance, strict=True)),
         "separate_with": [advice(n.candidate.name, rival) for n in named for rival in n.rivals],
-        "driven_by": diagnosis.input_source,
-        "seconds": diagnosis.seconds,
-        "warnings": diagnosis.warnings,
+        "driven_by": found.input_source,
+        "seconds": found.seconds,
+        "warnings": found.warnings,
+    }
+    held_out = [short_name(name) for name in found.held_out]
+    if isinstance(found, Diagnosis):
+        return {
+            **shared,
+            "gap": {**_whole_gap(found), "held_out": held_out},
+            "views": ["whole"],
+            "control": found.control
+            and {
+                "effect": found.control[0],
+                "after": found.control[1].rms,
+                "after_ci95": found.control[1].ci95(found.seed, found.limits),
+            },
+            "unexplained": {
+                "share": found.verdict.share_left,
+                "where": found.verdict.where,
+                "shapes": [shape._asdict() for shape in found.residual.shapes[:SHOWN]],
+                "coloured": found.residual.coloured,
+            },
+        }
+    main = found.main
+    return {
+        **shared,
+        "gap": {**_views_gap(found), "held_out": held_out},
+        "views": [one.view.name for one in found.results if one.names] or [main.view.name],
+        "unexplained": {"share": main.gap.share(main.gap.left), "where": _where(found)},
+        "reference": list(found.references),
+        "headline": headline(found),
+    }
+
+
+def _whole_gap(found: Diagnosis) -> dict[str, Any]:
+    before, after, seed = found.before, found.after, found.seed
+    return {
+        "measure": MEASURE,
+        "before": before.rms,
+        "after": after.rms,
+        "noise_floor": 1.0,
+        "model_error": model_error(found),
+        "before_ci95": before.ci95(seed, found.limits),
+        "after_ci95": after.ci95(seed, found.limits),
+        "horizon_s": HEADLINE_S,
+        "channels": {
+            f"{horizon:g} s": {
+                group: {
+                    "before": error,
+                    "after": after.table[horizon][group][0],
+                    "noise_floor": floor,
+                }
+                for group, (error, floor) in table.items()
+            }
+            for horizon, table in before.table.items()
+        },
+    }
+
+
+def _views_gap(found: ViewsDiagnosis) -> dict[str, Any]:
+    view, gap = found.main.view, found.main.gap
+    about = {"about": view.about, "unit": view.unit, "width": view.width_s}
+    return {
+        "measure": VIEW_MEASURE.format(**about),
+        "before": gap.rms(gap.before),
+        "after": gap.rms(gap.after),
+        "noise_floor": gap.rms(gap.floor),
+        "model_error": None,
+        "horizon_s": view.width_s,
+        "channels": {one.view.name: _channels(one) for one in found.results},
+        "closed": gap.share(gap.closed),
+        "explainable": gap.share(gap.explainable),
     }
 
 
@@ -97,26 +135,51 @@ def checks_json(checks: Checks, seed: int) -> dict[str, Any]:
     }
 
 
-def _effect(diagnosis: Diagnosis, name: str) -> dict[str, Any]:
-    ones = [n for n in diagnosis.search.named if n.candidate.name == name]
-    before, after = diagnosis.before.rms, diagnosis.after.rms
-    without = [diagnosis.without[n.candidate.label].rms for n in ones]
-    removed = (max(without) - after) / max(before - 1.0, 1e-9)
-    return {
+def effects_json(found: Diagnosis | ViewsDiagnosis) -> list[dict[str, Any]]:
+    """Return the named effects, one entry for all names of one effect."""
+    told = [
+        _effect(found, result, [n for n in result.names if n.candidate.name == name])
+        for result in found.results
+        for name in dict.fromkeys(n.candidate.name for n in result.names)
+    ]
+    if isinstance(found, Diagnosis):
+        return [*told, *_gusts(found.turbulence)]
+    return told if found.lag is None else [*told, _lag_effect(found, found.lag)]
+
+
+def _effect(
+    found: Diagnosis | ViewsDiagnosis,
+    result: Diagnosis | ViewResult,
+    ones: Sequence[NamedEffect],
+) -> dict[str, Any]:
+    name, theta = ones[0].candidate.name, result.search.estimate.theta
+    indices = sorted(i for one in ones for i in one.candidate.indices)
+    width, undecided = result.half_width, _undecided(found, ones)
+    entry = {
         "name": name,
-        "alternatives": sorted({rival for n in ones for rival in n.rivals} - {name}),
-        "parameters": parameters_json(
-            diagnosis.model.space,
-            name,
-            sorted(i for n in ones for i in n.candidate.indices),
-            diagnosis.search.estimate.theta,
-            dict(zip(diagnosis.search.indices, diagnosis.half_widths.tolist(), strict=True)),
-            _undecided(diagnosis, ones),
-        ),
-        "gap_removed": min(max(removed, 0.0), 1.0),
-        "p_value": max(n.p_value for n in ones),
-        "size": diagnosis.sizes[name].as_json(),
+        "alternatives": sorted({rival for one in ones for rival in one.rivals} - {name}),
+        "parameters": parameters_json(found.space, name, indices, theta, width, undecided),
+        "gap_removed": min(max(result.removed(ones), 0.0), 1.0),
+        "p_value": max(one.p_value for one in ones),
+        "size": result.size(ones)[0].as_json(),
         "relevant": True,
+    }
+    return entry if isinstance(result, Diagnosis) else {**entry, "view": result.view.name}
+
+
+def _lag_effect(found: ViewsDiagnosis, lag: RotorLag) -> dict[str, Any]:
+    (index,) = (i for i, entry in enumerate(found.space.entries) if entry.effect == LAG)
+    theta = found.space.array("start")
+    theta[index] = lag.time_constant
+    return {
+        "name": LAG,
+        "alternatives": [],
+        "parameters": parameters_json(found.space, LAG, [index], theta, {index: lag.half_width}),
+        "gap_removed": lag.closed,
+        "p_value": lag.p_value,
+        "size": None,
+        "relevant": True,
+        "view": "commands",
     }
 
 
@@ -133,13 +196,13 @@ def model_error(diagnosis: Diagnosis) -> float:
     return float(min(share.max(), 1.0))
 
 
-def _undecided(diagnosis: Diagnosis, ones: Sequence[NamedEffect]) -> list[int]:
+def _undecided(found: Diagnosis | ViewsDiagnosis, ones: Sequence[NamedEffect]) -> list[int]:
     """Return the places of an effect's other numbers, one at a time, that fit as well."""
     taken = {i for one in ones for i in one.candidate.indices}
-    near = diagnosis.limits.rival_chi2
+    near = found.limits.rival_chi2
     return [
         i
-        for i, entry in enumerate(diagnosis.model.space.entries)
+        for i, entry in enumerate(found.space.entries)
         if entry.effect == ones[0].candidate.name and i not in taken
         and any(one.worse_by.get(f"{entry.effect} {(entry.component or 0) + 1}", np.inf) <= near
                 for one in ones)
@@ -199,3 +262,75 @@ def _gap(gap: Gap, seed: int) -> dict[str, Any]:
             for horizon, groups in gap.table.items()
         },
     }
+
+
+def headline(found: ViewsDiagnosis) -> str:
+    """Return the answer in a sentence."""
+    gap, view = found.main.gap, found.main.view
+    could = gap.share(gap.explainable)
+    late = _late(found)
+    if not found.named:
+        if found.label == "named":
+            return late.strip()
+        if found.label == "no_gap":
+            what = "has changed" if found.references else "is missing"
+            return f"Nothing that the flights agree on {what}."
+        swings = f"It {found.swing.words}. " if found.swing else ""
+        return (
+            f"{swings}No effect that flights can tell explains it; a black box closes "
+            f"{100 * could:.0f} % of the variance of the {view.name}.{late}"
+        )
+    names = " and ".join(
+        " or ".join([name.candidate.label, *name.rivals]) for _, name in found.named
+    )
+    since = " since the reference flights" if found.references else ""
+    share = gap.share(gap.closed) / max(could, 1e-9)
+    swings = f" What is left {found.swing.words}." if found.swing else ""
+    return (
+        f"{names}{since}: the {view.name} on held-out flights is {gap.rms(gap.after):.3g} instead "
+        f"of {gap.rms(gap.before):.3g} {view.unit} off; of what any model could close of its "
+        f"changes within a flight here, {100 * min(share, 1.0):.0f} %.{swings}{late}"
+    )
+
+
+def _late(found: ViewsDiagnosis) -> str:
+    """Return what is said of the rotors' lag, "" where it is the vehicle's."""
+    if found.lag is None:
+        return ""
+    lag = found.lag
+    return (
+        f" {LAG}: the rotors follow their commands with a time constant of "
+        f"{lag.time_constant:.3g} s instead of {lag.known:.3g} s."
+    )
+
+
+def _channels(one: ViewResult) -> dict[str, Any]:
+    gap = one.gap
+    told = {
+        "before": gap.before,
+        "after": gap.after,
+        "noise_floor": gap.floor,
+        "repeatability": gap.repeatability,
+        "closed": gap.closed,
+        "explainable": gap.explainable,
+    }
+    return {
+        "xyz"[axis]: {
+            key: float(values[axis]) if np.isfinite(values[axis]) else None
+            for key, values in told.items()
+        }
+        for axis in one.view.axes
+    }
+
+
+def _where(found: ViewsDiagnosis) -> str | None:
+    """Return where something is left that a black box closes, in words."""
+    if found.label in ("no_gap", "named"):
+        return None
+    one = max(found.results, key=lambda r: r.gap.share(r.gap.left))
+    axis = max(one.view.axes, key=lambda k: float(one.gap.left[k] * one.gap.variance[k]))
+    swings = f"{found.swing.words}; " if found.swing else ""
+    return (
+        f"{swings}{one.view.name} along body {'xyz'[axis]}: a black box closes another "
+        f"{100 * max(float(one.gap.left[axis]), 0.0):.0f} % of its variance"
+    )

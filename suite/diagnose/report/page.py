@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -66,69 +66,59 @@ FLIGHTS = (
 
 
 def page(
-    diagnosis: Diagnosis, found: Mapping[str, Any], checks: Checks, toml: str, files: set[str]
-) -> Report:
-    """Return the report of a diagnosis; `found` is its JSON, and the words are taken from there.
-
-    `toml` is the vehicle file that was written, `files` which of `FILES` there are.
-    """
-    gap = found["gap"]
-    facts = {
-        "gap before": f"{gap['before']:.2f}",
-        "gap after": f"{gap['after']:.2f}",
-        "noise floor": "1",
-        "held out": _few(gap["held_out"]),
-        "driven by": found["driven_by"],
-    }
-    sections = [
-        Section("What was measured, and what the model says", _held_out(diagnosis, found)),
-        Section("The answer in numbers", _answer(found, TOTALS)),
-        logs_section(diagnosis, checks),
-        noise_section(diagnosis),
-        *actuators_section(checks, diagnosis.input_source),
-        _candidates(diagnosis),
-        _identity(diagnosis, found),
-        residual_section(diagnosis, found),
-        held_out_section(diagnosis, found, checks),
-    ]
-    return _report(found, _lead(found), facts, sections, toml, files)
-
-
-def views_page(found: ViewsDiagnosis, told: Mapping[str, Any], toml: str) -> Report:
-    """Return the report; `told` is the JSON, `toml` the vehicle file that was written."""
-    facts = {
-        "flights": str(len(found.flights.names)),
-        "reference": str(len(found.references)) if found.references else "none",
-        "held out": ", ".join(told["gap"]["held_out"]),
-        "rotors by": told["driven_by"],
-    }
-    sections = [
-        Section("What was measured, and what the model says", _picture(found, told)),
-        Section("The answer in numbers", _answer(told, VIEW_TOTALS)),
-        Section("Each view, axis by axis", [_channels(told)]),
-        Section("Do the flights agree", _agreement(found)),
-        Section("What the views compare", _views(found)),
-    ]
-    files = {"vehicle.toml", "diagnosis.json"}
-    return _report(told, told["headline"], facts, sections, toml, files)
-
-
-def _report(
+    diagnosis: Diagnosis | ViewsDiagnosis,
     found: Mapping[str, Any],
-    lead: str,
-    facts: Mapping[str, str],
-    sections: Sequence[Section],
+    checks: Checks | None,
     toml: str,
     files: set[str],
 ) -> Report:
-    """Return a report with what every one has: what was written, and warnings."""
+    """Return the report of a diagnosis; `found` is its JSON, and the words are taken from there.
+
+    `checks` are there where rollouts were flown, `toml` is the vehicle file that was written, and
+    `files` which of `FILES` there are.
+    """
+    if isinstance(diagnosis, Diagnosis):
+        assert checks is not None
+        gap = found["gap"]
+        facts = {
+            "gap before": f"{gap['before']:.2f}",
+            "gap after": f"{gap['after']:.2f}",
+            "noise floor": "1",
+            "held out": _few(gap["held_out"]),
+            "driven by": found["driven_by"],
+        }
+        picture, totals = _held_out(diagnosis, found), TOTALS
+        details = [
+            logs_section(diagnosis, checks),
+            noise_section(diagnosis),
+            *actuators_section(checks, diagnosis.input_source),
+            _candidates(diagnosis),
+            _identity(diagnosis, found),
+            residual_section(diagnosis, found),
+            held_out_section(diagnosis, found, checks),
+        ]
+    else:
+        facts = {
+            "flights": str(len(diagnosis.flights.names)),
+            "reference": str(len(diagnosis.references)) if diagnosis.references else "none",
+            "held out": ", ".join(found["gap"]["held_out"]),
+            "rotors by": found["driven_by"],
+        }
+        picture, totals = _picture(diagnosis, found), VIEW_TOTALS
+        details = [
+            Section("Each view, axis by axis", [_channels(found)]),
+            Section("Do the flights agree", _agreement(diagnosis)),
+            Section("What the views compare", _views(diagnosis)),
+        ]
     warnings = [Details("what was odd", "\n".join(found["warnings"]))]
     return Report(
         title=f"Diagnosis: {found['verdict']}",
-        lead=lead,
+        lead=found.get("headline") or _lead(found),
         facts={**facts, "took": f"{found['seconds']:.0f} s"},
         sections=[
-            *sections,
+            Section("What was measured, and what the model says", picture),
+            Section("The answer in numbers", _answer(found, totals)),
+            *details,
             _written(found, toml, files),
             *([Section("Warnings", warnings)] if found["warnings"] else []),
         ],

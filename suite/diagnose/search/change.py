@@ -23,7 +23,7 @@ from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
 from suite.diagnose.estimate.gauss_newton import chi2_fall, fit
 from suite.diagnose.estimate.parameters import Candidate, at_bound, usual_first
 from suite.diagnose.estimate.permutation import CandidateScore
-from suite.diagnose.evidence.evidence import flights_agree
+from suite.diagnose.evidence.evidence import Evidence, flights_agree
 from suite.diagnose.evidence.moments import (
     ViewData,
     Weights,
@@ -153,7 +153,7 @@ class ChangeEvidence(ViewEvidence):
         """Return what a candidate takes, see `Evidence`."""
         if at_bound(self.space, at.theta, candidate) or not flights_agree(gains):
             return None
-        return 1.0 - float((then.residual**2).sum() / max((now.residual**2).sum(), 1e-9))
+        return Evidence.share(self, now, at, then, candidate, gains)
 
     def order(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
         """Return the plausible first, then the fewer numbers, then the more usual."""

@@ -1,8 +1,7 @@
 """What stands beside the names: logs and their consistency, the actuators, a black box.
 
-The attitude's turn over 60 ms must be the gyro's mean over the same time. What is left goes with
-nothing (a bias of the gyro) or with the gyro's change (the pose is late: clocks apart). The
-velocity must be the path's slope. Left alone these faults imitate physics.
+The attitude must turn as the gyro says, but for a bias of the gyro, and not later; the velocity
+must be the path's slope. Left alone these faults imitate physics.
 """
 
 from __future__ import annotations
@@ -13,15 +12,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from eval.logs.faults.clock import delay_of
 from eval.logs.flight_log import FlightLog
 from eval.logs.velocity import velocity_from_position
+from suite.diagnose.data.flights import turning_of
 from suite.diagnose.data.sampling import on_every_row
 from suite.diagnose.estimate.gauss_newton import Z95
+from suite.diagnose.evidence.moments import means_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import ActuatorMismatch, actuator_mismatches
 from suite.diagnose.verdict.black_box import BlackBoxComparisons
 from suite.diagnose.verdict.diagnosis import Diagnosis
-from tracks.geometry.rotation import quat_to_rot
 
 
 @dataclass(frozen=True)
@@ -107,83 +108,33 @@ def check_kinematics(
     logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
 ) -> Kinematics | None:
     """Return what pose and gyro of `logs` say about each other; None where too little is there."""
-    parts = [part for log in logs if (part := _comparisons(log, limits)) is not None]
-    if not parts:
+    biases, late = [], []
+    for log in logs:
+        whole = on_every_row(log, limits)
+        off = whole.rate_b - turning_of(log.time_s, whole.quat_wxyz)
+        good = np.isfinite(off).all(axis=1)
+        if good.sum() < LEAST_TURNS:
+            continue
+        block = ((log.time_s - log.time_s[0]) / limits.turn_block_s).astype(int)
+        biases.append(means_of(off[good], block[good]))
+        posed, turned = (np.isfinite(v).all(axis=1) for v in (log.quat_wxyz, log.rate_b))
+        found = delay_of(
+            log.time_s[posed], log.quat_wxyz[posed], log.time_s[turned], log.rate_b[turned]
+        )
+        late += [] if found is None else [found]
+    if not biases:
         return None
-    # Columns: the bias of each axis, then the offset, which acts on all three.
-    square, pulls = np.zeros((4, 4)), []
-    for apart, change, block in parts:
-        for b in np.unique(block):
-            rows = block == b
-            design = _design(change[rows])
-            square += design.T @ design
-            pulls.append((design, apart[rows].ravel()))
-    inverse = np.linalg.pinv(square)
-    best = inverse @ sum(design.T @ values for design, values in pulls)
-    scatter = np.zeros((4, 4))
-    for design, values in pulls:
-        pull = design.T @ (values - design @ best)
-        scatter += np.outer(pull, pull)
-    freedom = max(len(pulls) - 4, 1)
-    error = np.sqrt(np.diag(inverse @ scatter @ inverse) * len(pulls) / freedom)
-    calm = square[3, 3] < limits.calm * sum(len(part[0]) for part in parts)
-    return Kinematics(
-        flights=len(parts),
-        bias=best[:3],
-        bias_ci=Z95 * error[:3],
-        offset=0.0 if calm else float(best[3]),
-        offset_ci=float("inf") if calm else float(Z95 * error[3]),
-        velocity_scale=_velocity_scale(logs),
-    )
+    bias = np.concatenate(biases)
+    spread = bias.std(axis=0, ddof=1) / np.sqrt(len(bias)) if len(bias) > 1 else np.full(3, np.inf)
+    weight = np.array([1.0 / max(one.error_s, 1e-6) ** 2 for one in late])
+    offset = float(weight @ [one.delay_s for one in late] / weight.sum()) if late else 0.0
+    error = float(1.0 / np.sqrt(weight.sum())) if late else float("inf")
+    scale = _velocity_scale(logs)
+    return Kinematics(len(biases), bias.mean(axis=0), Z95 * spread, offset, Z95 * error, scale)
 
 
-def _design(change: np.ndarray) -> np.ndarray:
-    """Return (3 K, 4): gyro - turn = bias + offset * change of the rates."""
-    return np.concatenate([np.tile(np.eye(3), (len(change), 1)), change.reshape(-1, 1)], axis=1)
-
-
-def _comparisons(
-    log: FlightLog, limits: Thresholds
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return gyro less turn (K, 3), change of the rates (K, 3) [rad/s^2] and blocks (K,)."""
-    log = on_every_row(log, limits)
-    time, rate = log.time_s, log.rate_b
-    count = max(1, round(limits.turn_span_s / float(np.median(np.diff(time)))))
-    if len(time) < 4 * count:
-        return None
-    first = np.arange(0, len(time) - count)
-    last = first + count
-    span = (time[last] - time[first])[:, None]
-    rot_w = quat_to_rot(log.quat_wxyz)
-    turn = np.swapaxes(rot_w[first], 1, 2) @ rot_w[last]
-    skew = np.stack(
-        [
-            turn[:, 2, 1] - turn[:, 1, 2],
-            turn[:, 0, 2] - turn[:, 2, 0],
-            turn[:, 1, 0] - turn[:, 0, 1],
-        ],
-        axis=1,
-    )
-    cos = np.clip((np.trace(turn, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
-    angle = np.arccos(cos)[:, None]
-    by_attitude = skew * 0.5 / np.sinc(angle / np.pi) / span
-    step = np.diff(time)[:, None]
-    area = 0.5 * step * (rate[1:] + rate[:-1])
-    hole = np.concatenate([[0], np.cumsum(~np.isfinite(area).all(axis=1))])
-    full = np.concatenate([np.zeros((1, 3)), np.cumsum(np.nan_to_num(area), axis=0)])
-    by_gyro = (full[last] - full[first]) / span
-    change = (rate[last] - rate[first]) / span
-    good = (
-        (span[:, 0] < 1.5 * limits.turn_span_s)
-        & (hole[last] == hole[first])
-        & np.isfinite(by_attitude).all(axis=1)
-        & np.isfinite(change).all(axis=1)
-        & (angle[:, 0] < 1.5)
-    )
-    if good.sum() < 20:
-        return None
-    block = ((time[first] - time[0]) / limits.turn_block_s).astype(int)
-    return (by_gyro - by_attitude)[good], change[good], block[good]
+LEAST_TURNS = 20
+"""Rows with a gyro and a turn of the attitude, at least."""
 
 
 def _velocity_scale(logs: Sequence[FlightLog]) -> float | None:

@@ -16,12 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.whitening import make_whitening
 from suite.diagnose.data.windows import SLICES, FlightWindows, cut
 from suite.diagnose.estimate.block import Estimate
-from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
+from suite.diagnose.estimate.parameters import Candidate, ParameterSpace, effects_in, indices_of
 from suite.diagnose.evidence.rollouts import RolloutModel, block_of
 from suite.diagnose.search.look import NamedEffect, SearchResult, rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -36,8 +37,8 @@ class Diagnosis:
 
     verdict: Verdict
     search: SearchResult
-    half_widths: np.ndarray
-    """Of the 95 % intervals, in the order of `search.indices`."""
+    half_width: dict[int, float]
+    """Of the 95 % interval, by the place of each named number."""
     vehicle: Vehicle
     """With the named effects in place of what the nominal one has of them."""
     before: Gap
@@ -71,6 +72,40 @@ class Diagnosis:
     limits: Thresholds = THRESHOLDS
 
     @property
+    def label(self) -> str:
+        """no_gap, named, partly or unknown."""
+        return self.verdict.label
+
+    @property
+    def results(self) -> tuple[Diagnosis]:
+        """What each kind of evidence found: here one did."""
+        return (self,)
+
+    @property
+    def names(self) -> tuple[NamedEffect, ...]:
+        """Every name that stands."""
+        return self.search.named
+
+    @property
+    def named(self) -> list[tuple[Diagnosis, NamedEffect]]:
+        """Every name that stands, with what found it."""
+        return [(self, name) for name in self.search.named]
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The catalogue's numbers."""
+        return self.model.space
+
+    def removed(self, names: Sequence[NamedEffect]) -> float:
+        """Return the share of the gap that `names`, of one effect, take away when added last."""
+        without = max(self.without[one.candidate.label].rms for one in names)
+        return (without - self.after.rms) / max(self.before.rms - 1.0, 1e-9)
+
+    def size(self, names: Sequence[NamedEffect]) -> tuple[EffectSize]:
+        """Return what `names`, of one effect, do on these flights."""
+        return (self.sizes[names[0].candidate.name],)
+
+    @property
     def sigma(self) -> np.ndarray:
         """(19,) measurement noise of each channel in its unit; NaN where nothing was measured."""
         return rollouts_of(self.search.last).noise.sigma
@@ -90,10 +125,10 @@ class Diagnosis:
         """Return the numbers (P,) with what was named; None where nothing was."""
         return self.search.estimate.theta if self.search.named else None
 
-    def cut(self, stride_s: float) -> FlightWindows:
-        """Return windows of all flights, one every `stride_s` [s]."""
+    def cut(self, stride_s: float, only: Sequence[int] | None = None) -> FlightWindows:
+        """Return windows of all flights or of `only` some, one every `stride_s` [s]."""
         how = (self.rotor_input, stride_s, self.limits, self.model.integrator)
-        windows, _ = cut(self.logs, self.nominal, *how)
+        windows, _ = cut(self.logs, self.nominal, *how, only=only)
         assert windows is not None  # the diagnosis has cut them before
         return windows
 
@@ -322,7 +357,8 @@ def relevant_part(
 ) -> tuple[SearchResult, Gap, dict[str, EffectSize], list[Negligible]]:
     """Return `found` without what does not matter on its flights.
 
-    `gaps` on the windows `held` are those before and after it was found.
+    `gaps` on the windows `held` are those before and after it was found. Where rollouts are surely
+    off by less than matters before anything is named, only faults of the log may.
 
     Returns:
         What stays, its gap, the sizes of its effects by name, and what was left out.
@@ -330,7 +366,12 @@ def relevant_part(
     (before, after), out = gaps, list[Negligible]()
     while found.named:
         sizes, upper = _sizes(model, found)
-        small = [name for name, most in upper.items() if not most.relevant(limits)]
+        none = not gap_matters(before, len(held.flight), limits)
+        small = [
+            name
+            for name, most in upper.items()
+            if (none and not EFFECTS[name].of_log) or not most.relevant(limits)
+        ]
         if not small:
             return found, after, sizes, out
         out += [Negligible(name, sizes[name]) for name in small]

@@ -88,3 +88,14 @@ def test_what_drives_must_be_known_all_the_way(rotor_input):
     assert windows is not None and windows.start_s.min() > 1.15 + BURN_IN_S
     other = cut([replace(log, **{name: lost})], PLAIN, not rotor_input)[0]
     assert other is not None and other.start_s.min() < 0.5
+
+
+def test_of_many_stretches_as_many_as_allowed_are_spread_over_the_flights():
+    logs = [fly(PLAIN, seed, duration_s=8.0) for seed in (0, 1)]
+    every, _ = cut(logs, PLAIN, False)
+    some, (said,) = cut(logs, PLAIN, False, limits=Thresholds(most_windows=4))
+    assert said == f"4 stretches of 1 s, evenly spread, are used of {len(every.flight)}"
+    assert some.flight.tolist() == [0, 0, 1, 1]
+    assert some.start_s[0] == every.start_s[0] and some.start_s[-1] == every.start_s[-1]
+    second, _ = cut(logs, PLAIN, False, only=[1])
+    assert set(second.flight.tolist()) == {1}

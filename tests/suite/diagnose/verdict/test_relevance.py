@@ -11,6 +11,7 @@ from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.diagnosis import (
     EffectSize,
     gap_matters,
+    relevant_part,
     rollout_size,
     sizes_of,
     view_size,
@@ -88,3 +89,13 @@ def test_a_gap_matters_beyond_its_noise_by_more_than_the_thresholds():
     assert not gap_matters(gap(0.04, 0.05), 400, LIMITS)
     assert gap_matters(gap(0.04, 0.04), 4, LIMITS), "few rollouts cannot say that it is small"
     assert gap_matters(gap(0.0, 0.0), 400, Thresholds(relevance=(0.0, 0.0, 0.0)))
+
+
+def test_where_rollouts_as_given_are_near_enough_no_name_matters(drag):
+    """Noise-free flights: 0.5 % of inertia, by how rotor speeds run between rows, is no finding."""
+    none = {h: {g: (1e-3, 0.0) for g in groups} for h, groups in drag.before.table.items()}
+    near = drag.before._replace(table=none, score=np.ones(400))
+    held = drag.held_windows._replace(flight=np.zeros(400, int))
+    found, after, _, out = relevant_part(drag.model, drag.search, held, (near, drag.after), LIMITS)
+    assert found.named == () and after is near
+    assert [one.name for one in out] == ["linear_drag"] and out[0].size.force > 0.05

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from suite.diagnose.by_views import diagnose_by_views
-from suite.diagnose.report.views_json import views_json
+from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.actuators import another_lag
 from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
@@ -25,7 +25,7 @@ def slow():
 
 def test_slow_rotors_are_named_beside_what_the_views_name(slow):
     found = diagnose_by_views(slow, GIVEN)
-    told = views_json(found)
+    told = diagnosis_json(found)
     effects = {effect["name"]: effect for effect in told["effects"]}
     assert {"motor_lag", "linear_drag"} <= set(effects)
     entry = effects["motor_lag"]["parameters"]["time_constant"]

@@ -22,7 +22,7 @@ def found():
 
 
 def test_a_drag_is_named_and_closes_what_any_model_could(found):
-    assert found.verdict == "named" and found.warnings == []
+    assert found.label == "named" and found.warnings == []
     assert found.vehicle.effects["linear_drag"].coefficient[0] == pytest.approx(0.4, abs=0.05)
     force = found.main.gap
     assert force.share(force.closed) > 0.8 > 0.3 * force.share(force.explainable)
@@ -53,7 +53,7 @@ def test_a_thrust_that_the_force_refuses_is_contradicted(found, scale, count):
 def test_a_drag_that_only_the_file_has_is_named_and_goes():
     found = diagnose_by_views(flights(4), with_effects(VEHICLE, linear_drag=(DRAG,)))
     assert [name.candidate.name for _, name in found.named] == ["linear_drag"]
-    assert found.verdict == "named"
+    assert found.label == "named"
     assert found.vehicle.effects["linear_drag"].coefficient == pytest.approx((0, 0, 0), abs=0.05)
 
 
@@ -100,7 +100,7 @@ def without_gyro(logs):
 
 def test_rates_that_a_log_lacks_are_those_of_its_attitude():
     found = diagnose_by_views(without_gyro(flights(4, seed=5)), VEHICLE)
-    assert (found.verdict, found.named) == ("no_gap", [])
+    assert (found.label, found.named) == ("no_gap", [])
 
 
 def test_an_attitude_alone_tells_the_torque_as_finely_as_a_gyro():
@@ -185,4 +185,4 @@ def test_a_wind_is_named_alone_where_the_file_has_the_drag(blown_at_one_heading)
 def test_noise_of_the_rotor_speeds_is_no_inertia_and_no_thrust(seed, speed):
     """Noise in what drives makes every slope smaller, as more inertia would."""
     found = diagnose_by_views(flights(4, seed=seed, speed=speed), VEHICLE)
-    assert found.verdict == "no_gap"
+    assert found.label == "no_gap"
