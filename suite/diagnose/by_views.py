@@ -34,7 +34,6 @@ from suite.diagnose.verdict.diagnosis import EffectSize, Negligible, view_size
 from suite.diagnose.verdict.disturbances import Swing, swing_left
 from suite.diagnose.verdict.view_gap import ViewGap, gap_without, judge
 
-
 BASE_S, ROW_S = 5.0, 4e-4
 """About how long it takes, in all and a row more, on two cores [s]."""
 
