@@ -30,8 +30,8 @@ from suite.diagnose.search.look import NamedEffect, SearchResult, contradicted
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import LAG, RotorLag, another_lag
-from suite.diagnose.verdict.diagnosis import EffectSize, Negligible, view_size
 from suite.diagnose.verdict.disturbances import Swing, swing_left
+from suite.diagnose.verdict.relevance import EffectSize, Negligible, view_size
 from suite.diagnose.verdict.view_gap import ViewGap, gap_without, judge
 
 BASE_S, ROW_S = 5.0, 4e-4

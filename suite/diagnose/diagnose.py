@@ -32,13 +32,7 @@ from suite.diagnose.search.look import SearchResult, rollouts_of
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import another_controller, integrator_of, rotors_are_input
-from suite.diagnose.verdict.diagnosis import (
-    Diagnosis,
-    confirmed,
-    control,
-    gap_matters,
-    relevant_part,
-)
+from suite.diagnose.verdict.diagnosis import Diagnosis, confirmed, control
 from suite.diagnose.verdict.disturbances import Swing, Turbulence, find_turbulence, swing_left
 from suite.diagnose.verdict.gap import (
     Gap,
@@ -50,6 +44,7 @@ from suite.diagnose.verdict.gap import (
     with_swing,
     worse,
 )
+from suite.diagnose.verdict.relevance import gap_matters, relevant_part
 from suite.diagnose.verdict.residual_structure import (
     ResidualStructure,
     disturbance_equations,
@@ -149,7 +144,8 @@ def _diagnose(
     rough = _coarser(logs, vehicle, model, rotor_input, whole, limits)
     whole, linear = take(whole, good), _take(linear, good)
     if rough is not None:
-        limits = with_model_error(model, begin, whole, linear, take(rough, good), limits)
+        rough = take(rough, good)
+        limits = with_model_error(model, begin, whole, linear, rough, limits)
     most = limits.hopeless_chi2
     if or_else and least_left(model, whole, linear, limits, most) > most:
         raise BeyondRollouts
@@ -182,7 +178,9 @@ def _diagnose(
             found, after = found.refitted(()), before
     found, after, without, gone = confirmed(model, found, held, (before, after), limits)
     warnings += [f"{label}: withdrawn, held-out flights are no better for it" for label in gone]
-    found, after, sizes, small = relevant_part(model, found, held, (before, after), limits)
+    rough = take(rough, inside) if rough is not None and rotor_input else None
+    explained = found, (before, after)
+    found, after, sizes, small = relevant_part(model, found, held, (before, after), limits, rough)
     warnings += [f"{one.name}: left out, too small to matter: {one.size.words()}" for one in small]
 
     def leaves(
@@ -197,7 +195,10 @@ def _diagnose(
         verdict = verdict_on(bool(found.named), slow, residual, gaps, rotor_input, limits)
         return residual, turbulence, verdict
 
-    (residual, turbulence, verdict), swing = leaves(found, (before, after)), None
+    # What is too small to matter explains what it explains.
+    (residual, turbulence, verdict), swing = leaves(*explained), None
+    if small and not found.named and verdict.label in ("named", "partly"):
+        verdict = verdict._replace(label="no_gap" if verdict.label == "named" else "unknown")
     if turbulence or verdict.where:
         swing = _swing(logs, vehicle, voltage, found, limits)
     if swing:

@@ -31,3 +31,12 @@ def test_a_gyro_of_half_the_rate_and_no_commands_end_in_a_verdict():
         logs.append(replace(log, rate_b=rate_b, thrust_cmd=None, rate_cmd_b=None))
     found = diagnosis_json(diagnose(logs, LAGGED))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
+
+
+@pytest.mark.slow
+def test_how_rotor_speeds_run_between_rows_is_no_finding():
+    """At 100 rows a second it looks like 0.5 % less inertia, and 2 % with every second row."""
+    logs = fly_all([LAGGED] * 3, range(3), duration_s=6.0, noise=0.0, motors=True)
+    found = diagnosis_json(diagnose(logs, LAGGED, "motors"))
+    assert (found["verdict"], found["effects"]) == ("no_gap", [])
+    assert [one["name"] for one in found["negligible"]] == ["inertia_scale"]

@@ -8,7 +8,8 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.thresholds import Thresholds
-from suite.diagnose.verdict.diagnosis import (
+from suite.diagnose.verdict.gap import Gap
+from suite.diagnose.verdict.relevance import (
     EffectSize,
     gap_matters,
     relevant_part,
@@ -16,7 +17,6 @@ from suite.diagnose.verdict.diagnosis import (
     sizes_of,
     view_size,
 )
-from suite.diagnose.verdict.gap import Gap
 
 LIMITS = Thresholds()
 
