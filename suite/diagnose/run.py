@@ -85,6 +85,7 @@ def diagnose_files(
     warnings += [*slow, *slow_before]
     for warning in warnings:
         console.note(f"warning: {warning}")
+    said = len(warnings)
     asked = {
         "--compare-delta": compare_delta,
         "--plan": plan,
@@ -94,15 +95,6 @@ def diagnose_files(
     }
     unused = [f"{flag} is of rollouts: left out" for flag, given in asked.items() if given]
 
-    def noted(found: dict[str, Any]) -> dict[str, Any]:
-        for warning in found["warnings"][len(warnings) :]:
-            console.note(f"warning: {warning}")
-        found["findings"], found["not_examined"] = findings, not_examined(logs)
-        if found["verdict"] == "no_gap" and found["not_examined"]:
-            console.note(f"not examined: {', '.join(found['not_examined'])}")
-        write_json(out / "diagnosis.json", found)
-        return found
-
     result, checks = None, None
     if not before and not only_views(logs, vehicle):
         try:
@@ -111,7 +103,7 @@ def diagnose_files(
             console.note("rollouts of a second leave these flights, whatever is fitted: by views")
     if result is None:
         result = diagnose_by_views(logs, vehicle, before, console.note, seed, limits)
-        warnings += unused
+        warnings = [*warnings, *unused]
     found: dict[str, Any] = diagnosis_json(result)
     found["warnings"] = [*warnings, *found["warnings"]]
     files = {"vehicle.toml", "diagnosis.json"}
@@ -135,7 +127,7 @@ def diagnose_files(
     found = {**plain(found), **stamp(SCHEMA, seed)}
     toml = _vehicle_file(result.vehicle, vehicle, found, out)
     write_report(out / "report.html", page(result, found, checks, toml, files))
-    for warning in found["warnings"][len(warnings) :]:
+    for warning in found["warnings"][said:]:
         console.note(f"warning: {warning}")
     found["findings"], found["not_examined"] = findings, not_examined(logs)
     if found["verdict"] == "no_gap" and found["not_examined"]:
