@@ -163,8 +163,7 @@ def diagnose_by_views(
         unseen = [f"without a position these flights do not show {what}" for what in UNSEEN]
     whole = not any(log.partial for log in [*logs, *references])
     known, spread, left_out = _reference_tasks(flights, model, vehicle, references, limits)
-    rows = sum(len(log.time_s) for log in logs)
-    about = ", ".join(view.about for view in flights.views)
+    rows, about = sum(len(log.time_s) for log in logs), ", ".join(v.about for v in flights.views)
     say(f"views: {about}; by {flights.source}; {rows} rows: about {BASE_S + rows * ROW_S:.0f} s")
     held_numbers, held_names = _held(logs, flights, model, limits)
     inside, held = parted(flights, held_numbers, limits)
