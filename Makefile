@@ -42,6 +42,7 @@ style: $(STAMP)
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) tools/reference.py --check
+	$(PY) tools/words.py
 
 types: $(STAMP)
 	$(PY) -m pyright --pythonpath $(PY) --warnings --level warning

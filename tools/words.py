@@ -39,7 +39,8 @@ def pages() -> Iterator[Path]:
 
 
 def prose(text: str) -> str:
-    """Return a page's sentences: no code, tables, headings, comments and link targets."""
+    """Return a page's sentences: no code, tables, headings, comments, links and made parts."""
+    text = re.sub(r"<!-- made by.*?<!-- end of.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r"```.*?```|<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r"^\s*(\||#|!\[).*$", "", text, flags=re.MULTILINE)
     text = re.sub(r"\]\([^)]*\)|`[^`]*`", "]", text)
