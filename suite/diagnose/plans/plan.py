@@ -341,6 +341,6 @@ def plan_for(names: Iterable[str]) -> list[Trajectory]:
 
 
 def advice(name: str, rival: str) -> str:
-    """Return a line that says which flight would tell `name` from `rival`."""
+    """Return a line that says which flight separates `name` from `rival`."""
     known = separations_of((name, rival))
     return f"{name} from {rival}: {known[0].words if known else OTHERWISE}"

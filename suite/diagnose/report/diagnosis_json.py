@@ -285,7 +285,7 @@ def headline(found: ViewsDiagnosis) -> str:
     )
     since = " since the reference flights" if found.references else ""
     share = gap.share(gap.closed) / max(could, 1e-9)
-    swings = f" What is left {found.swing.words}." if found.swing else ""
+    swings = f" The residual {found.swing.words}." if found.swing else ""
     return (
         f"{names}{since}: the {view.name} on held-out flights is {gap.rms(gap.after):.3g} instead "
         f"of {gap.rms(gap.before):.3g} {view.unit} off; of what any model could close of its "

@@ -44,7 +44,7 @@ FILES = (
     ("vehicle.toml", "the vehicle with what was named; every command takes it"),
     ("diagnosis.json", "all numbers of this page"),
     ("recording.rrd", "held-out flights measured and simulated, before and after, for rerun"),
-    ("plan/plan.json", "flights that would tell apart what these could not"),
+    ("plan/plan.json", "flights that separate what these could not"),
 )
 """Beside the report, where they were written."""
 RIVALS = 6
@@ -178,7 +178,7 @@ def _answer(found: Mapping[str, Any], note: str) -> list[Part]:
     ]  # fmt: skip
     note = note.format(chance=max(effect["p_value"] for effect in effects))
     words.append(grid("", headers, rows, note))
-    return [*words, *(f"What would tell {line}." for line in found["separate_with"])]
+    return [*words, *(f"To separate {line}." for line in found["separate_with"])]
 
 
 LEAST_FLOOR = 1e-9
@@ -249,7 +249,7 @@ def _identity(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
         ordered = sorted(one.worse_by.items(), key=lambda item: item[1])
         for label, worse_by in ordered[:RIVALS]:
             same = label.rstrip(" 1234") in one.rivals
-            verdict = Cell("cannot be told apart", "bad") if same else Cell("ruled out")
+            verdict = Cell("not separable", "bad") if same else Cell("ruled out")
             rows.append([*cells(one.candidate.label, label, f"{worse_by:.1f}"), verdict])
     headers = ["named", "in its place", "worse by", ""]
     note = (
@@ -325,7 +325,7 @@ def _picture(found: ViewsDiagnosis, told: Mapping[str, Any]) -> list[Part]:
 def _channels(told: Mapping[str, Any]) -> Grid:
     def short(value: float | None, percent: bool = False) -> str:
         if value is None:
-            return "not told"
+            return "not identifiable"
         return f"{100 * value:.0f} %" if percent else f"{value:.3g}"
 
     rows = [
@@ -357,7 +357,7 @@ def _agreement(found: ViewsDiagnosis) -> list[Part]:
             f"The {len(found.references)} reference flights differ as though each rotor's thrust "
             f"were off by {100 * found.spread.share:.1f} % from flight to flight "
             f"({found.spread.freedom} degrees of freedom); along an axis its own differences count "
-            "beside that. A change is named where it stands out of them."
+            "next to that. A change is named where it stands out of them."
         )
     return parts or ["Nothing was named on which flights could agree."]
 

@@ -45,7 +45,7 @@ def logs_section(diagnosis: Diagnosis, checks: Checks) -> Section:
         )
         for fact in checks.facts[:SHOWN]
     ]
-    headers = ["log", "lasts", "rows", "rate", "longest step", "incomplete", "top speed", "besides"]
+    headers = ["log", "lasts", "rows", "rate", "longest step", "incomplete", "top speed", "others"]
     more = len(checks.facts) - SHOWN
     parts: list[Part] = [grid("", headers, rows, f"And {more} more." if more > 0 else "")]
     if checks.kinematics is None:
@@ -168,7 +168,7 @@ def residual_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
         rows = [(axis, f"{p:.2g}") for axis, p in residual.coloured.items()]
         note = "How often noise alone has as much energy in a smooth push along the axis."
         parts.append(grid("A push that no shape follows", ["axis", "p"], rows, note))
-    return Section("5. What is left", parts)
+    return Section("5. Remaining error", parts)
 
 
 def held_out_section(diagnosis: Diagnosis, found: Mapping[str, Any], checks: Checks) -> Section:

@@ -20,7 +20,7 @@ STEPS = (
     "2. The measurement noise",
     "3. The candidates",
     "4. What could stand in its place",
-    "5. What is left",
+    "5. Remaining error",
     "6. The evidence",
 )
 
