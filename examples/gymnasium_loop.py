@@ -29,7 +29,7 @@ def main(episodes: int) -> None:
         total, steps, over = 0.0, 0, False
         while not over:
             seen, reward, terminated, truncated, info = env.step(pilot(seen["state"]))
-            total, steps, over = total + reward, steps + 1, terminated or truncated
+            total, steps, over = total + float(reward), steps + 1, terminated or truncated
         depth = seen["image"]  # (24, 32) encoded inverse depth, what our policies see
         print(
             f"{info['gates']} gates, {info['ended_by']} after {steps} decisions, return {total:.1f}"

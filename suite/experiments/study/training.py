@@ -182,7 +182,7 @@ def train_one(
         iterations = config.iterations if is_ppo else config.optimizer.iterations
         measure = make_validation(shared, *looks[1:], rewarded(shared))
         watch = Watch(max(1, iterations // looks.measurements), measure)
-    begin = {}
+    begin: dict[str, Any] = {}
     if job.reads is not None:
         begin = {"params": started_from(str(job.reads), config.spec)}
     try:
