@@ -111,7 +111,7 @@ def test_an_attitude_alone_tells_the_torque_as_finely_as_a_gyro():
 
 def test_the_vehicle_itself_has_no_gap():
     none = diagnose_by_views(flights(3, seed=2), VEHICLE)
-    assert (none.verdict, none.named) == ("no_gap", [])
+    assert (none.label, none.named) == ("no_gap", [])
 
 
 def test_a_black_box_closes_what_goes_with_what_was_flown_and_no_noise(found):
