@@ -20,6 +20,10 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
     "table2": ("--seed", "9600000"),
     "robustness": ("--seed", "9700000", "--trials", "16"),
     "perception": ("--seed", "9720000"),
+    "perception": (
+        *("--seed", "9900000", "--trials", "6", "--growing-trials", "6", "--only"),
+        *("vio", "gate-relative", "stereo-depth", "all", "imu+gates"),
+    ),
     "simulators": ("--seed", "9750000"),
     "ablation": (),
     "schemes": (
@@ -29,6 +33,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
         "episode.start_speed=3.0",
         "episode.image_stride=3",
     ),
+    "faults": (),
 }
 """Page -> its options, in the order in which `suite reproduce all` makes them."""
 
