@@ -19,7 +19,6 @@ from tracks.common.grid import Grid, table
 PUBLISHED: dict[str, tuple[str, ...]] = {
     "table2": ("--seed", "9600000"),
     "robustness": ("--seed", "9700000", "--trials", "16"),
-    "perception": ("--seed", "9720000"),
     "perception": (
         *("--seed", "9900000", "--trials", "6", "--growing-trials", "6", "--only"),
         *("vio", "gate-relative", "stereo-depth", "all", "imu+gates"),
