@@ -23,7 +23,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 from suite.common.running.interrupts import end_at_once, ends_in_seconds
 from suite.common.startup import check_names, hush, keep_compiled, open_streams, pin
-from suite.common.usage import COMMANDS, description, joined_lists, overview, renamed
+from suite.common.usage import COMMANDS, description, overview, renamed, spread_lists
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -87,13 +87,11 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
 
     command = importlib.import_module(f"suite.commands.{name}")
     plain_flags = (tyro.conf.FlagCreatePairsOff,)
-    args = joined_lists(args)
     options = command.config_type(args) if hasattr(command, "config_type") else command.Config
-    from tyro.conf import Positional, UseAppendAction
-
-    repeated = set(_marked(options, UseAppendAction))
-    if not list(_marked(options, Positional)):
-        args = _each_with_its_option(args, repeated)
+    repeated = set(_marked(options, tyro.conf.UseAppendAction))
+    # Behind the options of a command with positional words, a word may be one of those.
+    if not list(_marked(options, tyro.conf.Positional)):
+        args = spread_lists(args, repeated)
     _refuse_twice(args, repeated)
     about = description(name, command.Config.__doc__ or "")
     config, left = tyro.cli(
@@ -110,19 +108,6 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
         # Once more, and it ends by saying which options were meant.
         tyro.cli(options, prog=f"suite {name}", args=args, config=plain_flags)
     return command, config
-
-
-def _each_with_its_option(args: Sequence[str], repeated: set[str]) -> list[str]:
-    """Return `--policy a b` as `--policy a --policy b`, as a shell expands `--policy runs/*`."""
-    found, option, values = [], "", 0
-    for arg in args:
-        if arg.startswith("-"):
-            option, values = arg, 0
-        elif option in repeated:
-            values += 1
-            found += [option] if values > 1 else []
-        found.append(arg)
-    return found
 
 
 def _refuse_twice(args: Sequence[str], repeated: set[str]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 
 GROUPS: dict[str, dict[str, str]] = {
     "Fly": {
@@ -143,20 +143,23 @@ def description(name: str, about: str) -> str:
     return "\n\n".join([first, *([f"Examples:\n{examples}"] if examples else []), *more])
 
 
-def joined_lists(args: Sequence[str]) -> list[str]:
-    """Return `args` with the words behind an option of `JOINED` joined: `--track a b` is `a,b`."""
-    out: list[str] = []
-    open_list = fresh = False
+def spread_lists(args: Sequence[str], repeated: Container[str]) -> list[str]:
+    """Return `args` with the words of a list behind an option as the option takes them.
+
+    `--track a b` is `--track a,b`, and with `--policy` among the `repeated` ones, `--policy a b`
+    is `--policy a --policy b`, as a shell expands `--policy runs/*`.
+    """
+    out, option, values = list[str](), "", 0
     for word in args:
         if word.startswith("-"):
+            option, values = word, int("=" in word)
             out.append(word)
-            open_list = word.partition("=")[0] in JOINED
-            fresh = open_list and "=" not in word
-        elif open_list and not fresh:
+            continue
+        values += 1
+        if values > 1 and option.partition("=")[0] in JOINED:
             out[-1] += f",{word}"
         else:
-            out.append(word)
-            fresh = False
+            out += [option, word] if values > 1 and option in repeated else [word]
     return out
 
 

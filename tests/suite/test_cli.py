@@ -103,6 +103,11 @@ def test_a_list_may_have_commas_or_spaces(line, track, levels):
     assert (config.flown.track, config.flown.difficulty) == (track, levels)
 
 
+def test_a_word_behind_a_list_may_be_a_positional_one():
+    _, config = cli.parse("tracks", ["--difficulty", "9", "ellipse"])
+    assert (config.difficulty, config.track) == ("9", "ellipse")
+
+
 def test_a_word_too_many_belongs_to_no_option(capsys):
     assert cli.main(["eval", "runs/one"]) == 2
     assert "'runs/one' belongs to no option; suite eval --help" in capsys.readouterr().err
