@@ -9,17 +9,16 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
-from collections.abc import Iterable, Iterator
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import suite
 from eval.effects import EFFECTS
 from eval.effects.interface import at
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
-from suite.common.settings import abouts, settings
+from suite.common.settings import options, settings
 from suite.common.usage import EXAMPLES, GROUPS
 from suite.train.recipes import named_recipe
 
@@ -32,24 +31,6 @@ def cell(text: Any) -> str:
     return " ".join(str(text).split()).replace("|", "\\|")
 
 
-def options(cls: type) -> Iterator[tuple[str, str, str]]:
-    """Yield (option, default, meaning) of a command's configuration and of those within."""
-    hints, texts = get_type_hints(cls, include_extras=True), abouts(cls)
-    for field in fields(cls):
-        kind = getattr(hints[field.name], "__origin__", hints[field.name])
-        if is_dataclass(kind) and isinstance(kind, type):
-            yield from options(kind)
-            continue
-        notes = getattr(hints[field.name], "__metadata__", ())
-        named = next((n.name for n in notes if getattr(n, "name", None)), field.name)
-        positional = "Positional" in repr(notes)
-        name = field.name.upper() if positional else f"--{named.replace('_', '-')}"
-        if field.default is True:
-            name = f"--no-{named.replace('_', '-')}"
-        plain = isinstance(field.default, str | int | float) and not isinstance(field.default, bool)
-        yield name, str(field.default) if plain else "", texts.get(field.name, "")
-
-
 def commands() -> str:
     """Return the page of commands."""
     parts = ["# Commands, option by option\n"]
@@ -60,9 +41,9 @@ def commands() -> str:
             parts.append(f"### suite {name}\n\n{summary[0].upper()}{summary[1:]}.\n")
             parts.append("```sh\n" + "\n".join(EXAMPLES[name]) + "\n```\n")
             rows = [
-                f"| `{option}` | {cell(default)} | {cell(about)} |"
-                for option, default, about in options(module.Config)
-                if option != "--json"
+                f"| `{one.path}` | {cell(one.default)} | {cell(one.about)} |"
+                for one in options(module.Config)
+                if one.path != "--json"
             ]
             if rows:
                 parts.append("\n".join(["| option | default | meaning |", "|---|---|---|", *rows]))

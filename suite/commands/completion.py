@@ -56,10 +56,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 def options_of(name: str) -> list[str]:
     """Return the options of a command, such as --track."""
-    from tyro.extras import get_parser
+    from suite.common.settings import options
 
     command = importlib.import_module(f"suite.commands.{name}")
-    options = command.config_type([]) if hasattr(command, "config_type") else command.Config
-    parser = get_parser(options, config=(tyro.conf.FlagCreatePairsOff,))
-    found = {text for action in parser._actions for text in action.option_strings}
-    return sorted(text for text in found if text.startswith("--"))
+    return sorted({"--help", *(o.path for o in options(command.Config) if o.path[0] == "-")})

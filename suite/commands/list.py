@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import tyro
 
+from suite.commands.tracks import family_text
 from suite.common.console import Console
+from suite.common.usage import first_paragraph
 from tracks.common.names import unknown_name
 
 
@@ -37,7 +39,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.kind == "settings":
         return {"settings": list_settings(config.recipe, console)}
     if not config.kind:
-        found = {kind: sorted(about()) for kind, about in KINDS.items()}
+        found = {kind: sorted(of.names()) for kind, of in KINDS.items()}
         width = max(map(len, found))
         for kind, names in found.items():
             console.say(f"{kind:<{width}}  {', '.join(names)}")
@@ -45,7 +47,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         return found
     if config.kind not in KINDS:
         raise unknown_name("kind", config.kind, [*KINDS, "settings"])
-    abouts = KINDS[config.kind]()
+    of = KINDS[config.kind]
+    abouts = {name: of.about(name) for name in of.names()}
     width = max(map(len, abouts))
     for name, about in abouts.items():
         console.say(f"{name:<{width}}  {about}")
@@ -64,86 +67,103 @@ def list_settings(recipe: str, console: Console) -> list[dict[str, Any]]:
     return [one._asdict() for one in found]
 
 
-def _first_line(text: str | None) -> str:
-    return " ".join((text or "").split("\n\n")[0].split())
+class Kind(NamedTuple):
+    """Things of one kind; what only the line about one needs is loaded when it is asked for."""
+
+    names: Callable[[], Iterable[str]]
+    about: Callable[[str], str]
 
 
-def _tracks() -> dict[str, str]:
-    from suite.commands.tracks import family_texts
+def _tracks() -> Iterable[str]:
+    from tracks.families import FAMILIES
 
-    return family_texts()
-
-
-def _vehicles() -> dict[str, str]:
-    from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
-
-    def about(name: str) -> str:
-        vehicle = load_vehicle(name)
-        effects = ", ".join(vehicle.effects) or "no effects"
-        return f"{vehicle.mass:g} kg, controller {vehicle.controller.kind}; {effects}"
-
-    return {name: about(name) for name in shipped_vehicles()}
+    return FAMILIES
 
 
-def _policies() -> dict[str, str]:
-    from policies.policy import load_policy
+def _vehicles() -> Iterable[str]:
+    from eval.quadrotor.vehicle_file import shipped_vehicles
+
+    return shipped_vehicles()
+
+
+def _vehicle(name: str) -> str:
+    from eval.quadrotor.vehicle_file import load_vehicle
+
+    vehicle = load_vehicle(name)
+    effects = ", ".join(vehicle.effects) or "no effects"
+    return f"{vehicle.mass:g} kg, controller {vehicle.controller.kind}; {effects}"
+
+
+def _policies() -> Iterable[str]:
     from policies.shipped import names
 
-    def about(name: str) -> str:
-        spec = load_policy(name).spec
-        return f"{spec.action.kind}, {spec.rate_hz:g} Hz, {spec.state_size} state inputs and depth"
-
-    return {name: about(name) for name in names()}
+    return names()
 
 
-def _recipes() -> dict[str, str]:
+def _policy(name: str) -> str:
+    from policies.policy import load_policy
+
+    spec = load_policy(name).spec
+    return f"{spec.action.kind}, {spec.rate_hz:g} Hz, {spec.state_size} state inputs and depth"
+
+
+def _recipes() -> Mapping[str, Any]:
     from suite.train.recipes import RECIPES
 
-    return {name: _first_line(make.__doc__) for name, make in RECIPES.items()}
+    return RECIPES
 
 
-def _effects() -> dict[str, str]:
+def _effects() -> Mapping[str, Any]:
     from eval.effects import EFFECTS
 
-    return {effect.name: effect.summary for effect in EFFECTS.values()}
+    return EFFECTS
 
 
-def _sensors() -> dict[str, str]:
-    from eval.sensors.sensors_file import load_sensors, shipped_sensors
+def _sensors() -> Iterable[str]:
+    from eval.sensors.sensors_file import shipped_sensors
 
-    def about(name: str) -> str:
-        return ", ".join(load_sensors(name).models) or "the truth"
-
-    return {name: about(name) for name in shipped_sensors()}
+    return shipped_sensors()
 
 
-def _sensor_models() -> dict[str, str]:
+def _sensor(name: str) -> str:
+    from eval.sensors.sensors_file import load_sensors
+
+    return ", ".join(load_sensors(name).models) or "the truth"
+
+
+def _sensor_models() -> Mapping[str, Any]:
     from eval.sensors import SENSORS
 
-    return {sensor.name: sensor.summary for sensor in SENSORS.values()}
+    return SENSORS
 
 
-def _simulators() -> dict[str, str]:
+def _simulators() -> Iterable[str]:
     from eval.worlds import WORLDS
 
-    return {name: _first_line(WORLDS.find(name).__doc__) for name in WORLDS}
+    return WORLDS
 
 
-def _benchmarks() -> dict[str, str]:
+def _simulator(name: str) -> str:
+    from eval.worlds import WORLDS
+
+    return first_paragraph(WORLDS.find(name).__doc__)
+
+
+def _benchmarks() -> Mapping[str, str]:
     from suite.experiments.bench import BENCHES
 
-    return dict(BENCHES)
+    return BENCHES
 
 
-KINDS: dict[str, Callable[[], dict[str, str]]] = {
-    "tracks": _tracks,
-    "vehicles": _vehicles,
-    "policies": _policies,
-    "recipes": _recipes,
-    "effects": _effects,
-    "sensors": _sensors,
-    "sensor-models": _sensor_models,
-    "simulators": _simulators,
-    "benchmarks": _benchmarks,
+KINDS: dict[str, Kind] = {
+    "tracks": Kind(_tracks, family_text),
+    "vehicles": Kind(_vehicles, _vehicle),
+    "policies": Kind(_policies, _policy),
+    "recipes": Kind(_recipes, lambda name: first_paragraph(_recipes()[name].__doc__)),
+    "effects": Kind(_effects, lambda name: _effects()[name].summary),
+    "sensors": Kind(_sensors, _sensor),
+    "sensor-models": Kind(_sensor_models, lambda name: _sensor_models()[name].summary),
+    "simulators": Kind(_simulators, _simulator),
+    "benchmarks": Kind(_benchmarks, lambda name: _benchmarks()[name]),
 }
-"""Kind -> function that returns the names with a line about each."""
+"""What can be listed."""

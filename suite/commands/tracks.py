@@ -11,6 +11,7 @@ import tyro
 
 from suite.common.choices import is_track_file, parse_levels
 from suite.common.console import Console
+from suite.common.usage import first_paragraph
 from tracks.input.ranges import Seed
 
 
@@ -61,25 +62,22 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 
 def _list(console: Console) -> dict[str, Any]:
-    from tracks.families import JUDGED
+    from tracks.families import FAMILIES, JUDGED
 
     families = {}
-    for name, about in family_texts().items():
-        families[name] = {"about": about, "judged": name in JUDGED}
-        console.say(f"{name:<10}{about}")
+    for name in FAMILIES:
+        families[name] = {"about": family_text(name), "judged": name in JUDGED}
+        console.say(f"{name:<10}{families[name]['about']}")
     console.say()
     console.say("levels 0 (easy) to 9 (hard); suite tracks NAME --difficulty 9 draws one")
     return {"families": families}
 
 
-def family_texts() -> dict[str, str]:
-    """Return what each track family is, by its name."""
+def family_text(name: str) -> str:
+    """Return what a track family is."""
     from tracks.families import FAMILIES
 
-    texts = {}
-    for name, make in FAMILIES.items():
-        # A file of its own is described at its head, a function among others in its docstring.
-        alone = getattr(make, "__name__", "") == "make"
-        about = (sys.modules[make.__module__] if alone else make).__doc__ or ""
-        texts[name] = " ".join(about.split("\n\n")[0].split())
-    return texts
+    make = FAMILIES.find(name)
+    # A file of its own is described at its head, a function among others in its docstring.
+    alone = getattr(make, "__name__", "") == "make"
+    return first_paragraph((sys.modules[make.__module__] if alone else make).__doc__)

@@ -1,4 +1,4 @@
-"""The settings of a configuration as a list: path, default, allowed values and meaning of each."""
+"""The settings of a configuration, and a command's options, as lists with the meaning of each."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import functools
 import inspect
 import textwrap
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from tracks.input.ranges import ranged
 
@@ -17,9 +17,9 @@ class Setting(NamedTuple):
     """One setting."""
 
     path: str
-    """As `--set` takes it, such as loss.progress."""
+    """As `--set` takes it, such as loss.progress; of a command as it is given, such as --track."""
     default: Any
-    """Its value in the configuration at hand."""
+    """Its value in the configuration at hand; of a command "" where there is none to show."""
     allowed: str
     """Its range; "" where its type alone limits it."""
     about: str
@@ -33,7 +33,7 @@ def settings(config: Any) -> Iterator[Setting]:
 
 
 def _settings(config: Any, prefix: str, allowed: dict[str, str]) -> Iterator[Setting]:
-    texts = abouts(type(config))
+    texts = _abouts(type(config))
     for field in dataclasses.fields(config):
         path, value = f"{prefix}{field.name}", getattr(config, field.name)
         if dataclasses.is_dataclass(value):
@@ -42,8 +42,32 @@ def _settings(config: Any, prefix: str, allowed: dict[str, str]) -> Iterator[Set
             yield Setting(path, value, allowed.get(path, ""), texts.get(field.name, ""))
 
 
+def options(command: type) -> Iterator[Setting]:
+    """Yield the options of a command's configuration and of the dataclasses within.
+
+    What is given without an option is a word in capitals.
+    """
+    import tyro
+
+    hints, texts = get_type_hints(command, include_extras=True), _abouts(command)
+    for field in dataclasses.fields(command):
+        kind = getattr(hints[field.name], "__origin__", hints[field.name])
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            yield from options(kind)
+            continue
+        notes = getattr(hints[field.name], "__metadata__", ())
+        named = next((n.name for n in notes if getattr(n, "name", None)), field.name)
+        # A type variable stands for the subcommands.
+        free = tyro.conf.Positional in notes or isinstance(kind, TypeVar)
+        dashed = ("no-" if field.default is True else "") + named.replace("_", "-")
+        plain = isinstance(field.default, str | int | float) and not isinstance(field.default, bool)
+        default = str(field.default) if plain else ""
+        name = field.name.upper() if free else f"--{dashed}"
+        yield Setting(name, default, "", texts.get(field.name, ""))
+
+
 @functools.cache
-def abouts(cls: type) -> dict[str, str]:
+def _abouts(cls: type) -> dict[str, str]:
     """Return the text under each field of a dataclass, which Python itself does not keep."""
     (body,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
     assert isinstance(body, ast.ClassDef)

@@ -136,6 +136,11 @@ def overview() -> str:
     return "\n".join(lines)
 
 
+def first_paragraph(text: str | None) -> str:
+    """Return the first paragraph of a docstring as one line."""
+    return " ".join((text or "").split("\n\n")[0].split())
+
+
 def description(name: str, about: str) -> str:
     """Return the head of a command's help: its purpose, its examples, then what more there is."""
     first, *more = [" ".join(part.split()) for part in about.split("\n\n")]

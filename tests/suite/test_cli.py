@@ -282,3 +282,25 @@ def test_what_makes_no_sense_is_refused_in_one_line(line, tmp_path, monkeypatch,
     options = [word for word in line.split() if word.startswith("--")]
     assert any(option in said or "=" in line for option in options)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_other_commands_take_by_name_is_listed(capfd):
+    assert cli.main(["list", "--json"]) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert {"race", "race-small"} <= set(found["policies"]) and "vio" in found["sensors"]
+    for kind in found:
+        assert cli.main(["list", kind, "--json"]) == 0
+        abouts = json.loads(capfd.readouterr().out)[kind]
+        assert sorted(abouts) == found[kind] and all(abouts.values())
+    assert cli.main(["list", "trakcs"]) == 2
+    assert "Did you mean 'tracks'" in capfd.readouterr().err
+
+
+def test_a_shell_is_given_every_command_with_its_options(capsys):
+    assert cli.main(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    lines = {
+        line.split(")")[0].strip(): line for line in script.splitlines() if ") options=" in line
+    }
+    assert set(lines) == set(cli.COMMANDS)
+    assert "--simulator" in lines["eval"] and "--no-delta" in lines["loop"]
