@@ -19,7 +19,7 @@ from eval.logs.columns import GROUPS, KNOWN
 from eval.logs.faults.reading import TIMES
 from eval.logs.files import METADATA
 from tracks.common.names import unknown_name
-from tracks.common.toml_table import Table, read_toml
+from tracks.common.toml_table import Table, read_toml, shipped_names
 
 SHIPPED = Path(__file__).resolve().parent / "mappings"
 DEG = float(np.pi / 180.0)
@@ -124,7 +124,7 @@ class LogMap:
 
 def shipped_maps() -> list[str]:
     """Return the names of the mappings that come with the suite."""
-    return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+    return shipped_names(SHIPPED)
 
 
 def map_file(path: Path) -> Path:

@@ -20,10 +20,9 @@ from eval.quadrotor.loops import KINDS, NOMINAL
 from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Vector, Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
 from tracks.common.files import write_text
-from tracks.common.names import printable, unknown_name
-from tracks.common.toml_table import REQUIRED, Table, to_toml
+from tracks.common.names import printable
+from tracks.common.toml_table import REQUIRED, Table, load_shipped, shipped_names, to_toml
 from tracks.geometry.camera import Camera
-from tracks.input.reading import InputError, read_toml, reason
 
 SCHEMA = 1
 SHIPPED = Path(__file__).resolve().parents[1] / "vehicles"
@@ -40,7 +39,7 @@ class VehicleFileError(ValueError):
 
 def shipped_vehicles() -> list[str]:
     """Return the names of the vehicles that come with the suite."""
-    return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+    return shipped_names(SHIPPED)
 
 
 def load_vehicle(source: str | os.PathLike[str]) -> Vehicle:
@@ -53,24 +52,7 @@ def load_vehicle(source: str | os.PathLike[str]) -> Vehicle:
         VehicleFileError: for what the file says or lacks.
         ValueError: for a name that is neither.
     """
-    path = Path(source)
-    if path.suffix != ".toml" and len(path.parts) == 1 and not path.is_file():
-        if str(source) not in shipped_vehicles():
-            raise unknown_name("vehicle (or file)", str(source), shipped_vehicles())
-        path = SHIPPED / f"{source}.toml"
-    try:
-        table = read_toml(path)
-    except FileNotFoundError as error:
-        known = ", ".join(shipped_vehicles())
-        raise VehicleFileError(f"{path}: no such file; shipped by name: {known}") from error
-    except OSError as error:
-        raise VehicleFileError(f"{path}: cannot be read: {reason(error)}") from error
-    except InputError as error:
-        raise VehicleFileError(str(error)) from error
-    try:
-        return parse_vehicle(table)
-    except ValueError as error:
-        raise VehicleFileError(f"{path}: {error}") from error
+    return load_shipped(source, SHIPPED, "vehicle", parse_vehicle, VehicleFileError)
 
 
 def parse_vehicle(table: Mapping[str, Any]) -> Vehicle:

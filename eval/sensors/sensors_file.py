@@ -16,9 +16,8 @@ from typing import Any
 from eval.sensors import SENSORS, scaled
 from eval.sensors.interface import STAGES, Ages, Sensor
 from tracks.common.files import write_text
-from tracks.common.names import printable, unknown_name
-from tracks.common.toml_table import Table, to_toml
-from tracks.input.reading import InputError, read_toml, reason
+from tracks.common.names import printable
+from tracks.common.toml_table import Table, load_shipped, shipped_names, to_toml
 
 SCHEMA = 1
 PRESETS = Path(__file__).resolve().parent / "presets"
@@ -95,7 +94,7 @@ def grown(sensors: SensorSet, magnitude: float) -> SensorSet:
 
 def shipped_sensors() -> list[str]:
     """Return the names of the sensors files that come with the suite."""
-    return sorted(path.stem for path in PRESETS.glob("*.toml"))
+    return shipped_names(PRESETS)
 
 
 def load_sensors(source: str | os.PathLike[str]) -> SensorSet:
@@ -108,22 +107,7 @@ def load_sensors(source: str | os.PathLike[str]) -> SensorSet:
         SensorsFileError: for what the file says or lacks.
         ValueError: for a name that is neither.
     """
-    path = Path(source)
-    if path.suffix != ".toml" and len(path.parts) == 1 and not path.is_file():
-        if str(source) not in shipped_sensors():
-            raise unknown_name("sensors (or file)", str(source), shipped_sensors())
-        path = PRESETS / f"{source}.toml"
-    try:
-        return parse_sensors(read_toml(path))
-    except FileNotFoundError as error:
-        known = ", ".join(shipped_sensors())
-        raise SensorsFileError(f"{path}: no such file; shipped by name: {known}") from error
-    except OSError as error:
-        raise SensorsFileError(f"{path}: cannot be read: {reason(error)}") from error
-    except InputError as error:
-        raise SensorsFileError(str(error)) from error
-    except ValueError as error:
-        raise SensorsFileError(f"{path}: {error}") from error
+    return load_shipped(source, PRESETS, "sensors", parse_sensors, SensorsFileError)
 
 
 def parse_sensors(table: Mapping[str, Any]) -> SensorSet:

@@ -8,14 +8,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from tracks.common.names import closest, printable
+from tracks.common.names import closest, printable, unknown_name
 from tracks.input import reading
 from tracks.input.ranges import is_number, shown
 
@@ -35,6 +36,51 @@ def read_toml(path: Path) -> Table:
         return Table(str(path), "", reading.read_toml(path))
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({reading.reason(error)})") from None
+
+
+def shipped_names(folder: Path) -> list[str]:
+    """Return the names of the TOML files in a folder of what comes with the suite."""
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
+def load_shipped(
+    source: str | os.PathLike[str],
+    folder: Path,
+    kind: str,
+    parse: Callable[[dict[str, Any]], T],
+    refused: type[ValueError],
+) -> T:
+    """Return what a TOML file describes, or one that comes with the suite by its name.
+
+    Args:
+        source: a path (it ends in .toml, has a folder or exists) or a shipped name.
+        folder: of the shipped files.
+        kind: what a message calls one.
+        parse: makes it of the file's table; a ValueError says what is wrong.
+        refused: the error for what the file says or lacks.
+
+    Raises:
+        refused: naming the file.
+        ValueError: for a source that is neither.
+    """
+    path = Path(source)
+    if path.suffix != ".toml" and len(path.parts) == 1 and not path.is_file():
+        if str(source) not in shipped_names(folder):
+            raise unknown_name(f"{kind} (or file)", str(source), shipped_names(folder))
+        path = folder / f"{source}.toml"
+    try:
+        table = reading.read_toml(path)
+    except FileNotFoundError as error:
+        known = ", ".join(shipped_names(folder))
+        raise refused(f"{path}: no such file; shipped by name: {known}") from error
+    except OSError as error:
+        raise refused(f"{path}: cannot be read: {reading.reason(error)}") from error
+    except reading.InputError as error:
+        raise refused(str(error)) from error
+    try:
+        return parse(table)
+    except ValueError as error:
+        raise refused(f"{path}: {error}") from error
 
 
 class Table:
