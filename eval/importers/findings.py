@@ -43,6 +43,6 @@ def asked_of(rows: dict[str, np.ndarray], lacks: list[str]) -> Finding:
     if no_pose:
         text = f"this log has no pose: {text}; not identifiable from it: "
         text += ", ".join(
-            what for name, told in UNSEEN.items() if name not in rows for what in told
+            what for name, whats in UNSEEN.items() if name not in rows for what in whats
         )
     return Finding("note", "partial", text)

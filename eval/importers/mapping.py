@@ -30,7 +30,7 @@ Find = Callable[[tuple[str, ...]], Part | None]
 KEPT = "kept:"
 """Before the name of a column that is kept as it is."""
 ESTIMATED = ("pos", "quat", "vel")
-"""Signals of which an on-board estimate may stand beside motion capture."""
+"""Signals of which an on-board estimate may stand next to motion capture."""
 
 
 def recording_of(
@@ -112,8 +112,8 @@ def _estimates(
             part = find(column.names) if column.source == "estimate" else None
             if part is None or _is_world(signal, column) != (signal == "vel"):
                 continue
-            told = {signal: column}
-            time_s, value = _turned(signal, *_values(part, column, name), told, mapping)
+            alone = {signal: column}
+            time_s, value = _turned(signal, *_values(part, column, name), alone, mapping)
             value = continuous(value) if signal == "quat" else value
             for k, group in enumerate(GROUPS[signal]):
                 kept[f"{KEPT}{ESTIMATE}{group}"] = (time_s, value[:, k : k + 1])

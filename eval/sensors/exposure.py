@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, over_image, sticky
+from eval.sensors.interface import (
+    Array,
+    Moment,
+    Needs,
+    Parameter,
+    Sensor,
+    View,
+    absent,
+    over_image,
+    sticky,
+)
 
 
 class Exposure(NamedTuple):
@@ -12,11 +22,6 @@ class Exposure(NamedTuple):
 
     share: Array
     length: Array
-
-
-def start(values: Exposure, moment: Moment) -> Array:
-    """Return that the camera sees."""
-    return moment.draws.uniform[..., 0] < 0.0
 
 
 def sense(values: Exposure, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
@@ -41,6 +46,6 @@ SENSOR = Sensor(
     grows=("share",),
     trial=Needs(uniform=1),
     observation=Needs(uniform=1),
-    start=start,
+    start=absent,
     sense=sense,
 )

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, over_image, sticky
+from eval.sensors.interface import (
+    Array,
+    Moment,
+    Needs,
+    Parameter,
+    Sensor,
+    View,
+    absent,
+    over_image,
+    sticky,
+)
 
 
 class FrameLoss(NamedTuple):
@@ -16,7 +26,7 @@ class FrameLoss(NamedTuple):
 
 def start(values: FrameLoss, moment: Moment) -> dict[str, Any]:
     """Return that nothing is lost; the first image always comes."""
-    return {"lost": moment.draws.uniform[..., 0] < 0.0, "shown_m": moment.truth.depth_m}
+    return {"lost": absent(values, moment), "shown_m": moment.truth.depth_m}
 
 
 def sense(

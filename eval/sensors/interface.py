@@ -51,7 +51,7 @@ class Draws(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """What a model is told of one observation besides what the models before it made of it."""
+    """What a model is given of one observation, apart from what the models before it made of it."""
 
     truth: View
     """What there truly is, at the time of what is seen."""
@@ -127,6 +127,12 @@ def column(value: Array) -> Array:
 def over_image(value: Array) -> Array:
     """Return numbers (...,) as (..., 1, 1), to multiply images."""
     return value[..., None, None]
+
+
+def absent(values: Values, moment: Moment) -> Array:
+    """Return, at the start, that a fault with one uniform draw a trial is not there (...,)."""
+    del values
+    return moment.draws.uniform[..., 0] < 0.0
 
 
 def sticky(on: Array, chance: Array, share: Array, length_s: Array, dt_s: Any) -> Array:

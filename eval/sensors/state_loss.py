@@ -8,7 +8,17 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, column, sticky
+from eval.sensors.interface import (
+    Array,
+    Moment,
+    Needs,
+    Parameter,
+    Sensor,
+    View,
+    absent,
+    column,
+    sticky,
+)
 
 
 class StateLoss(NamedTuple):
@@ -23,7 +33,7 @@ class StateLoss(NamedTuple):
 def start(values: StateLoss, moment: Moment) -> dict[str, Any]:
     """Return that the estimator has track, and no errors."""
     none_w = 0.0 * moment.truth.pos_w
-    lost = moment.draws.uniform[..., 0] < 0.0
+    lost = absent(values, moment)
     return {"lost": lost, "acc_w": none_w, "vel_w": none_w, "pos_w": none_w, "jump_w": none_w}
 
 

@@ -41,7 +41,7 @@ def sense(values: Stereo, memory: Array, seen: View, moment: Moment) -> tuple[Vi
     """Return the view with the image as stereo gives it."""
     depth_m, grain, chance = seen.depth_m, moment.draws.grain, moment.draws.chance
     xp, range_m = depth_m.__array_namespace__(), moment.camera.range_m
-    left, right = beside(depth_m, -1), beside(depth_m, 1)
+    left, right = neighbour(depth_m, -1), neighbour(depth_m, 1)
     nearer, further = xp.minimum(left, right), xp.maximum(left, right)
     edge = EDGE * nearer < depth_m
     thin = EDGE * depth_m < xp.minimum(left, right)
@@ -54,7 +54,7 @@ def sense(values: Stereo, memory: Array, seen: View, moment: Moment) -> tuple[Vi
     return seen._replace(depth_m=found_m), memory
 
 
-def beside(depth_m: Array, side: int) -> Array:
+def neighbour(depth_m: Array, side: int) -> Array:
     """Return each pixel's left (-1) or right (1) neighbour; at the border the pixel itself."""
     xp = depth_m.__array_namespace__()
     if side < 0:

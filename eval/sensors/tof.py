@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, over_image
-from eval.sensors.stereo import EDGE, NEAREST_M, beside
+from eval.sensors.stereo import EDGE, NEAREST_M, neighbour
 
 LIGHT = 299_792_458.0
 """Speed of light [m/s]."""
@@ -33,7 +33,7 @@ def sense(values: TimeOfFlight, memory: Array, seen: View, moment: Moment) -> tu
     """Return the view with the image as time of flight gives it."""
     depth_m, draws, range_m = seen.depth_m, moment.draws, moment.camera.range_m
     xp, chance = depth_m.__array_namespace__(), draws.chance
-    neighbours = [beside(depth_m, side) for side in (-1, 1)]
+    neighbours = [neighbour(depth_m, side) for side in (-1, 1)]
     nearer = xp.minimum(*neighbours)
     mixed = (EDGE * nearer < depth_m) & (chance[..., 0, :, :] < over_image(values.mixing))
     share = chance[..., 1, :, :]

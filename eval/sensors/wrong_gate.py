@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, column, sticky
+from eval.sensors.interface import (
+    Array,
+    Moment,
+    Needs,
+    Parameter,
+    Sensor,
+    View,
+    absent,
+    column,
+    sticky,
+)
 
 
 class WrongGate(NamedTuple):
@@ -12,11 +22,6 @@ class WrongGate(NamedTuple):
 
     share: Array
     length: Array
-
-
-def start(values: WrongGate, moment: Moment) -> Array:
-    """Return that the gates are told apart."""
-    return moment.draws.uniform[..., 0] < 0.0
 
 
 def sense(values: WrongGate, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
@@ -42,6 +47,6 @@ SENSOR = Sensor(
     grows=("share",),
     trial=Needs(uniform=1),
     observation=Needs(uniform=1),
-    start=start,
+    start=absent,
     sense=sense,
 )

@@ -15,12 +15,13 @@ from tracks.input.ranges import Range
 
 @dataclass(frozen=True)
 class Config:
-    """Read a log of PX4, Betaflight, a Crazyflie, ROS 2 (MCAP) or a table, check and convert it."""
+    """Read and check a log of PX4, ArduPilot, Betaflight, a Crazyflie, ROS 2 or a table."""
 
     file: tyro.conf.Positional[Path]
     """The log."""
     format: str = ""
-    """px4, betaflight, crazyflie, table or mcap; by default told by the file's first bytes."""
+    """px4, betaflight, ardupilot, crazyflie, table or mcap; by default the file's first bytes
+    decide."""
     out: Path = Path("flight.parquet")
     """The flight log to write (.parquet or .csv)."""
     map: Path | None = None

@@ -19,7 +19,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "export": "write a policy as torch program, ONNX and C",
     },
     "Logs": {
-        "import": "read a log of PX4, Betaflight, a Crazyflie, ROS 2 or a table",
+        "import": "read a log of PX4, ArduPilot, Betaflight, a Crazyflie, ROS 2 or a table",
         "check": "find mistakes of unit, frame, sign and scale in logs, vehicle and policy files",
         "identify": "estimate the parameters of a vehicle file from flight logs",
         "diagnose": "name the physical effect that a vehicle file lacks, from flight logs",

@@ -183,7 +183,7 @@ class EpisodeConfig:
     """Largest speed towards the gate of a world that starts on the way; sideways some is added
     [m/s]."""
     missed_share: Share = 0.0
-    """Share of the worlds that start on the way which start beside or above their gate's frame, as
+    """Share of the worlds that start on the way which start next to or above their gate's frame, as
     one does that has missed it."""
     sharp_share: Share = 0.55
     """Share of tracks with one or two sharp turns."""

@@ -124,9 +124,9 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         reason = f"an ArduPilot log that cannot be read ({type(error).__name__}: {error})"
         raise FlightLogError(str(path), None, None, reason) from None
     parameters = {str(one["Name"]): float(one["Value"]) for one in table.pop("PARM")}
-    told = [str(one["Message"]) for one in table.pop("MSG")]
+    texts = [str(one["Message"]) for one in table.pop("MSG")]
     messages = {name: _columns(rows, name) for name, rows in table.items() if rows}
-    return messages, parameters, {"firmware": told[0]} if told else {}
+    return messages, parameters, {"firmware": texts[0]} if texts else {}
 
 
 def _columns(rows: list[dict[str, Any]], name: str) -> Rows:
