@@ -13,7 +13,7 @@ import numpy as np
 
 from eval.effects.interface import as_arrays
 from eval.sensors import SENSORS
-from eval.sensors.draws import blank_draws, draw
+from eval.sensors.draws import blank_of_each, draw
 from eval.sensors.filter.delayed import Delayed, present, step, wait
 from eval.sensors.filter.kalman import (
     GRAVITY,
@@ -80,10 +80,8 @@ class Filtered:
             for name, values in wanted.models.items()
             if SENSORS[name].measure
         }
-        self._trial, self._sample = (
-            {name: blank_draws(needs(SENSORS[name]), slots, camera) for name in self._imu}
-            for needs in (lambda sensor: sensor.trial, lambda sensor: sensor.observation)
-        )
+        used = (SENSORS[name] for name in self._imu)
+        self._trial, self._sample = blank_of_each(used, slots, camera)
         self._late = round(settings.delay_s / dt)
         self._period = 1.0 / (settings.frame_hz * dt)
         self._half_view = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) / 2.0)

@@ -13,7 +13,7 @@ import numpy as np
 
 from eval import sensors
 from eval.sensors import SENSORS
-from eval.sensors.draws import blank_draws, draw
+from eval.sensors.draws import blank_of_each, draw
 from eval.sensors.sensors_file import SensorSet
 from eval.worlds.slots import SENSED, generator_of
 from eval.worlds.trial import TrialSpec
@@ -35,10 +35,8 @@ class Sensors:
             camera: the policy's.
         """
         self._models, self._dt_s, self._camera = sensors.sensing(wanted.models), 1 / rate_hz, camera
-        self._trial, self._draws = (
-            {name: blank_draws(needs(SENSORS[name]), slots, camera) for name in self._models}
-            for needs in (lambda sensor: sensor.trial, lambda sensor: sensor.observation)
-        )
+        used = (SENSORS[name] for name in self._models)
+        self._trial, self._draws = blank_of_each(used, slots, camera)
         nobody = np.random.default_rng(0)
         self._generators = {name: [nobody] * slots for name in self._models}
         self._memory: dict[str, Any] | None = None

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eval.sensors.interface import Draws, Needs
+from eval.sensors.interface import Draws, Needs, Sensor
 from tracks.geometry.camera import Camera
 
 if TYPE_CHECKING:
@@ -22,6 +23,15 @@ def blank_draws(needs: Needs, rows: int, camera: Camera) -> Draws:
         np.zeros((rows, needs.grain, *shape)),
         np.zeros((rows, needs.chance, *shape)),
     )
+
+
+def blank_of_each(
+    models: Iterable[Sensor], rows: int, camera: Camera
+) -> tuple[dict[str, Draws], dict[str, Draws]]:
+    """Return room for the draws of a trial, and of an observation, by the models' names."""
+    each = list(models)
+    trial = {one.name: blank_draws(one.trial, rows, camera) for one in each}
+    return trial, {one.name: blank_draws(one.observation, rows, camera) for one in each}
 
 
 def draw(into: Draws, row: int, generator: np.random.Generator) -> None:
