@@ -12,6 +12,7 @@ import contextlib
 import errno
 import os
 import shlex
+import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,7 +43,7 @@ def one_writer(folder: Path) -> Iterator[None]:
     with folder_while_used(folder):
         path = folder / LOCK
         lock = FileLock(path, timeout=0, mode=0o644, fallback_to_soft=False)
-        if path.exists() and (not path.is_file() or path.stat().st_size):
+        if _is_foreign(path):
             raise ValueError(
                 f"{path} is not the suite's, whose own is an empty file; move it away, or give "
                 "another --out"
@@ -67,6 +68,15 @@ def one_writer(folder: Path) -> Iterator[None]:
             for name in (HOLDER, LOCK):
                 (folder / name).unlink(missing_ok=True)
             lock.release()
+
+
+def _is_foreign(path: Path) -> bool:
+    """Say whether what stands at `path` is no lock of ours; another command may just remove its."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return False
+    return not stat.S_ISREG(found.st_mode) or found.st_size > 0
 
 
 @contextmanager
